@@ -1,0 +1,147 @@
+"""Windows of pixels and the map grid of a product."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.errors import UsageError
+
+__all__ = ["MapGrid", "Window"]
+
+
+@dataclass(frozen=True, order=True)
+class Window:
+    """A rectangle of pixels: `col`, `row` of its first pixel, `width`, `height` in pixels (zero: empty)."""
+
+    col: int
+    row: int
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        if self.width < 0 or self.height < 0:
+            raise UsageError(f"window of {self.width} × {self.height} pixels; sides must not be negative")
+
+    @property
+    def stop(self) -> tuple[int, int]:
+        """First column and row beyond the window."""
+        return self.col + self.width, self.row + self.height
+
+    @property
+    def size(self) -> int:
+        """Number of pixels."""
+        return self.width * self.height
+
+    def __and__(self, other: Window) -> Window:
+        """The common part; empty if there is none."""
+        col, row = max(self.col, other.col), max(self.row, other.row)
+        right = min(self.stop[0], other.stop[0])
+        bottom = min(self.stop[1], other.stop[1])
+        return Window(col, row, max(0, right - col), max(0, bottom - row))
+
+    def tiles(self, side: int) -> Iterator[Window]:
+        """The window cut into tiles of `side` pixels, row by row; the last ones are smaller."""
+        right, bottom = self.stop
+        for row in range(self.row, bottom, side):
+            for col in range(self.col, right, side):
+                yield Window(col, row, min(side, right - col), min(side, bottom - row))
+
+
+@dataclass(frozen=True)
+class MapGrid:
+    """A north-up raster of square pixels in a projected CRS.
+
+    (x, y) = (column, row) refer to pixel centres: (0, 0) is the centre of the upper-left pixel.
+    """
+
+    left: float
+    """X of the outer left edge, metres."""
+    top: float
+    """Y of the outer upper edge, metres."""
+    resolution: float
+    """Side of a pixel, metres."""
+    width: int
+    """Columns."""
+    height: int
+    """Rows."""
+    crs: str
+    """Coordinate reference system as a string that pyproj reads (usually `EPSG:…` or WKT)."""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.resolution) and self.resolution > 0):
+            raise UsageError(f"resolution {self.resolution}; a positive number of metres is needed")
+        if self.width < 1 or self.height < 1:
+            raise UsageError(f"grid of {self.width} × {self.height} pixels; it must hold at least one")
+
+    @classmethod
+    def covering(cls, bounds: tuple[float, float, float, float], resolution: float, crs: str) -> MapGrid:
+        """The grid that covers `bounds` (xmin, ymin, xmax, ymax) with edges on multiples of `resolution`.
+
+        Grids of one resolution therefore share their pixels, whatever their bounds: a crop of a product is the
+        product of the crop.
+        """
+        xmin, ymin, xmax, ymax = bounds
+        if not all(math.isfinite(b) for b in bounds) or xmin >= xmax or ymin >= ymax:
+            raise UsageError(f"bounds {bounds}; needed are xmin ymin xmax ymax with xmin < xmax and ymin < ymax")
+        if not (math.isfinite(resolution) and resolution > 0):
+            raise UsageError(f"resolution {resolution}; a positive number of metres is needed")
+        # A bound on a multiple stays there although the quotient carries rounding errors.
+        col0 = math.floor(xmin / resolution + 1e-6)
+        col1 = math.ceil(xmax / resolution - 1e-6)
+        row0 = math.floor(-ymax / resolution + 1e-6)
+        row1 = math.ceil(-ymin / resolution - 1e-6)
+        return cls(
+            col0 * resolution, -row0 * resolution, resolution, max(1, col1 - col0), max(1, row1 - row0), crs
+        )
+
+    @property
+    def window(self) -> Window:
+        """All pixels."""
+        return Window(0, 0, self.width, self.height)
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Outer edges xmin, ymin, xmax, ymax."""
+        return (
+            self.left,
+            self.top - self.height * self.resolution,
+            self.left + self.width * self.resolution,
+            self.top,
+        )
+
+    def to_map(self, uv: ArrayLike) -> NDArray[np.float64]:
+        """Pixel coordinates (column, row) to map X, Y; shapes (..., 2)."""
+        uv = np.asarray(uv, float)
+        return np.stack(
+            [
+                self.left + (uv[..., 0] + 0.5) * self.resolution,
+                self.top - (uv[..., 1] + 0.5) * self.resolution,
+            ],
+            axis=-1,
+        )
+
+    def to_pixel(self, XY: ArrayLike) -> NDArray[np.float64]:
+        """Map X, Y to pixel coordinates (column, row); inverse of `to_map`."""
+        XY = np.asarray(XY, float)
+        return np.stack(
+            [
+                (XY[..., 0] - self.left) / self.resolution - 0.5,
+                (self.top - XY[..., 1]) / self.resolution - 0.5,
+            ],
+            axis=-1,
+        )
+
+    def bounds_of(self, window: Window) -> tuple[float, float, float, float]:
+        """Outer edges of a window of this grid."""
+        right, bottom = window.stop
+        return (
+            self.left + window.col * self.resolution,
+            self.top - bottom * self.resolution,
+            self.left + right * self.resolution,
+            self.top - window.row * self.resolution,
+        )

@@ -1,0 +1,84 @@
+"""Rotations from angles and back, for every order that orientation tables use."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.errors import UsageError
+
+__all__ = ["ROTATION_ORDERS", "angles_from_rotation", "opk_from_rotation", "rotation_from_angles", "rotation_opk"]
+
+#: Orders of the three angles; the first letter is the primary rotation (about the fixed axis).
+ROTATION_ORDERS = ("opk", "pok", "kpo", "kop", "okp", "pko")
+
+_AXIS = {"o": 0, "p": 1, "k": 2}
+
+
+def _about(axis: int, angle: float) -> NDArray[np.float64]:
+    c, s = np.cos(angle), np.sin(angle)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    R = np.eye(3)
+    R[i, i] = R[j, j] = c
+    R[i, j], R[j, i] = -s, s
+    return R
+
+
+def rotation_from_angles(angles: ArrayLike, order: str = "opk") -> NDArray[np.float64]:
+    """Rotation matrix of three angles given in the sequence of `order`.
+
+    Parameters
+    ----------
+    angles : array_like, shape (3,)
+        Radians, in the sequence that `order` spells: with ``"pok"`` the first angle is φ.
+    order : str
+        One of `ROTATION_ORDERS`; the first letter is the primary rotation, o = about X, p = about Y, k = about Z.
+
+    Returns
+    -------
+    R_ground_camera : ndarray, shape (3, 3)
+        Takes camera axes to ground axes; for ``"opk"`` it is Ecker 1991, eq. 3.3.
+
+    Raises
+    ------
+    UsageError
+        `order` is unknown.
+    """
+    if order not in ROTATION_ORDERS:
+        raise UsageError(f"rotation order {order!r}; allowed are {', '.join(ROTATION_ORDERS)}")
+    first, second, third = (_about(_AXIS[k], float(a)) for k, a in zip(order, np.asarray(angles, float)))
+    return first @ second @ third
+
+
+def rotation_opk(omega: float, phi: float, kappa: float) -> NDArray[np.float64]:
+    """R_ground_camera = R_ω R_φ R_κ, angles in radians (Ecker 1991, eq. 3.3)."""
+    return rotation_from_angles((omega, phi, kappa), "opk")
+
+
+def opk_from_rotation(R_ground_camera: ArrayLike) -> NDArray[np.float64]:
+    """Angles ω, φ, κ in radians of a rotation matrix; φ in [−π/2, π/2].
+
+    At φ = ±π/2 only one combination of ω and κ is determined; ω is then 0.
+    """
+    R = np.asarray(R_ground_camera, float)
+    phi = np.arcsin(np.clip(R[0, 2], -1.0, 1.0))
+    if np.hypot(R[0, 0], R[0, 1]) < 1e-12:
+        return np.array([0.0, phi, np.arctan2(R[1, 0], R[1, 1])])
+    return np.array([np.arctan2(-R[1, 2], R[2, 2]), phi, np.arctan2(-R[0, 1], R[0, 0])])
+
+
+def angles_from_rotation(R_ground_camera: ArrayLike, order: str = "opk") -> NDArray[np.float64]:
+    """Angles, in the sequence of `order`, of a rotation matrix; inverse of `rotation_from_angles`.
+
+    Raises
+    ------
+    UsageError
+        `order` is unknown.
+    """
+    if order not in ROTATION_ORDERS:
+        raise UsageError(f"rotation order {order!r}; allowed are {', '.join(ROTATION_ORDERS)}")
+    # Renaming the axes turns every order into ω φ κ; an odd renaming mirrors space, which negates the angles.
+    axes = [_AXIS[k] for k in order]
+    P = np.eye(3)[axes]
+    sign = np.linalg.det(P)
+    return sign * opk_from_rotation(P @ np.asarray(R_ground_camera, float) @ P.T)  # type: ignore[no-any-return]

@@ -1,0 +1,38 @@
+"""The smooth part of a plan: where the pixels of a tile lie in the source image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.geometry.grid import Window
+
+__all__ = ["Anchors"]
+
+
+@dataclass(frozen=True, eq=False)
+class Anchors:
+    """A tile cut into rectangles, each a pile of boxes in (u, v, h) with eight homogeneous corners.
+
+    A pixel looks up the box of its rectangle that holds its height, interpolates (x·w, y·w, w) trilinearly and
+    divides once. For an undistorted frame camera over a map this is exact for a box of any size.
+    """
+
+    rects: NDArray[np.int32]
+    """(m, 4): first column, first row, end column, end row of each rectangle, relative to the tile; half-open."""
+    box_start: NDArray[np.int32]
+    """(m + 1,): boxes of rectangle i are `box_start[i]` to `box_start[i + 1]`, from low to high, without gaps."""
+    box_heights: NDArray[np.float64]
+    """(n, 2): lowest and highest h of each box, metres."""
+    corners: NDArray[np.float64]
+    """(n, 8, 3): (x·w, y·w, w) at corner 4·ih + 2·iv + iu. The corners of a rectangle lie on its pixels' outer edges
+    (first column − 1/2, end column − 1/2); x and y are relative to the first pixel of `source_window`; w > 0 and
+    is scaled to be about 1 inside a tile."""
+    residual: float
+    """Worst difference to the strict projection measured at the boxes' centre, face and edge middles, pixels."""
+    source_window: Window
+    """Part of the source image that holds every position, with the kernel's margin, cut at the image's border."""
+    scale: float
+    """Largest number of source pixels per target pixel along x or y, at the boxes' corners."""

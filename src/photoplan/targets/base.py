@@ -1,0 +1,25 @@
+"""What every target can do."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.geometry.grid import Window
+
+__all__ = ["Target"]
+
+
+class Target(Protocol):
+    """The product's own coordinates: pixel (u, v) = (column, row) and depth h, and where they are on the ground."""
+
+    @property
+    def window(self) -> Window:
+        """All pixels of the product."""
+        ...
+
+    def to_ground(self, uvh: ArrayLike) -> NDArray[np.float64]:
+        """(u, v, h) of shape (..., 3) to ground X, Y, Z of the same shape."""
+        ...
