@@ -1,0 +1,156 @@
+"""Terrain as a grid of heights, bilinear inside a mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.grid import Window
+from photoplan.kernels.sample_grid import sample_lattice, sample_points
+from photoplan.targets.base import Target
+from photoplan.targets.map import MapTarget
+
+__all__ = ["HeightGrid", "RasterSurface"]
+
+#: Between CRSs, positions are computed at every so-manieth pixel and interpolated …
+STEP = 32
+#: … if that is good to this part of a mesh; else each pixel is transformed.
+POSITION_TOLERANCE = 0.01
+
+
+class HeightGrid(Protocol):
+    """Posts of a terrain grid, read by windows; safe to call from several threads."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Columns and rows."""
+        ...
+
+    def read(self, window: Window) -> NDArray[np.float32]:
+        """Heights of a window inside the grid, shape (height, width), metres; NaN where there is none."""
+        ...
+
+
+@dataclass(frozen=True)
+class RasterSurface:
+    """A height grid placed in a CRS. Between four posts the height is bilinear (Behr 1989, eq. 5.10).
+
+    Up to half a mesh beyond the outer posts the edge is continued, since a height raster's cells have an area;
+    further out, and in every mesh that touches a missing post, there is no surface.
+    """
+
+    grid: HeightGrid
+    origin: tuple[float, float]
+    """X, Y of the upper-left post, metres."""
+    mesh: tuple[float, float]
+    """Mesh width in X and in Y, metres, both positive; rows run from north to south."""
+    to_grid_crs: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+    """Takes X, Y of the product's CRS (..., 2) to the grid's CRS; None if they are the same."""
+
+    def __post_init__(self) -> None:
+        if not (self.mesh[0] > 0 and self.mesh[1] > 0):
+            raise InputError(f"terrain grid with mesh {self.mesh}; mesh widths must be positive (a north-up grid)")
+
+    def relief(self, target: Target, window: Window) -> NDArray[np.float32]:
+        """Heights of the pixel centres of a window of a map target, shape (height, width); NaN: no surface."""
+        if not isinstance(target, MapTarget):
+            raise UsageError(f"a raster surface gives relief for map targets, not for {type(target).__name__}")
+        if self.to_grid_crs is not None:
+            return self._relief_across(target, window)
+        first = self._posts(target.grid.to_map((window.col, window.row)))
+        step_x = target.grid.resolution / self.mesh[0]
+        step_y = target.grid.resolution / self.mesh[1]
+        last = first + ((window.width - 1) * step_x, (window.height - 1) * step_y)
+        part, offset = self._read(first, last)
+        if part is None:
+            return np.full((window.height, window.width), np.nan, np.float32)
+        x0, y0 = first - offset
+        return sample_lattice(part, x0, step_x, window.width, y0, step_y, window.height)  # type: ignore[no-any-return]
+
+    def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
+        """Height at map points (..., 2), shape (...); NaN where there is no surface."""
+        XY = np.asarray(XY, float)
+        posts = self._posts(XY if self.to_grid_crs is None else self.to_grid_crs(XY))
+        flat = posts.reshape(-1, 2)
+        there = np.isfinite(flat).all(axis=1)
+        if not there.any():
+            return np.full(posts.shape[:-1], np.nan)
+        part, offset = self._read(flat[there].min(axis=0), flat[there].max(axis=0))
+        if part is None:
+            return np.full(posts.shape[:-1], np.nan)
+        return sample_points(part, flat - offset).astype(float).reshape(posts.shape[:-1])  # type: ignore[no-any-return]
+
+    def height_range(self, bounds: tuple[float, float, float, float]) -> tuple[float, float]:
+        """Lowest and highest post inside or next to map `bounds`; NaN, NaN where there is none."""
+        xmin, ymin, xmax, ymax = bounds
+        edge = np.linspace(0, 1, 9)
+        x, y = np.meshgrid(xmin + edge * (xmax - xmin), ymin + edge * (ymax - ymin))
+        XY = np.stack([x, y], axis=-1)
+        posts = self._posts(XY if self.to_grid_crs is None else self.to_grid_crs(XY)).reshape(-1, 2)
+        part, _ = self._read(posts.min(axis=0), posts.max(axis=0))
+        if part is None or not np.isfinite(part).any():
+            return np.nan, np.nan
+        return float(np.nanmin(part)), float(np.nanmax(part))
+
+    def _posts(self, XY: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Map coordinates to (column, row) of the posts."""
+        return np.stack(
+            [(XY[..., 0] - self.origin[0]) / self.mesh[0], (self.origin[1] - XY[..., 1]) / self.mesh[1]], axis=-1
+        )
+
+    def _read(
+        self, low: NDArray[np.float64], high: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float32] | None, NDArray[np.float64]]:
+        """Posts that surround positions from `low` to `high`, and the position of the first; None if there are none."""
+        columns, rows = self.grid.size
+        # A post more on each side: a position that rounding has moved over a post must still find its mesh.
+        col0, row0 = (max(0, int(np.clip(np.floor(a), -1, s)) - 1) for a, s in zip(low, (columns, rows)))
+        col1, row1 = (min(s, int(np.clip(np.floor(a), -3, s)) + 3) for a, s in zip(high, (columns, rows)))
+        if col0 >= col1 or row0 >= row1:
+            return None, np.zeros(2)
+        part = self.grid.read(Window(col0, row0, col1 - col0, row1 - row0))
+        return part, np.array([col0, row0], float)
+
+    def _relief_across(self, target: MapTarget, window: Window) -> NDArray[np.float32]:
+        assert self.to_grid_crs is not None
+        v, u = np.mgrid[: window.height, : window.width]
+        uv = np.stack([u + window.col, v + window.row], axis=-1).astype(float)
+        corner_u = np.append(np.arange(0, window.width - 1, STEP), window.width - 1)
+        corner_v = np.append(np.arange(0, window.height - 1, STEP), window.height - 1)
+        nodes = np.stack(np.meshgrid(corner_u + window.col, corner_v + window.row), axis=-1).astype(float)
+        at_nodes = self._posts(self.to_grid_crs(target.grid.to_map(nodes)))
+        middles = (nodes[1:, 1:] + nodes[:-1, :-1]) / 2
+        if middles.size:
+            strict = self._posts(self.to_grid_crs(target.grid.to_map(middles)))
+            between = (at_nodes[1:, 1:] + at_nodes[1:, :-1] + at_nodes[:-1, 1:] + at_nodes[:-1, :-1]) / 4
+            if np.abs(strict - between).max() > POSITION_TOLERANCE:
+                return self.heights(target.grid.to_map(uv)).astype(np.float32)
+        posts = _between_nodes(at_nodes, corner_u, corner_v)
+        part, offset = self._read(posts.min(axis=(0, 1)), posts.max(axis=(0, 1)))
+        if part is None:
+            return np.full((window.height, window.width), np.nan, np.float32)
+        flat = sample_points(part, (posts - offset).reshape(-1, 2))
+        return flat.reshape(window.height, window.width)  # type: ignore[no-any-return]
+
+
+def _between_nodes(
+    nodes: NDArray[np.float64], at_u: NDArray[np.int64], at_v: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Bilinear positions at every pixel between the nodes."""
+    u, v = np.arange(at_u[-1] + 1.0), np.arange(at_v[-1] + 1.0)
+    columns = np.empty((nodes.shape[0], len(u), 2))
+    full = np.empty((len(v), len(u), 2))
+    for k in range(2):
+        for i in range(nodes.shape[0]):
+            columns[i, :, k] = np.interp(u, at_u, nodes[i, :, k])
+    upper = np.clip(np.searchsorted(at_v, v, side="right") - 1, 0, max(len(at_v) - 2, 0))
+    lower = np.minimum(upper + 1, len(at_v) - 1)
+    span = np.maximum(at_v[lower] - at_v[upper], 1)
+    t = ((v - at_v[upper]) / span)[:, None, None]
+    full[:] = columns[upper] * (1 - t) + columns[lower] * t
+    return full
