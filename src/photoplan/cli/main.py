@@ -1,0 +1,103 @@
+"""The command `photoplan`: one file per verb, loaded when it is called."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import os
+import signal
+import sys
+from types import FrameType
+
+import click
+
+from photoplan.errors import PhotoplanError, ResourceError
+
+__all__ = ["main"]
+
+#: Verb and its one-line help, in the order of a job; the command is `photoplan.cli.<verb>:command`.
+VERBS = {
+    "init": "Write a project file from the files you have.",
+    "check": "Validate a project and print what to expect of it.",
+    "ortho": "Make orthophotos.",
+    "run": "Execute a plan written by `ortho --plan`.",
+    "info": "Show what a raster, plan, project or camera file holds.",
+    "demo": "Make the orthophotos of the included real block.",
+}
+
+
+class _Lazy(click.Group):
+    """Lists verbs without importing them, so that `--help` answers at once."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(VERBS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in VERBS:
+            return None
+        module = importlib.import_module(f"photoplan.cli.{cmd_name}")
+        return module.command  # type: ignore[no-any-return]
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Verbs"):
+            formatter.write_dl(list(VERBS.items()))
+
+
+@click.group(cls=_Lazy, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(package_name="photoplan")
+def photoplan() -> None:
+    """Photographs with known geometry become measurable pictures.
+
+    A job goes: init → check → ortho. Results are printed on stdout, talk and progress on stderr.
+    Exit codes: 0 done, 1 failed, 2 wrong use, 3 bad input, 4 finished with failed tiles, 5 out of disk or memory,
+    130 interrupted.
+    """
+
+
+def main() -> None:
+    """Entry point: runs a verb and turns every error into a message and an exit code."""
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        code = photoplan.main(standalone_mode=False)
+    except click.exceptions.Abort:
+        code = _say("interrupted; the same command continues where this run stopped", 130)
+    except click.ClickException as error:
+        error.show()
+        code = 2
+    except PhotoplanError as error:
+        code = _say(str(error), error.exit_code)
+    except KeyboardInterrupt:
+        code = _say("interrupted; the same command continues where this run stopped", 130)
+    except MemoryError:
+        code = _say("out of memory; give fewer --workers or less --memory", ResourceError.exit_code)
+    except OSError as error:
+        code = _say(_os_message(error), 5 if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) else 1)
+    except Exception as error:
+        if os.environ.get("PHOTOPLAN_TRACEBACK"):
+            raise
+        name = type(error).__name__
+        code = _say(f"{name}: {error} — a fault of photoplan; PHOTOPLAN_TRACEBACK=1 shows where", 1)
+    _leave(code if isinstance(code, int) else 0)
+
+
+def _terminate(signum: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def _say(message: str, code: int) -> int:
+    click.echo(f"photoplan: {message}", err=True)
+    return code
+
+
+def _os_message(error: OSError) -> str:
+    where = f"{error.filename}: " if error.filename else ""
+    return f"{where}{error.strerror or error}"
+
+
+def _leave(code: int) -> None:
+    """Flush and exit; a reader that closed its end of a pipe (`| head`) is no error."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(code)

@@ -1,0 +1,183 @@
+"""Tiles handed to workers: threads, processes or a Dask cluster, all as `concurrent.futures.Executor`.
+
+A worker that dies is not the end of a run: its tiles are tried again, alone, so that one tile that kills its worker
+is found and listed without harming the others.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
+from dataclasses import dataclass
+from typing import Any
+
+from photoplan.errors import PhotoplanError, UsageError
+
+__all__ = ["Outcome", "SerialExecutor", "executor_factory", "run_tiles"]
+
+#: How often a tile is tried again after its worker died or an unforeseen error.
+RETRIES = 2
+
+
+class SerialExecutor(Executor):
+    """Runs each task in the caller's thread when it is submitted."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Run `fn` now; the future that is returned is done."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one task."""
+
+    task: Any
+    """The task as it was given."""
+    result: Any
+    """What the work returned; None if it failed."""
+    error: str | None
+    """Why it failed at last; None if it did not."""
+
+
+def executor_factory(kind: str, workers: int) -> Callable[[], Executor]:
+    """How to make (and make again) the executor a user asked for.
+
+    Parameters
+    ----------
+    kind : str
+        ``"threads"``, ``"processes"`` or the address of a Dask scheduler (``tcp://host:port``).
+    workers : int
+        Number of threads or processes; a cluster has its own number.
+
+    Raises
+    ------
+    UsageError
+        Unknown kind, or less than one worker.
+    """
+    if workers < 1:
+        raise UsageError(f"{workers} workers; at least one is needed")
+    if kind == "threads":
+        return (lambda: SerialExecutor()) if workers == 1 else (lambda: ThreadPoolExecutor(workers, "photoplan"))
+    if kind == "processes":
+        # Forking a process that runs threads can lock up; a fresh interpreter cannot.
+        return lambda: ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
+    if "://" in kind:
+        return lambda: _dask_executor(kind)
+    raise UsageError(f"executor {kind!r}; allowed are threads, processes or a Dask scheduler's address tcp://host:port")
+
+
+def _dask_executor(address: str) -> Executor:
+    try:
+        from distributed import Client  # noqa: PLC0415  (an optional package)
+    except ImportError as error:
+        raise UsageError(
+            f"executor {address}: Dask is not installed; install it with: pip install 'photoplan[cluster]'"
+        ) from error
+    try:
+        client = Client(address, timeout="10s", set_as_default=False)
+        client.get_versions(check=True)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise UsageError(f"executor {address}: no usable Dask scheduler ({error})") from error
+    return client.get_executor(retries=RETRIES)  # type: ignore[no-any-return]
+
+
+def run_tiles(
+    tasks: Iterable[Any], work: Callable[[Any], Any], make: Callable[[], Executor], in_flight: int
+) -> Iterator[Outcome]:
+    """Run `work(task)` for every task and yield outcomes as they come, in any order.
+
+    Parameters
+    ----------
+    tasks : iterable
+        Small and hashable; for processes and clusters they and `work` must pickle.
+    work : callable
+        Returns a tile's result.
+    make : callable
+        Makes an executor (see `executor_factory`); called again when its workers died.
+    in_flight : int
+        Tasks that are submitted and not yet yielded: what bounds memory.
+
+    Raises
+    ------
+    PhotoplanError
+        Raised by the work itself: an input or resource fault stops the run, since the other tiles share the inputs.
+    """
+    waiting = deque(tasks)
+    alone: deque[Any] = deque()
+    failures: dict[Any, int] = {}
+    executor = make()
+    pending: dict[Future[Any], Any] = {}
+    try:
+        while waiting or alone or pending:
+            try:
+                _fill(executor, work, pending, waiting, alone, in_flight)
+            except BrokenExecutor:
+                # The pool broke after its last result came: what is pending is told so below.
+                if not pending:
+                    executor = make()
+                    continue
+            done, _ = wait(pending, return_when=FIRST_COMPLETED)
+            broken = [f for f in done if isinstance(f.exception(), BrokenExecutor)]
+            if broken:
+                lost, pending = list(pending.values()), {}
+                executor.shutdown(wait=False, cancel_futures=True)
+                executor = make()
+                yield from _lost(lost, alone, failures)
+                continue
+            for future in done:
+                task = pending.pop(future)
+                error = future.exception()
+                if error is None:
+                    yield Outcome(task, future.result(), None)
+                elif isinstance(error, (PhotoplanError, MemoryError)) or not isinstance(error, Exception):
+                    raise error
+                elif _again(task, failures):
+                    alone.append(task)
+                else:
+                    yield Outcome(task, None, f"{type(error).__name__}: {error}")
+    finally:
+        executor.shutdown(wait=not pending, cancel_futures=True)
+
+
+def _fill(
+    executor: Executor,
+    work: Callable[[Any], Any],
+    pending: dict[Future[Any], Any],
+    waiting: deque[Any],
+    alone: deque[Any],
+    in_flight: int,
+) -> None:
+    """Submit what may run now: many tasks at once, or one of those that must run alone."""
+    while waiting and not alone and len(pending) < in_flight:
+        pending[executor.submit(work, waiting[0])] = waiting.popleft()
+    if alone and not pending:
+        pending[executor.submit(work, alone[0])] = alone.popleft()
+
+
+def _lost(lost: list[Any], alone: deque[Any], failures: dict[Any, int]) -> Iterator[Outcome]:
+    """Queue what died with a worker; blame a task only if it ran alone."""
+    for task in lost:
+        if len(lost) > 1 or _again(task, failures):
+            alone.append(task)
+        else:
+            yield Outcome(task, None, "its worker died, also when it ran alone")
+
+
+def _again(task: Any, failures: dict[Any, int]) -> bool:
+    failures[task] = failures.get(task, 0) + 1
+    return failures[task] <= RETRIES
