@@ -1,0 +1,148 @@
+"""How GDAL is run: its settings, its warnings, and one open handle per thread."""
+
+from __future__ import annotations
+
+import logging
+import re
+import threading
+import warnings
+from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+from photoplan.errors import InputError
+
+__all__ = ["close_handles", "first_cause", "gdal_settings", "handle", "open_raster", "warnings_of_gdal"]
+
+CACHE_MB = 64
+"""GDAL's block cache of the whole process, MiB; its default of a twentieth of the memory is not bounded enough."""
+_HANDLES_PER_THREAD = 4
+_DAMAGE = re.compile(r"corrupt|premature|truncat|too short|not enough data|invalid|bad huffman|crc|checksum", re.I)
+_open_lock = threading.Lock()
+
+
+def gdal_settings(**more: Any) -> rasterio.Env:
+    """The settings under which every raster is opened, read and written; a context manager.
+
+    A warning of the JPEG library is an error, vertical reference systems are reported, nothing is fetched from a
+    network.
+    """
+    settings = {
+        "GDAL_CACHEMAX": CACHE_MB,
+        "GDAL_ERROR_ON_LIBJPEG_WARNING": True,
+        "GTIFF_REPORT_COMPD_CS": True,
+        "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": ".nothing",
+        "GDAL_HTTP_TIMEOUT": 1,
+    }
+    return rasterio.Env(**(settings | more))
+
+
+class _Collector(logging.Filter):
+    """Takes GDAL's warnings of a thread that asked for them; all others pass on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.thread = threading.local()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        found: list[str] | None = getattr(self.thread, "found", None)
+        if found is None or record.levelno < logging.WARNING:
+            return True
+        found.append(record.getMessage())
+        return False
+
+
+_collector = _Collector()
+_logger = logging.getLogger("rasterio._env")
+
+
+@contextmanager
+def warnings_of_gdal() -> Iterator[list[str]]:
+    """A list that GDAL's warnings of this thread are added to while the context lasts.
+
+    Some decoders only warn where the picture is damaged (JPEG inside TIFF, for one).
+    """
+    if _collector not in _logger.filters:
+        _logger.addFilter(_collector)
+    found: list[str] = []
+    before = getattr(_collector.thread, "found", None)
+    _collector.thread.found = found
+    try:
+        yield found
+    finally:
+        _collector.thread.found = before
+
+
+def damage_in(found: list[str]) -> str | None:
+    """First of the warnings that speaks of damaged pixels."""
+    return next((text for text in found if _DAMAGE.search(text)), None)
+
+
+def first_cause(error: BaseException) -> str:
+    """What GDAL said first about an error, in one line."""
+    chain: list[BaseException] = [error]
+    while chain[-1].__cause__ is not None:
+        chain.append(chain[-1].__cause__)
+    text = " ".join(str(getattr(chain[-1], "errmsg", chain[-1])).split())
+    return text[:300]
+
+
+def open_raster(path: Path, driver: str | None) -> Any:
+    """Open a raster for reading with one driver (None: any), under `gdal_settings`.
+
+    Raises
+    ------
+    InputError
+        If GDAL cannot open it.
+    """
+    # `catch_warnings` changes a list of the whole process, so only one thread may be inside.
+    with _open_lock, warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        try:
+            with gdal_settings():
+                return rasterio.open(path, driver=driver, sharing=False)
+        except (RasterioError, OSError, ValueError) as error:
+            raise InputError(
+                f"{path}: cannot be opened ({first_cause(error)}); the file is damaged or cut off, get a fresh copy"
+            ) from error
+
+
+class _Handles(threading.local):
+    """Open rasters of one thread; they close when the thread ends. GDAL's handles must not be shared."""
+
+    def __init__(self) -> None:
+        self.open: OrderedDict[tuple[str, int, int], Any] = OrderedDict()
+
+
+_handles = _Handles()
+
+
+def handle(path: Path, driver: str | None) -> Any:
+    """This thread's open handle of a raster; opened again when the file has been replaced."""
+    try:
+        state = path.stat()
+        key = str(path), state.st_mtime_ns, state.st_ino
+    except OSError as error:
+        if driver is not None:
+            raise InputError(f"{path}: is no longer there ({error.strerror})") from error
+        key = str(path), 0, 0
+    found = _handles.open.get(key)
+    if found is None:
+        found = open_raster(path, driver)
+        _handles.open[key] = found
+        while len(_handles.open) > _HANDLES_PER_THREAD:
+            _handles.open.popitem(last=False)[1].close()
+    else:
+        _handles.open.move_to_end(key)
+    return found
+
+
+def close_handles() -> None:
+    """Close all rasters that this thread holds open."""
+    while _handles.open:
+        _handles.open.popitem()[1].close()

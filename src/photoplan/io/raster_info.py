@@ -1,0 +1,272 @@
+"""Facts of a raster file, read from its header."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from photoplan.errors import InputError
+from photoplan.io.checks import (
+    IMAGE_LIMITS,
+    RasterLimits,
+    check_declared_size,
+    check_plain_file,
+    check_sidecars,
+    raster_driver,
+)
+from photoplan.io.gdal import gdal_settings, open_raster, warnings_of_gdal
+from photoplan.io.png_chunks import check_png_complete
+from photoplan.io.tiff_layout import TiffLayout, read_tiff_layout
+
+__all__ = ["RasterInfo", "read_info"]
+
+_METRES = {"m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0}
+_METRES |= dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048)
+_METRES |= dict.fromkeys(("us survey foot", "us-ft", "ftus", "ft_us", "foot_us"), 1200.0 / 3937.0)
+
+
+@dataclass(frozen=True)
+class RasterInfo:
+    """What a raster file states about itself."""
+
+    path: Path
+    """The file."""
+    driver: str
+    """GDAL's name of the format."""
+    size: tuple[int, int]
+    """Width and height in pixels."""
+    dtype: str
+    """NumPy name of the pixels' type."""
+    colour_bands: tuple[int, ...]
+    """Numbers (from 1) of the bands without alpha."""
+    alpha_bands: tuple[int, ...]
+    """Numbers (from 1) of the alpha bands."""
+    colours: tuple[str, ...]
+    """Colour interpretation of every band, as GDAL names it."""
+    colour_space: str | None
+    """Colour space of the stored data where it differs from the bands' (JPEG: `YCbCr`, `CMYK`, `YCCK`)."""
+    bits: int
+    """Bits per sample as stored."""
+    nodata: float | None
+    """Value that means "nothing here"; may be NaN."""
+    has_mask: bool
+    """A mask band inside the file, or a `.msk` file beside it."""
+    missing_blocks: int
+    """Blocks that were never written (sparse TIFF)."""
+    block: tuple[int, int]
+    """Width and height of a stored block."""
+    overviews: tuple[int, ...]
+    """Reduction factors of the overviews."""
+    crs: str | None
+    """Coordinate reference system as WKT."""
+    vertical_crs: str | None
+    """The vertical part of a compound reference system as WKT."""
+    to_map: tuple[float, float, float, float, float, float] | None
+    """(X0, Xx, Xy, Y0, Yx, Yy): X = X0 + Xx x + Xy y, Y = Y0 + Yx x + Yy y, where (x, y) = (column, row) refer to
+    pixel **centres**. None if the file is not georeferenced."""
+    unit: str | None
+    """Unit of the values as the first band or the vertical reference system states it."""
+    scales: tuple[float, ...]
+    """Factor of every band from stored to true values."""
+    offsets: tuple[float, ...]
+    """Offset of every band from stored to true values."""
+    white_is_zero: bool
+    """Grey values are stored inverted (TIFF photometric interpretation 0)."""
+    orientation: int
+    """Orientation of EXIF or TIFF, 1 to 8. Pixels are used as they are stored, whatever it says: the camera's
+    geometry refers to the sensor."""
+
+    @property
+    def bands(self) -> int:
+        """Bands without alpha; a palette counts as the three colours that it stands for."""
+        return 3 if self.palette else len(self.colour_bands)
+
+    @property
+    def palette(self) -> bool:
+        """The only band holds indices into a colour table."""
+        return len(self.colour_bands) == 1 and self.colours[self.colour_bands[0] - 1] == "palette"
+
+    @property
+    def metres_per_unit(self) -> float | None:
+        """Metres in the unit of heights; None if the unit is not stated or unknown."""
+        return None if self.unit is None else _METRES.get(self.unit.strip().lower())
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a user should know before these pixels are used, one sentence each."""
+        found = []
+        if self.orientation != 1:
+            found.append(
+                f"{self.path.name}: the orientation tag says {self.orientation} (a viewer turns the picture); pixels "
+                "are used as stored, because the camera's geometry refers to the sensor"
+            )
+        if self.white_is_zero:
+            found.append(f"{self.path.name}: white is stored as zero; grey values are used as stored")
+        if self.missing_blocks and self.nodata is None:
+            found.append(f"{self.path.name}: {self.missing_blocks} blocks were never written; they count as invalid")
+        return tuple(found)
+
+
+def read_info(path: str | Path, *, limits: RasterLimits = IMAGE_LIMITS, allow_remote: bool = False) -> RasterInfo:
+    """Read the facts of a raster from its header, and refuse a file that cannot be what it says.
+
+    Parameters
+    ----------
+    path
+        A plain file (TIFF, JPEG, PNG, JPEG 2000, BMP or ASCII grid; judged by content, not by name).
+    limits
+        How much the header may promise.
+    allow_remote
+        Follow virtual rasters, `/vsi…` paths and URLs too; such a source is not checked before it is opened.
+
+    Raises
+    ------
+    InputError
+        If the file is not plain, not a raster, cut off, contradicts itself, or promises more than `limits`.
+    """
+    if allow_remote and not Path(path).is_file():
+        return _describe(Path(path), None, None, limits)
+    plain = check_plain_file(path)
+    driver = None
+    layout = None
+    try:
+        driver = raster_driver(plain)
+    except InputError:
+        if not allow_remote:
+            raise
+    check_sidecars(plain)
+    if driver == "GTiff":
+        layout = read_tiff_layout(plain)
+        _check_layout(plain, layout, limits)
+    elif driver == "PNG":
+        check_png_complete(plain)
+    return _describe(plain, driver, layout, limits)
+
+
+def _check_layout(path: Path, layout: TiffLayout, limits: RasterLimits) -> None:
+    """Compare a TIFF's promises with its blocks, before GDAL sees it."""
+    check_declared_size(
+        path,
+        limits,
+        size=layout.size,
+        pixel_bytes=-(-layout.bits * layout.samples // 8),
+        # Plain strips are read line by line, however many lines one strip has.
+        block=(layout.block[0], 1) if layout.compression == 1 and layout.block[0] == layout.size[0] else layout.block,
+        stored=layout.ratio,
+    )
+
+
+def _describe(path: Path, driver: str | None, layout: TiffLayout | None, limits: RasterLimits) -> RasterInfo:
+    """Open a raster and put its facts together."""
+    with warnings_of_gdal():
+        dataset = open_raster(path, driver)
+    with dataset, gdal_settings():
+        if dataset.count < 1:
+            raise InputError(f"{path}: holds no bands of pixels; give one of its parts as a plain file")
+        if dataset.tags(ns="OVERVIEWS"):
+            raise InputError(f"{path}: its metadata lead to other files, which are not followed; make a plain copy")
+        if len(set(dataset.dtypes)) > 1:
+            raise InputError(f"{path}: bands of different types ({', '.join(dataset.dtypes)}); make them one type")
+        if layout is None and driver is not None:
+            pixel_bytes = dataset.count * np.dtype(dataset.dtypes[0]).itemsize
+            check_declared_size(
+                path,
+                limits,
+                size=(dataset.width, dataset.height),
+                pixel_bytes=pixel_bytes,
+                block=dataset.block_shapes[0][::-1],
+                stored=float(dataset.width * dataset.height * pixel_bytes) / path.stat().st_size,
+            )
+        return _facts(path, dataset, layout)
+
+
+def _facts(path: Path, dataset: Any, layout: TiffLayout | None) -> RasterInfo:
+    """The facts of an open dataset."""
+    colours = tuple(c.name for c in dataset.colorinterp)
+    alpha = tuple(i + 1 for i, name in enumerate(colours) if name == "alpha")
+    wkt = dataset.crs.to_wkt() if dataset.crs else None
+    vertical = _part(wkt, "VERT_CS[") if wkt else None
+    unit = next((u for u in dataset.units if u), None) or (_unit_of(vertical) if vertical else None)
+    orientation = dataset.tags().get("EXIF_Orientation") or dataset.tags(ns="EXIF").get("EXIF_Orientation")
+    bits = dataset.tags(1, ns="IMAGE_STRUCTURE").get("NBITS")
+    return RasterInfo(
+        path=path,
+        driver=dataset.driver,
+        size=(dataset.width, dataset.height),
+        dtype=dataset.dtypes[0],
+        colour_bands=tuple(i for i in dataset.indexes if i not in alpha),
+        alpha_bands=alpha,
+        colours=colours,
+        colour_space=dataset.tags(ns="IMAGE_STRUCTURE").get("SOURCE_COLOR_SPACE"),
+        bits=int(bits) if bits else (layout.bits if layout else np.dtype(_known(dataset.dtypes[0])).itemsize * 8),
+        nodata=_nodata(path, dataset, alpha),
+        has_mask=_has_mask(dataset),
+        missing_blocks=int((~layout.present).sum()) if layout else 0,
+        block=dataset.block_shapes[0][::-1],
+        overviews=tuple(dataset.overviews(1)),
+        crs=wkt,
+        vertical_crs=vertical,
+        to_map=_centre_transform(dataset),
+        unit=unit,
+        scales=tuple(dataset.scales),
+        offsets=tuple(dataset.offsets),
+        white_is_zero=layout is not None and layout.photometric == 0,
+        orientation=layout.orientation if layout else int(orientation or 1),
+    )
+
+
+def _known(dtype: str) -> str:
+    """A type that NumPy knows; GDAL has a complex 16-bit integer of its own."""
+    return "complex64" if dtype == "complex_int16" else dtype
+
+
+def _nodata(path: Path, dataset: Any, alpha: tuple[int, ...]) -> float | None:
+    """The one nodata value of all bands; alpha bands do not count."""
+    values = [value for i, value in zip(dataset.indexes, dataset.nodatavals) if i not in alpha and value is not None]
+    if not values:
+        return None
+    if any(v != values[0] and not (np.isnan(v) and np.isnan(values[0])) for v in values):
+        raise InputError(f"{path}: bands with different nodata values {values}; give them one value")
+    return float(values[0])
+
+
+def _has_mask(dataset: Any) -> bool:
+    """Whether a mask band or file says which pixels are valid (alpha and nodata are looked at by themselves)."""
+    for flags in dataset.mask_flag_enums:
+        names = {flag.name for flag in flags}
+        if not names or ("per_dataset" in names and "alpha" not in names):
+            return True
+    return False
+
+
+def _centre_transform(dataset: Any) -> tuple[float, float, float, float, float, float] | None:
+    """GDAL's geotransform, which refers to pixel corners, moved to pixel centres.
+
+    GDAL has already moved files whose tags refer to pixel centres (`AREA_OR_POINT=Point`) to corners.
+    """
+    t = dataset.transform
+    if t.is_identity:
+        return None
+    return (t.c + 0.5 * (t.a + t.b), t.a, t.b, t.f + 0.5 * (t.d + t.e), t.d, t.e)
+
+
+def _part(wkt: str, key: str) -> str | None:
+    """The bracketed part of a WKT that begins with `key`."""
+    start = wkt.find(key)
+    if start < 0:
+        return None
+    depth = 0
+    for i in range(start, len(wkt)):
+        depth += {"[": 1, "]": -1}.get(wkt[i], 0)
+        if wkt[i] == "]" and depth == 0:
+            return wkt[start : i + 1]
+    return None
+
+
+def _unit_of(wkt: str) -> str | None:
+    """Name of the unit in the WKT of a vertical reference system."""
+    unit = _part(wkt, "UNIT[")
+    return unit.split('"')[1] if unit and unit.count('"') >= 2 else None
