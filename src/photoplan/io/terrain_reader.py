@@ -1,0 +1,159 @@
+"""Heights of a grid terrain model that may be larger than memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.grid import Window
+from photoplan.io.block_cache import BlockCache
+from photoplan.io.checks import TERRAIN_LIMITS, RasterLimits
+from photoplan.io.raster import missing_blocks, read_pixels
+from photoplan.io.raster_info import RasterInfo, read_info
+from photoplan.io.validity import MissingBlocks
+
+__all__ = ["LOWEST", "HIGHEST", "TERRAIN_TYPES", "TerrainReader"]
+
+LOWEST, HIGHEST = -12_000.0, 9_000.0
+"""Heights of the Earth, metres: below the deepest sea, above the highest mountain."""
+TERRAIN_TYPES = ("uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")
+"""Types of stored heights."""
+
+_BLOCK = 256
+_VOID = 1e30
+"""Numbers of this size (±3.4e38 of many programs) are never heights."""
+_USUAL_NODATA = (-9999.0, -32768.0, -32767.0, -99999.0)
+
+
+@dataclass(frozen=True, eq=False)
+class TerrainReader:
+    """One band of heights, delivered as float32 with NaN where there is none.
+
+    Scale and offset of the file are applied; the unit is the file's (`info.unit`, `info.metres_per_unit`). Overviews
+    are not used. Blocks that were read are kept up to `cache_bytes`, least recently used ones are forgotten first.
+    Safe to call from several threads and to pickle (the cache stays behind).
+
+    Nodata, alpha, mask and blocks that were never written follow the rule of `photoplan.io.validity`; NaN and values
+    of ±1e30 and more are void as well. Other values that are no height on Earth (below -12 000 m or above 9 000 m), and
+    the usual nodata values where none is declared, are refused with their count, or taken as void if `void_outside`.
+
+    Raises
+    ------
+    InputError
+        When made: whatever `read_info` refuses; another number of bands than one, or another type than
+        `TERRAIN_TYPES`; a grid that is not georeferenced. When read: damaged data, values that are no heights.
+    """
+
+    path: Path
+    """The file."""
+    cache_bytes: int = 64 << 20
+    """Bytes of blocks that are kept."""
+    void_outside: bool = False
+    """Take values that are no height on Earth as void instead of refusing them."""
+    limits: RasterLimits = TERRAIN_LIMITS
+    """How much the header may promise."""
+    allow_remote: bool = False
+    """Follow virtual rasters, `/vsi…` paths and URLs."""
+    info: RasterInfo = field(init=False, repr=False)
+    """Facts of the file."""
+    _missing: MissingBlocks | None = field(init=False, repr=False)
+    _cache: BlockCache = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        info = read_info(self.path, limits=self.limits, allow_remote=self.allow_remote)
+        if len(info.colour_bands) != 1 or info.palette:
+            raise InputError(f"{info.path}: {len(info.colours)} bands or a palette; a terrain grid has one band")
+        if info.dtype not in TERRAIN_TYPES:
+            raise InputError(
+                f"{info.path}: heights of type {info.dtype}; allowed are {', '.join(TERRAIN_TYPES)}. "
+                "Convert it with `gdal_translate -ot Float32`"
+            )
+        if info.to_map is None:
+            raise InputError(f"{info.path}: the grid is not georeferenced; give it a world file or a geotransform")
+        if not (info.scales[0] != 0 and np.isfinite([info.scales[0], info.offsets[0]]).all()):
+            raise InputError(f"{info.path}: scale {info.scales[0]} and offset {info.offsets[0]} make no heights")
+        object.__setattr__(self, "path", info.path)
+        object.__setattr__(self, "info", info)
+        object.__setattr__(self, "_missing", missing_blocks(info))
+        object.__setattr__(self, "_cache", BlockCache(self.cache_bytes))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in self.__dict__.items() if key != "_cache"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        object.__setattr__(self, "_cache", BlockCache(self.cache_bytes))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Columns and rows of the grid."""
+        return self.info.size
+
+    @property
+    def cached_bytes(self) -> int:
+        """Bytes of blocks held now."""
+        return self._cache.bytes
+
+    def read(self, window: Window) -> NDArray[np.float32]:
+        """Heights of a window inside the grid, shape (height, width), in the file's unit; NaN where there is none."""
+        width, height = self.info.size
+        right, bottom = window.stop
+        if window.size == 0 or window.col < 0 or window.row < 0 or right > width or bottom > height:
+            raise UsageError(f"{self.path}: {window} is not inside the grid of {width} × {height} points")
+        out = np.empty((window.height, window.width), np.float32)
+        block_width, block_height = self._block
+        for row in range(window.row // block_height, -(-bottom // block_height)):
+            for col in range(window.col // block_width, -(-right // block_width)):
+                area = Window(col * block_width, row * block_height, block_width, block_height)
+                part = area & window
+                block = self._cache.get((col, row), lambda area=area: self._load(area & Window(0, 0, width, height)))
+                source = block[part.row - area.row :, part.col - area.col :][: part.height, : part.width]
+                out[part.row - window.row :, part.col - window.col :][: part.height, : part.width] = source
+        return out
+
+    def pixel(self, col: int, row: int) -> float:
+        """Height of one grid point in the file's unit; NaN if there is none."""
+        return float(self.read(Window(col, row, 1, 1))[0, 0])
+
+    @property
+    def _block(self) -> tuple[int, int]:
+        """Width and height of the blocks that are kept: the file's tiles, or whole lines of about 64 thousand points."""
+        width, height = self.info.block
+        if width < self.info.size[0] and width * height >= _BLOCK * _BLOCK // 4:
+            return width, height
+        return self.info.size[0], max(height, min(_BLOCK, max(1, _BLOCK * _BLOCK // self.info.size[0])))
+
+    def _load(self, window: Window) -> NDArray[np.float32]:
+        """Read and check a block."""
+        pixels, valid = read_pixels(self.info, window, self._missing)
+        stored = pixels[0]
+        heights = stored.astype(np.float64) * self.info.scales[0] + self.info.offsets[0]
+        void = ~(np.abs(heights) < _VOID)
+        if valid is not None:
+            void |= ~valid
+        self._check_range(stored, heights, void, window)
+        heights[void] = np.nan
+        return heights.astype(np.float32)
+
+    def _check_range(
+        self, stored: NDArray[Any], heights: NDArray[np.float64], void: NDArray[np.bool_], window: Window
+    ) -> None:
+        """Refuse values that are no heights, or add them to `void`."""
+        metres = self.info.metres_per_unit or 1.0
+        wrong = ~void & ((heights * metres < LOWEST) | (heights * metres > HIGHEST))
+        if self.info.nodata is None:
+            wrong |= ~void & np.isin(stored, _USUAL_NODATA)
+        if not wrong.any():
+            return
+        if not self.void_outside:
+            raise InputError(
+                f"{self.path}: {int(wrong.sum())} values in window col {window.col} row {window.row} {window.width} × "
+                f"{window.height} are no heights (allowed {LOWEST:g} to {HIGHEST:g} m), for one "
+                f"{heights[wrong][0]:g}; declare the nodata value (`gdal_edit -a_nodata {stored[wrong][0]:g}`)"
+            )
+        void |= wrong
