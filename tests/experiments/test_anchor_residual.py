@@ -1,0 +1,67 @@
+"""Residual of homogeneous anchors with a distorted lens: figures, order, and the compiler's own bound."""
+
+import anchor_residual as experiment
+import numpy as np
+import pytest
+
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.plan.compile import AnchorRule, compile_anchors
+from photoplan.targets.map import MapTarget
+
+
+@pytest.mark.parametrize(
+    ("side", "height", "quoted"),
+    [(32.0, 5.0, 0.0048), (64.0, 5.0, 0.0146), (32.0, 20.0, 0.027), (32.0, 60.0, 0.220)],
+)
+def test_figures_quoted_on_the_page(side, height, quoted):
+    assert experiment.worst_residual(side, height) == pytest.approx(quoted, rel=0.02)
+
+
+def test_order_two_in_the_side():
+    e = [experiment.worst_residual(s, 0.0) for s in (128.0, 64.0, 32.0)]
+    np.testing.assert_allclose([e[0] / e[1], e[1] / e[2]], 4.0, rtol=1e-3)
+
+
+def test_order_two_in_the_height_range():
+    e = [experiment.worst_residual(0.5, h) for h in (20.0, 10.0, 5.0)]
+    np.testing.assert_allclose([e[0] / e[1], e[1] / e[2]], 4.0, rtol=1e-2)
+
+
+def test_leading_terms():
+    plan, depth = experiment.leading_terms(64.0, 20.0)
+    assert experiment.worst_residual(64.0, 0.0) == pytest.approx(plan, rel=1e-3)
+    assert experiment.worst_residual(0.5, 20.0) == pytest.approx(depth, rel=1e-2)
+    assert experiment.worst_residual(64.0, 20.0) == pytest.approx(plan + depth, rel=0.02)
+
+
+def test_without_distortion_nothing_is_left(monkeypatch):
+    monkeypatch.setattr(experiment, "K1", 0.0)
+    assert experiment.worst_residual(512.0, 200.0) < 1e-10
+
+
+class Drone:
+    """The experiment's camera as the package sees one."""
+
+    size = (10_000, 7_500)
+    center = np.array([0.0, 0.0, experiment.FLYING_HEIGHT])
+
+    def project_homogeneous(self, XYZ):
+        h = experiment.homogeneous(np.asarray(XYZ, float)) * np.array([1.0, -1.0, 1.0])
+        h[..., 0] += 4_999.5 * h[..., 2]
+        h[..., 1] += 3_749.5 * h[..., 2]
+        return h
+
+
+@pytest.mark.parametrize("tolerance", [0.02, 0.001])
+def test_the_compiler_cuts_until_the_tolerance_is_met(tolerance):
+    """A tile near the image's corner with a wall of 60 m: its cells are cut in the plan, those at the wall in h too."""
+    window = Window(0, 0, 256, 256)
+    grid = MapGrid(left=400.0, top=330.0, resolution=0.1, width=256, height=256, crs="EPSG:25832")
+    relief = np.zeros((256, 256), np.float32)
+    relief[:, 100:] = 60.0
+    anchors = compile_anchors(Drone(), MapTarget(grid), window, relief, AnchorRule(tolerance, 2, 256))
+    assert 0 < anchors.residual <= tolerance
+    layers = np.diff(anchors.box_start)
+    wall = (anchors.rects[:, 0] < 100) & (anchors.rects[:, 2] > 100)
+    assert (layers[wall] > 1).all()
+    assert (layers[~wall] == 1).all()
