@@ -1,0 +1,296 @@
+"""Coordinate reference systems: reading them, refusing unfit ones, and exact steps from one to another.
+
+pyproj silently falls back to inexact ("ballpark") operations and returns coordinates unchanged where a grid is
+missing. Every transformation here is asked for without that fallback, and its results are looked at.
+"""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pyproj import CRS, Transformer
+from pyproj.aoi import AreaOfInterest
+from pyproj.exceptions import CRSError, ProjError
+from pyproj.transformer import TransformerGroup
+
+from photoplan.errors import InputError
+
+__all__ = [
+    "CrsStep",
+    "canonical_crs",
+    "crs_label",
+    "crs_step",
+    "grid_rotation",
+    "parse_crs",
+    "require_projected_metres",
+    "same_crs",
+    "split_compound",
+    "topocentric_poses",
+]
+
+
+@lru_cache(maxsize=256)
+def parse_crs(text: str, where: str = "CRS") -> CRS:
+    """CRS of a string: `EPSG:…`, WKT, or a PROJ string. `where` names it in messages.
+
+    Raises
+    ------
+    InputError
+        The text is not a CRS.
+    """
+    try:
+        return CRS.from_user_input(text.strip())
+    except CRSError as error:
+        reason = str(error).split(":")[-1].strip(" )")
+        raise InputError(
+            f"{where}: {text[:120]!r} is not a coordinate reference system ({reason}); "
+            "give EPSG:nnnn, WKT or a PROJ string"
+        ) from None
+
+
+def require_projected_metres(text: str, where: str = "CRS") -> CRS:
+    """The CRS, if it is projected, horizontal and in metres; else an error that says what to give instead.
+
+    Raises
+    ------
+    InputError
+        The CRS is geographic, geocentric, local, in feet, or compound.
+    """
+    crs = parse_crs(text, where)
+    if crs.is_compound:
+        horizontal, vertical = split_compound(text)
+        raise InputError(
+            f"{where}: {crs.name!r} joins a horizontal and a vertical CRS; give crs = {crs_label(horizontal)!r} and "
+            f"state heights as height_system = {vertical!r}"
+        )
+    kind = "geographic" if crs.is_geographic else "geocentric" if crs.is_geocentric else "not projected"
+    if not crs.is_projected:
+        raise InputError(
+            f"{where}: {crs.name!r} is {kind}; a projected CRS in metres is needed, such as the UTM zone of the area"
+        )
+    units = {axis.unit_name for axis in crs.axis_info[:2]}
+    factors = {axis.unit_conversion_factor for axis in crs.axis_info[:2]}
+    if factors != {1.0}:
+        raise InputError(
+            f"{where}: {crs.name!r} is in {', '.join(sorted(units))}; a projected CRS in metres is needed "
+            "(inputs in other CRSs are transformed, products are in metres)"
+        )
+    return crs
+
+
+def split_compound(text: str) -> tuple[str, str | None]:
+    """Horizontal CRS as a string, and the height system that the text states.
+
+    The second is a vertical CRS's string for a compound CRS, ``"ellipsoidal"`` for a three-dimensional one,
+    and None where nothing is said of heights.
+    """
+    crs = parse_crs(text)
+    if crs.is_compound:
+        parts = crs.sub_crs_list
+        return canonical_crs(parts[0].to_wkt()), canonical_crs(parts[1].to_wkt())
+    if len(crs.axis_info) == 3 and not crs.is_geocentric:
+        return canonical_crs(crs.to_2d().to_wkt()), "ellipsoidal"
+    return canonical_crs(text), None
+
+
+@lru_cache(maxsize=256)
+def canonical_crs(text: str) -> str:
+    """The shortest string that means exactly this CRS: `EPSG:…`, else a PROJ string, else WKT on one line."""
+    crs = parse_crs(text)
+    code = crs.to_authority(min_confidence=100)
+    if code is not None and code[0] == "EPSG" and CRS.from_authority(*code) == crs:
+        return ":".join(code)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        proj = crs.to_proj4()
+    if proj and not crs.is_vertical:
+        proj = proj.removesuffix(" +type=crs")
+        if CRS.from_user_input(proj) == crs and len(proj) < 300:
+            return str(proj)
+    return str(crs.to_wkt())
+
+
+def crs_label(text: str) -> str:
+    """The CRS in a few words, for people."""
+    short = canonical_crs(text)
+    return short if len(short) <= 120 else parse_crs(text).name
+
+
+def same_crs(a: str, b: str) -> bool:
+    """Whether two strings mean the same horizontal CRS; axis order is ignored (X is always east)."""
+    if a == b:
+        return True
+    first, second = (parse_crs(t) for t in (a, b))
+    first, second = (c.sub_crs_list[0] if c.is_compound else c for c in (first, second))
+    return bool(first.equals(second, ignore_axis_order=True))
+
+
+@dataclass(frozen=True)
+class CrsStep:
+    """An exact transformation of horizontal coordinates; call it with X, Y of shape (..., 2)."""
+
+    source: str
+    target: str
+    operation: str
+    """Name of the coordinate operation, for the run record."""
+    accuracy: float | None
+    """Its stated accuracy, metres; None if it has none."""
+    definition: str
+    """PROJ pipeline."""
+    _own: threading.local = field(default_factory=threading.local, repr=False, compare=False)
+
+    def __call__(self, XY: ArrayLike) -> NDArray[np.float64]:
+        """Coordinates (..., 2) in the source CRS to the target CRS, X east and Y north; NaN stays NaN.
+
+        Raises
+        ------
+        InputError
+            A point lies where the operation is not defined.
+        """
+        XY = np.asarray(XY, float)
+        X, Y = self._transformer().transform(XY[..., 0], XY[..., 1])
+        out = np.stack([np.asarray(X, float), np.asarray(Y, float)], axis=-1)
+        lost = ~np.isfinite(out).all(axis=-1) & np.isfinite(XY).all(axis=-1)
+        if lost.any():
+            x, y = np.atleast_2d(XY[lost])[0]
+            raise InputError(
+                f"X {x:.3f}, Y {y:.3f} of {crs_label(self.source)} has no coordinates in {crs_label(self.target)}; "
+                "is it the right CRS, and are X and Y in the right order?"
+            )
+        out[~np.isfinite(XY).all(axis=-1)] = np.nan
+        return out
+
+    def _transformer(self) -> Transformer:
+        # A PROJ object belongs to one thread; every thread makes its own from the same definition.
+        if not hasattr(self._own, "transformer"):
+            self._own.transformer = Transformer.from_pipeline(self.definition)
+        transformer: Transformer = self._own.transformer
+        return transformer
+
+    def __reduce__(self) -> tuple[Callable[..., CrsStep], tuple[str | float | None, ...]]:
+        return CrsStep, (self.source, self.target, self.operation, self.accuracy, self.definition)
+
+
+def crs_step(source: str, target: str, bounds: tuple[float, float, float, float] | None = None) -> CrsStep:
+    """Exact step from one horizontal CRS to another.
+
+    Parameters
+    ----------
+    source, target : str
+        Strings that pyproj reads; of compound CRSs the horizontal part is taken.
+    bounds : tuple of float, optional
+        xmin, ymin, xmax, ymax in `source`: where it is used, which decides between operations of different areas.
+
+    Raises
+    ------
+    InputError
+        No operation without a fallback is available; a missing grid is named.
+    """
+    a, b = (parse_crs(t).to_2d() for t in (source, target))
+    a, b = (c.sub_crs_list[0] if c.is_compound else c for c in (a, b))
+    area = area_of(a, bounds)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        group = TransformerGroup(a, b, always_xy=True, allow_ballpark=False, area_of_interest=area)
+    if not group.transformers or not group.best_available:
+        missing = missing_grids(group)
+        what = f"the grid {missing[0]} is missing" if missing else "there is none without an inexact fallback"
+        raise InputError(
+            f"no exact transformation from {crs_label(source)} to {crs_label(target)}: {what}; "
+            "give the inputs in one CRS" + (", or install the grid" if missing else "")
+        )
+    best = group.transformers[0]
+    accuracy = best.accuracy if best.accuracy is not None and best.accuracy >= 0 else None
+    return CrsStep(source, target, best.description, accuracy, best.definition)
+
+
+def missing_grids(group: TransformerGroup) -> list[str]:
+    """Grids that the best operation of a group would need and that are not installed, with their address."""
+    for operation in group.unavailable_operations:
+        lost = [g for g in operation.grids if not g.available]
+        if lost and all(g.url for g in lost):
+            return [f"{g.short_name} ({g.url})" for g in lost]
+    return [g.short_name for o in group.unavailable_operations[:1] for g in o.grids if not g.available]
+
+
+def area_of(crs: CRS, bounds: tuple[float, float, float, float] | None) -> Any:
+    """pyproj's area of interest of map bounds; None if there are none or they are nowhere on the earth."""
+    if bounds is None:
+        return None
+    try:
+        to_degrees = Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+        west, south, east, north = to_degrees.transform_bounds(*bounds)
+    except ProjError:
+        return None
+    return AreaOfInterest(west, south, east, north) if np.isfinite([west, south, east, north]).all() else None
+
+
+def grid_rotation(step: CrsStep, XY: ArrayLike, reach: float = 50.0) -> NDArray[np.float64]:
+    """Rotation from the source CRS's axes to the target CRS's axes at points X, Y (..., 2), shape (..., 3, 3).
+
+    It is the difference of the meridian convergences: the nearest rotation to the derivatives of the step, taken
+    over ±`reach` metres. Heights keep their axis.
+    """
+    XY = np.asarray(XY, float)
+    right, up = np.array([reach, 0.0]), np.array([0.0, reach])
+    along_x = step(XY + right) - step(XY - right)
+    along_y = step(XY + up) - step(XY - up)
+    # Of a 2 × 2 matrix [[a, b], [c, d]] the nearest rotation has the angle atan2(c − b, a + d).
+    angle = np.arctan2(along_x[..., 1] - along_y[..., 0], along_x[..., 0] + along_y[..., 1])
+    R = np.zeros((*XY.shape[:-1], 3, 3))
+    R[..., 0, 0] = R[..., 1, 1] = np.cos(angle)
+    R[..., 1, 0] = np.sin(angle)
+    R[..., 0, 1] = -R[..., 1, 0]
+    R[..., 2, 2] = 1.0
+    return R
+
+
+def topocentric_poses(
+    origin: tuple[float, float, float], target: str, centers: ArrayLike, reach: float = 50.0
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points of a local tangential system brought into a projected CRS, with the rotation of the axes there.
+
+    Parameters
+    ----------
+    origin : tuple of float
+        Latitude and longitude in degrees (WGS 84) and ellipsoidal height of the system's origin; its axes point
+        east, north and up there.
+    target : str
+        Projected CRS in metres.
+    centers : array_like, shape (n, 3)
+        East, north, up, metres.
+
+    Returns
+    -------
+    XYZ : ndarray, shape (n, 3)
+        Map coordinates and ellipsoidal height.
+    R : ndarray, shape (n, 3, 3)
+        Takes the local system's axes to map axes at each point: convergence of meridians and the inclination of the
+        two horizons. The map's scale is no rotation and is left out.
+    """
+    require_projected_metres(target)
+    lat, lon, h = origin
+    to_degrees = Transformer.from_pipeline(
+        f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lon_0={lon!r} +lat_0={lat!r} +h_0={h!r} "
+        "+step +inv +proj=cart +ellps=WGS84 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
+    )
+    to_map = crs_step("EPSG:4326", target)
+
+    def to_ground(enu: NDArray[np.float64]) -> NDArray[np.float64]:
+        lon_, lat_, h_ = to_degrees.transform(enu[..., 0], enu[..., 1], enu[..., 2])
+        return np.concatenate([to_map(np.stack([lon_, lat_], axis=-1)), np.asarray(h_)[..., None]], axis=-1)
+
+    enu = np.asarray(centers, float).reshape(-1, 3)
+    J = np.stack([to_ground(enu + d) - to_ground(enu - d) for d in np.eye(3) * reach], axis=-1) / (2 * reach)
+    # Map and height have different scales: taking the horizontal scale out first keeps the rotation free of it.
+    scale = np.sqrt(np.abs(np.linalg.det(J)))
+    J[:, :2, :] /= scale[:, None, None]
+    U, _, Vt = np.linalg.svd(J)
+    return to_ground(enu), U @ Vt

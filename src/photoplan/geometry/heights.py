@@ -1,0 +1,192 @@
+"""Height systems: declared, never guessed, and joined exactly or not at all.
+
+A name of a height system is ``"ellipsoidal"``, a vertical CRS (``"EPSG:5773"`` or its WKT), or ``"same"``: declared
+to equal the other input's without being named. None means that nothing is stated.
+"""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pyproj import CRS, Transformer
+from pyproj.crs import CompoundCRS
+from pyproj.transformer import TransformerGroup
+
+from photoplan.errors import HeightSystemError, InputError
+from photoplan.geometry.crs import area_of, canonical_crs, crs_label, missing_grids, parse_crs
+
+__all__ = ["HeightStep", "check_height_system", "declared_pair", "height_label", "height_step"]
+
+OPTIONS = (
+    "ellipsoidal, EPSG:nnnn (a vertical CRS, such as EPSG:5773 for EGM96), or same (both inputs are in one system)"
+)
+
+
+def check_height_system(name: str, where: str = "height system") -> str:
+    """The name in its canonical form.
+
+    Raises
+    ------
+    HeightSystemError
+        It is not a height system.
+    """
+    if name.strip().casefold() in ("ellipsoidal", "same"):
+        return name.strip().casefold()
+    try:
+        crs = parse_crs(name)
+    except InputError:
+        raise HeightSystemError(f"{where}: {name[:120]!r} is not a height system; allowed are {OPTIONS}") from None
+    if crs.is_compound:
+        return canonical_crs(crs.sub_crs_list[1].to_wkt())
+    if crs.is_vertical:
+        return canonical_crs(name)
+    if len(crs.axis_info) == 3 and not crs.is_geocentric:
+        return "ellipsoidal"
+    raise HeightSystemError(f"{where}: {crs.name!r} says nothing of heights; allowed are {OPTIONS}")
+
+
+def height_label(name: str | None) -> str:
+    """A height system in a few words."""
+    if name is None:
+        return "not stated"
+    if name == "same":
+        return "declared the same"
+    return "ellipsoidal" if name == "ellipsoidal" else f"{parse_crs(name).name} ({crs_label(name)})"
+
+
+def declared_pair(terrain: str | None, orientation: str | None) -> tuple[str, str]:
+    """Height systems of terrain and orientation, both known; ``"same"`` stands for the other one's where it has a name.
+
+    Raises
+    ------
+    HeightSystemError
+        One of them is not stated; the message says what can be declared.
+    """
+    if terrain is None or orientation is None:
+        raise HeightSystemError(
+            f"height systems: terrain {height_label(terrain)}, orientation {height_label(orientation)} → declare "
+            f"one, or --height-system same; in the project file: height_system in [terrain] and [orientation]; "
+            f"allowed are {OPTIONS}"
+        )
+    pair = [check_height_system(terrain, "terrain"), check_height_system(orientation, "orientation")]
+    named = [p for p in pair if p != "same"]
+    if len(named) == 1:
+        pair = named * 2
+    return pair[0], pair[1]
+
+
+@dataclass(frozen=True)
+class HeightStep:
+    """An exact step between height systems; call it with X, Y, Z of shape (..., 3), it returns Z (...)."""
+
+    crs: str
+    source: str
+    target: str
+    operation: str
+    """Name of the coordinate operation, for the run record; ``"none"`` where the systems are equal."""
+    accuracy: float | None
+    """Its stated accuracy, metres."""
+    grids: tuple[str, ...]
+    """Grids that it uses."""
+    definition: str | None
+    """PROJ pipeline; None where the systems are equal."""
+    _own: threading.local = field(default_factory=threading.local, repr=False, compare=False)
+
+    def __call__(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """Heights in the target system of points (..., 3); NaN stays NaN.
+
+        Raises
+        ------
+        HeightSystemError
+            A point lies outside the operation's grid.
+        """
+        XYZ = np.asarray(XYZ, float)
+        if self.definition is None:
+            return XYZ[..., 2].copy()
+        if not hasattr(self._own, "transformer"):
+            self._own.transformer = Transformer.from_pipeline(self.definition)
+        X, Y, Z = (np.asarray(c, float) for c in self._own.transformer.transform(*np.moveaxis(XYZ, -1, 0)))
+        given = np.isfinite(XYZ).all(axis=-1)
+        # Where a grid ends PROJ returns infinity, or leaves the point untouched to the last bit.
+        lost = given & ~(np.isfinite(Z) & np.isfinite(X) & np.isfinite(Y))
+        if lost.any():
+            x, y = np.atleast_2d(XYZ[lost])[0, :2]
+            raise HeightSystemError(
+                f"X {x:.1f}, Y {y:.1f}: {height_label(self.source)} cannot be turned into {height_label(self.target)} "
+                f"there; the operation {self.operation!r} does not cover the point"
+            )
+        return np.where(given, Z, np.nan)
+
+    def __reduce__(self) -> tuple[type[HeightStep], tuple[object, ...]]:
+        return HeightStep, (
+            self.crs,
+            self.source,
+            self.target,
+            self.operation,
+            self.accuracy,
+            self.grids,
+            self.definition,
+        )
+
+
+def height_step(
+    source: str, target: str, crs: str, bounds: tuple[float, float, float, float] | None = None
+) -> HeightStep:
+    """Exact step from one height system to another at points of a projected CRS.
+
+    Parameters
+    ----------
+    source, target : str
+        Names as returned by `declared_pair`.
+    crs : str
+        Horizontal CRS of the points.
+    bounds : tuple of float, optional
+        xmin, ymin, xmax, ymax of the points, which decides between operations of different areas.
+
+    Raises
+    ------
+    HeightSystemError
+        The grid that joins the systems is not installed (it is named, with its address), or none is known.
+    """
+    source, target = check_height_system(source), check_height_system(target)
+    if source == target or "same" in (source, target):
+        return HeightStep(crs, source, target, "none", 0.0, (), None)
+    horizontal = parse_crs(crs)
+    a, b = (_with_heights(horizontal, name) for name in (source, target))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        group = TransformerGroup(
+            a, b, always_xy=True, allow_ballpark=False, area_of_interest=area_of(horizontal, bounds)
+        )
+    if not group.transformers or not group.best_available:
+        _refuse(group, source, target)
+    best = group.transformers[0]
+    grids = tuple(g.short_name for o in best.operations or () for g in o.grids)
+    accuracy = best.accuracy if best.accuracy is not None and best.accuracy >= 0 else None
+    return HeightStep(crs, source, target, best.description, accuracy, grids, best.definition)
+
+
+def _with_heights(horizontal: CRS, name: str) -> CRS:
+    if name == "ellipsoidal":
+        return horizontal.to_3d()
+    return CompoundCRS(f"{horizontal.name} + heights", [horizontal, parse_crs(name)])
+
+
+def _refuse(group: TransformerGroup, source: str, target: str) -> None:
+    what = f"heights {height_label(source)} cannot be turned into {height_label(target)}"
+    missing = missing_grids(group)
+    if not missing:
+        raise HeightSystemError(
+            f"{what}: no exact operation is known; declare the height systems that the inputs really have, "
+            "or convert one of them beforehand"
+        )
+    names = " ".join(g.split()[0] for g in missing)
+    raise HeightSystemError(
+        f"{what}: the grid {', '.join(missing)} is not installed; get it with `pyproj sync --file "
+        f"{names.split()[0]}` or put it into the folder that PROJ_DATA names, then run again "
+        "(heights are never passed on unchanged)"
+    )

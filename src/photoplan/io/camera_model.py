@@ -1,0 +1,226 @@
+"""Descriptions of cameras and lenses, as checked and frozen values.
+
+`photoplan.io.project_cameras` turns them into the interior orientation and lens that compute.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Strict, Tag, field_validator, model_validator
+
+from photoplan.errors import InputError
+
+__all__ = [
+    "BrownLens",
+    "Camera",
+    "Entry",
+    "Fiducials",
+    "FilmCamera",
+    "FrameCamera",
+    "Lens",
+    "Name",
+    "NoLens",
+    "Number",
+    "OpenCVFisheyeLens",
+    "OpenCVLens",
+    "Pair",
+    "Pixels",
+    "Positive",
+    "RadialTableLens",
+    "Triple",
+]
+
+Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
+Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False)]
+Pixels = Annotated[int, Strict(), Field(gt=0, le=10_000_000)]
+Pair = tuple[Number, Number]
+Triple = tuple[Number, Number, Number]
+Name = Annotated[str, Field(min_length=1, max_length=1000)]
+Fiducials = dict[Name, Pair]
+
+
+class Entry(BaseModel):
+    """Base of every entry: unknown keys are errors, values never change."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class NoLens(Entry):
+    """A lens without distortion."""
+
+    type: Literal["none"] = "none"
+
+
+class BrownLens(Entry):
+    """Brown's lens: radial k1–k3, decentring p1–p2, affinity b1 and shear b2.
+
+    Coefficients refer to image coordinates divided by the camera constant, y upwards (see the page on conventions).
+    """
+
+    type: Literal["brown"]
+    k1: Number = 0.0
+    k2: Number = 0.0
+    k3: Number = 0.0
+    p1: Number = 0.0
+    p2: Number = 0.0
+    b1: Number = 0.0
+    b2: Number = 0.0
+
+
+class OpenCVLens(Entry):
+    """OpenCV's lens with eight coefficients: rational radial k1–k6 and tangential p1–p2."""
+
+    type: Literal["opencv"]
+    k1: Number = 0.0
+    k2: Number = 0.0
+    p1: Number = 0.0
+    p2: Number = 0.0
+    k3: Number = 0.0
+    k4: Number = 0.0
+    k5: Number = 0.0
+    k6: Number = 0.0
+
+
+class OpenCVFisheyeLens(Entry):
+    """OpenCV's fisheye lens: a polynomial k1–k4 of the angle of incidence."""
+
+    type: Literal["opencv_fisheye"]
+    k1: Number = 0.0
+    k2: Number = 0.0
+    k3: Number = 0.0
+    k4: Number = 0.0
+
+
+class RadialTableLens(Entry):
+    """Radial distortion of a calibration report: micrometres at field angles (degrees) or at radii (millimetres)."""
+
+    type: Literal["radial_table"]
+    angles_deg: tuple[Number, ...] | None = None
+    radii_mm: tuple[Number, ...] | None = None
+    distortion_um: tuple[Number, ...]
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        if (self.angles_deg is None) == (self.radii_mm is None):
+            raise ValueError("a radial table needs either angles_deg or radii_mm")
+        at = self.angles_deg if self.angles_deg is not None else self.radii_mm
+        assert at is not None
+        if len(at) != len(self.distortion_um) or len(at) < 2:
+            raise ValueError(
+                f"{len(at)} positions and {len(self.distortion_um)} distortions; equal numbers, at least 2"
+            )
+        if at[0] < 0 or any(b <= a for a, b in pairwise(at)):
+            raise ValueError("positions of a radial table must not be negative and must increase")
+        if self.angles_deg is not None and at[-1] >= 90:
+            raise ValueError(f"field angle {at[-1]}°; a radial table ends below 90°")
+        return self
+
+
+Lens = Annotated[NoLens | BrownLens | OpenCVLens | OpenCVFisheyeLens | RadialTableLens, Field(discriminator="type")]
+
+
+class FrameCamera(Entry):
+    """A digital frame camera: by its focal length in pixels, or by camera constant and pixel or sensor size."""
+
+    type: Literal["frame"] = "frame"
+    size: tuple[Pixels, Pixels]
+    """Width and height in pixels."""
+    focal_px: Positive | tuple[Positive, Positive] | None = None
+    """Camera constant in pixels; two numbers where pixels are not square (x, y)."""
+    camera_constant_mm: Positive | None = None
+    pixel_size_um: Positive | tuple[Positive, Positive] | None = None
+    sensor_size_mm: tuple[Positive, Positive] | None = None
+    principal_point_px: Pair | None = None
+    """Column and row of the principal point, (0, 0) the centre of the upper-left pixel; default the image's middle."""
+    principal_point_mm: Pair | None = None
+    """The same as x0 to the right and y0 upwards from the image's middle, millimetres."""
+    lens: Lens = NoLens()
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if (self.focal_px is None) == (self.camera_constant_mm is None):
+            raise ValueError("give either focal_px or camera_constant_mm")
+        sizes = (self.pixel_size_um is not None) + (self.sensor_size_mm is not None)
+        if self.camera_constant_mm is not None and sizes != 1:
+            raise ValueError("camera_constant_mm needs either pixel_size_um or sensor_size_mm")
+        if self.focal_px is not None and sizes:
+            raise ValueError("focal_px stands alone: leave out pixel_size_um and sensor_size_mm")
+        if self.principal_point_mm is not None and self.focal_px is not None:
+            raise ValueError("principal_point_mm goes with camera_constant_mm; with focal_px give principal_point_px")
+        if self.principal_point_mm is not None and self.principal_point_px is not None:
+            raise ValueError("give either principal_point_px or principal_point_mm")
+        if self.lens.type == "radial_table" and self.lens.radii_mm is not None and self.camera_constant_mm is None:
+            raise ValueError("a radial table against radii_mm needs camera_constant_mm")
+        return self
+
+    @property
+    def focal(self) -> tuple[float, float]:
+        """Camera constant in pixels, in x and in y."""
+        if self.focal_px is not None:
+            return self.focal_px if isinstance(self.focal_px, tuple) else (self.focal_px, self.focal_px)
+        assert self.camera_constant_mm is not None
+        px, py = self.pixel_mm
+        return self.camera_constant_mm / px, self.camera_constant_mm / py
+
+    @property
+    def pixel_mm(self) -> tuple[float, float]:
+        """Side lengths of a pixel in millimetres; only where the camera is described in millimetres."""
+        if self.sensor_size_mm is not None:
+            return self.sensor_size_mm[0] / self.size[0], self.sensor_size_mm[1] / self.size[1]
+        if self.pixel_size_um is None:
+            raise InputError("the camera is described in pixels; its pixel size is not known")
+        pair = self.pixel_size_um if isinstance(self.pixel_size_um, tuple) else (self.pixel_size_um,) * 2
+        return pair[0] / 1000, pair[1] / 1000
+
+    @property
+    def principal_point(self) -> tuple[float, float]:
+        """Column and row of the principal point in pixels."""
+        if self.principal_point_px is not None:
+            return self.principal_point_px
+        col, row = (self.size[0] - 1) / 2, (self.size[1] - 1) / 2
+        if self.principal_point_mm is None:
+            return col, row
+        px, py = self.pixel_mm
+        return col + self.principal_point_mm[0] / px, row - self.principal_point_mm[1] / py
+
+
+class FilmCamera(Entry):
+    """A film camera whose photographs were scanned; each image states where its fiducial marks are in the scan."""
+
+    type: Literal["film"]
+    camera_constant_mm: Positive
+    fiducials_mm: Fiducials
+    """Calibrated fiducial marks: name = [x, y], x right and y upwards, millimetres."""
+    principal_point_mm: Pair = (0.0, 0.0)
+    """Principal point of the calibration report in the system of the fiducial marks."""
+    interior: Literal["affine", "bilinear"] = "affine"
+    size: tuple[Pixels, Pixels] | None = None
+    """Width and height of the scans in pixels, where all are equal."""
+    lens: Lens = NoLens()
+
+    @field_validator("fiducials_mm")
+    @classmethod
+    def _marks(cls, marks: dict[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+        if len(set(marks.values())) != len(marks):
+            twice = sorted(n for n, at in marks.items() if list(marks.values()).count(at) > 1)
+            raise ValueError(f"fiducial marks {', '.join(twice)} have the same coordinates")
+        return marks
+
+    @model_validator(mode="after")
+    def _enough(self) -> Self:
+        needed = {"affine": 3, "bilinear": 4}[self.interior]
+        if len(self.fiducials_mm) < needed:
+            raise ValueError(f"{len(self.fiducials_mm)} fiducial marks; {self.interior} needs at least {needed}")
+        return self
+
+
+def _camera_type(value: Any) -> str:
+    found = value.get("type", "frame") if isinstance(value, dict) else getattr(value, "type", "frame")
+    return found if isinstance(found, str) else repr(found)
+
+
+Camera = Annotated[
+    Annotated[FrameCamera, Tag("frame")] | Annotated[FilmCamera, Tag("film")], Discriminator(_camera_type)
+]

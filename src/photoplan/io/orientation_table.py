@@ -1,0 +1,128 @@
+"""Exterior orientations as a file states them, before they are brought into a project."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.rotation import ROTATION_ORDERS, opk_from_rotation, rotation_from_angles
+from photoplan.io.project_model import ANGLE_UNITS
+
+__all__ = ["Direction", "OrientationTable", "OrientedImage", "TableFormat", "angle_in_radians"]
+
+Direction = Literal["camera-to-ground", "ground-to-camera"]
+
+
+def angle_in_radians(value: NDArray[np.float64], unit: str) -> NDArray[np.float64]:
+    """Angles of a unit (deg, gon, rad) in radians."""
+    return value * (2 * np.pi / ANGLE_UNITS[unit])
+
+
+@dataclass(frozen=True)
+class TableFormat:
+    """What a table of numbers does not say of itself; checked at birth."""
+
+    columns: str | None = None
+    """None: the header names the columns. ``"name=Label,x=East,…"``: roles and header names. ``"name,x,y,z,…"``: roles
+    of the columns in their order, ``-`` for one that is not used; the table then needs no header."""
+    delimiter: Literal[",", ";", "\t", " "] | None = None
+    """None: the one that splits all lines equally."""
+    decimal_comma: bool = False
+    """Whether numbers are written 1,5 instead of 1.5."""
+    angle_unit: str = "deg"
+    """deg, gon or rad."""
+    rotation: str = "opk"
+    """Order of rotations, the first is the primary one. It is not the order of columns: each angle has its own."""
+    direction: Direction = "camera-to-ground"
+    """What the matrix of the angles does; ``ground-to-camera`` tables are transposed."""
+
+    def __post_init__(self) -> None:
+        if self.angle_unit not in ANGLE_UNITS:
+            raise UsageError(f"angle unit {self.angle_unit!r}; allowed are {', '.join(ANGLE_UNITS)}")
+        if self.rotation not in ROTATION_ORDERS:
+            raise UsageError(f"rotation {self.rotation!r}; allowed are {', '.join(ROTATION_ORDERS)}")
+        if self.direction not in ("camera-to-ground", "ground-to-camera"):
+            raise UsageError(f"rotation direction {self.direction!r}; allowed are camera-to-ground, ground-to-camera")
+        if self.delimiter not in (None, ",", ";", "\t", " "):
+            raise UsageError(f"delimiter {self.delimiter!r}; allowed are comma, semicolon, tab and space")
+        if self.delimiter == "," and self.decimal_comma:
+            raise UsageError("a comma cannot be both delimiter and decimal sign")
+
+
+@dataclass(frozen=True)
+class OrientedImage:
+    """One line of an orientation table."""
+
+    name: str
+    center: tuple[float, float, float]
+    """Projection centre in the table's system, metres."""
+    angles: tuple[float, float, float]
+    """Angles in the table's unit, in the sequence of its rotation order."""
+    camera: str | None = None
+    """Name of the camera, where the table states it."""
+    line: int | None = None
+    """Line in the file."""
+    fiducials: dict[str, tuple[float, float]] | None = None
+    """Measured fiducial marks [column, row], where the table states them."""
+
+
+@dataclass(frozen=True, eq=False)
+class OrientationTable:
+    """All images of an orientation file and what the numbers mean."""
+
+    file: Path
+    images: tuple[OrientedImage, ...]
+    angle_unit: str = "deg"
+    rotation: str = "opk"
+    direction: Direction = "camera-to-ground"
+    crs: str | None = None
+    """Horizontal CRS; None if the file does not state it."""
+    height_system: str | None = None
+    """None if the file does not state it."""
+    origin: tuple[float, float, float] | None = None
+    """Latitude, longitude (degrees, WGS 84) and height of a local tangential system (east, north, up), where positions
+    and rotations refer to one; None where they refer to `crs`."""
+    notes: tuple[str, ...] = ()
+    """What a user should know of how the file was read."""
+
+    def __post_init__(self) -> None:
+        if not self.images:
+            raise InputError(f"{self.file}: holds no image")
+        first: dict[str, OrientedImage] = {}
+        for image in self.images:
+            if image.name in first:
+                lines = [str(i.line) for i in (first[image.name], image) if i.line is not None]
+                where = f" (lines {' and '.join(lines)})" if lines else ""
+                raise InputError(f"{self.file}: image {image.name!r} is given twice{where}; keep one of them")
+            first[image.name] = image
+
+    @cached_property
+    def centers(self) -> NDArray[np.float64]:
+        """Projection centres, shape (n, 3)."""
+        return np.array([i.center for i in self.images], float)
+
+    @cached_property
+    def rotations(self) -> NDArray[np.float64]:
+        """R_ground_camera of every image, shape (n, 3, 3), in the axes of the table's system."""
+        angles = angle_in_radians(np.array([i.angles for i in self.images], float), self.angle_unit)
+        R = np.stack([rotation_from_angles(a, self.rotation) for a in angles])
+        return R if self.direction == "camera-to-ground" else np.swapaxes(R, 1, 2)
+
+    def opk_degrees(self) -> NDArray[np.float64]:
+        """ω, φ, κ in degrees, shape (n, 3); numbers that are already so stay untouched."""
+        if (self.angle_unit, self.rotation, self.direction) == ("deg", "opk", "camera-to-ground"):
+            return np.array([i.angles for i in self.images], float)
+        return degrees_of(self.rotations)
+
+
+def degrees_of(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """ω, φ, κ in degrees of matrices (n, 3, 3); rounded to 1e-12°, below the noise of the conversion."""
+    # Adding zero turns −0.0 into 0.0.
+    angles = np.array([opk_from_rotation(R) for R in rotations], np.float64)
+    return np.asarray(np.round(np.degrees(angles), 12) + 0.0, np.float64)

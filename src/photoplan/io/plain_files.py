@@ -1,0 +1,142 @@
+"""Text files read with limits: size, encoding, and depth of nesting."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from photoplan.errors import InputError
+from photoplan.io.project_errors import explain
+
+__all__ = ["build", "finite", "read_json", "read_text", "read_yaml"]
+
+#: Levels of nesting that any of our formats could need.
+MAX_DEPTH = 32
+
+M = TypeVar("M", bound=BaseModel)
+
+
+def read_text(path: Path, max_bytes: int) -> str:
+    """Text of a UTF-8 file (a byte order mark is dropped, line ends become newlines).
+
+    Raises
+    ------
+    InputError
+        The file is missing, is larger than `max_bytes`, or is not UTF-8; the message names the line.
+    """
+    try:
+        size = path.stat().st_size
+        if size > max_bytes:
+            raise InputError(f"{path}: {size} bytes; at most {max_bytes} are read from a file of this kind")
+        raw = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = raw[: error.start].count(b"\n") + 1
+        raise InputError(f"{path}:{line}: not UTF-8 (byte {raw[error.start]:#04x}); save the file as UTF-8") from None
+    if "\0" in text:
+        line = text[: text.index("\0")].count("\n") + 1
+        raise InputError(f"{path}:{line}: holds a zero byte; this is not a text file")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_yaml(path: Path, max_bytes: int = 200_000) -> Any:
+    """Plain contents of a YAML file.
+
+    Aliases (which let a small file unfold without bound), deep nesting and repeated keys are refused before anything
+    is built.
+
+    Raises
+    ------
+    InputError
+        The file is not such YAML.
+    """
+    text = read_text(path, max_bytes)
+    try:
+        depth = 0
+        for event in yaml.parse(text, yaml.SafeLoader):
+            line = event.start_mark.line + 1 if event.start_mark else 0
+            if isinstance(event, yaml.AliasEvent):
+                raise InputError(f"{path}:{line}: YAML aliases are not read; write the values out")
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > MAX_DEPTH:
+                raise InputError(f"{path}:{line}: nested deeper than {MAX_DEPTH} levels")
+        _refuse_repeated_keys(yaml.compose(text, yaml.SafeLoader), path)
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f"{path}:{mark.line + 1}" if mark else str(path)
+        raise InputError(f"{where}: not valid YAML ({getattr(error, 'problem', None) or error})") from None
+
+
+def _refuse_repeated_keys(node: Any, path: Path) -> None:
+    if isinstance(node, yaml.SequenceNode):
+        for child in node.value:
+            _refuse_repeated_keys(child, path)
+    if isinstance(node, yaml.MappingNode):
+        seen: set[str] = set()
+        for key, child in node.value:
+            if str(key.value) in seen:
+                raise InputError(f"{path}:{key.start_mark.line + 1}: {key.value!r} is given twice")
+            seen.add(str(key.value))
+            _refuse_repeated_keys(child, path)
+
+
+def read_json(path: Path, max_bytes: int = 1_000_000_000) -> Any:
+    """Plain contents of a JSON file; NaN and infinity are refused, since JSON has no such numbers.
+
+    Raises
+    ------
+    InputError
+        The file is not JSON, or nested without reason.
+    """
+    text = read_text(path, max_bytes)
+
+    def refuse(word: str) -> NoReturn:
+        raise InputError(f"{path}: holds {word}, which is no number in JSON; repair the file")
+
+    try:
+        return json.loads(text, parse_constant=refuse)
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}:{error.lineno}: not valid JSON ({error.msg})") from None
+    except RecursionError:
+        raise InputError(f"{path}: nested far too deep for a file of this kind") from None
+
+
+def build(model: type[M], values: dict[str, Any], source: str) -> M:
+    """A model of plain values; errors become messages that begin with `source`.
+
+    Raises
+    ------
+    InputError
+        A value is not allowed.
+    """
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise InputError(explain(error, values, source)) from None
+
+
+def finite(value: Any, where: str, count: int | None = None) -> Any:
+    """A finite number, or `count` of them as a tuple of floats.
+
+    Raises
+    ------
+    InputError
+        It is something else; the message begins with `where`.
+    """
+    if count is not None:
+        if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != count:
+            raise InputError(f"{where}: {value!r} given; {count} numbers are needed")
+        return tuple(finite(v, where) for v in value)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{where}: {value!r} given; a finite number is needed")
+    return float(value)

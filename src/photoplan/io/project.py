@@ -1,0 +1,80 @@
+"""The project file: the one place for inputs, their CRS and their height systems."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from photoplan.errors import InputError
+from photoplan.geometry.crs import require_projected_metres
+from photoplan.geometry.heights import check_height_system
+from photoplan.io.project_errors import explain
+from photoplan.io.project_model import Project
+from photoplan.io.project_write import project_text
+from photoplan.io.toml_file import read_toml
+
+__all__ = ["Project", "load_project", "parse_project", "project_schema", "write_project"]
+
+
+def load_project(path: str | Path) -> Project:
+    """Read and check a project file.
+
+    Inputs that it names are not opened here; their paths, the CRS and the height systems are checked.
+
+    Raises
+    ------
+    InputError
+        The file or an entry is wrong; the message names the entry and its line.
+    """
+    path = Path(path)
+    data, text = read_toml(path)
+    return parse_project(data, path.resolve().parent, str(path), text)
+
+
+def parse_project(data: dict[str, Any], folder: Path, source: str, text: str = "") -> Project:
+    """Project of the plain contents of a project file; `source` and `text` are for messages.
+
+    Raises
+    ------
+    InputError
+        An entry is wrong.
+    """
+    if "folder" in data:
+        raise InputError(f"{source}: unknown entry 'folder'")
+    try:
+        project = Project.model_validate({**data, "folder": folder})
+    except ValidationError as error:
+        raise InputError(explain(error, data, source, text)) from None
+    require_projected_metres(project.crs, f"{source}: crs")
+    for table, name in (("terrain", project.terrain.height_system), ("orientation", project.orientation.height_system)):
+        if name is not None:
+            check_height_system(name, f"{source}: [{table}] height_system")
+    return project
+
+
+def write_project(path: str | Path, project: Project) -> None:
+    """Write a project file with a comment for every entry; `load_project` gives an equal project again.
+
+    The file appears complete or not at all.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written to.
+    """
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_text(project_text(project), encoding="utf-8", newline="\n")
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
+
+
+def project_schema() -> str:
+    """JSON Schema of the project file, as text."""
+    return json.dumps(Project.model_json_schema(), indent=2, ensure_ascii=False)

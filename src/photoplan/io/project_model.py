@@ -1,0 +1,218 @@
+"""What a project file says, as checked and frozen values. Files are read and written in `photoplan.io.project`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, Strict, field_validator, model_validator
+from pydantic.json_schema import SkipJsonSchema
+
+from photoplan.errors import InputError, UsageError
+from photoplan.io.camera_model import (
+    Camera,
+    Entry,
+    Fiducials,
+    FilmCamera,
+    FrameCamera,
+    Name,
+    Number,
+    Pixels,
+    Positive,
+    Triple,
+)
+from photoplan.io.names import check_input_name, resolve_input, unique_stems
+
+__all__ = ["ANGLE_UNITS", "Image", "Orientation", "OrthoDefaults", "Project", "Terrain"]
+
+#: Angle units and the size of one unit in radians' common measure, a full circle.
+ANGLE_UNITS = {"deg": 360.0, "gon": 400.0, "rad": 6.283185307179586}
+
+InputName = Annotated[str, Field(max_length=4000)]
+
+
+class Image(Entry):
+    """One oriented image."""
+
+    name: Name
+    """Products are called after it."""
+    file: InputName
+    camera: Name
+    center: Triple
+    """Projection centre X0, Y0, Z0 in the project's CRS and the orientation's height system, metres."""
+    angles: Triple
+    """Three angles in the sequence and unit that [orientation] states."""
+    fiducials: Fiducials | None = None
+    """Measured fiducial marks of a film scan: name = [column, row], pixels."""
+    size: tuple[Pixels, Pixels] | None = None
+    """Width and height of this scan, where the camera does not state them."""
+
+    @field_validator("file")
+    @classmethod
+    def _file(cls, text: str) -> str:
+        return _plain_file(text)
+
+
+class Terrain(Entry):
+    """Where the ground is: a raster of heights, or one height everywhere."""
+
+    file: InputName | None = None
+    height: Number | None = None
+    height_system: Name | None = None
+
+    @field_validator("file")
+    @classmethod
+    def _file(cls, text: str | None) -> str | None:
+        return None if text is None else _plain_file(text)
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        if (self.file is None) == (self.height is None):
+            raise ValueError("give either file (a raster of heights) or height (one height everywhere)")
+        return self
+
+
+class Orientation(Entry):
+    """What the numbers of all [[images]] mean."""
+
+    height_system: Name | None = None
+    angle_unit: Literal["deg", "gon", "rad"] = "deg"
+    rotation: Literal["opk", "pok", "kpo", "kop", "okp", "pko"] = "opk"
+    earth_curvature: Literal["none", "correction", "strict"] = "none"
+    refraction: Annotated[bool, Strict()] = False
+
+
+class OrthoDefaults(Entry):
+    """Defaults of `photoplan ortho`; options of the command override them."""
+
+    resolution: Positive | None = None
+    bounds: tuple[Number, Number, Number, Number] | None = None
+    kernel: Name | None = None
+    tolerance: Positive | None = None
+    nodata: Number | Literal["auto", "mask"] | None = None
+    compress: Name | None = None
+    overviews: Annotated[bool, Strict()] | None = None
+
+    @field_validator("bounds")
+    @classmethod
+    def _bounds(cls, b: tuple[float, float, float, float] | None) -> tuple[float, float, float, float] | None:
+        if b is not None and (b[0] >= b[2] or b[1] >= b[3]):
+            raise ValueError(f"bounds {list(b)}; needed are [xmin, ymin, xmax, ymax] with xmin < xmax and ymin < ymax")
+        return b
+
+
+class Project(Entry):
+    """All inputs of a block of images, checked against each other."""
+
+    format: Literal[1] = 1
+    crs: Annotated[str, Field(min_length=1, max_length=20_000)]
+    terrain: Terrain
+    orientation: Orientation = Orientation()
+    cameras: dict[Name, Camera]
+    images: tuple[Image, ...]
+    ortho: OrthoDefaults = OrthoDefaults()
+    folder: SkipJsonSchema[Path] = Field(default=Path(), exclude=True)
+    """Folder of the project file, from which relative paths start; not an entry of the file."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if not self.images:
+            raise ValueError("no [[images]] entry; a project needs at least one image")
+        names: set[str] = set()
+        for number, image in enumerate(self.images, 1):
+            where = f"image {image.name!r} (entry {number})"
+            if image.name in names:
+                raise ValueError(f"{where}: the name is given twice")
+            names.add(image.name)
+            if image.camera not in self.cameras:
+                known = ", ".join(map(repr, self.cameras)) or "none"
+                raise ValueError(f"{where}: camera {image.camera!r} is not described; cameras are {known}")
+            _check_film(image, self.cameras[image.camera], where)
+        try:
+            unique_stems(i.name for i in self.images)
+        except InputError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+    def resolve(self, file: str) -> Path:
+        """Absolute path of an entry `file`, relative ones from the project's folder."""
+        return resolve_input(self.folder, file)
+
+    def select(self, patterns: Sequence[str] | None = None) -> list[str]:
+        """Names of the images that match one of `patterns` (``*`` and ``?`` allowed), in the project's order.
+
+        Raises
+        ------
+        UsageError
+            A pattern matches no image.
+        """
+        names = [image.name for image in self.images]
+        if patterns is None:
+            return names
+        chosen: set[str] = set()
+        for pattern in patterns:
+            found = [n for n in names if n == pattern or fnmatchcase(n, pattern)]
+            if not found:
+                raise UsageError(
+                    f"image {pattern!r} is not in the project; "
+                    f"its {len(names)} images begin with {', '.join(names[:5])}"
+                )
+            chosen.update(found)
+        return [n for n in names if n in chosen]
+
+    def ortho_settings(self) -> dict[str, Any]:
+        """What the `[ortho]` table states, by the names of `photoplan.products.settings.OrthoSettings`."""
+        stated = self.ortho.model_dump(exclude_none=True)
+        if "nodata" in stated:
+            stated["nodata"] = str(stated["nodata"])
+        return stated
+
+    def image(self, name: str) -> Image:
+        """The image of this name.
+
+        Raises
+        ------
+        InputError
+            There is none.
+        """
+        for image in self.images:
+            if image.name == name:
+                return image
+        raise InputError(
+            f"image {name!r} is not in the project; its {len(self.images)} images begin with "
+            f"{', '.join(i.name for i in self.images[:5])}"
+        )
+
+
+def _plain_file(text: str) -> str:
+    try:
+        return check_input_name(text)
+    except InputError as error:
+        raise ValueError(str(error)) from None
+
+
+def _check_film(image: Image, camera: FrameCamera | FilmCamera, where: str) -> None:
+    """A film scan needs enough of the camera's marks, and no others; a digital image needs none."""
+    if isinstance(camera, FrameCamera):
+        if image.fiducials is not None:
+            raise ValueError(f'{where}: fiducials are given, but camera {image.camera!r} is digital (type = "frame")')
+        return
+    if not image.fiducials:
+        raise ValueError(f"{where}: film camera {image.camera!r} needs the measured fiducials of this scan")
+    unknown = [n for n in image.fiducials if n not in camera.fiducials_mm]
+    if unknown:
+        raise ValueError(
+            f"{where}: fiducial marks {', '.join(unknown)} are not among those of camera {image.camera!r}:"
+            f" {', '.join(camera.fiducials_mm)}"
+        )
+    needed = {"affine": 3, "bilinear": 4}[camera.interior]
+    if len(image.fiducials) < needed:
+        missing = [n for n in camera.fiducials_mm if n not in image.fiducials]
+        raise ValueError(
+            f"{where}: {len(image.fiducials)} fiducial marks measured, {camera.interior} needs {needed}; "
+            f"missing {', '.join(missing)}"
+        )
+    if image.size is None and camera.size is None:
+        raise ValueError(f"{where}: size = [width, height] of the scan is stated neither here nor for its camera")
