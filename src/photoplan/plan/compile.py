@@ -6,7 +6,7 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import Camera
 from photoplan.errors import UsageError
@@ -110,14 +110,15 @@ def compile_anchors(
 
 
 def initial_cell(
-    camera: Camera, target: Target, uv: tuple[float, float], height: float, side: int, rule: AnchorRule
+    camera: Camera, target: Target, uv: ArrayLike, height: float, side: int, rule: AnchorRule
 ) -> int:
     """Side of the cells that flat ground needs near (u, v), so that tiles need not find it again by halving.
 
     It depends on the camera and the target alone, not on the order in which tiles are computed, so that every run
     gives the same bytes.
     """
-    window = Window(int(uv[0]) - side // 2, int(uv[1]) - side // 2, side, side)
+    u, v = (int(a) for a in np.asarray(uv, float))
+    window = Window(u - side // 2, v - side // 2, side, side)
     flat = np.full((side, side), height, np.float32)
     anchors = compile_anchors(camera, target, window, flat, rule)
     if anchors is None:

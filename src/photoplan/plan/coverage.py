@@ -12,7 +12,7 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.surfaces.base import Surface
 from photoplan.surfaces.intersect import intersect
 
-__all__ = ["Coverage", "cover", "image_border"]
+__all__ = ["Coverage", "cover", "covered_tiles", "image_border"]
 
 #: Points per side of the lattice on which coverage is sampled.
 LATTICE = 192
@@ -97,12 +97,13 @@ def _one_look(
         # The footprint may fall between the lattice points: look where the middle of the image would be.
         return _around_nadir(camera, surface, bounds)
     rows, cols = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
-    dx, dy = x[1] - x[0], y[1] - y[0]
+    # A corner of the image is narrow at its tip: the outermost lattice point inside can be two steps away from it.
+    dx, dy = 2 * (x[1] - x[0]), 2 * (y[1] - y[0])
     return (
-        max(xmin, x[cols[0]] - dx),
-        max(ymin, y[rows[0]] - dy),
-        min(xmax, x[cols[-1]] + dx),
-        min(ymax, y[rows[-1]] + dy),
+        max(xmin, float(x[cols[0]] - dx)),
+        max(ymin, float(y[rows[0]] - dy)),
+        min(xmax, float(x[cols[-1]] + dx)),
+        min(ymax, float(y[rows[-1]] + dy)),
     )
 
 
@@ -114,8 +115,9 @@ def _around_nadir(
     if not len(there):
         return None
     low, high = there[:, :2].min(axis=0), there[:, :2].max(axis=0)
-    margin = 0.25 * (high - low).max() + 1e-3
-    smaller = (low[0] - margin, low[1] - margin, high[0] + margin, high[1] + margin)
+    margin = 0.25 * float((high - low).max()) + 1e-3
+    left, bottom, right, top = (float(a) for a in (*(low - margin), *(high + margin)))
+    smaller = (left, bottom, right, top)
     return smaller if (smaller[2] - smaller[0]) < 0.5 * (bounds[2] - bounds[0]) else None
 
 

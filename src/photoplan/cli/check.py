@@ -1,0 +1,34 @@
+"""`photoplan check`: validate a project and say what to expect."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from photoplan.cli.options import json_option
+
+__all__ = ["command"]
+
+
+@click.command("check")
+@click.argument("project", type=click.Path(path_type=Path))
+@click.option("--images", "images", multiple=True, metavar="NAME", help="Image or pattern; may be repeated [all].")
+@json_option
+def command(project: Path, images: tuple[str, ...], as_json: bool) -> None:
+    """Open every input of PROJECT and print, image by image, what it promises.
+
+    Ends with exit code 3 if an orientation is implausible; the table then names what would fit.
+    """
+    from photoplan.errors import GeometryError
+    from photoplan.io.project import load_project
+    from photoplan.products.check import check_project
+
+    found = check_project(load_project(project), images or None)
+    if as_json:
+        click.echo(json.dumps(found.to_dict(), indent=2))
+    else:
+        click.echo(str(found))
+    if found.implausible:
+        raise GeometryError(f"{len(found.implausible)} of {len(found.images)} images are implausible: {found.implausible[0]}")

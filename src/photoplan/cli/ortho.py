@@ -1,0 +1,54 @@
+"""`photoplan ortho`: orthophotos of a project."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photoplan.cli.options import executing
+
+__all__ = ["command"]
+
+
+@click.command("ortho")
+@click.argument("project", type=click.Path(path_type=Path))
+@click.option("--images", "images", multiple=True, metavar="NAME", help="Image or pattern; may be repeated [all].")
+@click.option("--resolution", type=float, metavar="R", help="Ground pixel in metres [the images' mean GSD].")
+@click.option("--bounds", type=float, nargs=4, default=None, metavar="XMIN YMIN XMAX YMAX", help="Part to make.")
+@click.option("--kernel", help="nearest, bilinear, bicubic, bicubic-1 or lanczos3 [bicubic].")
+@click.option("--tolerance", type=float, metavar="PX", help="Largest residual of the anchors [0.02].")
+@click.option("--compress", help="deflate, zstd, lzw, jpeg or none [deflate].")
+@click.option("--nodata", help="A number, mask, or auto: 0 for integers, NaN for floats [auto].")
+@click.option("--overviews/--no-overviews", default=None, help="Whether the file holds overviews [yes].")
+@click.option("--tile", type=int, metavar="PX", help="Side of a tile [512].")
+@click.option("--output", type=click.Path(path_type=Path), help="Folder of the products [PROJECT's folder/products].")
+@click.option("--plan", "plan_file", type=click.Path(path_type=Path), help="Write the plan (GeoPackage) and stop.")
+@click.option("--dry-run", is_flag=True, help="Compile the plan, print it, and stop.")
+@executing
+def command(
+    project: Path,
+    images: tuple[str, ...],
+    output: Path | None,
+    plan_file: Path | None,
+    dry_run: bool,
+    **options: Any,
+) -> None:
+    """Make an orthophoto of each image: NAME_ortho.tif (a cloud-optimised GeoTIFF) and its run record.
+
+    The same command continues a run that was interrupted.
+    """
+    from photoplan.cli import running
+    from photoplan.io.project import load_project
+    from photoplan.products.orthophoto import plan_orthophotos
+
+    how = running.How.from_options(options)
+    loaded = load_project(project)
+    changes = {k: v for k, v in options.items() if v is not None and v != ()}
+    plan = plan_orthophotos(loaded, images or None, **changes)
+    folder = output or loaded.folder / "products"
+    if dry_run or plan_file is not None:
+        running.show_plan(plan, folder, plan_file, how)
+        return
+    running.execute_and_report(plan, folder, how)

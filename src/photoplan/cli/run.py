@@ -1,0 +1,29 @@
+"""`photoplan run`: execute a plan that was looked at."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photoplan.cli.options import executing
+
+__all__ = ["command"]
+
+
+@click.command("run")
+@click.argument("plan", type=click.Path(path_type=Path))
+@click.option("--output", type=click.Path(path_type=Path), help="Folder of the products [as planned].")
+@executing
+def command(plan: Path, output: Path | None, **options: Any) -> None:
+    """Execute PLAN, a GeoPackage written by `photoplan ortho PROJECT --plan PLAN`.
+
+    Inputs that have changed since it was written are refused.
+    """
+    from photoplan.cli import running
+    from photoplan.products.plan_file import read_plan
+
+    how = running.How.from_options(options)
+    loaded, folder = read_plan(plan)
+    running.execute_and_report(loaded, output or folder, how)

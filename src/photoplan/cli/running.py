@@ -1,0 +1,112 @@
+"""What `ortho`, `run` and `demo` do with a plan: show it, or execute it and report."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photoplan.cli.progress import progress
+from photoplan.products.execution import ProductResult, Run, execute
+from photoplan.products.orthophoto import OrthoPlan
+from photoplan.products.plan_file import PlanFigures, compile_figures, write_plan
+
+__all__ = ["How", "execute_and_report", "show_plan"]
+
+
+@dataclass(frozen=True)
+class How:
+    """The options of `executing`, as values."""
+
+    workers: int
+    executor: str
+    memory: int | None
+    overwrite: bool
+    quicklook: bool
+    as_json: bool
+    quiet: bool
+
+    @classmethod
+    def from_options(cls, options: dict[str, Any]) -> How:
+        """Take the options of `executing` out of the options of a verb."""
+        return cls(
+            workers=options.pop("workers") or len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+            executor=options.pop("executor"),
+            memory=options.pop("memory"),
+            overwrite=options.pop("overwrite"),
+            quicklook=not options.pop("no_quicklook"),
+            as_json=options.pop("as_json"),
+            quiet=options.pop("quiet"),
+        )
+
+    def talk(self, text: str) -> None:
+        """Say something on stderr."""
+        if not self.quiet:
+            click.echo(text, err=True)
+
+
+def show_plan(plan: OrthoPlan, folder: Path, plan_file: Path | None, how: How) -> None:
+    """Compile every tile's geometry, print the figures, write the plan if asked."""
+    tiles = sum(len(p.plan.tiles) for p in plan.products)
+    with progress(tiles, how.quiet) as report:
+        figures = compile_figures(plan, report)
+    if plan_file is not None:
+        write_plan(plan_file, plan, figures, folder, how.overwrite)
+    if how.as_json:
+        click.echo(json.dumps({"plan": plan_file and str(plan_file), **figures.to_dict(plan)}, indent=2))
+        return
+    click.echo(str(plan))
+    click.echo(_sums(plan, figures))
+    for line in plan.blind:
+        click.echo(f"  sees no terrain: {line}")
+    if plan_file is not None:
+        click.echo(str(plan_file))
+
+
+def _sums(plan: OrthoPlan, figures: PlanFigures) -> str:
+    return (
+        f"plan: {len(plan.products)} products, {figures.tiles} tiles, {figures.cells} cells, "
+        f"worst anchor residual {figures.residual:.3g} px"
+    )
+
+
+def execute_and_report(plan: OrthoPlan, folder: Path, how: How) -> None:
+    """Make the products and print their paths, or one JSON object."""
+    started = time.perf_counter()
+    settings = plan.settings
+    tiles = sum(len(p.plan.tiles) for p in plan.products)
+    how.talk(
+        f"plan: {len(plan.products)} products, {tiles} tiles · {settings.resolution:g} m · kernel {settings.kernel} · "
+        f"tolerance {settings.tolerance:g} px · nodata {settings.nodata} · {how.workers} {how.executor}"
+    )
+    for line in plan.blind:
+        how.talk(f"  sees no terrain and is left out: {line}")
+    with progress(tiles, how.quiet) as report:
+        results = execute(
+            plan, folder, Run(how.workers, how.executor, how.memory, how.overwrite, how.quicklook, report, how.talk)
+        )
+    seconds = time.perf_counter() - started
+    if how.as_json:
+        products = [r.to_dict() for r in results]
+        click.echo(json.dumps({"products": products, "seconds": round(seconds, 3), "folder": str(folder)}, indent=2))
+        return
+    for result in results:
+        click.echo(str(result.path))
+    how.talk(_summary(results, plan, seconds))
+    if how.quicklook:
+        how.talk(f"quick look: {folder / 'overview.png'}")
+
+
+def _summary(results: list[ProductResult], plan: OrthoPlan, seconds: float) -> str:
+    pixels = sum(p.grid.width * p.grid.height for p in plan.products) / 1e6
+    worst = max(r.residual for r in results)
+    cells = sum(r.cells for r in results)
+    return (
+        f"{len(results)} orthophotos in {seconds:.1f} s · {pixels:.1f} Mpx, {pixels / seconds:.0f} Mpx/s · "
+        f"{cells} cells, worst anchor residual {worst:.3g} px"
+    )

@@ -1,0 +1,282 @@
+"""Execute a plan: tiles to workers, pixels to files, a record beside each product."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from photoplan import __version__
+from photoplan.engine.execute import MOST_SOURCE_BYTES, Pixels
+from photoplan.engine.executors import executor_factory, run_tiles
+from photoplan.errors import TilesFailed, UsageError
+from photoplan.io.product import ProductFile
+from photoplan.io.quicklook import write_overview
+from photoplan.io.run_record import peak_memory, versions, write_run_record
+from photoplan.plan.product import ProductPlan, Tile
+from photoplan.products.orthophoto import OrthoPlan, OrthoProduct, render_tile
+from photoplan.products.scene import Scene, SceneAddress, open_scene
+
+__all__ = ["ProductResult", "Run", "execute"]
+
+#: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
+BASE_MEMORY = 320 * 2**20
+
+
+@dataclass(frozen=True)
+class Run:
+    """How a plan is executed; none of it changes a pixel."""
+
+    workers: int = 1
+    """Threads or processes."""
+    executor: str = "threads"
+    """``threads``, ``processes`` or a Dask scheduler's address."""
+    memory: int | None = None
+    """Bytes the run should stay under; None: no bound but the tiles in flight."""
+    overwrite: bool = False
+    """Whether finished products may be replaced."""
+    quicklook: bool = True
+    """Whether to write `overview.png`."""
+    progress: Callable[[int, int], None] = lambda tiles, pixels: None
+    """Called with the number of tiles just finished and of their pixels."""
+    talk: Callable[[str], None] = lambda text: None
+    """Called with a sentence that a user may want to read while it goes on."""
+
+    @property
+    def in_flight(self) -> int:
+        """Tiles that may be under way at once.
+
+        Raises
+        ------
+        UsageError
+            `memory` does not suffice for one tile.
+        """
+        wanted = self.workers if self.workers == 1 else 2 * self.workers
+        if self.memory is None:
+            return wanted
+        # A tile holds its source window as read and as packed for the kernel, relief, anchors and result.
+        per_tile = 3 * MOST_SOURCE_BYTES
+        fits = (self.memory - BASE_MEMORY) // per_tile
+        if fits < 1:
+            least = (BASE_MEMORY + per_tile) / 2**20
+            raise UsageError(f"--memory {self.memory / 2**20:.0f} MiB; at least {least:.0f} MiB are needed for one tile")
+        return int(min(wanted, fits))
+
+
+@dataclass(frozen=True)
+class ProductResult:
+    """What became of one product."""
+
+    path: Path
+    image: str
+    seconds: float
+    valid_share: float
+    """Valid pixels among all pixels of the product, 0 to 1."""
+    residual: float
+    """Worst residual of the anchors over all tiles, pixels of the source image."""
+    cells: int
+    """Boxes that the anchors of all tiles have."""
+    tiles: int
+    """Tiles that the product has, the empty ones included."""
+    resumed: int
+    """Tiles taken over from an earlier run."""
+    failed: tuple[int, ...]
+    """Tiles that could not be computed; the product is then not written."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        return {
+            "path": str(self.path),
+            "image": self.image,
+            "seconds": round(self.seconds, 3),
+            "valid_share": round(self.valid_share, 6),
+            "worst_anchor_residual_px": self.residual,
+            "cells": self.cells,
+            "tiles": self.tiles,
+            "resumed_tiles": self.resumed,
+            "failed_tiles": list(self.failed),
+        }
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What a worker is told once: small, and pickles."""
+
+    scene: SceneAddress
+    product: ProductPlan
+    kernel: str
+
+
+def _work(job: _Job, tile: Tile) -> Pixels:
+    return render_tile(job.product, job.kernel, job.scene.open(), tile)
+
+
+def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list[ProductResult]:
+    """Make all products of a plan.
+
+    Parameters
+    ----------
+    plan : OrthoPlan
+    output : path
+        Folder for `NAME_ortho.tif`, its run record, and the overview picture; made if it does not exist.
+    run : Run, optional
+        Workers, memory, overwriting, progress.
+
+    Returns
+    -------
+    list of ProductResult
+        In the plan's order.
+
+    Raises
+    ------
+    UsageError
+        A product exists and `run.overwrite` is False, or a product would replace an input; nothing is done then.
+    RunLocked
+        Another run is writing the same product.
+    InputError
+        An input is missing, damaged, or has changed since it was planned.
+    TilesFailed
+        Some tiles failed again and again; their products are not written, all others are.
+    ResourceError
+        Disk or memory ran out.
+    """
+    run = run or Run()
+    folder = Path(output)
+    _refuse_existing(plan, folder, run)
+    in_flight = run.in_flight
+    results = [_make(plan, product, folder, run, in_flight) for product in plan.products]
+    if run.quicklook:
+        write_overview(folder / "overview.png", [r.path for r in results if not r.failed])
+    failed = [f"{r.path.name}: tiles {', '.join(map(str, r.failed))}" for r in results if r.failed]
+    if failed:
+        raise TilesFailed("finished, but these products lack tiles and were not written:\n  " + "\n  ".join(failed))
+    return results
+
+
+def _refuse_existing(plan: OrthoPlan, folder: Path, run: Run) -> None:
+    existing = [p for p in (_path(folder, product) for product in plan.products) if p.exists()]
+    if existing and not run.overwrite:
+        more = f" and {len(existing) - 1} more" if len(existing) > 1 else ""
+        raise UsageError(f"{existing[0]}{more} exists; give --overwrite to replace it, or another --output")
+
+
+def _path(folder: Path, product: OrthoProduct) -> Path:
+    return folder / f"{product.plan.name}.tif"
+
+
+def _make(plan: OrthoPlan, product: OrthoProduct, folder: Path, run: Run, in_flight: int) -> ProductResult:
+    started = time.perf_counter()
+    settings, scene = plan.settings, open_scene(plan.project, product.plan.image)
+    job = _Job(scene.address, replace(product.plan, tiles=()), settings.kernel)
+    tally = _Tally()
+    with ProductFile(
+        _path(folder, product),
+        product.grid,
+        scene.reader.bands,
+        scene.reader.dtype,
+        run_key=product.key,
+        nodata=settings.nodata,
+        compress=settings.compress,
+        overviews=settings.overviews,
+        tile=settings.tile,
+        overwrite=run.overwrite,
+        inputs=scene.files,
+    ) as file:
+        finished = file.finished
+        todo = [tile for tile in product.plan.tiles if tile.index not in finished]
+        tally.resumed = len(product.plan.tiles) - len(todo)
+        run.progress(tally.resumed, 0)
+        for outcome in run_tiles(todo, partial(_work, job), executor_factory(run.executor, run.workers), in_flight):
+            tile: Tile = outcome.task
+            if outcome.error is not None:
+                tally.failed.append(tile.index)
+                tally.reasons.append(f"tile {tile.index}: {outcome.error}")
+            else:
+                pixels: Pixels = outcome.result
+                if pixels.values is None:
+                    file.append_empty(tile.index)
+                else:
+                    file.append(tile.index, pixels.values, pixels.valid)
+                tally.add(pixels)
+            run.progress(1, tile.window.size)
+        if not tally.failed:
+            file.complete(_tags(plan, product))
+    result = ProductResult(
+        _path(folder, product),
+        product.plan.image,
+        time.perf_counter() - started,
+        tally.valid / (product.grid.width * product.grid.height),
+        tally.residual,
+        tally.cells,
+        product.plan.tile_count,
+        tally.resumed,
+        tuple(sorted(tally.failed)),
+    )
+    if not tally.failed:
+        write_run_record(result.path, _record(plan, product, scene, run, result))
+    return result
+
+
+@dataclass
+class _Tally:
+    valid: int = 0
+    residual: float = 0.0
+    cells: int = 0
+    resumed: int = 0
+    failed: list[int] = field(default_factory=list)
+    reasons: list[str] = field(default_factory=list)
+
+    def add(self, pixels: Pixels) -> None:
+        self.valid += pixels.valid_count
+        self.residual = max(self.residual, pixels.residual)
+        self.cells += pixels.cells
+
+
+def _tags(plan: OrthoPlan, product: OrthoProduct) -> dict[str, str]:
+    """What the file itself says of its origin."""
+    return {
+        "PHOTOPLAN_VERSION": __version__,
+        "PHOTOPLAN_IMAGE": product.plan.image,
+        "PHOTOPLAN_KERNEL": plan.settings.kernel,
+        "PHOTOPLAN_KEY": product.key,
+    }
+
+
+def _record(plan: OrthoPlan, product: OrthoProduct, scene: Scene, run: Run, result: ProductResult) -> dict[str, Any]:
+    """The run record: what a person needs to answer for the product, and to make it again."""
+    center = scene.camera.center
+    return {
+        "product": result.to_dict(),
+        "key": product.key,
+        "inputs": [
+            {"path": path, "sampled_sha256": digest, "size": Path(path).stat().st_size}
+            for path, digest in scene.address.digests
+        ],
+        "project": json.loads(scene.address.text),
+        "settings": plan.settings.to_dict(),
+        "grid": {
+            "crs": product.grid.crs,
+            "bounds": product.grid.bounds,
+            "resolution": product.grid.resolution,
+            "width": product.grid.width,
+            "height": product.grid.height,
+        },
+        "heights": {
+            "terrain": scene.ground.height_systems[0],
+            "orientation": scene.ground.height_systems[1],
+            "working": scene.ground.working_system,
+        },
+        "crs_operations": [
+            {"operation": step.operation, "accuracy_m": step.accuracy} for step in scene.ground.operations
+        ],
+        "projection_centre": [float(c) for c in center],
+        "gsd_m": product.gsd,
+        "first_cell_px": product.plan.rule.cell,
+        "run": {"workers": run.workers, "executor": run.executor, "memory": run.memory},
+        "versions": versions(),
+        "peak_memory_bytes": peak_memory(),
+    }

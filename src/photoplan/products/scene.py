@@ -1,0 +1,295 @@
+"""From a project's description to the things that plan and engine work with: camera, surface, pixels."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.base import Camera
+from photoplan.cameras.build import oriented_camera
+from photoplan.errors import InputError
+from photoplan.geometry.crs import CrsStep, crs_step, same_crs
+from photoplan.geometry.heights import HeightStep, declared_pair, height_step
+from photoplan.geometry.rotation import rotation_from_angles
+from photoplan.geometry.pose import Pose
+from photoplan.io.fingerprint import fingerprint
+from photoplan.io.names import resolve_input
+from photoplan.io.project import parse_project
+from photoplan.io.project_cameras import interior_of, lens_of
+from photoplan.io.project_model import ANGLE_UNITS, Image, Project, Terrain
+from photoplan.io.raster import RasterReader
+from photoplan.io.terrain_reader import TerrainReader
+from photoplan.plan.coverage import image_border
+from photoplan.surfaces.base import Surface
+from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.raster import RasterSurface
+from photoplan.surfaces.shifted import ShiftedSurface
+
+__all__ = ["Ground", "Scene", "SceneAddress", "ground_of", "open_scene", "pose_of"]
+
+#: Terrain further from the projection centre than this is not looked at, metres.
+_FAR = 30_000.0
+#: Rays are followed sideways for this many heights above the lowest ground (87° from the nadir).
+_FLATTEST = 20.0
+
+
+@dataclass(frozen=True)
+class SceneAddress:
+    """All that a worker needs to open a scene: small, hashable, pickles."""
+
+    text: str
+    """JSON of a project that holds this image alone."""
+    folder: str
+    """Folder from which its relative paths start."""
+    digests: tuple[tuple[str, str], ...]
+    """Path and content digest of each input file."""
+
+    def open(self) -> Scene:
+        """The scene; kept for the next tile.
+
+        Raises
+        ------
+        InputError
+            An input has changed since the address was made.
+        """
+        return _open(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """The terrain of a project, in the project's CRS and the orientation's height system."""
+
+    surface: Surface
+    bounds: tuple[float, float, float, float] | None
+    """Outer edges xmin, ymin, xmax, ymax; None: everywhere."""
+    file: Path | None
+    """The height raster."""
+    operations: tuple[CrsStep | HeightStep, ...]
+    """Coordinate operations on the way from the file, for the run record."""
+    height_systems: tuple[str, str]
+    """Those of the terrain file and of the orientation, as declared or read."""
+    working_system: str
+    """The one that surface and cameras are in."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One image with its camera and the ground below it."""
+
+    camera: Camera
+    surface: Surface
+    terrain_bounds: tuple[float, float, float, float]
+    """Where the surface can be seen from this camera at all."""
+    reader: RasterReader
+    ground: Ground
+    address: SceneAddress
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Input files."""
+        return tuple(Path(path) for path, _ in self.address.digests)
+
+    @property
+    def facts(self) -> list[Any]:
+        """What identifies the scene in a product's key: description and contents, not places."""
+        return [self.address.text, [digest for _, digest in self.address.digests]]
+
+
+def open_scene(project: Project, name: str) -> Scene:
+    """Camera, surface and pixels of one image of a project.
+
+    Raises
+    ------
+    InputError
+        A file is missing or cannot be used, an image's size differs from its camera's, or height systems are not
+        declared or cannot be joined exactly.
+    """
+    image = project.image(name)
+    alone = project.model_copy(update={"images": (image,), "cameras": {image.camera: project.cameras[image.camera]}})
+    files = [project.resolve(image.file)]
+    if project.terrain.file is not None:
+        files.append(project.resolve(project.terrain.file))
+    digests = tuple((str(path), _digest(str(path), _stamp(path))) for path in files)
+    return _open(SceneAddress(alone.model_dump_json(exclude={"ortho"}, exclude_none=True), str(project.folder), digests))
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    try:
+        state = path.stat()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check that it is there and readable") from error
+    return state.st_size, state.st_mtime_ns
+
+
+@lru_cache(maxsize=4096)
+def _digest(path: str, stamp: tuple[int, int]) -> str:
+    """Digest of a file's content; read again only when size or time of the file change."""
+    return fingerprint(path).digest
+
+
+@lru_cache(maxsize=64)
+def _open(address: SceneAddress) -> Scene:
+    for path, digest in address.digests:
+        if _digest(path, _stamp(Path(path))) != digest:
+            raise InputError(f"{path}: has changed since the run was planned; plan it again")
+    project = parse_project(json.loads(address.text), Path(address.folder), "project")
+    image = project.images[0]
+    ground = ground_of(project)
+    reader = RasterReader(project.resolve(image.file))
+    camera = _camera(project, image, ground, reader.size)
+    return Scene(camera, ground.surface, _reach(camera, ground), reader, ground, address)
+
+
+@dataclass(frozen=True)
+class _GroundAddress:
+    """What decides the ground of a project; hashable."""
+
+    terrain: Terrain
+    orientation_system: str | None
+    to_ellipsoid: bool
+    crs: str
+    folder: str
+    stamp: tuple[int, int]
+    """Size and time of the file: a file that changes is opened again."""
+
+
+def ground_of(project: Project) -> Ground:
+    """The terrain of a project as a surface, in the project's CRS and the height system that the cameras work in.
+
+    Raises
+    ------
+    InputError
+        The terrain file cannot be used, or its CRS is not known or not joined exactly to the project's.
+    HeightSystemError
+        Height systems are not declared, or the grid that joins them is missing.
+    """
+    orientation = project.orientation
+    strict = orientation.earth_curvature == "strict"
+    file = project.terrain.file
+    stamp = (0, 0) if file is None else _stamp(project.resolve(file))
+    return _ground(
+        _GroundAddress(project.terrain, orientation.height_system, strict, project.crs, str(project.folder), stamp)
+    )
+
+
+@lru_cache(maxsize=8)
+def _ground(address: _GroundAddress) -> Ground:
+    terrain = address.terrain
+    if terrain.height is not None:
+        systems = declared_pair(terrain.height_system, address.orientation_system)
+        return _in_system(Ground(LevelSurface(terrain.height), None, None, (), systems, systems[1]), address)
+    assert terrain.file is not None
+    reader = TerrainReader(resolve_input(Path(address.folder), terrain.file))
+    info = reader.info
+    if info.crs is None:
+        raise InputError(f"{info.path}: no CRS; state it in the file (gdal_edit -a_srs), it is not guessed")
+    if info.metres_per_unit not in (None, 1.0):
+        raise InputError(f"{info.path}: heights in {info.unit}; convert them to metres first")
+    systems = declared_pair(terrain.height_system or info.vertical_crs, address.orientation_system)
+    surface, bounds, steps = _placed(reader, address.crs)
+    return _in_system(Ground(surface, bounds, info.path, steps, systems, systems[1]), address)
+
+
+def _placed(reader: TerrainReader, crs: str) -> tuple[Surface, tuple[float, float, float, float], tuple[CrsStep, ...]]:
+    """A height raster as a surface in the project's CRS, and its outer edges there."""
+    info = reader.info
+    assert info.to_map is not None and info.crs is not None
+    x0, xx, xy, y0, yx, yy = info.to_map
+    if xy or yx or xx <= 0 or yy >= 0:
+        raise InputError(f"{info.path}: the grid is rotated or not north-up; bring it north-up with gdalwarp first")
+    columns, rows = info.size
+    edges = (x0 - xx / 2, y0 + yy * (rows - 0.5), x0 + xx * (columns - 0.5), y0 - yy / 2)
+    if same_crs(info.crs, crs):
+        return RasterSurface(reader, (x0, y0), (xx, -yy)), edges, ()
+    back = crs_step(info.crs, crs, edges)
+    t = np.linspace(0, 1, 17)
+    x, y = edges[0] + t * (edges[2] - edges[0]), edges[1] + t * (edges[3] - edges[1])
+    corners = back(np.stack(np.meshgrid(x, y), axis=-1)).reshape(-1, 2)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    step = crs_step(crs, info.crs, bounds)
+    return RasterSurface(reader, (x0, y0), (xx, -yy), step), bounds, (step,)
+
+
+def _in_system(ground: Ground, address: _GroundAddress) -> Ground:
+    """The ground with heights in the system that the cameras work in."""
+    terrain, orientation = ground.height_systems
+    wanted = "ellipsoidal" if address.to_ellipsoid and orientation != "same" else orientation
+    step = height_step(terrain, wanted, address.crs, ground.bounds)
+    surface = ground.surface if step.definition is None else ShiftedSurface(ground.surface, _Undulation(step))
+    operations = ground.operations if step.definition is None else (*ground.operations, step)
+    return replace(ground, surface=surface, operations=operations, working_system=wanted)
+
+
+@dataclass(frozen=True)
+class _Undulation:
+    """What a height step adds at map points."""
+
+    step: HeightStep
+
+    def __call__(self, XY: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self.step(np.concatenate([XY, np.zeros((*XY.shape[:-1], 1))], axis=-1))
+
+
+def pose_of(project: Project, image: Image, ground: Ground) -> Pose:
+    """Exterior orientation of an image, in the height system that the ground has."""
+    orientation = project.orientation
+    angles = np.array(image.angles) * (2 * np.pi / ANGLE_UNITS[orientation.angle_unit])
+    center = np.array(image.center, float)
+    center[2] = height_step(ground.height_systems[1], ground.working_system, project.crs)(center)
+    return Pose(center, rotation_from_angles(angles, orientation.rotation))
+
+
+def _camera(project: Project, image: Image, ground: Ground, size: tuple[int, int]) -> Camera:
+    description = project.cameras[image.camera]
+    stated = image.size or description.size
+    if stated is not None and tuple(stated) != size:
+        raise InputError(
+            f"{image.file}: {size[0]} × {size[1]} pixels, but camera {image.camera!r} has {stated[0]} × {stated[1]}; "
+            "an image that was cropped or scaled needs a camera of its own"
+        )
+    interior = interior_of(description, image, size)
+    pose = pose_of(project, image, ground)
+    nadir = float(ground.surface.heights(pose.center[:2]))
+    return oriented_camera(
+        interior,
+        lens_of(description),
+        pose,
+        crs=project.crs,
+        earth_curvature=project.orientation.earth_curvature,
+        refraction=project.orientation.refraction,
+        mean_ground=nadir if np.isfinite(nadir) else 0.0,
+    )
+
+
+def _reach(camera: Camera, ground: Ground) -> tuple[float, float, float, float]:
+    """Where the ground can be seen: rays of the image's border down to the lowest ground, cut at the terrain."""
+    x, y, z = camera.center
+    around = ground.bounds or (x - _FAR, y - _FAR, x + _FAR, y + _FAR)
+    near = (
+        max(around[0], x - _FAR), max(around[1], y - _FAR), min(around[2], x + _FAR), min(around[3], y + _FAR)
+    )  # fmt: skip
+    if near[0] >= near[2] or near[1] >= near[3]:
+        return around
+    low = ground.surface.height_range(near)[0]
+    if not (np.isfinite(low) and low < z):
+        return near
+    border = np.concatenate([image_border(camera.size), [[(s - 1) / 2 for s in camera.size]]])
+    origin, direction = camera.rays(border, low)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        foot = origin[:, :2] + direction[:, :2] * ((low - origin[:, 2]) / direction[:, 2])[:, None]
+    far = _FLATTEST * (z - low)
+    out = np.where(direction[:, 2:] < 0, foot - (x, y), direction[:, :2] * np.inf)
+    out = np.clip(np.nan_to_num(out, nan=0.0, posinf=far, neginf=-far), -far, far)
+    margin = 0.05 * float(np.ptp(out, axis=0).max())
+    low_xy, high_xy = out.min(axis=0) - margin + (x, y), out.max(axis=0) + margin + (x, y)
+    cut = (
+        max(near[0], low_xy[0]), max(near[1], low_xy[1]), min(near[2], high_xy[0]), min(near[3], high_xy[1])
+    )  # fmt: skip
+    return cut if cut[0] < cut[2] and cut[1] < cut[3] else near
