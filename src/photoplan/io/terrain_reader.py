@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from photoplan.io.raster import missing_blocks, read_pixels
 from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.validity import MissingBlocks
 
-__all__ = ["LOWEST", "HIGHEST", "TERRAIN_TYPES", "TerrainReader"]
+__all__ = ["HIGHEST", "LOWEST", "TERRAIN_TYPES", "TerrainReader"]
 
 LOWEST, HIGHEST = -12_000.0, 9_000.0
 """Heights of the Earth, metres: below the deepest sea, above the highest mountain."""
@@ -111,7 +112,7 @@ class TerrainReader:
             for col in range(window.col // block_width, -(-right // block_width)):
                 area = Window(col * block_width, row * block_height, block_width, block_height)
                 part = area & window
-                block = self._cache.get((col, row), lambda area=area: self._load(area & Window(0, 0, width, height)))
+                block = self._cache.get((col, row), partial(self._load, area & Window(0, 0, width, height)))
                 source = block[part.row - area.row :, part.col - area.col :][: part.height, : part.width]
                 out[part.row - window.row :, part.col - window.col :][: part.height, : part.width] = source
         return out
@@ -122,8 +123,10 @@ class TerrainReader:
 
     @property
     def _block(self) -> tuple[int, int]:
-        """Width and height of the blocks that are kept: the file's tiles, or whole lines of about 64 thousand points."""
+        """Width and height of the blocks that are kept: the file's tiles, or whole lines of about 2^16 points."""
         width, height = self.info.block
+        if width * height > 16 * _BLOCK * _BLOCK and height > 1:
+            return _BLOCK, _BLOCK
         if width < self.info.size[0] and width * height >= _BLOCK * _BLOCK // 4:
             return width, height
         return self.info.size[0], max(height, min(_BLOCK, max(1, _BLOCK * _BLOCK // self.info.size[0])))

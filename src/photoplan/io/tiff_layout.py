@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 
-__all__ = ["TiffArray", "TiffLayout", "read_tiff_layout"]
+__all__ = ["TiffArray", "TiffLayout", "read_tiff_layout", "read_tiff_layouts"]
 
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
 _CODES = {1: "u1", 3: "u2", 4: "u4", 13: "u4", 16: "u8", 18: "u8"}
@@ -97,11 +97,27 @@ def read_tiff_layout(path: Path) -> TiffLayout:
     InputError
         If the directory is not there, contradicts itself, or speaks of bytes beyond the end of the file.
     """
+    return read_tiff_layouts(path, most=1)[0]
+
+
+def read_tiff_layouts(path: Path, most: int = 64) -> list[TiffLayout]:
+    """Read the directories of a TIFF or BigTIFF in the order of their chain: image, overviews, masks.
+
+    Raises
+    ------
+    InputError
+        See `read_tiff_layout`.
+    """
     file_size = path.stat().st_size
     try:
         with path.open("rb") as file:
-            directory = _Directory(file, file_size)
-            return _layout(directory, file_size)
+            layouts: list[TiffLayout] = []
+            start = None
+            while start != 0 and len(layouts) < most:
+                directory = _Directory(file, file_size, start)
+                layouts.append(_layout(directory, file_size))
+                start = directory.next
+            return layouts
     except (struct.error, ValueError, KeyError, OverflowError, IndexError) as error:
         raise InputError(
             f"{path}: the TIFF directory is damaged or cut off ({error}); the file has {file_size} bytes. "
@@ -112,9 +128,9 @@ def read_tiff_layout(path: Path) -> TiffLayout:
 
 
 class _Directory:
-    """Tags of the first directory: code -> (type, count, position of the values)."""
+    """Tags of a directory: code -> (type, count, position of the values); the first one without `start`."""
 
-    def __init__(self, file: BinaryIO, file_size: int) -> None:
+    def __init__(self, file: BinaryIO, file_size: int, start: int | None = None) -> None:
         self._file, self._file_size = file, file_size
         head = self._at(0, 16)
         self.order = {b"II": "<", b"MM": ">"}[head[:2]]
@@ -123,11 +139,15 @@ class _Directory:
         if version not in (42, 43):
             raise ValueError(f"version {version}")
         self.start = struct.unpack(self.order + ("Q" if self.big else "I"), head[8:16] if self.big else head[4:8])[0]
+        if start is not None:
+            self.start = start
         number_size, entry = (8, 20) if self.big else (2, 12)
         number = struct.unpack(self.order + ("Q" if self.big else "H"), self._at(self.start, number_size))[0]
         if not 0 < number <= _MAX_TAGS:
             raise ValueError(f"{number} tags")
         block = self._at(self.start + number_size, number * entry)
+        link = self._at(self.start + number_size + number * entry, 8 if self.big else 4)
+        self.next = struct.unpack(self.order + ("Q" if self.big else "I"), link)[0]
         self.tags: dict[int, tuple[int, int, int]] = {}
         for i in range(number):
             code, kind, count = struct.unpack_from(self.order + ("HHQ" if self.big else "HHI"), block, i * entry)

@@ -1,0 +1,348 @@
+"""A product file that appears under its name only when it is complete."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import rasterio.crs
+import rasterio.transform
+from numpy.typing import ArrayLike, NDArray
+from rasterio.errors import RasterioError
+
+from photoplan.errors import PhotoplanError, ResourceError, UsageError
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.io.cog import CogOptions, write_cog
+from photoplan.io.disk import disk_error, free_megabytes, sync_file, sync_folder
+from photoplan.io.gdal import first_cause
+from photoplan.io.lock import FileLock
+from photoplan.io.plain_tiff import write_plain_tiff
+from photoplan.io.product_check import check_product
+from photoplan.io.storage import PRODUCT_TYPES, BlockCoder, Nodata, nodata_for
+from photoplan.io.tile_log import TileLog
+
+__all__ = ["ProductFacts", "ProductFile", "check_output"]
+
+_SAMPLES = 12
+_BIG = 3_900_000_000
+
+
+@dataclass(frozen=True)
+class ProductFacts:
+    """What became of a product."""
+
+    path: Path
+    """The file."""
+    bytes: int
+    """Its size."""
+    tiles: int
+    """Tiles of the grid."""
+    empty_tiles: int
+    """Tiles without a valid pixel; they are not stored."""
+    missing_tiles: tuple[int, ...]
+    """Tiles that were never delivered."""
+    valid_share: float
+    """Share of valid pixels, 0 to 1."""
+    moved_values: int
+    """Valid values that equalled nodata and became its neighbour."""
+
+
+def check_output(path: Path, inputs: Sequence[Path | str] = (), *, overwrite: bool = False) -> None:
+    """Refuse an output that exists, or that is one of the inputs, also by a link.
+
+    Raises
+    ------
+    UsageError
+        Naming the file and the way out.
+    """
+    for source in map(Path, inputs):
+        same = path.exists() and source.exists() and path.samefile(source)
+        if same or path.resolve() == source.resolve():
+            raise UsageError(f"{path}: the output is the input {source}; choose another output")
+    if path.is_dir():
+        raise UsageError(f"{path}: is a folder; give the name of a file")
+    if not overwrite and (path.exists() or path.is_symlink()):
+        raise UsageError(f"{path}: exists already; choose another output or say --overwrite")
+
+
+@dataclass(eq=False)
+class ProductFile:
+    """Collects finished tiles and makes a cloud-optimised GeoTIFF of them; a context manager.
+
+    Tiles go into a crash-safe log beside the output, so that the next run with the same `run_key` finds them in
+    `finished`. `complete` assembles the product under a temporary name, opens it again, compares it with the log,
+    and only then gives it its name. Leaving the context without `complete` keeps the log.
+
+    A second run on the same output is refused while the first one lives. `append` may be called from several threads.
+
+    Raises
+    ------
+    UsageError
+        When made or entered: a type or option that is not allowed, an output that exists or is an input, a folder
+        that cannot be written.
+    RunLocked
+        On entry, if another run is writing this product.
+    ResourceError
+        In `append` and `complete`, if the disk is full: no product, no temporary files, finished tiles are kept.
+    """
+
+    path: Path
+    """The product."""
+    grid: MapGrid
+    """Where its pixels are on the map."""
+    bands: int
+    """Bands."""
+    dtype: np.dtype[Any]
+    """uint8, uint16, int16 or float32."""
+    _: KW_ONLY
+    run_key: str
+    """A digest of inputs, parameters and version: another key starts afresh."""
+    nodata: Nodata = "auto"
+    """A value, `mask` for a mask band, or `auto`: 0 for unsigned integers, -32768 for int16, NaN for float32. JPEG
+    always takes a mask."""
+    compress: str = "deflate"
+    """`none`, `deflate`, `zstd`, `lzw` or `jpeg`."""
+    overviews: bool = True
+    """Reduced copies inside the file."""
+    tile: int = 512
+    """Side of tiles and blocks, pixels."""
+    overwrite: bool = False
+    """Replace an output that exists."""
+    inputs: Sequence[Path | str] = ()
+    """Files that must not be overwritten."""
+    quality: int = 90
+    """Quality of JPEG."""
+    threads: int = 1
+    """Threads that compress."""
+    _log: TileLog | None = field(default=None, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self.path = Path(self.path)
+        self.dtype = np.dtype(self.dtype)
+        if self.dtype.name not in PRODUCT_TYPES:
+            raise UsageError(f"{self.path}: pixels of type {self.dtype}; allowed are {', '.join(PRODUCT_TYPES)}")
+        if self.bands < 1 or (self.compress == "jpeg" and (self.dtype != np.uint8 or self.bands not in (1, 3))):
+            raise UsageError(
+                f"{self.path}: {self.bands} bands of {self.dtype} with compression {self.compress}; JPEG takes one or "
+                "three bands of uint8, the others one band and more"
+            )
+        self._options = CogOptions(self.compress, self.overviews, self.tile, quality=self.quality, threads=self.threads)
+        value = nodata_for(self.dtype, self.nodata, self.compress)
+        self._coder = BlockCoder(self.tile, self.bands, self.dtype, value)
+        self._windows = tuple(self.grid.window.tiles(self.tile))
+        self._lock = FileLock(self.path.with_name(f".{self.path.name}.lock"))
+        self._state = threading.Lock()
+
+    def __enter__(self) -> ProductFile:
+        check_output(self.path, self.inputs, overwrite=self.overwrite)
+        self._lock.acquire()
+        try:
+            # The run before may have finished between the check and the lock.
+            check_output(self.path, self.inputs, overwrite=self.overwrite)
+            self._remove_parts()
+            key = f"{self.run_key} {self.grid} {self._coder}"
+            self._log = TileLog(self.path.with_name(f".{self.path.name}.tiles"), key)
+        except BaseException:
+            self._lock.release()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._log is not None:
+            self._log.close()
+            self._log = None
+        self._lock.release()
+
+    @property
+    def windows(self) -> tuple[Window, ...]:
+        """The tiles of the grid, row by row; a tile's index is its place here."""
+        return self._windows
+
+    @property
+    def finished(self) -> frozenset[int]:
+        """Indices of the tiles that need not be computed any more."""
+        return self._open_log().finished
+
+    @property
+    def nodata_value(self) -> float | None:
+        """The nodata value that is stored; None if there is a mask band."""
+        return self._coder.nodata
+
+    def append(self, index: int, pixels: ArrayLike, valid: NDArray[np.bool_] | None = None) -> None:
+        """Add a finished tile.
+
+        Parameters
+        ----------
+        index
+            Its place in `windows`.
+        pixels
+            Shape (bands, height, width) of the tile's window, in the product's type.
+        valid
+            Shape (height, width), True = valid; None: all.
+        """
+        pixels = np.asarray(pixels)
+        window = self._windows[index]
+        shape = self.bands, window.height, window.width
+        if pixels.shape != shape or pixels.dtype != self.dtype:
+            raise UsageError(
+                f"{self.path}: tile {index} of shape {pixels.shape} and type {pixels.dtype}; needed are {shape} and "
+                f"{self.dtype}"
+            )
+        count = window.size if valid is None else int(np.count_nonzero(valid))
+        if count == 0:
+            self.append_empty(index)
+            return
+        payload, moved = self._coder.encode(pixels, None if count == window.size else valid)
+        self._open_log().append(index, payload, (moved, count))
+
+    def append_empty(self, index: int) -> None:
+        """Add a tile without any valid pixel."""
+        if not 0 <= index < len(self._windows):
+            raise UsageError(f"{self.path}: tile {index}; the product has tiles 0 to {len(self._windows) - 1}")
+        self._open_log().append(index)
+
+    def complete(self, tags: dict[str, str] | None = None, *, allow_missing: bool = False) -> ProductFacts:
+        """Make the product and give it its name.
+
+        Parameters
+        ----------
+        tags
+            Tags of the file.
+        allow_missing
+            Make it although tiles were not delivered: they stay nodata, and the log stays for a later run.
+        """
+        log = self._open_log()
+        missing = tuple(sorted(set(range(len(self._windows))) - log.finished))
+        if missing and not allow_missing:
+            raise PhotoplanError(f"{self.path}: {len(missing)} tiles are missing, the first is {missing[0]}")
+        try:
+            try:
+                part = self._assemble(log, tags or {})
+                self._check(log, part)
+                sync_file(part)
+                # The last look before the name is taken: another program may have made the file meanwhile.
+                check_output(self.path, self.inputs, overwrite=self.overwrite)
+                part.replace(self.path)
+                sync_folder(self.path.parent)
+            finally:
+                self._remove_parts()
+        except OSError as error:
+            raise disk_error(self.path, error) from error
+        except (RasterioError, MemoryError) as error:
+            raise self._unwritten(first_cause(error)) from error
+        except UsageError:
+            raise
+        except PhotoplanError as error:
+            raise self._unwritten(str(error)) from error
+        facts = self._facts(log, missing)
+        if not missing:
+            log.remove()
+            self._log = None
+        return facts
+
+    def _open_log(self) -> TileLog:
+        if self._log is None:
+            raise UsageError(f"{self.path}: the product is not open; use it in a `with` block")
+        return self._log
+
+    def _part(self, kind: str) -> Path:
+        return self.path.with_name(f".{self.path.name}.{kind}.tif")
+
+    def _remove_parts(self) -> None:
+        """Remove what this product's runs may have left: GDAL makes files beside its output."""
+        for kind in ("plain", "part"):
+            stem = self._part(kind).name
+            for left in self.path.parent.glob(f"{_escaped(stem)}*"):
+                left.unlink(missing_ok=True)
+
+    def _profile(self) -> dict[str, Any]:
+        """What GDAL is told about the product."""
+        grid = self.grid
+        blocks = len(self._windows) * (self._coder.pixel_bytes + self._coder.mask_bytes)
+        try:
+            crs = rasterio.crs.CRS.from_user_input(grid.crs) if grid.crs else None
+        except RasterioError as error:
+            raise UsageError(f"{self.path}: the reference system {grid.crs!r} is not understood ({error})") from error
+        return {
+            "width": grid.width,
+            "height": grid.height,
+            "count": self.bands,
+            "dtype": self.dtype.name,
+            "crs": crs,
+            # GDAL's transform refers to the outer edge of the upper-left pixel, as the grid's edges do.
+            "transform": rasterio.transform.Affine(grid.resolution, 0, grid.left, 0, -grid.resolution, grid.top),
+            "nodata": self._coder.nodata,
+            "blockxsize": self.tile,
+            "blockysize": self.tile,
+            "bigtiff": "YES" if blocks > _BIG else "NO",
+            "photometric": "RGB" if self.bands in (3, 4) and self.dtype != np.float32 else "MINISBLACK",
+        } | ({"alpha": "NO"} if self.bands != 3 else {})
+
+    def _assemble(self, log: TileLog, tags: dict[str, str]) -> Path:
+        """Make the product under a temporary name."""
+        profile, plain, part = self._profile(), self._part("plain"), self._part("part")
+        places = [(i, *log.place(i)) for i in sorted(log.finished)]
+        stored = [place for place in places if place[2] > 0]
+        pixels = self._coder.pixel_bytes
+        direct = self.compress == "none" and not self.overviews and not self._coder.mask_bytes
+        blocks = ((i, position, pixels) for i, position, _ in stored)
+        write_plain_tiff(part if direct else plain, profile, tags, blocks, log.descriptor)
+        if direct:
+            return part
+        if self._coder.mask_bytes:
+            mask = {"count": 1, "dtype": "uint8", "nodata": None, "photometric": "MINISBLACK"}
+            blocks = ((i, position + pixels, self._coder.mask_bytes) for i, position, _ in stored)
+            msk = plain.with_name(plain.name + ".msk")
+            # Flag 2: the mask holds for all bands.
+            flags = {f"INTERNAL_MASK_FLAGS_{band + 1}": "2" for band in range(self.bands)}
+            write_plain_tiff(msk, profile | mask, flags, blocks, log.descriptor)
+        write_cog(plain, part, self._options, self.dtype)
+        return part
+
+    def _check(self, log: TileLog, part: Path) -> None:
+        """Compare the assembled file with the log at some tiles."""
+        stored = [i for i in sorted(log.finished) if log.place(i)[1] > 0]
+        step = max(1, -(-len(stored) // _SAMPLES))
+        samples = {self._windows[i]: i for i in stored[::step]}
+
+        def expected(window: Window) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+            return self._coder.decode(log.read(samples[window]), (window.height, window.width))
+
+        check_product(
+            part,
+            self._profile(),
+            list(samples),
+            expected,
+            lossy=self.compress == "jpeg",
+            overviews=self.overviews and max(self.grid.width, self.grid.height) > self.tile,
+        )
+
+    def _facts(self, log: TileLog, missing: tuple[int, ...]) -> ProductFacts:
+        notes = [log.notes(i) for i in log.finished]
+        return ProductFacts(
+            self.path,
+            self.path.stat().st_size,
+            len(self._windows),
+            sum(log.place(i)[1] == 0 for i in log.finished),
+            missing,
+            sum(count for _, count in notes) / self.grid.window.size,
+            sum(moved for moved, _ in notes),
+        )
+
+    def _unwritten(self, cause: str) -> ResourceError:
+        return ResourceError(
+            f"{self.path}: could not be written ({cause}; {free_megabytes(self.path)} MB are free there); free some "
+            "space and run the same command again: finished tiles are kept"
+        )
+
+
+def _escaped(name: str) -> str:
+    """A name for `glob`, with its special characters taken literally."""
+    return "".join(f"[{c}]" if c in "*?[" else c for c in name)

@@ -1,0 +1,88 @@
+"""A finished product is opened again and compared with what was computed, before it gets its name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+import rasterio.windows
+from numpy.typing import NDArray
+
+from photoplan.errors import PhotoplanError
+from photoplan.geometry.grid import Window
+from photoplan.io.gdal import gdal_settings, open_raster
+from photoplan.io.tiff_layout import read_tiff_layouts
+
+__all__ = ["check_product"]
+
+_LOSSY = 20.0
+"""Mean difference in grey values up to which a tile compressed with losses counts as the one that was computed."""
+
+
+def check_product(
+    path: Path,
+    profile: dict[str, Any],
+    samples: Sequence[Window],
+    expected: Callable[[Window], tuple[NDArray[Any], NDArray[np.bool_]]],
+    *,
+    lossy: bool,
+    overviews: bool,
+) -> None:
+    """Compare a file with what it must hold.
+
+    Parameters
+    ----------
+    path
+        The file.
+    profile
+        Size, bands, type, transform, reference system and nodata as they were asked for.
+    samples
+        Windows that are read again.
+    expected
+        Pixels (bands, h, w) and validity (h, w) of a window.
+    lossy
+        The compression changes values a little.
+    overviews
+        There must be overviews.
+
+    Raises
+    ------
+    PhotoplanError
+        Naming what differs.
+    InputError
+        If blocks of any directory lie beyond the end of the file, or cannot be decoded.
+    """
+    read_tiff_layouts(path)
+    with open_raster(path, "GTiff") as dataset, gdal_settings():
+        for name in ("width", "height", "count", "transform"):
+            if getattr(dataset, name) != profile[name]:
+                raise PhotoplanError(f"{path}: {name} is {getattr(dataset, name)}, not {profile[name]}")
+        if dataset.dtypes[0] != profile["dtype"]:
+            raise PhotoplanError(f"{path}: pixels are {dataset.dtypes[0]}, not {profile['dtype']}")
+        if profile["crs"] is not None and (
+            dataset.crs is None or dataset.crs.to_epsg() != rasterio.crs.CRS.from_user_input(profile["crs"]).to_epsg()
+        ):
+            raise PhotoplanError(f"{path}: the reference system {profile['crs']} was not kept")
+        if overviews and not dataset.overviews(1):
+            raise PhotoplanError(f"{path}: the overviews are missing")
+        for factor in dataset.overviews(1):
+            shape = -(-dataset.height // factor), -(-dataset.width // factor)
+            if shape[0] * shape[1] <= 1 << 20:
+                dataset.read(1, out_shape=shape)
+        for window in samples:
+            _compare(path, dataset, window, expected(window), lossy)
+
+
+def _compare(
+    path: Path, dataset: Any, window: Window, wanted: tuple[NDArray[Any], NDArray[np.bool_]], lossy: bool
+) -> None:
+    """Compare one window of a file with what was computed."""
+    area = rasterio.windows.Window(window.col, window.row, window.width, window.height)
+    pixels, valid = dataset.read(window=area), (dataset.read_masks(window=area) > 0).any(axis=0)
+    difference = np.abs(pixels.astype(float) - wanted[0])[:, wanted[1]] if wanted[1].any() else np.zeros(1)
+    good = float(difference.mean()) <= _LOSSY if lossy else not np.any(difference > 0)
+    if not good or not np.array_equal(valid, wanted[1]):
+        raise PhotoplanError(f"{path}: {window} is not what was computed; the disk or a library is at fault, run again")

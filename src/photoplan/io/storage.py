@@ -1,0 +1,105 @@
+"""How a product is stored, and how a finished tile becomes the bytes of a block."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import UsageError
+
+__all__ = ["COMPRESSIONS", "PRODUCT_TYPES", "BlockCoder", "Nodata", "nodata_for"]
+
+COMPRESSIONS = ("none", "deflate", "zstd", "lzw", "jpeg")
+PRODUCT_TYPES = ("uint8", "uint16", "int16", "float32")
+Nodata = float | Literal["auto", "mask"]
+
+
+def nodata_for(dtype: np.dtype[Any], wanted: Nodata, compress: str) -> float | None:
+    """The nodata value of a product; None stands for a mask band.
+
+    `auto` is 0 for unsigned integers, -32768 for int16 and NaN for float32. JPEG changes values, so it always takes a
+    mask.
+    """
+    if wanted == "mask" or compress == "jpeg":
+        return None
+    if wanted == "auto":
+        return {"u": 0.0, "i": -32768.0, "f": float("nan")}[dtype.kind]
+    value = float(wanted)
+    if dtype.kind in "iu":
+        limits = np.iinfo(dtype)
+        if not limits.min <= value <= limits.max or value != int(value):
+            raise UsageError(f"nodata {wanted}; {dtype} holds whole numbers from {limits.min} to {limits.max}")
+    return value
+
+
+@dataclass(frozen=True)
+class BlockCoder:
+    """Turns a tile (bands, h, w) into one block of a tiled TIFF: (side, side, bands), and its mask, as bytes."""
+
+    side: int
+    """Side of a block in pixels."""
+    bands: int
+    """Bands."""
+    dtype: np.dtype[Any]
+    """Type of the pixels."""
+    nodata: float | None
+    """Nodata value; None: a mask of one byte per pixel (0 or 255) follows the pixels."""
+
+    @property
+    def pixel_bytes(self) -> int:
+        """Bytes of a block's pixels."""
+        return self.side * self.side * self.bands * self.dtype.itemsize
+
+    @property
+    def mask_bytes(self) -> int:
+        """Bytes of a block's mask; 0 with a nodata value."""
+        return self.side * self.side if self.nodata is None else 0
+
+    def encode(self, pixels: NDArray[Any], valid: NDArray[np.bool_] | None) -> tuple[bytes | memoryview, int]:
+        """Bytes of a block, and how many valid values were moved because they equalled nodata.
+
+        Such a value becomes its neighbour (nodata + 1, or nodata - 1 at the upper end of the type), so that no reader
+        takes a valid dark pixel for nothing. Invalid pixels become nodata (0 under a mask).
+        """
+        block, moved = self._interleave(pixels)
+        if valid is not None and not valid.all():
+            block[: pixels.shape[1], : pixels.shape[2]][~valid] = 0 if self.nodata is None else self.nodata
+        if self.nodata is not None:
+            return block.data.cast("B"), moved
+        mask = np.zeros((self.side, self.side), np.uint8)
+        mask[: pixels.shape[1], : pixels.shape[2]] = 255 if valid is None else valid * np.uint8(255)
+        return b"".join((block.data.cast("B"), mask.data.cast("B"))), 0
+
+    def decode(self, payload: bytes, shape: tuple[int, int]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        """Pixels (bands, h, w) and validity (h, w) of a block's bytes; `shape` cuts a border block."""
+        block = np.frombuffer(payload[: self.pixel_bytes], self.dtype).reshape(self.side, self.side, self.bands)
+        pixels = np.moveaxis(block, -1, 0)[:, : shape[0], : shape[1]]
+        if self.nodata is None:
+            mask = np.frombuffer(payload[self.pixel_bytes :], np.uint8).reshape(self.side, self.side)
+            return pixels, mask[: shape[0], : shape[1]] > 0
+        empty = np.isnan(pixels) if np.isnan(self.nodata) else pixels == self.nodata
+        return pixels, ~empty.all(axis=0)
+
+    def _interleave(self, pixels: NDArray[Any]) -> tuple[NDArray[Any], int]:
+        """A tile with its bands side by side in a full block, values that equal nodata moved, and their number."""
+        _, height, width = pixels.shape
+        fill = 0 if self.nodata is None else self.nodata
+        shape = (self.side, self.side, self.bands)
+        whole = height == width == self.side
+        block = np.empty(shape, self.dtype) if whole else np.full(shape, fill, self.dtype)
+        inner = block[:height, :width]
+        # Band by band: a transposing copy of the whole array is seven times slower.
+        for band in range(self.bands):
+            inner[..., band] = pixels[band]
+        moved = 0
+        if self.nodata is not None and self.dtype.kind in "iu":
+            equal = pixels == self.dtype.type(self.nodata)
+            moved = int(np.count_nonzero(equal))
+            if moved:
+                neighbour = self.nodata + (1 if self.nodata < np.iinfo(self.dtype).max else -1)
+                for band in range(self.bands):
+                    inner[..., band][equal[band]] = self.dtype.type(neighbour)
+        return block, moved

@@ -1,0 +1,205 @@
+"""The crash-safe store of finished tiles: one file to which records are only appended.
+
+The file begins with the key of its run. Each record is a header (magic, tile, two notes, length, checksum of the
+payload, checksum of the header) and the payload; an empty tile is a record of length 0. A process that dies at any byte
+leaves whole records and at most one torn tail, which is cut off when the log is opened again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import struct
+import threading
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO
+
+from photoplan.errors import PhotoplanError
+from photoplan.io.disk import disk_error, write_all
+
+__all__ = ["TileLog"]
+
+_MAGIC = b"PPTILES2"
+_START = struct.Struct("<8s32sI")
+_RECORD = struct.Struct("<4sQQQQI")
+_CHECK = struct.Struct("<I")
+_TILE = b"TILE"
+_CHUNK = 1 << 20
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a payload stands in the file, and what its record says of it."""
+
+    position: int
+    length: int
+    checksum: int
+    notes: tuple[int, int]
+
+
+class TileLog:
+    """Finished tiles by their index; a context manager that closes the file and leaves it in place.
+
+    Parameters
+    ----------
+    path
+        The file; made when absent.
+    key
+        What makes a run itself: a digest of inputs, parameters and version. A log with another key is started afresh.
+
+    Raises
+    ------
+    UsageError, ResourceError
+        If the file cannot be made or written; after a failed `append` the log still holds what it held before.
+
+    Notes
+    -----
+    `append` may be called from several threads. Two processes must not share a log: see `FileLock`.
+    """
+
+    def __init__(self, path: Path, key: str) -> None:
+        self.path = path
+        self._lock = threading.Lock()
+        self._places: dict[int, _Place] = {}
+        start = _MAGIC, hashlib.sha256(key.encode()).digest()
+        self._start = _START.pack(*start, zlib.crc32(start[0] + start[1]))
+        try:
+            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
+        except OSError as error:
+            raise disk_error(path, error, "made") from error
+        try:
+            self._end = self._scan()
+        except OSError as error:
+            os.close(self._descriptor)
+            raise disk_error(path, error) from error
+
+    def __enter__(self) -> TileLog:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def finished(self) -> frozenset[int]:
+        """Indices of all tiles in the log."""
+        with self._lock:
+            return frozenset(self._places)
+
+    @property
+    def descriptor(self) -> int:
+        """Descriptor of the open file, for copying payloads inside the kernel."""
+        return self._descriptor
+
+    def place(self, index: int) -> tuple[int, int]:
+        """First byte of a tile's payload in the file, and its length (0: an empty tile)."""
+        place = self._places[index]
+        return place.position, place.length
+
+    def notes(self, index: int) -> tuple[int, int]:
+        """The two whole numbers that were kept with a tile."""
+        return self._places[index].notes
+
+    def append(self, index: int, payload: bytes | memoryview = b"", notes: tuple[int, int] = (0, 0)) -> None:
+        """Add a tile and two notes about it; without a payload it is an empty one.
+
+        A tile that is there already is replaced.
+        """
+        payload = memoryview(payload).cast("B")
+        length, checksum = len(payload), zlib.crc32(payload)
+        head = _RECORD.pack(_TILE, index, *notes, length, checksum)
+        head += _CHECK.pack(zlib.crc32(head))
+        with self._lock:
+            os.lseek(self._descriptor, self._end, os.SEEK_SET)
+            try:
+                write_all(self._descriptor, head, payload)
+            except BaseException as error:
+                # Ctrl-C may come here as well: whatever was written of this record goes.
+                os.ftruncate(self._descriptor, self._end)
+                if isinstance(error, OSError):
+                    raise disk_error(self.path, error) from error
+                raise
+            self._places[index] = _Place(self._end + len(head), length, checksum, notes)
+            self._end += len(head) + length
+
+    def read(self, index: int) -> bytes:
+        """Payload of a tile, compared with its checksum.
+
+        Raises
+        ------
+        KeyError
+            If the tile is not in the log.
+        PhotoplanError
+            If the payload is no longer what was written.
+        """
+        place = self._places[index]
+        length = place.length
+        with self._lock:
+            os.lseek(self._descriptor, place.position, os.SEEK_SET)
+            parts = []
+            while length > 0:
+                parts.append(os.read(self._descriptor, length))
+                if not parts[-1]:
+                    break
+                length -= len(parts[-1])
+        payload = b"".join(parts)
+        if zlib.crc32(payload) != place.checksum:
+            raise PhotoplanError(f"{self.path}: tile {index} has changed since it was written; delete the file, rerun")
+        return payload
+
+    def close(self) -> None:
+        """Close the file; it stays for the next run."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def remove(self) -> None:
+        """Close and delete the file: its product is complete."""
+        self.close()
+        self.path.unlink(missing_ok=True)
+
+    def _scan(self) -> int:
+        """Find all whole records, cut off a torn tail, start afresh for another key; returns the end of the file."""
+        size = os.fstat(self._descriptor).st_size
+        with os.fdopen(os.dup(self._descriptor), "rb") as file:
+            file.seek(0)
+            if file.read(_START.size) != self._start:
+                os.ftruncate(self._descriptor, 0)
+                os.lseek(self._descriptor, 0, os.SEEK_SET)
+                write_all(self._descriptor, self._start)
+                return len(self._start)
+            end = _START.size
+            for index, place in self._records(file, size):
+                self._places[index] = place
+                end = place.position + place.length
+        os.ftruncate(self._descriptor, end)
+        return end
+
+    @staticmethod
+    def _records(file: BinaryIO, size: int) -> Iterator[tuple[int, _Place]]:
+        """Whole records from the file's position on."""
+        position = file.tell()
+        while True:
+            head = file.read(_RECORD.size + _CHECK.size)
+            if len(head) < _RECORD.size + _CHECK.size:
+                return
+            magic, index, note0, note1, length, checksum = _RECORD.unpack_from(head)
+            (head_checksum,) = _CHECK.unpack_from(head, _RECORD.size)
+            position += len(head)
+            if magic != _TILE or zlib.crc32(head[: _RECORD.size]) != head_checksum or position + length > size:
+                return
+            found, left = 0, length
+            while left:
+                part = file.read(min(left, _CHUNK))
+                if not part:
+                    return
+                found, left = zlib.crc32(part, found), left - len(part)
+            if found != checksum:
+                return
+            yield index, _Place(position, length, checksum, (note0, note1))
+            position += length
