@@ -1,0 +1,112 @@
+"""The frame camera: central projection, lens and interior orientation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.cameras.interior import Interior
+from photoplan.cameras.lenses.base import Lens
+from photoplan.cameras.lenses.field import FieldLimited, field_limited
+from photoplan.cameras.lenses.none import NoLens
+from photoplan.cameras.plane import Affine2D
+from photoplan.errors import UsageError
+from photoplan.geometry.pose import Pose
+
+__all__ = ["FrameCamera"]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameCamera:
+    """A frame image in Cartesian ground space (Ecker 1991, eq. 3.1–3.3).
+
+    The camera axes are x right, y up, z towards the viewer: the scene lies at z < 0 and depth = −z. An image whose
+    orientation was determined with the scene at z > 0 (ω near 200 gon, as in Ecker 1991, §8.1) is brought into this
+    system by turning its axes, R · diag(1, −1, −1), and changing the sign of its image x.
+
+    With a lens, the homogeneous coordinates of points at and behind the camera's plane are NaN with w ≤ 0.
+
+    Raises
+    ------
+    InputError
+        The lens folds back inside the image.
+    """
+
+    interior: Interior
+    lens: Lens
+    pose: Pose
+    """Exterior orientation."""
+    _field: Lens = field(init=False, repr=False)
+    _linear: NDArray[np.float64] | None = field(init=False, repr=False)
+    _axes: NDArray[np.float64] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        plain = isinstance(self.lens, NoLens | FieldLimited)
+        object.__setattr__(self, "_field", self.lens if plain else field_limited(self.lens, self.interior))
+        # Columns: camera x, camera y, depth.
+        axes = np.ascontiguousarray(self.pose.R_ground_camera * (1.0, 1.0, -1.0))
+        object.__setattr__(self, "_axes", axes)
+        T = self.interior.tangent_to_pixel
+        linear = None
+        if isinstance(self.lens, NoLens) and isinstance(T, Affine2D):
+            linear = axes @ np.array([[T.a1, T.a4, 0.0], [T.a2, T.a5, 0.0], [T.a3, T.a6, 1.0]])
+        object.__setattr__(self, "_linear", linear)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the image in pixels."""
+        return self.interior.size
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """Projection centre in ground coordinates, shape (3,)."""
+        return self.pose.center
+
+    def project_homogeneous(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """Ground (..., 3) to (x·w, y·w, w), w = depth in metres; linear in XYZ without lens on an affine interior."""
+        XYZ = np.asarray(XYZ, float)
+        from_center = (XYZ - self.pose.center).reshape(-1, 3)
+        if self._linear is not None:
+            return (from_center @ self._linear).reshape(XYZ.shape)
+        p = from_center @ self._axes
+        w = p[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            t = p[:, :2] / np.where(w > 0, w, np.nan)[:, None]
+            out = np.empty_like(p)
+            np.multiply(self.interior.tangent_to_pixel(self._field.distort(t)), w[:, None], out=out[:, :2])
+        out[:, 2] = w
+        return out.reshape(XYZ.shape)
+
+    def rays(self, xy: ArrayLike, height: float | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Image points (..., 2) to the projection centre and unit directions, each (..., 3); `height` is not used."""
+        t = self._field.undistort(self.interior.tangent_to_pixel.inverse(xy))
+        d = np.concatenate([t, np.ones((*t.shape[:-1], 1))], axis=-1) @ self._axes.T
+        d /= np.linalg.norm(d, axis=-1, keepdims=True)
+        return np.broadcast_to(self.pose.center, d.shape).copy(), d
+
+    def derivatives(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """∂(x, y)/∂(X, Y, Z), shape (..., 2, 3), pixels per metre; NaN behind the camera."""
+        p = (np.asarray(XYZ, float) - self.pose.center) @ self._axes
+        depth = np.where(p[..., 2] > 0, p[..., 2], np.nan)
+        t = p[..., :2] / depth[..., None]
+        # t = p / depth: its derivative by camera x, camera y, depth.
+        inner = np.zeros((*t.shape[:-1], 2, 3))
+        inner[..., 0, 0] = inner[..., 1, 1] = 1.0
+        inner[..., :, 2] = -t
+        real = self._field.distort(t)
+        outer = self.interior.tangent_to_pixel.derivative(real) @ self._field.jacobian(t)
+        return outer @ (inner / depth[..., None, None]) @ self._axes.T
+
+    def matrix(self) -> NDArray[np.float64]:
+        """The projection as one matrix P (3, 4): (x·w, y·w, w) = P (X, Y, Z, 1) (Ecker 1991, appendix B).
+
+        Raises
+        ------
+        UsageError
+            The camera has a lens or a bilinear interior orientation; no matrix holds these.
+        """
+        if self._linear is None:
+            raise UsageError("only an undistorted camera with affine interior orientation is a matrix")
+        return np.concatenate([self._linear.T, -(self.pose.center @ self._linear)[:, None]], axis=1)
