@@ -1,13 +1,13 @@
 """Configuration of the documentation; it builds without a network."""
 
-from importlib.metadata import PackageNotFoundError, version
+from importlib import metadata
 
 project = "photoplan"
 author = "the photoplan authors"
 copyright = "the photoplan authors"
 try:
-    release = version("photoplan")
-except PackageNotFoundError:
+    release = metadata.version("photoplan")
+except metadata.PackageNotFoundError:
     release = "0"
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
@@ -25,6 +25,9 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 autodoc_default_options = {"members": True}
 
+# In docstrings a single backtick marks code.
+default_role = "code"
+
 html_theme = "alabaster"
 html_title = "photoplan"
 html_static_path = ["_static"]
@@ -39,3 +42,19 @@ html_theme_options = {
 html_sidebars = {"**": ["about.html", "searchfield.html", "navigation.html"]}
 html_show_sourcelink = False
 pygments_style = "friendly"
+
+
+def hide_colons(app, what, name, obj, options, lines):
+    """Before napoleon: it would take what stands before a colon in the docstring of a field for its type."""
+    if what == "attribute":
+        lines[:] = [line.replace(":", "\ue000") for line in lines]
+
+
+def show_colons(app, what, name, obj, options, lines):
+    """After napoleon."""
+    lines[:] = [line.replace("\ue000", ":") for line in lines]
+
+
+def setup(app):
+    app.connect("autodoc-process-docstring", hide_colons, priority=400)
+    app.connect("autodoc-process-docstring", show_colons, priority=600)
