@@ -8,6 +8,7 @@ from dataclasses import astuple, dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from photoplan.cameras.lenses.radial import radial_jacobian
 from photoplan.errors import InputError
 
 __all__ = ["Fisheye"]
@@ -64,10 +65,7 @@ class Fisheye:
         theta = np.arctan(r)
         across = _sinc_like(theta, r) * self._factor(theta)
         along = self._slope(theta) / (1.0 + r * r)
-        e = t / np.where(r > 0, r, 1.0)[..., None]
-        return (
-            across[..., None, None] * np.eye(2) + (along - across)[..., None, None] * e[..., :, None] * e[..., None, :]
-        )
+        return radial_jacobian(t, r, across, along)
 
     def _factor(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         q = theta * theta

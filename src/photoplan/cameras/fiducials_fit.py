@@ -1,0 +1,234 @@
+"""Interior orientation of scanned film: from calibrated and measured fiducial marks to a plane transformation."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.plane import Affine2D, Bilinear2D
+from photoplan.errors import GeometryError, InputError
+
+__all__ = ["FiducialFit", "Marks", "fit_affine", "fit_bilinear"]
+
+#: Marks as name → (x, y), or as rows (name, x, y) of a file, in which a name may by mistake occur twice.
+Marks = Mapping[str, tuple[float, float]] | Iterable[tuple[str, float, float]]
+
+_Design = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+#: Film shrinks by a few parts in ten thousand; residuals beyond this part of the marks' extent are blunders.
+BLUNDER = 0.005
+
+
+@dataclass(frozen=True, eq=False)
+class FiducialFit:
+    """Result of the adjustment."""
+
+    transformation: Affine2D | Bilinear2D
+    """From the image plane (millimetres, x right, y up) to pixels."""
+    names: tuple[str, ...]
+    """The marks that were used."""
+    residuals: NDArray[np.float64]
+    """Transformed minus measured position of each mark, shape (n, 2), pixels."""
+    redundancy: int
+    """Observations minus unknowns: 0 means that nothing checks the marks."""
+    sigma0: float
+    """Standard deviation of one measured coordinate, pixels; NaN without redundancy."""
+    covariance: NDArray[np.float64]
+    """Of the coefficients, in the transformation's order, shape (6, 6) or (8, 8); NaN without redundancy."""
+    missing: tuple[str, ...]
+    """Calibrated marks that were not measured."""
+
+    def __str__(self) -> str:
+        kind = "affine" if isinstance(self.transformation, Affine2D) else "bilinear"
+        check = f"sigma0 {self.sigma0:.3f} px" if self.redundancy else "no redundancy: the marks are not checked"
+        lines = [f"{kind} interior orientation from {len(self.names)} fiducial marks, {check}"]
+        lines += [f"  {n:>8}  vx {v[0]:+8.3f}  vy {v[1]:+8.3f} px" for n, v in zip(self.names, self.residuals)]
+        if self.missing:
+            lines.append(f"  not measured: {', '.join(self.missing)}")
+        return "\n".join(lines)
+
+
+def fit_affine(plane_mm: Marks, scan_px: Marks, *, mirrored: bool = False) -> FiducialFit:
+    """Affine transformation from image plane to scan by least squares (Ecker 1991, eq. 4.2; Behr 1989, eq. 5.2).
+
+    Parameters
+    ----------
+    plane_mm : Marks
+        Calibrated marks, millimetres, x right, y up.
+    scan_px : Marks
+        The same marks measured in the scan: column and row, pixels, (0, 0) the centre of the upper-left pixel.
+    mirrored : bool
+        Whether the two systems are known to have the same handedness: the film was scanned through its back, or the
+        rows are counted upwards (as the marks of Ecker 1991, §8.1).
+
+    Raises
+    ------
+    InputError
+        A mark is unknown, named twice, given twice under two names, exchanged with another or far off, less than three
+        are left, or the scan is mirrored against what was said.
+    GeometryError
+        The marks lie on a line.
+    """
+    common = _pair(plane_mm, scan_px, 3, "affine")
+    coefficients, covariance, residuals, sigma0 = _adjust(common.plane, common.scan, _affine_design)
+    _check_blunders(common, residuals)
+    transformation = Affine2D(*coefficients)
+    _check_handedness(transformation.determinant, mirrored)
+    return _result(common, transformation, residuals, sigma0, covariance)
+
+
+def fit_bilinear(plane_mm: Marks, scan_px: Marks, *, mirrored: bool = False) -> FiducialFit:
+    """Bilinear transformation from image plane to scan by least squares (Ecker 1991, eq. 4.3).
+
+    Four marks determine it without any check, so they are first compared with an affine transformation. Parameters
+    and errors are those of `fit_affine`, with at least four marks.
+    """
+    common = _pair(plane_mm, scan_px, 4, "bilinear")
+    affine, _, affine_residuals, _ = _adjust(common.plane, common.scan, _affine_design)
+    _check_blunders(common, affine_residuals)
+    _check_handedness(Affine2D(*affine).determinant, mirrored)
+    coefficients, covariance, residuals, sigma0 = _adjust(common.plane, common.scan, _bilinear_design)
+    return _result(common, Bilinear2D(*coefficients), residuals, sigma0, covariance)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    names: tuple[str, ...]
+    plane: NDArray[np.float64]
+    scan: NDArray[np.float64]
+    missing: tuple[str, ...]
+
+
+def _result(
+    common: _Pairs,
+    transformation: Affine2D | Bilinear2D,
+    residuals: NDArray[np.float64],
+    sigma0: float,
+    covariance: NDArray[np.float64],
+) -> FiducialFit:
+    redundancy = residuals.size - len(covariance)
+    return FiducialFit(transformation, common.names, residuals, redundancy, sigma0, covariance, common.missing)
+
+
+def _pair(plane_mm: Marks, scan_px: Marks, least: int, kind: str) -> _Pairs:
+    plane, scan = _table(plane_mm, "calibrated"), _table(scan_px, "measured")
+    unknown = [name for name in scan if name not in plane]
+    if unknown:
+        raise InputError(
+            f"measured fiducial mark {_list(unknown)} is not calibrated; the calibration has {_list(plane)}"
+        )
+    names = tuple(name for name in plane if name in scan)
+    missing = tuple(name for name in plane if name not in scan)
+    if len(names) < least:
+        raise InputError(
+            f"{len(names)} fiducial marks ({_list(names) or 'none'}) for {kind} interior orientation; "
+            f"{least} are needed. Not measured: {_list(missing) or 'none'}"
+        )
+    P, p = np.array([plane[n] for n in names]), np.array([scan[n] for n in names])
+    for points, what in ((P, "calibrated"), (p, "measured")):
+        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+        if spread[1] < 0.01 * spread[0]:
+            raise GeometryError(f"the {what} fiducial marks {_list(names)} lie on a line; marks beside it are needed")
+    return _Pairs(names, P, p, missing)
+
+
+def _table(marks: Marks, what: str) -> dict[str, tuple[float, float]]:
+    rows = [(n, *xy) for n, xy in marks.items()] if isinstance(marks, Mapping) else list(marks)
+    table: dict[str, tuple[float, float]] = {}
+    for name, x, y in rows:
+        if name in table:
+            raise InputError(f"{what} fiducial mark {name!r} is given twice; remove one of the two")
+        if not (math.isfinite(x) and math.isfinite(y)):
+            raise InputError(f"{what} fiducial mark {name!r} at ({x}, {y}); two finite numbers are needed")
+        table[name] = (float(x), float(y))
+    if len(table) > 1:
+        extent = max(np.ptp([v[k] for v in table.values()]) for k in (0, 1))
+        for (a, p), (b, q) in itertools.combinations(table.items(), 2):
+            if math.dist(p, q) <= BLUNDER * extent:
+                raise InputError(
+                    f"{what} fiducial marks {a!r} and {b!r} have the same place ({p[0]:g}, {p[1]:g}); one is wrong"
+                )
+    return table
+
+
+def _affine_design(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.column_stack([xy, np.ones(len(xy))])
+
+
+def _bilinear_design(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.column_stack([xy, xy[:, 0] * xy[:, 1], np.ones(len(xy))])
+
+
+def _adjust(
+    plane: NDArray[np.float64], scan: NDArray[np.float64], design: _Design
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
+    """Least squares with one design for columns and rows: coefficients, covariance, residuals, sigma0."""
+    A = design(plane)
+    # Columns of very different size (1 and x y) are brought to one length.
+    length = np.linalg.norm(A, axis=0)
+    U, s, Vt = np.linalg.svd(A / length, full_matrices=False)
+    if s[-1] < 1e-9 * s[0]:
+        raise GeometryError("the fiducial marks do not determine the transformation; marks at other places are needed")
+    inverse = Vt.T / s
+    unknowns = (inverse @ (U.T @ scan)) / length[:, None]
+    residuals = A @ unknowns - scan
+    redundancy = scan.size - unknowns.size
+    sigma0 = math.sqrt(float((residuals**2).sum()) / redundancy) if redundancy else math.nan
+    Q = (inverse @ inverse.T) / np.outer(length, length)
+    covariance = np.kron(np.eye(2), Q) * sigma0**2
+    return unknowns.T.ravel(), covariance, residuals, sigma0
+
+
+def _check_blunders(common: _Pairs, residuals: NDArray[np.float64]) -> None:
+    """Refuse residuals that no film has, and say which marks are exchanged or which one is off."""
+    off = np.linalg.norm(residuals, axis=1)
+    limit = BLUNDER * float(np.ptp(common.scan, axis=0).max())
+    if off.max() <= limit:
+        return
+    for i, j in itertools.combinations(range(len(off)), 2):
+        order = list(range(len(off)))
+        order[i], order[j] = j, i
+        fit = _adjust(common.plane, common.scan[order], _affine_design)
+        if np.linalg.norm(fit[2], axis=1).max() <= limit:
+            raise InputError(
+                f"fiducial marks {common.names[i]!r} and {common.names[j]!r} are exchanged: residuals of "
+                f"{off.max():.1f} px become {np.linalg.norm(fit[2], axis=1).max():.1f} px when they change places"
+            )
+    listed = ", ".join(f"{n} {v:.1f}" for n, v in zip(common.names, off))
+    raise InputError(
+        f"fiducial marks: {_suspect(common)}; residuals (px: {listed}) exceed {limit:.1f} px, more than film deforms. "
+        "Measure again, or check that the calibration belongs to this camera"
+    )
+
+
+def _suspect(common: _Pairs) -> str:
+    """The mark without which the others fit best; all, where nothing tells them apart."""
+    n = len(common.names)
+    if n < 5:
+        return f"one of {_list(common.names)} is wrong (four marks cannot tell which)"
+    left = []
+    for k in range(n):
+        rest = np.arange(n) != k
+        left.append(_adjust(common.plane[rest], common.scan[rest], _affine_design)[3])
+    return f"{common.names[int(np.argmin(left))]!r} is wrong"
+
+
+def _check_handedness(determinant: float, mirrored: bool) -> None:
+    # Image plane y up, rows downwards: the determinant of an unmirrored scan is negative.
+    if (determinant > 0) == mirrored:
+        return
+    if mirrored:
+        raise InputError("the fiducial marks are not mirrored in the scan, but mirrored = true was stated")
+    raise InputError(
+        "the scan is mirrored: its fiducial marks run the other way round than the calibrated ones. Scan the film from "
+        "its other side or mirror the image, or check that rows are counted downwards and y upwards"
+    )
+
+
+def _list(names: Iterable[str]) -> str:
+    return ", ".join(map(repr, names))
