@@ -17,10 +17,18 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from photoplan.errors import InputError
 
-__all__ = ["close_handles", "first_cause", "gdal_settings", "handle", "open_raster", "warnings_of_gdal"]
+__all__ = [
+    "close_handles",
+    "first_cause",
+    "gdal_settings",
+    "handle",
+    "not_georeferenced",
+    "open_raster",
+    "warnings_of_gdal",
+]
 
-CACHE_MB = 64
-"""GDAL's block cache of the whole process, MiB; its default of a twentieth of the memory is not bounded enough."""
+CACHE_BYTES = 64 << 20
+"""GDAL's block cache of the whole process; its default of a twentieth of the memory is not bounded enough."""
 _HANDLES_PER_THREAD = 4
 _DAMAGE = re.compile(r"corrupt|premature|truncat|too short|not enough data|invalid|bad huffman|crc|checksum", re.I)
 _open_lock = threading.Lock()
@@ -33,7 +41,8 @@ def gdal_settings(**more: Any) -> rasterio.Env:
     network.
     """
     settings = {
-        "GDAL_CACHEMAX": CACHE_MB,
+        # In bytes: rasterio hands a number on as it is, where GDAL's own option would mean MiB.
+        "GDAL_CACHEMAX": CACHE_BYTES,
         "GDAL_ERROR_ON_LIBJPEG_WARNING": True,
         "GTIFF_REPORT_COMPD_CS": True,
         "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": ".nothing",
@@ -100,16 +109,24 @@ def open_raster(path: Path, driver: str | None) -> Any:
     InputError
         If GDAL cannot open it.
     """
-    # `catch_warnings` changes a list of the whole process, so only one thread may be inside.
+    try:
+        with not_georeferenced(), gdal_settings():
+            return rasterio.open(path, driver=driver, sharing=False)
+    except (RasterioError, OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: cannot be opened ({first_cause(error)}); the file is damaged or cut off, get a fresh copy"
+        ) from error
+
+
+@contextmanager
+def not_georeferenced() -> Iterator[None]:
+    """Open and write rasters that need no georeference without a word about it.
+
+    `catch_warnings` changes a list of the whole process, so only one thread may be inside.
+    """
     with _open_lock, warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        try:
-            with gdal_settings():
-                return rasterio.open(path, driver=driver, sharing=False)
-        except (RasterioError, OSError, ValueError) as error:
-            raise InputError(
-                f"{path}: cannot be opened ({first_cause(error)}); the file is damaged or cut off, get a fresh copy"
-            ) from error
+        yield
 
 
 class _Handles(threading.local):
