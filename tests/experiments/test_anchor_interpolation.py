@@ -4,7 +4,12 @@ import anchor_interpolation as experiment
 import numpy as np
 import pytest
 
+from photoplan.cameras.base import project
+from photoplan.cameras.frame import FrameCamera
+from photoplan.cameras.interior import Interior
+from photoplan.cameras.lenses.none import NoLens
 from photoplan.geometry.grid import MapGrid, Window
+from photoplan.geometry.pose import Pose
 from photoplan.plan.compile import AnchorRule, compile_anchors
 from photoplan.targets.map import MapTarget
 
@@ -67,16 +72,16 @@ def test_homogeneous_anchors_are_exact_on_the_same_meshes(side, slope, roughness
         assert e.max() / experiment.PIXEL < 1e-11
 
 
-class Pinhole:
-    """The experiment's camera as the package sees one, pixels of 15 µm."""
+def camera():
+    """The experiment's camera as the package has it, pixels of 15 µm."""
+    interior = Interior.metric((16_000, 16_000), 1e3 * experiment.CAMERA_CONSTANT, 1e3 * experiment.PIXEL)
+    return FrameCamera(interior, NoLens(), Pose(np.array([0.0, 0.0, experiment.FLYING_HEIGHT]), np.eye(3)))
 
-    size = (16_000, 16_000)
-    center = np.array([0.0, 0.0, experiment.FLYING_HEIGHT])
 
-    def project_homogeneous(self, XYZ):
-        h = experiment.homogeneous(np.asarray(XYZ, float)) / np.array([experiment.PIXEL, -experiment.PIXEL, 1.0])
-        h[..., :2] += 7_999.5 * h[..., 2:]
-        return h
+def test_the_packages_camera_is_the_experiments():
+    XYZ = experiment.Mesh(1300.0, 50.0, 45.0).ground(*np.meshgrid(CENTRES, CENTRES))
+    expected = experiment.image(XYZ) / experiment.PIXEL * (1, -1) + 7_999.5
+    np.testing.assert_allclose(project(camera(), XYZ), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("slope", [0.0, 45.0])
@@ -84,6 +89,6 @@ def test_the_package_needs_one_cell_for_behrs_steepest_mesh(slope):
     window = Window(0, 0, 512, 512)
     grid = MapGrid(left=1000.0, top=100.0, resolution=0.2, width=512, height=512, crs="EPSG:25832")
     relief = np.tan(np.radians(slope)) * np.broadcast_to(0.2 * np.arange(512), (512, 512))
-    anchors = compile_anchors(Pinhole(), MapTarget(grid), window, relief.astype(np.float32), AnchorRule(0.02, 2, 512))
+    anchors = compile_anchors(camera(), MapTarget(grid), window, relief.astype(np.float32), AnchorRule(0.02, 2, 512))
     assert len(anchors.rects) == len(anchors.corners) == 1
     assert anchors.residual < 2e-11

@@ -4,7 +4,12 @@ import anchor_residual as experiment
 import numpy as np
 import pytest
 
+from photoplan.cameras.base import project
+from photoplan.cameras.frame import FrameCamera
+from photoplan.cameras.interior import Interior
+from photoplan.cameras.lenses.brown import Brown
 from photoplan.geometry.grid import MapGrid, Window
+from photoplan.geometry.pose import Pose
 from photoplan.plan.compile import AnchorRule, compile_anchors
 from photoplan.targets.map import MapTarget
 
@@ -39,17 +44,18 @@ def test_without_distortion_nothing_is_left(monkeypatch):
     assert experiment.worst_residual(512.0, 200.0) < 1e-10
 
 
-class Drone:
-    """The experiment's camera as the package sees one."""
+def camera():
+    """The experiment's camera as the package has it."""
+    interior = Interior.digital((10_000, 7_500), (experiment.FOCAL, experiment.FOCAL))
+    lens = Brown(k1=experiment.K1)
+    return FrameCamera(interior, lens, Pose(np.array([0.0, 0.0, experiment.FLYING_HEIGHT]), np.eye(3)))
 
-    size = (10_000, 7_500)
-    center = np.array([0.0, 0.0, experiment.FLYING_HEIGHT])
 
-    def project_homogeneous(self, XYZ):
-        h = experiment.homogeneous(np.asarray(XYZ, float)) * np.array([1.0, -1.0, 1.0])
-        h[..., 0] += 4_999.5 * h[..., 2]
-        h[..., 1] += 3_749.5 * h[..., 2]
-        return h
+def test_the_packages_camera_is_the_experiments():
+    XYZ = np.random.default_rng(3).uniform((-480, -360, -30), (480, 360, 30), (200, 3))
+    h = experiment.homogeneous(XYZ)
+    expected = h[:, :2] / h[:, 2:] * (1, -1) + (4_999.5, 3_749.5)
+    np.testing.assert_allclose(project(camera(), XYZ), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("tolerance", [0.02, 0.001])
@@ -59,7 +65,7 @@ def test_the_compiler_cuts_until_the_tolerance_is_met(tolerance):
     grid = MapGrid(left=400.0, top=330.0, resolution=0.1, width=256, height=256, crs="EPSG:25832")
     relief = np.zeros((256, 256), np.float32)
     relief[:, 100:] = 60.0
-    anchors = compile_anchors(Drone(), MapTarget(grid), window, relief, AnchorRule(tolerance, 2, 256))
+    anchors = compile_anchors(camera(), MapTarget(grid), window, relief, AnchorRule(tolerance, 2, 256))
     assert 0 < anchors.residual <= tolerance
     layers = np.diff(anchors.box_start)
     wall = (anchors.rects[:, 0] < 100) & (anchors.rects[:, 2] > 100)
