@@ -1,4 +1,4 @@
-"""The snippets on the design pages run, and so does the Python of the documentation that says so."""
+"""The Python on the design pages and in the documentation runs, and prints what the page says."""
 
 import re
 from pathlib import Path
@@ -6,16 +6,20 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+#: A block of Python and, where one follows at once, the text that it prints.
+BLOCK = re.compile(r"^```python\n(.*?)^```$(?:\n\n```text\n(.*?)^```$)?", re.M | re.S)
 SNIPPETS = [
-    pytest.param(block, id=f"{page.stem}-{number}")
-    for page in sorted((ROOT / "design").glob("*.md"))
-    for number, block in enumerate(re.findall(r"^```python\n(.*?)^```$", page.read_text("utf-8"), re.M | re.S), 1)
+    pytest.param(code, printed, id=f"{page.stem}-{number}")
+    for page in [*sorted((ROOT / "design").glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
+    for number, (code, printed) in enumerate(BLOCK.findall(page.read_text("utf-8")), 1)
 ]
 
 
-@pytest.mark.parametrize("block", SNIPPETS)
-def test_design_snippet_runs(block):
-    exec(compile(block, "snippet", "exec"), {"__name__": "snippet"})
+@pytest.mark.parametrize(("code", "printed"), SNIPPETS)
+def test_snippet_runs(code, printed, capsys):
+    exec(compile(code, "snippet", "exec"), {"__name__": "snippet"})
+    if printed:
+        assert capsys.readouterr().out.rstrip() == printed.rstrip()
 
 
 def test_every_design_page_has_a_snippet():
