@@ -67,7 +67,7 @@ class _Collector(logging.Filter):
 
 
 _collector = _Collector()
-_logger = logging.getLogger("rasterio._env")
+_loggers = tuple(logging.getLogger(f"rasterio.{name}") for name in ("_env", "_err"))
 
 
 @contextmanager
@@ -76,8 +76,8 @@ def warnings_of_gdal() -> Iterator[list[str]]:
 
     Some decoders only warn where the picture is damaged (JPEG inside TIFF, for one).
     """
-    if _collector not in _logger.filters:
-        _logger.addFilter(_collector)
+    for logger in _loggers:
+        logger.addFilter(_collector)  # adding it twice adds it once
     found: list[str] = []
     before = getattr(_collector.thread, "found", None)
     _collector.thread.found = found
@@ -92,13 +92,17 @@ def damage_in(found: list[str]) -> str | None:
     return next((text for text in found if _DAMAGE.search(text)), None)
 
 
-def first_cause(error: BaseException) -> str:
-    """What GDAL said first about an error, in one line."""
+def all_causes(error: BaseException) -> list[str]:
+    """What GDAL said about an error, the first cause first; one line each."""
     chain: list[BaseException] = [error]
     while chain[-1].__cause__ is not None:
         chain.append(chain[-1].__cause__)
-    text = " ".join(str(getattr(chain[-1], "errmsg", chain[-1])).split())
-    return text[:300]
+    return [" ".join(str(getattr(link, "errmsg", link)).split())[:300] for link in reversed(chain)]
+
+
+def first_cause(error: BaseException) -> str:
+    """What GDAL said first about an error, in one line."""
+    return all_causes(error)[0]
 
 
 def open_raster(path: Path, driver: str | None) -> Any:

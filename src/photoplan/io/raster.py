@@ -15,7 +15,7 @@ from rasterio.errors import RasterioError
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io.checks import DRIVER_NAMES, IMAGE_LIMITS, RasterLimits
-from photoplan.io.gdal import damage_in, first_cause, gdal_settings, handle, warnings_of_gdal
+from photoplan.io.gdal import all_causes, damage_in, gdal_settings, handle, warnings_of_gdal
 from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.tiff_layout import read_tiff_layout
 from photoplan.io.validity import MissingBlocks, finite, not_nodata
@@ -134,10 +134,10 @@ def read_pixels(
                 band = "mask"
                 valid = _both(valid, (dataset.read_masks(window=area) > 0).all(axis=0))
     except (RasterioError, OSError, MemoryError) as error:
-        raise _damaged(info.path, window, band, first_cause(error)) from error
+        raise _damaged(info.path, window, band, all_causes(error)) from error
     damage = damage_in(found)
     if damage:
-        raise _damaged(info.path, window, band, damage)
+        raise _damaged(info.path, window, band, [damage])
     valid = _both(valid, not_nodata(pixels, info.nodata))
     valid = _both(valid, finite(pixels))
     if missing is not None:
@@ -152,12 +152,12 @@ def _both(a: NDArray[np.bool_] | None, b: NDArray[np.bool_] | None) -> NDArray[n
     return np.logical_and(a, b)
 
 
-def _damaged(path: Path, window: Window, band: str | int, cause: str) -> InputError:
+def _damaged(path: Path, window: Window, band: str | int, causes: list[str]) -> InputError:
     """The error of pixels that cannot be read."""
-    named = re.search(r"band (\d+)", cause)
+    named = re.search(r"band (\d+)", " ".join(causes))
     return InputError(
         f"{path}: band {named.group(1) if named else band}, window col {window.col} row {window.row} "
-        f"{window.width} × {window.height}: the pixels cannot be read ({cause}); the file is damaged or cut off, "
+        f"{window.width} × {window.height}: the pixels cannot be read ({causes[0]}); the file is damaged or cut off, "
         "get a fresh copy"
     )
 
