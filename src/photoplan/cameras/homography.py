@@ -62,10 +62,12 @@ class Homography:
             ]
         )
         _, singular, Vt = np.linalg.svd(rows)
-        M: NDArray[np.float64] = np.linalg.inv(T) @ Vt[-1].reshape(3, 3) @ S
+        M = (np.linalg.inv(T) @ Vt[-1].reshape(3, 3) @ S).astype(np.float64)
         if singular[7] < 1e-9 * singular[0] or np.linalg.cond(Vt[-1].reshape(3, 3)) > 1e9:
             raise GeometryError("homography: the points do not determine it; of four points no three may be collinear")
-        return cls(M / M[2, 2] if abs(M[2, 2]) > 1e-12 * np.abs(M).max() else M)
+        if abs(M[2, 2]) > 1e-12 * np.abs(M).max():
+            M /= M[2, 2]
+        return cls(M)
 
     def __call__(self, XY: ArrayLike) -> NDArray[np.float64]:
         """Points of the plane to image points, shapes (..., 2); NaN on the vanishing line."""
@@ -73,7 +75,7 @@ class Homography:
         return _apply(self.matrix, XY)
 
     def __invert__(self) -> Homography:
-        return Homography(np.linalg.inv(self.matrix))
+        return Homography(np.linalg.inv(self.matrix).astype(np.float64))
 
     def __matmul__(self, other: Homography) -> Homography:
         return Homography(self.matrix @ other.matrix)

@@ -1,0 +1,215 @@
+"""Local tangential systems: true Cartesian space around a point of a map projection."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pyproj import Transformer
+
+from photoplan.errors import InputError
+from photoplan.geometry.crs import crs_label, require_projected_metres
+
+__all__ = ["LocalFrame", "altered_height", "earth_radius", "unaltered_height"]
+
+#: Half the distance over which the mapping's derivative is taken, metres: the mapping is so smooth (its third
+#: derivative is of the order 1/R²) that truncation and rounding both stay below 1e-10.
+_REACH = 100.0
+
+
+@dataclass(frozen=True)
+class _Projection:
+    """A map projection with the ellipsoid below it."""
+
+    to_geographic: Transformer
+    unit: float
+    """Radians in one unit of the geographic coordinates."""
+    a: float
+    """Semi-major axis, metres."""
+    e2: float
+    """Squared first eccentricity."""
+
+    def radians(self, XY: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Longitude and latitude in radians of map points (..., 2); NaN where the projection ends."""
+        lon, lat = self.to_geographic.transform(XY[..., 0], XY[..., 1])
+        lon, lat = (np.where(np.isfinite(v), v, np.nan) * self.unit for v in (lon, lat))
+        return lon, lat
+
+    def map(self, lon: NDArray[np.float64], lat: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Map points (..., 2) of longitude and latitude in radians."""
+        X, Y = self.to_geographic.transform(lon / self.unit, lat / self.unit, direction="INVERSE")
+        out = np.stack([np.asarray(X, float), np.asarray(Y, float)], axis=-1)
+        out[~np.isfinite(out)] = np.nan
+        return out
+
+    def geocentric(self, XYZ: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Geocentric coordinates and the ellipsoid's outward normal of map points with height, each (..., 3)."""
+        lon, lat = self.radians(XYZ)
+        sin, cos = np.sin(lat), np.cos(lat)
+        up = np.stack([cos * np.cos(lon), cos * np.sin(lon), sin], axis=-1)
+        N = self.a / np.sqrt(1.0 - self.e2 * sin * sin)
+        xyz = up * (N + XYZ[..., 2])[..., None]
+        xyz[..., 2] -= self.e2 * N * sin
+        return xyz, up
+
+    def from_geocentric(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Map points with ellipsoidal height of geocentric coordinates (..., 3)."""
+        p, z = np.hypot(xyz[..., 0], xyz[..., 1]), xyz[..., 2]
+        b_over_a = math.sqrt(1.0 - self.e2)
+        # Bowring's iteration for the parametric latitude; the third step changes nothing in the last digit.
+        t = z / (p * b_over_a)
+        for _ in range(3):
+            cos = 1.0 / np.sqrt(1.0 + t * t)
+            sin = t * cos
+            tan = (z + self.e2 / b_over_a * self.a * sin**3) / (p - self.e2 * self.a * cos**3)
+            t = b_over_a * tan
+        lat = np.arctan(tan)
+        sin = np.sin(lat)
+        h = p * np.cos(lat) + z * sin - self.a * np.sqrt(1.0 - self.e2 * sin * sin)
+        XY = self.map(np.arctan2(xyz[..., 1], xyz[..., 0]), lat)
+        return np.concatenate([XY, h[..., None]], axis=-1)
+
+
+@lru_cache(maxsize=64)
+def _projection(crs: str) -> _Projection:
+    projected = require_projected_metres(crs)
+    geographic = projected.geodetic_crs
+    ellipsoid = projected.ellipsoid
+    if geographic is None or ellipsoid is None:
+        raise InputError(f"CRS {crs_label(crs)!r} has no ellipsoid; a projected CRS of the earth is needed")
+    # A pyproj Transformer keeps one PROJ object per thread.
+    transformer = Transformer.from_crs(projected, geographic, always_xy=True)
+    flattening = 1.0 / ellipsoid.inverse_flattening if ellipsoid.inverse_flattening else 0.0
+    unit = geographic.axis_info[0].unit_conversion_factor
+    return _Projection(transformer, unit, ellipsoid.semi_major_metre, flattening * (2.0 - flattening))
+
+
+@dataclass(frozen=True)
+class LocalFrame:
+    """East, north, up about a point of a map: the Cartesian system in which central projection is strict.
+
+    Heights are taken as ellipsoidal (Ecker 1991, §4.6.5): a geoid undulation that is constant over the product moves
+    everything together and does no harm; where it is not, heights are converted before. (Z of the map system is
+    measured along the ellipsoid's normal of each point, up of the local system along the origin's.)
+
+    Raises
+    ------
+    InputError
+        The CRS is not a projected one in metres, or the origin lies outside its projection.
+    """
+
+    crs: str
+    """Projected CRS, as pyproj reads it."""
+    origin_XY: tuple[float, float]
+    """Map coordinates of the origin, near the product's middle, metres."""
+    height: float = 0.0
+    """Height of the origin, metres."""
+    _projection: _Projection = field(init=False, repr=False, compare=False)
+    _origin: NDArray[np.float64] = field(init=False, repr=False, compare=False)
+    _R_local_earth: NDArray[np.float64] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        projection = _projection(self.crs)
+        X, Y = (float(v) for v in self.origin_XY)
+        at = np.array([X, Y, float(self.height)])
+        lon, lat = projection.radians(at)
+        if not (np.isfinite(at).all() and np.isfinite([lon, lat]).all()):
+            raise InputError(
+                f"origin X {X}, Y {Y}, height {self.height} has no position in {crs_label(self.crs)}; are the "
+                "coordinates in this CRS?"
+            )
+        s, c, S, C = np.sin(lon), np.cos(lon), np.sin(lat), np.cos(lat)
+        object.__setattr__(self, "origin_XY", (X, Y))
+        object.__setattr__(self, "_projection", projection)
+        object.__setattr__(self, "_origin", projection.geocentric(at)[0])
+        R = np.array([[-s, c, 0.0], [-S * c, -S * s, C], [C * c, C * s, S]])
+        object.__setattr__(self, "_R_local_earth", R)
+
+    def __call__(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """The same as `to_local`."""
+        return self.to_local(XYZ)
+
+    def to_local(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """Map X, Y and height to east, north, up; shapes (..., 3), metres; NaN where the projection ends."""
+        earth, _ = self._projection.geocentric(np.asarray(XYZ, float))
+        return (earth - self._origin) @ self._R_local_earth.T
+
+    def to_map(self, enu: ArrayLike) -> NDArray[np.float64]:
+        """East, north, up to map X, Y and height; inverse of `to_local` (to the rounding of coordinates, 1e-9 m)."""
+        return self._projection.from_geocentric(np.asarray(enu, float) @ self._R_local_earth + self._origin)
+
+    def jacobian(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """∂(east, north, up) / ∂(X, Y, height), shape (..., 3, 3), to 1e-10.
+
+        The last column is the ellipsoid's normal, exactly: heights are straight lines.
+        """
+        XYZ = np.asarray(XYZ, float)
+        step = np.zeros((4, *(1,) * (XYZ.ndim - 1), 3))
+        step[0, ..., 0], step[1, ..., 0], step[2, ..., 1], step[3, ..., 1] = _REACH, -_REACH, _REACH, -_REACH
+        around, _ = self._projection.geocentric(XYZ + step)
+        _, up = self._projection.geocentric(XYZ)
+        J = np.stack([around[0] - around[1], around[2] - around[3], up * (2.0 * _REACH)], axis=-1) / (2.0 * _REACH)
+        return np.asarray(self._R_local_earth @ J, float)
+
+    def axes(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """R_local_map (..., 3, 3): the map's axes at a station — grid east, grid north, height — in the local system.
+
+        Angles of an exterior orientation that refer to the map grid at the station are multiplied from the left by
+        it. It holds the meridian convergence and the tilt of the station's horizon. Grid east is taken at right
+        angles to grid north, which makes no difference in a conformal projection.
+        """
+        J = self.jacobian(XYZ)
+        up = J[..., 2]
+        north = J[..., 1] / np.linalg.norm(J[..., 1], axis=-1, keepdims=True)
+        return np.stack([np.cross(north, up), north, up], axis=-1)
+
+    def convergence(self, XY: ArrayLike) -> NDArray[np.float64]:
+        """Meridian convergence at map points (..., 2), radians: positive where grid north is east of true north."""
+        XY = np.asarray(XY, float)
+        lon, lat = self._projection.radians(XY)
+        at = np.concatenate([XY, np.zeros((*XY.shape[:-1], 1))], axis=-1)
+        grid_north = self.jacobian(at)[..., 1] @ self._R_local_earth
+        sin, cos = np.sin(lon), np.cos(lon)
+        east = grid_north[..., 1] * cos - grid_north[..., 0] * sin
+        away = grid_north[..., 0] * cos + grid_north[..., 1] * sin
+        north = grid_north[..., 2] * np.cos(lat) - away * np.sin(lat)
+        return np.arctan2(east, north)
+
+    def scale(self, XY: ArrayLike) -> NDArray[np.float64]:
+        """Scale of the map at points (..., 2): length in the map over length on the ellipsoid, along grid north."""
+        XY = np.asarray(XY, float)
+        at = np.concatenate([XY, np.zeros((*XY.shape[:-1], 1))], axis=-1)
+        return 1.0 / np.linalg.norm(self.jacobian(at)[..., 1], axis=-1)
+
+
+def earth_radius(crs: str, XY: ArrayLike) -> float:
+    """Mean radius of curvature (Gauss) of the ellipsoid at a map point (2,), metres."""
+    projection = _projection(crs)
+    _, lat = projection.radians(np.asarray(XY, float))
+    return float(projection.a * math.sqrt(1.0 - projection.e2) / (1.0 - projection.e2 * np.sin(lat) ** 2))
+
+
+def altered_height(Z_station: ArrayLike, Z_ground: ArrayLike, map_scale: ArrayLike) -> NDArray[np.float64]:
+    """Height of a projection centre with the *linear alteration* of a block that was computed in map coordinates.
+
+    Such a block treats the map as Cartesian. As horizontal distances carry the scale k of the map, its flying heights
+    above ground carry it too: Zs' = Zg + k (Zs − Zg). Blocks of the French mapping agency are delivered so.
+
+    Parameters
+    ----------
+    Z_station, Z_ground : array_like
+        True height of the projection centre and mean height of the ground below, same height system, metres.
+    map_scale : array_like
+        Scale k of the map at the station (`LocalFrame.scale`).
+    """
+    Zs, Zg = np.asarray(Z_station, float), np.asarray(Z_ground, float)
+    return Zg + np.asarray(map_scale, float) * (Zs - Zg)
+
+
+def unaltered_height(Z_station: ArrayLike, Z_ground: ArrayLike, map_scale: ArrayLike) -> NDArray[np.float64]:
+    """True height of a projection centre that carries the linear alteration; inverse of `altered_height`."""
+    Zs, Zg = np.asarray(Z_station, float), np.asarray(Z_ground, float)
+    return Zg + (Zs - Zg) / np.asarray(map_scale, float)
