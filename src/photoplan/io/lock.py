@@ -72,7 +72,7 @@ class FileLock:
         if self._descriptor is None:
             return
         descriptor, self._descriptor = self._descriptor, None
-        if fcntl:
+        if fcntl and _same_file(descriptor, self._path):
             self._path.unlink(missing_ok=True)
         os.close(descriptor)
 
