@@ -178,6 +178,7 @@ class CrsStep:
         return CrsStep, (self.source, self.target, self.operation, self.accuracy, self.definition)
 
 
+@lru_cache(maxsize=64)
 def crs_step(source: str, target: str, bounds: tuple[float, float, float, float] | None = None) -> CrsStep:
     """Exact step from one horizontal CRS to another.
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 import warnings
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -133,6 +134,7 @@ class HeightStep:
         )
 
 
+@lru_cache(maxsize=64)
 def height_step(
     source: str, target: str, crs: str, bounds: tuple[float, float, float, float] | None = None
 ) -> HeightStep:

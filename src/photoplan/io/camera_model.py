@@ -54,12 +54,15 @@ class NoLens(Entry):
 
 
 class BrownLens(Entry):
-    """Brown's lens: radial k1–k3, decentring p1–p2, affinity b1 and shear b2.
-
-    Coefficients refer to image coordinates divided by the camera constant, y upwards (see the page on conventions).
-    """
+    """Brown's lens: radial k1–k3, decentring p1–p2, affinity b1 and shear b2."""
 
     type: Literal["brown"]
+    unit: Literal["tangent", "mm", "px"] = "tangent"
+    """What the coefficients multiply: image coordinates divided by the camera constant, in millimetres or in pixels."""
+    y_axis: Literal["up", "down"] = "up"
+    """Direction of y where they were determined."""
+    meaning: Literal["distortion", "correction"] = "distortion"
+    """``distortion`` is added to ideal coordinates, ``correction`` to measured ones."""
     k1: Number = 0.0
     k2: Number = 0.0
     k3: Number = 0.0
@@ -121,6 +124,10 @@ class RadialTableLens(Entry):
 Lens = Annotated[NoLens | BrownLens | OpenCVLens | OpenCVFisheyeLens | RadialTableLens, Field(discriminator="type")]
 
 
+def _in_mm(lens: Lens) -> bool:
+    return lens.type == "radial_table" or (lens.type == "brown" and lens.unit == "mm")
+
+
 class FrameCamera(Entry):
     """A digital frame camera: by its focal length in pixels, or by camera constant and pixel or sensor size."""
 
@@ -151,8 +158,8 @@ class FrameCamera(Entry):
             raise ValueError("principal_point_mm goes with camera_constant_mm; with focal_px give principal_point_px")
         if self.principal_point_mm is not None and self.principal_point_px is not None:
             raise ValueError("give either principal_point_px or principal_point_mm")
-        if self.lens.type == "radial_table" and self.lens.radii_mm is not None and self.camera_constant_mm is None:
-            raise ValueError("a radial table against radii_mm needs camera_constant_mm")
+        if self.camera_constant_mm is None and _in_mm(self.lens):
+            raise ValueError("a radial table and a lens in unit mm need camera_constant_mm instead of focal_px")
         return self
 
     @property
@@ -196,6 +203,8 @@ class FilmCamera(Entry):
     principal_point_mm: Pair = (0.0, 0.0)
     """Principal point of the calibration report in the system of the fiducial marks."""
     interior: Literal["affine", "bilinear"] = "affine"
+    mirrored: Annotated[bool, Strict()] = False
+    """Whether the film was scanned through its back, so that left and right are exchanged."""
     size: tuple[Pixels, Pixels] | None = None
     """Width and height of the scans in pixels, where all are equal."""
     lens: Lens = NoLens()
@@ -210,6 +219,8 @@ class FilmCamera(Entry):
 
     @model_validator(mode="after")
     def _enough(self) -> Self:
+        if self.lens.type == "brown" and self.lens.unit == "px":
+            raise ValueError("unit px has no meaning for the lens of a film camera; allowed are tangent and mm")
         needed = {"affine": 3, "bilinear": 4}[self.interior]
         if len(self.fiducials_mm) < needed:
             raise ValueError(f"{len(self.fiducials_mm)} fiducial marks; {self.interior} needs at least {needed}")

@@ -25,9 +25,9 @@ _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+._-]+:")
 def safe_stem(name: str) -> str:
     """File stem for the products of an image called `name`.
 
-    Folders and the last suffix are dropped; letters and digits of any script, ``-``, ``_`` and inner ``.`` stay;
-    everything else becomes ``_``. Reserved device names get a trailing ``_``; stems of more than 120 bytes are cut
-    and end with eight digits of a hash of the whole name, so that they stay different.
+    Folders and the suffix of a raster format are dropped; letters and digits of any script, ``-``, ``_`` and inner
+    ``.`` stay; everything else becomes ``_``. Reserved device names get a trailing ``_``; stems of more than 120 bytes
+    are cut and end with eight digits of a hash of the whole name, so that they stay different.
 
     Raises
     ------
@@ -35,8 +35,7 @@ def safe_stem(name: str) -> str:
         Nothing usable is left of the name.
     """
     text = unicodedata.normalize("NFC", name)
-    last = re.split(r"[/\\]", text)[-1]
-    stem = re.sub(r"(?<=[^.])\.[A-Za-z0-9]{1,5}$", "", last)
+    stem = match_key(name)
     stem = "".join(c if c.isalnum() or c in "-_." else "_" for c in stem).strip(". ").lstrip("-")
     if not any(c.isalnum() for c in stem):
         raise InputError(f"image name {name!r} holds no letter or digit; give the image a name to write products under")

@@ -70,9 +70,9 @@ def read(path: Path, form: TableFormat) -> OrientationTable:
         raise InputError(f"{path}: holds a header and no image")
     width = len(rows[0].fields) if form.columns is not None else len(_split(data[0], delimiter, path).fields)
     images = tuple(_image(row, roles, width, form, path) for row in rows)
-    crs, heights = _sidecar(path)
+    side, crs, heights = _sidecar(path)
     return OrientationTable(
-        path, images, form.angle_unit, form.rotation, form.direction, crs, heights, notes=tuple(notes)
+        path, images, form.angle_unit, form.rotation, form.direction, crs, side, heights, notes=tuple(notes)
     )
 
 
@@ -214,11 +214,11 @@ def _number(row: _Row, role: str, roles: dict[str, int], form: TableFormat, path
     raise InputError(f"{path}:{row.line}: {role} = {text!r} is not a number{hint}")
 
 
-def _sidecar(path: Path) -> tuple[str | None, str | None]:
-    """CRS and height system of the ``.prj`` file beside the table."""
+def _sidecar(path: Path) -> tuple[Path | None, str | None, str | None]:
+    """The ``.prj`` file beside the table, its CRS and height system."""
     side = next((p for p in (path.with_suffix(".prj"), path.with_suffix(".PRJ")) if p.is_file()), None)
     if side is None:
-        return None, None
+        return None, None, None
     text = read_text(side, 100_000).strip()
     parse_crs(text, str(side))
-    return split_compound(text)
+    return side, *split_compound(text)

@@ -83,6 +83,8 @@ class OrientationTable:
     direction: Direction = "camera-to-ground"
     crs: str | None = None
     """Horizontal CRS; None if the file does not state it."""
+    crs_file: Path | None = None
+    """The file that states it, where it is another one."""
     height_system: str | None = None
     """None if the file does not state it."""
     origin: tuple[float, float, float] | None = None
