@@ -24,16 +24,33 @@ def command(folder: Path, resolution: float, quiet: bool) -> None:
     from photoplan.cli import running
     from photoplan.io.project import load_project
     from photoplan.products.check import check_project
-    from photoplan.products.init import init_project
+    from photoplan.products.init import InitRequest, init_project
     from photoplan.products.orthophoto import plan_orthophotos
 
-    how = running.How.plain(quiet)
+    how = running.How.from_options(
+        {"workers": None, "executor": "threads", "memory": None, "overwrite": True, "no_quicklook": False}
+        | {"as_json": False, "quiet": quiet}
+    )
     data = folder / "data"
     with as_file(files("photoplan") / "demo_block") as block:
         shutil.copytree(block, data, dirs_exist_ok=True)
-    project = folder / "project.toml"
     how.talk(
         f"$ photoplan init {folder} --images '{data}/images/*.jpg' --camera {data}/int.yaml "
         f"--orientation {data}/ext.csv --terrain {data}/dsm.tif --height-system same"
     )
-    raise NotImplementedError
+    request = InitRequest(
+        folder,
+        (str(data / "images" / "*.jpg"),),
+        data / "int.yaml",
+        data / "ext.csv",
+        str(data / "dsm.tif"),
+        height_system="same",
+        overwrite=True,
+    )
+    project = init_project(request, lambda line: how.talk(f"  {line}")).path
+    how.talk(f"$ photoplan check {project}")
+    loaded = load_project(project)
+    how.talk(str(check_project(loaded)))
+    how.talk(f"$ photoplan ortho {project} --resolution {resolution:g}")
+    plan = plan_orthophotos(loaded, resolution=resolution)
+    running.execute_and_report(plan, folder / "products", how)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import click
+import psutil
 
 from photoplan.cli.progress import progress
 from photoplan.products.execution import ProductResult, Run, execute
@@ -35,7 +35,7 @@ class How:
     def from_options(cls, options: dict[str, Any]) -> How:
         """Take the options of `executing` out of the options of a verb."""
         return cls(
-            workers=options.pop("workers") or len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+            workers=options.pop("workers") or psutil.cpu_count() or 1,
             executor=options.pop("executor"),
             memory=options.pop("memory"),
             overwrite=options.pop("overwrite"),

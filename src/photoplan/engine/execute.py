@@ -62,7 +62,9 @@ def execute_tile(tile: CompiledTile, reader: Reader, kernel: str) -> Pixels:
     values = np.zeros((source.shape[0], *tile.relief.shape), source.dtype)
     valid = np.zeros(tile.relief.shape, bool)
     if usable is None or usable.any():
-        rectify_tile(anchors, tile.relief, source, usable, _border(anchors.source_window, reader.size), kernel, values, valid)
+        arrays = (anchors.rects, anchors.box_start, anchors.box_heights, anchors.corners)
+        border = _border(anchors.source_window, reader.size)
+        rectify_tile(arrays, tile.relief, source, usable, border, kernel, values, valid)
     if not valid.any():
         return Pixels(None, None, anchors.residual, len(anchors.corners), anchors.source_window)
     return Pixels(values, valid, anchors.residual, len(anchors.corners), anchors.source_window)

@@ -164,9 +164,11 @@ def _fill(
 ) -> None:
     """Submit what may run now: many tasks at once, or one of those that must run alone."""
     while waiting and not alone and len(pending) < in_flight:
-        pending[executor.submit(work, waiting[0])] = waiting.popleft()
+        future = executor.submit(work, waiting[0])
+        pending[future] = waiting.popleft()
     if alone and not pending:
-        pending[executor.submit(work, alone[0])] = alone.popleft()
+        future = executor.submit(work, alone[0])
+        pending[future] = alone.popleft()
 
 
 def _lost(lost: list[Any], alone: deque[Any], failures: dict[Any, int]) -> Iterator[Outcome]:

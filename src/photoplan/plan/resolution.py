@@ -101,8 +101,8 @@ def admissible_shift(displacement: ArrayLike, scale_number: ArrayLike) -> NDArra
 def displacement_by_tilt(angle: ArrayLike, c: ArrayLike, w: ArrayLike) -> NDArray[np.float64]:
     """Displacement by an error in ω or φ: c √(2w⁴ + 2w² + 1) Δω (Ecker 1991, eq. 4.27, 4.28).
 
-    `w` is the tangent of the field angle along either axis at an image corner, X / Z = Y / Z there (0.733 for wide-angle
-    film); at the principal point it is 0.
+    `w` is the tangent of the field angle along either axis at an image corner, X / Z = Y / Z there (0.733 for
+    wide-angle film); at the principal point it is 0.
     """
     w2 = np.asarray(w, float) ** 2
     return np.asarray(c, float) * np.sqrt(2.0 * w2 * w2 + 2.0 * w2 + 1.0) * np.asarray(angle, float)

@@ -16,8 +16,9 @@ from photoplan.engine.executors import executor_factory, run_tiles
 from photoplan.errors import TilesFailed, UsageError
 from photoplan.io.product import ProductFile
 from photoplan.io.quicklook import write_overview
-from photoplan.io.run_record import peak_memory, versions, write_run_record
-from photoplan.plan.product import ProductPlan, Tile
+from photoplan.io.run_record import peak_memory_bytes, record_path, versions, write_run_record
+from photoplan.plan.anchors import Anchors
+from photoplan.plan.product import ProductPlan, Tile, compile_tile
 from photoplan.products.orthophoto import OrthoPlan, OrthoProduct, render_tile
 from photoplan.products.scene import Scene, SceneAddress, open_scene
 
@@ -148,9 +149,10 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     folder = Path(output)
     _refuse_existing(plan, folder, run)
     in_flight = run.in_flight
+    folder.mkdir(parents=True, exist_ok=True)
     results = [_make(plan, product, folder, run, in_flight) for product in plan.products]
     if run.quicklook:
-        write_overview(folder / "overview.png", [r.path for r in results if not r.failed])
+        write_overview([r.path for r in results if not r.failed], folder / "overview.png")
     failed = [f"{r.path.name}: tiles {', '.join(map(str, r.failed))}" for r in results if r.failed]
     if failed:
         raise TilesFailed("finished, but these products lack tiles and were not written:\n  " + "\n  ".join(failed))
@@ -179,17 +181,22 @@ def _make(plan: OrthoPlan, product: OrthoProduct, folder: Path, run: Run, in_fli
         scene.reader.bands,
         scene.reader.dtype,
         run_key=product.key,
-        nodata=settings.nodata,
+        nodata=settings.nodata_value,
         compress=settings.compress,
         overviews=settings.overviews,
         tile=settings.tile,
         overwrite=run.overwrite,
         inputs=scene.files,
+        threads=run.workers,
     ) as file:
         finished = file.finished
         todo = [tile for tile in product.plan.tiles if tile.index not in finished]
-        tally.resumed = len(product.plan.tiles) - len(todo)
-        run.progress(tally.resumed, 0)
+        for tile in product.plan.tiles:
+            if tile.index in finished:
+                tally.again(compile_tile(product.plan, tile.window, scene.camera, scene.surface).anchors)
+        if tally.resumed:
+            run.talk(f"{product.plan.name}: {tally.resumed} of {len(product.plan.tiles)} tiles are finished already")
+            run.progress(tally.resumed, 0)
         for outcome in run_tiles(todo, partial(_work, job), executor_factory(run.executor, run.workers), in_flight):
             tile: Tile = outcome.task
             if outcome.error is not None:
@@ -203,27 +210,27 @@ def _make(plan: OrthoPlan, product: OrthoProduct, folder: Path, run: Run, in_fli
                     file.append(tile.index, pixels.values, pixels.valid)
                 tally.add(pixels)
             run.progress(1, tile.window.size)
-        if not tally.failed:
-            file.complete(_tags(plan, product))
+        # Tiles that the plan leaves out hold nothing of the image: they stay empty.
+        facts = None if tally.failed else file.complete(_tags(plan, product), allow_missing=True)
     result = ProductResult(
         _path(folder, product),
         product.plan.image,
         time.perf_counter() - started,
-        tally.valid / (product.grid.width * product.grid.height),
+        0.0 if facts is None else facts.valid_share,
         tally.residual,
         tally.cells,
         product.plan.tile_count,
         tally.resumed,
         tuple(sorted(tally.failed)),
     )
-    if not tally.failed:
-        write_run_record(result.path, _record(plan, product, scene, run, result))
+    if facts is not None:
+        record = _record(plan, product, scene, run, result)
+        write_run_record(record_path(result.path), {**record, "values_moved_off_nodata": facts.moved_values, "bytes": facts.bytes})
     return result
 
 
 @dataclass
 class _Tally:
-    valid: int = 0
     residual: float = 0.0
     cells: int = 0
     resumed: int = 0
@@ -231,9 +238,15 @@ class _Tally:
     reasons: list[str] = field(default_factory=list)
 
     def add(self, pixels: Pixels) -> None:
-        self.valid += pixels.valid_count
         self.residual = max(self.residual, pixels.residual)
         self.cells += pixels.cells
+
+    def again(self, anchors: Anchors | None) -> None:
+        """Count a tile that an earlier run has finished."""
+        self.resumed += 1
+        if anchors is not None:
+            self.residual = max(self.residual, anchors.residual)
+            self.cells += len(anchors.corners)
 
 
 def _tags(plan: OrthoPlan, product: OrthoProduct) -> dict[str, str]:
@@ -278,5 +291,5 @@ def _record(plan: OrthoPlan, product: OrthoProduct, scene: Scene, run: Run, resu
         "first_cell_px": product.plan.rule.cell,
         "run": {"workers": run.workers, "executor": run.executor, "memory": run.memory},
         "versions": versions(),
-        "peak_memory_bytes": peak_memory(),
+        "peak_memory_bytes": peak_memory_bytes(),
     }

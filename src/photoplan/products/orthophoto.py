@@ -5,11 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,11 +14,12 @@ from numpy.typing import NDArray
 
 from photoplan import __version__
 from photoplan.cameras.base import Camera
-from photoplan.engine.execute import Pixels, render as render_window
+from photoplan.engine.execute import Pixels
+from photoplan.engine.execute import render as render_window
 from photoplan.errors import GeometryError, UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.names import safe_stem
-from photoplan.io.project import Project
+from photoplan.io.project_model import Project
 from photoplan.kernels.weights import KERNELS
 from photoplan.plan.compile import AnchorRule, initial_cell
 from photoplan.plan.coverage import Coverage, cover, covered_tiles
@@ -30,7 +28,17 @@ from photoplan.products.scene import Scene, open_scene
 from photoplan.products.settings import OrthoSettings
 from photoplan.targets.map import MapTarget
 
-__all__ = ["OrthoPlan", "OrthoProduct", "plan_orthophotos", "render"]
+__all__ = [
+    "OrthoPlan",
+    "OrthoProduct",
+    "mean_gsd",
+    "plan_orthophotos",
+    "project_settings",
+    "render",
+    "render_tile",
+    "two_figures",
+    "window_of",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +124,7 @@ def plan_orthophotos(
             blind.append(_nothing_seen(scene, name))
         else:
             looks.append((name, scene, coverage, mean_gsd(scene.camera, coverage)))
-    resolution = chosen.resolution or (_two_figures(float(np.mean([look[3] for look in looks]))) if looks else 1.0)
+    resolution = chosen.resolution or (two_figures(float(np.mean([look[3] for look in looks]))) if looks else 1.0)
     products = []
     for name, scene, coverage, gsd in looks:
         plan = _plan_one(project, scene, name, coverage, replace(chosen, resolution=resolution))
@@ -184,7 +192,8 @@ def mean_gsd(camera: Camera, coverage: Coverage) -> float:
     return float(np.nanmean(1 / np.sqrt(area)))
 
 
-def _two_figures(value: float) -> float:
+def two_figures(value: float) -> float:
+    """A positive number rounded to two significant figures."""
     digits = 1 - math.floor(math.log10(value))
     return round(value, digits)
 

@@ -22,7 +22,8 @@ from photoplan.io.fingerprint import fingerprint
 from photoplan.io.names import resolve_input
 from photoplan.io.project import parse_project
 from photoplan.io.project_cameras import interior_of, lens_of
-from photoplan.io.project_model import ANGLE_UNITS, Image, Project, Terrain
+from photoplan.io.orientation_table import angle_in_radians
+from photoplan.io.project_model import Image, Project, Terrain
 from photoplan.io.raster import RasterReader
 from photoplan.io.terrain_reader import TerrainReader
 from photoplan.plan.coverage import image_border
@@ -240,7 +241,7 @@ class _Undulation:
 def pose_of(project: Project, image: Image, ground: Ground) -> Pose:
     """Exterior orientation of an image, in the height system that the ground has."""
     orientation = project.orientation
-    angles = np.array(image.angles) * (2 * np.pi / ANGLE_UNITS[orientation.angle_unit])
+    angles = angle_in_radians(np.array(image.angles), orientation.angle_unit)
     center = np.array(image.center, float)
     center[2] = height_step(ground.height_systems[1], ground.working_system, project.crs)(center)
     return Pose(center, rotation_from_angles(angles, orientation.rotation))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 from photoplan.errors import UsageError
 from photoplan.products.choices import Compression, Kernel
@@ -26,7 +26,7 @@ class OrthoSettings:
     tile: int = 512
     """Side of a tile, pixels; a multiple of 16."""
     nodata: str = "auto"
-    """A number, ``mask`` (an internal mask band), or ``auto``: 0 for integers, NaN for floats."""
+    """A number, ``mask`` (an internal mask band), or ``auto``: 0 for unsigned integers, −32768 for int16, NaN for floats."""
     compress: Compression = "deflate"
     """Compression of the file; jpeg needs ``nodata = "mask"`` and sets it."""
     overviews: bool = True
@@ -50,6 +50,11 @@ class OrthoSettings:
                 float(self.nodata)
             except ValueError:
                 raise UsageError(f"nodata {self.nodata!r}; allowed are auto, mask or a number") from None
+
+    @property
+    def nodata_value(self) -> float | Literal["auto", "mask"]:
+        """`nodata` as the product's writer takes it."""
+        return self.nodata if self.nodata in ("auto", "mask") else float(self.nodata)  # type: ignore[return-value]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for plan and run record."""

@@ -1,0 +1,116 @@
+"""Plans as GeoPackages: tile footprints and image footprints to look at in any GIS, and what is needed to execute."""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyogrio.raw
+import shapely
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError, UsageError
+
+__all__ = ["PlanTables", "read_plan_tables", "write_plan_tables"]
+
+FORMAT = 1
+_HEADER = "photoplan_plan"
+
+
+@dataclass(frozen=True, eq=False)
+class PlanTables:
+    """A plan as plain tables."""
+
+    header: dict[str, Any]
+    """Settings, products, inputs with fingerprints: all that executing needs; JSON values only."""
+    tiles: dict[str, NDArray[Any]]
+    """Columns of the layer `tiles`: product, image, index, col, row, width, height, cells, residual, source_*."""
+    tile_bounds: NDArray[np.float64]
+    """Outer edges of each tile, shape (n, 4), in the product's CRS."""
+    footprints: dict[str, NDArray[Any]]
+    """Columns of the layer `footprints`: image, product, columns, rows, resolution."""
+    outlines: list[NDArray[np.float64]]
+    """Footprint of each image, shape (k, 2), in the product's CRS."""
+    crs: str
+    """CRS of both layers."""
+
+
+def write_plan_tables(path: Path, plan: PlanTables, overwrite: bool = False) -> None:
+    """Write a plan; it appears under its name only when complete.
+
+    Raises
+    ------
+    UsageError
+        The file exists and `overwrite` is False.
+    """
+    if path.exists() and not overwrite:
+        raise UsageError(f"{path} exists; give --overwrite to replace it")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.stem}.partial.gpkg")
+    partial.unlink(missing_ok=True)
+    try:
+        _write_layer(partial, "tiles", shapely.box(*plan.tile_bounds.T), plan.tiles, plan.crs, "Polygon")
+        outlines = np.array([shapely.Polygon(o) for o in plan.outlines], object)
+        _write_layer(partial, "footprints", outlines, plan.footprints, plan.crs, "Polygon", append=True)
+        # A table of its own that GIS programs leave alone; GeoPackage is SQLite and allows it as an attribute table.
+        with sqlite3.connect(partial) as db:
+            db.execute(f"CREATE TABLE {_HEADER} (id INTEGER PRIMARY KEY, format INTEGER NOT NULL, content TEXT NOT NULL)")
+            db.execute(f"INSERT INTO {_HEADER} (format, content) VALUES (?, ?)", (FORMAT, json.dumps(plan.header)))
+            db.execute(
+                "INSERT INTO gpkg_contents (table_name, data_type, identifier, description) "
+                "VALUES (?, 'attributes', ?, 'what photoplan needs to execute this plan')",
+                (_HEADER, _HEADER),
+            )
+        db.close()
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _write_layer(
+    path: Path,
+    layer: str,
+    geometry: NDArray[Any],
+    columns: dict[str, NDArray[Any]],
+    crs: str,
+    kind: str,
+    append: bool = False,
+) -> None:
+    pyogrio.raw.write(
+        str(path),
+        geometry=shapely.to_wkb(geometry),
+        field_data=list(columns.values()),
+        fields=list(columns),
+        layer=layer,
+        driver="GPKG",
+        geometry_type=kind,
+        crs=crs,
+        append=append,
+    )
+
+
+def read_plan_tables(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Header and tile columns of a plan.
+
+    Raises
+    ------
+    InputError
+        The file is missing or no plan of this format.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such plan")
+    try:
+        with sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True) as db:
+            row = db.execute(f"SELECT format, content FROM {_HEADER}").fetchone()
+        db.close()
+    except sqlite3.Error as error:
+        raise InputError(f"{path}: not a plan of photoplan ({error}); make one with `photoplan ortho --plan`") from error
+    if row is None or row[0] != FORMAT:
+        raise InputError(f"{path}: plan format {row and row[0]}; this version reads {FORMAT}: make the plan again")
+    meta, _, _, values = pyogrio.raw.read(str(path), layer="tiles", read_geometry=False)
+    return json.loads(row[1]), dict(zip(meta["fields"], values))

@@ -1,0 +1,108 @@
+"""The engine against its slow exact twin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+from tools.arrays import ArrayReader, noise, product
+from tools.pinhole import Pinhole
+
+from photoplan.engine.execute import render
+from photoplan.engine.twin import strict_positions, strict_scales, twin_resample
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.geometry.pose import Pose
+from photoplan.surfaces.level import LevelSurface
+from photoplan.targets.map import MapTarget
+
+KERNELS = ["nearest", "bilinear", "bicubic", "bicubic-1", "lanczos3"]
+SIZE = (90, 70)
+
+
+def camera(kappa: float, tilt: float = 0.05, k1: float = 0.0) -> Pinhole:
+    """A small camera 100 m above level ground: one pixel is 1 m there."""
+    return Pinhole(Pose.from_angles((0, 0, 100), (tilt, -tilt / 2, kappa)), 100.0, SIZE, k1)
+
+
+def both(cam: Pinhole, resolution: float, kernel: str, reader: ArrayReader, half: int = 24):  # type: ignore[no-untyped-def]
+    grid = MapGrid.covering((-half * resolution, -half * resolution, half * resolution, half * resolution), resolution, "EPSG:32615")
+    surface = LevelSurface(0.0)
+    plan = product(grid)
+    got = render(plan, grid.window, cam, surface, reader, kernel)
+    xy, uvh = strict_positions(MapTarget(grid), grid.window, cam, surface)
+    want, good = twin_resample(reader.image, reader.valid, xy, kernel, strict_scales(MapTarget(grid), cam, uvh))
+    return got, want, good
+
+
+def compare(got, want, good, dtype: str, slack: float) -> None:  # type: ignore[no-untyped-def]
+    if dtype != "float32":
+        limits = np.iinfo(dtype)
+        want = np.clip(want, limits.min, limits.max)
+    valid = np.zeros(good.shape, bool) if got.valid is None else got.valid
+    # Positions differ by up to 1e-4 px: on the very edge of validity the two may decide differently, seldom.
+    assert np.count_nonzero(valid != good) <= 3
+    common = valid & good
+    if got.values is not None:
+        assert np.abs(got.values.astype(float) - want)[:, common].max(initial=0) <= slack
+        assert (got.values[:, ~valid] == 0).all()
+
+
+@settings(max_examples=25, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
+@given(
+    kappa=st.floats(-3.1, 3.1),
+    tilt=st.floats(-0.15, 0.15),
+    kernel=st.sampled_from(KERNELS[1:]),
+    dtype=st.sampled_from(["uint8", "uint16", "int16", "float32"]),
+    bands=st.sampled_from([1, 2, 3, 4, 5]),
+    resolution=st.sampled_from([0.5, 0.9, 1.2, 2.0, 5.0]),
+    holes=st.booleans(),
+    seed=st.integers(0, 5),
+)
+def test_every_pixel_as_the_twin_says(
+    kappa: float, tilt: float, kernel: str, dtype: str, bands: int, resolution: float, holes: bool, seed: int
+) -> None:
+    image = noise(bands, SIZE[1], SIZE[0], dtype, seed)
+    valid = np.random.default_rng(seed).random((SIZE[1], SIZE[0])) > 0.1 if holes else None
+    got, want, good = both(camera(kappa, tilt), resolution, kernel, ArrayReader(image, valid))
+    # Rounding, plus what a position error of 1e-3 px makes of full-range noise.
+    spread = 4.0 if dtype == "float32" else float(np.iinfo(dtype).max) - np.iinfo(dtype).min
+    compare(got, want, good, dtype, 0.501 * (dtype != "float32") + 4e-3 * spread)
+
+
+@pytest.mark.parametrize("kappa", [0.0, 0.7, 2.9])
+def test_nearest_takes_the_same_pixel(kappa: float) -> None:
+    got, want, good = both(camera(kappa), 0.8, "nearest", ArrayReader(noise(3, SIZE[1], SIZE[0], "uint16")))
+    # At a border between two pixels either is the nearest.
+    assert np.mean((got.values != want).any(axis=0) & got.valid & good) < 1e-3
+
+
+@pytest.mark.parametrize("resolution", [0.5, 3.0])
+def test_distorted_lens_stays_within_its_tolerance(resolution: float) -> None:
+    """A ramp in x turns a position into a grey value: the image of the engine's own position error."""
+    ramp = np.broadcast_to(np.arange(SIZE[0], dtype=np.float32), (SIZE[1], SIZE[0]))[None].copy()
+    got, want, good = both(camera(0.4, k1=-0.2), resolution, "bilinear", ArrayReader(ramp), half=12)
+    assert got.residual <= 0.02
+    common = got.valid & good
+    assert common.sum() > 200
+    assert np.abs(got.values[0] - want[0])[common].max() <= 0.02
+
+
+def test_a_tile_with_too_large_a_source_is_cut_and_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    reader = ArrayReader(noise(3, 600, 800, "uint8"))
+    cam = Pinhole(Pose.from_angles((0, 0, 100), (0.02, 0.01, 0.3)), 400.0, (800, 600))
+    grid = MapGrid.covering((-80, -60, 80, 60), 0.4, "EPSG:32615")
+    whole = render(product(grid), grid.window, cam, LevelSurface(0.0), reader, "bicubic")
+    monkeypatch.setattr("photoplan.engine.execute.MOST_SOURCE_BYTES", 100_000)
+    parts = render(product(grid), grid.window, cam, LevelSurface(0.0), reader, "bicubic")
+    assert whole.valid is not None and parts.valid is not None and parts.values is not None
+    assert np.count_nonzero(whole.valid != parts.valid) <= 3
+    assert np.abs(whole.values.astype(int) - parts.values.astype(int)).max() <= 1
+    assert parts.source_window == whole.source_window
+
+
+def test_a_window_beside_the_image_holds_nothing() -> None:
+    reader = ArrayReader(noise(1, SIZE[1], SIZE[0], "uint8"))
+    grid = MapGrid.covering((1000, 1000, 1100, 1100), 1.0, "EPSG:32615")
+    nothing = render(product(grid), Window(0, 0, 64, 64), camera(0.0), LevelSurface(0.0), reader, "bicubic")
+    assert nothing.values is None and nothing.valid is None and nothing.valid_count == 0
