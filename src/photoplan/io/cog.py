@@ -26,7 +26,7 @@ class CogOptions:
     overviews: bool = True
     """Reduced copies inside the file, by averaging."""
     tile: int = 512
-    """Side of the blocks in pixels; a multiple of 16."""
+    """Side of the blocks in pixels; a multiple of 16, at least 128."""
     quality: int = 90
     """Quality of JPEG, 1 to 100."""
     level: int = 6
@@ -37,8 +37,8 @@ class CogOptions:
     def __post_init__(self) -> None:
         if self.compress not in COMPRESSIONS:
             raise UsageError(f"compression {self.compress!r}; allowed are {', '.join(COMPRESSIONS)}")
-        if self.tile < 16 or self.tile % 16 or self.tile > 4096:
-            raise UsageError(f"blocks of {self.tile} pixels; a multiple of 16 from 16 to 4096 is needed")
+        if self.tile < 128 or self.tile % 16 or self.tile > 4096:
+            raise UsageError(f"blocks of {self.tile} pixels; a multiple of 16 from 128 to 4096 is needed")
         if not (1 <= self.quality <= 100 and 1 <= self.level <= 9 and self.threads >= 1):
             raise UsageError(f"quality {self.quality}, level {self.level}, threads {self.threads}; see CogOptions")
 

@@ -13,11 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import rasterio
+from rasterio._err import CPLE_BaseError
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from photoplan.errors import InputError
 
 __all__ = [
+    "GDAL_ERRORS",
     "close_handles",
     "first_cause",
     "gdal_settings",
@@ -29,6 +31,8 @@ __all__ = [
 
 CACHE_BYTES = 64 << 20
 """GDAL's block cache of the whole process; its default of a twentieth of the memory is not bounded enough."""
+GDAL_ERRORS = (RasterioError, CPLE_BaseError)
+"""What may come out of a call of rasterio: its own errors, and GDAL's where it does not translate them."""
 _HANDLES_PER_THREAD = 4
 _DAMAGE = re.compile(r"corrupt|premature|truncat|too short|not enough data|invalid|bad huffman|crc|checksum", re.I)
 _open_lock = threading.Lock()
@@ -116,7 +120,7 @@ def open_raster(path: Path, driver: str | None) -> Any:
     try:
         with not_georeferenced(), gdal_settings():
             return rasterio.open(path, driver=driver, sharing=False)
-    except (RasterioError, OSError, ValueError) as error:
+    except (*GDAL_ERRORS, OSError, ValueError) as error:
         raise InputError(
             f"{path}: cannot be opened ({first_cause(error)}); the file is damaged or cut off, get a fresh copy"
         ) from error

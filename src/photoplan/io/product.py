@@ -13,13 +13,12 @@ import numpy as np
 import rasterio.crs
 import rasterio.transform
 from numpy.typing import ArrayLike, NDArray
-from rasterio.errors import RasterioError
 
 from photoplan.errors import PhotoplanError, ResourceError, UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.cog import CogOptions, write_cog
 from photoplan.io.disk import disk_error, free_megabytes, sync_file, sync_folder
-from photoplan.io.gdal import first_cause
+from photoplan.io.gdal import GDAL_ERRORS, first_cause
 from photoplan.io.lock import FileLock
 from photoplan.io.plain_tiff import write_plain_tiff
 from photoplan.io.product_check import check_product
@@ -110,7 +109,7 @@ class ProductFile:
     overviews: bool = True
     """Reduced copies inside the file."""
     tile: int = 512
-    """Side of tiles and blocks, pixels."""
+    """Side of tiles and blocks, pixels; a multiple of 16, at least 128."""
     overwrite: bool = False
     """Replace an output that exists."""
     inputs: Sequence[Path | str] = ()
@@ -235,7 +234,7 @@ class ProductFile:
                 self._remove_parts()
         except OSError as error:
             raise disk_error(self.path, error) from error
-        except (RasterioError, MemoryError) as error:
+        except (*GDAL_ERRORS, MemoryError) as error:
             raise self._unwritten(first_cause(error)) from error
         except UsageError:
             raise
@@ -258,8 +257,7 @@ class ProductFile:
     def _remove_parts(self) -> None:
         """Remove what this product's runs may have left: GDAL makes files beside its output."""
         for kind in ("plain", "part"):
-            stem = self._part(kind).name
-            for left in self.path.parent.glob(f"{_escaped(stem)}*"):
+            for left in self.path.parent.glob(f"{_escaped(self._part(kind).stem)}*"):
                 left.unlink(missing_ok=True)
 
     def _profile(self) -> dict[str, Any]:
@@ -268,7 +266,7 @@ class ProductFile:
         blocks = len(self._windows) * (self._coder.pixel_bytes + self._coder.mask_bytes)
         try:
             crs = rasterio.crs.CRS.from_user_input(grid.crs) if grid.crs else None
-        except RasterioError as error:
+        except GDAL_ERRORS as error:
             raise UsageError(f"{self.path}: the reference system {grid.crs!r} is not understood ({error})") from error
         return {
             "width": grid.width,

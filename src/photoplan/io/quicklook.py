@@ -12,12 +12,11 @@ import numpy as np
 import rasterio
 import rasterio.enums
 from numpy.typing import NDArray
-from rasterio.errors import RasterioError
 
 from photoplan.errors import InputError, UsageError
 from photoplan.io.checks import check_plain_file, raster_driver
 from photoplan.io.disk import write_atomically
-from photoplan.io.gdal import first_cause, gdal_settings, not_georeferenced, open_raster
+from photoplan.io.gdal import GDAL_ERRORS, first_cause, gdal_settings, not_georeferenced, open_raster
 
 __all__ = ["write_overview", "write_quicklook"]
 
@@ -126,7 +125,7 @@ def _look(path: Path, dataset: Any, width: int, height: int) -> NDArray[np.uint8
     try:
         pixels = dataset.read(sorted(set(indexes)), **how)
         valid = (dataset.read_masks(sorted(set(indexes)), **how) > 0).any(axis=0)
-    except (RasterioError, OSError) as error:
+    except (*GDAL_ERRORS, OSError) as error:
         raise InputError(f"{path}: cannot be read for a quick look ({first_cause(error)})") from error
     if pixels.dtype != np.uint8:
         pixels = _stretched(pixels, valid)

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import rasterio.windows
 from numpy.typing import NDArray
-from rasterio.errors import RasterioError
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io.checks import DRIVER_NAMES, IMAGE_LIMITS, RasterLimits
-from photoplan.io.gdal import all_causes, damage_in, gdal_settings, handle, warnings_of_gdal
+from photoplan.io.gdal import GDAL_ERRORS, all_causes, damage_in, gdal_settings, handle, warnings_of_gdal
 from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.tiff_layout import read_tiff_layout
 from photoplan.io.validity import MissingBlocks, finite, not_nodata
@@ -133,7 +132,7 @@ def read_pixels(
             if info.has_mask:
                 band = "mask"
                 valid = _both(valid, (dataset.read_masks(window=area) > 0).all(axis=0))
-    except (RasterioError, OSError, MemoryError) as error:
+    except (*GDAL_ERRORS, OSError, MemoryError) as error:
         raise _damaged(info.path, window, band, all_causes(error)) from error
     damage = damage_in(found)
     if damage:
