@@ -19,6 +19,7 @@ myst_heading_anchors = 3
 
 napoleon_numpy_docstring = True
 napoleon_google_docstring = False
+napoleon_use_param = False
 napoleon_use_rtype = False
 napoleon_preprocess_types = False
 autodoc_member_order = "bysource"

@@ -16,7 +16,8 @@ SNIPPETS = [
 
 
 @pytest.mark.parametrize(("code", "printed"), SNIPPETS)
-def test_snippet_runs(code, printed, capsys):
+def test_snippet_runs(code, printed, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     exec(compile(code, "snippet", "exec"), {"__name__": "snippet"})
     if printed:
         assert capsys.readouterr().out.rstrip() == printed.rstrip()
