@@ -21,12 +21,14 @@ SIZE = (90, 70)
 
 
 def camera(kappa: float, tilt: float = 0.05, k1: float = 0.0) -> Pinhole:
-    """A small camera 100 m above level ground: one pixel is 1 m there."""
-    return Pinhole(Pose.from_angles((0, 0, 100), (tilt, -tilt / 2, kappa)), 100.0, SIZE, k1)
+    """A small camera 100 m above level ground: a pixel is about 1 m there, and no position is on a round number."""
+    return Pinhole(Pose.from_angles((0.123, 0.377, 100), (tilt, -tilt / 2, kappa)), 101.3, SIZE, k1)
 
 
 def both(cam: Pinhole, resolution: float, kernel: str, reader: ArrayReader, half: int = 24):  # type: ignore[no-untyped-def]
-    grid = MapGrid.covering((-half * resolution, -half * resolution, half * resolution, half * resolution), resolution, "EPSG:32615")
+    grid = MapGrid.covering(
+        (-half * resolution, -half * resolution, half * resolution, half * resolution), resolution, "EPSG:32615"
+    )
     surface = LevelSurface(0.0)
     plan = product(grid)
     got = render(plan, grid.window, cam, surface, reader, kernel)

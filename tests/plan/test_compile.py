@@ -97,7 +97,9 @@ def test_residual_falls_with_the_square_of_the_cell() -> None:
     loose = AnchorRule(1e3, 2, 256)
     misses = []
     for cell in (128, 64, 32, 16):
-        anchors = compile_anchors(camera, TARGET, Window(6500, 4000, 256, 256), relief, dataclasses.replace(loose, cell=cell))
+        anchors = compile_anchors(
+            camera, TARGET, Window(6500, 4000, 256, 256), relief, dataclasses.replace(loose, cell=cell)
+        )
         assert anchors is not None
         misses.append(anchors.residual)
     orders = np.log2(np.array(misses[:-1]) / misses[1:])

@@ -31,9 +31,7 @@ class Pinhole:
             bend = 1 + self.k1 * (x * x + y * y) if self.k1 else 1.0
         col = (self.size[0] - 1) / 2
         row = (self.size[1] - 1) / 2
-        return np.stack(
-            [self.focal * c[..., 0] * bend + col * w, -self.focal * c[..., 1] * bend + row * w, w], axis=-1
-        )
+        return np.stack([self.focal * c[..., 0] * bend + col * w, -self.focal * c[..., 1] * bend + row * w, w], axis=-1)
 
     def rays(self, xy: ArrayLike, height: float | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         assert not self.k1

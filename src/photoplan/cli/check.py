@@ -31,4 +31,6 @@ def command(project: Path, images: tuple[str, ...], as_json: bool) -> None:
     else:
         click.echo(str(found))
     if found.implausible:
-        raise GeometryError(f"{len(found.implausible)} of {len(found.images)} images are implausible: {found.implausible[0]}")
+        raise GeometryError(
+            f"{len(found.implausible)} of {len(found.images)} images are implausible: {found.implausible[0]}"
+        )

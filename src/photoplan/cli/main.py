@@ -36,7 +36,7 @@ class _Lazy(click.Group):
         if cmd_name not in VERBS:
             return None
         module = importlib.import_module(f"photoplan.cli.{cmd_name}")
-        return module.command  # type: ignore[no-any-return]
+        return module.command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Verbs"):

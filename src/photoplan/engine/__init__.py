@@ -1,0 +1,1 @@
+"""Tiles executed: the only place where pixels are resampled."""

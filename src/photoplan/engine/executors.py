@@ -93,7 +93,7 @@ def _dask_executor(address: str) -> Executor:
         client.get_versions(check=True)
     except (OSError, TimeoutError, ValueError) as error:
         raise UsageError(f"executor {address}: no usable Dask scheduler ({error})") from error
-    return client.get_executor(retries=RETRIES)  # type: ignore[no-any-return]
+    return client.get_executor(retries=RETRIES)
 
 
 def run_tiles(

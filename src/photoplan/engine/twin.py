@@ -39,9 +39,10 @@ def strict_positions(
 
 def strict_scales(target: Target, camera: Camera, uvh: NDArray[np.float64]) -> NDArray[np.float64]:
     """Source pixels per target pixel along x and y at constant h, by central differences; shape (..., 2)."""
-    du = project(camera, target.to_ground(uvh + (0.5, 0, 0))) - project(camera, target.to_ground(uvh - (0.5, 0, 0)))
-    dv = project(camera, target.to_ground(uvh + (0, 0.5, 0))) - project(camera, target.to_ground(uvh - (0, 0.5, 0)))
-    return np.hypot(du, dv)  # type: ignore[no-any-return]
+    step_u, step_v = np.array([0.5, 0, 0]), np.array([0, 0.5, 0])
+    du = project(camera, target.to_ground(uvh + step_u)) - project(camera, target.to_ground(uvh - step_u))
+    dv = project(camera, target.to_ground(uvh + step_v)) - project(camera, target.to_ground(uvh - step_v))
+    return np.hypot(du, dv)
 
 
 def twin_resample(

@@ -1,0 +1,1 @@
+"""Rotations, poses, grids, reference systems and height systems."""

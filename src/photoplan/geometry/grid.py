@@ -95,9 +95,7 @@ class MapGrid:
         col1 = math.ceil(xmax / resolution - 1e-6)
         row0 = math.floor(-ymax / resolution + 1e-6)
         row1 = math.ceil(-ymin / resolution - 1e-6)
-        return cls(
-            col0 * resolution, -row0 * resolution, resolution, max(1, col1 - col0), max(1, row1 - row0), crs
-        )
+        return cls(col0 * resolution, -row0 * resolution, resolution, max(1, col1 - col0), max(1, row1 - row0), crs)
 
     @property
     def window(self) -> Window:

@@ -61,8 +61,10 @@ def opk_from_rotation(R_ground_camera: ArrayLike) -> NDArray[np.float64]:
     At φ = ±π/2 only one combination of ω and κ is determined; ω is then 0.
     """
     R = np.asarray(R_ground_camera, float)
-    phi = np.arcsin(np.clip(R[0, 2], -1.0, 1.0))
-    if np.hypot(R[0, 0], R[0, 1]) < 1e-12:
+    # The arc sine would lose half the digits near ±π/2.
+    cos_phi = np.hypot(R[0, 0], R[0, 1])
+    phi = np.arctan2(R[0, 2], cos_phi)
+    if cos_phi < 1e-12:
         return np.array([0.0, phi, np.arctan2(R[1, 0], R[1, 1])])
     return np.array([np.arctan2(-R[1, 2], R[2, 2]), phi, np.arctan2(-R[0, 1], R[0, 0])])
 
@@ -81,4 +83,4 @@ def angles_from_rotation(R_ground_camera: ArrayLike, order: str = "opk") -> NDAr
     axes = [_AXIS[k] for k in order]
     P = np.eye(3)[axes]
     sign = np.linalg.det(P)
-    return sign * opk_from_rotation(P @ np.asarray(R_ground_camera, float) @ P.T)  # type: ignore[no-any-return]
+    return sign * opk_from_rotation(P @ np.asarray(R_ground_camera, float) @ P.T)

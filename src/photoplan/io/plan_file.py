@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sqlite3
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,7 +58,9 @@ def write_plan_tables(path: Path, plan: PlanTables, overwrite: bool = False) -> 
         _write_layer(partial, "footprints", outlines, plan.footprints, plan.crs, "Polygon", append=True)
         # A table of its own that GIS programs leave alone; GeoPackage is SQLite and allows it as an attribute table.
         with sqlite3.connect(partial) as db:
-            db.execute(f"CREATE TABLE {_HEADER} (id INTEGER PRIMARY KEY, format INTEGER NOT NULL, content TEXT NOT NULL)")
+            db.execute(
+                f"CREATE TABLE {_HEADER} (id INTEGER PRIMARY KEY, format INTEGER NOT NULL, content TEXT NOT NULL)"
+            )
             db.execute(f"INSERT INTO {_HEADER} (format, content) VALUES (?, ?)", (FORMAT, json.dumps(plan.header)))
             db.execute(
                 "INSERT INTO gpkg_contents (table_name, data_type, identifier, description) "
@@ -67,7 +68,7 @@ def write_plan_tables(path: Path, plan: PlanTables, overwrite: bool = False) -> 
                 (_HEADER, _HEADER),
             )
         db.close()
-        os.replace(partial, path)
+        partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
 
@@ -109,7 +110,9 @@ def read_plan_tables(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]
             row = db.execute(f"SELECT format, content FROM {_HEADER}").fetchone()
         db.close()
     except sqlite3.Error as error:
-        raise InputError(f"{path}: not a plan of photoplan ({error}); make one with `photoplan ortho --plan`") from error
+        raise InputError(
+            f"{path}: not a plan of photoplan ({error}); make one with `photoplan ortho --plan`"
+        ) from error
     if row is None or row[0] != FORMAT:
         raise InputError(f"{path}: plan format {row and row[0]}; this version reads {FORMAT}: make the plan again")
     meta, _, _, values = pyogrio.raw.read(str(path), layer="tiles", read_geometry=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
 from typing import Any
@@ -65,7 +66,9 @@ def _entry(location: Sequence[int | str]) -> str:
         if isinstance(step, int):
             text += f"[{step + 1}]"
         else:
-            text += ("." if text else "") + (step if re.fullmatch(r"[A-Za-z0-9_-]+", step) else f'"{step}"')
+            text += ("." if text else "") + (
+                step if re.fullmatch(r"[A-Za-z0-9_-]+", step) else json.dumps(step, ensure_ascii=False)
+            )
     return text
 
 
@@ -105,8 +108,9 @@ def line_of(text: str, location: Sequence[int | str]) -> int | None:
 
 
 def _key(step: int | str) -> str:
+    quoted = re.escape(json.dumps(str(step), ensure_ascii=False))
     bare = re.escape(str(step))
-    return rf"(?:{bare}|\"{bare}\"|'{bare}')"
+    return rf"(?:{bare}|{quoted}|'{bare}')"
 
 
 def _key_below(lines: list[str], start: int, rest: Sequence[int | str]) -> int | None:

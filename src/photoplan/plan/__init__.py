@@ -1,0 +1,1 @@
+"""Products before their pixels: anchors, tiles, coverage."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,8 +18,8 @@ from photoplan.targets.base import Target
 
 __all__ = ["AnchorRule", "compile_anchors", "initial_cell"]
 
-#: A rectangle that still reaches behind the camera at this side is left out.
-SMALLEST_CELL = 4
+#: A rectangle that still reaches behind the camera at this side is left out, pixels.
+SMALLEST_BEHIND = 4
 #: More layers than this over one rectangle do not pay; the residual that is left is reported.
 MOST_LAYERS = 64
 
@@ -109,9 +110,7 @@ def compile_anchors(
     return _assemble(camera, done, residual, rule.radius)
 
 
-def initial_cell(
-    camera: Camera, target: Target, uv: ArrayLike, height: float, side: int, rule: AnchorRule
-) -> int:
+def initial_cell(camera: Camera, target: Target, uv: ArrayLike, height: float, side: int, rule: AnchorRule) -> int:
     """Side of the cells that flat ground needs near (u, v), so that tiles need not find it again by halving.
 
     It depends on the camera and the target alone, not on the order in which tiles are computed, so that every run
@@ -126,7 +125,7 @@ def initial_cell(
     sides = np.sort(anchors.rects[:, 2] - anchors.rects[:, 0])
     # The side that half of the area needs: starting with it costs the fewest projections.
     half = np.searchsorted(np.cumsum(sides.astype(float) ** 2), 0.5 * float((sides.astype(float) ** 2).sum()))
-    return max(SMALLEST_CELL, int(sides[half]))
+    return int(sides[half])
 
 
 def _first_rects(window: Window, cell: int) -> NDArray[np.int32]:
@@ -137,7 +136,9 @@ def _first_rects(window: Window, cell: int) -> NDArray[np.int32]:
     return np.stack([c, r, *ends], axis=1).astype(np.int32)
 
 
-def _with_heights(rects: NDArray[np.int32], relief: NDArray[np.float32], layers: NDArray[np.int64] | None = None) -> _Work:
+def _with_heights(
+    rects: NDArray[np.int32], relief: NDArray[np.float32], layers: NDArray[np.int64] | None = None
+) -> _Work:
     """Give rectangles their own height range and drop those without a surface."""
     heights = height_ranges(relief, rects)
     there = np.isfinite(heights).all(axis=1)
@@ -169,7 +170,7 @@ def _project(
     return lattice, owner, np.stack([bottom, top], axis=1)
 
 
-def _any_per_rect(flags: NDArray[np.bool_], owner: NDArray[np.int64], n: int) -> NDArray[np.bool_]:
+def _any_per_rect(flags: Any, owner: NDArray[np.int64], n: int) -> NDArray[np.bool_]:
     return np.bincount(owner, weights=flags, minlength=n) > 0
 
 
@@ -191,7 +192,9 @@ def _touches_image(
         xy = lattice[..., :2] / lattice[..., 2:]
     low, high = xy.min(axis=1), xy.max(axis=1)
     width, height = camera.size
-    inside = (high >= -0.5 - radius).all(axis=1) & (low[:, 0] <= width - 0.5 + radius) & (low[:, 1] <= height - 0.5 + radius)
+    inside = (
+        (high >= -0.5 - radius).all(axis=1) & (low[:, 0] <= width - 0.5 + radius) & (low[:, 1] <= height - 0.5 + radius)
+    )
     return _any_per_rect(inside, owner, n)
 
 
@@ -218,8 +221,9 @@ def _verdict(
     # Halving divides a smooth residual by four: whatever has more than a third of the tolerance along it is halved.
     leading = np.maximum(np.maximum(along_u, along_v), along_h)
     share = np.minimum(tolerance / 3, leading)
-    split_u = bad & (along_u >= share) & (width > SMALLEST_CELL)
-    split_v = bad & (along_v >= share) & (height > SMALLEST_CELL)
+    least = np.where(behind, SMALLEST_BEHIND, 1)
+    split_u = bad & (along_u >= share) & (width > least)
+    split_v = bad & (along_v >= share) & (height > least)
     thin = bad & ~behind & (along_h >= share) & ~(split_u | split_v) & (work.layers < MOST_LAYERS)
     return split_u, split_v, thin
 

@@ -125,9 +125,7 @@ def _inside(camera: Camera, XYZ: NDArray[np.float64]) -> NDArray[np.bool_]:
     xy = project(camera, XYZ)
     width, height = camera.size
     with np.errstate(invalid="ignore"):
-        return (  # type: ignore[no-any-return]
-            (xy[..., 0] >= -0.5) & (xy[..., 0] <= width - 0.5) & (xy[..., 1] >= -0.5) & (xy[..., 1] <= height - 0.5)
-        )
+        return (xy[..., 0] >= -0.5) & (xy[..., 0] <= width - 0.5) & (xy[..., 1] >= -0.5) & (xy[..., 1] <= height - 0.5)
 
 
 def covered_tiles(camera: Camera, surface: Surface, grid: MapGrid, tiles: list[Window]) -> list[bool]:

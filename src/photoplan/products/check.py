@@ -181,6 +181,6 @@ def _advice(project: Project, checks: list[ImageCheck], plausible: Plausibility)
     if project.orientation.earth_curvature == "none" and curvature > _CURVATURE_MATTERS:
         lines.append(
             f"the earth's curvature displaces up to {curvature:.1f} px: if the orientation was computed with it, "
-            "set earth_curvature = \"strict\" in [orientation]"
+            'set earth_curvature = "strict" in [orientation]'
         )
     return tuple(lines)

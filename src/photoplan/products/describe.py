@@ -68,7 +68,9 @@ def _record(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: no readable JSON ({error})") from None
     if not isinstance(content, dict) or "product" not in content:
         raise InputError(f"{path}: no run record of photoplan")
-    return {str(key): value if isinstance(value, (str, int, float)) else json.dumps(value) for key, value in content.items()}
+    return {
+        str(key): value if isinstance(value, (str, int, float)) else json.dumps(value) for key, value in content.items()
+    }
 
 
 def _raster(info: RasterInfo) -> dict[str, Any]:

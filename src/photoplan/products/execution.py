@@ -21,6 +21,7 @@ from photoplan.plan.anchors import Anchors
 from photoplan.plan.product import ProductPlan, Tile, compile_tile
 from photoplan.products.orthophoto import OrthoPlan, OrthoProduct, render_tile
 from photoplan.products.scene import Scene, SceneAddress, open_scene
+from photoplan.products.settings import OrthoSettings
 
 __all__ = ["ProductResult", "Run", "execute"]
 
@@ -64,7 +65,9 @@ class Run:
         fits = (self.memory - BASE_MEMORY) // per_tile
         if fits < 1:
             least = (BASE_MEMORY + per_tile) / 2**20
-            raise UsageError(f"--memory {self.memory / 2**20:.0f} MiB; at least {least:.0f} MiB are needed for one tile")
+            raise UsageError(
+                f"--memory {self.memory / 2**20:.0f} MiB; at least {least:.0f} MiB are needed for one tile"
+            )
         return int(min(wanted, fits))
 
 
@@ -147,10 +150,12 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     """
     run = run or Run()
     folder = Path(output)
-    _refuse_existing(plan, folder, run)
     in_flight = run.in_flight
-    folder.mkdir(parents=True, exist_ok=True)
-    results = [_make(plan, product, folder, run, in_flight) for product in plan.products]
+    kept = _finished(plan, folder, run)
+    _make_folder(folder)
+    if kept:
+        run.talk(f"{len(kept)} of {len(plan.products)} products are finished already")
+    results = [kept.get(p.plan.name) or _make(plan, p, folder, run, in_flight) for p in plan.products]
     if run.quicklook:
         write_overview([r.path for r in results if not r.failed], folder / "overview.png")
     failed = [f"{r.path.name}: tiles {', '.join(map(str, r.failed))}" for r in results if r.failed]
@@ -159,11 +164,51 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     return results
 
 
-def _refuse_existing(plan: OrthoPlan, folder: Path, run: Run) -> None:
-    existing = [p for p in (_path(folder, product) for product in plan.products) if p.exists()]
-    if existing and not run.overwrite:
+def _finished(plan: OrthoPlan, folder: Path, run: Run) -> dict[str, ProductResult]:
+    """Products that exist: those of this very run, interrupted, are kept; any other is refused before any work.
+
+    When all products of a plan exist, the run was not interrupted: doing it again needs `overwrite`.
+    """
+    existing = [p for p in plan.products if _path(folder, p).exists()]
+    if run.overwrite or not existing:
+        return {}
+    kept = {p.plan.name: _kept(plan, p, folder) for p in existing}
+    foreign = [name for name, result in kept.items() if result is None]
+    if foreign or len(existing) == len(plan.products):
+        first = _path(folder, plan[foreign[0]] if foreign else existing[0])
         more = f" and {len(existing) - 1} more" if len(existing) > 1 else ""
-        raise UsageError(f"{existing[0]}{more} exists; give --overwrite to replace it, or another --output")
+        raise UsageError(f"{first}{more} exists; give --overwrite to replace it, or another --output")
+    return {name: result for name, result in kept.items() if result is not None}
+
+
+def _kept(plan: OrthoPlan, product: OrthoProduct, folder: Path) -> ProductResult | None:
+    """The result of an earlier run with the same key and settings; None if the product is not one."""
+    path = _path(folder, product)
+    try:
+        record = json.loads(record_path(path).read_text(encoding="utf-8"))
+        if record["key"] != product.key or OrthoSettings.from_dict(record["settings"]) != plan.settings:
+            return None
+        made = record["product"]
+        return ProductResult(
+            path,
+            product.plan.image,
+            made["seconds"],
+            made["valid_share"],
+            made["worst_anchor_residual_px"],
+            made["cells"],
+            made["tiles"],
+            made["tiles"],
+            (),
+        )
+    except (OSError, ValueError, KeyError, TypeError, UsageError):
+        return None
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder}: no such folder, and it cannot be made ({error.strerror})") from None
 
 
 def _path(folder: Path, product: OrthoProduct) -> Path:
@@ -198,18 +243,18 @@ def _make(plan: OrthoPlan, product: OrthoProduct, folder: Path, run: Run, in_fli
             run.talk(f"{product.plan.name}: {tally.resumed} of {len(product.plan.tiles)} tiles are finished already")
             run.progress(tally.resumed, 0)
         for outcome in run_tiles(todo, partial(_work, job), executor_factory(run.executor, run.workers), in_flight):
-            tile: Tile = outcome.task
+            done: Tile = outcome.task
             if outcome.error is not None:
-                tally.failed.append(tile.index)
-                tally.reasons.append(f"tile {tile.index}: {outcome.error}")
+                tally.failed.append(done.index)
+                tally.reasons.append(f"tile {done.index}: {outcome.error}")
             else:
                 pixels: Pixels = outcome.result
                 if pixels.values is None:
-                    file.append_empty(tile.index)
+                    file.append_empty(done.index)
                 else:
-                    file.append(tile.index, pixels.values, pixels.valid)
+                    file.append(done.index, pixels.values, pixels.valid)
                 tally.add(pixels)
-            run.progress(1, tile.window.size)
+            run.progress(1, done.window.size)
         # Tiles that the plan leaves out hold nothing of the image: they stay empty.
         facts = None if tally.failed else file.complete(_tags(plan, product), allow_missing=True)
     result = ProductResult(
@@ -225,7 +270,9 @@ def _make(plan: OrthoPlan, product: OrthoProduct, folder: Path, run: Run, in_fli
     )
     if facts is not None:
         record = _record(plan, product, scene, run, result)
-        write_run_record(record_path(result.path), {**record, "values_moved_off_nodata": facts.moved_values, "bytes": facts.bytes})
+        write_run_record(
+            record_path(result.path), {**record, "values_moved_off_nodata": facts.moved_values, "bytes": facts.bytes}
+        )
     return result
 
 

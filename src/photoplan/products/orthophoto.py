@@ -210,7 +210,10 @@ def _refuse_equal_names(products: Iterable[OrthoProduct]) -> None:
         # Many file systems do not tell capitals from small letters.
         name = product.plan.name.casefold()
         if name in seen:
-            raise UsageError(f"images {seen[name]} and {product.plan.image} would both be written as {product.plan.name}.tif; rename one")
+            raise UsageError(
+                f"images {seen[name]} and {product.plan.image} would both be written as {product.plan.name}.tif; "
+                "rename one"
+            )
         seen[name] = product.plan.image
 
 
@@ -245,7 +248,9 @@ def render(
         pixels = render_tile(product.plan, plan.settings.kernel, scene, tile)
         if pixels.values is None or pixels.valid is None:
             continue
-        to = np.s_[common.row - window.row : common.stop[1] - window.row, common.col - window.col : common.stop[0] - window.col]
+        to = np.s_[
+            common.row - window.row : common.stop[1] - window.row, common.col - window.col : common.stop[0] - window.col
+        ]
         of = np.s_[
             common.row - tile.window.row : common.stop[1] - tile.window.row,
             common.col - tile.window.col : common.stop[0] - tile.window.col,

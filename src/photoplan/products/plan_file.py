@@ -104,7 +104,16 @@ def compile_figures(plan: OrthoPlan, report: Callable[[int, int], None] = lambda
             )
             bounds = product.grid.bounds_of(tile.window)
             rows.append(
-                (product.plan.name, product.plan.image, tile.index, cells, residual, source, _numbers(tile.window), bounds)
+                (
+                    product.plan.name,
+                    product.plan.image,
+                    tile.index,
+                    cells,
+                    residual,
+                    source,
+                    _numbers(tile.window),
+                    bounds,
+                )
             )
             report(1, tile.window.size)
     columns = list(zip(*rows))

@@ -16,13 +16,13 @@ from photoplan.cameras.build import oriented_camera
 from photoplan.errors import InputError
 from photoplan.geometry.crs import CrsStep, crs_step, same_crs
 from photoplan.geometry.heights import HeightStep, declared_pair, height_step
-from photoplan.geometry.rotation import rotation_from_angles
 from photoplan.geometry.pose import Pose
+from photoplan.geometry.rotation import rotation_from_angles
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.names import resolve_input
+from photoplan.io.orientation_table import angle_in_radians
 from photoplan.io.project import parse_project
 from photoplan.io.project_cameras import interior_of, lens_of
-from photoplan.io.orientation_table import angle_in_radians
 from photoplan.io.project_model import Image, Project, Terrain
 from photoplan.io.raster import RasterReader
 from photoplan.io.terrain_reader import TerrainReader
@@ -117,7 +117,9 @@ def open_scene(project: Project, name: str) -> Scene:
     if project.terrain.file is not None:
         files.append(project.resolve(project.terrain.file))
     digests = tuple((str(path), _digest(str(path), _stamp(path))) for path in files)
-    return _open(SceneAddress(alone.model_dump_json(exclude={"ortho"}, exclude_none=True), str(project.folder), digests))
+    return _open(
+        SceneAddress(alone.model_dump_json(exclude={"ortho"}, exclude_none=True), str(project.folder), digests)
+    )
 
 
 def _stamp(path: Path) -> tuple[int, int]:

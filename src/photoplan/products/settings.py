@@ -26,7 +26,8 @@ class OrthoSettings:
     tile: int = 512
     """Side of a tile, pixels; a multiple of 16."""
     nodata: str = "auto"
-    """A number, ``mask`` (an internal mask band), or ``auto``: 0 for unsigned integers, −32768 for int16, NaN for floats."""
+    """A number, ``mask`` (an internal mask band), or ``auto``: 0 for unsigned integers, −32768 for int16, NaN for
+    floats."""
     compress: Compression = "deflate"
     """Compression of the file; jpeg needs ``nodata = "mask"`` and sets it."""
     overviews: bool = True

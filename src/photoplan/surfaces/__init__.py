@@ -1,0 +1,1 @@
+"""Where the object is: a depth for every pixel of a target."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -50,7 +52,7 @@ def intersect(
     upper = np.full(len(xy), np.nan)
     lower = np.full(len(xy), np.nan)
     open_ = np.ones(len(xy), bool)
-    for above, level in zip(levels[:-1], levels[1:]):
+    for above, level in itertools.pairwise(levels):
         point = _at_height(camera, xy, np.full(len(xy), level))
         hit = open_ & (surface.heights(point[:, :2]) >= level)
         upper[hit], lower[hit] = above, level

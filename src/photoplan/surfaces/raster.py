@@ -65,12 +65,12 @@ class RasterSurface:
         first = self._posts(target.grid.to_map((window.col, window.row)))
         step_x = target.grid.resolution / self.mesh[0]
         step_y = target.grid.resolution / self.mesh[1]
-        last = first + ((window.width - 1) * step_x, (window.height - 1) * step_y)
+        last = first + np.array([(window.width - 1) * step_x, (window.height - 1) * step_y])
         part, offset = self._read(first, last)
         if part is None:
             return np.full((window.height, window.width), np.nan, np.float32)
         x0, y0 = first - offset
-        return sample_lattice(part, x0, step_x, window.width, y0, step_y, window.height)  # type: ignore[no-any-return]
+        return sample_lattice(part, x0, step_x, window.width, y0, step_y, window.height)
 
     def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
         """Height at map points (..., 2), shape (...); NaN where there is no surface."""
@@ -83,7 +83,7 @@ class RasterSurface:
         part, offset = self._read(flat[there].min(axis=0), flat[there].max(axis=0))
         if part is None:
             return np.full(posts.shape[:-1], np.nan)
-        return sample_points(part, flat - offset).astype(float).reshape(posts.shape[:-1])  # type: ignore[no-any-return]
+        return sample_points(part, flat - offset).astype(float).reshape(posts.shape[:-1])
 
     def height_range(self, bounds: tuple[float, float, float, float]) -> tuple[float, float]:
         """Lowest and highest post inside or next to map `bounds`; NaN, NaN where there is none."""
@@ -135,12 +135,10 @@ class RasterSurface:
         if part is None:
             return np.full((window.height, window.width), np.nan, np.float32)
         flat = sample_points(part, (posts - offset).reshape(-1, 2))
-        return flat.reshape(window.height, window.width)  # type: ignore[no-any-return]
+        return flat.reshape(window.height, window.width)
 
 
-def _between_nodes(
-    nodes: NDArray[np.float64], at_u: NDArray[np.int64], at_v: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def _between_nodes(nodes: NDArray[np.float64], at_u: NDArray[np.int64], at_v: NDArray[np.int64]) -> NDArray[np.float64]:
     """Bilinear positions at every pixel between the nodes."""
     u, v = np.arange(at_u[-1] + 1.0), np.arange(at_v[-1] + 1.0)
     columns = np.empty((nodes.shape[0], len(u), 2))

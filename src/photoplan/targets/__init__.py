@@ -1,0 +1,1 @@
+"""Products' own coordinates and where they are on the ground."""

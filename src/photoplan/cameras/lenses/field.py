@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
-from photoplan.cameras.lenses.inverse import determinant, newton_inverse, solve2
+from photoplan.cameras.lenses.inverse import newton_inverse, solve2, upright
 from photoplan.errors import InputError
 
 __all__ = ["FieldLimited", "field_limited"]
@@ -65,9 +65,11 @@ class FieldLimited:
         if math.isinf(self.radius):
             return self.lens.undistort(t)
         inside = self.lens.undistort(t)
-        # A solution inside the field is the only one, as the field is free of folds.
+        # A solution inside the field is the only one, as the field is free of folds. A closed form (`Reversed`) may
+        # return a point that is none, so the way forward is looked at.
         with np.errstate(invalid="ignore"):
             good = np.hypot(inside[..., 0], inside[..., 1]) <= self.radius
+            good &= np.abs(self.lens.distort(inside) - t).max(axis=-1, initial=0.0) < 1e-9
         if good.all():
             return inside
         beyond = t[~good]
@@ -160,7 +162,7 @@ def _farthest(lens: Lens, real: NDArray[np.float64]) -> float:
             with np.errstate(all="ignore"):
                 J = lens.jacobian(t)
                 t = t - solve2(J, lens.distort(t) - target)
-        bad = ~((np.abs(lens.distort(t) - target).max(axis=-1) < 1e-9) & (determinant(lens.jacobian(t)) > 0))
+        bad = ~((np.abs(lens.distort(t) - target).max(axis=-1) < 1e-9) & upright(lens.jacobian(t)))
         if bad.any():
             if _is_endless(lens):
                 return math.inf
@@ -190,5 +192,5 @@ def _first_fold(
     phi = np.arange(_AZIMUTHS) * (2.0 * math.pi / _AZIMUTHS)
     t = radius * f[:, None, None] * np.stack([np.cos(phi), np.sin(phi)], axis=-1)
     with np.errstate(all="ignore"):
-        folded = ~(determinant(jacobian(t)) > 0).all(axis=1)
+        folded = ~upright(jacobian(t)).all(axis=1)
     return float(radius * f[folded][0]) if folded.any() else None

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["determinant", "newton_inverse", "solve2"]
+__all__ = ["determinant", "newton_inverse", "solve2", "upright"]
 
 #: What is left of the residual at a point that counts as solved, relative to 1 + |t|.
 PRECISION = 1e-12
@@ -19,6 +19,15 @@ _Map = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 def determinant(J: NDArray[np.float64]) -> NDArray[np.float64]:
     """Determinant of matrices (..., 2, 2)."""
     return J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+
+
+def upright(J: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Where a lens's derivative (..., 2, 2) neither mirrors nor turns round; False for NaN.
+
+    On the axis it is close to the unit matrix; on its way to a fold the determinant vanishes, and beyond the fold at
+    least one of determinant and trace is negative.
+    """
+    return np.asarray((determinant(J) > 0) & (J[..., 0, 0] + J[..., 1, 1] > 0))
 
 
 def solve2(J: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -45,7 +54,7 @@ def newton_inverse(
     Returns
     -------
     ndarray, shape (..., 2)
-        NaN where the search did not converge, or ended on a sheet that is folded over (determinant not positive).
+        NaN where the search did not converge, or ended on a sheet that is folded over.
     """
     t = np.array(start, float)
     with np.errstate(all="ignore"):
@@ -56,6 +65,6 @@ def newton_inverse(
             if not (np.abs(step) > 4e-16 + 2e-15 * np.abs(t)).any():
                 break
         miss = np.abs(distort(t) - target).max(axis=-1, initial=0.0)
-        good = (miss <= PRECISION * (1.0 + np.abs(target).max(axis=-1, initial=0.0))) & (determinant(jacobian(t)) > 0)
+        good = (miss <= PRECISION * (1.0 + np.abs(target).max(axis=-1, initial=0.0))) & upright(jacobian(t))
     t[~good] = np.nan
     return t
