@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import threading
 from pathlib import Path
@@ -14,6 +15,8 @@ from rasterio.enums import ColorInterp
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
+from photoplan.io import raster as raster_module
+from photoplan.io.decoded import DecodedPicture, decoded_picture
 from photoplan.io.gdal import close_handles
 from photoplan.io.raster import RasterReader
 from photoplan.io.raster_info import read_info
@@ -333,3 +336,52 @@ def test_a_real_drone_image(block: Path) -> None:
         expected = file.read(window=rasterio.windows.Window(100, 50, 64, 32))
     assert valid is None
     np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pictures are decoded once where files can be nameless")
+@pytest.mark.parametrize("name", ["a.jpg", "a.png", "rgba.png", "deep.png"])
+def test_large_pictures_are_decoded_once(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Same pixels as from the file, in any order of windows, and the decoder runs once."""
+    bands, dtype = {"a.jpg": (3, "uint8"), "a.png": (3, "uint8"), "rgba.png": (4, "uint8"), "deep.png": (1, "uint16")}[
+        name
+    ]
+    pixels = scene(bands, dtype, (400, 500))
+    path = make(tmp_path / name, pixels, "JPEG" if name.endswith("jpg") else "PNG")
+    if bands == 4:
+        pixels[3, :50] = 0
+        path = make(tmp_path / name, pixels, "PNG")
+    direct = [RasterReader(path).read(window) for window in Window(0, 0, 500, 400).tiles(150)]
+    monkeypatch.setattr(raster_module, "_SMALL", 1000)
+    calls = []
+    read = raster_module._from_file
+    monkeypatch.setattr(raster_module, "_from_file", lambda *a: (calls.append(a), read(*a))[1])
+    reader = RasterReader(path)
+    tiles = list(Window(0, 0, 500, 400).tiles(150))
+    for i in reversed(range(len(tiles))):
+        found, valid = reader.read(tiles[i])
+        np.testing.assert_array_equal(found, direct[i][0])
+        assert (valid is None) is (direct[i][1] is None)
+        if valid is not None:
+            np.testing.assert_array_equal(valid, direct[i][1])
+    assert len(calls) == 1
+
+
+def test_threads_share_one_decoding() -> None:
+    made = []
+
+    def make_one() -> DecodedPicture:
+        made.append(1)
+        return DecodedPicture((300, 200), 2, np.dtype("uint8"), lambda w: np.full((2, w.height, w.width), 7, np.uint8))
+
+    found: list[int] = []
+    work = lambda: found.append(int(decoded_picture(("threads",), make_one).read(Window(3, 4, 10, 10)).sum()))  # noqa: E731
+    threads = [threading.Thread(target=work) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (len(made), found) == (1, [7 * 200] * 8)
+    for other in range(3):
+        decoded_picture((other,), make_one)
+    decoded_picture(("threads",), make_one)
+    assert len(made) == 5, "the two used last are kept"

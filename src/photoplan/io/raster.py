@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,8 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io.checks import DRIVER_NAMES, IMAGE_LIMITS, RasterLimits
-from photoplan.io.gdal import GDAL_ERRORS, all_causes, damage_in, gdal_settings, handle, warnings_of_gdal
+from photoplan.io.decoded import SEQUENTIAL, DecodedPicture, decoded_picture
+from photoplan.io.gdal import GDAL_ERRORS, all_causes, close_handles, damage_in, gdal_settings, handle, warnings_of_gdal
 from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.tiff_layout import read_tiff_layout
 from photoplan.io.validity import MissingBlocks, finite, not_nodata
@@ -24,6 +27,8 @@ __all__ = ["IMAGE_TYPES", "RasterReader", "read_pixels"]
 IMAGE_TYPES = ("uint8", "uint16", "int16", "float32")
 """Types of the pixels of source images."""
 
+_SMALL = 16 << 20
+"""Decoded bytes up to which a picture is left to GDAL's block cache."""
 _NOT_RGB = (5, 8, 9, 10)
 """TIFF photometric interpretations: CMYK and the kinds of CIELab."""
 
@@ -120,28 +125,56 @@ def read_pixels(
     """
     if window.size == 0 or window.col < 0 or window.row < 0 or np.any(np.array(window.stop) > info.size):
         raise UsageError(f"{info.path}: {window} is not inside the raster of {info.size[0]} × {info.size[1]} pixels")
-    area = rasterio.windows.Window(window.col, window.row, window.width, window.height)
-    band: str | int = "all"
-    try:
-        with gdal_settings(), warnings_of_gdal() as found:
-            dataset = handle(info.path, info.driver if info.driver in DRIVER_NAMES else None)
-            pixels = dataset.read(list(info.colour_bands), window=area)
-            valid: NDArray[np.bool_] | None = None
-            for band in info.alpha_bands:
-                valid = _both(valid, dataset.read(band, window=area) > 0)
-            if info.has_mask:
-                band = "mask"
-                valid = _both(valid, (dataset.read_masks(window=area) > 0).all(axis=0))
-    except (*GDAL_ERRORS, OSError, MemoryError) as error:
-        raise _damaged(info.path, window, band, all_causes(error)) from error
-    damage = damage_in(found)
-    if damage:
-        raise _damaged(info.path, window, band, [damage])
+    count = len(info.colour_bands)
+    if _decode_once(info):
+        state = info.path.stat()
+        picture = decoded_picture((info.path, state.st_mtime_ns, state.st_ino), partial(_decode, info))
+        stored, valid = picture.read(window), None
+    else:
+        stored, valid = _from_file(info, window)
+    pixels = stored[:count]
+    if info.alpha_bands:
+        valid = _both(valid, np.logical_and.reduce(stored[count:] > 0))
     valid = _both(valid, not_nodata(pixels, info.nodata))
     valid = _both(valid, finite(pixels))
     if missing is not None:
         valid = _both(valid, missing.written(window))
     return pixels, None if valid is None or valid.all() else valid
+
+
+def _from_file(info: RasterInfo, window: Window) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+    """Colour bands, then alpha bands, shape (bands, h, w), and the mask of the file (None: there is none)."""
+    area = rasterio.windows.Window(window.col, window.row, window.width, window.height)
+    band, mask = "all", None
+    try:
+        with gdal_settings(), warnings_of_gdal() as found:
+            dataset = handle(info.path, info.driver if info.driver in DRIVER_NAMES else None)
+            pixels = dataset.read([*info.colour_bands, *info.alpha_bands], window=area)
+            if info.has_mask:
+                band = "mask"
+                mask = (dataset.read_masks(window=area) > 0).all(axis=0)
+    except (*GDAL_ERRORS, OSError) as error:
+        raise _damaged(info.path, window, band, all_causes(error)) from error
+    damage = damage_in(found)
+    if damage:
+        raise _damaged(info.path, window, band, [damage])
+    return pixels, mask
+
+
+def _decode_once(info: RasterInfo) -> bool:
+    """Whether a picture is large and of a format that is decoded from the top."""
+    width, height = info.size
+    pixel = len(info.colours) * np.dtype(info.dtype).itemsize
+    large = width * height * pixel > _SMALL and os.name == "posix"
+    return large and info.driver in SEQUENTIAL and not info.has_mask and info.path.is_file()
+
+
+def _decode(info: RasterInfo) -> DecodedPicture:
+    """Decode a whole picture; this thread's handle, which holds its decoder, is closed again."""
+    bands = len(info.colour_bands) + len(info.alpha_bands)
+    picture = DecodedPicture(info.size, bands, np.dtype(info.dtype), lambda window: _from_file(info, window)[0])
+    close_handles()
+    return picture
 
 
 def _both(a: NDArray[np.bool_] | None, b: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
@@ -151,7 +184,7 @@ def _both(a: NDArray[np.bool_] | None, b: NDArray[np.bool_] | None) -> NDArray[n
     return np.logical_and(a, b)
 
 
-def _damaged(path: Path, window: Window, band: str | int, causes: list[str]) -> InputError:
+def _damaged(path: Path, window: Window, band: str, causes: list[str]) -> InputError:
     """The error of pixels that cannot be read."""
     named = re.search(r"band (\d+)", " ".join(causes))
     return InputError(
