@@ -17,6 +17,7 @@ from photoplan.errors import TilesFailed, UsageError
 from photoplan.io.product import ProductFile
 from photoplan.io.quicklook import write_overview
 from photoplan.io.run_record import peak_memory_bytes, record_path, versions, write_run_record
+from photoplan.kernels.rectify import is_compiled
 from photoplan.plan.anchors import Anchors
 from photoplan.plan.product import ProductPlan, Tile, compile_tile
 from photoplan.products.orthophoto import OrthoPlan, OrthoProduct, render_tile
@@ -218,6 +219,8 @@ def _path(folder: Path, product: OrthoProduct) -> Path:
 def _make(plan: OrthoPlan, product: OrthoProduct, folder: Path, run: Run, in_flight: int) -> ProductResult:
     started = time.perf_counter()
     settings, scene = plan.settings, open_scene(plan.project, product.plan.image)
+    if not is_compiled(scene.reader.dtype, scene.reader.bands, settings.kernel):
+        run.talk("compiling the resampling kernels for this kind of image, once (up to a minute)")
     job = _Job(scene.address, replace(product.plan, tiles=()), settings.kernel)
     tally = _Tally()
     with ProductFile(
