@@ -22,7 +22,7 @@ __version__ = "0.1.0"
 _HOME = {
     "load_project": "photoplan.io.project",
     "plan_orthophotos": "photoplan.products.orthophoto",
-    "execute": "photoplan.products.orthophoto",
+    "execute": "photoplan.products.execution",
     "render": "photoplan.products.orthophoto",
     "read_plan": "photoplan.products.plan_file",
 }

@@ -258,8 +258,13 @@ def _make(plan: OrthoPlan, product: OrthoProduct, folder: Path, run: Run, in_fli
                     file.append(done.index, pixels.values, pixels.valid)
                 tally.add(pixels)
             run.progress(1, done.window.size)
-        # Tiles that the plan leaves out hold nothing of the image: they stay empty.
-        facts = None if tally.failed else file.complete(_tags(plan, product), allow_missing=True)
+        facts = None
+        if not tally.failed:
+            # Tiles that the plan leaves out hold nothing of the image.
+            planned = {tile.index for tile in product.plan.tiles}
+            for index in set(range(product.plan.tile_count)) - planned - finished:
+                file.append_empty(index)
+            facts = file.complete(_tags(plan, product))
     result = ProductResult(
         _path(folder, product),
         product.plan.image,

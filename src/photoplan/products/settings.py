@@ -24,7 +24,7 @@ class OrthoSettings:
     tolerance: float = 0.02
     """Largest residual of the anchors, pixels of the source image."""
     tile: int = 512
-    """Side of a tile, pixels; a multiple of 16."""
+    """Side of a tile, pixels; a multiple of 16 from 128 on."""
     nodata: str = "auto"
     """A number, ``mask`` (an internal mask band), or ``auto``: 0 for unsigned integers, −32768 for int16, NaN for
     floats."""
@@ -42,8 +42,8 @@ class OrthoSettings:
             raise UsageError(f"compression {self.compress!r}; allowed are {', '.join(get_args(Compression))}")
         if not 1e-6 <= self.tolerance <= 10:
             raise UsageError(f"tolerance {self.tolerance} px; allowed are 1e-6 to 10, usual is 0.02")
-        if self.tile < 16 or self.tile > 4096 or self.tile % 16:
-            raise UsageError(f"tile side {self.tile}; allowed are multiples of 16 from 16 to 4096")
+        if self.tile < 128 or self.tile > 4096 or self.tile % 16:
+            raise UsageError(f"tile side {self.tile}; allowed are multiples of 16 from 128 to 4096")
         if self.bounds is not None:
             object.__setattr__(self, "bounds", tuple(float(b) for b in self.bounds))
         if self.nodata not in ("auto", "mask"):
