@@ -93,7 +93,7 @@ def _delimiter(data: list[tuple[int, str]], form: TableFormat, path: Path) -> st
         return form.delimiter
     first = []
     for delimiter in DELIMITERS:
-        counts = [len(_split(item, delimiter, path).fields) for item in data[:SNIFFED]]
+        counts = [_count(item, delimiter, path) for item in data[:SNIFFED]]
         if counts[0] >= len(NEEDED):
             if len(set(counts)) == 1:
                 return delimiter
@@ -105,6 +105,14 @@ def _delimiter(data: list[tuple[int, str]], form: TableFormat, path: Path) -> st
         f"{path}:{line}: {text[:80]!r} has fewer than {len(NEEDED)} columns by comma, semicolon, tab or space; "
         f"needed are {', '.join(NEEDED)}"
     )
+
+
+def _count(item: tuple[int, str], delimiter: str, path: Path) -> int:
+    """Columns of a line; 0 where quotes do not allow this delimiter."""
+    try:
+        return len(_split(item, delimiter, path).fields)
+    except InputError:
+        return 0
 
 
 def _columns(rows: list[_Row], form: TableFormat, path: Path) -> tuple[dict[str, int], list[_Row], list[str]]:

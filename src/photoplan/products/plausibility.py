@@ -24,7 +24,7 @@ __all__ = ["ImagePlausibility", "Plausibility", "View", "assess", "view_of"]
 Heights = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 #: Images that are looked at under other readings.
-SAMPLE = 24
+SAMPLE = 12
 #: A reading is taken as better by its tilts only if all stay below this, and half of the declared ones are above the
 #: second; degrees. Between them lies everything that oblique images may be.
 UPRIGHT, OBLIQUE = 10.0, 20.0
@@ -191,12 +191,16 @@ def _alternative(views: list[View], images: tuple[ImagePlausibility, ...], heigh
         return None
     ranked: list[tuple[tuple[float, ...], Reading, list[ImagePlausibility]]] = []
     for reading in readings(sample[0].order):
-        if ranked and reading.changes > ranked[0][1].changes:
+        # What one change explains needs no second, except where only the second makes the images upright.
+        if ranked and reading.changes > ranked[0][1].changes and (ranked[0][0][0] < 0 or len(sample) < ENOUGH):
             break
+        if not _possible(reading, evidence.largest):
+            continue
         seen = [_look(v, *reading.apply(v.center, v.angles, v.order), heights) for v in sample]
         other = _Evidence.of(sample, seen, reading)
         if other.better_than(evidence, reading):
-            rank = (-float(other.steepest < UPRIGHT), -round(other.on_terrain, 2), -round(other.alike, 2))
+            upright = -float(other.steepest < UPRIGHT)
+            rank = (upright, reading.changes, -round(other.on_terrain, 2), -round(other.alike, 2))
             ranked.append((rank, reading, seen))
             ranked.sort(key=lambda r: r[0])
     if not ranked:
@@ -254,7 +258,7 @@ class _Evidence:
 
     def better_than(self, declared: _Evidence, reading: Reading) -> bool:
         """Whether this reading removes what is wrong with the declared one; what only looks different is not better."""
-        if self.faults:
+        if self.faults or self.middles < declared.middles:
             return False
         # The terrain may end inside the block, so it is the gain that counts, not a share.
         if self.on_terrain > declared.on_terrain + 0.2 and (declared.faults or self.middles > declared.middles + 0.2):
@@ -267,8 +271,16 @@ class _Evidence:
             return self.alike > 0.97 and abs(self.offset) < 5
         # All images lie alike, but askew. Only readings that people really mix up count then, since a heading that was
         # kept askew to the lines on purpose looks the same.
-        small = reading == Reading(unit="rad") and declared.largest < 2 * np.pi
-        return (small or reading == Reading(transposed=True)) and self.alike > 0.9 and abs(self.offset) < 8
+        usual = reading in (Reading(unit="rad"), Reading(transposed=True))
+        return usual and self.alike > 0.9 and abs(self.offset) < 8
+
+
+def _possible(reading: Reading, largest: float) -> bool:
+    """Whether the largest declared angle, as a number of degrees, can be what the reading takes it for."""
+    if reading.unit == "rad":
+        return largest < 2 * np.pi
+    # Angles divided by 57 are upright whatever they were: only more than a full circle lets one think of that.
+    return reading.unit != "rad to deg" or largest > 360.0
 
 
 def _sample(views: list[View], images: tuple[ImagePlausibility, ...]) -> list[int]:

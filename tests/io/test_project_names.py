@@ -1,0 +1,147 @@
+"""Names from tables never lead out of a folder or to a device (faults 9, 11, 12)."""
+
+from __future__ import annotations
+
+import unicodedata
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from photoplan.errors import InputError, UsageError
+from photoplan.io.names import check_input_name, inside, match_key, resolve_input, safe_stem, unique_stems
+
+
+@pytest.mark.parametrize(
+    ("name", "stem"),
+    [
+        ("DJI_0018.jpg", "DJI_0018"),
+        ("3324c_2015_1004_05_0182_RGB", "3324c_2015_1004_05_0182_RGB"),
+        ("IMG.0001", "IMG.0001"),
+        ("flight 1/IMG.0001.TIF", "IMG.0001"),
+        ("../../etc/passwd", "passwd"),
+        (r"..\..\Windows\win.ini", "win.ini"),
+        ("/absolute/name.tif", "name"),
+        ("C:\\x\\name.tif", "name"),
+        ("CON", "CON_"),
+        ("nul.txt", "nul_.txt"),
+        ("Lpt1.tif", "Lpt1_"),
+        ("console", "console"),
+        ("Übersicht 1.tif", "Übersicht_1"),
+        ("日本.jp2", "日本"),
+        ("-rf", "rf"),
+        (".hidden", "hidden"),
+        ("trailing. ", "trailing"),
+        ('a:b*c?d|e<f>g"h', "a_b_c_d_e_f_g_h"),
+        ("new\nline\0zero", "new_line_zero"),
+    ],
+)
+def test_fault_11_stems(name: str, stem: str) -> None:
+    assert safe_stem(name) == stem
+
+
+@pytest.mark.parametrize("name", ["", "..", "/", "...", "../..", ".tif", "__", "\0"])
+def test_fault_11_a_name_of_nothing_is_refused(name: str) -> None:
+    with pytest.raises(InputError, match="no letter or digit"):
+        safe_stem(name)
+
+
+def test_fault_11_long_names_are_cut_and_stay_different() -> None:
+    a, b = safe_stem("ä" * 3000 + "1"), safe_stem("ä" * 3000 + "2")
+    assert a != b
+    assert max(len(a.encode()), len(b.encode())) <= 120
+
+
+@given(st.text(max_size=60))
+def test_fault_11_any_name_gives_a_plain_stem_or_an_error(name: str) -> None:
+    try:
+        stem = safe_stem(name)
+    except InputError:
+        return
+    assert stem == Path(stem).name
+    assert not any(c in stem for c in '/\\:*?"<>|\0\n ')
+    assert not stem.startswith((".", "-"))
+    assert not stem.endswith(".")
+    assert 0 < len(stem.encode()) <= 120
+    assert safe_stem(stem + ".tif") == stem
+    root = Path("/out")
+    assert inside(root, f"{stem}_ortho.tif").parent == root
+
+
+@pytest.mark.parametrize("name", ["../x.tif", "/etc/x.tif", "a/../../x.tif", "."])
+def test_fault_11_outputs_stay_inside(tmp_path: Path, name: str) -> None:
+    with pytest.raises(UsageError, match="outside"):
+        inside(tmp_path, name)
+
+
+def test_fault_11_a_link_does_not_lead_out(tmp_path: Path) -> None:
+    out, other = tmp_path / "out", tmp_path / "other"
+    out.mkdir()
+    other.mkdir()
+    (out / "link").symlink_to(other)
+    with pytest.raises(UsageError):
+        inside(out, "link/x.tif")
+    assert inside(out, "sub/x.tif") == out.resolve() / "sub" / "x.tif"
+
+
+def test_fault_12_two_names_of_one_product_are_named() -> None:
+    with pytest.raises(InputError, match=r"'a/IMG_1\.tif' and 'b/img_1\.jpg'"):
+        unique_stems(["a/IMG_1.tif", "IMG_2.tif", "b/img_1.jpg"])
+    assert unique_stems(["x/1.tif", "2"]) == {"x/1.tif": "1", "2": "2"}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "/vsicurl/https://example.org/a.tif",
+        "/VSIZIP/a.zip/a.tif",
+        "//vsis3/bucket/a.tif",
+        "\\vsimem\\a.tif",
+        "  /vsistdin/",
+        "https://example.org/a.tif",
+        "ftp://example.org/a",
+        "file:///etc/passwd",
+        "zip+file://a.zip!a.tif",
+        "NETCDF:a.nc:v",
+        "GTIFF_DIR:1:a.tif",
+        "WMS:http://x",
+        "<VRTDataset>",
+        '{"type": "gdal"}',
+        "a\0b.tif",
+        "a\nb.tif",
+        "",
+        "   ",
+    ],
+)
+def test_fault_09_only_plain_paths_are_inputs(text: str) -> None:
+    with pytest.raises(InputError):
+        check_input_name(text)
+
+
+@pytest.mark.parametrize(
+    "text", ["a.tif", "../data/a b.tif", "C:\\data\\a.tif", "c:/data/a.tif", "/data/vsi.tif", "ä.tif"]
+)
+def test_plain_paths_are_inputs(text: str) -> None:
+    assert check_input_name(text) == text
+
+
+def test_fault_09_a_relative_path_cannot_become_virtual(tmp_path: Path) -> None:
+    climb = "../" * len(tmp_path.parts)
+    with pytest.raises(InputError, match="virtual"):
+        resolve_input(tmp_path, f"{climb}vsicurl/x.tif")
+    assert resolve_input(tmp_path, "a/../b.tif") == (tmp_path / "b.tif").resolve()
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "same"),
+    [
+        ("DJI_0018.jpg", "images/DJI_0018.TIF", True),
+        ("DJI_0018", "DJI_0018.jpeg", True),
+        (unicodedata.normalize("NFD", "Übung.tif"), "Übung", True),
+        ("IMG.1", "IMG.2", False),
+        ("IMG_1", "img_1", False),
+    ],
+)
+def test_names_are_compared_without_folder_and_suffix(a: str, b: str, same: bool) -> None:
+    assert (match_key(a) == match_key(b)) is same
