@@ -12,6 +12,7 @@ import rasterio.shutil
 
 from photoplan.errors import PhotoplanError, UsageError
 from photoplan.geometry.grid import MapGrid
+from photoplan.io import product as product_module
 from photoplan.io.cog import CogOptions, write_cog
 from photoplan.io.product import ProductFile
 from photoplan.io.tiff_layout import TiffLayout, read_tiff_layout, read_tiff_layouts
@@ -90,6 +91,20 @@ def test_overviews_are_averages_of_valid_pixels(tmp_path: Path) -> None:
         found = opened.read(1)
     masked = np.ma.array(pixels[0], mask=~valid).reshape(128, 2, 256, 2).mean(axis=(1, 3))
     np.testing.assert_allclose(found, masked.filled(np.nan), rtol=1e-6)
+
+
+@pytest.mark.parametrize("options", [{"compress": "none", "overviews": False}, {"nodata": "mask"}], ids=str)
+def test_fault_24_products_over_4_gb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any]) -> None:
+    """The large form of TIFF, forced on a small product: the same pixels, positions of eight bytes."""
+    product(tmp_path / "small.tif", **options)
+    monkeypatch.setattr(product_module, "_BIG", 0)
+    layouts = product(tmp_path / "big.tif", **options)
+    if options.get("compress") == "none":
+        assert (tmp_path / "big.tif").read_bytes()[2] == 43
+        assert np.dtype(layouts[0].offsets_array.dtype).itemsize == 8
+    with rasterio.open(tmp_path / "small.tif") as small, rasterio.open(tmp_path / "big.tif") as big:
+        np.testing.assert_array_equal(small.read(), big.read())
+        np.testing.assert_array_equal(small.dataset_mask(), big.dataset_mask())
 
 
 @pytest.mark.parametrize("big", ["NO", "YES"])

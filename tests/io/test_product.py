@@ -105,6 +105,26 @@ def test_jpeg_takes_a_mask_and_colours(tmp_path: Path) -> None:
         assert np.abs(file.read().astype(float) - pixels)[:, valid].mean() < 6
 
 
+def test_fault_22_no_dark_fringe_beside_a_hole_in_jpeg(tmp_path: Path) -> None:
+    """A bright field with a ragged hole: black under the mask would ring into the valid pixels."""
+    pixels = np.full((3, 400, 600), 240, np.uint8)
+    y, x = np.mgrid[:400, :600]
+    valid = (x - 303) ** 2 + (y - 203) ** 2 > 101**2
+    make(tmp_path / "a.tif", pixels, valid, compress="jpeg", quality=75)
+    with rasterio.open(tmp_path / "a.tif") as file:
+        assert np.abs(file.read().astype(int) - 240)[:, valid].max() <= 2
+
+
+def test_names_with_special_characters_touch_no_other_file(tmp_path: Path) -> None:
+    others = [".a.tif.part.tif", ".b.tif.plain.tif.msk", "x.tif"]
+    for other in others:
+        (tmp_path / other).write_text("precious")
+    pixels, _ = scene(1, "uint8")
+    for name in ("[ab]*.tif", "?.tif", "ü ß.tif"):
+        make(tmp_path / name, pixels, None, overwrite=True)
+    assert {p.name for p in tmp_path.iterdir()} == {*others, "[ab]*.tif", "?.tif", "ü ß.tif"}
+
+
 def test_a_black_valid_pixel_stays_valid_for_other_readers(tmp_path: Path) -> None:
     pixels = np.zeros((3, 400, 600), np.uint8)
     facts = make(tmp_path / "a.tif", pixels, None)

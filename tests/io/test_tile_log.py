@@ -171,8 +171,10 @@ def test_fault_04_no_more_room(tmp_path: Path) -> None:
     assert int(count) == 11
     assert str(path) in message
     assert "finished tiles are kept" in message
+    size = path.stat().st_size
     with TileLog(path, "run") as log:
         assert log.finished == set(range(11))
+    assert path.stat().st_size == size, "the torn record was removed at once, its room is free"
 
 
 def test_fault_29_a_place_that_cannot_be_written(tmp_path: Path) -> None:

@@ -132,7 +132,7 @@ class ProductFile:
             )
         self._options = CogOptions(self.compress, self.overviews, self.tile, quality=self.quality, threads=self.threads)
         value = nodata_for(self.dtype, self.nodata, self.compress)
-        self._coder = BlockCoder(self.tile, self.bands, self.dtype, value)
+        self._coder = BlockCoder(self.tile, self.bands, self.dtype, value, lossy=self.compress == "jpeg")
         self._windows = tuple(self.grid.window.tiles(self.tile))
         self._lock = FileLock(self.path.with_name(f".{self.path.name}.lock"))
         self._state = threading.Lock()

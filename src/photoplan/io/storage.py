@@ -47,6 +47,8 @@ class BlockCoder:
     """Type of the pixels."""
     nodata: float | None
     """Nodata value; None: a mask of one byte per pixel (0 or 255) follows the pixels."""
+    lossy: bool = False
+    """The compression changes values: what lies under the mask must not stand out."""
 
     @property
     def pixel_bytes(self) -> int:
@@ -62,11 +64,15 @@ class BlockCoder:
         """Bytes of a block, and how many valid values were moved because they equalled nodata.
 
         Such a value becomes its neighbour (nodata + 1, or nodata - 1 at the upper end of the type), so that no reader
-        takes a valid dark pixel for nothing. Invalid pixels become nodata (0 under a mask).
+        takes a valid dark pixel for nothing. Invalid pixels become nodata, or 0 under a mask; with a lossy compression
+        they take the tile's mean, because a step to black would ring into the valid pixels beside it.
         """
         block, moved = self._interleave(pixels)
         if valid is not None and not valid.all():
-            block[: pixels.shape[1], : pixels.shape[2]][~valid] = 0 if self.nodata is None else self.nodata
+            empty: Any = 0 if self.nodata is None else self.nodata
+            if self.lossy and valid.any():
+                empty = [np.rint(band[valid].mean()) for band in pixels]
+            block[: pixels.shape[1], : pixels.shape[2]][~valid] = empty
         if self.nodata is not None:
             return block.data.cast("B"), moved
         mask = np.zeros((self.side, self.side), np.uint8)
