@@ -76,10 +76,8 @@ def fit_affine(plane_mm: Marks, scan_px: Marks, *, mirrored: bool = False) -> Fi
     """
     common = _pair(plane_mm, scan_px, 3, "affine")
     coefficients, covariance, residuals, sigma0 = _adjust(common.plane, common.scan, _affine_design)
-    _check_blunders(common, residuals)
-    transformation = Affine2D(*coefficients)
-    _check_handedness(transformation.determinant, mirrored)
-    return _result(common, transformation, residuals, sigma0, covariance)
+    _check_marks(common, residuals, coefficients, mirrored)
+    return _result(common, Affine2D(*coefficients), residuals, sigma0, covariance)
 
 
 def fit_bilinear(plane_mm: Marks, scan_px: Marks, *, mirrored: bool = False) -> FiducialFit:
@@ -90,8 +88,7 @@ def fit_bilinear(plane_mm: Marks, scan_px: Marks, *, mirrored: bool = False) -> 
     """
     common = _pair(plane_mm, scan_px, 4, "bilinear")
     affine, _, affine_residuals, _ = _adjust(common.plane, common.scan, _affine_design)
-    _check_blunders(common, affine_residuals)
-    _check_handedness(Affine2D(*affine).determinant, mirrored)
+    _check_marks(common, affine_residuals, affine, mirrored)
     coefficients, covariance, residuals, sigma0 = _adjust(common.plane, common.scan, _bilinear_design)
     return _result(common, Bilinear2D(*coefficients), residuals, sigma0, covariance)
 
@@ -184,25 +181,52 @@ def _adjust(
     return unknowns.T.ravel(), covariance, residuals, sigma0
 
 
-def _check_blunders(common: _Pairs, residuals: NDArray[np.float64]) -> None:
-    """Refuse residuals that no film has, and say which marks are exchanged or which one is off."""
+def _check_marks(common: _Pairs, residuals: NDArray[np.float64], affine: NDArray[np.float64], mirrored: bool) -> None:
+    """Refuse residuals that no film has and scans of the wrong handedness, and say what would explain them."""
     off = np.linalg.norm(residuals, axis=1)
     limit = BLUNDER * float(np.ptp(common.scan, axis=0).max())
-    if off.max() <= limit:
+    turned = not _has_handedness(affine, mirrored)
+    if off.max() <= limit and not turned:
         return
-    for i, j in itertools.combinations(range(len(off)), 2):
-        order = list(range(len(off)))
-        order[i], order[j] = j, i
-        fit = _adjust(common.plane, common.scan[order], _affine_design)
-        if np.linalg.norm(fit[2], axis=1).max() <= limit:
-            raise InputError(
-                f"fiducial marks {common.names[i]!r} and {common.names[j]!r} are exchanged: residuals of "
-                f"{off.max():.1f} px become {np.linalg.norm(fit[2], axis=1).max():.1f} px when they change places"
-            )
+    exchanged = _exchanged(common, limit, mirrored)
+    if off.max() <= limit:
+        raise InputError(_turned_message(mirrored, exchanged))
+    if exchanged:
+        raise InputError(
+            f"fiducial marks {' or '.join(exchanged)} are exchanged: residuals reach {off.max():.1f} px, and "
+            f"less than {limit:.1f} px when these two change places"
+        )
     listed = ", ".join(f"{n} {v:.1f}" for n, v in zip(common.names, off))
     raise InputError(
         f"fiducial marks: {_suspect(common)}; residuals (px: {listed}) exceed {limit:.1f} px, more than film deforms. "
         "Measure again, or check that the calibration belongs to this camera"
+    )
+
+
+def _exchanged(common: _Pairs, limit: float, mirrored: bool) -> list[str]:
+    """Pairs of marks that make all residuals small, with the right handedness, when they change places."""
+    pairs = []
+    for i, j in itertools.combinations(range(len(common.names)), 2):
+        order = list(range(len(common.names)))
+        order[i], order[j] = j, i
+        affine, _, residuals, _ = _adjust(common.plane, common.scan[order], _affine_design)
+        if np.linalg.norm(residuals, axis=1).max() <= limit and _has_handedness(affine, mirrored):
+            pairs.append(f"{common.names[i]!r} and {common.names[j]!r}")
+    return pairs
+
+
+def _has_handedness(affine: NDArray[np.float64], mirrored: bool) -> bool:
+    # Image plane y up, rows downwards: the determinant of an unmirrored scan is negative.
+    return bool((affine[0] * affine[4] - affine[1] * affine[3] > 0) == mirrored)
+
+
+def _turned_message(mirrored: bool, exchanged: list[str]) -> str:
+    also = f"; or the marks {' or '.join(exchanged)} are exchanged" if exchanged else ""
+    if mirrored:
+        return f"the fiducial marks are not mirrored in the scan, but mirrored = true was stated{also}"
+    return (
+        "the scan is mirrored: its fiducial marks run the other way round than the calibrated ones. Scan the film from "
+        f"its other side or mirror the image, or check that rows are counted downwards and y upwards{also}"
     )
 
 
@@ -216,18 +240,6 @@ def _suspect(common: _Pairs) -> str:
         rest = np.arange(n) != k
         left.append(_adjust(common.plane[rest], common.scan[rest], _affine_design)[3])
     return f"{common.names[int(np.argmin(left))]!r} is wrong"
-
-
-def _check_handedness(determinant: float, mirrored: bool) -> None:
-    # Image plane y up, rows downwards: the determinant of an unmirrored scan is negative.
-    if (determinant > 0) == mirrored:
-        return
-    if mirrored:
-        raise InputError("the fiducial marks are not mirrored in the scan, but mirrored = true was stated")
-    raise InputError(
-        "the scan is mirrored: its fiducial marks run the other way round than the calibrated ones. Scan the film from "
-        "its other side or mirror the image, or check that rows are counted downwards and y upwards"
-    )
 
 
 def _list(names: Iterable[str]) -> str:

@@ -20,7 +20,7 @@ _SEA_LEVEL = 277.0e-6
 _TOP = _SEA_LEVEL * (1.0 - _LAPSE * _TROPOPAUSE) ** _POWER
 
 #: Below this difference of heights the integral is replaced by its series, metres.
-_NEAR = 50.0
+_NEAR = 2.0
 
 
 def refractivity(z: ArrayLike) -> NDArray[np.float64]:

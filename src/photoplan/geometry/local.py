@@ -40,6 +40,13 @@ class _Projection:
 
     def map(self, lon: NDArray[np.float64], lat: NDArray[np.float64]) -> NDArray[np.float64]:
         """Map points (..., 2) of longitude and latitude in radians."""
+        out = self._forward(lon, lat)
+        # Some inverse projections of PROJ are good to tenths of a millimetre only (LAEA); as `radians` uses them, the
+        # difference is taken out here, so that the two are inverse to the last digit.
+        back_lon, back_lat = self.radians(out)
+        return self._forward(2.0 * lon - back_lon, 2.0 * lat - back_lat)
+
+    def _forward(self, lon: NDArray[np.float64], lat: NDArray[np.float64]) -> NDArray[np.float64]:
         X, Y = self.to_geographic.transform(lon / self.unit, lat / self.unit, direction="INVERSE")
         out = np.stack([np.asarray(X, float), np.asarray(Y, float)], axis=-1)
         out[~np.isfinite(out)] = np.nan
@@ -161,9 +168,13 @@ class LocalFrame:
         it. It holds the meridian convergence and the tilt of the station's horizon. Grid east is taken at right
         angles to grid north, which makes no difference in a conformal projection.
         """
-        J = self.jacobian(XYZ)
+        at = np.array(XYZ, float)
+        # Grid north is a direction on the ellipsoid; at 10 km it would differ by 1e-8.
+        at[..., 2] = 0.0
+        J = self.jacobian(at)
         up = J[..., 2]
-        north = J[..., 1] / np.linalg.norm(J[..., 1], axis=-1, keepdims=True)
+        north = J[..., 1] - (J[..., 1] * up).sum(axis=-1, keepdims=True) * up
+        north /= np.linalg.norm(north, axis=-1, keepdims=True)
         return np.stack([np.cross(north, up), north, up], axis=-1)
 
     def convergence(self, XY: ArrayLike) -> NDArray[np.float64]:
