@@ -5,12 +5,11 @@ from __future__ import annotations
 import errno
 import importlib
 import os
-import signal
 import sys
-from types import FrameType
 
 import click
 
+from photoplan.cli.interrupt import CODE, catch_interrupts, stop_children
 from photoplan.errors import PhotoplanError, ResourceError
 
 __all__ = ["main"]
@@ -56,18 +55,17 @@ def photoplan() -> None:
 
 def main() -> None:
     """Entry point: runs a verb and turns every error into a message and an exit code."""
-    signal.signal(signal.SIGTERM, _terminate)
+    catch_interrupts()
     try:
         code = photoplan.main(standalone_mode=False)
-    except click.exceptions.Abort:
-        code = _say("interrupted; the same command continues where this run stopped", 130)
+    except (click.exceptions.Abort, KeyboardInterrupt):
+        stop_children()
+        code = _say("interrupted; the same command continues where this run stopped", CODE)
     except click.ClickException as error:
         error.show()
         code = 2
     except PhotoplanError as error:
         code = _say(str(error), error.exit_code)
-    except KeyboardInterrupt:
-        code = _say("interrupted; the same command continues where this run stopped", 130)
     except MemoryError:
         code = _say("out of memory; give fewer --workers or less --memory", ResourceError.exit_code)
     except OSError as error:
@@ -78,10 +76,6 @@ def main() -> None:
         name = type(error).__name__
         code = _say(f"{name}: {error} — a fault of photoplan; PHOTOPLAN_TRACEBACK=1 shows where", 1)
     _leave(code if isinstance(code, int) else 0)
-
-
-def _terminate(signum: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
 
 
 def _say(message: str, code: int) -> int:
@@ -101,3 +95,7 @@ def _leave(code: int) -> None:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

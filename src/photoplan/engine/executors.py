@@ -7,6 +7,9 @@ is found and listed without harming the others.
 from __future__ import annotations
 
 import multiprocessing
+import os
+import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import (
@@ -18,6 +21,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,11 +78,71 @@ def executor_factory(kind: str, workers: int) -> Callable[[], Executor]:
     if kind == "threads":
         return (lambda: SerialExecutor()) if workers == 1 else (lambda: ThreadPoolExecutor(workers, "photoplan"))
     if kind == "processes":
-        # Forking a process that runs threads can lock up; a fresh interpreter cannot.
-        return lambda: ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
+        return lambda: _ProcessExecutor(workers)
     if "://" in kind:
         return lambda: _dask_executor(kind)
     raise UsageError(f"executor {kind!r}; allowed are threads, processes or a Dask scheduler's address tcp://host:port")
+
+
+class _ProcessExecutor(Executor):
+    """Worker processes that leave Ctrl-C to their parent, and end with it however it ends."""
+
+    def __init__(self, workers: int) -> None:
+        # Forking a process that runs threads can lock up; a fresh interpreter cannot.
+        self._pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _begin_worker)
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Submit to a worker; this may start one."""
+        with _signals_held():
+            return self._pool.submit(fn, *args, **kwargs)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the workers after the tiles they are at."""
+        self._pool.shutdown(wait, cancel_futures=cancel_futures)
+
+
+@contextmanager
+def _signals_held() -> Iterator[None]:
+    """Hold back Ctrl-C and SIGTERM: a worker is started whole, and begins its life with both held back too."""
+    if os.name != "posix":
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _begin_worker() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if os.name == "posix":
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, signal.SIGTERM))
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+class _DaskExecutor(Executor):
+    """Tiles on a Dask cluster; it is the cluster that tries a tile again when its worker dies."""
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+        self._inner = client.get_executor(retries=RETRIES, pure=False)
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Submit to the cluster."""
+        return self._inner.submit(fn, *args, **kwargs)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Leave the cluster; the cluster itself goes on."""
+        self._inner.shutdown(wait=wait and not cancel_futures)
+        self._client.close()
 
 
 def _dask_executor(address: str) -> Executor:
@@ -93,7 +157,7 @@ def _dask_executor(address: str) -> Executor:
         client.get_versions(check=True)
     except (OSError, TimeoutError, ValueError) as error:
         raise UsageError(f"executor {address}: no usable Dask scheduler ({error})") from error
-    return client.get_executor(retries=RETRIES)
+    return _DaskExecutor(client)
 
 
 def run_tiles(
