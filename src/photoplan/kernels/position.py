@@ -1,0 +1,188 @@
+"""Where the pixels of a tile lie in the source window, from anchors.
+
+Pixels are taken in runs of up to `RUN` columns of one row of a rectangle. The coefficients of a run are computed in
+double precision and refer to a whole source pixel near its middle; what is left per pixel is small, so single
+precision holds it to about 1e-5 pixel wherever the run lies in the source.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.kernels.jit import inner, kernel
+
+__all__ = ["RUN", "locate_run", "positions", "tile_runs"]
+
+RUN = 256
+"""Columns of a rectangle that share one set of coefficients."""
+
+
+@inner
+def _run_coefficients(rect, heights, corners, u_ref, v, coef):
+    """Row `v` of a box as polynomials in (u − u_ref, h − h_ref): fills coef (4, 3), returns h_ref.
+
+    coef[:, c] are the factors of 1, u, h and u·h for c = x·w, y·w, w.
+    """
+    width = float(rect[2] - rect[0])
+    t = (v - rect[1] + 0.5) / (rect[3] - rect[1])
+    s = (u_ref - rect[0] + 0.5) / width
+    rise = heights[1] - heights[0]
+    h_ref = float(np.float32(0.5 * (heights[0] + heights[1])))
+    q = (h_ref - heights[0]) / rise if rise > 0.0 else 0.0
+    per_metre = 1.0 / rise if rise > 0.0 else 0.0
+    for c in range(3):
+        p00 = corners[0, c] + t * (corners[2, c] - corners[0, c])
+        p01 = corners[1, c] + t * (corners[3, c] - corners[1, c])
+        p10 = corners[4, c] + t * (corners[6, c] - corners[4, c])
+        p11 = corners[5, c] + t * (corners[7, c] - corners[5, c])
+        along_u = p01 - p00
+        along_h = p10 - p00
+        twist = (p11 - p10) - along_u
+        coef[0, c] = p00 + s * along_u + q * (along_h + s * twist)
+        coef[1, c] = (along_u + q * twist) / width
+        coef[2, c] = (along_h + s * twist) * per_metre
+        coef[3, c] = twist / width * per_metre
+    return h_ref
+
+
+@inner
+def _run_origin(coef, origin):
+    """Whole source pixel at the middle of the run, relative to which `_run_positions` works."""
+    for c in range(2):
+        value = np.floor(coef[0, c] / coef[0, 2])
+        # Far or undefined positions are outside every window; the kernels only need a number that converts.
+        origin[c] = value if abs(value) < 1e9 else 0.0
+
+
+@inner
+def _single(coef, c):
+    return np.float32(coef[0, c]), np.float32(coef[1, c]), np.float32(coef[2, c]), np.float32(coef[3, c])
+
+
+@inner
+def _run_positions(coef, origin, u_first, heights, h_ref, dx, dy):
+    """Positions of a run relative to `origin`; NaN heights give NaN.
+
+    u_first is the first column relative to the reference column of `coef`.
+    """
+    for k in range(4):
+        coef[k, 0] -= origin[0] * coef[k, 2]
+        coef[k, 1] -= origin[1] * coef[k, 2]
+    x0, x1, x2, x3 = _single(coef, 0)
+    y0, y1, y2, y3 = _single(coef, 1)
+    w0, w1, w2, w3 = _single(coef, 2)
+    h0, first, one = np.float32(h_ref), np.float32(u_first), np.float32(1.0)
+    for i in range(heights.shape[0]):
+        u = first + np.float32(np.int32(i))
+        h = heights[i] - h0
+        inverse = one / ((w0 + w1 * u) + h * (w2 + w3 * u))
+        dx[i] = ((x0 + x1 * u) + h * (x2 + x3 * u)) * inverse
+        dy[i] = ((y0 + y1 * u) + h * (y2 + y3 * u)) * inverse
+
+
+@inner
+def _keep_from(heights, low, higher_x, higher_y, dx, dy):
+    """Take the higher box's positions where the height is not below it."""
+    for i in range(heights.shape[0]):
+        if heights[i] >= low:
+            dx[i], dy[i] = higher_x[i], higher_y[i]
+
+
+@inner
+def locate_run(anchors, run, heights, frame, dx, dy):
+    """Positions of the pixels of one run, relative to the run's origin.
+
+    Parameters
+    ----------
+    anchors : tuple
+        rects, box_start, box_heights, corners, as in `rectify_tile`.
+    run : (5,) int32
+        A line of `tile_runs`.
+    heights : (n,) float32
+    frame : (origin (2,), coef (4, 3))
+        Filled: the whole source pixel to be added to dx, dy; the coefficients of the highest box.
+    dx, dy : (n,) float32
+        Filled. With several boxes piled up, a pixel keeps what the highest box not above it says; heights below the
+        lowest box are taken by that one.
+    """
+    rects, box_start, box_heights, corners = anchors
+    origin, coef = frame
+    index, v = run[0], run[1]
+    # The middle of the run as the rectangle has it, not as a crop may: crops must get the same bytes.
+    u_ref = run[2] + min(RUN, rects[index, 2] - run[2]) // 2
+    lowest = box_start[index]
+    for box in range(lowest, box_start[index + 1]):
+        h_ref = _run_coefficients(rects[index], box_heights[box], corners[box], u_ref, v, coef)
+        if box == lowest:
+            _run_origin(coef, origin)
+            _run_positions(coef, origin, run[3] - u_ref, heights, h_ref, dx, dy)
+        else:
+            higher = np.empty((2, RUN), np.float32)
+            _run_positions(coef, origin, run[3] - u_ref, heights, h_ref, higher[0], higher[1])
+            _keep_from(heights, np.float32(box_heights[box, 0]), higher[0], higher[1], dx, dy)
+
+
+@kernel
+def tile_runs(rects, chosen, offset, rows, cols):
+    """Runs of the rectangles `chosen` inside rows × cols pixels from `offset` (column, row) on.
+
+    Returns (k, 5) int32: rectangle, row, column from which the run's coefficients hold, first and end column; in the
+    tile's pixels.
+    """
+    count = 0
+    for index in chosen:
+        width = rects[index, 2] - rects[index, 0]
+        count += max(0, rects[index, 3] - rects[index, 1]) * (width // RUN + 1)
+    runs = np.empty((count, 5), np.int32)
+    count = 0
+    for index in chosen:
+        right, bottom = min(rects[index, 2], offset[0] + cols), min(rects[index, 3], offset[1] + rows)
+        for v in range(max(rects[index, 1], offset[1]), bottom):
+            for u_run in range(rects[index, 0], right, RUN):
+                u, end = max(u_run, offset[0]), min(u_run + RUN, right)
+                if u < end:
+                    runs[count, 0], runs[count, 1], runs[count, 2] = index, v, u_run
+                    runs[count, 3], runs[count, 4] = u, end
+                    count += 1
+    return runs[:count]
+
+
+@kernel
+def _positions(anchors, runs, relief, offset, result):
+    coef, origin = np.empty((4, 3)), np.empty(2)
+    moved = np.empty((2, RUN), np.float32)
+    for k in range(runs.shape[0]):
+        row, col, n = runs[k, 1] - offset[1], runs[k, 3] - offset[0], runs[k, 4] - runs[k, 3]
+        dx, dy = moved[0, :n], moved[1, :n]
+        locate_run(anchors, runs[k], relief[row, col : col + n], (origin, coef), dx, dy)
+        for i in range(n):
+            result[row, col + i, 0] = origin[0] + dx[i]
+            result[row, col + i, 1] = origin[1] + dy[i]
+
+
+def positions(
+    anchors: tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]],
+    relief: NDArray[np.float32],
+    offset: tuple[int, int] = (0, 0),
+) -> NDArray[np.float32]:
+    """Source positions of the pixels of a tile, as the engine uses them.
+
+    Parameters
+    ----------
+    anchors : tuple of arrays
+        rects (m, 4) int32, box_start (m + 1,) int32, box_heights (n, 2) float64, corners (n, 8, 3) float64.
+    relief : ndarray, shape (rows, cols), float32
+        Height of every pixel; NaN where there is no surface.
+    offset : (column, row)
+        First pixel of `relief` in the tile's pixels.
+
+    Returns
+    -------
+    ndarray, shape (rows, cols, 2), float32
+        (x, y) in pixels of the source window; NaN where there is no surface or no rectangle.
+    """
+    result = np.full((*relief.shape, 2), np.nan, np.float32)
+    runs = tile_runs(anchors[0], np.arange(len(anchors[0])), offset, *relief.shape)
+    _positions(tuple(anchors), runs, np.ascontiguousarray(relief, np.float32), offset, result)
+    return result

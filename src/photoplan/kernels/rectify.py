@@ -1,0 +1,202 @@
+"""One tile resampled from one source window: the only entry to the resampling kernels.
+
+Validity, one rule: a tap outside the image, or invalid in the source's mask, carries no weight, and the rest is
+renormalised. A pixel is valid if its height is finite, it lies in a rectangle of the anchors, its position lies within
+the outer edges of the image's border pixels, and its valid taps carry at least half of the kernel's weight (nearest:
+the pixel itself is valid). What invalid source pixels hold never enters a sum.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.kernels.area import average_runs, largest_scales, stretch_runs
+from photoplan.kernels.border import border_runs
+from photoplan.kernels.gather import gather_runs
+from photoplan.kernels.jit import is_ready
+from photoplan.kernels.pack import as_bytes, pack, solid_patches
+from photoplan.kernels.place import empty_block, place_runs
+from photoplan.kernels.position import RUN, tile_runs
+from photoplan.kernels.weights import KERNELS, STRETCH_FROM
+
+__all__ = ["AnchorArrays", "is_compiled", "rectify_packed", "rectify_tile"]
+
+AnchorArrays = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]
+"""rects (m, 4), box_start (m + 1,), box_heights (n, 2), corners (n, 8, 3): the fields of `photoplan.plan.Anchors`."""
+
+Border = tuple[float, float, float, float]
+"""Outer edges of the image x_min, y_min, x_max, y_max in pixels of the source window."""
+
+# Scales are measured at the corners of boxes; between them a perspective is hardly larger. A rectangle that comes
+# this near to averaging is looked at pixel by pixel.
+BLOCK = 64
+"""Runs that go through the steps together: small enough to stay in the processor's cache."""
+
+_LOOK_CLOSER = 0.97 * STRETCH_FROM
+
+
+_ANCHOR_TYPES = (np.int32, np.int32, np.float64, np.float64)
+
+
+@lru_cache(maxsize=64)
+def _rule(name: str, dtype: np.dtype[Any], lanes: int) -> tuple[Any, ...]:
+    """Coefficients, tags and limits as `gather_runs` wants them."""
+    kernel = KERNELS[name]
+    width = {1: 1, 2: 2, 4: 4, 6: 8}[kernel.taps]
+    coefficients = np.zeros((len(kernel.coefficients), 2 * width), np.float32)
+    coefficients[:, : kernel.taps] = kernel.coefficients
+    coefficients[:, width : width + kernel.taps] = kernel.coefficients
+    limits = (-np.inf, np.inf, 0.0)
+    if dtype.kind != "f":
+        limits = (float(np.iinfo(dtype).min), float(np.iinfo(dtype).max), 0.5)
+    return coefficients, ((0,) * kernel.taps, (0,) * lanes), limits
+
+
+def rectify_tile(
+    anchors: AnchorArrays,
+    relief: NDArray[np.float32],
+    source: NDArray[Any],
+    valid: NDArray[Any] | None,
+    border: Border | None,
+    kernel: str,
+    out: NDArray[Any],
+    out_valid: NDArray[np.bool_],
+    offset: tuple[int, int] = (0, 0),
+) -> None:
+    """Resample one tile from a source window as it was read.
+
+    Parameters
+    ----------
+    anchors : tuple of arrays
+        rects (m, 4) int32, box_start (m + 1,) int32, box_heights (n, 2) float64, corners (n, 8, 3) float64.
+    relief : ndarray, shape (rows, cols), float32
+        Height of every pixel, metres; NaN where there is no surface.
+    source : ndarray, shape (bands, height, width)
+        uint8, uint16, int16 or float32.
+    valid : ndarray, shape (height, width), or None
+        Bool or uint8, 0 = invalid. NaN pixels of float data must be marked here.
+    border : (x_min, y_min, x_max, y_max) or None
+        Outer edges of the image in pixels of the window; None: the window is the image.
+    kernel : str
+        A name of `KERNELS`.
+    out : ndarray, shape (bands, rows, cols), type of `source`
+        Written everywhere; 0 where the pixel is not valid.
+    out_valid : ndarray, shape (rows, cols), bool
+        Written everywhere.
+    offset : (column, row)
+        First pixel of `relief` and `out` in the tile's pixels: part of a tile is the same, byte by byte, as the tile
+        cut afterwards.
+
+    Notes
+    -----
+    Integers are rounded half away from zero and clipped. Where the target is coarser than the source the kernel is
+    widened along image x and y (see `weights.stretch`), except for "nearest", which keeps grey values.
+    """
+    rectify_packed(anchors, relief, pack(source, valid), valid, border, kernel, out, out_valid, offset)
+
+
+def rectify_packed(
+    anchors: AnchorArrays,
+    relief: NDArray[np.float32],
+    packed: NDArray[Any],
+    valid: NDArray[Any] | None,
+    border: Border | None,
+    kernel: str,
+    out: NDArray[Any],
+    out_valid: NDArray[np.bool_],
+    offset: tuple[int, int] = (0, 0),
+) -> None:
+    """Resample one tile from a source window that went through `pack` (for several tiles from one window).
+
+    Parameters as in `rectify_tile`; `packed` has the shape (groups, height, width, lanes).
+    """
+    height, width = packed.shape[1:3]
+    target, target_valid = np.require(out, requirements="CAW"), np.require(out_valid, bool, "CAW")
+    target[...] = 0
+    target_valid[...] = False
+    arrays = tuple(_plain(array, dtype) for array, dtype in zip(anchors, _ANCHOR_TYPES))
+    if packed.size and len(arrays[0]):
+        mask = solid = np.empty((0, 0), np.uint8)
+        if valid is not None:
+            mask = _plain(as_bytes(valid), np.uint8)
+            solid = solid_patches(mask, KERNELS[kernel].taps)
+        edges = (-0.5, -0.5, width - 0.5, height - 0.5) if border is None else tuple(float(edge) for edge in border)
+        image = (_plain(packed, packed.dtype), mask, solid, edges)
+        place = (int(offset[0]), int(offset[1]))
+        _resample(arrays, _plain(relief, np.float32), image, kernel, place, (target, target_valid))
+    if target is not out:
+        out[...] = target
+    if target_valid is not out_valid:
+        out_valid[...] = target_valid
+
+
+def _plain(array: NDArray[Any], dtype: Any) -> NDArray[Any]:
+    """The array in the one form that kernels are compiled for: contiguous, aligned, not read-only."""
+    return np.require(array, dtype, "CAW")
+
+
+def _resample(
+    anchors: tuple[Any, ...],
+    relief: NDArray[np.float32],
+    image: tuple[Any, ...],
+    name: str,
+    offset: tuple[int, int],
+    result: tuple[Any, ...],
+) -> None:
+    """Rectangles at about the source's scale, and those that are coarser, block by block."""
+    rects, box_start, _, corners = anchors
+    coarse = np.zeros(len(rects), bool)
+    if name != "nearest":
+        coarse = ~(largest_scales(rects, box_start, corners) <= _LOOK_CLOSER)
+    for averaging in (False, True):
+        chosen = np.flatnonzero(coarse == averaging)
+        runs = tile_runs(rects, chosen, offset, *relief.shape)
+        block = empty_block(min(BLOCK, len(runs)))
+        for start in range(0, len(runs), BLOCK):
+            _block(anchors, runs[start : start + BLOCK], relief, image, name, offset, (block, averaging), result)
+
+
+def _block(
+    anchors: tuple[Any, ...],
+    runs: NDArray[np.int32],
+    relief: NDArray[np.float32],
+    image: tuple[Any, ...],
+    name: str,
+    offset: tuple[int, int],
+    work: tuple[Any, bool],
+    result: tuple[Any, ...],
+) -> None:
+    """The steps of one block of runs; those that no pixel needs are skipped (and not compiled)."""
+    packed, mask, solid, edges = image
+    block, averaging = work
+    _, height, width, lanes = packed.shape
+    coefficients, tags, limits = _rule(name, packed.dtype, lanes)
+    taps = KERNELS[name].taps
+    doubtful = place_runs(anchors, runs, relief, offset, (taps, width, height, solid, edges), block, result[1])
+    averaged = 0
+    if averaging:
+        scales = np.empty((len(runs), 2, RUN))
+        averaged = stretch_runs(anchors, runs, relief, offset, block, scales)
+    gather_runs(packed, runs, offset, block, coefficients, tags, result[0])
+    if doubtful:
+        border_runs(packed, mask, runs, offset, block, (coefficients, taps, limits), result)
+    if averaged:
+        sums = np.empty(width * lanes, np.float64 if packed.dtype.kind == "f" else np.float32)
+        average_runs(packed, mask, runs, offset, block, scales, (coefficients, taps, limits), result, sums)
+
+
+def is_compiled(dtype: Any, bands: int, kernel: str) -> bool:
+    """Whether the code for such pixels exists, in this process or on the disk; if not, the first tile waits for it.
+
+    Costs a few milliseconds. Kernels are compiled once for each type of pixel, for one band or several, and for one,
+    two, four or six taps; callers announce it ("compiling kernels, once") when this is False. The code for averaging
+    is compiled apart, when a tile is first coarser than its source. Plain Python (`NUMBA_DISABLE_JIT=1`) is True.
+    """
+    lanes = 1 if bands == 1 else 4
+    coefficients, tags, _ = _rule(kernel, np.dtype(dtype), lanes)
+    source, out = np.empty((1, 1, 1, lanes), dtype), np.empty((bands, 1, 1), dtype)
+    return is_ready(gather_runs, (source, np.empty((0, 5), np.int32), (0, 0), empty_block(0), coefficients, tags, out))
