@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photoplan.geometry.rotation import ROTATION_ORDERS, angles_from_rotation, rotation_from_angles, rotation_opk
+from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles, rotation_opk
 from photoplan.io.camera_file import read_cameras
 from photoplan.io.camera_model import FrameCamera
 from photoplan.io.orientation_file import read_orientation
@@ -182,23 +182,30 @@ def test_fault_14_transposed_rotation_of_a_block_in_two_directions() -> None:
     assert "--rotation-direction ground-to-camera" in fails(assess(views(opk, centers, transposed), hills))
 
 
-@pytest.mark.parametrize("order", [o for o in ROTATION_ORDERS if o != "opk"])
-def test_fault_14_rotation_order_of_oblique_images(order: str) -> None:
-    """Images that look inwards from around the terrain: another order sends them elsewhere."""
-    azimuth = np.arange(0, 360, 30.0) + 7
-    a = np.radians(azimuth)
-    centers = np.column_stack([700_000 - 2400 * np.sin(a), 5_300_000 - 2400 * np.cos(a), np.full(12, 2400.0)])
-    R = [rotation_from_angles([-k, 0, 0], "kpo") @ rotation_opk(np.radians(50), 0, 0) for k in a]
-    assert assess(views([np.degrees(angles_from_rotation(r)) for r in R], centers), hills).alternative is None
-    # The table was written in another order; each angle has its own column, so it is read with the wrong one.
-    written = []
-    for r in R:
-        named = dict(zip(order, np.degrees(angles_from_rotation(r, order))))
-        written.append([named[k] for k in "opk"])
-    result = assess(views(written, centers), hills)
-    if not result.implausible:
-        pytest.skip("this order happens to look at the terrain too")
+def inwards(order: str) -> tuple[list[list[float]], np.ndarray]:
+    """Oblique images around the terrain that look inwards, their angles worked out in `order`, one column each."""
+    a = np.radians(np.arange(0, 360, 30.0) + 7)
+    centers = np.column_stack([MIDDLE[0] - 2400 * np.sin(a), MIDDLE[1] - 2400 * np.cos(a), np.full(12, 2400.0)])
+    rows = []
+    for k in a:
+        R = rotation_from_angles([-k, 0, 0], "kpo") @ rotation_opk(np.radians(50), 0, 0)
+        named = dict(zip(order, np.degrees(angles_from_rotation(R, order))))
+        rows.append([named[letter] for letter in "opk"])
+    return rows, centers
+
+
+@pytest.mark.parametrize("order", ["kpo", "kop", "okp", "pko"])
+def test_fault_14_rotation_order_that_sends_oblique_images_elsewhere(order: str) -> None:
+    result = assess(views(*inwards(order)), hills)
     assert f"--rotation {order}" in fails(result)
+
+
+@pytest.mark.parametrize("order", ["opk", "pok"])
+def test_the_right_order_and_one_that_looks_at_the_terrain_too_claim_nothing(order: str) -> None:
+    """What geometry alone cannot tell is not guessed."""
+    result = assess(views(*inwards(order)), hills)
+    assert result.implausible == ()
+    assert result.alternative is None
 
 
 def test_cameras_below_the_terrain_are_a_question_of_heights() -> None:
@@ -248,3 +255,15 @@ def test_fault_14_on_the_real_drone_block(block: Path, written: Callable[[np.nda
         assert abs(np.median(scale) - 1) < 0.01
     else:
         assert says in fails(result)
+
+
+def test_terrain_is_never_asked_for_in_a_large_window() -> None:
+    """Flat rays reach far; a window around all their points could be the whole of a huge terrain."""
+    opk, centers = strips()
+    opk[:, 0] = 85
+
+    def careful(XY: np.ndarray) -> np.ndarray:
+        assert np.ptp(XY, axis=0).max(initial=0) <= 1000
+        return hills(XY)
+
+    assert len(assess(views(opk, centers), careful).images) == 12

@@ -290,8 +290,6 @@ def topocentric_poses(
 
     enu = np.asarray(centers, float).reshape(-1, 3)
     J = np.stack([to_ground(enu + d) - to_ground(enu - d) for d in np.eye(3) * reach], axis=-1) / (2 * reach)
-    # Map and height have different scales: taking the horizontal scale out first keeps the rotation free of it.
-    scale = np.sqrt(np.abs(np.linalg.det(J)))
-    J[:, :2, :] /= scale[:, None, None]
+    # The nearest rotation: the map's scale stretches rows of J and does not turn it.
     U, _, Vt = np.linalg.svd(J)
     return to_ground(enu), U @ Vt

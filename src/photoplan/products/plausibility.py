@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from photoplan.geometry.rotation import rotation_from_angles
 from photoplan.io.camera_model import FilmCamera, FrameCamera
@@ -28,8 +29,12 @@ SAMPLE = 12
 #: A reading is taken as better by its tilts only if all stay below this, and half of the declared ones are above the
 #: second; degrees. Between them lies everything that oblique images may be.
 UPRIGHT, OBLIQUE = 10.0, 20.0
+#: Images whose lines are looked at.
+LINES = 400
 #: Points on a side of the grid over an image.
 POINTS = 5
+#: Side of the area in which heights are asked for at once, metres.
+CELL = 1000.0
 #: Points that count as the image's middle.
 INNER = 10
 #: Images needed before tilts or flight lines say anything.
@@ -157,17 +162,27 @@ def _footprint(
     if not np.isfinite(below):
         # The camera does not stand over the terrain: begin with heights that the rays come by.
         level[:] = _level_near(center, d, heights)
-    for _ in range(6):
+    for _ in range(5):
         with np.errstate(invalid="ignore"):
             points = center + d * ((level - center[2]) / d[:, 2])[:, None]
         there = np.isfinite(points[:, 0])
         found = np.full(len(d), np.nan)
         if there.any():
-            found[there] = heights(points[there, :2])
+            found[there] = _ground(heights, points[there, :2])
         # A ray that has left the terrain stays on its last level, it may come back in the next step.
         level = np.where(np.isfinite(found), found, level)
     points[:, 2] = found
     return points
+
+
+def _ground(heights: Heights, XY: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Heights at points that may lie far apart: asked for cell by cell, so that no large window is ever read."""
+    out = np.full(len(XY), np.nan)
+    cells, of = np.unique(np.floor(XY / CELL), axis=0, return_inverse=True)
+    for k in range(len(cells)):
+        mine = of.reshape(-1) == k
+        out[mine] = heights(XY[mine])
+    return out
 
 
 def _level_near(center: NDArray[np.float64], d: NDArray[np.float64], heights: Heights) -> float:
@@ -175,9 +190,10 @@ def _level_near(center: NDArray[np.float64], d: NDArray[np.float64], heights: He
     flat = d[np.isfinite(d[:, 2])]
     if not len(flat):
         return np.nan
-    reach = np.geomspace(10.0, 30_000.0, 25)
-    points = center[:2] + reach[:, None, None] * (flat[:, :2] / np.abs(flat[:, 2:]))
-    found = heights(points.reshape(-1, 2))
+    reach = np.geomspace(10.0, 30_000.0, 20)
+    rays = flat[:: max(1, len(flat) // 5)]
+    points = center[:2] + reach[:, None, None] * (rays[:, :2] / np.abs(rays[:, 2:]))
+    found = _ground(heights, points.reshape(-1, 2))
     good = np.isfinite(found)
     return float(np.median(found[good])) if good.any() else np.nan
 
@@ -186,7 +202,7 @@ def _alternative(views: list[View], images: tuple[ImagePlausibility, ...], heigh
     """Sentence on the reading that fits where the declared one does not."""
     chosen = _sample(views, images)
     sample, declared = [views[k] for k in chosen], [images[k] for k in chosen]
-    evidence = _Evidence.of(sample, declared, DECLARED)
+    evidence = _Evidence.of(views, declared, DECLARED)
     if not evidence.doubtful:
         return None
     ranked: list[tuple[tuple[float, ...], Reading, list[ImagePlausibility]]] = []
@@ -197,7 +213,7 @@ def _alternative(views: list[View], images: tuple[ImagePlausibility, ...], heigh
         if not _possible(reading, evidence.largest):
             continue
         seen = [_look(v, *reading.apply(v.center, v.angles, v.order), heights) for v in sample]
-        other = _Evidence.of(sample, seen, reading)
+        other = _Evidence.of(views, seen, reading)
         if other.better_than(evidence, reading):
             upright = -float(other.steepest < UPRIGHT)
             rank = (upright, reading.changes, -round(other.on_terrain, 2), -round(other.alike, 2))
@@ -240,7 +256,7 @@ class _Evidence:
             alike,
             offset,
             float(np.degrees(max(np.abs(v.angles).max() for v in views))),
-            len(images),
+            len(views),
         )
 
     @property
@@ -295,13 +311,12 @@ def _alignment(views: list[View], reading: Reading) -> tuple[float, float]:
 
     The line through an image and its nearest neighbour is along or across a strip, so angles count modulo 90°.
     """
-    posed = [reading.apply(v.center, v.angles, v.order) for v in views]
+    posed = [reading.apply(v.center, v.angles, v.order) for v in views[:LINES]]
     XY = np.array([center[:2] for center, _ in posed])
     if len(XY) < 2:
         return 1.0, 0.0
-    apart = np.linalg.norm(XY[:, None] - XY, axis=2)
-    np.fill_diagonal(apart, np.inf)
-    to = XY[apart.argmin(axis=1)] - XY
+    nearest = np.asarray(cKDTree(XY).query(XY, k=2)[1])[:, 1]
+    to = XY[nearest] - XY
     line = np.arctan2(to[:, 1], to[:, 0])
     kappa = np.array([np.arctan2(R[1, 0], R[0, 0]) for _, R in posed])
     mean = np.mean(np.exp(4j * (kappa - line)))
