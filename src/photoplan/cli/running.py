@@ -12,6 +12,7 @@ import click
 import psutil
 
 from photoplan.cli.progress import progress
+from photoplan.errors import TilesFailed
 from photoplan.products.execution import ProductResult, Run, execute
 from photoplan.products.orthophoto import OrthoPlan
 from photoplan.products.plan_file import PlanFigures, compile_figures, write_plan
@@ -86,17 +87,26 @@ def execute_and_report(plan: OrthoPlan, folder: Path, how: How) -> None:
     )
     for line in plan.blind:
         how.talk(f"  sees no terrain and is left out: {line}")
+    results: list[ProductResult] = []
+
+    def finished(result: ProductResult) -> None:
+        results.append(result)
+        if not how.as_json and not result.failed:
+            click.echo(str(result.path))
+
+    failed = None
     with progress(tiles, how.quiet) as report:
-        results = execute(
-            plan, folder, Run(how.workers, how.executor, how.memory, how.overwrite, how.quicklook, report, how.talk)
-        )
+        run = Run(how.workers, how.executor, how.memory, how.overwrite, how.quicklook, report, how.talk, finished)
+        try:
+            execute(plan, folder, run)
+        except TilesFailed as error:
+            failed = error
     seconds = time.perf_counter() - started
     if how.as_json:
         products = [r.to_dict() for r in results]
         click.echo(json.dumps({"products": products, "seconds": round(seconds, 3), "folder": str(folder)}, indent=2))
-        return
-    for result in results:
-        click.echo(str(result.path))
+    if failed is not None:
+        raise failed
     how.talk(_summary(results, plan, seconds))
     if how.quicklook:
         how.talk(f"quick look: {folder / 'overview.png'}")

@@ -23,11 +23,12 @@ from concurrent.futures import (
 )
 from contextlib import contextmanager
 from dataclasses import dataclass
+from types import TracebackType
 from typing import Any
 
 from photoplan.errors import PhotoplanError, UsageError
 
-__all__ = ["Outcome", "SerialExecutor", "executor_factory", "run_tiles"]
+__all__ = ["Outcome", "SerialExecutor", "Workers", "executor_factory", "run_tiles"]
 
 #: How often a tile is tried again after its worker died or an unforeseen error.
 RETRIES = 2
@@ -160,9 +161,47 @@ def _dask_executor(address: str) -> Executor:
     return _DaskExecutor(client)
 
 
-def run_tiles(
-    tasks: Iterable[Any], work: Callable[[Any], Any], make: Callable[[], Executor], in_flight: int
-) -> Iterator[Outcome]:
+class Workers:
+    """The executor of a whole run, a context manager: made when first needed, and anew when its workers died.
+
+    Parameters
+    ----------
+    make : callable
+        Makes an executor, see `executor_factory`.
+    """
+
+    def __init__(self, make: Callable[[], Executor]) -> None:
+        self._make = make
+        self._executor: Executor | None = None
+
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.end(wait=kind is None)
+
+    def submit(self, work: Callable[[Any], Any], task: Any) -> Future[Any]:
+        """Hand one task to the workers.
+
+        Raises
+        ------
+        BrokenExecutor
+            They have died; `end` them and submit again.
+        """
+        if self._executor is None:
+            self._executor = self._make()
+        return self._executor.submit(work, task)
+
+    def end(self, wait: bool = True) -> None:
+        """Let the workers go, at once or after the tasks they are at."""
+        executor, self._executor = self._executor, None
+        if executor is not None:
+            executor.shutdown(wait=wait, cancel_futures=True)
+
+
+def run_tiles(tasks: Iterable[Any], work: Callable[[Any], Any], workers: Workers, in_flight: int) -> Iterator[Outcome]:
     """Run `work(task)` for every task and yield outcomes as they come, in any order.
 
     Parameters
@@ -171,8 +210,8 @@ def run_tiles(
         Small and hashable; for processes and clusters they and `work` must pickle.
     work : callable
         Returns a tile's result.
-    make : callable
-        Makes an executor (see `executor_factory`); called again when its workers died.
+    workers : Workers
+        They stay for the next call.
     in_flight : int
         Tasks that are submitted and not yet yielded: what bounds memory.
 
@@ -184,23 +223,21 @@ def run_tiles(
     waiting = deque(tasks)
     alone: deque[Any] = deque()
     failures: dict[Any, int] = {}
-    executor = make()
     pending: dict[Future[Any], Any] = {}
     try:
         while waiting or alone or pending:
             try:
-                _fill(executor, work, pending, waiting, alone, in_flight)
+                _fill(workers, work, pending, waiting, alone, in_flight)
             except BrokenExecutor:
                 # The pool broke after its last result came: what is pending is told so below.
                 if not pending:
-                    executor = make()
+                    workers.end(wait=False)
                     continue
             done, _ = wait(pending, return_when=FIRST_COMPLETED)
             broken = [f for f in done if isinstance(f.exception(), BrokenExecutor)]
             if broken:
                 lost, pending = list(pending.values()), {}
-                executor.shutdown(wait=False, cancel_futures=True)
-                executor = make()
+                workers.end(wait=False)
                 yield from _lost(lost, alone, failures)
                 continue
             for future in done:
@@ -215,11 +252,12 @@ def run_tiles(
                 else:
                     yield Outcome(task, None, f"{type(error).__name__}: {error}")
     finally:
-        executor.shutdown(wait=not pending, cancel_futures=True)
+        for future in pending:
+            future.cancel()
 
 
 def _fill(
-    executor: Executor,
+    workers: Workers,
     work: Callable[[Any], Any],
     pending: dict[Future[Any], Any],
     waiting: deque[Any],
@@ -228,10 +266,10 @@ def _fill(
 ) -> None:
     """Submit what may run now: many tasks at once, or one of those that must run alone."""
     while waiting and not alone and len(pending) < in_flight:
-        future = executor.submit(work, waiting[0])
+        future = workers.submit(work, waiting[0])
         pending[future] = waiting.popleft()
     if alone and not pending:
-        future = executor.submit(work, alone[0])
+        future = workers.submit(work, alone[0])
         pending[future] = alone.popleft()
 
 

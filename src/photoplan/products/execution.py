@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 
 from photoplan import __version__
 from photoplan.engine.execute import MOST_SOURCE_BYTES, Pixels
-from photoplan.engine.executors import executor_factory, run_tiles
+from photoplan.engine.executors import Outcome, Workers, executor_factory, run_tiles
 from photoplan.errors import TilesFailed, UsageError
 from photoplan.io.product import ProductFile
 from photoplan.io.quicklook import write_overview
@@ -21,8 +21,8 @@ from photoplan.kernels.rectify import is_compiled
 from photoplan.plan.anchors import Anchors
 from photoplan.plan.product import ProductPlan, Tile, compile_tile
 from photoplan.products.orthophoto import OrthoPlan, OrthoProduct, render_tile
+from photoplan.products.results import ProductResult, finished_products, product_path
 from photoplan.products.scene import Scene, SceneAddress, open_scene
-from photoplan.products.settings import OrthoSettings
 
 __all__ = ["ProductResult", "Run", "execute"]
 
@@ -48,6 +48,8 @@ class Run:
     """Called with the number of tiles just finished and of their pixels."""
     talk: Callable[[str], None] = lambda text: None
     """Called with a sentence that a user may want to read while it goes on."""
+    report: Callable[[ProductResult], None] = lambda result: None
+    """Called with each product's result as soon as it is known, also if some of its tiles failed."""
 
     @property
     def in_flight(self) -> int:
@@ -70,41 +72,6 @@ class Run:
                 f"--memory {self.memory / 2**20:.0f} MiB; at least {least:.0f} MiB are needed for one tile"
             )
         return int(min(wanted, fits))
-
-
-@dataclass(frozen=True)
-class ProductResult:
-    """What became of one product."""
-
-    path: Path
-    image: str
-    seconds: float
-    valid_share: float
-    """Valid pixels among all pixels of the product, 0 to 1."""
-    residual: float
-    """Worst residual of the anchors over all tiles, pixels of the source image."""
-    cells: int
-    """Boxes that the anchors of all tiles have."""
-    tiles: int
-    """Tiles that the product has, the empty ones included."""
-    resumed: int
-    """Tiles taken over from an earlier run."""
-    failed: tuple[int, ...]
-    """Tiles that could not be computed; the product is then not written."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        return {
-            "path": str(self.path),
-            "image": self.image,
-            "seconds": round(self.seconds, 3),
-            "valid_share": round(self.valid_share, 6),
-            "worst_anchor_residual_px": self.residual,
-            "cells": self.cells,
-            "tiles": self.tiles,
-            "resumed_tiles": self.resumed,
-            "failed_tiles": list(self.failed),
-        }
 
 
 @dataclass(frozen=True)
@@ -139,7 +106,8 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     Raises
     ------
     UsageError
-        A product exists and `run.overwrite` is False, or a product would replace an input; nothing is done then.
+        A product exists and `run.overwrite` is False, or would replace any of the project's inputs; nothing is done
+        then.
     RunLocked
         Another run is writing the same product.
     InputError
@@ -151,58 +119,49 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     """
     run = run or Run()
     folder = Path(output)
-    in_flight = run.in_flight
-    kept = _finished(plan, folder, run)
+    in_flight, make = run.in_flight, executor_factory(run.executor, run.workers)
+    picture = folder / "overview.png"
+    _refuse_inputs(plan, [*(product_path(folder, p) for p in plan.products), *([picture] if run.quicklook else [])])
+    kept = finished_products(plan, folder, run.overwrite)
     _make_folder(folder)
     if kept:
         run.talk(f"{len(kept)} of {len(plan.products)} products are finished already")
-    results = [kept.get(p.plan.name) or _make(plan, p, folder, run, in_flight) for p in plan.products]
+    results = []
+    with Workers(make) as workers:
+        for product in plan.products:
+            results.append(
+                kept.get(product.plan.name) or _make(plan, product, folder, run, partial(_tiles, workers, in_flight))
+            )
+            run.report(results[-1])
     if run.quicklook:
-        write_overview([r.path for r in results if not r.failed], folder / "overview.png")
-    failed = [f"{r.path.name}: tiles {', '.join(map(str, r.failed))}" for r in results if r.failed]
+        write_overview([r.path for r in results if not r.failed], picture)
+    failed = [f"{r.path.name}: tiles {', '.join(map(str, r.failed))} ({r.reason})" for r in results if r.failed]
     if failed:
-        raise TilesFailed("finished, but these products lack tiles and were not written:\n  " + "\n  ".join(failed))
+        raise TilesFailed(
+            "finished, but these products lack tiles and were not written; the same command tries the tiles again:\n  "
+            + "\n  ".join(failed)
+        )
     return results
 
 
-def _finished(plan: OrthoPlan, folder: Path, run: Run) -> dict[str, ProductResult]:
-    """Products that exist: those of this very run, interrupted, are kept; any other is refused before any work.
-
-    When all products of a plan exist, the run was not interrupted: doing it again needs `overwrite`.
-    """
-    existing = [p for p in plan.products if _path(folder, p).exists()]
-    if run.overwrite or not existing:
-        return {}
-    kept = {p.plan.name: _kept(plan, p, folder) for p in existing}
-    foreign = [name for name, result in kept.items() if result is None]
-    if foreign or len(existing) == len(plan.products):
-        first = _path(folder, plan[foreign[0]] if foreign else existing[0])
-        more = f" and {len(existing) - 1} more" if len(existing) > 1 else ""
-        raise UsageError(f"{first}{more} exists; give --overwrite to replace it, or another --output")
-    return {name: result for name, result in kept.items() if result is not None}
+def _refuse_inputs(plan: OrthoPlan, outputs: list[Path]) -> None:
+    """No output may be an input of the project, whichever product it belongs to and by whatever link."""
+    project = plan.project
+    files = [image.file for image in project.images]
+    files += [] if project.terrain.file is None else [project.terrain.file]
+    inputs = {_identity(project.resolve(file)) for file in files}
+    for path in outputs:
+        if _identity(path) in inputs:
+            raise UsageError(f"{path}: the output is an input of the project; choose another --output")
 
 
-def _kept(plan: OrthoPlan, product: OrthoProduct, folder: Path) -> ProductResult | None:
-    """The result of an earlier run with the same key and settings; None if the product is not one."""
-    path = _path(folder, product)
+def _identity(path: Path) -> object:
+    """What two names of one file have in common."""
     try:
-        record = json.loads(record_path(path).read_text(encoding="utf-8"))
-        if record["key"] != product.key or OrthoSettings.from_dict(record["settings"]) != plan.settings:
-            return None
-        made = record["product"]
-        return ProductResult(
-            path,
-            product.plan.image,
-            made["seconds"],
-            made["valid_share"],
-            made["worst_anchor_residual_px"],
-            made["cells"],
-            made["tiles"],
-            made["tiles"],
-            (),
-        )
-    except (OSError, ValueError, KeyError, TypeError, UsageError):
-        return None
+        state = path.stat()
+        return state.st_dev, state.st_ino
+    except OSError:
+        return path.resolve()
 
 
 def _make_folder(folder: Path) -> None:
@@ -212,11 +171,17 @@ def _make_folder(folder: Path) -> None:
         raise UsageError(f"{folder}: no such folder, and it cannot be made ({error.strerror})") from None
 
 
-def _path(folder: Path, product: OrthoProduct) -> Path:
-    return folder / f"{product.plan.name}.tif"
+def _tiles(workers: Workers, in_flight: int, job: _Job, tiles: list[Tile]) -> Iterator[Outcome]:
+    return run_tiles(tiles, partial(_work, job), workers, in_flight)
 
 
-def _make(plan: OrthoPlan, product: OrthoProduct, folder: Path, run: Run, in_flight: int) -> ProductResult:
+def _make(
+    plan: OrthoPlan,
+    product: OrthoProduct,
+    folder: Path,
+    run: Run,
+    compute: Callable[[_Job, list[Tile]], Iterator[Outcome]],
+) -> ProductResult:
     started = time.perf_counter()
     settings, scene = plan.settings, open_scene(plan.project, product.plan.image)
     if not is_compiled(scene.reader.dtype, scene.reader.bands, settings.kernel):
@@ -224,7 +189,7 @@ def _make(plan: OrthoPlan, product: OrthoProduct, folder: Path, run: Run, in_fli
     job = _Job(scene.address, replace(product.plan, tiles=()), settings.kernel)
     tally = _Tally()
     with ProductFile(
-        _path(folder, product),
+        product_path(folder, product),
         product.grid,
         scene.reader.bands,
         scene.reader.dtype,
@@ -237,36 +202,10 @@ def _make(plan: OrthoPlan, product: OrthoProduct, folder: Path, run: Run, in_fli
         inputs=scene.files,
         threads=run.workers,
     ) as file:
-        finished = file.finished
-        todo = [tile for tile in product.plan.tiles if tile.index not in finished]
-        for tile in product.plan.tiles:
-            if tile.index in finished:
-                tally.again(compile_tile(product.plan, tile.window, scene.camera, scene.surface).anchors)
-        if tally.resumed:
-            run.talk(f"{product.plan.name}: {tally.resumed} of {len(product.plan.tiles)} tiles are finished already")
-            run.progress(tally.resumed, 0)
-        for outcome in run_tiles(todo, partial(_work, job), executor_factory(run.executor, run.workers), in_flight):
-            done: Tile = outcome.task
-            if outcome.error is not None:
-                tally.failed.append(done.index)
-                tally.reasons.append(f"tile {done.index}: {outcome.error}")
-            else:
-                pixels: Pixels = outcome.result
-                if pixels.values is None:
-                    file.append_empty(done.index)
-                else:
-                    file.append(done.index, pixels.values, pixels.valid)
-                tally.add(pixels)
-            run.progress(1, done.window.size)
-        facts = None
-        if not tally.failed:
-            # Tiles that the plan leaves out hold nothing of the image.
-            planned = {tile.index for tile in product.plan.tiles}
-            for index in set(range(product.plan.tile_count)) - planned - finished:
-                file.append_empty(index)
-            facts = file.complete(_tags(plan, product))
+        _collect(file, product.plan, scene, partial(compute, job), run, tally)
+        facts = None if tally.failed else file.complete(_tags(plan, product))
     result = ProductResult(
-        _path(folder, product),
+        product_path(folder, product),
         product.plan.image,
         time.perf_counter() - started,
         0.0 if facts is None else facts.valid_share,
@@ -275,6 +214,7 @@ def _make(plan: OrthoPlan, product: OrthoProduct, folder: Path, run: Run, in_fli
         product.plan.tile_count,
         tally.resumed,
         tuple(sorted(tally.failed)),
+        next(iter(tally.reasons), ""),
     )
     if facts is not None:
         record = _record(plan, product, scene, run, result)
@@ -282,6 +222,40 @@ def _make(plan: OrthoPlan, product: OrthoProduct, folder: Path, run: Run, in_fli
             record_path(result.path), {**record, "values_moved_off_nodata": facts.moved_values, "bytes": facts.bytes}
         )
     return result
+
+
+def _collect(
+    file: ProductFile,
+    product: ProductPlan,
+    scene: Scene,
+    compute: Callable[[list[Tile]], Iterator[Outcome]],
+    run: Run,
+    tally: _Tally,
+) -> None:
+    """Bring every tile of a product into its file: those of an earlier run are there, the others are computed."""
+    finished = file.finished
+    for tile in product.tiles:
+        if tile.index in finished:
+            tally.again(compile_tile(product, tile.window, scene.camera, scene.surface).anchors)
+    if tally.resumed:
+        run.talk(f"{product.name}: {tally.resumed} of {len(product.tiles)} tiles are finished already")
+        run.progress(tally.resumed, 0)
+    # Tiles that the plan leaves out hold nothing of the image.
+    for index in set(range(product.tile_count)) - {tile.index for tile in product.tiles} - finished:
+        file.append_empty(index)
+    for outcome in compute([tile for tile in product.tiles if tile.index not in finished]):
+        done: Tile = outcome.task
+        if outcome.error is not None:
+            tally.failed.append(done.index)
+            tally.reasons.append(f"tile {done.index}: {outcome.error}")
+        else:
+            pixels: Pixels = outcome.result
+            if pixels.values is None:
+                file.append_empty(done.index)
+            else:
+                file.append(done.index, pixels.values, pixels.valid)
+            tally.add(pixels)
+        run.progress(1, done.window.size)
 
 
 @dataclass
