@@ -29,6 +29,7 @@ _DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
     metavar="NAME",
     help="What the files do not state: ellipsoidal, EPSG:nnnn (a vertical CRS), or same.",
 )
+@click.option("--terrain-crs", metavar="CRS", help="CRS of a terrain file that states none (ASC).")
 @click.option("--terrain-height-system", metavar="NAME", help="The terrain's alone.")
 @click.option("--orientation-height-system", metavar="NAME", help="The orientation's alone.")
 @click.option("--columns", help="Columns of a table: name,x,y,z,omega,phi,kappa[,camera] or name=LABEL,x=…")

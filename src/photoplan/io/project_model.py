@@ -60,6 +60,8 @@ class Terrain(Entry):
 
     file: InputName | None = None
     height: Number | None = None
+    crs: Name | None = None
+    """CRS of a file that does not state one, such as an ASCII grid."""
     height_system: Name | None = None
 
     @field_validator("file")

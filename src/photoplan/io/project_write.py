@@ -76,8 +76,9 @@ def _terrain(terrain: Terrain) -> list[str]:
         "[terrain]",
         *_entries(
             [
-                ("file", terrain.file, "raster of heights (GeoTIFF, ASC) with its own CRS"),
+                ("file", terrain.file, "raster of heights (GeoTIFF, ASC)"),
                 ("height", terrain.height, "or one height everywhere"),
+                ("crs", terrain.crs, "its CRS, where the file does not state one"),
             ]
         ),
         '# Height system: "ellipsoidal", a vertical CRS such as "EPSG:5773", or "same" = that of the other input.',

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +62,8 @@ class InitRequest:
     """Projected CRS of the project; None: that of the orientation."""
     height_system: str | None = None
     """Declares whatever the files do not state: ellipsoidal, EPSG:nnnn, same."""
+    terrain_crs: str | None = None
+    """CRS of a terrain file that states none, such as an ASCII grid."""
     terrain_height_system: str | None = None
     """Declares the terrain's, also against what its file states."""
     orientation_height_system: str | None = None
@@ -192,12 +194,16 @@ def _terrain(request: InitRequest) -> tuple[Terrain, RasterInfo | None]:
     check_input_name(text)
     file = Path(text)
     info = read_info(file)
-    if info.crs is None:
+    if info.crs is None and request.terrain_crs is None:
+        raise InputError(f"terrain {file}: states no CRS; say the one it is in: --terrain-crs EPSG:nnnn")
+    stated = info.crs or request.terrain_crs
+    parse_crs(stated or "", f"terrain {file}")
+    if info.crs is not None and request.terrain_crs is not None and not same_crs(info.crs, request.terrain_crs):
         raise InputError(
-            f"terrain {file}: states no CRS; assign the one it is in, for example gdal_edit.py -a_srs EPSG:nnnn {file}"
+            f"terrain {file}: states {crs_label(info.crs)}, not {request.terrain_crs}; leave --terrain-crs out"
         )
-    parse_crs(info.crs, f"terrain {file}")
-    return Terrain(file=_relative(file.absolute(), request.folder)), info
+    crs = None if info.crs is not None else request.terrain_crs
+    return Terrain(file=_relative(file.absolute(), request.folder), crs=crs), replace(info, crs=stated)
 
 
 def _crs(request: InitRequest, table: OrientationTable, terrain: RasterInfo | None) -> tuple[str, str]:

@@ -190,33 +190,36 @@ def _ground(address: _GroundAddress) -> Ground:
     assert terrain.file is not None
     reader = TerrainReader(resolve_input(Path(address.folder), terrain.file))
     info = reader.info
-    if info.crs is None:
-        raise InputError(f"{info.path}: no CRS; state it in the file (gdal_edit -a_srs), it is not guessed")
+    crs = info.crs or terrain.crs
+    if crs is None:
+        raise InputError(f"{info.path}: no CRS; state it as crs = \"EPSG:nnnn\" in [terrain], it is not guessed")
     if info.metres_per_unit not in (None, 1.0):
         raise InputError(f"{info.path}: heights in {info.unit}; convert them to metres first")
     systems = declared_pair(terrain.height_system or info.vertical_crs, address.orientation_system)
-    surface, bounds, steps = _placed(reader, address.crs)
+    surface, bounds, steps = _placed(reader, crs, address.crs)
     return _in_system(Ground(surface, bounds, info.path, steps, systems, systems[1]), address)
 
 
-def _placed(reader: TerrainReader, crs: str) -> tuple[Surface, tuple[float, float, float, float], tuple[CrsStep, ...]]:
+def _placed(
+    reader: TerrainReader, grid_crs: str, crs: str
+) -> tuple[Surface, tuple[float, float, float, float], tuple[CrsStep, ...]]:
     """A height raster as a surface in the project's CRS, and its outer edges there."""
     info = reader.info
-    assert info.to_map is not None and info.crs is not None
+    assert info.to_map is not None
     x0, xx, xy, y0, yx, yy = info.to_map
     if xy or yx or xx <= 0 or yy >= 0:
         raise InputError(f"{info.path}: the grid is rotated or not north-up; bring it north-up with gdalwarp first")
     columns, rows = info.size
     edges = (x0 - xx / 2, y0 + yy * (rows - 0.5), x0 + xx * (columns - 0.5), y0 - yy / 2)
-    if same_crs(info.crs, crs):
+    if same_crs(grid_crs, crs):
         return RasterSurface(reader, (x0, y0), (xx, -yy)), edges, ()
-    back = crs_step(info.crs, crs, edges)
+    back = crs_step(grid_crs, crs, edges)
     t = np.linspace(0, 1, 17)
     x, y = edges[0] + t * (edges[2] - edges[0]), edges[1] + t * (edges[3] - edges[1])
     corners = back(np.stack(np.meshgrid(x, y), axis=-1)).reshape(-1, 2)
     low, high = corners.min(axis=0), corners.max(axis=0)
     bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-    step = crs_step(crs, info.crs, bounds)
+    step = crs_step(crs, grid_crs, bounds)
     return RasterSurface(reader, (x0, y0), (xx, -yy), step), bounds, (step,)
 
 
