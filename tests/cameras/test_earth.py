@@ -17,7 +17,7 @@ from photoplan.cameras.lenses.none import NoLens
 from photoplan.cameras.refraction import Refraction, refractivity
 from photoplan.cameras.warped import WarpedCamera
 from photoplan.errors import InputError, UsageError
-from photoplan.geometry.local import LocalFrame
+from photoplan.geometry.local import LocalFrame, earth_radius
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_opk
 from photoplan.plan.resolution import curvature_displacement
@@ -286,6 +286,17 @@ def test_kinds_of_camera() -> None:
         oriented_camera(WIDE, NoLens(), pose, earth_curvature="exact")
     with pytest.raises(UsageError, match="CRS"):
         oriented_camera(WIDE, NoLens(), pose, earth_curvature="strict")
+
+
+def test_correction_refers_to_the_ground_below_the_camera() -> None:
+    pose = Pose.from_angles(STATION, ATTITUDES["tilted"])
+    chosen = oriented_camera(WIDE, NoLens(), pose, crs=UTM, earth_curvature="correction", mean_ground=700.0)
+    radius = earth_radius(UTM, (STATION[0], STATION[1])) + 700.0
+    built = corrected_camera(FrameCamera(WIDE, NoLens(), pose), 700.0, radius)
+    _, P, _ = seen_points(built)
+    np.testing.assert_array_equal(project(chosen, P), project(built, P))
+    without_crs = oriented_camera(WIDE, NoLens(), pose, earth_curvature="correction", mean_ground=700.0)
+    assert 0 < np.abs(project(without_crs, P) - project(built, P)).max() < 0.3
 
 
 def test_fault_20_strict_curvature_needs_a_projected_crs_in_metres() -> None:

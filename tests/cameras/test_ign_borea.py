@@ -1,13 +1,15 @@
-"""A real block of 805 UltraCam exposures: the strict model reproduces its 14,491 image observations.
+"""A real block of 805 UltraCam exposures: the strict model reproduces its image observations.
 
-The block's ground points carry ellipsoidal heights; its projection centres carry altitudes above the geoid and the
-linear alteration of a block that was adjusted in map coordinates; its angles refer to the map grid at each station.
+Of the 14,491 observations 14,407 are of points whose ground coordinates come with the block. Ground points carry
+ellipsoidal heights; projection centres carry altitudes above the geoid and the linear alteration of a block that was
+adjusted in map coordinates; angles refer to the map grid at each station.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +38,7 @@ def rows(path: Path, fields: int) -> list[list[str]]:
 
 
 @lru_cache
-def undulations(path: Path) -> tuple[np.ndarray, object]:
+def undulations(path: Path) -> tuple[np.ndarray, Any]:
     with rasterio.open(path) as raster:
         return raster.read(1).astype(float), ~raster.transform
 
@@ -44,8 +46,8 @@ def undulations(path: Path) -> tuple[np.ndarray, object]:
 def undulation(path: Path, XY: np.ndarray) -> float:
     """Geoid height, bilinear between the grid's pixel centres."""
     grid, to_pixel = undulations(path)
-    col, row = to_pixel * Transformer.from_crs(CRS, "EPSG:4171", always_xy=True).transform(*XY)
-    col, row = col - 0.5, row - 0.5
+    lon, lat = Transformer.from_crs(CRS, "EPSG:4171", always_xy=True).transform(*XY)
+    col, row = to_pixel.a * lon + to_pixel.c - 0.5, to_pixel.e * lat + to_pixel.f - 0.5
     j, i = int(col), int(row)
     u, v = col - j, row - i
     square = grid[i : i + 2, j : j + 2]
