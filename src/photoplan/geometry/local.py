@@ -66,7 +66,7 @@ class _Projection:
         """Map points with ellipsoidal height of geocentric coordinates (..., 3)."""
         p, z = np.hypot(xyz[..., 0], xyz[..., 1]), xyz[..., 2]
         b_over_a = math.sqrt(1.0 - self.e2)
-        # Bowring's iteration for the parametric latitude: one step is good to 1e-8 m up to orbits, two to the last digit.
+        # Bowring's iteration for the parametric latitude: one step is good to 1e-8 m, two to the last digit.
         t = z / (p * b_over_a)
         for _ in range(2):
             cos = 1.0 / np.sqrt(1.0 + t * t)
