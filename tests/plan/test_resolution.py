@@ -45,8 +45,8 @@ def test_ecker_table_4_2(scale: int, c: int, printed: tuple[int, ...]) -> None:
     c_m = c / 1000
     ours = curvature_displacement(0.140, c_m, scale * c_m, np.array(TABLE_4_2_HEIGHTS)) * 1e6
     np.testing.assert_allclose(ours, printed, atol=2.0)
-    # Most agree to the digit; none is off by more than the rounding of one unit and a half.
-    assert np.abs(ours - printed).max() < 1.5
+    # In fact 43 of the 45 agree to the printed digit, and two miss it by 0.03 µm.
+    assert np.abs(ours - printed).max() < 0.55
 
 
 def test_ecker_displacement_on_the_map() -> None:
