@@ -16,6 +16,8 @@ __all__ = ["Coverage", "cover", "covered_tiles", "image_border"]
 
 #: Points per side of the lattice on which coverage is sampled.
 LATTICE = 192
+#: A tile this far beside the image is not compiled, pixels.
+SLACK = 16.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,31 +133,25 @@ def _inside(camera: Camera, XYZ: NDArray[np.float64]) -> NDArray[np.bool_]:
 def covered_tiles(camera: Camera, surface: Surface, grid: MapGrid, tiles: list[Window]) -> list[bool]:
     """Which tiles can hold a pixel of the image, judged from the heights' range under each tile.
 
-    A tile is a box in X, Y and height; if all eight corners lie beyond the same side of the image, no point of the
-    box lies in it (collinearity maps the box into the hull of its corners).
+    A tile is a box in X, Y and height, sampled by a lattice on its top and bottom. If the whole lattice lies beyond
+    the same side of the image, nothing inside does: collinearity maps the box into the hull of its corners, and what
+    a lens bends between two points of the lattice stays far below `SLACK`.
     """
-    keep = []
-    for tile in tiles:
-        bounds = grid.bounds_of(tile)
-        low, high = surface.height_range(bounds)
-        if not np.isfinite(low):
-            keep.append(False)
-            continue
-        xmin, ymin, xmax, ymax = bounds
-        corners = np.array([(x, y, z) for x in (xmin, xmax) for y in (ymin, ymax) for z in (low, high)])
-        h = camera.project_homogeneous(corners)
-        if not (h[:, 2] > 0).all():
-            keep.append(bool((h[:, 2] > 0).any()))
-            continue
-        xy = h[:, :2] / h[:, 2:]
-        width, height = camera.size
-        slack = 8.0
-        keep.append(
-            bool(
-                xy[:, 0].max() >= -slack
-                and xy[:, 0].min() <= width + slack
-                and xy[:, 1].max() >= -slack
-                and xy[:, 1].min() <= height + slack
-            )
-        )
-    return keep
+    ranges = np.array([surface.height_range(grid.bounds_of(tile)) for tile in tiles])
+    bounds = np.array([grid.bounds_of(tile) for tile in tiles])
+    t = np.linspace(0, 1, 5)
+    x = bounds[:, :1] + t * (bounds[:, 2] - bounds[:, 0])[:, None]
+    y = bounds[:, 1:2] + t * (bounds[:, 3] - bounds[:, 1])[:, None]
+    lattice = np.empty((len(tiles), 2, 5, 5, 3))
+    lattice[..., 0] = x[:, None, None, :]
+    lattice[..., 1] = y[:, None, :, None]
+    lattice[..., 2] = ranges[:, :, None, None]
+    h = camera.project_homogeneous(lattice.reshape(len(tiles), -1, 3))
+    front = (h[..., 2] > 0) & np.isfinite(h).all(axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        xy = h[..., :2] / h[..., 2:]
+        near = (xy.max(axis=1) >= -SLACK).all(axis=-1) & (xy.min(axis=1) <= np.array(camera.size) + SLACK).all(axis=-1)
+    # A box that reaches behind the camera is looked at when it is compiled.
+    partly = front.any(axis=1) & ~front.all(axis=1)
+    keep = np.isfinite(ranges).all(axis=1) & ((front.all(axis=1) & near) | partly)
+    return keep.tolist()
