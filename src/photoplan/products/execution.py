@@ -184,6 +184,8 @@ def _make(
 ) -> ProductResult:
     started = time.perf_counter()
     settings, scene = plan.settings, open_scene(plan.project, product.plan.image)
+    for note in scene.reader.info.warnings:
+        run.talk(f"note: {note}")
     if not is_compiled(scene.reader.dtype, scene.reader.bands, settings.kernel):
         run.talk("compiling the resampling kernels for this kind of image, once (up to a minute)")
     job = _Job(scene.address, replace(product.plan, tiles=()), settings.kernel)
