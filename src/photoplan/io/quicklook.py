@@ -60,7 +60,7 @@ def write_quicklook(product: Path, picture: Path, *, max_side: int = 1600) -> Pa
 def write_overview(products: Sequence[Path], picture: Path, *, max_side: int = 1600) -> Path | None:
     """Write a PNG of many products placed on the map together; the first ones lie on top.
 
-    Transparent where there is nothing, a thin frame around every product. The products must share one reference system;
+    Transparent where there is nothing. The products must share one reference system;
     those with another one than the first are left out. None if there is nothing to show.
 
     Parameters
@@ -88,7 +88,6 @@ def write_overview(products: Sequence[Path], picture: Path, *, max_side: int = 1
             rgba = _look(sheet.path, dataset, width, height)
         part = canvas[:, row : row + height, col : col + width]
         np.copyto(part, rgba, where=rgba[3] > 0)
-        _frame(part)
     return _write_png(picture, canvas)
 
 
@@ -140,13 +139,6 @@ def _stretched(pixels: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[np.uin
     low, high = np.percentile(values, _PERCENT) if values.size else (0.0, 1.0)
     scaled = (np.nan_to_num(pixels.astype(np.float64), nan=low) - low) * (255.0 / max(high - low, 1e-12))
     return np.clip(scaled, 0, 255).astype(np.uint8)
-
-
-def _frame(part: NDArray[np.uint8]) -> None:
-    """Draw a thin line along the border of a part of the picture."""
-    colour = np.array([255, 128, 0, 255], np.uint8)[:, None]
-    for line in (part[:, 0], part[:, -1], part[:, :, 0], part[:, :, -1]):
-        line[:] = colour
 
 
 def _write_png(picture: Path, rgba: NDArray[np.uint8]) -> Path:
