@@ -117,6 +117,6 @@ def _summary(results: list[ProductResult], plan: OrthoPlan, seconds: float) -> s
     worst = max(r.residual for r in results)
     cells = sum(r.cells for r in results)
     return (
-        f"{len(results)} orthophotos in {seconds:.1f} s · {pixels:.1f} Mpx, {pixels / seconds:.0f} Mpx/s · "
+        f"{len(results)} orthophotos in {seconds:.1f} s · {pixels:.1f} Mpx, {pixels / seconds:.3g} Mpx/s · "
         f"{cells} cells, worst anchor residual {worst:.3g} px"
     )

@@ -84,8 +84,8 @@ class ProjectCheck:
         for i in self.images:
             size = f"{i.footprint[0]:.0f} × {i.footprint[1]:.0f} m"
             lines.append(
-                f"{i.image:<{width}}  {i.tilt_deg:4.1f}°  {i.gsd:7.3g} m  {size:>15}       {i.on_terrain:5.0%}   "
-                f"{i.relief_px:7.2f} px   {i.admissible_height_error:8.3g} m   {i.curvature_px:6.2f} px"
+                f"{i.image:<{width}}  {i.tilt_deg:4.1f}°  {i.gsd:#7.3g} m  {size:>15}       {i.on_terrain:5.0%}   "
+                f"{i.relief_px:7.2f} px   {i.admissible_height_error:#8.3g} m   {i.curvature_px:6.2f} px"
             )
             lines += [f"{'':<{width}}  note: {note}" for note in i.notes]
             lines += [f"{'':<{width}}  FAULT: {i.fault}"] if i.fault else []
