@@ -6,13 +6,14 @@ import errno
 import importlib
 import os
 import sys
+from collections.abc import Sequence
 
 import click
 
 from photoplan.cli.interrupt import CODE, catch_interrupts, stop_children
 from photoplan.errors import PhotoplanError, ResourceError
 
-__all__ = ["main"]
+__all__ = ["main", "run"]
 
 #: Verb and its one-line help, in the order of a job; the command is `photoplan.cli.<verb>:command`.
 VERBS = {
@@ -54,28 +55,39 @@ def photoplan() -> None:
 
 
 def main() -> None:
-    """Entry point: runs a verb and turns every error into a message and an exit code."""
+    """Entry point of the command."""
     catch_interrupts()
+    _leave(run())
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run a verb; every error becomes a message on stderr and an exit code.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        The verb and what follows it; those of the process if it is None.
+    """
     try:
-        code = photoplan.main(standalone_mode=False)
+        code = photoplan.main(arguments, prog_name="photoplan", standalone_mode=False)
     except (click.exceptions.Abort, KeyboardInterrupt):
         stop_children()
-        code = _say("interrupted; the same command continues where this run stopped", CODE)
+        return _say("interrupted; the same command continues where this run stopped", CODE)
     except click.ClickException as error:
         error.show()
-        code = 2
+        return 2
     except PhotoplanError as error:
-        code = _say(str(error), error.exit_code)
+        return _say(str(error), error.exit_code)
     except MemoryError:
-        code = _say("out of memory; give fewer --workers or less --memory", ResourceError.exit_code)
+        return _say("out of memory; give fewer --workers or less --memory", ResourceError.exit_code)
     except OSError as error:
-        code = _say(_os_message(error), 5 if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) else 1)
+        return _say(_os_message(error), 5 if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) else 1)
     except Exception as error:
         if os.environ.get("PHOTOPLAN_TRACEBACK"):
             raise
         name = type(error).__name__
-        code = _say(f"{name}: {error} — a fault of photoplan; PHOTOPLAN_TRACEBACK=1 shows where", 1)
-    _leave(code if isinstance(code, int) else 0)
+        return _say(f"{name}: {error} — a fault of photoplan; PHOTOPLAN_TRACEBACK=1 shows where", 1)
+    return code if isinstance(code, int) else 0
 
 
 def _say(message: str, code: int) -> int:

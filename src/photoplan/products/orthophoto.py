@@ -20,9 +20,10 @@ from photoplan.errors import GeometryError, UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.names import safe_stem
 from photoplan.io.project_model import Project
+from photoplan.io.storage import nodata_for
 from photoplan.kernels.weights import KERNELS
 from photoplan.plan.compile import AnchorRule, initial_cell
-from photoplan.plan.coverage import Coverage, cover, covered_tiles
+from photoplan.plan.coverage import Coverage, cover, covered_tiles, image_border
 from photoplan.plan.product import ProductPlan, Tile
 from photoplan.products.scene import Scene, open_scene
 from photoplan.products.settings import OrthoSettings
@@ -39,6 +40,10 @@ __all__ = [
     "two_figures",
     "window_of",
 ]
+
+
+#: Tiles of a product: their list is kept in memory.
+MOST_TILES = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +126,7 @@ def plan_orthophotos(
         scene = open_scene(project, name)
         coverage = cover(scene.camera, scene.surface, scene.terrain_bounds)
         if coverage.bounds is None:
-            blind.append(_nothing_seen(scene, name))
+            blind.append(_sees_no_terrain(scene, name))
         else:
             looks.append((name, scene, coverage, mean_gsd(scene.camera, coverage)))
     resolution = chosen.resolution or (two_figures(float(np.mean([look[3] for look in looks]))) if looks else 1.0)
@@ -129,11 +134,12 @@ def plan_orthophotos(
     for name, scene, coverage, gsd in looks:
         plan = _plan_one(project, scene, name, coverage, replace(chosen, resolution=resolution))
         if plan is None:
-            blind.append(_nothing_seen(scene, name))
+            blind.append(f"{name}: sees {_extent(coverage.bounds)}; the bounds are {_extent(chosen.bounds)}")
         else:
             products.append(OrthoProduct(plan, coverage, gsd, _key(scene, plan, chosen)))
     if not products:
-        raise GeometryError("no image sees the terrain inside the bounds:\n  " + "\n  ".join(blind))
+        where = "the terrain" if chosen.bounds is None else "terrain inside the bounds"
+        raise GeometryError(f"no image sees {where} (xmin ymin xmax ymax in metres):\n  " + "\n  ".join(blind))
     _refuse_equal_names(products)
     return OrthoPlan(project, replace(chosen, resolution=resolution), tuple(products), tuple(blind))
 
@@ -149,6 +155,7 @@ def _plan_one(
     bounds = settings.bounds or coverage.bounds
     assert bounds is not None and settings.resolution is not None
     grid = MapGrid.covering(bounds, settings.resolution, project.crs)
+    _check_storable(scene, name, grid, settings)
     target = MapTarget(grid)
     windows = list(grid.window.tiles(settings.tile))
     keep = covered_tiles(scene.camera, scene.surface, grid, windows)
@@ -161,6 +168,21 @@ def _plan_one(
         x, y, z = seen.mean(axis=0)
         rule = replace(rule, cell=initial_cell(scene.camera, target, grid.to_pixel((x, y)), z, settings.tile, rule))
     return ProductPlan(f"{safe_stem(name)}_ortho", name, target, settings.tile, rule, tiles)
+
+
+def _check_storable(scene: Scene, name: str, grid: MapGrid, settings: OrthoSettings) -> None:
+    """Refuse a product that cannot be written, before any is."""
+    tiles = -(-grid.width // settings.tile) * -(-grid.height // settings.tile)
+    if tiles > MOST_TILES:
+        raise UsageError(
+            f"{name}: resolution {settings.resolution:g} m gives {grid.width:.3g} × {grid.height:.3g} pixels in "
+            f"{tiles:.3g} tiles, more than {MOST_TILES}; choose a larger --resolution or --tile, or smaller --bounds"
+        )
+    nodata_for(scene.reader.dtype, settings.nodata_value, settings.compress)
+    if settings.compress == "jpeg" and (scene.reader.dtype != np.uint8 or scene.reader.bands not in (1, 3)):
+        raise UsageError(
+            f"{name}: {scene.reader.bands} bands of {scene.reader.dtype}; compression jpeg takes one or three of uint8"
+        )
 
 
 def _key(scene: Scene, plan: ProductPlan, settings: OrthoSettings) -> str:
@@ -198,10 +220,28 @@ def two_figures(value: float) -> float:
     return round(value, digits)
 
 
-def _nothing_seen(scene: Scene, name: str) -> str:
+def _sees_no_terrain(scene: Scene, name: str) -> str:
+    """Extents of both the terrain and what the image looks at, on the level of the terrain's middle height."""
     x, y, z = scene.camera.center
-    terrain = " ".join(f"{b:.0f}" for b in scene.terrain_bounds)
-    return f"{name}: projection centre {x:.0f} {y:.0f} {z:.0f}; terrain xmin ymin xmax ymax {terrain}"
+    center = f"{name}: projection centre {x:.0f} {y:.0f} {z:.0f}"
+    bounds = scene.ground.bounds
+    if bounds is None:
+        return f"{center} sees nothing of the level terrain; is it above it, and do height systems and angles fit?"
+    low, high = scene.ground.surface.height_range(bounds)
+    level = (low + high) / 2
+    origin, direction = scene.camera.rays(image_border(scene.camera.size), level)
+    down = (direction[:, 2] < 0) & (origin[:, 2] > level)
+    if down.any():
+        foot = origin[down] + direction[down] * ((level - origin[down, 2]) / direction[down, 2])[:, None]
+        (xmin, ymin), (xmax, ymax) = foot[:, :2].min(axis=0), foot[:, :2].max(axis=0)
+        looks = f"looks at {_extent((xmin, ymin, xmax, ymax))} on the level {level:.0f}"
+    else:
+        looks = f"does not look down to the level {level:.0f}"
+    return f"{center} {looks}; the terrain is {_extent(bounds)}, heights {low:.0f} to {high:.0f}"
+
+
+def _extent(bounds: tuple[float, float, float, float] | None) -> str:
+    return "everywhere" if bounds is None else " ".join(f"{b:.0f}" for b in bounds)
 
 
 def _refuse_equal_names(products: Iterable[OrthoProduct]) -> None:

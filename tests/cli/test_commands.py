@@ -1,0 +1,216 @@
+"""Verbs, streams, figures and plans: what a user and a script see."""
+
+from __future__ import annotations
+
+import json
+import re
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from tools.command import COMMAND, OPTIONS, Here, Undisturbed, process
+from tools.small_block import CRS, NAMES, SIZE, Block
+
+from photoplan.cli.main import VERBS
+
+
+def test_help_answers_at_once() -> None:
+    """Under 0.3 s of process time: heavy imports happen inside the verbs."""
+    best = np.inf
+    for _ in range(5):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        done = subprocess.run([*COMMAND, "--help"], capture_output=True, text=True, check=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        best = min(best, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    assert best < 0.3
+    for verb in VERBS:
+        assert re.search(rf"^  {verb} ", done.stdout, re.MULTILINE)
+    assert "Exit codes: 0 done" in done.stdout
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_explains_itself(photoplan: Here, verb: str) -> None:
+    said = photoplan(verb, "--help")
+    assert said.code == 0
+    assert said.out.startswith(f"Usage: photoplan {verb} ")
+    assert said.err == ""
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = "import sys, photoplan.cli.main; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert "photoplan.cli.main" in loaded
+    assert not {"numpy", "numba", "rasterio", "pyproj", "rich", "pydantic"} & set(loaded)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["orto"], "No such command 'orto'"),
+        (["ortho"], "Missing argument 'PROJECT'"),
+        (["ortho", "p.toml", "--memory", "much"], "'much' is no size; write for example 2GB"),
+        (["ortho", "p.toml", "--workers", "0"], "0 is not in the range x>=1"),
+        (["ortho", "p.toml", "--bounds", "1", "2", "3"], "--bounds"),
+    ],
+)
+def test_wrong_use_ends_with_2(photoplan: Here, words: list[str], message: str) -> None:
+    said = photoplan(*words)
+    assert (said.code, said.out) == (2, "")
+    assert message in said.err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--kernel", "sinc"], "kernel 'sinc'; allowed are nearest"),
+        (["--compress", "rar"], "compression 'rar'; allowed are"),
+        (["--resolution", "-1"], "resolution -1.0; a positive number"),
+        (["--resolution", "nan"], "resolution nan; a positive number"),
+        (["--resolution", "inf"], "resolution inf"),
+        (["--tolerance", "0"], "tolerance 0.0 px; allowed are"),
+        (["--tile", "100"], "tile side 100; allowed are multiples of 16 from 128"),
+        (["--nodata", "black"], "nodata 'black'; allowed are auto, mask or a number"),
+        (["--nodata", "300"], "nodata"),
+        (["--images", "four"], "image 'four' is not in the project; its 3 images begin with one, three, two"),
+        (["--executor", "magic"], "executor 'magic'; allowed are threads, processes"),
+        (["--memory", "100MB"], "at least 464 MiB are needed"),
+        (["--bounds", "1", "2", "3", "4"], "no image sees terrain inside the bounds"),
+        (["--bounds", "3", "2", "1", "4"], "bounds"),
+        (["--resolution", "1e-6"], "one: resolution 1e-06 m gives 3.17e+08 × "),
+    ],
+)
+def test_values_that_cannot_be_meant(
+    photoplan: Here, pristine: Block, tmp_path: Path, options: list[str], message: str
+) -> None:
+    said = photoplan("ortho", pristine.project, "--output", tmp_path / "out", *options)
+    assert said.code in (2, 3)
+    assert message in said.err
+    assert said.out == ""
+    assert not (tmp_path / "out").exists()
+
+
+def test_json_is_one_object_and_talk_is_on_stderr(undisturbed: Undisturbed) -> None:
+    said = undisturbed.said
+    facts = json.loads(said.out)
+    assert [p["image"] for p in facts["products"]] == sorted(NAMES)
+    for product in facts["products"]:
+        assert Path(product["path"]) == undisturbed.folder / f"{product['image']}_ortho.tif"
+        assert product["seconds"] > 0
+        assert product["worst_anchor_residual_px"] <= 0.02
+        assert product["failed_tiles"] == []
+        with rasterio.open(product["path"]) as file:
+            assert product["valid_share"] == pytest.approx((file.dataset_mask() > 0).mean(), abs=1e-6)
+    assert "kernel bicubic · tolerance 0.02 px · nodata auto · 1 threads" in said.err
+    assert "quick look" in said.err
+    names = {f"{n}_ortho{end}" for n in NAMES for end in (".tif", ".run.json")} | {"overview.png"}
+    assert {p.name for p in undisturbed.folder.iterdir()} == names
+
+
+def test_paths_on_stdout_and_nothing_else(photoplan: Here, pristine: Block, tmp_path: Path) -> None:
+    said = photoplan("ortho", pristine.project, *OPTIONS, "--output", tmp_path, "--images", "t*", "--quiet")
+    assert said.code == 0
+    assert said.out.splitlines() == [str(tmp_path / f"{name}_ortho.tif") for name in ("three", "two")]
+    assert said.err == ""
+
+
+def test_a_reader_that_goes_away_is_met_in_silence(undisturbed: Undisturbed) -> None:
+    """`photoplan … | head -1`."""
+    running = subprocess.Popen(
+        [*COMMAND, "info", undisturbed.folder / "one_ortho.tif"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert running.stdout is not None and running.stderr is not None
+    running.stdout.close()
+    assert running.stderr.read() == b""
+    assert running.wait() == 1
+
+
+def test_dry_run_touches_nothing(photoplan: Here, pristine: Block, tmp_path: Path) -> None:
+    said = photoplan("ortho", pristine.project, *OPTIONS, "--output", tmp_path / "out", "--dry-run")
+    assert said.code == 0
+    assert re.search(r"plan: 3 products, \d+ tiles, \d+ cells, worst anchor residual [\d.e-]+ px", said.out)
+    assert list(tmp_path.iterdir()) == []
+    said = photoplan("ortho", pristine.project, *OPTIONS, "--output", tmp_path / "out", "--dry-run", "--json")
+    facts = json.loads(said.out)
+    assert facts["plan"] is None
+    assert sum(p["tiles"] for p in facts["products"]) == facts["tiles"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_check_prints_a_line_for_each_image(photoplan: Here, pristine: Block) -> None:
+    said = photoplan("check", pristine.project)
+    assert said.code == 0
+    assert len(re.findall(r"^(one|two|three) .* 100%", said.out, re.MULTILINE)) == 3
+    assert "sensible resolution 1.5 m · all plausible" in said.out
+    facts = json.loads(photoplan("check", pristine.project, "--json", "--images", "two").out)
+    assert [i["image"] for i in facts["images"]] == ["two"]
+    assert facts["images"][0]["gsd"] == pytest.approx(1.5, rel=0.05)
+    assert facts["height_systems"] == {"terrain": "same", "orientation": "same", "working": "same"}
+
+
+def test_info_knows_rasters_projects_plans_and_records(
+    photoplan: Here, pristine: Block, undisturbed: Undisturbed, tmp_path: Path
+) -> None:
+    raster = json.loads(photoplan("info", undisturbed.folder / "one_ortho.tif", "--json").out)
+    assert raster["bands"].startswith("3 of uint8")
+    assert raster["pixel"] == "1 × 1"
+    assert CRS in raster["crs"]
+    project = photoplan("info", pristine.project).out
+    assert all(f"{name}: images/{name}.tif" in project for name in NAMES)
+    record = json.loads(photoplan("info", undisturbed.folder / "one_ortho.run.json", "--json").out)
+    assert json.loads(record["settings"])["kernel"] == "bicubic"
+    plan = tmp_path / "p.gpkg"
+    assert photoplan("ortho", pristine.project, *OPTIONS, "--plan", plan).code == 0
+    facts = json.loads(photoplan("info", plan, "--json").out)
+    assert facts["tiles"] > 10
+    assert "kernel = bicubic" in facts["settings"]
+    assert f"{SIZE[0]} × {SIZE[1]} pixels" in photoplan("info", pristine.images[0]).out
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.tif", b"not a raster", "not a raster that is read here"),
+        ("a.gpkg", b"SQLite format 3\0 no more", "not a plan of photoplan"),
+        ("a.json", b'{"a": 1}', "no run record of photoplan"),
+        ("a.json", b"{", "no readable JSON"),
+        ("a.toml", b"= 3", "a.toml"),
+        ("absent.tif", None, "no such file"),
+    ],
+)
+def test_info_refuses_by_name(photoplan: Here, tmp_path: Path, name: str, content: bytes | None, message: str) -> None:
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    said = photoplan("info", tmp_path / name)
+    assert (said.code, said.out) == (3, "")
+    assert str(tmp_path / name) in said.err
+    assert message in said.err
+
+
+def test_init_check_ortho_by_the_installed_steps(small: Block, undisturbed: Undisturbed, tmp_path: Path) -> None:
+    """A job as the help tells it, each step a process: init → check → ortho."""
+    small.project.unlink()
+    said = process("init", small.folder, *small.init_options(), "--height-system", "same")
+    assert said.code == 0, said.err
+    assert said.out.splitlines() == [str(small.project)]
+    assert "3 images" in said.err
+    said = process("check", small.project)
+    assert said.code == 0, said.err
+    said = process("ortho", small.project, *OPTIONS)
+    assert said.code == 0, said.err
+    for name in NAMES:
+        path = small.folder / "products" / f"{name}_ortho.tif"
+        assert str(path) in said.out.splitlines()
+        assert path.read_bytes() == undisturbed.bytes_of(name)
+
+
+def test_the_demo_runs_on_the_package_alone(photoplan: Here, tmp_path: Path) -> None:
+    said = photoplan("demo", tmp_path / "demo", "--resolution", "1")
+    assert said.code == 0, said.err
+    assert len(said.out.splitlines()) == 18
+    assert (tmp_path / "demo" / "products" / "overview.png").stat().st_size > 10_000
+    assert "$ photoplan ortho" in said.err

@@ -1,0 +1,99 @@
+"""The command line as users have it: a process with an exit code and two streams."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from photoplan.cli.main import run
+
+COMMAND = (sys.executable, "-m", "photoplan.cli.main")
+OPTIONS = ("--resolution", "1", "--tile", "128")
+"""Of `photoplan ortho` for the small block: twenty tiles."""
+SABOTEUR = Path(__file__).parent / "saboteur"
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a command left behind."""
+
+    code: int
+    out: str
+    err: str
+
+    def __post_init__(self) -> None:
+        assert "Traceback" not in self.err, self.err
+        assert "a fault of photoplan" not in self.err, self.err
+
+
+@dataclass(frozen=True)
+class Undisturbed:
+    """One quiet run of a whole block."""
+
+    folder: Path
+    said: Said
+
+    def bytes_of(self, name: str) -> bytes:
+        return (self.folder / f"{name}_ortho.tif").read_bytes()
+
+
+def sabotage(**how: object) -> dict[str, str]:
+    """Environment in which tiles behave badly, see `tools/saboteur/sitecustomize.py`."""
+    path = os.pathsep.join(filter(None, [str(SABOTEUR), os.environ.get("PYTHONPATH", "")]))
+    return {"PYTHONPATH": path, **{f"SABOTAGE_{key.upper()}": str(value) for key, value in how.items()}}
+
+
+def process(*words: object, env: Mapping[str, str] | None = None, **options: Any) -> Said:
+    """Run the command to its end as a process of its own."""
+    done = subprocess.run(
+        [*COMMAND, *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=240,
+        env={**os.environ, **(env or {})},
+        check=False,
+        **options,
+    )
+    return Said(done.returncode, done.stdout, done.stderr)
+
+
+def start(*words: object, env: Mapping[str, str] | None = None, **options: Any) -> subprocess.Popen[str]:
+    """Start the command and come back at once; it leads a process group of its own, as in a terminal."""
+    return subprocess.Popen(
+        [*COMMAND, *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **(env or {})},
+        start_new_session=True,
+        **options,
+    )
+
+
+def wait_for(condition: Callable[[], object], running: subprocess.Popen[str], seconds: float = 120) -> None:
+    """Wait until something holds while a command runs."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert running.poll() is None, running.communicate()
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+@dataclass(frozen=True)
+class Here:
+    """The command inside the test's process: the same without start-up; for whatever needs no process."""
+
+    capture: pytest.CaptureFixture[str]
+
+    def __call__(self, *words: object) -> Said:
+        self.capture.readouterr()
+        code = run([str(word) for word in words])
+        return Said(code, *self.capture.readouterr())
