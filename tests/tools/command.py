@@ -6,10 +6,9 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -51,30 +50,28 @@ def sabotage(**how: object) -> dict[str, str]:
     return {"PYTHONPATH": path, **{f"SABOTAGE_{key.upper()}": str(value) for key, value in how.items()}}
 
 
-def process(*words: object, env: Mapping[str, str] | None = None, **options: Any) -> Said:
-    """Run the command to its end as a process of its own."""
+def process(*words: object, env: Mapping[str, str] | None = None, before: Sequence[str] = ()) -> Said:
+    """Run the command to its end as a process of its own, `before` in front of it."""
     done = subprocess.run(
-        [*COMMAND, *map(str, words)],
+        [*before, *COMMAND, *map(str, words)],
         capture_output=True,
         text=True,
         timeout=240,
         env={**os.environ, **(env or {})},
         check=False,
-        **options,
     )
     return Said(done.returncode, done.stdout, done.stderr)
 
 
-def start(*words: object, env: Mapping[str, str] | None = None, **options: Any) -> subprocess.Popen[str]:
+def start(*words: object, env: Mapping[str, str] | None = None, before: Sequence[str] = ()) -> subprocess.Popen[str]:
     """Start the command and come back at once; it leads a process group of its own, as in a terminal."""
     return subprocess.Popen(
-        [*COMMAND, *map(str, words)],
+        [*before, *COMMAND, *map(str, words)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, **(env or {})},
         start_new_session=True,
-        **options,
     )
 
 

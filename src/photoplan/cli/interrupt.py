@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: the first one unwinds what runs; a second one, or some seconds, end it as it stands.
+"""Ctrl-C and SIGTERM: the first one unwinds what runs; if that takes some seconds, the run is ended as it stands.
 
 Whatever is on the disk survives death at any moment, so that ending hard costs only the tiles under way.
 """
@@ -40,7 +40,9 @@ def _first(signum: int, frame: FrameType | None) -> None:
 
 
 def _second(signum: int, frame: FrameType | None) -> None:
-    _end()
+    """Leave the unwinding alone, it is timed; where it is not, end at once."""
+    if os.name != "posix":
+        _end()
 
 
 def _watch(reader: int) -> None:

@@ -15,7 +15,7 @@ from photoplan.cli.progress import progress
 from photoplan.errors import TilesFailed
 from photoplan.products.execution import ProductResult, Run, execute
 from photoplan.products.orthophoto import OrthoPlan
-from photoplan.products.plan_file import PlanFigures, compile_figures, write_plan
+from photoplan.products.plan_file import PlanFigures, check_plan_path, compile_figures, write_plan
 
 __all__ = ["How", "execute_and_report", "show_plan"]
 
@@ -53,6 +53,8 @@ class How:
 
 def show_plan(plan: OrthoPlan, folder: Path, plan_file: Path | None, how: How) -> None:
     """Compile every tile's geometry, print the figures, write the plan if asked."""
+    if plan_file is not None:
+        check_plan_path(plan_file, plan, how.overwrite)
     tiles = sum(len(p.plan.tiles) for p in plan.products)
     with progress(tiles, how.quiet) as report:
         figures = compile_figures(plan, report)

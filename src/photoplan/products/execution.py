@@ -22,7 +22,7 @@ from photoplan.plan.anchors import Anchors
 from photoplan.plan.product import ProductPlan, Tile, compile_tile
 from photoplan.products.orthophoto import OrthoPlan, OrthoProduct, render_tile
 from photoplan.products.results import ProductResult, finished_products, product_path
-from photoplan.products.scene import Scene, SceneAddress, open_scene
+from photoplan.products.scene import Scene, SceneAddress, input_files, open_scene
 
 __all__ = ["ProductResult", "Run", "execute"]
 
@@ -146,10 +146,7 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
 
 def _refuse_inputs(plan: OrthoPlan, outputs: list[Path]) -> None:
     """No output may be an input of the project, whichever product it belongs to and by whatever link."""
-    project = plan.project
-    files = [image.file for image in project.images]
-    files += [] if project.terrain.file is None else [project.terrain.file]
-    inputs = {_identity(project.resolve(file)) for file in files}
+    inputs = {_identity(file) for file in input_files(plan.project)}
     for path in outputs:
         if _identity(path) in inputs:
             raise UsageError(f"{path}: the output is an input of the project; choose another --output")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sqlite3
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,15 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan import __version__
-from photoplan.errors import InputError
+from photoplan.errors import InputError, ResourceError, UsageError
+from photoplan.io.disk import disk_error, free_megabytes
 from photoplan.io.plan_file import PlanTables, read_plan_tables, write_plan_tables
+from photoplan.io.product import check_output
 from photoplan.io.project import parse_project
 from photoplan.plan.product import compile_tile
 from photoplan.products.orthophoto import OrthoPlan, OrthoProduct, plan_orthophotos
-from photoplan.products.scene import open_scene
+from photoplan.products.scene import input_files, open_scene
 from photoplan.products.settings import OrthoSettings
 
-__all__ = ["PlanFigures", "compile_figures", "read_plan", "write_plan"]
+__all__ = ["PlanFigures", "check_plan_path", "compile_figures", "read_plan", "write_plan"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,8 +153,11 @@ def write_plan(path: Path, plan: OrthoPlan, figures: PlanFigures, output: Path, 
     Raises
     ------
     UsageError
-        The file exists and `overwrite` is False.
+        The file exists and `overwrite` is False, is an input or the project, or cannot be written.
+    ResourceError
+        The disk is full.
     """
+    check_plan_path(path, plan, overwrite)
     there = figures.cells_of_tile > 0
     header = {
         "photoplan": __version__,
@@ -179,9 +185,29 @@ def write_plan(path: Path, plan: OrthoPlan, figures: PlanFigures, output: Path, 
         "on_terrain": np.array([p.coverage.on_surface for p in plan.products]),
     }
     outlines = [_outline(p) for p in plan.products]
-    write_plan_tables(
-        path, PlanTables(header, tiles, figures.bounds[there], footprints, outlines, plan.project.crs), overwrite
-    )
+    tables = PlanTables(header, tiles, figures.bounds[there], footprints, outlines, plan.project.crs)
+    try:
+        write_plan_tables(path, tables, overwrite)
+    except OSError as error:
+        raise disk_error(path, error) from error
+    except (RuntimeError, sqlite3.Error) as error:
+        # What the libraries of vector files and of SQLite raise does not tell a full disk from a place without rights.
+        if free_megabytes(path) < 1:
+            raise ResourceError(f"{path}: cannot be written, the disk is full; free some space") from error
+        raise UsageError(f"{path}: cannot be written ({error}); choose a folder that can be written") from error
+
+
+def check_plan_path(path: Path, plan: OrthoPlan, overwrite: bool = False) -> None:
+    """Refuse a place for a plan before the work of compiling it.
+
+    Raises
+    ------
+    UsageError
+        The name is not that of a GeoPackage, the file exists and `overwrite` is False, or it is an input.
+    """
+    if path.suffix.lower() != ".gpkg":
+        raise UsageError(f"{path}: a plan is a GeoPackage; give it a name that ends in .gpkg")
+    check_output(path, input_files(plan.project), overwrite=overwrite)
 
 
 def _outline(product: OrthoProduct) -> NDArray[np.float64]:

@@ -32,7 +32,7 @@ from photoplan.surfaces.level import LevelSurface
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.surfaces.shifted import ShiftedSurface
 
-__all__ = ["Ground", "Scene", "SceneAddress", "ground_of", "open_scene", "pose_of"]
+__all__ = ["Ground", "Scene", "SceneAddress", "ground_of", "input_files", "open_scene", "pose_of"]
 
 #: Terrain further from the projection centre than this is not looked at, metres.
 _FAR = 30_000.0
@@ -100,6 +100,13 @@ class Scene:
     def facts(self) -> list[Any]:
         """What identifies the scene in a product's key: description and contents, not places."""
         return [self.address.text, [digest for _, digest in self.address.digests]]
+
+
+def input_files(project: Project) -> list[Path]:
+    """All rasters that a project names; nothing that is written may replace one of them."""
+    files = [image.file for image in project.images]
+    files += [] if project.terrain.file is None else [project.terrain.file]
+    return [project.resolve(file) for file in files]
 
 
 def open_scene(project: Project, name: str) -> Scene:
@@ -192,7 +199,7 @@ def _ground(address: _GroundAddress) -> Ground:
     info = reader.info
     crs = info.crs or terrain.crs
     if crs is None:
-        raise InputError(f"{info.path}: no CRS; state it as crs = \"EPSG:nnnn\" in [terrain], it is not guessed")
+        raise InputError(f'{info.path}: no CRS; state it as crs = "EPSG:nnnn" in [terrain], it is not guessed')
     if info.metres_per_unit not in (None, 1.0):
         raise InputError(f"{info.path}: heights in {info.unit}; convert them to metres first")
     systems = declared_pair(terrain.height_system or info.vertical_crs, address.orientation_system)

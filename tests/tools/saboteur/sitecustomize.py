@@ -1,6 +1,7 @@
 """Python imports this at its start where a test has put its folder on the path; worker processes do so too.
 
 SABOTAGE_SLOW    seconds that every tile takes longer
+SABOTAGE_QUICK   number of tiles that do not, by their place in the product
 SABOTAGE_DEADLY  image:tile whose worker kills itself whenever it gets there
 SABOTAGE_ONCE    a file; the first worker that finds it removes it and kills itself
 """
@@ -16,7 +17,8 @@ _render = execution.render_tile
 
 
 def _sabotaged(product, kernel, scene, tile):  # type: ignore[no-untyped-def]
-    time.sleep(float(os.environ.get("SABOTAGE_SLOW", "0")))
+    if tile.index >= int(os.environ.get("SABOTAGE_QUICK", "0")):
+        time.sleep(float(os.environ.get("SABOTAGE_SLOW", "0")))
     if os.environ.get("SABOTAGE_DEADLY") == f"{product.image}:{tile.index}":
         os.kill(os.getpid(), signal.SIGKILL)
     once = os.environ.get("SABOTAGE_ONCE")
