@@ -2,222 +2,220 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from photoplan.kernels.border import LEAST_WEIGHT, store
 from photoplan.kernels.jit import inner, kernel
-from photoplan.kernels.place import ALL, AVERAGE, EMPTY, INTERIOR, NOTHING, SOME
-from photoplan.kernels.weights import STRETCH_FROM, STRETCH_FULL
+from photoplan.kernels.place import ALL, AVERAGE
+from photoplan.kernels.sampling import add_block, block_pixels
+from photoplan.kernels.weights import TABLE_STEPS
 
-__all__ = ["average_runs", "largest_scales", "stretch_runs"]
+__all__ = ["average_runs"]
+
+# Weights stand in the middle of zeros, so that blocks of pixels may reach beyond them.
+_BEFORE = 8
 
 
-@kernel
-def largest_scales(rects, box_start, corners):
-    """Largest scale of each rectangle along image x or y, source pixels per target pixel, at its boxes' corners.
+@inner
+def _look_up(table: NDArray[np.float32], distance: float) -> np.float32:
+    """Weight at a distance in steps of the table, linear between them."""
+    step = np.int32(distance)
+    lower = table[step]
+    return lower + (distance - np.float32(step)) * (table[step + 1] - lower)
+
+
+@inner
+def _wide_weights(
+    table: NDArray[np.float32], place: tuple[Any, ...], stretch: float, size: int, weights: NDArray[Any]
+) -> tuple[int, int, float, float]:
+    """Weights of the pixels of one axis under the widened kernel.
 
     Parameters
     ----------
-    rects, box_start, corners : ndarrays
-        As in `rectify_tile`.
+    table : (reach · TABLE_STEPS + 2,) float32
+        See `weight_table`.
+    place : (whole, fraction)
+        Position.
+    stretch : float
+        Widening.
+    size : int
+        Pixels of the source along this axis.
+    weights : float32
+        Filled from _BEFORE on with the weights of the pixels start … stop − 1 that are inside, zeros after them.
 
     Returns
     -------
-    ndarray, shape (m,)
-        NaN where a corner is not in front of the camera.
+    start, stop, inside, total
+        Pixels; sum of their weights; sum of all weights, also of pixels outside.
     """
-    result = np.zeros(rects.shape[0])
-    for index in range(rects.shape[0]):
-        width, height = float(rects[index, 2] - rects[index, 0]), float(rects[index, 3] - rects[index, 1])
-        for box in range(box_start[index], box_start[index + 1]):
-            for corner in range(8):
-                p, p_u, p_v = corners[box, corner], corners[box, corner ^ 1], corners[box, corner ^ 2]
-                for c in range(2):
-                    # Signs do not matter: the derivatives are squared.
-                    along_u = ((p_u[c] - p[c]) - p[c] / p[2] * (p_u[2] - p[2])) / (width * p[2])
-                    along_v = ((p_v[c] - p[c]) - p[c] / p[2] * (p_v[2] - p[2])) / (height * p[2])
-                    scale = np.sqrt(along_u * along_u + along_v * along_v)
-                    result[index] = scale if not scale <= result[index] else result[index]
-    return result
+    whole, fraction = place
+    reach = ((table.shape[0] - 2) // TABLE_STEPS) * stretch
+    first = np.int64(np.ceil(fraction - reach))
+    last = np.int64(np.floor(fraction + reach))
+    start, stop = max(whole + first, 0), min(whole + last + 1, size)
+    rate, middle = np.float32(TABLE_STEPS / stretch), np.float32(fraction)
+    sum_inside = np.float32(0.0)
+    for i in range(stop - start):
+        weight = _look_up(table, abs(np.float32(start - whole + i) - middle) * rate)
+        weights[_BEFORE + i] = weight
+        sum_inside += weight
+    for i in range(max(stop - start, 0), max(stop - start, 0) + _BEFORE):
+        weights[_BEFORE + i] = np.float32(0.0)
+    total = np.float64(sum_inside)
+    for i in range(first, min(start - whole, last + 1)):
+        total += np.float64(_look_up(table, abs(np.float32(i) - middle) * rate))
+    for i in range(max(stop - whole, first), last + 1):
+        total += np.float64(_look_up(table, abs(np.float32(i) - middle) * rate))
+    return start, stop, np.float64(sum_inside), total
 
 
 @inner
-def _stretch(scale):
-    """See `weights.stretch`."""
-    if scale >= STRETCH_FULL:
-        return scale
-    part = max(0.0, (scale - STRETCH_FROM) / (STRETCH_FULL - STRETCH_FROM))
-    return 1.0 + part * (STRETCH_FULL - 1.0)
-
-
-@inner
-def _lerp(corners, c, iv_step, s, t):
-    """Value and derivatives along s and t of component c on the face whose first corner is `iv_step`."""
-    p00, p01 = corners[iv_step, c], corners[iv_step + 1, c]
-    p10, p11 = corners[iv_step + 2, c], corners[iv_step + 3, c]
-    lower, upper = p00 + s * (p01 - p00), p10 + s * (p11 - p10)
-    along_s = (p01 - p00) + t * ((p11 - p10) - (p01 - p00))
-    return lower + t * (upper - lower), along_s, upper - lower
-
-
-@inner
-def _pixel_stretch(anchors, index, u, v, h):
-    """Widening of the kernel along image x and y at one pixel, from the derivatives at constant h."""
-    rects, box_start, box_heights, corners = anchors
-    box = box_start[index]
-    while box + 1 < box_start[index + 1] and h >= box_heights[box + 1, 0]:
-        box += 1
-    width, height = float(rects[index, 2] - rects[index, 0]), float(rects[index, 3] - rects[index, 1])
-    s, t = (u - rects[index, 0] + 0.5) / width, (v - rects[index, 1] + 0.5) / height
-    low, rise = box_heights[box, 0], box_heights[box, 1] - box_heights[box, 0]
-    q = (h - low) / rise if rise > 0.0 else 0.0
-    value, du, dv = np.empty(3), np.empty(3), np.empty(3)
-    for c in range(3):
-        a, a_s, a_t = _lerp(corners[box], c, 0, s, t)
-        b, b_s, b_t = _lerp(corners[box], c, 4, s, t)
-        value[c] = a + q * (b - a)
-        du[c] = (a_s + q * (b_s - a_s)) / width
-        dv[c] = (a_t + q * (b_t - a_t)) / height
-    w = value[2]
-    x, y = value[0] / w, value[1] / w
-    sx = np.sqrt((du[0] - x * du[2]) ** 2 + (dv[0] - x * dv[2]) ** 2) / w
-    sy = np.sqrt((du[1] - y * du[2]) ** 2 + (dv[1] - y * dv[2]) ** 2) / w
-    return _stretch(sx), _stretch(sy)
-
-
-@inner
-def _wide_weights(coefficients, taps, position, stretch, size, weights):
-    """Weights of the pixels of one axis under the widened kernel.
-
-    Fills weights[0 : stop − start] for the pixels start … stop − 1 inside 0 … size − 1. Returns start, stop, the sum of
-    those weights and the sum of all, also of the pixels outside.
-    """
-    reach = taps // 2
-    first = np.int64(np.ceil(position - reach * stretch))
-    last = np.int64(np.floor(position + reach * stretch))
-    start, stop = max(first, 0), min(last + 1, size)
-    inside, total = 0.0, 0.0
-    for i in range(first, last + 1):
-        t = (i - position) / stretch
-        upper = np.ceil(t)
-        tap = np.int64(upper) + reach - 1
-        if tap < 0 or tap >= taps:
-            weight = 0.0
-        else:
-            g = upper - t - 0.5
-            weight = 0.0
-            for power in range(coefficients.shape[0] - 1, -1, -1):
-                weight = weight * g + float(coefficients[power, tap])
-        total += weight
-        if start <= i < stop:
-            weights[i - start] = weight
-            inside += weight
-    return start, stop, inside, total
-
-
-@inner
-def _sum_rows(lines, ranges, wy, sums):
-    """Weighted sum of the rows: sums[k] = Σ wy · lines[row, first + k]."""
-    first, count, top, bottom = ranges
-    for k in range(count):
-        sums[k] = 0
-    for row in range(top, bottom):
-        weight = sums.dtype.type(wy[row - top])
-        line = lines[row, first : first + count]
-        for k in range(count):
-            sums[k] += weight * sums.dtype.type(line[k])
-
-
-@inner
-def _usable(valid, ranges, weights, sums):
-    """Sum of the weights of the valid pixels among columns left … right − 1, rows top … bottom − 1."""
+def _usable(valid: NDArray[np.uint8], ranges: tuple[Any, ...], weights: tuple[Any, ...]) -> tuple[float, bool]:
+    """Sum of the weights of the valid pixels among columns left … right − 1, rows top … bottom − 1; are all valid?"""
     left, right, top, bottom = ranges
     wx, wy = weights
-    _sum_rows(valid, (left, right - left, top, bottom), wy, sums)
-    total = 0.0
-    for k in range(right - left):
-        total += wx[k] * sums[k]
-    return total
+    total, missing = 0.0, 0
+    for row in range(top, bottom):
+        along = 0.0
+        for col in range(left, right):
+            if valid[row, col] != 0:
+                along += np.float64(wx[_BEFORE + col - left])
+            else:
+                missing += 1
+        total += along * np.float64(wy[_BEFORE + row - top])
+    return total, missing == 0
 
 
 @inner
-def _average_one(source, valid, spot, rule, work, result, place):
-    """Average over the widened kernel at spot = (x, y, stretch along x, along y); written at place = (row, column)."""
-    x, y, stretch_x, stretch_y = spot
-    coefficients, taps, limits = rule
-    wx, wy, sums, mask_sums = work
+def _sum_each(
+    source: NDArray[Any],
+    valid: NDArray[np.uint8],
+    group: int,
+    ranges: tuple[Any, ...],
+    weights: tuple[Any, ...],
+    patch: tuple[Any, ...],
+) -> None:
+    """What `_sum_blocks` computes, pixel by pixel: for invalid pixels among float data, and very narrow sources."""
+    left, right, top, bottom = ranges
+    wx, wy = weights
+    base, _, totals = patch
+    for lane in range(source.shape[3]):
+        total = 0.0
+        for row in range(top, bottom):
+            for col in range(left, right):
+                if valid.size == 0 or valid[row, col] != 0:
+                    weight = np.float64(wx[_BEFORE + col - left]) * np.float64(wy[_BEFORE + row - top])
+                    total += weight * (np.float64(source[group, row, col, lane]) - np.float64(base[lane]))
+        totals[lane] = total
+
+
+@inner
+def _sum_blocks(
+    source: NDArray[Any],
+    group: int,
+    ranges: tuple[Any, ...],
+    weights: tuple[Any, ...],
+    patch: tuple[Any, ...],
+    lanes_tag: tuple[Any, ...],
+) -> bool:
+    """totals[lane] = Σ wx · wy · (pixel − base) of one group of bands; False if the source is too narrow for blocks.
+
+    patch = (base, sums, totals). For float pixels, base is one of those summed, so that a constant image stays constant
+    to the last bit; integers are summed without it.
+    """
+    left, right, top, bottom = ranges
+    wx, wy = weights
+    base, sums, totals = patch
+    height, width, lanes = source.shape[1], source.shape[2], len(lanes_tag)
+    many = block_pixels(lanes_tag)
+    blocks = (right - left + many - 1) // many
+    if blocks * many > width:
+        return False
+    start = min(left, width - blocks * many)
+    for lane in range(lanes):
+        sums[lane] = 0.0
+    first = ((group * height + top) * width + start) * lanes
+    for block in range(blocks):
+        at = _BEFORE + start - left + block * many
+        place = (first + block * many * lanes, width * lanes, bottom - top, at, _BEFORE)
+        add_block(source, place, wx, wy, base, lanes_tag, sums)
+    for lane in range(lanes):
+        totals[lane] = sums[lane]
+    return True
+
+
+@inner
+def _average_one(
+    source: NDArray[Any],
+    valid: NDArray[np.uint8],
+    spot: tuple[Any, ...],
+    rule: tuple[Any, ...],
+    work: tuple[Any, ...],
+    result: tuple[Any, ...],
+    place: tuple[Any, ...],
+) -> None:
+    """Average over the widened kernel at spot; written at place = (row, column).
+
+    spot = (whole x, fraction, widening, whole y, fraction, widening).
+    """
+    table, lanes_tag, limits = rule
+    wx, wy, patch = work
+    base, _, totals = patch
     out, out_valid = result
     groups, height, width, lanes = source.shape
-    left, right, in_x, all_x = _wide_weights(coefficients, taps, x, stretch_x, width, wx)
-    top, bottom, in_y, all_y = _wide_weights(coefficients, taps, y, stretch_y, height, wy)
+    left, right, in_x, all_x = _wide_weights(table, (spot[0], spot[1]), spot[2], width, wx)
+    top, bottom, in_y, all_y = _wide_weights(table, (spot[3], spot[4]), spot[5], height, wy)
     if left >= right or top >= bottom:
         return
-    usable = in_x * in_y
+    ranges = (left, right, top, bottom)
+    usable, complete = in_x * in_y, True
     if valid.size > 0:
-        usable = _usable(valid, (left, right, top, bottom), (wx, wy), mask_sums)
+        usable, complete = _usable(valid, ranges, (wx, wy))
     if usable < LEAST_WEIGHT * all_x * all_y:
         return
     out_valid[place[0], place[1]] = True
-    lines = source.reshape(groups * height, width * lanes)
+    is_float = limits[2] == 0.0
     for group in range(groups):
-        rows = (left * lanes, (right - left) * lanes, group * height + top, group * height + bottom)
-        _sum_rows(lines, rows, wy, sums)
+        for lane in range(lanes):
+            base[lane] = source[group, top, left, lane] if is_float and complete else 0.0
+        # Invalid integers are 0 and add nothing; among floats the base would have to be taken from them as well.
+        done = (complete or not is_float) and _sum_blocks(source, group, ranges, (wx, wy), patch, lanes_tag)
+        if not done:
+            _sum_each(source, valid, group, ranges, (wx, wy), patch)
         for lane in range(min(lanes, out.shape[0] - group * lanes)):
-            value = 0.0
-            for k in range(right - left):
-                value += wx[k] * float(sums[k * lanes + lane])
-            store(value / usable, limits, out, (group * lanes + lane, place[0], place[1]))
+            value = np.float64(base[lane]) + totals[lane] / usable
+            store(value, limits, out, (group * lanes + lane, place[0], place[1]))
 
 
 @kernel
-def stretch_runs(anchors, runs, relief, offset, block, scales):
-    """Find the pixels whose kernel is to be widened and make them AVERAGE; returns their number.
-
-    Parameters
-    ----------
-    scales : (k, 2, RUN) float64
-        Filled where AVERAGE: widening along image x and y.
-
-    See `place_runs` for the others.
-    """
-    kind, fill = block[3], block[4]
-    count = 0
-    for k in range(runs.shape[0]):
-        row, col, n = runs[k, 1] - offset[1], runs[k, 3] - offset[0], runs[k, 4] - runs[k, 3]
-        if fill[k] == ALL:
-            kind[k, :n] = INTERIOR
-        interior = 0
-        for i in range(n):
-            if kind[k, i] == EMPTY:
-                continue
-            sx, sy = _pixel_stretch(anchors, runs[k, 0], runs[k, 3] + i, runs[k, 1], relief[row, col + i])
-            if sx > 1.0 or sy > 1.0:
-                kind[k, i] = AVERAGE
-                scales[k, 0, i], scales[k, 1, i] = sx, sy
-                count += 1
-            elif kind[k, i] == INTERIOR:
-                interior += 1
-        fill[k] = ALL if interior == n else (SOME if interior > 0 else NOTHING)
-    return count
-
-
-@kernel
-def average_runs(source, valid, runs, offset, block, scales, rule, result, sums):
+def average_runs(
+    source: NDArray[Any],
+    valid: NDArray[np.uint8],
+    runs: NDArray[np.int32],
+    offset: tuple[int, int],
+    block: tuple[Any, ...],
+    scales: NDArray[np.float32],
+    rule: tuple[Any, ...],
+    result: tuple[Any, ...],
+) -> None:
     """Resample the AVERAGE pixels of runs.
 
     Parameters
     ----------
-    scales : (k, 2, RUN) float64
+    scales : (k, 2, RUN) float32
         See `stretch_runs`.
-    sums : (width of the source · lanes,) float32 or float64
-        Working space; float64 for float32 pixels, so that a constant image stays constant to the last bit.
+    rule : tuple
+        `weight_table` of the kernel; tag for lanes; limits (low, high, rounding).
 
     See `border_runs` for the others.
     """
     corner, first, part, kind, fill = block
-    before = rule[1] // 2 - 1
-    _, height, width, _ = source.shape
-    work = (np.empty(width), np.empty(height), sums, np.empty(width))
+    before = (rule[0].shape[0] - 2) // TABLE_STEPS - 1
+    wx, wy = np.zeros(source.shape[2] + 3 * _BEFORE, np.float32), np.zeros(source.shape[1] + 3 * _BEFORE, np.float32)
+    work = (wx, wy, (np.zeros(4, np.float32), np.zeros(4, np.float32), np.zeros(4)))
     for k in range(runs.shape[0]):
         if fill[k] == ALL:
             continue
@@ -225,7 +223,12 @@ def average_runs(source, valid, runs, offset, block, scales, rule, result, sums)
         for i in range(runs[k, 4] - runs[k, 3]):
             if kind[k, i] == AVERAGE:
                 result[1][row, col + i] = False
-                x = corner[k, 0] + first[k, 0, i] + before + (float(part[k, 0, i]) + 0.5)
-                y = corner[k, 1] + first[k, 1, i] + before + (float(part[k, 1, i]) + 0.5)
-                spot = (x, y, scales[k, 0, i], scales[k, 1, i])
+                spot = (
+                    corner[k, 0] + first[k, 0, i] + before,
+                    np.float64(part[k, 0, i]) + 0.5,
+                    np.float64(scales[k, 0, i]),
+                    corner[k, 1] + first[k, 1, i] + before,
+                    np.float64(part[k, 1, i]) + 0.5,
+                    np.float64(scales[k, 1, i]),
+                )
                 _average_one(source, valid, spot, rule, work, result, (row, col + i))

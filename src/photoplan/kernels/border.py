@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 from photoplan.kernels.place import ALL, BORDER
@@ -14,7 +17,7 @@ LEAST_WEIGHT = 0.5 - 1e-6
 
 
 @inner
-def store(value, limits, out, place):
+def store(value: float, limits: tuple[Any, ...], out: NDArray[Any], place: tuple[Any, ...]) -> None:
     """Round half away from zero, clip and write; limits = (low, high, rounding), rounding 0 for float data."""
     low, high, rounding = limits
     if rounding > 0.0:
@@ -24,20 +27,27 @@ def store(value, limits, out, place):
 
 
 @inner
-def _weight(coefficients, column, g):
+def _weight(coefficients: NDArray[Any], column: int, g: float) -> float:
     value = 0.0
     for power in range(coefficients.shape[0] - 1, -1, -1):
-        value = value * g + float(coefficients[power, column])
+        value = value * g + np.float64(coefficients[power, column])
     return value
 
 
 @inner
-def _tap_weights(coefficients, taps, valid, size, place, weights):
+def _tap_weights(
+    coefficients: NDArray[Any],
+    taps: int,
+    valid: NDArray[np.uint8],
+    size: tuple[Any, ...],
+    place: tuple[Any, ...],
+    weights: NDArray[Any],
+) -> float:
     """Weights of the taps that are inside and valid, 0 for the others; returns their sum.
 
     place = (column, row of the first tap, gx, gy); size = (width, height).
     """
-    col, row, gx, gy = place[0], place[1], float(place[2]), float(place[3])
+    col, row, gx, gy = place[0], place[1], np.float64(place[2]), np.float64(place[3])
     half = coefficients.shape[1] // 2
     total = 0.0
     for j in range(taps):
@@ -54,17 +64,27 @@ def _tap_weights(coefficients, taps, valid, size, place, weights):
 
 
 @inner
-def _weighted(source, group, lane, place, taps, weights):
+def _weighted(
+    source: NDArray[Any], group: int, lane: int, place: tuple[Any, ...], taps: int, weights: NDArray[np.float64]
+) -> float:
     value = 0.0
     for j in range(taps):
         for i in range(taps):
             if weights[j, i] != 0.0:
-                value += weights[j, i] * float(source[group, place[1] + j, place[0] + i, lane])
+                value += weights[j, i] * np.float64(source[group, place[1] + j, place[0] + i, lane])
     return value
 
 
 @kernel
-def border_runs(source, valid, runs, offset, block, rule, result):
+def border_runs(
+    source: NDArray[Any],
+    valid: NDArray[np.uint8],
+    runs: NDArray[np.int32],
+    offset: tuple[int, int],
+    block: tuple[Any, ...],
+    rule: tuple[Any, ...],
+    result: tuple[Any, ...],
+) -> None:
     """Resample the BORDER pixels of runs: taps outside or invalid carry no weight, the rest is renormalised.
 
     Parameters

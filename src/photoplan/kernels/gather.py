@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 from photoplan.kernels.place import ALL, INTERIOR
@@ -13,7 +16,9 @@ __all__ = ["gather_runs"]
 
 
 @inner
-def _write(buffer, lanes_tag, first_band, place, out):
+def _write(
+    buffer: NDArray[Any], lanes_tag: tuple[Any, ...], first_band: int, place: tuple[Any, ...], out: NDArray[Any]
+) -> None:
     """Bands side by side to planes, at place = (row, column, count)."""
     row, col, count = place
     lanes = len(lanes_tag)
@@ -24,7 +29,15 @@ def _write(buffer, lanes_tag, first_band, place, out):
 
 
 @kernel
-def gather_runs(source, runs, offset, block, coefficients, tags, out):
+def gather_runs(
+    source: NDArray[Any],
+    runs: NDArray[np.int32],
+    offset: tuple[int, int],
+    block: tuple[Any, ...],
+    coefficients: NDArray[Any],
+    tags: tuple[Any, ...],
+    out: NDArray[Any],
+) -> None:
     """Resample the INTERIOR pixels of runs, write 0 to all others.
 
     Parameters

@@ -41,10 +41,18 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 
 def inner(function: Callable[..., Any]) -> Any:
-    """Compile a part of a kernel: called by kernels only, so the code for calls from Python is left out."""
-    return njit(nogil=True, error_model="numpy", fastmath=_FAST, no_cpython_wrapper=True, no_cfunc_wrapper=True)(
-        function
-    )
+    """Compile a part of a kernel: called by kernels only, and always inlined there.
+
+    Arrays are many machine words each; a real call would spend more time on passing them than some parts need.
+    """
+    return njit(
+        nogil=True,
+        error_model="numpy",
+        fastmath=_FAST,
+        no_cpython_wrapper=True,
+        no_cfunc_wrapper=True,
+        forceinline=True,
+    )(function)
 
 
 def is_ready(dispatcher: Any, arguments: tuple[Any, ...]) -> bool:

@@ -45,12 +45,10 @@ def as_bytes(mask: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 @kernel
-def _interleave(source, packed):
+def _interleave(source: NDArray[Any], packed: NDArray[Any]) -> None:
+    """Two bands or more. Four named lanes, not a loop over them: the compiler then writes whole pixels."""
     bands, height, width = source.shape
-    groups, lanes = packed.shape[0], packed.shape[3]
-    if lanes == 1:
-        packed[0, :, :, 0] = source[0]
-        return
+    groups = packed.shape[0]
     nothing = np.zeros(width, source.dtype)
     for group in range(groups):
         first = 4 * group
@@ -68,7 +66,7 @@ def _interleave(source, packed):
 
 
 @kernel
-def _interleave_valid(source, valid, packed):
+def _interleave_valid(source: NDArray[Any], valid: NDArray[np.uint8], packed: NDArray[Any]) -> None:
     bands, height, width = source.shape
     groups, lanes = packed.shape[0], packed.shape[3]
     zero = source.dtype.type(0)
@@ -88,7 +86,7 @@ def _interleave_valid(source, valid, packed):
 
 
 @kernel
-def solid_patches(valid, taps):
+def solid_patches(valid: NDArray[np.uint8], taps: int) -> NDArray[np.uint8]:
     """1 where the taps × taps pixels from (row, column) on to the lower right are all inside and valid; uint8."""
     height, width = valid.shape
     solid = np.zeros((height, width), np.uint8)

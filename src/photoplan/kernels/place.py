@@ -5,7 +5,10 @@ Nothing here depends on the type of the pixels, so it is compiled once for all o
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 from photoplan.kernels.position import RUN, locate_run
@@ -19,7 +22,7 @@ NOTHING, ALL, SOME = 0, 1, 2
 """Whether a run has no pixel, only pixels, or some pixels of kind INTERIOR."""
 
 
-def empty_block(count):
+def empty_block(count: int) -> tuple[Any, ...]:
     """Working space for `count` runs.
 
     Returns
@@ -41,7 +44,15 @@ def empty_block(count):
 
 
 @inner
-def _split(dx, dy, edges, inner_edges, shift, located, kind):
+def _split(
+    dx: NDArray[np.float32],
+    dy: NDArray[np.float32],
+    edges: tuple[Any, ...],
+    inner_edges: tuple[Any, ...],
+    shift: float,
+    located: tuple[Any, ...],
+    kind: NDArray[Any],
+) -> tuple[Any, Any]:
     """Whole and fractional positions of a run, relative to its origin; returns the counts of BORDER and INTERIOR.
 
     edges: left, top, right, bottom of the image, float32; inner_edges: lowest and highest column and row whose taps are
@@ -75,13 +86,19 @@ def _split(dx, dy, edges, inner_edges, shift, located, kind):
 
 
 @inner
-def _limit(value):
+def _limit(value: float) -> np.int32:
     """As int32, cut where no position within a run can reach."""
     return np.int32(min(max(value, -(1 << 30)), 1 << 30))
 
 
 @inner
-def _look_at_mask(solid, corner, columns, rows, kind):
+def _look_at_mask(
+    solid: NDArray[np.uint8],
+    corner: NDArray[np.int64],
+    columns: NDArray[np.int32],
+    rows: NDArray[np.int32],
+    kind: NDArray[Any],
+) -> int:
     """Turn INTERIOR pixels with an invalid tap into BORDER; returns how many."""
     count = 0
     for i in range(kind.shape[0]):
@@ -92,7 +109,15 @@ def _look_at_mask(solid, corner, columns, rows, kind):
 
 
 @kernel
-def place_runs(anchors, runs, relief, offset, frame, block, out_valid):
+def place_runs(
+    anchors: tuple[Any, ...],
+    runs: NDArray[np.int32],
+    relief: NDArray[np.float32],
+    offset: tuple[int, int],
+    frame: tuple[Any, ...],
+    block: tuple[Any, ...],
+    out_valid: NDArray[np.bool_],
+) -> int:
     """Place the pixels of some runs.
 
     Parameters
@@ -140,7 +165,8 @@ def place_runs(anchors, runs, relief, offset, frame, block, out_valid):
         valid_line = out_valid[row, col : col + n]
         if whole == n and solid.size == 0:
             fill[k] = ALL
-            valid_line[:] = True
+            for i in range(n):
+                valid_line[i] = True
             continue
         line = kind[k]
         for i in range(n):

@@ -7,35 +7,55 @@ precision holds it to about 1e-5 pixel wherever the run lies in the source.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 
-__all__ = ["RUN", "locate_run", "positions", "tile_runs"]
+__all__ = [
+    "RUN",
+    "locate_run",
+    "middle_of_run",
+    "positions",
+    "row_weights",
+    "run_coefficients",
+    "shift_to",
+    "single",
+    "tile_runs",
+]
 
 RUN = 256
 """Columns of a rectangle that share one set of coefficients."""
 
 
 @inner
-def _run_coefficients(rect, heights, corners, u_ref, v, coef):
-    """Row `v` of a box as polynomials in (u − u_ref, h − h_ref): fills coef (4, 3), returns h_ref.
+def run_coefficients(
+    rect: NDArray[np.int32],
+    heights: NDArray[np.float32],
+    corners: NDArray[np.float64],
+    u_ref: int,
+    edges: tuple[Any, ...],
+    coef: NDArray[np.float64],
+) -> float:
+    """One row of a box as polynomials in (u − u_ref, h − h_ref): fills coef (4, 3), returns h_ref.
 
-    coef[:, c] are the factors of 1, u, h and u·h for c = x·w, y·w, w.
+    coef[:, c] are the factors of 1, u, h and u·h for c = x·w, y·w, w. `edges` are the weights of the rectangle's upper
+    and lower edge: those of `row_weights` for the values, (−1, 1) / height for their derivatives along v.
     """
+    a, b = edges
     width = float(rect[2] - rect[0])
-    t = (v - rect[1] + 0.5) / (rect[3] - rect[1])
     s = (u_ref - rect[0] + 0.5) / width
     rise = heights[1] - heights[0]
-    h_ref = float(np.float32(0.5 * (heights[0] + heights[1])))
+    h_ref = np.float64(np.float32(0.5 * (heights[0] + heights[1])))
     q = (h_ref - heights[0]) / rise if rise > 0.0 else 0.0
     per_metre = 1.0 / rise if rise > 0.0 else 0.0
     for c in range(3):
-        p00 = corners[0, c] + t * (corners[2, c] - corners[0, c])
-        p01 = corners[1, c] + t * (corners[3, c] - corners[1, c])
-        p10 = corners[4, c] + t * (corners[6, c] - corners[4, c])
-        p11 = corners[5, c] + t * (corners[7, c] - corners[5, c])
+        p00 = a * corners[0, c] + b * corners[2, c]
+        p01 = a * corners[1, c] + b * corners[3, c]
+        p10 = a * corners[4, c] + b * corners[6, c]
+        p11 = a * corners[5, c] + b * corners[7, c]
         along_u = p01 - p00
         along_h = p10 - p00
         twist = (p11 - p10) - along_u
@@ -47,7 +67,28 @@ def _run_coefficients(rect, heights, corners, u_ref, v, coef):
 
 
 @inner
-def _run_origin(coef, origin):
+def row_weights(rect: NDArray[np.int32], v: int) -> tuple[float, float]:
+    """Weights of a rectangle's upper and lower edge in row v."""
+    t = (v - rect[1] + 0.5) / (rect[3] - rect[1])
+    return 1.0 - t, t
+
+
+@inner
+def shift_to(origin: NDArray[np.float64], coef: NDArray[np.float64]) -> None:
+    """Refer coefficients to `origin`."""
+    for k in range(4):
+        coef[k, 0] -= origin[0] * coef[k, 2]
+        coef[k, 1] -= origin[1] * coef[k, 2]
+
+
+@inner
+def middle_of_run(rect: NDArray[np.int32], run: NDArray[np.int32]) -> int:
+    """Column that a run's coefficients refer to: its middle as the rectangle has it. Crops must get the same bytes."""
+    return run[2] + min(RUN, rect[2] - run[2]) // 2
+
+
+@inner
+def _run_origin(coef: NDArray[np.float64], origin: NDArray[np.float64]) -> None:
     """Whole source pixel at the middle of the run, relative to which `_run_positions` works."""
     for c in range(2):
         value = np.floor(coef[0, c] / coef[0, 2])
@@ -56,22 +97,27 @@ def _run_origin(coef, origin):
 
 
 @inner
-def _single(coef, c):
+def single(coef: NDArray[np.float64], c: int) -> tuple[Any, ...]:
+    """Factors of 1, u, h, u·h of component c in single precision."""
     return np.float32(coef[0, c]), np.float32(coef[1, c]), np.float32(coef[2, c]), np.float32(coef[3, c])
 
 
 @inner
-def _run_positions(coef, origin, u_first, heights, h_ref, dx, dy):
-    """Positions of a run relative to `origin`; NaN heights give NaN.
+def _run_positions(
+    coef: NDArray[np.float64],
+    u_first: float,
+    heights: NDArray[np.float32],
+    h_ref: float,
+    dx: NDArray[np.float32],
+    dy: NDArray[np.float32],
+) -> None:
+    """Positions of a run from coefficients shifted to its origin; NaN heights give NaN.
 
     u_first is the first column relative to the reference column of `coef`.
     """
-    for k in range(4):
-        coef[k, 0] -= origin[0] * coef[k, 2]
-        coef[k, 1] -= origin[1] * coef[k, 2]
-    x0, x1, x2, x3 = _single(coef, 0)
-    y0, y1, y2, y3 = _single(coef, 1)
-    w0, w1, w2, w3 = _single(coef, 2)
+    x0, x1, x2, x3 = single(coef, 0)
+    y0, y1, y2, y3 = single(coef, 1)
+    w0, w1, w2, w3 = single(coef, 2)
     h0, first, one = np.float32(h_ref), np.float32(u_first), np.float32(1.0)
     for i in range(heights.shape[0]):
         u = first + np.float32(np.int32(i))
@@ -82,7 +128,14 @@ def _run_positions(coef, origin, u_first, heights, h_ref, dx, dy):
 
 
 @inner
-def _keep_from(heights, low, higher_x, higher_y, dx, dy):
+def _keep_from(
+    heights: NDArray[np.float32],
+    low: float,
+    higher_x: NDArray[np.float32],
+    higher_y: NDArray[np.float32],
+    dx: NDArray[np.float32],
+    dy: NDArray[np.float32],
+) -> None:
     """Take the higher box's positions where the height is not below it."""
     for i in range(heights.shape[0]):
         if heights[i] >= low:
@@ -90,7 +143,14 @@ def _keep_from(heights, low, higher_x, higher_y, dx, dy):
 
 
 @inner
-def locate_run(anchors, run, heights, frame, dx, dy):
+def locate_run(
+    anchors: tuple[Any, ...],
+    run: NDArray[np.int32],
+    heights: NDArray[np.float32],
+    frame: tuple[Any, ...],
+    dx: NDArray[np.float32],
+    dy: NDArray[np.float32],
+) -> None:
     """Positions of the pixels of one run, relative to the run's origin.
 
     Parameters
@@ -108,23 +168,25 @@ def locate_run(anchors, run, heights, frame, dx, dy):
     """
     rects, box_start, box_heights, corners = anchors
     origin, coef = frame
-    index, v = run[0], run[1]
-    # The middle of the run as the rectangle has it, not as a crop may: crops must get the same bytes.
-    u_ref = run[2] + min(RUN, rects[index, 2] - run[2]) // 2
-    lowest = box_start[index]
-    for box in range(lowest, box_start[index + 1]):
-        h_ref = _run_coefficients(rects[index], box_heights[box], corners[box], u_ref, v, coef)
+    rect, lowest = rects[run[0]], box_start[run[0]]
+    u_ref, edges = middle_of_run(rect, run), row_weights(rect, run[1])
+    for box in range(lowest, box_start[run[0] + 1]):
+        h_ref = run_coefficients(rect, box_heights[box], corners[box], u_ref, edges, coef)
         if box == lowest:
             _run_origin(coef, origin)
-            _run_positions(coef, origin, run[3] - u_ref, heights, h_ref, dx, dy)
+        shift_to(origin, coef)
+        if box == lowest:
+            _run_positions(coef, run[3] - u_ref, heights, h_ref, dx, dy)
         else:
             higher = np.empty((2, RUN), np.float32)
-            _run_positions(coef, origin, run[3] - u_ref, heights, h_ref, higher[0], higher[1])
+            _run_positions(coef, run[3] - u_ref, heights, h_ref, higher[0], higher[1])
             _keep_from(heights, np.float32(box_heights[box, 0]), higher[0], higher[1], dx, dy)
 
 
 @kernel
-def tile_runs(rects, chosen, offset, rows, cols):
+def tile_runs(
+    rects: NDArray[np.int32], chosen: NDArray[np.int64], offset: tuple[int, int], rows: int, cols: int
+) -> NDArray[np.int32]:
     """Runs of the rectangles `chosen` inside rows × cols pixels from `offset` (column, row) on.
 
     Returns (k, 5) int32: rectangle, row, column from which the run's coefficients hold, first and end column; in the
@@ -149,7 +211,13 @@ def tile_runs(rects, chosen, offset, rows, cols):
 
 
 @kernel
-def _positions(anchors, runs, relief, offset, result):
+def _positions(
+    anchors: tuple[Any, ...],
+    runs: NDArray[np.int32],
+    relief: NDArray[np.float32],
+    offset: tuple[int, int],
+    result: NDArray[Any],
+) -> None:
     coef, origin = np.empty((4, 3)), np.empty(2)
     moved = np.empty((2, RUN), np.float32)
     for k in range(runs.shape[0]):

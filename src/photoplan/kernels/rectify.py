@@ -14,14 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.kernels.area import average_runs, largest_scales, stretch_runs
+from photoplan.kernels.area import average_runs
 from photoplan.kernels.border import border_runs
 from photoplan.kernels.gather import gather_runs
 from photoplan.kernels.jit import is_ready
 from photoplan.kernels.pack import as_bytes, pack, solid_patches
 from photoplan.kernels.place import empty_block, place_runs
 from photoplan.kernels.position import RUN, tile_runs
-from photoplan.kernels.weights import KERNELS, STRETCH_FROM
+from photoplan.kernels.scale import largest_scales, stretch_runs
+from photoplan.kernels.weights import KERNELS, STRETCH_FROM, weight_table
 
 __all__ = ["AnchorArrays", "is_compiled", "rectify_packed", "rectify_tile"]
 
@@ -115,10 +116,10 @@ def rectify_packed(
     Parameters as in `rectify_tile`; `packed` has the shape (groups, height, width, lanes).
     """
     height, width = packed.shape[1:3]
-    target, target_valid = np.require(out, requirements="CAW"), np.require(out_valid, bool, "CAW")
+    target, target_valid = _plain(out, out.dtype), _plain(out_valid, bool)
     target[...] = 0
     target_valid[...] = False
-    arrays = tuple(_plain(array, dtype) for array, dtype in zip(anchors, _ANCHOR_TYPES))
+    arrays = tuple(_plain(np.asarray(array), dtype) for array, dtype in zip(anchors, _ANCHOR_TYPES))
     if packed.size and len(arrays[0]):
         mask = solid = np.empty((0, 0), np.uint8)
         if valid is not None:
@@ -136,7 +137,7 @@ def rectify_packed(
 
 def _plain(array: NDArray[Any], dtype: Any) -> NDArray[Any]:
     """The array in the one form that kernels are compiled for: contiguous, aligned, not read-only."""
-    return np.require(array, dtype, "CAW")
+    return np.require(array, dtype, ("C", "A", "W"))
 
 
 def _resample(
@@ -179,14 +180,13 @@ def _block(
     doubtful = place_runs(anchors, runs, relief, offset, (taps, width, height, solid, edges), block, result[1])
     averaged = 0
     if averaging:
-        scales = np.empty((len(runs), 2, RUN))
+        scales = np.empty((len(runs), 2, RUN), np.float32)
         averaged = stretch_runs(anchors, runs, relief, offset, block, scales)
     gather_runs(packed, runs, offset, block, coefficients, tags, result[0])
     if doubtful:
         border_runs(packed, mask, runs, offset, block, (coefficients, taps, limits), result)
     if averaged:
-        sums = np.empty(width * lanes, np.float64 if packed.dtype.kind == "f" else np.float32)
-        average_runs(packed, mask, runs, offset, block, scales, (coefficients, taps, limits), result, sums)
+        average_runs(packed, mask, runs, offset, block, scales, (weight_table(name), tags[1], limits), result)
 
 
 def is_compiled(dtype: Any, bands: int, kernel: str) -> bool:

@@ -7,6 +7,8 @@ cell the edge value is continued; farther outside the result is NaN.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +22,7 @@ _SPARSE = 2.0
 
 
 @inner
-def _post(x, count):
+def _post(x: float, count: int) -> tuple[Any, Any]:
     """Lower post and weight of the upper one, −1 if outside; the upper post is used only if its weight is not 0."""
     if not (x >= -0.5 - _ON_POST and x <= count - 0.5 + _ON_POST):
         return -1, 0.0
@@ -33,7 +35,7 @@ def _post(x, count):
 
 
 @inner
-def _bilinear(grid, col, row, fx, fy):
+def _bilinear(grid: NDArray[np.float32], col: int, row: int, fx: float, fy: float) -> float:
     right, below = (1 if fx > 0.0 else 0), (1 if fy > 0.0 else 0)
     upper, lower = grid[row, col], grid[row + below, col]
     a = upper + fx * (grid[row, col + right] - upper) if right else upper
@@ -42,7 +44,7 @@ def _bilinear(grid, col, row, fx, fy):
 
 
 @inner
-def _blend_row(grid, row, fy, first, line):
+def _blend_row(grid: NDArray[np.float32], row: int, fy: float, first: int, line: NDArray[np.float32]) -> None:
     """line[k] = grid at column first + k, fractional row row + fy."""
     upper = grid[row, first : first + line.shape[0]]
     if fy > 0.0:
@@ -51,11 +53,14 @@ def _blend_row(grid, row, fy, first, line):
         for k in range(line.shape[0]):
             line[k] = upper[k] + weight * (lower[k] - upper[k])
     else:
-        line[:] = upper
+        for k in range(line.shape[0]):
+            line[k] = upper[k]
 
 
 @inner
-def _dense_row(line, picks, weights, target):
+def _dense_row(
+    line: NDArray[np.float32], picks: NDArray[np.int32], weights: NDArray[np.float32], target: NDArray[Any]
+) -> None:
     """Linear interpolation along one row; a post without weight is not touched by NaN beside it."""
     none = np.float32(0.0)
     for i in range(target.shape[0]):
@@ -66,7 +71,9 @@ def _dense_row(line, picks, weights, target):
 
 
 @kernel
-def _lattice(grid, columns, rows, result):
+def _lattice(
+    grid: NDArray[np.float32], columns: tuple[float, float], rows: tuple[float, float], result: NDArray[Any]
+) -> None:
     """See `sample_lattice`; columns = (x0, dx), rows = (y0, dy)."""
     ny, nx = result.shape
     picks, weights = np.empty(nx, np.int32), np.empty(nx, np.float32)
@@ -124,7 +131,7 @@ def sample_lattice(
 
 
 @kernel
-def _points(grid, xy, result):
+def _points(grid: NDArray[np.float32], xy: NDArray[np.float64], result: NDArray[Any]) -> None:
     for i in range(xy.shape[0]):
         col, fx = _post(xy[i, 0], grid.shape[1])
         row, fy = _post(xy[i, 1], grid.shape[0])

@@ -12,18 +12,31 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic
+from numpy.typing import NDArray
 
-from photoplan.kernels.jit import COMPILED
+from photoplan.kernels.jit import COMPILED, inner
 
-__all__ = ["gather"]
+__all__ = ["add_block", "block_pixels", "gather"]
 
 _F32 = ir.FloatType()
 _I32 = ir.IntType(32)
 _FUSE = ("contract", "nsz")
 
 
-def _gather_python(source, first, stride, gx, gy, coefficients, taps_tag, lanes_tag, out, at):
+def _gather_python(
+    source: NDArray[Any],
+    first: Any,
+    stride: Any,
+    gx: float,
+    gy: float,
+    coefficients: NDArray[Any],
+    taps_tag: tuple[Any, ...],
+    lanes_tag: tuple[Any, ...],
+    out: NDArray[Any],
+    at: int,
+) -> None:
     """Weighted sum of taps × taps pixels of `lanes` interleaved bands, rounded into out[at·lanes : …].
 
     Parameters
@@ -188,7 +201,19 @@ def _emit(builder: Any, dtype: Any, taps: int, lanes: int, data: tuple[Any, Any,
 
 
 @intrinsic
-def _gather_llvm(typingctx, source, first, stride, gx, gy, coefficients, taps_tag, lanes_tag, out, at):
+def _gather_llvm(
+    typingctx: Any,
+    source: Any,
+    first: Any,
+    stride: Any,
+    gx: Any,
+    gy: Any,
+    coefficients: Any,
+    taps_tag: Any,
+    lanes_tag: Any,
+    out: Any,
+    at: Any,
+) -> Any:
     """See `_gather_python`."""
     taps, lanes, dtype = len(taps_tag), len(lanes_tag), source.dtype
     signature = types.void(
@@ -204,8 +229,8 @@ def _gather_llvm(typingctx, source, first, stride, gx, gy, coefficients, taps_ta
         types.int64,
     )
 
-    def codegen(context, builder, signature, args):
-        def data(position):
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        def data(position: Any) -> Any:
             return context.make_array(signature.args[position])(context, builder, value=args[position]).data
 
         _emit(builder, dtype, taps, lanes, (data(0), data(5), data(8)), (args[1], args[2], args[3], args[4], args[9]))
@@ -215,3 +240,92 @@ def _gather_llvm(typingctx, source, first, stride, gx, gy, coefficients, taps_ta
 
 
 gather = _gather_llvm if COMPILED else _gather_python
+
+_BLOCK = {1: 8, 4: 4}
+
+
+def _add_block_python(
+    source: NDArray[Any],
+    place: tuple[Any, ...],
+    wx: NDArray[np.float32],
+    wy: NDArray[np.float32],
+    base: NDArray[np.float32],
+    lanes_tag: tuple[Any, ...],
+    sums: NDArray[np.float32],
+) -> None:
+    """Add the weighted sum of a block of pixels, some columns wide and any number of rows high.
+
+    sums[lane] += Σ wx[at_x + i] · wy[at_y + r] · (source[first + r · stride + i · lanes + lane] − base[lane]) over the
+    `block_pixels` columns i and the rows r; integers are summed without base.
+
+    Parameters
+    ----------
+    source : array of any shape, C order
+    place : (first, stride, rows, at_x, at_y)
+        Element of the first pixel, elements from row to row, number of rows, first weight of x and of y.
+    wx, wy, base, sums : one-dimensional float32
+    lanes_tag : tuple of int
+        Its length counts: bands side by side.
+    """
+    first, stride, rows, at_x, at_y = place
+    lanes = len(lanes_tag)
+    many = _BLOCK[lanes]
+    flat = source.ravel()
+    block = np.stack([flat[first + r * stride : first + r * stride + many * lanes] for r in range(rows)])
+    block = block.reshape(rows, many, lanes).astype(np.float32)
+    if source.dtype.kind == "f":
+        block = block - base[:lanes]
+    columns = np.tensordot(wy[at_y : at_y + rows], block, 1)
+    sums[:lanes] += np.tensordot(wx[at_x : at_x + many], columns, 1)
+
+
+def _emit_block(builder: Any, dtype: Any, lanes: int, data: tuple[Any, ...], place: tuple[Any, ...]) -> None:
+    """The code of `add_block`; `data` = source, wx, wy, base, sums."""
+    source, wx, wy, base, sums = data
+    first, stride, rows, at_x, at_y = place
+    many = _BLOCK[lanes]
+    count = many * lanes
+    zero = ir.Constant(_vector(count, _F32), [0.0] * count)
+    total = cgutils.alloca_once_value(builder, zero)
+    is_float = isinstance(dtype, types.Float)
+    if is_float:
+        level = _shuffle(builder, _load(builder, base, ir.IntType(64)(0), lanes), list(range(lanes)) * many)
+    with cgutils.for_range(builder, rows) as loop:
+        index = builder.add(first, builder.mul(loop.index, stride))
+        pixels = _widen(builder, _load(builder, source, index, count), dtype)
+        if is_float:
+            pixels = builder.fsub(pixels, level)
+        weight = _splat(builder, builder.load(builder.gep(wy, [builder.add(at_y, loop.index)])), count)
+        builder.store(_fused(builder, weight, pixels, builder.load(total)), total)
+    weight = _shuffle(builder, _load(builder, wx, at_x, many), [i for i in range(many) for _ in range(lanes)])
+    result = _total(builder, builder.fmul(weight, builder.load(total), flags=_FUSE), lanes)
+    result = builder.fadd(_load(builder, sums, ir.IntType(64)(0), lanes), result)
+    builder.store(result, builder.bitcast(sums, result.type.as_pointer()), align=1)
+
+
+@intrinsic
+def _add_block_llvm(
+    typingctx: Any, source: Any, place: Any, wx: Any, wy: Any, base: Any, lanes_tag: Any, sums: Any
+) -> Any:
+    """See `_add_block_python`."""
+    lanes, dtype = len(lanes_tag), source.dtype
+    signature = types.void(source, types.UniTuple(types.int64, 5), wx, wy, base, lanes_tag, sums)
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        def data(position: Any) -> Any:
+            return context.make_array(signature.args[position])(context, builder, value=args[position]).data
+
+        place = cgutils.unpack_tuple(builder, args[1], 5)
+        _emit_block(builder, dtype, lanes, (data(0), data(2), data(3), data(4), data(6)), place)
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+add_block = _add_block_llvm if COMPILED else _add_block_python
+
+
+@inner
+def block_pixels(lanes_tag: tuple[Any, ...]) -> int:
+    """Columns of a block of `add_block`."""
+    return 8 if len(lanes_tag) == 1 else 4

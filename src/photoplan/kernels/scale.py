@@ -1,0 +1,152 @@
+"""How many source pixels a target pixel spans, and what that means for the kernel."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.kernels.jit import inner, kernel
+from photoplan.kernels.place import ALL, AVERAGE, EMPTY, INTERIOR, NOTHING, SOME
+from photoplan.kernels.position import RUN, middle_of_run, row_weights, run_coefficients, shift_to, single
+from photoplan.kernels.weights import STRETCH_FROM, STRETCH_FULL
+
+__all__ = ["largest_scales", "stretch_runs"]
+
+
+@kernel
+def largest_scales(
+    rects: NDArray[np.int32], box_start: NDArray[np.int32], corners: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Largest scale of each rectangle along image x or y, source pixels per target pixel, at its boxes' corners.
+
+    Parameters
+    ----------
+    rects, box_start, corners : ndarrays
+        As in `rectify_tile`.
+
+    Returns
+    -------
+    ndarray, shape (m,)
+        NaN where a corner is not in front of the camera.
+    """
+    result = np.zeros(rects.shape[0])
+    for index in range(rects.shape[0]):
+        width, height = float(rects[index, 2] - rects[index, 0]), float(rects[index, 3] - rects[index, 1])
+        for box in range(box_start[index], box_start[index + 1]):
+            for corner in range(8):
+                p, p_u, p_v = corners[box, corner], corners[box, corner ^ 1], corners[box, corner ^ 2]
+                for c in range(2):
+                    # Signs do not matter: the derivatives are squared.
+                    along_u = ((p_u[c] - p[c]) - p[c] / p[2] * (p_u[2] - p[2])) / (width * p[2])
+                    along_v = ((p_v[c] - p[c]) - p[c] / p[2] * (p_v[2] - p[2])) / (height * p[2])
+                    scale = np.sqrt(along_u * along_u + along_v * along_v)
+                    result[index] = scale if not scale <= result[index] else result[index]
+    return result
+
+
+@inner
+def _run_stretch(
+    coef: NDArray[np.float64],
+    slope: NDArray[np.float64],
+    u_first: float,
+    heights: NDArray[np.float32],
+    h_ref: float,
+    component: int,
+    stretch: NDArray[np.float32],
+) -> None:
+    """Widening of the kernel along image x (component 0) or y (1) for the pixels of a run; see `weights.stretch`.
+
+    coef and slope are the coefficients of the run and of its derivative along v, shifted to its origin. At constant h
+    x = X / w has the derivatives ∂x/∂u = (∂X/∂u − x ∂w/∂u) / w, and so along v; jumps of the relief do not enter.
+    """
+    x0, x1, x2, x3 = single(coef, component)
+    w0, w1, w2, w3 = single(coef, 2)
+    a0, a1, a2, a3 = single(slope, component)
+    b0, b1, b2, b3 = single(slope, 2)
+    h0, first, one = np.float32(h_ref), np.float32(u_first), np.float32(1.0)
+    begin, full = np.float32(STRETCH_FROM), np.float32(STRETCH_FULL)
+    rate = np.float32((STRETCH_FULL - 1.0) / (STRETCH_FULL - STRETCH_FROM))
+    for i in range(heights.shape[0]):
+        u, h = first + np.float32(np.int32(i)), heights[i] - h0
+        inverse = one / ((w0 + w1 * u) + h * (w2 + w3 * u))
+        x = ((x0 + x1 * u) + h * (x2 + x3 * u)) * inverse
+        along_u = ((x1 + x3 * h) - x * (w1 + w3 * h)) * inverse
+        along_v = (((a0 + a1 * u) + h * (a2 + a3 * u)) - x * ((b0 + b1 * u) + h * (b2 + b3 * u))) * inverse
+        scale = np.sqrt(along_u * along_u + along_v * along_v)
+        partly = one + rate * (scale - begin)
+        widened = partly if scale > begin else one
+        stretch[i] = scale if scale >= full else widened
+
+
+@inner
+def _stretch_of_run(
+    anchors: tuple[Any, ...],
+    run: NDArray[np.int32],
+    heights: NDArray[np.float32],
+    origin: NDArray[np.float64],
+    work: tuple[Any, ...],
+    stretch: NDArray[np.float32],
+) -> None:
+    """Fills stretch (2, RUN) along image x and y."""
+    rects, box_start, box_heights, corners = anchors
+    coef, slope, higher = work
+    rect, lowest = rects[run[0]], box_start[run[0]]
+    u_ref, edges = middle_of_run(rect, run), row_weights(rect, run[1])
+    per_row = 1.0 / (rect[3] - rect[1])
+    n = heights.shape[0]
+    for box in range(lowest, box_start[run[0] + 1]):
+        h_ref = run_coefficients(rect, box_heights[box], corners[box], u_ref, edges, coef)
+        run_coefficients(rect, box_heights[box], corners[box], u_ref, (-per_row, per_row), slope)
+        shift_to(origin, coef)
+        shift_to(origin, slope)
+        for c in range(2):
+            if box == lowest:
+                _run_stretch(coef, slope, run[3] - u_ref, heights, h_ref, c, stretch[c])
+            else:
+                _run_stretch(coef, slope, run[3] - u_ref, heights, h_ref, c, higher)
+                low = np.float32(box_heights[box, 0])
+                for i in range(n):
+                    if heights[i] >= low:
+                        stretch[c, i] = higher[i]
+
+
+@kernel
+def stretch_runs(
+    anchors: tuple[Any, ...],
+    runs: NDArray[np.int32],
+    relief: NDArray[np.float32],
+    offset: tuple[int, int],
+    block: tuple[Any, ...],
+    scales: NDArray[np.float32],
+) -> int:
+    """Find the pixels whose kernel is to be widened and make them AVERAGE; returns their number.
+
+    Parameters
+    ----------
+    scales : (k, 2, RUN) float32
+        Filled: widening along image x and y.
+
+    See `place_runs` for the others.
+    """
+    corner, _, _, kind, fill = block
+    work = (np.empty((4, 3)), np.empty((4, 3)), np.empty(RUN, np.float32))
+    origin = np.empty(2)
+    count = 0
+    for k in range(runs.shape[0]):
+        row, col, n = runs[k, 1] - offset[1], runs[k, 3] - offset[0], runs[k, 4] - runs[k, 3]
+        origin[0], origin[1] = float(corner[k, 0]), float(corner[k, 1])
+        _stretch_of_run(anchors, runs[k], relief[row, col : col + n], origin, work, scales[k])
+        whole = fill[k] == ALL
+        interior = 0
+        for i in range(n):
+            if whole:
+                kind[k, i] = INTERIOR
+            if kind[k, i] != EMPTY and (scales[k, 0, i] > 1.0 or scales[k, 1, i] > 1.0):
+                kind[k, i] = AVERAGE
+                count += 1
+            elif kind[k, i] == INTERIOR:
+                interior += 1
+        fill[k] = ALL if interior == n else (SOME if interior > 0 else NOTHING)
+    return count
