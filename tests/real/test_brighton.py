@@ -1,8 +1,11 @@
 """The drone block against the coloured point cloud of its own survey (see the block's licence file).
 
 Horizontal datum, scale and heading of the orientation were fitted to the cloud, so this proves tilt, distortion,
-relief and the images' mutual registration, not absolute position. The rules were fixed before the first comparison of
-a photoplan product, on another program's orthophotos: patches of 20 m, a correlation above 0.7, nothing else rejected.
+relief and the images' mutual registration, not absolute position. The rules were chosen on another program's
+orthophotos, before the first comparison of a photoplan product: patches of 20 m, a correlation above 0.7, nothing else
+rejected. Patches of 10 m were tried first; the other program's orthophotos then had an rms of 7.2 and 7.8 cm, since the
+smaller patches fall more often on single trees. Three images (0018, 0019, 0023) have medians of 7 to 10 cm, with both
+programs.
 """
 
 from __future__ import annotations
