@@ -94,3 +94,21 @@ class Here:
         self.capture.readouterr()
         code = run([str(word) for word in words])
         return Said(code, *self.capture.readouterr())
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    """Replace what stands in a text file once."""
+    text = path.read_text()
+    assert text.count(old) == 1, (old, text.count(old))
+    path.write_text(text.replace(old, new))
+
+
+def refused(photoplan: Here, project: Path, *words: object) -> str:
+    """What `check` and `ortho` say when they refuse a project; neither leaves a product."""
+    said = photoplan("check", project)
+    assert said.code == 3, said
+    said = photoplan("ortho", project, *OPTIONS, *words)
+    assert said.code == 3, said
+    assert said.out == ""
+    assert not list(project.parent.glob("products/*.tif"))
+    return said.err

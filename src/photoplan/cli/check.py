@@ -19,7 +19,7 @@ __all__ = ["command"]
 def command(project: Path, images: tuple[str, ...], as_json: bool) -> None:
     """Open every input of PROJECT and print, image by image, what it promises.
 
-    Ends with exit code 3 if an orientation is implausible; the table then names what would fit.
+    Ends with exit code 3 if orientations are implausible or another reading fits better; that is named.
     """
     from photoplan.errors import GeometryError
     from photoplan.io.project import load_project
@@ -30,7 +30,8 @@ def command(project: Path, images: tuple[str, ...], as_json: bool) -> None:
         click.echo(json.dumps(found.to_dict(), indent=2))
     else:
         click.echo(str(found))
-    if found.implausible:
-        raise GeometryError(
-            f"{len(found.implausible)} of {len(found.images)} images are implausible: {found.implausible[0]}"
-        )
+    if found.implausible or found.alternative is not None:
+        faults = f"{len(found.implausible)} of {len(found.images)} images are implausible"
+        first = f": {found.implausible[0]}" if found.implausible else ""
+        remedy = found.alternative or "no other reading of the angles fits; look at heights, axes and image names"
+        raise GeometryError(f"{project}: {faults}{first}\n{remedy}")

@@ -12,7 +12,7 @@ from photoplan.geometry.crs import crs_label
 from photoplan.io.project_model import Project
 from photoplan.plan.coverage import Coverage, cover
 from photoplan.products.orthophoto import mean_gsd, two_figures
-from photoplan.products.plausibility import Plausibility, assess, view_of
+from photoplan.products.plausibility import assess, view_of
 from photoplan.products.scene import Scene, ground_of, open_scene, pose_of
 
 __all__ = ["ImageCheck", "ProjectCheck", "check_project"]
@@ -57,6 +57,8 @@ class ProjectCheck:
     heights: tuple[str, str, str]
     """Height systems of terrain and orientation, and the one that is worked in."""
     crs: str
+    alternative: str | None
+    """The reading of the orientation that would fit, where the declared one does not; None otherwise."""
     advice: tuple[str, ...]
     """Sentences that tell what would be better."""
 
@@ -72,6 +74,7 @@ class ProjectCheck:
             "sensible_resolution": _plain(self.sensible_resolution),
             "height_systems": dict(zip(("terrain", "orientation", "working"), self.heights)),
             "crs": self.crs,
+            "alternative": self.alternative,
             "advice": list(self.advice),
         }
 
@@ -90,9 +93,10 @@ class ProjectCheck:
             lines += [f"{'':<{width}}  note: {note}" for note in i.notes]
             lines += [f"{'':<{width}}  FAULT: {i.fault}"] if i.fault else []
         closing = [f"sensible resolution {self.sensible_resolution:g} m"]
-        if not self.implausible:
+        if not self.implausible and self.alternative is None:
             closing.append("all plausible")
-        return "\n".join([*lines, " · ".join(closing), *self.advice])
+        alternative = [] if self.alternative is None else [self.alternative]
+        return "\n".join([*lines, " · ".join(closing), *alternative, *self.advice])
 
 
 def _plain(value: Any) -> Any:
@@ -132,7 +136,8 @@ def check_project(project: Project, images: Sequence[str] | None = None) -> Proj
         two_figures(float(np.mean(gsds))) if gsds else float("nan"),
         (*ground.height_systems, ground.working_system),
         project.crs,
-        _advice(project, checks, plausible),
+        plausible.alternative,
+        _advice(project, checks),
     )
 
 
@@ -173,10 +178,8 @@ def _sensitivity(scene: Scene, coverage: Coverage) -> tuple[float, float]:
     return float(np.nanmax(per_metre)), float(np.nanmax(per_metre * drop))
 
 
-def _advice(project: Project, checks: list[ImageCheck], plausible: Plausibility) -> tuple[str, ...]:
+def _advice(project: Project, checks: list[ImageCheck]) -> tuple[str, ...]:
     lines = []
-    if plausible.alternative is not None:
-        lines.append(plausible.alternative)
     curvature = np.nanmax([c.curvature_px for c in checks] + [0.0])
     if project.orientation.earth_curvature == "none" and curvature > _CURVATURE_MATTERS:
         lines.append(

@@ -25,6 +25,7 @@ from photoplan.kernels.weights import KERNELS
 from photoplan.plan.compile import AnchorRule, initial_cell
 from photoplan.plan.coverage import Coverage, cover, covered_tiles, image_border
 from photoplan.plan.product import ProductPlan, Tile
+from photoplan.products.reach import some_height
 from photoplan.products.scene import Scene, open_scene
 from photoplan.products.settings import OrthoSettings
 from photoplan.targets.map import MapTarget
@@ -221,14 +222,13 @@ def two_figures(value: float) -> float:
 
 
 def _sees_no_terrain(scene: Scene, name: str) -> str:
-    """Extents of both the terrain and what the image looks at, on the level of the terrain's middle height."""
+    """Extents of both the terrain and what the image looks at, on a level that the terrain has."""
     x, y, z = scene.camera.center
     center = f"{name}: projection centre {x:.0f} {y:.0f} {z:.0f}"
     bounds = scene.ground.bounds
     if bounds is None:
         return f"{center} sees nothing of the level terrain; is it above it, and do height systems and angles fit?"
-    low, high = scene.ground.surface.height_range(bounds)
-    level = (low + high) / 2
+    level = some_height(scene.ground.surface, bounds, x, y)
     origin, direction = scene.camera.rays(image_border(scene.camera.size), level)
     down = (direction[:, 2] < 0) & (origin[:, 2] > level)
     if down.any():
@@ -237,7 +237,7 @@ def _sees_no_terrain(scene: Scene, name: str) -> str:
         looks = f"looks at {_extent((xmin, ymin, xmax, ymax))} on the level {level:.0f}"
     else:
         looks = f"does not look down to the level {level:.0f}"
-    return f"{center} {looks}; the terrain is {_extent(bounds)}, heights {low:.0f} to {high:.0f}"
+    return f"{center} {looks}; the terrain is {_extent(bounds)}"
 
 
 def _extent(bounds: tuple[float, float, float, float] | None) -> str:

@@ -26,18 +26,13 @@ from photoplan.io.project_cameras import interior_of, lens_of
 from photoplan.io.project_model import Image, Project, Terrain
 from photoplan.io.raster import RasterReader
 from photoplan.io.terrain_reader import TerrainReader
-from photoplan.plan.coverage import image_border
+from photoplan.products.reach import reach
 from photoplan.surfaces.base import Surface
 from photoplan.surfaces.level import LevelSurface
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.surfaces.shifted import ShiftedSurface
 
 __all__ = ["Ground", "Scene", "SceneAddress", "ground_of", "input_files", "open_scene", "pose_of"]
-
-#: Terrain further from the projection centre than this is not looked at, metres.
-_FAR = 30_000.0
-#: Rays are followed sideways for this many heights above the lowest ground (87° from the nadir).
-_FLATTEST = 20.0
 
 
 @dataclass(frozen=True)
@@ -153,7 +148,7 @@ def _open(address: SceneAddress) -> Scene:
     ground = ground_of(project)
     reader = RasterReader(project.resolve(image.file))
     camera = _camera(project, image, ground, reader.size)
-    return Scene(camera, ground.surface, _reach(camera, ground), reader, ground, address)
+    return Scene(camera, ground.surface, reach(camera, ground.surface, ground.bounds), reader, ground, address)
 
 
 @dataclass(frozen=True)
@@ -279,30 +274,3 @@ def _camera(project: Project, image: Image, ground: Ground, size: tuple[int, int
         refraction=project.orientation.refraction,
         mean_ground=nadir if np.isfinite(nadir) else 0.0,
     )
-
-
-def _reach(camera: Camera, ground: Ground) -> tuple[float, float, float, float]:
-    """Where the ground can be seen: rays of the image's border down to the lowest ground, cut at the terrain."""
-    x, y, z = camera.center
-    around = ground.bounds or (x - _FAR, y - _FAR, x + _FAR, y + _FAR)
-    near = (
-        max(around[0], x - _FAR), max(around[1], y - _FAR), min(around[2], x + _FAR), min(around[3], y + _FAR)
-    )  # fmt: skip
-    if near[0] >= near[2] or near[1] >= near[3]:
-        return around
-    low = ground.surface.height_range(near)[0]
-    if not (np.isfinite(low) and low < z):
-        return near
-    border = np.concatenate([image_border(camera.size), [[(s - 1) / 2 for s in camera.size]]])
-    origin, direction = camera.rays(border, low)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        foot = origin[:, :2] + direction[:, :2] * ((low - origin[:, 2]) / direction[:, 2])[:, None]
-    far = _FLATTEST * (z - low)
-    out = np.where(direction[:, 2:] < 0, foot - (x, y), direction[:, :2] * np.inf)
-    out = np.clip(np.nan_to_num(out, nan=0.0, posinf=far, neginf=-far), -far, far)
-    margin = 0.05 * float(np.ptp(out, axis=0).max())
-    low_xy, high_xy = out.min(axis=0) - margin + (x, y), out.max(axis=0) + margin + (x, y)
-    cut = (
-        max(near[0], low_xy[0]), max(near[1], low_xy[1]), min(near[2], high_xy[0]), min(near[3], high_xy[1])
-    )  # fmt: skip
-    return cut if cut[0] < cut[2] and cut[1] < cut[3] else near

@@ -1,0 +1,74 @@
+"""Inputs far larger than the memory that a run may take."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+
+import numpy as np
+import pytest
+import rasterio
+from tools.command import COMMAND
+from tools.huge_tiff import write_huge_tiff
+from tools.small_block import X0, Y0, Z0, Block, make_project
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs the peak memory of a child")
+
+LIMIT = 600 * 2**20
+SIDE = 40_000
+
+
+def peak_of(*words: object) -> tuple[int, str, int]:
+    """Exit code, stderr, and peak resident memory of the command, bytes."""
+    running = subprocess.Popen([*COMMAND, *map(str, words)], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
+    assert running.stderr is not None
+    err = running.stderr.read().decode()
+    _, status, usage = os.wait4(running.pid, 0)
+    running.returncode = os.waitstatus_to_exitcode(status)
+    running.stderr.close()
+    return running.returncode, err, usage.ru_maxrss * 1024
+
+
+@pytest.fixture
+def huge(small: Block) -> Block:
+    """One image of 40,000 × 40,000 × 3 bytes: 4.8 GB in memory, a pixel of 7.5 mm on the ground."""
+    for path in small.images:
+        path.unlink()
+    noise = np.random.default_rng(1).integers(60, 200, (256, 256, 3), dtype=np.uint8)
+    write_huge_tiff(small.images[0], noise, (SIDE, SIDE))
+    small.camera.write_text(
+        f"c:\n  type: pinhole\n  im_size: [{SIDE}, {SIDE}]\n  focal_len: 1\n  sensor_size: [1, 1]\n"
+    )
+    small.orientation.write_text(f"name,x,y,z,omega,phi,kappa\none,{X0 + 60},{Y0},{Z0},1,-2,30\n")
+    make_project(small)
+    return small
+
+
+def test_fault_06_an_image_far_larger_than_memory(huge: Block) -> None:
+    """A sixteenth of it, 300 MB, falls on one tile: that is cut into parts, and each pixel is a mean of a thousand."""
+    bounds = [X0 + 20, Y0 - 40, X0 + 95, Y0 + 35]
+    words = ["ortho", huge.project, "--images", "one", "--resolution", "0.25", "--bounds", *bounds]
+    code, err, peak = peak_of(*words, "--memory", "600MB", "--workers", 2)
+    assert code == 0, err
+    assert peak < LIMIT
+    with rasterio.open(huge.folder / "products" / "one_ortho.tif") as file:
+        made, valid = file.read().astype(float), file.dataset_mask() > 0
+    assert valid.all()
+    # Noise from 60 to 199 has the mean 129.5; means of some 1100 pixels spread by 40/33.
+    assert abs(made.mean() - 129.5) < 1
+    assert made.std() < 3
+
+
+def test_fault_06_terrain_far_larger_than_memory(small: Block) -> None:
+    """Posts of 0.25 m over 10 km × 10 km: 6.4 GB in memory, of which an image sees some megabytes."""
+    u, v = np.meshgrid(np.arange(256), np.arange(256))
+    waves = (100 + 2 * np.sin(2 * np.pi * u / 256) * np.cos(2 * np.pi * v / 256)).astype(np.float32)
+    place = (32633, X0 - 5000, Y0 + 5000, 0.25)
+    write_huge_tiff(small.terrain, waves[..., None], (SIDE, SIDE), place)
+    code, err, peak = peak_of(
+        "ortho", small.project, "--images", "one", "--resolution", "0.5", "--memory", "600MB", "--workers", 2
+    )
+    assert code == 0, err
+    assert peak < LIMIT
+    with rasterio.open(small.folder / "products" / "one_ortho.tif") as file:
+        assert (file.dataset_mask() > 0).mean() > 0.7

@@ -1,0 +1,120 @@
+"""Where ground can be seen at all: never too small, and found without reading far terrain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tools.pinhole import Pinhole
+
+from photoplan.cameras.base import project
+from photoplan.geometry.grid import Window
+from photoplan.geometry.pose import Pose
+from photoplan.products.reach import FAR, reach
+from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.raster import RasterSurface
+
+MESH = 25.0
+
+
+@dataclass(eq=False)
+class Grid:
+    """Heights in memory that remember how much of them was read at once."""
+
+    values: NDArray[np.float32]
+    largest: int = 0
+    asked: list[Window] = field(default_factory=list)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.values.shape[1], self.values.shape[0]
+
+    def read(self, window: Window) -> NDArray[np.float32]:
+        self.largest = max(self.largest, window.size)
+        self.asked.append(window)
+        return self.values[window.row : window.stop[1], window.col : window.stop[0]]
+
+
+def terrain(seed: int, side: int = 400, roughness: float = 250.0) -> tuple[Grid, RasterSurface]:
+    """Hills and a steep mountain around the origin."""
+    rng = np.random.default_rng(seed)
+    k = np.arange(side)
+    phase = rng.uniform(0, 6, 4)
+    waves = np.sin(k / 17 + phase[0]) * np.cos(k[:, None] / 23 + phase[1]) + np.sin((k + k[:, None]) / 9 + phase[2])
+    u, v = rng.uniform(0.3, 0.7, 2) * side
+    mountain = 900 * np.exp(-((k - u) ** 2 + (k[:, None] - v) ** 2) / 60)
+    grid = Grid((500 + roughness * waves + mountain).astype(np.float32))
+    return grid, RasterSurface(grid, (-side / 2 * MESH, side / 2 * MESH), (MESH, MESH))
+
+
+def edges(grid: Grid) -> tuple[float, float, float, float]:
+    half = grid.size[0] / 2 * MESH
+    return (-half - MESH / 2, -half + MESH / 2, half - MESH / 2, half + MESH / 2)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("tilt", [0.0, 30.0, 60.0, 80.0])
+def test_all_ground_that_falls_into_the_image_is_inside(seed: int, tilt: float) -> None:
+    """Also a mountain between the camera and what it looks at, and ground below the level of the camera's foot."""
+    grid, surface = terrain(seed)
+    rng = np.random.default_rng(seed + 100)
+    center = (*rng.uniform(-1500, 1500, 2), 2200.0)
+    camera = Pinhole(Pose.from_angles(center, np.radians((tilt, 5, 0))), 900.0, (800, 600))
+    k = np.arange(0, 400, 2)
+    XY = np.stack(np.meshgrid((k - 200) * MESH, (200 - k) * MESH), axis=-1)
+    points = np.concatenate([XY, surface.heights(XY)[..., None]], axis=-1)
+    xy = project(camera, points)
+    inside = (xy >= -0.5).all(axis=-1) & (xy <= np.array(camera.size) - 0.5).all(axis=-1)
+    assert inside.any()
+    # 20 heights above the lowest ground: what is further is left out on purpose.
+    near = (np.abs(XY - camera.center[:2]) < 20 * (2200 - 500)).all(axis=-1)
+    seen = XY[inside & near]
+    xmin, ymin, xmax, ymax = reach(camera, surface, edges(grid))
+    assert (seen >= (xmin, ymin)).all()
+    assert (seen <= (xmax, ymax)).all()
+
+
+def test_a_vertical_image_is_bounded_tightly_and_reads_little() -> None:
+    grid, surface = terrain(1, side=2000, roughness=20.0)
+    camera = Pinhole(Pose.from_angles((300, -200, 1500), (0, 0, 0)), 900.0, (800, 600))
+    xmin, ymin, xmax, ymax = reach(camera, surface, edges(grid))
+    assert 800 < xmax - xmin < 1400
+    assert 600 < ymax - ymin < 1000
+    assert grid.largest < 60**2
+    assert sum(w.size for w in grid.asked) < 50_000
+
+
+def test_nothing_to_see_is_a_square_metre() -> None:
+    grid, surface = terrain(2)
+    bounds = edges(grid)
+    up = Pinhole(Pose.from_angles((0, 0, 2500), (np.pi, 0, 0)), 900.0, (800, 600))
+    below = Pinhole(Pose.from_angles((0, 0, -3000), (0, 0, 0)), 900.0, (800, 600))
+    away = Pinhole(Pose.from_angles((10 * FAR, 0, 2500), (0, 0, 0)), 900.0, (800, 600))
+    beside = Pinhole(Pose.from_angles((bounds[2] + 4000, 0, 2500), (0, 0, 0)), 900.0, (800, 600))
+    for camera in (below, away, beside):
+        xmin, ymin, xmax, ymax = reach(camera, surface, bounds)
+        assert (xmax - xmin, ymax - ymin) == (1, 1)
+        assert bounds[0] <= xmin < xmax <= bounds[2]
+        assert bounds[1] <= ymin < ymax <= bounds[3]
+    # Rays that go up meet no ground; what is left is around the camera's foot.
+    xmin, ymin, xmax, ymax = reach(up, surface, bounds)
+    assert xmin <= 0 <= xmax
+
+
+def test_a_hole_below_the_camera() -> None:
+    """Ground that begins beside the camera's foot is found."""
+    grid, surface = terrain(3)
+    grid.values[150:260, 150:260] = np.nan
+    camera = Pinhole(Pose.from_angles((0, 0, 2500), np.radians((40, 0, 0))), 900.0, (800, 600))
+    xmin, ymin, xmax, ymax = reach(camera, surface, edges(grid))
+    assert ymax > 2000
+    assert (xmax - xmin) * (ymax - ymin) > 1e6
+
+
+def test_level_ground_everywhere() -> None:
+    camera = Pinhole(Pose.from_angles((0, 0, 1000), (0, 0, 0)), 1000.0, (800, 600))
+    xmin, ymin, xmax, ymax = reach(camera, LevelSurface(0.0), None)
+    assert -500 < xmin < -400 < 400 < xmax < 500
+    assert -400 < ymin < -300 < 300 < ymax < 400
