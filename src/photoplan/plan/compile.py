@@ -88,8 +88,8 @@ def compile_anchors(
     while len(work.rects):
         lattice, owner, bounds = _project(camera, target, window, work)
         keep, behind = _in_front(lattice, owner, len(work.rects))
-        keep &= _touches_image(camera, lattice, owner, len(work.rects), rule.radius) | behind
         errors = _errors(lattice, owner, len(work.rects))
+        keep &= _touches_image(camera, lattice, owner, rule.radius + 2 * errors[:, 3]) | behind
         errors[behind] = np.inf
         split_u, split_v, thin = _verdict(errors, work, rule.tolerance, behind)
         settled = keep & ~(split_u | split_v | thin) & ~behind
@@ -185,17 +185,25 @@ def _in_front(
 
 
 def _touches_image(
-    camera: Camera, lattice: NDArray[np.float64], owner: NDArray[np.int64], n: int, radius: int
+    camera: Camera, lattice: NDArray[np.float64], owner: NDArray[np.int64], slack: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Which rectangles' corners span a part of the image. With w > 0 the corners bound everything inside."""
+    """Which rectangles' corners, widened by `slack` pixels, span a part of the image.
+
+    With w > 0 the corners bound the interpolation; the strict positions lie beside it by the residual, which is part of
+    the slack.
+    """
+    corners = lattice[:, _IS_CORNER]
     with np.errstate(divide="ignore", invalid="ignore"):
-        xy = lattice[..., :2] / lattice[..., 2:]
-    low, high = xy.min(axis=1), xy.max(axis=1)
+        x, y = corners[..., 0] / corners[..., 2], corners[..., 1] / corners[..., 2]
+    around = slack[owner]
     width, height = camera.size
     inside = (
-        (high >= -0.5 - radius).all(axis=1) & (low[:, 0] <= width - 0.5 + radius) & (low[:, 1] <= height - 0.5 + radius)
+        (x.max(axis=1) >= -0.5 - around)
+        & (x.min(axis=1) <= width - 0.5 + around)
+        & (y.max(axis=1) >= -0.5 - around)
+        & (y.min(axis=1) <= height - 0.5 + around)
     )
-    return _any_per_rect(inside, owner, n)
+    return _any_per_rect(inside, owner, len(slack))
 
 
 def _errors(lattice: NDArray[np.float64], owner: NDArray[np.int64], n: int) -> NDArray[np.float64]:
