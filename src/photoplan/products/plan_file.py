@@ -163,10 +163,12 @@ def write_plan(path: Path, plan: OrthoPlan, figures: PlanFigures, output: Path, 
         "photoplan": __version__,
         "project": plan.project.model_dump(mode="json", exclude_none=True),
         "folder": os.path.relpath(plan.project.folder.resolve(), path.resolve().parent),
-        "tiles": int(there.sum()),
         "output": os.path.relpath(output.resolve(), path.resolve().parent),
         "settings": plan.settings.to_dict(),
-        "products": [{"image": p.plan.image, "key": p.key} for p in plan.products],
+        "products": [
+            {"image": p.plan.image, "key": p.key, "tiles": int((there & (figures.product == p.plan.name)).sum())}
+            for p in plan.products
+        ],
     }
     tiles = {
         "product": figures.product[there],
@@ -234,35 +236,45 @@ def read_plan(path: Path | str) -> tuple[OrthoPlan, Path]:
         The file is no plan, or an input, the project or the version has changed since it was written.
     """
     path = Path(path)
-    header, tiles = read_plan_tables(path)
     try:
-        folder = (path.resolve().parent / header["folder"]).resolve()
-        project = parse_project(header["project"], folder, str(path))
-        images = [p["image"] for p in header["products"]]
-        plan = plan_orthophotos(project, images, OrthoSettings.from_dict(header["settings"]))
-        keys = {p["image"]: p["key"] for p in header["products"]}
-        output = (path.resolve().parent / header["output"]).resolve()
-        planned = int(header["tiles"])
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{path}: the plan is damaged ({error}); make it again") from error
-    changed = [p.plan.image for p in plan.products if keys.get(p.plan.image) != p.key]
-    if changed or len(plan.products) != len(keys):
+        header, tiles = read_plan_tables(path)
+        plan, output = _plan_again(path, header)
+        counts = {p["image"]: (p["key"], int(p["tiles"])) for p in header["products"]}
+        changed = [p.plan.image for p in plan.products if counts.get(p.plan.image, ("", 0))[0] != p.key]
+        if changed or len(plan.products) != len(counts):
+            raise InputError(
+                f"{path}: inputs have changed since the plan was written ({', '.join(changed) or 'images are gone'}); "
+                "make the plan again with `photoplan ortho --plan`"
+            )
+        chosen = _with_tiles(plan, tiles, {image: count for image, (_, count) in counts.items()})
+    except (KeyError, TypeError, ValueError, UsageError) as error:
         raise InputError(
-            f"{path}: inputs have changed since the plan was written ({', '.join(changed) or 'images are gone'}); "
-            "make the plan again with `photoplan ortho --plan`"
-        )
-    return _with_tiles(plan, tiles, planned), output
+            f"{path}: the plan is damaged ({error}); make it again with `photoplan ortho --plan`"
+        ) from error
+    if not chosen.products:
+        raise InputError(f"{path}: the plan has no tiles left; make it again with `photoplan ortho --plan`")
+    return chosen, output
 
 
-def _with_tiles(plan: OrthoPlan, tiles: dict[str, NDArray[Any]], planned: int) -> OrthoPlan:
+def _plan_again(path: Path, header: dict[str, Any]) -> tuple[OrthoPlan, Path]:
+    """The plan that a header describes, made again, and its folder for products."""
+    folder = (path.resolve().parent / header["folder"]).resolve()
+    project = parse_project(header["project"], folder, str(path))
+    images = [p["image"] for p in header["products"]]
+    plan = plan_orthophotos(project, images, OrthoSettings.from_dict(header["settings"]))
+    return plan, (path.resolve().parent / header["output"]).resolve()
+
+
+def _with_tiles(plan: OrthoPlan, tiles: dict[str, NDArray[Any]], planned: dict[str, int]) -> OrthoPlan:
     """Keep the tiles that the layer lists. A person may have deleted some: the product is then another one."""
-    whole = len(tiles["tile"]) == planned
     products = []
     for product in plan.products:
         listed = set(tiles["tile"][tiles["product"] == product.plan.name].tolist())
         chosen = tuple(t for t in product.plan.tiles if t.index in listed)
+        if not chosen:
+            continue
         key = product.key
-        if not whole:
+        if len(listed) != planned[product.plan.image]:
             key = hashlib.sha256(f"{key} {[t.index for t in chosen]}".encode()).hexdigest()
         products.append(replace(product, plan=replace(product.plan, tiles=chosen), key=key))
     return replace(plan, products=tuple(products))

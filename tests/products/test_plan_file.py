@@ -1,0 +1,190 @@
+"""Plans as files: executed they give the same bytes, changed inputs are refused, tiles may be taken out."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pyogrio
+import pytest
+import rasterio
+import shapely
+from tools.small_block import CRS, NAMES, Block, make_project, texture, write_image, write_terrain
+
+from photoplan.errors import InputError, UsageError
+from photoplan.io.project import load_project
+from photoplan.products.execution import Run, execute
+from photoplan.products.orthophoto import OrthoPlan, plan_orthophotos
+from photoplan.products.plan_file import compile_figures, read_plan, write_plan
+
+QUIET = Run(quicklook=False)
+SETTINGS = {"resolution": 1.0, "tile": 128, "kernel": "lanczos3", "tolerance": 0.01}
+
+
+@pytest.fixture
+def planned(small: Block) -> tuple[Path, OrthoPlan]:
+    """The block's plan, and the file that it was written to."""
+    plan = plan_orthophotos(load_project(small.project), **SETTINGS)  # type: ignore[arg-type]
+    path = small.folder / "plans" / "p.gpkg"
+    write_plan(path, plan, compile_figures(plan), small.folder / "products")
+    return path, plan
+
+
+def products(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / f"{name}_ortho.tif").read_bytes() for name in NAMES}
+
+
+def test_a_plan_that_was_written_gives_the_same_bytes(planned: tuple[Path, OrthoPlan], tmp_path: Path) -> None:
+    path, plan = planned
+    again, folder = read_plan(path)
+    assert folder == (path.parent.parent / "products").resolve()
+    assert again.settings == plan.settings
+    assert [p.key for p in again.products] == [p.key for p in plan.products]
+    execute(plan, tmp_path / "direct", QUIET)
+    execute(again, folder, QUIET)
+    assert products(folder) == products(tmp_path / "direct")
+
+
+def test_a_plan_moves_with_its_project(planned: tuple[Path, OrthoPlan], small: Block, tmp_path: Path) -> None:
+    """Paths in a plan are relative to it."""
+    path, plan = planned
+    moved = Path(shutil.move(small.folder, tmp_path / "elsewhere"))
+    again, folder = read_plan(moved / "plans" / path.name)
+    assert folder == (moved / "products").resolve()
+    assert [p.key for p in again.products] == [p.key for p in plan.products]
+
+
+def test_the_layers_show_what_will_be_done(planned: tuple[Path, OrthoPlan]) -> None:
+    """Tile footprints cover the products, figures are those of the compiler, and both layers are in the map's CRS."""
+    path, plan = planned
+    figures = compile_figures(plan)
+    meta, _, geometry, values = pyogrio.raw.read(path, layer="tiles")
+    tiles = dict(zip(meta["fields"], values))
+    assert meta["crs"] == CRS
+    there = figures.cells_of_tile > 0
+    assert len(geometry) == there.sum() == figures.tiles
+    np.testing.assert_array_equal(tiles["cells"], figures.cells_of_tile[there])
+    np.testing.assert_allclose(tiles["residual_px"], figures.residual_of_tile[there])
+    assert tiles["residual_px"].max() <= 0.01
+    bounds = shapely.bounds(shapely.from_wkb(geometry))
+    for (xmin, ymin, xmax, ymax), width, height in zip(bounds, tiles["width"], tiles["height"]):
+        assert (xmax - xmin, ymax - ymin) == pytest.approx((width, height), abs=1e-6)
+    for product in plan.products:
+        mine = bounds[tiles["product"] == product.plan.name]
+        xmin, ymin, xmax, ymax = product.grid.bounds
+        assert mine[:, 0].min() >= xmin - 1e-6 and mine[:, 3].max() <= ymax + 1e-6
+        assert mine[:, 1].min() >= ymin - 1e-6 and mine[:, 2].max() <= xmax + 1e-6
+    source = np.stack([tiles[f"source_{n}"] for n in ("col", "row", "width", "height")], axis=1)
+    assert (source[:, :2] >= 0).all()
+    assert (source[:, 0] + source[:, 2] <= 200).all() and (source[:, 1] + source[:, 3] <= 150).all()
+    assert pyogrio.read_info(path, layer="footprints")["features"] == 3
+
+
+@pytest.mark.parametrize("what", ["image", "terrain", "gone"])
+def test_a_changed_input_is_refused(planned: tuple[Path, OrthoPlan], small: Block, what: str) -> None:
+    path, _ = planned
+    image = small.images[NAMES.index("two")]
+    if what == "image":
+        pixels = texture(seed=1)
+        pixels[0, 75, 100] ^= 1
+        write_image(image, pixels)
+    elif what == "terrain":
+        with rasterio.open(small.terrain) as file:
+            heights = file.read(1)
+        heights[30, 30] += 0.01
+        write_terrain(small.terrain, heights)
+    else:
+        image.unlink()
+    with pytest.raises(InputError) as error:
+        read_plan(path)
+    text = str(error.value)
+    if what == "gone":
+        assert str(image) in text
+    else:
+        assert f"{path}: inputs have changed since the plan was written (" in text
+        assert ("two" in text, "one" in text) == (True, what == "terrain")
+        assert "make the plan again" in text
+
+
+def test_a_touched_input_is_no_other_one(planned: tuple[Path, OrthoPlan], small: Block) -> None:
+    for file in (*small.images, small.terrain):
+        file.touch()
+    read_plan(planned[0])
+
+
+def test_the_project_file_is_not_asked_again(planned: tuple[Path, OrthoPlan], small: Block) -> None:
+    """A plan is what was looked at, whatever became of the project file."""
+    path, plan = planned
+    small.project.unlink()
+    assert [p.key for p in read_plan(path)[0].products] == [p.key for p in plan.products]
+
+
+def test_tiles_that_were_taken_out_are_not_made(planned: tuple[Path, OrthoPlan], small: Block, tmp_path: Path) -> None:
+    """The rest is what it would have been; a product without tiles is not made; the whole one is another product."""
+    path, plan = planned
+    with sqlite3.connect(path) as db:
+        db.execute("DELETE FROM tiles WHERE product = 'one_ortho' AND tile <> 1")
+        db.execute("DELETE FROM tiles WHERE product = 'two_ortho'")
+    db.close()
+    part, folder = read_plan(path)
+    execute(part, folder, QUIET)
+    execute(plan, tmp_path / "whole", QUIET)
+    with rasterio.open(folder / "one_ortho.tif") as file:
+        pixels = file.read()
+    with rasterio.open(tmp_path / "whole" / "one_ortho.tif") as file:
+        whole = file.read()
+    assert pixels.shape == whole.shape
+    np.testing.assert_array_equal(pixels[:, :128, 128:256], whole[:, :128, 128:256])
+    assert pixels[:, :128, 128:256].any()
+    rest = pixels.copy()
+    rest[:, :128, 128:256] = 0
+    assert not rest.any()
+    assert part["one"].key != plan["one"].key
+    assert (folder / "three_ortho.tif").read_bytes() == (tmp_path / "whole" / "three_ortho.tif").read_bytes()
+    assert not (folder / "two_ortho.tif").exists()
+
+
+@pytest.mark.parametrize("damage", ["header", "format", "key", "settings", "layer", "tiles"])
+def test_a_damaged_plan_is_refused(planned: tuple[Path, OrthoPlan], damage: str) -> None:
+    path, _ = planned
+    with sqlite3.connect(path) as db:
+        if damage == "header":
+            db.execute("UPDATE photoplan_plan SET content = '{'")
+        elif damage == "format":
+            db.execute("UPDATE photoplan_plan SET format = 99")
+        elif damage == "key":
+            db.execute('UPDATE photoplan_plan SET content = replace(content, \'"key": "\', \'"key": "0\')')
+        elif damage == "settings":
+            db.execute("UPDATE photoplan_plan SET content = replace(content, '\"lanczos3\"', '17')")
+        elif damage == "tiles":
+            db.execute("DELETE FROM tiles")
+        else:
+            db.execute("ALTER TABLE tiles RENAME COLUMN tile TO tail")
+    db.close()
+    with pytest.raises(InputError) as error:
+        read_plan(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "make" in str(error.value)
+
+
+def test_fault_13_a_plan_exists(planned: tuple[Path, OrthoPlan]) -> None:
+    path, plan = planned
+    figures = compile_figures(plan)
+    before = path.read_bytes()
+    with pytest.raises(UsageError, match=r"p\.gpkg.*--overwrite"):
+        write_plan(path, plan, figures, path.parent)
+    assert path.read_bytes() == before
+    write_plan(path, plan, figures, path.parent, overwrite=True)
+    assert read_plan(path)[1] == path.parent.resolve()
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+def test_a_changed_setting_makes_another_plan(small: Block, planned: tuple[Path, OrthoPlan]) -> None:
+    """An orientation that was corrected in the project makes new keys, so that no old tile is taken over."""
+    _, plan = planned
+    small.orientation.write_text(small.orientation.read_text().replace("400.000000", "400.001000"))
+    make_project(small)
+    again = plan_orthophotos(load_project(small.project), **SETTINGS)  # type: ignore[arg-type]
+    assert not {p.key for p in again.products} & {p.key for p in plan.products}
