@@ -21,7 +21,7 @@ VERBS = {
     "check": "Validate a project and print what to expect of it.",
     "ortho": "Make orthophotos.",
     "run": "Execute a plan written by `ortho --plan`.",
-    "info": "Show what a raster, plan, project or camera file holds.",
+    "info": "Show what a raster, project, plan or run record holds.",
     "demo": "Make the orthophotos of the included real block.",
 }
 
