@@ -153,7 +153,7 @@ def report_kernel_rates() -> dict | None:
     except ImportError as error:
         print(f"left out: rates of the kernel alone ({error})")
         return None
-    print("\nTile kernel alone (geometry, relief and cubic), one core, Mpx/s; to reach with 3 bands of uint8: ratio 0.8")
+    print("\nTile kernel alone (geometry, relief and cubic), one core, Mpx/s; to reach with uint8 x 3: ratio 0.8")
     print(f"  {'':22}{'photoplan':>10}{'cv2.remap':>12}{'ratio':>8}{'packing':>10}")
     rates = kernel_rates()
     for name, row in rates.items():
