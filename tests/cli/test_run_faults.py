@@ -68,7 +68,7 @@ class TestFault03Killed:
         running = start(*words, env=sabotage(slow=30))
         children = workers_of(running, 2)
         running.kill()
-        running.communicate()
+        running.wait()
         gone, alive = psutil.wait_procs(children, timeout=5)
         for child in alive:
             child.kill()
