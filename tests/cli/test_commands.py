@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import rasterio
 from tools.command import COMMAND, OPTIONS, Here, Undisturbed, process
-from tools.small_block import CRS, NAMES, SIZE, Block
+from tools.small_block import CRS, NAMES, SIZE, Block, texture, write_image
 
 from photoplan.cli.main import VERBS
 
@@ -170,6 +170,25 @@ def test_info_knows_rasters_projects_plans_and_records(
     assert facts["tiles"] > 10
     assert "kernel = bicubic" in facts["settings"]
     assert f"{SIZE[0]} × {SIZE[1]} pixels" in photoplan("info", pristine.images[0]).out
+
+
+def test_run_executes_a_plan_and_nothing_else(photoplan: Here, small: Block, undisturbed: Undisturbed) -> None:
+    """`ortho --plan`, a look, `run`: the bytes of `ortho`; a plan whose input has changed since is refused."""
+    plan = small.folder / "p.gpkg"
+    said = photoplan("ortho", small.project, *OPTIONS, "--plan", plan)
+    assert said.code == 0, said.err
+    assert said.out.splitlines()[-1] == str(plan)
+    assert not (small.folder / "products").exists()
+    said = photoplan("run", plan, "--json")
+    assert said.code == 0, said.err
+    assert [p["image"] for p in json.loads(said.out)["products"]] == sorted(NAMES)
+    for name in NAMES:
+        assert (small.folder / "products" / f"{name}_ortho.tif").read_bytes() == undisturbed.bytes_of(name)
+    write_image(small.images[1], texture(seed=77))
+    said = photoplan("run", plan, "--output", small.folder / "other")
+    assert (said.code, said.out) == (3, "")
+    assert f"{plan}: inputs have changed since the plan was written (two)" in said.err
+    assert not (small.folder / "other").exists()
 
 
 @pytest.mark.parametrize(
