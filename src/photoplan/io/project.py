@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from photoplan.errors import InputError
 from photoplan.geometry.crs import require_projected_metres
 from photoplan.geometry.heights import check_height_system
+from photoplan.io.disk import write_atomically
 from photoplan.io.project_errors import explain
 from photoplan.io.project_model import Project
 from photoplan.io.project_write import project_text
@@ -62,17 +63,10 @@ def write_project(path: str | Path, project: Project) -> None:
 
     Raises
     ------
-    InputError
-        The folder cannot be written to.
+    ResourceError, UsageError
+        The disk is full, or the folder cannot be written to.
     """
-    path = Path(path)
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_text(project_text(project), encoding="utf-8", newline="\n")
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
+    write_atomically(Path(path), project_text(project).encode())
 
 
 def project_schema() -> str:
