@@ -117,6 +117,27 @@ def test_terrain_in_another_crs_lies_where_its_own_coordinates_say() -> None:
     np.testing.assert_allclose(relief, bilinear(XY[..., 0], XY[..., 1]), atol=5e-3)
 
 
+def test_far_heights_are_read_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same heights and the same range when a look may read a few posts at once only."""
+    s = surface()
+    XY = np.random.default_rng(3).uniform((500_000, 5_299_640), (500_720, 5_300_000), (300, 2))
+    bounds = (500_010, 5_299_700, 500_700, 5_299_990)
+    heights, span = s.heights(XY), s.height_range(bounds)
+    sizes: list[int] = []
+    read = Posts.read
+
+    def watched(self: Posts, window: Window) -> NDArray[np.float32]:
+        sizes.append(window.size)
+        return read(self, window)
+
+    monkeypatch.setattr(Posts, "read", watched)
+    monkeypatch.setattr("photoplan.surfaces.raster.MOST_POSTS", 40)
+    monkeypatch.setattr("photoplan.surfaces.raster.PART", 6)
+    np.testing.assert_array_equal(s.heights(XY), heights)
+    assert s.height_range(bounds) == span
+    assert len(sizes) > 20 and max(sizes) <= 40
+
+
 def test_only_map_targets_and_north_up_grids() -> None:
     with pytest.raises(InputError, match="mesh"):
         RasterSurface(surface().grid, (0, 0), (1.0, -1.0))

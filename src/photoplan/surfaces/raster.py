@@ -21,6 +21,10 @@ __all__ = ["HeightGrid", "RasterSurface"]
 STEP = 32
 #: … if that is good to this part of a mesh; else each pixel is transformed.
 POSITION_TOLERANCE = 0.01
+#: Posts that are read at once where single heights are asked for …
+MOST_POSTS = 4_000_000
+#: … and the side of the parts in which a range of heights is looked for.
+PART = 2048
 
 
 class HeightGrid(Protocol):
@@ -80,10 +84,24 @@ class RasterSurface:
         there = np.isfinite(flat).all(axis=1)
         if not there.any():
             return np.full(posts.shape[:-1], np.nan)
-        part, offset = self._read(flat[there].min(axis=0), flat[there].max(axis=0))
-        if part is None:
-            return np.full(posts.shape[:-1], np.nan)
-        return sample_points(part, flat - offset).astype(float).reshape(posts.shape[:-1])
+        heights = np.full(len(flat), np.nan)
+        heights[there] = self._sample(flat[there])
+        return heights.reshape(posts.shape[:-1])
+
+    def _sample(self, posts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Heights at finite post coordinates (n, 2), in halves where they span too much of the grid to read at once."""
+        low, high = posts.min(axis=0), posts.max(axis=0)
+        window = self._window(low, high)
+        if window.size == 0:
+            return np.full(len(posts), np.nan)
+        if window.size > MOST_POSTS and len(posts) > 1:
+            order = np.argsort(posts[:, np.argmax(high - low)], kind="stable")
+            heights = np.empty(len(posts))
+            for half in np.array_split(order, 2):
+                heights[half] = self._sample(posts[half])
+            return heights
+        offset = np.array([window.col, window.row], float)
+        return sample_points(self.grid.read(window), posts - offset).astype(float)
 
     def height_range(self, bounds: tuple[float, float, float, float]) -> tuple[float, float]:
         """Lowest and highest post inside or next to map `bounds`; NaN, NaN where there is none."""
@@ -92,10 +110,14 @@ class RasterSurface:
         x, y = np.meshgrid(xmin + edge * (xmax - xmin), ymin + edge * (ymax - ymin))
         XY = np.stack([x, y], axis=-1)
         posts = self._posts(XY if self.to_grid_crs is None else self.to_grid_crs(XY)).reshape(-1, 2)
-        part, _ = self._read(posts.min(axis=0), posts.max(axis=0))
-        if part is None or not np.isfinite(part).any():
-            return np.nan, np.nan
-        return float(np.nanmin(part)), float(np.nanmax(part))
+        window = self._window(posts.min(axis=0), posts.max(axis=0))
+        low, high = np.inf, -np.inf
+        for part in window.tiles(PART):
+            heights = self.grid.read(part)
+            there = heights[np.isfinite(heights)]
+            if there.size:
+                low, high = min(low, float(there.min())), max(high, float(there.max()))
+        return (low, high) if low <= high else (np.nan, np.nan)
 
     def _posts(self, XY: NDArray[np.float64]) -> NDArray[np.float64]:
         """Map coordinates to (column, row) of the posts."""
@@ -103,18 +125,22 @@ class RasterSurface:
             [(XY[..., 0] - self.origin[0]) / self.mesh[0], (self.origin[1] - XY[..., 1]) / self.mesh[1]], axis=-1
         )
 
-    def _read(
-        self, low: NDArray[np.float64], high: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float32] | None, NDArray[np.float64]]:
-        """Posts that surround positions from `low` to `high`, and the position of the first; None if there are none."""
+    def _window(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> Window:
+        """Posts that surround positions from `low` to `high`; empty if there are none."""
         columns, rows = self.grid.size
         # A post more on each side: a position that rounding has moved over a post must still find its mesh.
         col0, row0 = (max(0, int(np.clip(np.floor(a), -1, s)) - 1) for a, s in zip(low, (columns, rows)))
         col1, row1 = (min(s, int(np.clip(np.floor(a), -3, s)) + 3) for a, s in zip(high, (columns, rows)))
-        if col0 >= col1 or row0 >= row1:
+        return Window(col0, row0, max(0, col1 - col0), max(0, row1 - row0))
+
+    def _read(
+        self, low: NDArray[np.float64], high: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float32] | None, NDArray[np.float64]]:
+        """Posts that surround positions from `low` to `high`, and the position of the first; None if there are none."""
+        window = self._window(low, high)
+        if window.size == 0:
             return None, np.zeros(2)
-        part = self.grid.read(Window(col0, row0, col1 - col0, row1 - row0))
-        return part, np.array([col0, row0], float)
+        return self.grid.read(window), np.array([window.col, window.row], float)
 
     def _relief_across(self, target: MapTarget, window: Window) -> NDArray[np.float32]:
         assert self.to_grid_crs is not None
