@@ -17,6 +17,7 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io.checks import DRIVER_NAMES, IMAGE_LIMITS, RasterLimits
 from photoplan.io.decoded import SEQUENTIAL, DecodedPicture, decoded_picture
+from photoplan.io.deflate_check import damaged_block
 from photoplan.io.gdal import GDAL_ERRORS, all_causes, close_handles, damage_in, gdal_settings, handle, warnings_of_gdal
 from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.tiff_layout import read_tiff_layout
@@ -146,6 +147,9 @@ def _from_file(info: RasterInfo, window: Window) -> tuple[NDArray[Any], NDArray[
     """Colour bands, then alpha bands, shape (bands, h, w), and the mask of the file (None: there is none)."""
     area = rasterio.windows.Window(window.col, window.row, window.width, window.height)
     band, mask = "all", None
+    torn = damaged_block(info.path, window) if info.driver == "GTiff" and info.path.is_file() else None
+    if torn is not None:
+        raise _damaged(info.path, window, band, [torn])
     try:
         with gdal_settings(), warnings_of_gdal() as found:
             dataset = handle(info.path, info.driver if info.driver in DRIVER_NAMES else None)
