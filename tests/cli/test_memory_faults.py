@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-import subprocess
 
 import numpy as np
 import pytest
 import rasterio
-from tools.command import COMMAND
+from tools.command import peak_of
 from tools.huge_tiff import write_huge_tiff
 from tools.small_block import X0, Y0, Z0, Block, make_project
 
@@ -16,17 +15,6 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs the peak memor
 
 LIMIT = 600 * 2**20
 SIDE = 40_000
-
-
-def peak_of(*words: object) -> tuple[int, str, int]:
-    """Exit code, stderr, and peak resident memory of the command, bytes."""
-    running = subprocess.Popen([*COMMAND, *map(str, words)], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
-    assert running.stderr is not None
-    err = running.stderr.read().decode()
-    _, status, usage = os.wait4(running.pid, 0)
-    running.returncode = os.waitstatus_to_exitcode(status)
-    running.stderr.close()
-    return running.returncode, err, usage.ru_maxrss * 1024
 
 
 @pytest.fixture
@@ -48,8 +36,8 @@ def test_fault_06_an_image_far_larger_than_memory(huge: Block) -> None:
     """A sixteenth of it, 300 MB, falls on one tile: that is cut into parts, and each pixel is a mean of a thousand."""
     bounds = [X0 + 20, Y0 - 40, X0 + 95, Y0 + 35]
     words = ["ortho", huge.project, "--images", "one", "--resolution", "0.25", "--bounds", *bounds]
-    code, err, peak = peak_of(*words, "--memory", "600MB", "--workers", 2)
-    assert code == 0, err
+    said, peak = peak_of(*words, "--memory", "600MB", "--workers", 2)
+    assert said.code == 0, said
     assert peak < LIMIT
     with rasterio.open(huge.folder / "products" / "one_ortho.tif") as file:
         made, valid = file.read().astype(float), file.dataset_mask() > 0
@@ -65,10 +53,10 @@ def test_fault_06_terrain_far_larger_than_memory(small: Block) -> None:
     waves = (100 + 2 * np.sin(2 * np.pi * u / 256) * np.cos(2 * np.pi * v / 256)).astype(np.float32)
     place = (32633, X0 - 5000, Y0 + 5000, 0.25)
     write_huge_tiff(small.terrain, waves[..., None], (SIDE, SIDE), place)
-    code, err, peak = peak_of(
+    said, peak = peak_of(
         "ortho", small.project, "--images", "one", "--resolution", "0.5", "--memory", "600MB", "--workers", 2
     )
-    assert code == 0, err
+    assert said.code == 0, said
     assert peak < LIMIT
     with rasterio.open(small.folder / "products" / "one_ortho.tif") as file:
         assert (file.dataset_mask() > 0).mean() > 0.7

@@ -63,6 +63,22 @@ def process(*words: object, env: Mapping[str, str] | None = None, before: Sequen
     return Said(done.returncode, done.stdout, done.stderr)
 
 
+#: A small process between: a child's peak memory begins with what its parent held when it was started.
+_MEASURE = """
+import resource, subprocess, sys
+code = subprocess.call(sys.argv[1:])
+print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss, file=sys.stderr)
+sys.exit(code)
+"""
+
+
+def peak_of(*words: object) -> tuple[Said, int]:
+    """Run the command to its end; what it said, and its peak resident memory in bytes (Linux counts in KiB)."""
+    said = process(*words, before=[sys.executable, "-S", "-c", _MEASURE])
+    *lines, peak = said.err.strip().split("\n")
+    return Said(said.code, said.out, "\n".join(lines)), int(peak) * 1024
+
+
 def start(*words: object, env: Mapping[str, str] | None = None, before: Sequence[str] = ()) -> subprocess.Popen[str]:
     """Start the command and come back at once; it leads a process group of its own, as in a terminal."""
     return subprocess.Popen(
