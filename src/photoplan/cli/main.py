@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import importlib
 import os
 import sys
 from collections.abc import Sequence
@@ -11,6 +10,7 @@ from collections.abc import Sequence
 import click
 
 from photoplan.cli.interrupt import CODE, catch_interrupts, stop_children
+from photoplan.cli.lazy import LazyGroup
 from photoplan.errors import PhotoplanError, ResourceError
 
 __all__ = ["main", "run"]
@@ -21,29 +21,19 @@ VERBS = {
     "check": "Validate a project and print what to expect of it.",
     "ortho": "Make orthophotos.",
     "run": "Execute a plan written by `ortho --plan`.",
+    "dtm": "Terrain models: build, sample, contours, volumes …",
+    "monoplot": "Image points to ground points on a terrain model.",
     "info": "Show what a raster, project, plan or run record holds.",
     "demo": "Make the orthophotos of the included real block.",
 }
 
 
-class _Lazy(click.Group):
-    """Lists verbs without importing them, so that `--help` answers at once."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(VERBS)
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name not in VERBS:
-            return None
-        module = importlib.import_module(f"photoplan.cli.{cmd_name}")
-        return module.command
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Verbs"):
-            formatter.write_dl(list(VERBS.items()))
-
-
-@click.group(cls=_Lazy, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.group(
+    cls=LazyGroup,
+    verbs=VERBS,
+    package="photoplan.cli.",
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
 @click.version_option(package_name="photoplan")
 def photoplan() -> None:
     """Photographs with known geometry become measurable pictures.

@@ -1,0 +1,37 @@
+"""Groups of verbs that are imported only when they are used, so that `--help` answers at once."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from typing import Any
+
+import click
+
+__all__ = ["LazyGroup"]
+
+
+class LazyGroup(click.Group):
+    """Lists verbs without importing them."""
+
+    def __init__(self, *arguments: Any, verbs: Mapping[str, str], package: str, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.verbs = verbs
+        self.package = package
+        """What a verb's name is appended to, to give the module that holds its `command`."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """The verbs, in the order of a job."""
+        return list(self.verbs)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """The command of a verb, imported now."""
+        if cmd_name not in self.verbs:
+            return None
+        command: click.Command = importlib.import_module(self.package + cmd_name).command
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """One line for each verb."""
+        with formatter.section("Verbs"):
+            formatter.write_dl(list(self.verbs.items()))
