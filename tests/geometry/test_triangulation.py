@@ -14,7 +14,8 @@ def area(xy, faces):
 
 def test_fills_the_hull_counter_clockwise_and_keeps_edges():
     rng = np.random.default_rng(3)
-    xy = np.vstack([[[0, 0], [1, 0], [1, 1], [0, 1]], rng.uniform(0.05, 0.95, (200, 2))]) + [2.1e7, 6.7e6]
+    xy = np.vstack([[[0, 0], [1, 0], [1, 1], [0, 1]], [[0.1, 0.5], [0.9, 0.5], [0.5, 0.1]], rng.random((200, 2))])
+    xy += [2.1e7, 6.7e6]
     faces = constrained_faces(xy, np.array([[4, 5], [0, 6]]))
     areas = area(xy - xy[0], faces)
     assert (areas > 0).all()

@@ -49,7 +49,7 @@ def constrained_faces(xy: NDArray[np.float64], edges: NDArray[np.int64]) -> NDAr
     try:
         mesh.insert_vertices(local)
         if len(edges):
-            mesh.insert_edges(memoryview(edges.astype(np.uint32)))
+            mesh.insert_edges(edges.astype(np.uint32))  # type: ignore[call-overload]  # arrays are buffers
         mesh.erase_super_triangle()
     except (RuntimeError, ValueError) as error:
         raise GeometryError(f"triangulation: {error}; lines may meet in common points, but not cross") from error
