@@ -16,6 +16,8 @@ from photoplan.io.storage import COMPRESSIONS
 
 __all__ = ["CogOptions", "write_cog"]
 
+RESAMPLINGS = ("average", "mode", "nearest")
+
 
 @dataclass(frozen=True)
 class CogOptions:
@@ -24,7 +26,7 @@ class CogOptions:
     compress: str = "deflate"
     """`none`, `deflate`, `zstd`, `lzw` or `jpeg` (8 bit, one or three bands)."""
     overviews: bool = True
-    """Reduced copies inside the file, by averaging."""
+    """Reduced copies inside the file."""
     tile: int = 512
     """Side of the blocks in pixels; a multiple of 16, at least 128."""
     quality: int = 90
@@ -33,12 +35,16 @@ class CogOptions:
     """Effort of DEFLATE and ZSTD, 1 to 9."""
     threads: int = 1
     """Threads that compress."""
+    resampling: str = "average"
+    """How the reduced copies are made: `average`, `mode` or `nearest`."""
 
     def __post_init__(self) -> None:
         if self.compress not in COMPRESSIONS:
             raise UsageError(f"compression {self.compress!r}; allowed are {', '.join(COMPRESSIONS)}")
         if self.tile < 128 or self.tile % 16 or self.tile > 4096:
             raise UsageError(f"blocks of {self.tile} pixels; a multiple of 16 from 128 to 4096 is needed")
+        if self.resampling not in RESAMPLINGS:
+            raise UsageError(f"overviews by {self.resampling!r}; allowed are {', '.join(RESAMPLINGS)}")
         if not (1 <= self.quality <= 100 and 1 <= self.level <= 9 and self.threads >= 1):
             raise UsageError(f"quality {self.quality}, level {self.level}, threads {self.threads}; see CogOptions")
 
@@ -48,7 +54,7 @@ class CogOptions:
             "compress": self.compress.upper(),
             "blocksize": self.tile,
             "overviews": "IGNORE_EXISTING" if self.overviews else "NONE",
-            "overview_resampling": "AVERAGE",
+            "overview_resampling": self.resampling.upper(),
             "bigtiff": "IF_SAFER",
             "sparse_ok": True,
             "num_threads": self.threads,

@@ -41,7 +41,8 @@ def write_plain_tiff(
     path
         The file; replaced if it is there.
     profile
-        What `rasterio.open` needs: size, bands, type, reference system, transform, side of the blocks.
+        What `rasterio.open` needs: size, bands, type, reference system, transform, side of the blocks; and `colormap`,
+        a colour table.
     tags
         Tags of the data set.
     blocks
@@ -57,7 +58,11 @@ def write_plain_tiff(
     """
     path.unlink(missing_ok=True)
     fixed = {"driver": "GTiff", "tiled": True, "interleave": "pixel", "sparse_ok": True, "compress": "none"}
-    with gdal_settings(GDAL_PAM_ENABLED=False), rasterio.open(path, "w", **(profile | fixed)) as dataset:
+    colours = profile.get("colormap")
+    fixed = {name: value for name, value in (profile | fixed).items() if name != "colormap"}
+    with gdal_settings(GDAL_PAM_ENABLED=False), rasterio.open(path, "w", **fixed) as dataset:
+        if colours is not None:
+            dataset.write_colormap(1, colours)
         dataset.update_tags(**tags)
     layout = read_tiff_layout(path)
     offsets, counts = np.zeros_like(layout.offsets), np.zeros_like(layout.counts)

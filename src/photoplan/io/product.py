@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -118,6 +118,10 @@ class ProductFile:
     """Quality of JPEG."""
     threads: int = 1
     """Threads that compress."""
+    resampling: str = "average"
+    """How the overviews are made: `average`, `mode` or `nearest`."""
+    colours: Mapping[int, tuple[int, int, int]] | None = None
+    """Colour table of one band of uint8."""
     _log: TileLog | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -130,7 +134,14 @@ class ProductFile:
                 f"{self.path}: {self.bands} bands of {self.dtype} with compression {self.compress}; JPEG takes one or "
                 "three bands of uint8, the others one band and more"
             )
-        self._options = CogOptions(self.compress, self.overviews, self.tile, quality=self.quality, threads=self.threads)
+        self._options = CogOptions(
+            self.compress,
+            self.overviews,
+            self.tile,
+            quality=self.quality,
+            threads=self.threads,
+            resampling=self.resampling,
+        )
         value = nodata_for(self.dtype, self.nodata, self.compress)
         self._coder = BlockCoder(self.tile, self.bands, self.dtype, value, lossy=self.compress == "jpeg")
         self._windows = tuple(self.grid.window.tiles(self.tile))
@@ -246,6 +257,12 @@ class ProductFile:
             self._log = None
         return facts
 
+    def discard(self) -> None:
+        """Forget the finished tiles: no later run can use them."""
+        if self._log is not None:
+            self._log.remove()
+            self._log = None
+
     def _open_log(self) -> TileLog:
         if self._log is None:
             raise UsageError(f"{self.path}: the product is not open; use it in a `with` block")
@@ -291,7 +308,10 @@ class ProductFile:
         pixels = self._coder.pixel_bytes
         direct = self.compress == "none" and not self.overviews and not self._coder.mask_bytes
         blocks = ((i, position, pixels) for i, position, _ in stored)
-        write_plain_tiff(part if direct else plain, profile, tags, blocks, log.descriptor)
+        colours: dict[str, Any] = {}
+        if self.colours:
+            colours = {"colormap": dict(self.colours), "photometric": "PALETTE"}
+        write_plain_tiff(part if direct else plain, profile | colours, tags, blocks, log.descriptor)
         if direct:
             return part
         if self._coder.mask_bytes:
