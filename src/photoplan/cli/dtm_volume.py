@@ -1,0 +1,66 @@
+"""`photoplan dtm volume`: cut and fill."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photoplan.cli.options import json_option
+
+__all__ = ["command"]
+
+
+@click.command("volume")
+@click.argument("a", metavar="A", type=click.Path(path_type=Path))
+@click.argument("b", metavar="B", type=click.Path(path_type=Path))
+@click.option("--polygon", "polygons", type=click.Path(path_type=Path), help="Polygons: one line of figures for each.")
+@click.option("--resolution", type=click.FloatRange(0, min_open=True), help="Cells of the integration, metres [auto].")
+@click.option("--tolerance", type=float, default=1e-3, show_default=True, help="Where cells are halved: part of it.")
+@click.option("--difference", type=click.Path(path_type=Path), metavar="TIF", help="Write B − A as a raster.")
+@click.option("--sigma-a", type=float, help="Standard deviation of A's heights, metres [the model's own].")
+@click.option("--sigma-b", type=float, help="The same of B.")
+@click.option("--correlation", type=float, help="Correlation length of height errors, metres [the mesh width].")
+@click.option("--bias", type=float, default=0.0, help="Standard deviation of a common height error, metres [0].")
+@click.option("--height-system", metavar="same", help="Declare that both models have the same height system.")
+@click.option("--crs", help="CRS of files that do not state it.")
+@click.option("--overwrite", is_flag=True, help="Replace the raster if it exists.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(as_json: bool, quiet: bool, **options: Any) -> None:
+    """Cut, fill and net volume from terrain A to terrain B, with their exactness.
+
+    Cut is where A lies above B. Where one of the models has no height nothing is counted; that area is printed.
+    """
+    from photoplan.cli.progress import progress
+    from photoplan.products.dtm_volume import VolumeRequest, dtm_volume
+
+    with progress(0, quiet) as report:
+        found = dtm_volume(VolumeRequest(**options), report)
+    if as_json:
+        click.echo(json.dumps(found.to_dict(), indent=2))
+        return
+    width = max(7, *(len(row.name) for row in found.rows))
+    click.echo(
+        f"{'polygon':<{width}}  {'cut m³':>14} {'fill m³':>14} {'net m³':>14} {'area m²':>13} {'no model m²':>13}"
+    )
+    for row in found.rows:
+        v = row.volume
+        click.echo(
+            f"{row.name:<{width}}  {v.cut:>14.2f} {v.fill:>14.2f} {v.net:>14.2f} {v.area:>13.1f} {v.missing:>13.1f}"
+        )
+        click.echo(
+            f"{'':<{width}}  {v.error_cut:>13.2g}i {v.error_fill:>13.2g}i {v.error_net:>13.2g}i  cells {v.cell:g} m"
+        )
+        if row.sigma is not None:
+            s = row.sigma
+            click.echo(f"{'':<{width}}  {s.cut:>13.2f}σ {s.fill:>13.2f}σ {s.net:>13.2f}σ")
+    click.echo("i: change with the last halving of the cells; σ: standard deviation from that of the heights")
+    if found.difference is not None:
+        click.echo(str(found.difference))
+    if not quiet:
+        click.echo(f"height system: {found.height_system}", err=True)
+        for note in found.notes:
+            click.echo(note, err=True)

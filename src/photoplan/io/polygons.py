@@ -1,0 +1,164 @@
+"""Polygons, points and lines of users' vector files, and small vector products as GeoPackage."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyogrio.raw
+import shapely
+from numpy.typing import NDArray
+from pyogrio.errors import DataSourceError, FieldError, GeometryError
+
+from photoplan.errors import InputError, UsageError
+from photoplan.io.checks import check_plain_file
+from photoplan.io.disk import disk_error, sync_file, sync_folder
+
+__all__ = ["Feature", "Features", "read_features", "write_features"]
+
+_MAGIC = {b"SQLite format 3\0": "GeoPackage", b"\x00\x00\x27\x0a": "Shapefile", b"fgb": "FlatGeobuf"}
+_KINDS = {
+    "Polygon": ("Polygon", "MultiPolygon"),
+    "Point": ("Point", "MultiPoint"),
+    "LineString": ("LineString", "MultiLineString"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Feature:
+    """One object of a vector file."""
+
+    name: str
+    """Its column `name`, `id` or `NAME`, else its number from 1."""
+    geometry: Any
+    """Shapely geometry; Z is kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Objects of one layer."""
+
+    path: Path
+    crs: str | None
+    """As the file states it; None: it does not."""
+    items: tuple[Feature, ...]
+
+
+def read_features(path: Path, *kinds: str) -> Features:
+    """Objects of the first layer of a GeoPackage, Shapefile, GeoJSON or FlatGeobuf.
+
+    Parameters
+    ----------
+    path : Path
+    kinds : str
+        What the objects may be: `Polygon`, `Point`, `LineString`; several objects in one are taken as such.
+
+    Raises
+    ------
+    InputError
+        The file is none of these formats, holds no such objects, or polygons that cross themselves (all are named).
+    """
+    path = check_plain_file(path, "vector file")
+    with path.open("rb") as file:
+        head = file.read(16)
+    if not any(head.startswith(magic) for magic in _MAGIC) and not head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
+        raise InputError(f"{path}: not a vector file that is read here; allowed are GeoPackage, Shapefile, GeoJSON")
+    try:
+        meta, _, wkb, values = pyogrio.raw.read(os.fspath(path.resolve()), force_2d=False)
+        shapes = shapely.from_wkb(wkb)
+    except (DataSourceError, FieldError, GeometryError, shapely.errors.ShapelyError, ValueError, RuntimeError) as error:
+        raise InputError(f"{path}: cannot be read ({' '.join(str(error).split())[:200]})") from error
+    columns = dict(zip(meta["fields"], values))
+    names = next((columns[key] for key in ("name", "NAME", "Name", "id", "ID") if key in columns), None)
+    allowed = [name for kind in kinds for name in _KINDS[kind]]
+    items = []
+    for i, shape in enumerate(shapes):
+        if shape is None or shape.is_empty:
+            continue
+        if shape.geom_type not in allowed:
+            raise InputError(
+                f"{path}: feature {i + 1} is a {shape.geom_type}; allowed are {', '.join(allowed)}. Give another file"
+            )
+        own = None if names is None else names[i]
+        items.append(Feature(str(own) if own is not None and str(own).strip() else str(i + 1), shape))
+    if not items:
+        raise InputError(f"{path}: holds no {' or '.join(kinds)}; give a file that does")
+    _refuse_invalid(path, items)
+    return Features(path, meta["crs"] if _states_crs(path, head) else None, tuple(items))
+
+
+def _states_crs(path: Path, head: bytes) -> bool:
+    """Whether a file states its CRS; GDAL takes geographic coordinates for a GeoJSON that says nothing."""
+    if any(head.startswith(magic) for magic in _MAGIC):
+        return True
+    try:
+        return "crs" in json.loads(path.read_text(encoding="utf-8-sig"))
+    except (ValueError, OSError):
+        return False
+
+
+def _refuse_invalid(path: Path, items: Sequence[Feature]) -> None:
+    shapes = np.array([item.geometry for item in items], object)
+    wrong = [
+        f"{item.name!r} ({reason})"
+        for item, valid, reason in zip(items, shapely.is_valid(shapes), shapely.is_valid_reason(shapes))
+        if not valid and item.geometry.geom_type in _KINDS["Polygon"]
+    ]
+    if wrong:
+        raise InputError(f"{path}: {len(wrong)} polygons cross themselves or overlap: {', '.join(wrong)}; repair them")
+
+
+def write_features(
+    path: Path, kind: str, shapes: Sequence[Any], columns: Mapping[str, NDArray[Any]], crs: str, layer: str
+) -> None:
+    """Write one layer as a GeoPackage that appears under its name only when it is complete; replaces an older one.
+
+    Parameters
+    ----------
+    path : Path
+        Its name must end with `.gpkg`.
+    kind : str
+        Geometry type: `Polygon`, `MultiPolygon`, `LineString Z`, `Point Z` …
+    shapes : sequence of shapely geometries
+    columns : mapping
+        Name and values of each column.
+    crs : str
+    layer : str
+
+    Raises
+    ------
+    UsageError
+        The name does not end with `.gpkg`, or the folder cannot be written.
+    ResourceError
+        The disk is full.
+    """
+    if path.suffix.lower() != ".gpkg":
+        raise UsageError(f"{path}: vectors are written as GeoPackage; give a name that ends with .gpkg")
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial.gpkg")
+    try:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            pyogrio.raw.write(
+                os.fspath(partial),
+                geometry=shapely.to_wkb(np.array([*shapes], object)),
+                field_data=list(columns.values()),
+                fields=list(columns),
+                layer=layer,
+                driver="GPKG",
+                geometry_type=kind,
+                crs=crs,
+            )
+            sync_file(partial)
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
+        sync_folder(path.parent)
+    except DataSourceError as error:
+        raise UsageError(f"{path}: cannot be written ({error}); choose a folder that can be written") from error
+    except OSError as error:
+        raise disk_error(path, error) from error

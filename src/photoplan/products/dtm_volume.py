@@ -1,0 +1,222 @@
+"""Cut and fill between two terrain files, for each polygon of a file or where both exist."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from photoplan.errors import HeightSystemError, InputError, UsageError
+from photoplan.geometry.crs import crs_label, same_crs
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.io.grid_writer import GridOptions, write_grid
+from photoplan.io.polygons import Feature, read_features
+from photoplan.io.product import check_output
+from photoplan.products.open_terrain import OpenTerrain, open_terrain
+from photoplan.targets.map import MapTarget
+from photoplan.terrain.volume import TILE, Volume, VolumeSettings, volume_between
+from photoplan.terrain.volume_sigma import ErrorModel, VolumeSigma, volume_sigma
+
+__all__ = ["VolumeReport", "VolumeRequest", "VolumeRow", "dtm_volume"]
+
+
+@runtime_checkable
+class _WithSigmas(Protocol):
+    """A surface that knows how exact it is."""
+
+    def sigmas(self, XY: Any) -> NDArray[np.float64]: ...
+
+
+@dataclass(frozen=True)
+class VolumeRequest:
+    """What is asked."""
+
+    a: Path
+    b: Path
+    """Terrain files; the volume is that of B − A."""
+    polygons: Path | None = None
+    resolution: float | None = None
+    """Side of the cells, metres; None: begin with the finer mesh width and halve it as far as needed."""
+    tolerance: float = 1e-3
+    sigma_a: float | None = None
+    """Standard deviation of the heights, metres; None: the model's own, if it has one."""
+    sigma_b: float | None = None
+    correlation: float | None = None
+    """Correlation length of the height errors, metres; None: each model's mesh width."""
+    bias: float = 0.0
+    """Standard deviation of a height error that is everywhere alike, metres."""
+    height_system: str | None = None
+    """`same` declares that both files have one height system."""
+    crs: str | None = None
+    """Of files that do not state theirs."""
+    difference: Path | None = None
+    """Where to write the raster of B − A."""
+    overwrite: bool = False
+
+
+@dataclass(frozen=True)
+class VolumeRow:
+    """Figures of one polygon."""
+
+    name: str
+    volume: Volume
+    sigma: VolumeSigma | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`: m³, m², metres."""
+        v, s = self.volume, self.sigma
+        return {
+            "polygon": self.name,
+            "cut": v.cut,
+            "fill": v.fill,
+            "net": v.net,
+            "area": v.area,
+            "area_without_model": v.missing,
+            "cell": v.cell,
+            "integration_error_cut": v.error_cut,
+            "integration_error_fill": v.error_fill,
+            "integration_error_net": v.error_net,
+            "within_tolerance": v.settled,
+            "sigma_cut": s and s.cut,
+            "sigma_fill": s and s.fill,
+            "sigma_net": s and s.net,
+        }
+
+
+@dataclass(frozen=True)
+class VolumeReport:
+    """What came out."""
+
+    rows: tuple[VolumeRow, ...]
+    height_system: str
+    notes: tuple[str, ...]
+    """What a reader of the figures must know."""
+    difference: Path | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        return {
+            "volumes": [row.to_dict() for row in self.rows],
+            "height_system": self.height_system,
+            "difference": self.difference and str(self.difference),
+            "notes": list(self.notes),
+        }
+
+
+def dtm_volume(request: VolumeRequest, progress: Callable[[int, int], None] | None = None) -> VolumeReport:
+    """Volumes from terrain A to terrain B.
+
+    Raises
+    ------
+    UsageError
+        The raster of differences exists, or is an input.
+    HeightSystemError
+        The height systems differ, or are not stated.
+    InputError
+        A file cannot be used, CRSs differ, or the two models have nothing in common.
+    """
+    inputs = [request.a, request.b, *([request.polygons] if request.polygons else [])]
+    if request.difference is not None:
+        check_output(request.difference, inputs, overwrite=request.overwrite)
+    a, b = (open_terrain(path, request.crs) for path in (request.a, request.b))
+    system = _one_system(a, b, request.height_system)
+    if not same_crs(a.crs, b.crs):
+        raise InputError(
+            f"{a.path} is in {crs_label(a.crs)}, {b.path} in {crs_label(b.crs)}; bring both into one CRS first"
+        )
+    items = _polygons(request.polygons, a, b)
+    cell = request.resolution or min(a.resolution, b.resolution)
+    settings = VolumeSettings(cell, 0.0 if request.resolution else request.tolerance)
+    errors, notes = _errors(request, a, b)
+    rows = []
+    for item in items:
+        volume = volume_between(a.surface, b.surface, item.geometry, settings, progress)
+        sigma = None
+        if errors is not None:
+            sigma = volume_sigma(a.surface, b.surface, errors, item.geometry, cell, request.bias)
+            if sigma.unknown > 0:
+                notes.append(f"{item.name}: on {sigma.unknown:.6g} m² a model has no standard deviation")
+        rows.append(VolumeRow(item.name, volume, sigma))
+        if not volume.settled:
+            notes.append(f"{item.name}: not within the tolerance; see the change with the last halving of the cells")
+    if request.difference is not None:
+        _write_difference(request, a, b, items, cell, inputs)
+    return VolumeReport(tuple(rows), system, tuple(notes), request.difference)
+
+
+def _one_system(a: OpenTerrain, b: OpenTerrain, declared: str | None) -> str:
+    """The height system of both models."""
+    if declared not in (None, "same"):
+        raise UsageError(f"height system {declared!r}; `same` declares that both models have one")
+    named = [system for system in (a.height_system, b.height_system) if system is not None]
+    if len(named) == 2 and not (named[0] == named[1] or same_crs(named[0], named[1])):
+        raise HeightSystemError(f"{a.path}: heights in {named[0]}, {b.path}: in {named[1]}; convert one of them first")
+    if len(named) < 2 and declared is None:
+        without = " and ".join(str(t.path) for t in (a, b) if t.height_system is None)
+        raise HeightSystemError(
+            f"{without}: no height system stated; if both models have the same, say --height-system same"
+        )
+    return named[0] if named else "same, not named"
+
+
+def _polygons(path: Path | None, a: OpenTerrain, b: OpenTerrain) -> tuple[Feature, ...]:
+    """The polygons, or the rectangle that both models share."""
+    common = np.maximum(a.bounds[:2], b.bounds[:2]), np.minimum(a.bounds[2:], b.bounds[2:])
+    if not (common[0] < common[1]).all():
+        raise InputError(f"{a.path} covers {_text(a.bounds)}, {b.path} {_text(b.bounds)}: they have nothing in common")
+    if path is None:
+        return (Feature("all", shapely.box(*common[0], *common[1])),)
+    read = read_features(path, "Polygon")
+    if read.crs is not None and not same_crs(read.crs, a.crs):
+        raise InputError(
+            f"{path}: polygons in {crs_label(read.crs)}, the models are in {crs_label(a.crs)}; reproject them"
+        )
+    return tuple(Feature(item.name, shapely.force_2d(item.geometry)) for item in read.items)
+
+
+def _text(bounds: tuple[float, float, float, float]) -> str:
+    return " ".join(f"{v:.10g}" for v in bounds)
+
+
+def _errors(
+    request: VolumeRequest, a: OpenTerrain, b: OpenTerrain
+) -> tuple[tuple[ErrorModel, ErrorModel] | None, list[str]]:
+    """How both models err, or why the volumes have no standard deviation."""
+    models = []
+    for letter, terrain, given in (("a", a, request.sigma_a), ("b", b, request.sigma_b)):
+        sigma = given if given is not None else _own(terrain)
+        if sigma is None:
+            return None, [f"no standard deviation: {terrain.path} has none of its own; give --sigma-{letter} METRES"]
+        models.append(ErrorModel(sigma, request.correlation or terrain.resolution))
+    return (models[0], models[1]), []
+
+
+def _own(terrain: OpenTerrain) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
+    surface: object = terrain.surface
+    return surface.sigmas if isinstance(surface, _WithSigmas) else None
+
+
+def _write_difference(
+    request: VolumeRequest,
+    a: OpenTerrain,
+    b: OpenTerrain,
+    items: tuple[Feature, ...],
+    cell: float,
+    inputs: list[Path],
+) -> None:
+    """B − A as a raster over all polygons."""
+    bounds = shapely.total_bounds(np.array([item.geometry for item in items], object))
+    grid = MapGrid.covering(tuple(float(v) for v in bounds), cell, a.crs)  # type: ignore[arg-type]
+    target = MapTarget(grid)
+
+    def tile(window: Window) -> NDArray[np.float32]:
+        return np.asarray(b.surface.relief(target, window) - a.surface.relief(target, window))[None]
+
+    assert request.difference is not None
+    options = GridOptions(tile=TILE, overwrite=request.overwrite, inputs=inputs)
+    write_grid(request.difference, grid, np.float32, 1, "auto", tile, options)
