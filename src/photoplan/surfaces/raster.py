@@ -12,14 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.sample_grid import sample_lattice, sample_points
+from photoplan.surfaces.carried import carried_positions
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
 
 __all__ = ["HeightGrid", "RasterSurface"]
 
-#: Between CRSs, positions are computed at every so-manieth pixel and interpolated …
-STEP = 32
-#: … if that is good to this part of a mesh; else each pixel is transformed.
+#: Between CRSs, positions are interpolated where that is good to this part of a mesh; else each pixel is transformed.
 POSITION_TOLERANCE = 0.01
 #: Posts that are read at once where single heights are asked for …
 MOST_POSTS = 4_000_000
@@ -143,38 +142,15 @@ class RasterSurface:
         return self.grid.read(window), np.array([window.col, window.row], float)
 
     def _relief_across(self, target: MapTarget, window: Window) -> NDArray[np.float32]:
-        assert self.to_grid_crs is not None
-        v, u = np.mgrid[: window.height, : window.width]
-        uv = np.stack([u + window.col, v + window.row], axis=-1).astype(float)
-        corner_u = np.append(np.arange(0, window.width - 1, STEP), window.width - 1)
-        corner_v = np.append(np.arange(0, window.height - 1, STEP), window.height - 1)
-        nodes = np.stack(np.meshgrid(corner_u + window.col, corner_v + window.row), axis=-1).astype(float)
-        at_nodes = self._posts(self.to_grid_crs(target.grid.to_map(nodes)))
-        middles = (nodes[1:, 1:] + nodes[:-1, :-1]) / 2
-        if middles.size:
-            strict = self._posts(self.to_grid_crs(target.grid.to_map(middles)))
-            between = (at_nodes[1:, 1:] + at_nodes[1:, :-1] + at_nodes[:-1, 1:] + at_nodes[:-1, :-1]) / 4
-            if np.abs(strict - between).max() > POSITION_TOLERANCE:
-                return self.heights(target.grid.to_map(uv)).astype(np.float32)
-        posts = _between_nodes(at_nodes, corner_u, corner_v)
+        carry = self.to_grid_crs
+        assert carry is not None
+        posts = carried_positions(target.grid, window, lambda XY: self._posts(carry(XY)), POSITION_TOLERANCE)
+        if posts is None:
+            v, u = np.mgrid[: window.height, : window.width]
+            uv = np.stack([u + window.col, v + window.row], axis=-1).astype(float)
+            return self.heights(target.grid.to_map(uv)).astype(np.float32)
         part, offset = self._read(posts.min(axis=(0, 1)), posts.max(axis=(0, 1)))
         if part is None:
             return np.full((window.height, window.width), np.nan, np.float32)
         flat = sample_points(part, (posts - offset).reshape(-1, 2))
         return flat.reshape(window.height, window.width)
-
-
-def _between_nodes(nodes: NDArray[np.float64], at_u: NDArray[np.int64], at_v: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Bilinear positions at every pixel between the nodes."""
-    u, v = np.arange(at_u[-1] + 1.0), np.arange(at_v[-1] + 1.0)
-    columns = np.empty((nodes.shape[0], len(u), 2))
-    full = np.empty((len(v), len(u), 2))
-    for k in range(2):
-        for i in range(nodes.shape[0]):
-            columns[i, :, k] = np.interp(u, at_u, nodes[i, :, k])
-    upper = np.clip(np.searchsorted(at_v, v, side="right") - 1, 0, max(len(at_v) - 2, 0))
-    lower = np.minimum(upper + 1, len(at_v) - 1)
-    span = np.maximum(at_v[lower] - at_v[upper], 1)
-    t = ((v - at_v[upper]) / span)[:, None, None]
-    full[:] = columns[upper] * (1 - t) + columns[lower] * t
-    return full

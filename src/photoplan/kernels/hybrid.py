@@ -1,0 +1,284 @@
+"""Values of a computing unit whose meshes are bilinear or made of triangles.
+
+Positions are in meshes: x to the right from the unit's left edge, y downwards from its upper edge. `frame` = (X of the
+left edge, Y of the upper edge, meshes per metre) takes vertices there. A point on an edge (to 1e-7 of a mesh) belongs
+to a triangle on either side, so that no point is lost between two; where the triangles differ (two-sided breaklines)
+the one whose vertices have the lower numbers counts, which is the left one of the line.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.kernels.jit import inner, kernel
+from photoplan.kernels.sample_grid import _bilinear, _post
+
+__all__ = ["sample_hybrid", "scan_faces"]
+
+_ON_FACE = 1e-7
+_ON_LINE = 1e-6
+# Heights of two triangles at one pixel that differ by more than this, metres, are those of a wall.
+_WALL = 1e-3
+
+
+@inner
+def _weights(
+    vertices: NDArray[np.float64],
+    corners: NDArray[np.int32],
+    f: int,
+    frame: tuple[float, float, float],
+    x: float,
+    y: float,
+) -> tuple[Any, Any, Any, Any]:
+    """Barycentric weights of a point in triangle f, and a key: −2 outside, −1 inside, else a number of the edge."""
+    a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
+    ax, ay = (vertices[a, 0] - frame[0]) * frame[2] - x, (frame[1] - vertices[a, 1]) * frame[2] - y
+    bx, by = (vertices[b, 0] - frame[0]) * frame[2] - x, (frame[1] - vertices[b, 1]) * frame[2] - y
+    cx, cy = (vertices[c, 0] - frame[0]) * frame[2] - x, (frame[1] - vertices[c, 1]) * frame[2] - y
+    # y runs downwards: the sign makes counter-clockwise triangles positive.
+    wa, wb, wc = by * cx - bx * cy, cy * ax - cx * ay, ay * bx - ax * by
+    if not (wa + wb + wc > 0.0):
+        return 0.0, 0.0, 0.0, -2
+    limit_a = _ON_FACE * np.sqrt((cx - bx) ** 2 + (cy - by) ** 2)
+    limit_b = _ON_FACE * np.sqrt((ax - cx) ** 2 + (ay - cy) ** 2)
+    limit_c = _ON_FACE * np.sqrt((bx - ax) ** 2 + (by - ay) ** 2)
+    if wa < -limit_a or wb < -limit_b or wc < -limit_c:
+        return 0.0, 0.0, 0.0, -2
+    numbers, count = 0, 0
+    if wa > limit_a:
+        numbers, count = numbers + a, count + 1
+    if wb > limit_b:
+        numbers, count = numbers + b, count + 1
+    if wc > limit_c:
+        numbers, count = numbers + c, count + 1
+    wa, wb, wc = max(wa, 0.0), max(wb, 0.0), max(wc, 0.0)
+    total = wa + wb + wc
+    if not (total > 0.0):
+        return 0.0, 0.0, 0.0, -2
+    if count == 3:
+        return wa / total, wb / total, wc / total, -1
+    # Triangles at one edge share two vertices but for their copies at a wall, those at one vertex share one.
+    return wa / total, wb / total, wc / total, (6 * numbers) // max(count, 1)
+
+
+@inner
+def _in_mesh(
+    vertices: NDArray[np.float64],
+    values: NDArray[Any],
+    corners: NDArray[np.int32],
+    first: int,
+    last: int,
+    frame: tuple[float, float, float],
+    x: float,
+    y: float,
+) -> tuple[Any, Any]:
+    """Value at a point among triangles first … last − 1, and the key of the triangle; NaN, −2 if it is in none."""
+    best, found = -2, np.nan
+    for f in range(first, last):
+        wa, wb, wc, key = _weights(vertices, corners, f, frame, x, y)
+        if key == -2 or (best >= 0 and key >= best):
+            continue
+        value = wa * values[corners[f, 0]] + wb * values[corners[f, 1]] + wc * values[corners[f, 2]]
+        best, found = key, value
+        if key == -1:
+            break
+    return found, best
+
+
+@inner
+def _candidates(x: float, n: int) -> tuple[int, int]:
+    """First and last mesh that touches x (of n meshes)."""
+    first = min(max(np.int64(np.floor(x - _ON_LINE)), 0), n - 1)
+    last = min(max(np.int64(np.floor(x + _ON_LINE)), 0), n - 1)
+    return first, last
+
+
+@inner
+def _on_faces(
+    vertices: NDArray[np.float64],
+    values: NDArray[Any],
+    corners: NDArray[np.int32],
+    start: NDArray[np.int64],
+    n: int,
+    frame: tuple[float, float, float],
+    x: float,
+    y: float,
+) -> tuple[Any, Any]:
+    """Value on the triangles of all meshes that touch a point, and whether all of these meshes have triangles."""
+    c0, c1 = _candidates(x, n)
+    r0, r1 = _candidates(y, n)
+    found, best, every = np.nan, -2, True
+    for r in range(r0, r1 + 1):
+        for c in range(c0, c1 + 1):
+            m = r * n + c
+            if start[m + 1] == start[m]:
+                every = False
+                continue
+            value, key = _in_mesh(vertices, values, corners, start[m], start[m + 1], frame, x, y)
+            if key != -2 and (best == -2 or key < best):
+                found, best = value, key
+    return found, every
+
+
+@kernel
+def sample_hybrid(
+    posts: NDArray[np.float32],
+    vertices: NDArray[np.float64],
+    values: NDArray[np.float64],
+    corners: NDArray[np.int32],
+    start: NDArray[np.int64],
+    frame: tuple[float, float, float],
+    xy: NDArray[np.float64],
+    result: NDArray[np.float64],
+) -> None:
+    """Values at scattered points.
+
+    posts (n + 1, n + 1) and values (k,) of the vertices refer to one datum; xy (p, 2) are positions inside the unit in
+    meshes; result (p,) is filled, NaN where there is no surface.
+    """
+    n = posts.shape[0] - 1
+    for i in range(xy.shape[0]):
+        x, y = xy[i, 0], xy[i, 1]
+        result[i] = np.nan
+        if not (x >= -_ON_LINE and y >= -_ON_LINE and x <= n + _ON_LINE and y <= n + _ON_LINE):
+            continue
+        found, every = _on_faces(vertices, values, corners, start, n, frame, x, y)
+        if found == found or every:
+            result[i] = found
+        else:
+            col, fx = _post(x, n + 1)
+            row, fy = _post(y, n + 1)
+            result[i] = _bilinear(posts, col, row, fx, fy)
+
+
+@inner
+def _pixels(first: float, last: float, origin: float, step: float, count: int) -> tuple[Any, Any]:
+    """First and last pixel whose position lies in first … last, edges included; empty if the first is higher."""
+    a = max(np.int64(np.ceil((first - origin) / step - _ON_LINE)), 0)
+    b = min(np.int64(np.floor((last - origin) / step + _ON_LINE)), count - 1)
+    return a, b
+
+
+@inner
+def _all_faces(start: NDArray[np.int64], n: int, x: float, y: float) -> bool:
+    """Whether all meshes that touch a point have triangles."""
+    c0, c1 = _candidates(x, n)
+    r0, r1 = _candidates(y, n)
+    for r in range(r0, r1 + 1):
+        for c in range(c0, c1 + 1):
+            if start[r * n + c + 1] == start[r * n + c]:
+                return False
+    return True
+
+
+@inner
+def _clear(
+    result: NDArray[np.float32], start: NDArray[np.int64], n: int, lattice: tuple[float, float, float, float]
+) -> None:
+    """NaN at all pixels that belong to meshes with triangles only."""
+    x0, dx, y0, dy = lattice
+    for r in range(n):
+        j0, j1 = _pixels(r, r + 1, y0, dy, result.shape[0])
+        if j0 > j1 or start[r * n + n] == start[r * n]:
+            continue
+        for c in range(n):
+            if start[r * n + c + 1] == start[r * n + c]:
+                continue
+            i0, i1 = _pixels(c, c + 1, x0, dx, result.shape[1])
+            for j in range(j0, j1 + 1):
+                y = y0 + j * dy
+                edge = y - r <= _ON_LINE or r + 1 - y <= _ON_LINE
+                for i in range(i0, i1 + 1):
+                    x = x0 + i * dx
+                    if edge or x - c <= _ON_LINE or c + 1 - x <= _ON_LINE:
+                        if _all_faces(start, n, x, y):
+                            result[j, i] = np.nan
+                    else:
+                        result[j, i] = np.nan
+
+
+@inner
+def _cut(xa: float, ya: float, xb: float, yb: float, y: float, span: tuple[float, float]) -> tuple[float, float]:
+    """The span of a row widened by where edge a–b meets it."""
+    low, high = span
+    if (ya <= y and y <= yb) or (yb <= y and y <= ya):
+        if ya == yb:
+            low, high = min(low, xa, xb), max(high, xa, xb)
+        else:
+            x = xa + (y - ya) / (yb - ya) * (xb - xa)
+            low, high = min(low, x), max(high, x)
+    return low, high
+
+
+@kernel
+def scan_faces(
+    result: NDArray[np.float32],
+    lattice: tuple[float, float, float, float],
+    n: int,
+    frame: tuple[float, float, float],
+    vertices: NDArray[np.float64],
+    values: NDArray[np.float64],
+    corners: NDArray[np.int32],
+    start: NDArray[np.int64],
+) -> None:
+    """Values of the triangles at the pixels of a lattice.
+
+    result (ny, nx) holds the bilinear values; lattice = (x0, dx, y0, dy), positive steps: pixel (i, j) lies at
+    (x0 + i · dx, y0 + j · dy) in meshes. Pixels in meshes with triangles get their value, NaN where there is none.
+    """
+    x0, dx, y0, dy = lattice
+    ny, nx = result.shape
+    _clear(result, start, n, lattice)
+    sx, sy = frame[2] / dx, frame[2] / dy
+    tx, ty = _ON_FACE / dx, _ON_FACE / dy
+    ox, oy = x0 / dx, y0 / dy
+    for r in range(n):
+        j0, j1 = _pixels(r, r + 1, y0, dy, ny)
+        if j0 > j1:
+            continue
+        for m in range(r * n, r * n + n):
+            if start[m + 1] == start[m]:
+                continue
+            i0, i1 = _pixels(m - r * n, m - r * n + 1, x0, dx, nx)
+            if i0 > i1:
+                continue
+            for f in range(start[m], start[m + 1]):
+                a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
+                ya = (frame[1] - vertices[a, 1]) * sy - oy
+                yb = (frame[1] - vertices[b, 1]) * sy - oy
+                yc = (frame[1] - vertices[c, 1]) * sy - oy
+                upper, lower = min(ya, yb, yc), max(ya, yb, yc)
+                v0, v1 = max(np.int64(np.ceil(upper - ty)), j0), min(np.int64(np.floor(lower + ty)), j1)
+                if v0 > v1:
+                    continue
+                xa = (vertices[a, 0] - frame[0]) * sx - ox
+                xb = (vertices[b, 0] - frame[0]) * sx - ox
+                xc = (vertices[c, 0] - frame[0]) * sx - ox
+                if np.ceil(min(xa, xb, xc) - tx) > np.floor(max(xa, xb, xc) + tx):
+                    continue
+                area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
+                if area == 0.0:
+                    continue
+                za, zb, zc = values[a], values[b], values[c]
+                gx = ((zb - za) * (yc - ya) - (zc - za) * (yb - ya)) / area
+                gy = ((zc - za) * (xb - xa) - (zb - za) * (xc - xa)) / area
+                lowest, highest = min(za, zb, zc), max(za, zb, zc)
+                for j in range(v0, v1 + 1):
+                    y = min(max(np.float64(j), upper), lower)
+                    span = _cut(xa, ya, xb, yb, y, (np.inf, -np.inf))
+                    span = _cut(xb, yb, xc, yc, y, span)
+                    low, high = _cut(xc, yc, xa, ya, y, span)
+                    u0, u1 = max(np.int64(np.ceil(low - tx)), i0), min(np.int64(np.floor(high + tx)), i1)
+                    for i in range(u0, u1 + 1):
+                        z = min(max(za + gx * (i - xa) + gy * (j - ya), lowest), highest)
+                        old = result[j, i]
+                        if old != old:
+                            result[j, i] = z
+                        elif abs(old - z) > _WALL:
+                            px, py = x0 + i * dx, y0 + j * dy
+                            z, _ = _on_faces(vertices, values, corners, start, n, frame, px, py)
+                            if z == z:
+                                result[j, i] = z

@@ -1,0 +1,64 @@
+"""Positions of pixels in another CRS, interpolated where that is good enough."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.geometry.grid import MapGrid, Window
+
+__all__ = ["carried_positions"]
+
+#: Positions are computed at every so-manieth pixel and interpolated between.
+STEP = 32
+
+
+def carried_positions(
+    grid: MapGrid, window: Window, carry: Callable[[NDArray[np.float64]], NDArray[np.float64]], tolerance: float
+) -> NDArray[np.float64] | None:
+    """Pixel centres of a window, carried from the map to other coordinates.
+
+    Parameters
+    ----------
+    grid : MapGrid
+    window : Window
+        Pixels of the grid; at least one.
+    carry : callable
+        Takes X, Y of the map (..., 2) to the other coordinates, the same shape.
+    tolerance : float
+        Largest error of interpolated positions, in units of the other coordinates.
+
+    Returns
+    -------
+    ndarray, shape (height, width, 2), or None
+        Positions, bilinear between nodes 32 pixels apart; None if that would err by more than the tolerance.
+    """
+    at_u = np.append(np.arange(0, window.width - 1, STEP), window.width - 1)
+    at_v = np.append(np.arange(0, window.height - 1, STEP), window.height - 1)
+    nodes = np.stack(np.meshgrid(at_u + window.col, at_v + window.row), axis=-1).astype(float)
+    at_nodes = carry(grid.to_map(nodes))
+    middles = (nodes[1:, 1:] + nodes[:-1, :-1]) / 2
+    if middles.size:
+        strict = carry(grid.to_map(middles))
+        between = (at_nodes[1:, 1:] + at_nodes[1:, :-1] + at_nodes[:-1, 1:] + at_nodes[:-1, :-1]) / 4
+        if np.abs(strict - between).max() > tolerance:
+            return None
+    return _between_nodes(at_nodes, at_u, at_v)
+
+
+def _between_nodes(nodes: NDArray[np.float64], at_u: NDArray[np.int64], at_v: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Bilinear positions at every pixel between the nodes."""
+    u, v = np.arange(at_u[-1] + 1.0), np.arange(at_v[-1] + 1.0)
+    columns = np.empty((nodes.shape[0], len(u), 2))
+    full = np.empty((len(v), len(u), 2))
+    for k in range(2):
+        for i in range(nodes.shape[0]):
+            columns[i, :, k] = np.interp(u, at_u, nodes[i, :, k])
+    upper = np.clip(np.searchsorted(at_v, v, side="right") - 1, 0, max(len(at_v) - 2, 0))
+    lower = np.minimum(upper + 1, len(at_v) - 1)
+    span = np.maximum(at_v[lower] - at_v[upper], 1)
+    t = ((v - at_v[upper]) / span)[:, None, None]
+    full[:] = columns[upper] * (1 - t) + columns[lower] * t
+    return full
