@@ -16,7 +16,7 @@ __all__ = ["command"]
 @click.argument("file", type=click.Path(path_type=Path))
 @json_option
 def command(file: Path, as_json: bool) -> None:
-    """Show what FILE holds: a raster, a project, a plan or a run record."""
+    """Show what FILE holds: a raster, a terrain model, a project, a plan or a run record."""
     from photoplan.products.describe import describe
 
     facts = describe(file)

@@ -56,7 +56,7 @@ class Image(Entry):
 
 
 class Terrain(Entry):
-    """Where the ground is: a raster of heights, or one height everywhere."""
+    """Where the ground is: a raster of heights, a terrain model, or one height everywhere."""
 
     file: InputName | None = None
     height: Number | None = None
@@ -72,7 +72,7 @@ class Terrain(Entry):
     @model_validator(mode="after")
     def _one(self) -> Self:
         if (self.file is None) == (self.height is None):
-            raise ValueError("give either file (a raster of heights) or height (one height everywhere)")
+            raise ValueError("give either file (heights: a raster or a terrain model) or height (one everywhere)")
         return self
 
 

@@ -20,7 +20,6 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.io.block_cache import BlockCache
 from photoplan.io.terrain_model_blob import MOST_BYTES, check_unit, inflate, unit_of, unpack_line
 from photoplan.io.terrain_model_tables import (
     FORMAT,
@@ -31,6 +30,7 @@ from photoplan.io.terrain_model_tables import (
     ModelHeader,
     header_from_json,
 )
+from photoplan.io.unit_cache import UnitCache
 from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
 
 __all__ = ["ModelReader", "is_terrain_model", "unit_checksum"]
@@ -83,12 +83,12 @@ class ModelReader:
     """Meshes along a side that most units have."""
     finest: float = field(init=False)
     """Smallest grid width, metres."""
-    _cache: BlockCache = field(init=False, repr=False)
+    _cache: UnitCache[Unit] = field(init=False, repr=False)
     _own: _Connections = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "path", Path(self.path))
-        object.__setattr__(self, "_cache", BlockCache(self.cache_bytes))
+        object.__setattr__(self, "_cache", UnitCache(self.cache_bytes))
         object.__setattr__(self, "_own", _Connections(self.path))
         if not self.path.is_file():
             raise InputError(f"{self.path}: no such terrain model")
@@ -122,8 +122,7 @@ class ModelReader:
         layout = self.layout
         if not (0 <= column < layout.columns and 0 <= row < layout.rows) or np.isnan(self.ranges[row, column, 0]):
             return None
-        buffer = self._cache.get((column, row), partial(self._load, column, row))
-        return unit_of(buffer, layout, column, row)
+        return self._cache.get((column, row), partial(self._load, column, row))
 
     def units(self) -> Iterator[tuple[int, int]]:
         """Column and row of every unit that is not empty, row by row."""
@@ -186,8 +185,8 @@ class ModelReader:
         """Names of the layers that a GIS shows."""
         return [str(name) for (name,) in self._rows("SELECT table_name FROM gpkg_contents ORDER BY table_name")]
 
-    def _load(self, column: int, row: int) -> NDArray[np.uint8]:
-        """Bytes of a unit, checked."""
+    def _load(self, column: int, row: int) -> tuple[Unit, int]:
+        """A unit, checked, and its bytes."""
         where = f"{self.path}: unit column {column} row {row}"
         number = row * self.layout.columns + column
         query = f"SELECT size, low, high, checksum, CASE WHEN length(content) <= ? THEN content END FROM {UNITS} "
@@ -201,8 +200,9 @@ class ModelReader:
         ):
             raise InputError(f"{where}: damaged (its checksum differs); get a fresh copy of the file")
         buffer = inflate(packed, size, where)
-        check_unit(unit_of(buffer, self.layout, column, row), where)
-        return buffer
+        unit = unit_of(buffer, self.layout, column, row)
+        check_unit(unit, where)
+        return unit, buffer.nbytes
 
     def _read_ranges(self, layout: UnitLayout) -> tuple[NDArray[np.float64], Counter[int]]:
         missing = {HEADER, UNITS, LINES, "units"} - self._tables()

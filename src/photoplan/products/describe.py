@@ -1,4 +1,4 @@
-"""What a file holds, in words: rasters, projects, plans."""
+"""What a file holds, in words: rasters, terrain models, projects, plans."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from photoplan.geometry.crs import crs_label
 from photoplan.io.plan_file import read_plan_tables
 from photoplan.io.project import load_project
 from photoplan.io.raster_info import RasterInfo, read_info
+from photoplan.io.terrain_model_read import ModelReader, is_terrain_model
+from photoplan.products.describe_model import describe_model
 
 __all__ = ["describe"]
 
@@ -28,6 +30,8 @@ def describe(path: Path) -> dict[str, Any]:
     kind = path.suffix.lower()
     if kind == ".toml":
         return _project(path)
+    if is_terrain_model(path):
+        return describe_model(ModelReader(path))
     if kind == ".gpkg":
         return _plan(path)
     if kind == ".json":

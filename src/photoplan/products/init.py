@@ -31,6 +31,7 @@ from photoplan.io.orientation_table import OrientationTable, OrientedImage, Tabl
 from photoplan.io.project import parse_project, write_project
 from photoplan.io.project_model import Image, Project, Terrain
 from photoplan.io.raster_info import RasterInfo, read_info
+from photoplan.io.terrain_model_read import ModelReader, is_terrain_model
 from photoplan.products.init_match import camera_name, image_files, match_images, some
 
 __all__ = ["InitRequest", "InitResult", "init_project", "make_project"]
@@ -184,7 +185,24 @@ def _cameras(
     return used
 
 
-def _terrain(request: InitRequest) -> tuple[Terrain, RasterInfo | None]:
+@dataclass(frozen=True)
+class _TerrainFacts:
+    """What a terrain file states of its systems."""
+
+    path: Path
+    crs: str | None
+    vertical_crs: str | None
+
+
+def _terrain_facts(file: Path) -> _TerrainFacts:
+    if is_terrain_model(file):
+        header = ModelReader(file).header
+        return _TerrainFacts(file, header.crs, header.height_system)
+    info = read_info(file)
+    return _TerrainFacts(info.path, info.crs, info.vertical_crs)
+
+
+def _terrain(request: InitRequest) -> tuple[Terrain, _TerrainFacts | None]:
     """The terrain entry (height system still open) and the facts of its file."""
     text = request.terrain.strip()
     try:
@@ -193,7 +211,7 @@ def _terrain(request: InitRequest) -> tuple[Terrain, RasterInfo | None]:
         pass
     check_input_name(text)
     file = Path(text)
-    info = read_info(file)
+    info = _terrain_facts(file)
     if info.crs is None and request.terrain_crs is None:
         raise InputError(f"terrain {file}: states no CRS; say the one it is in: --terrain-crs EPSG:nnnn")
     stated = info.crs or request.terrain_crs
@@ -206,7 +224,7 @@ def _terrain(request: InitRequest) -> tuple[Terrain, RasterInfo | None]:
     return Terrain(file=_relative(file.absolute(), request.folder), crs=crs), replace(info, crs=stated)
 
 
-def _crs(request: InitRequest, table: OrientationTable, terrain: RasterInfo | None) -> tuple[str, str]:
+def _crs(request: InitRequest, table: OrientationTable, terrain: _TerrainFacts | None) -> tuple[str, str]:
     """The project's CRS and where it comes from."""
     if request.crs is not None:
         crs, source = request.crs, "as given"
@@ -225,7 +243,7 @@ def _horizontal(text: str) -> str:
     return str((crs.sub_crs_list[0] if crs.is_compound else crs).to_wkt())
 
 
-def _height_systems(request: InitRequest, table: OrientationTable, terrain: RasterInfo | None) -> tuple[str, str]:
+def _height_systems(request: InitRequest, table: OrientationTable, terrain: _TerrainFacts | None) -> tuple[str, str]:
     """Height systems of terrain and orientation: as declared, else as the files state."""
     stated_terrain = terrain.vertical_crs if terrain is not None else None
     stated = [

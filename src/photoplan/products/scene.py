@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from photoplan.cameras.base import Camera
 from photoplan.cameras.build import oriented_camera
 from photoplan.errors import InputError
-from photoplan.geometry.crs import CrsStep, crs_step, same_crs
+from photoplan.geometry.crs import CrsStep
 from photoplan.geometry.heights import HeightStep, declared_pair, height_step
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_from_angles
@@ -25,11 +25,10 @@ from photoplan.io.project import parse_project
 from photoplan.io.project_cameras import interior_of, lens_of
 from photoplan.io.project_model import Image, Project, Terrain
 from photoplan.io.raster import RasterReader
-from photoplan.io.terrain_reader import TerrainReader
+from photoplan.products.open_terrain import open_terrain
 from photoplan.products.reach import reach
 from photoplan.surfaces.base import Surface
 from photoplan.surfaces.level import LevelSurface
-from photoplan.surfaces.raster import RasterSurface
 from photoplan.surfaces.shifted import ShiftedSurface
 
 __all__ = ["Ground", "Scene", "SceneAddress", "ground_of", "input_files", "open_scene", "pose_of"]
@@ -65,7 +64,7 @@ class Ground:
     bounds: tuple[float, float, float, float] | None
     """Outer edges xmin, ymin, xmax, ymax; None: everywhere."""
     file: Path | None
-    """The height raster."""
+    """The height raster or terrain model."""
     operations: tuple[CrsStep | HeightStep, ...]
     """Coordinate operations on the way from the file, for the run record."""
     height_systems: tuple[str, str]
@@ -98,7 +97,7 @@ class Scene:
 
 
 def input_files(project: Project) -> list[Path]:
-    """All rasters that a project names; nothing that is written may replace one of them."""
+    """All files that a project names; nothing that is written may replace one of them."""
     files = [image.file for image in project.images]
     files += [] if project.terrain.file is None else [project.terrain.file]
     return [project.resolve(file) for file in files]
@@ -190,39 +189,11 @@ def _ground(address: _GroundAddress) -> Ground:
         systems = declared_pair(terrain.height_system, address.orientation_system)
         return _in_system(Ground(LevelSurface(terrain.height), None, None, (), systems, systems[1]), address)
     assert terrain.file is not None
-    reader = TerrainReader(resolve_input(Path(address.folder), terrain.file))
-    info = reader.info
-    crs = info.crs or terrain.crs
-    if crs is None:
-        raise InputError(f'{info.path}: no CRS; state it as crs = "EPSG:nnnn" in [terrain], it is not guessed')
-    if info.metres_per_unit not in (None, 1.0):
-        raise InputError(f"{info.path}: heights in {info.unit}; convert them to metres first")
-    systems = declared_pair(terrain.height_system or info.vertical_crs, address.orientation_system)
-    surface, bounds, steps = _placed(reader, crs, address.crs)
-    return _in_system(Ground(surface, bounds, info.path, steps, systems, systems[1]), address)
-
-
-def _placed(
-    reader: TerrainReader, grid_crs: str, crs: str
-) -> tuple[Surface, tuple[float, float, float, float], tuple[CrsStep, ...]]:
-    """A height raster as a surface in the project's CRS, and its outer edges there."""
-    info = reader.info
-    assert info.to_map is not None
-    x0, xx, xy, y0, yx, yy = info.to_map
-    if xy or yx or xx <= 0 or yy >= 0:
-        raise InputError(f"{info.path}: the grid is rotated or not north-up; bring it north-up with gdalwarp first")
-    columns, rows = info.size
-    edges = (x0 - xx / 2, y0 + yy * (rows - 0.5), x0 + xx * (columns - 0.5), y0 - yy / 2)
-    if same_crs(grid_crs, crs):
-        return RasterSurface(reader, (x0, y0), (xx, -yy)), edges, ()
-    back = crs_step(grid_crs, crs, edges)
-    t = np.linspace(0, 1, 17)
-    x, y = edges[0] + t * (edges[2] - edges[0]), edges[1] + t * (edges[3] - edges[1])
-    corners = back(np.stack(np.meshgrid(x, y), axis=-1)).reshape(-1, 2)
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-    step = crs_step(crs, grid_crs, bounds)
-    return RasterSurface(reader, (x0, y0), (xx, -yy), step), bounds, (step,)
+    path = resolve_input(Path(address.folder), terrain.file)
+    own = open_terrain(path, terrain.crs, 'as crs = "EPSG:nnnn" in [terrain]')
+    systems = declared_pair(terrain.height_system or own.height_system, address.orientation_system)
+    placed, steps = own.in_crs(address.crs)
+    return _in_system(Ground(placed.surface, placed.bounds, placed.path, steps, systems, systems[1]), address)
 
 
 def _in_system(ground: Ground, address: _GroundAddress) -> Ground:

@@ -1,0 +1,126 @@
+"""A terrain model in a project takes the place of a GeoTIFF: where it holds the same, products are the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from tools.command import edit
+from tools.small_block import CRS, DEM_STEP, Block
+from tools.small_model import write_units_of
+
+from photoplan.errors import HeightSystemError, InputError
+from photoplan.io.project import load_project
+from photoplan.io.terrain_model_read import ModelReader
+from photoplan.products.check import check_project
+from photoplan.products.execution import Run, execute
+from photoplan.products.orthophoto import plan_orthophotos
+from photoplan.products.scene import ground_of
+from photoplan.surfaces.units import Unit, UnitLayout
+
+MESHES = 9
+"""Seven by six units of nine meshes hold 64 × 55 posts of the block's 64 × 60."""
+
+
+def model_of(dem: Path, path: Path, crs: str = CRS, **header: object) -> ModelReader:
+    """The posts of a height raster as computing units, bit by bit."""
+    with rasterio.open(dem) as file:
+        heights = file.read(1)
+        x0, y0 = file.xy(0, 0)
+    rows, columns = ((n - 1) // MESHES for n in heights.shape)
+    layout = UnitLayout(x0, y0, MESHES * DEM_STEP, columns, rows)
+
+    def unit(column: int, row: int) -> Unit:
+        part = heights[row * MESHES :, column * MESHES :][: MESHES + 1, : MESHES + 1]
+        return Unit(*layout.corner(column, row), layout.side, part.copy(), np.full(part.shape, 0.1, np.float32))
+
+    return write_units_of(path, layout, unit, crs, **header)  # type: ignore[arg-type]
+
+
+def ortho(block: Block, folder: Path, workers: int = 2, executor: str = "threads") -> np.ndarray:
+    project = load_project(block.project)
+    # Inside the units: a raster goes on for half a mesh beyond its outer posts.
+    plan = plan_orthophotos(project, ["one"], resolution=1.0, tile=128, bounds=(500_180, 5_300_090, 500_420, 5_300_310))
+    (result,) = execute(plan, folder, Run(workers=workers, executor=executor, quicklook=False))
+    with rasterio.open(result.path) as file:
+        return file.read()
+
+
+@pytest.mark.parametrize("executor", ["threads", "processes"])
+def test_same_orthophoto_as_from_the_raster(pristine: Block, small: Block, tmp_path: Path, executor: str) -> None:
+    raster = ortho(pristine, tmp_path / "raster")
+    model_of(small.terrain, small.folder / "model.gpkg")
+    edit(small.project, "dem.tif", "model.gpkg")
+    model = ortho(small, tmp_path / "model", executor=executor)
+    assert raster.any()
+    assert np.array_equal(raster, model)
+
+
+def test_another_model_is_another_orthophoto(small: Block, tmp_path: Path) -> None:
+    """The surface is really taken from the model: raised by 20 m it gives other pixels."""
+    before = ortho(small, tmp_path / "before")
+    with rasterio.open(small.terrain, "r+") as file:
+        file.write(file.read() + np.float32(20))
+    model_of(small.terrain, small.folder / "model.gpkg")
+    edit(small.project, "dem.tif", "model.gpkg")
+    assert not np.array_equal(before, ortho(small, tmp_path / "after"))
+
+
+def test_the_run_record_names_the_model(small: Block, tmp_path: Path) -> None:
+    model_of(small.terrain, small.folder / "model.gpkg")
+    edit(small.project, "dem.tif", "model.gpkg")
+    ortho(small, tmp_path / "out")
+    record = next((tmp_path / "out").glob("*.run.json")).read_text()
+    assert "model.gpkg" in record
+
+
+def test_check_takes_a_model(small: Block) -> None:
+    reader = model_of(small.terrain, small.folder / "model.gpkg")
+    edit(small.project, "dem.tif", "model.gpkg")
+    report = check_project(load_project(small.project))
+    assert all(image.on_terrain > 0.9 for image in report.images)
+    assert ground_of(load_project(small.project)).bounds == reader.layout.bounds
+
+
+def test_a_model_in_another_crs(small: Block, tmp_path: Path) -> None:
+    """Terrain in ETRS89 under a project in WGS 84: the operation is recorded, heights stay."""
+    target = ground_of(load_project(small.project)).surface
+    model_of(small.terrain, small.folder / "model.gpkg", crs="EPSG:25833")
+    edit(small.project, "dem.tif", "model.gpkg")
+    ground = ground_of(load_project(small.project))
+    assert ground.file == (small.folder / "model.gpkg").resolve()
+    XY = np.array([[500_300.0, 5_300_200.0]])
+    assert [step.source for step in ground.operations] == ["EPSG:32633"]
+    assert ground.surface.heights(XY) == pytest.approx(target.heights(XY), abs=1e-3)
+
+
+class TestFault02HeightSystems:
+    def test_fault_02_not_declared(self, small: Block) -> None:
+        model_of(small.terrain, small.folder / "model.gpkg")
+        edit(small.project, "dem.tif", "model.gpkg")
+        text = small.project.read_text().replace('height_system = "same"', "")
+        small.project.write_text(text)
+        with pytest.raises(HeightSystemError, match="terrain not stated"):
+            ground_of(load_project(small.project))
+
+    def test_fault_02_the_models_own_counts(self, small: Block) -> None:
+        """A model that states its heights and an orientation in others are joined exactly, or refused by name."""
+        model_of(small.terrain, small.folder / "model.gpkg", height_system="EPSG:5773")
+        edit(small.project, "dem.tif", "model.gpkg")
+        edit(small.project, 'height_system = "same"\n', "")
+        edit(small.project, 'height_system = "same"', 'height_system = "ellipsoidal"')
+        try:
+            ground = ground_of(load_project(small.project))
+        except HeightSystemError as error:
+            assert "grid" in str(error)
+        else:
+            assert any("5773" in str(step) or "EGM96" in str(step) for step in ground.operations)
+
+
+def test_a_geopackage_that_is_no_model(small: Block) -> None:
+    edit(small.project, "dem.tif", "model.gpkg")
+    (small.folder / "model.gpkg").write_bytes(b"SQLite format 3\0" + bytes(4000))
+    with pytest.raises(InputError, match=r"model\.gpkg: no terrain model of photoplan"):
+        ground_of(load_project(small.project))
