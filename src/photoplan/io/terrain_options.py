@@ -1,0 +1,176 @@
+"""What files of measured terrain do not say of themselves: columns, codes, layers, CRS."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from photoplan.errors import InputError, UsageError
+from photoplan.io.plain_files import read_text
+from photoplan.io.toml_file import read_toml
+from photoplan.surfaces.measured import LINE_KINDS, POINT_KINDS
+
+__all__ = ["KINDS", "CodeClass", "CodeTable", "ReadOptions", "read_code_table"]
+
+KINDS: tuple[str, ...] = (*POINT_KINDS, *LINE_KINDS, "ignore")
+"""Classes that a code may mean."""
+#: Words that mean a class wherever a code or the name of a layer stands (in small letters, signs left out).
+WORDS = {
+    **{kind: kind for kind in KINDS},
+    **{f"{kind}s": kind for kind in KINDS},
+    **dict.fromkeys(("masspoint", "masspoints", "ground", "groundpoints"), "mass"),
+    **dict.fromkeys(("spotheight", "spotheights", "spotpoint", "spotpoints"), "spot"),
+    **dict.fromkeys(("hardbreakline", "hardbreaklines", "wall", "walls"), "breakline"),
+    **dict.fromkeys(("softbreakline", "softbreaklines", "contour", "contours"), "formline"),
+    **dict.fromkeys(("borderline", "borderlines", "boundary", "boundaries", "outer"), "border"),
+    **dict.fromkeys(("void", "voids"), "hole"),
+    **dict.fromkeys(("ignored", "skip"), "ignore"),
+}
+MAX_BYTES = 10_000_000
+OTHER = "*"
+
+
+@dataclass(frozen=True)
+class CodeClass:
+    """What a code means."""
+
+    kind: str
+    """One of `KINDS`."""
+    sigma: float | None = None
+    """Standard deviation of the heights, metres (the filter value); None: that of the class."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise InputError(f"class {self.kind!r}; allowed are {', '.join(KINDS)}")
+        if self.sigma is not None and not (np.isfinite(self.sigma) and self.sigma >= 0):
+            raise InputError(f"sigma {self.sigma}; a standard deviation in metres, zero or more, is needed")
+
+
+@dataclass(frozen=True)
+class CodeTable:
+    """Classes of codes, layer names and survey codes."""
+
+    classes: Mapping[str, CodeClass] = field(default_factory=dict)
+    """By code; ``*`` stands for all codes that are not named."""
+    file: Path | None = None
+    """Where it was read from."""
+
+    def find(self, code: str) -> CodeClass | None:
+        """Class of a code: by the table, else by ``*``, else where the code is itself the word for a class."""
+        found = self.classes.get(code) or self.classes.get(OTHER)
+        if found is None:
+            word = WORDS.get("".join(c for c in code.casefold() if c.isalnum()))
+            found = CodeClass(word) if word else None
+        return found
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """How files of measured terrain are to be read; checked at birth."""
+
+    columns: str | None = None
+    """Columns of text files. None: a header names them, or they are ``x,y,z,code,sigma,name,line,z_right`` as far as
+    there are columns. ``"x=East,y=North,z=Height,code=Art"``: roles and header names. ``"name,x,y,z,-,code"``: roles of
+    the columns in their order, ``-`` for one that is not used."""
+    delimiter: Literal[",", ";", "\t", " "] | None = None
+    """Of text files; None: the one that splits the first lines equally."""
+    decimal_comma: bool = False
+    """Whether numbers of text files are written 1,5 instead of 1.5."""
+    codes: CodeTable = field(default_factory=CodeTable)
+    """What the codes mean."""
+    attribute: str | None = None
+    """Attribute of vector files that holds the code; None: ``kind``, ``class`` or ``code``, else the layer's name."""
+    layers: tuple[str, ...] | None = None
+    """Layers of vector files (of DXF too) and surfaces of LandXML that are read; None: all."""
+    las_classes: tuple[int, ...] | None = None
+    """Classes of LAS points that are read; None: ground (2) in files with classified points, else all."""
+    tin_points: bool = False
+    """Take the vertices of a LandXML triangulation as mass points where the file holds nothing measured."""
+    nodata: float | None = None
+    """Height that means "none": such points are left out."""
+    crs: str | None = None
+    """CRS of all files, declared; files that state another one are refused."""
+
+    def __post_init__(self) -> None:
+        if self.delimiter not in (None, ",", ";", "\t", " "):
+            raise UsageError(f"delimiter {self.delimiter!r}; allowed are comma, semicolon, tab and space")
+        if self.delimiter == "," and self.decimal_comma:
+            raise UsageError("a comma cannot be both delimiter and decimal sign")
+        if self.las_classes is not None and not all(0 <= c <= 255 for c in self.las_classes):
+            raise UsageError(f"LAS classes {self.las_classes}; allowed are numbers from 0 to 255")
+
+
+def read_code_table(path: Path) -> CodeTable:
+    """Table of codes from a TOML or a CSV file.
+
+    TOML: ``121 = "breakline"`` or ``"D124" = { kind = "spot", sigma = 0.05 }``, at the top or under ``[codes]``.
+    CSV (comma, semicolon or tab): code, kind and, if wanted, sigma in metres; a header is allowed. ``*`` as a code
+    stands for all others.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read as such a table; the message names the line or the code.
+    """
+    if path.suffix.casefold() == ".toml":
+        content, _ = read_toml(path, MAX_BYTES)
+        entries = content.get("codes", content)
+        if not isinstance(entries, dict):
+            raise InputError(f'{path}: codes is not a table; write [codes] and below it: 121 = "breakline"')
+        classes = {str(code): _of_toml(value, f"{path}: code {code!r}") for code, value in entries.items()}
+    else:
+        classes = _of_csv(path)
+    if not classes:
+        raise InputError(f"{path}: holds no code; a line of it is, for example: 121,breakline,0.05")
+    return CodeTable(classes, path)
+
+
+def _of_toml(value: Any, where: str) -> CodeClass:
+    kind, sigma = (value, None) if isinstance(value, str) else (None, None)
+    if isinstance(value, dict) and set(value) <= {"kind", "sigma"}:
+        kind, sigma = value.get("kind"), value.get("sigma")
+    number = sigma is None or (isinstance(sigma, int | float) and not isinstance(sigma, bool))
+    if not isinstance(kind, str) or not number:
+        raise InputError(f'{where}: {value!r}; write "breakline", or {{ kind = "breakline", sigma = 0.05 }}')
+    return _class(kind, sigma, where)
+
+
+def _of_csv(path: Path) -> dict[str, CodeClass]:
+    classes: dict[str, CodeClass] = {}
+    lines = read_text(path, MAX_BYTES).split("\n")
+    delimiter = next((d for d in (";", "\t", ",") if any(d in line for line in lines)), ",")
+    try:
+        rows = list(csv.reader(lines, delimiter=delimiter, skipinitialspace=True))
+    except csv.Error as error:
+        raise InputError(f"{path}: cannot be split into columns ({error})") from None
+    for number, row in enumerate(rows, 1):
+        fields = [f.strip() for f in row]
+        if not any(fields) or fields[0].startswith("#"):
+            continue
+        where = f"{path}:{number}"
+        if len(fields) not in (2, 3):
+            raise InputError(f"{where}: {len(fields)} columns; code, kind and, if wanted, sigma are needed")
+        if not classes and fields[1].casefold() in ("kind", "class"):
+            continue
+        if fields[0] in classes:
+            raise InputError(f"{where}: code {fields[0]!r} is given twice; keep one of them")
+        text = fields[2].replace(",", ".") if len(fields) == 3 else ""
+        try:
+            sigma = float(text) if text else None
+        except ValueError:
+            raise InputError(f"{where}: sigma {text!r} is not a number; metres are needed") from None
+        classes[fields[0]] = _class(fields[1], sigma, where)
+    return classes
+
+
+def _class(kind: str, sigma: float | None, where: str) -> CodeClass:
+    word = WORDS.get("".join(c for c in kind.casefold() if c.isalnum()), kind)
+    try:
+        return CodeClass(word, sigma)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
