@@ -1,0 +1,226 @@
+"""Contour lines of triangles: which edges they cross, where, and in which order.
+
+Vertices carry an integer *rank*: the number of the highest level that they reach. Level k crosses an edge when it lies
+above one end's rank and not above the other's; a vertex exactly at a level therefore counts as above it, in every
+triangle alike, so that no line breaks, forks or is drawn twice. Each triangle holds at most one piece of each level.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.kernels.jit import inner, kernel
+
+__all__ = ["count_segments", "cross_edges", "fill_segments", "link_segments"]
+
+#: A crossing keeps away from the edge's ends by this difference of height, metres, at most by a quarter of all …
+APART = 5e-7
+#: … and where it may move, by this part of the edge.
+MARGIN = 0.02
+
+
+@inner
+def _corners(mesh: int, columns: int) -> tuple[Any, Any, Any, Any]:
+    """Posts NW, SW, SE, NE of a mesh: counter-clockwise on the map."""
+    north = mesh + mesh // columns
+    south = north + columns + 1
+    return north, south, south + 1, north + 1
+
+
+@kernel
+def count_segments(
+    ranks: NDArray[np.int64], columns: int, whole: NDArray[np.bool_], triangles: NDArray[np.int64]
+) -> int:
+    """Number of pieces that `fill_segments` will make of the same arguments."""
+    count = 0
+    posts = ranks.shape[0] - whole.shape[0]
+    for mesh in range(whole.shape[0]):
+        if not whole[mesh]:
+            continue
+        nw, sw, se, ne = _corners(mesh, columns)
+        low = min(min(ranks[nw], ranks[sw]), min(ranks[se], ranks[ne]))
+        high = max(max(ranks[nw], ranks[sw]), max(ranks[se], ranks[ne]))
+        if low == high:
+            continue
+        centre = ranks[posts + mesh]
+        for a, b in ((nw, sw), (sw, se), (se, ne), (ne, nw)):
+            count += max(max(ranks[a], ranks[b]), centre) - min(min(ranks[a], ranks[b]), centre)
+    for i in range(triangles.shape[0]):
+        a, b, c = ranks[triangles[i, 0]], ranks[triangles[i, 1]], ranks[triangles[i, 2]]
+        count += max(max(a, b), c) - min(min(a, b), c)
+    return count
+
+
+@inner
+def _cut(ranks: NDArray[np.int64], a: int, b: int, c: int, at: int, pieces: NDArray[np.int64]) -> int:
+    """Pieces of one counter-clockwise triangle, higher ground on their right; returns the next free row."""
+    ra, rb, rc = ranks[a], ranks[b], ranks[c]
+    for k in range(min(min(ra, rb), rc) + 1, max(max(ra, rb), rc) + 1):
+        # Turned so that the first vertex is alone on its side of the level.
+        u, v, w, alone = a, b, c, ra >= k
+        if (rb >= k) != (ra >= k) and (rb >= k) != (rc >= k):
+            u, v, w, alone = b, c, a, rb >= k
+        elif (rc >= k) != (ra >= k) and (rc >= k) != (rb >= k):
+            u, v, w, alone = c, a, b, rc >= k
+        first, last = (w, v) if alone else (v, w)
+        pieces[at, 0], pieces[at, 1] = min(u, first), max(u, first)
+        pieces[at, 2], pieces[at, 3] = min(u, last), max(u, last)
+        pieces[at, 4] = k
+        at += 1
+    return at
+
+
+@kernel
+def fill_segments(
+    ranks: NDArray[np.int64],
+    columns: int,
+    whole: NDArray[np.bool_],
+    triangles: NDArray[np.int64],
+    pieces: NDArray[np.int64],
+) -> int:
+    """Pieces of lines in all triangles.
+
+    Parameters
+    ----------
+    ranks
+        Of all vertices: posts row by row, then further vertices of triangles, and last the centre of every mesh.
+    columns
+        Meshes in a row.
+    whole
+        Meshes that are cut into four triangles round their centre; the others are empty or have `triangles`.
+    triangles
+        Vertex numbers, counter-clockwise, shape (n, 3).
+    pieces
+        Filled: lower and higher vertex of the edge where a piece begins, of the one where it ends, and the level.
+
+    Returns
+    -------
+    int
+        Rows filled.
+    """
+    at = 0
+    posts = ranks.shape[0] - whole.shape[0]
+    for mesh in range(whole.shape[0]):
+        if not whole[mesh]:
+            continue
+        nw, sw, se, ne = _corners(mesh, columns)
+        low = min(min(ranks[nw], ranks[sw]), min(ranks[se], ranks[ne]))
+        high = max(max(ranks[nw], ranks[sw]), max(ranks[se], ranks[ne]))
+        if low == high:
+            continue
+        centre = posts + mesh
+        for a, b in ((nw, sw), (sw, se), (se, ne), (ne, nw)):
+            at = _cut(ranks, a, b, centre, at, pieces)
+    for i in range(triangles.shape[0]):
+        at = _cut(ranks, triangles[i, 0], triangles[i, 1], triangles[i, 2], at, pieces)
+    return at
+
+
+@inner
+def _root(z0: float, z1: float, bend: float, level: float) -> float:
+    """Where z0 + (z1 − z0) s − bend s (1 − s) reaches a level between its ends: the only such s from 0 to 1."""
+    b, c = z1 - z0 - bend, z0 - level
+    q = -0.5 * (b + (1.0 if b >= 0.0 else -1.0) * np.sqrt(max(b * b - 4.0 * bend * c, 0.0)))
+    first = c / q if q != 0.0 else 0.5
+    second = q / bend if bend != 0.0 else first
+    return first if abs(first - 0.5) <= abs(second - 0.5) else second
+
+
+@kernel
+def cross_edges(
+    xyz: NDArray[np.float64],
+    bends: NDArray[np.float64],
+    edges: NDArray[np.int64],
+    levels: NDArray[np.float64],
+    band: float,
+    fixed: NDArray[np.bool_],
+    places: NDArray[np.float64],
+) -> None:
+    """Where levels cross edges, and how far the crossings may move.
+
+    Parameters
+    ----------
+    xyz
+        Vertices, shape (n, 3).
+    bends
+        Of each edge: how far its middle lies below the straight line, times four; 0 but from posts to centres.
+    edges
+        Vertex numbers, shape (m, 2).
+    levels
+        Height of the level, shape (m,).
+    band
+        Heights may change by this when a crossing moves, metres; less than half of the interval.
+    fixed
+        Crossings that must not move, shape (m,).
+    places
+        Filled, shape (m, 6): X, Y of the crossing; of the one end of its range; of the other end.
+    """
+    for i in range(edges.shape[0]):
+        a, b, level, bend = edges[i, 0], edges[i, 1], levels[i], bends[i]
+        za, zb = xyz[a, 2], xyz[b, 2]
+        apart = min(APART, 0.25 * abs(zb - za))
+        inside = min(max(level, min(za, zb) + apart), max(za, zb) - apart)
+        at = min(max(_root(za, zb, bend, inside), 0.0), 1.0)
+        low, high = at, at
+        if band > 0.0 and not fixed[i]:
+            below, above = level - band, level + band
+            if za <= zb:
+                low = _root(za, zb, bend, below) if below > za else 0.0
+                high = _root(za, zb, bend, above) if above < zb else 1.0
+            else:
+                low = _root(za, zb, bend, above) if above < za else 0.0
+                high = _root(za, zb, bend, below) if below > zb else 1.0
+            low = min(max(low, min(MARGIN, 0.5 * at)), at)
+            high = max(min(high, 1.0 - min(MARGIN, 0.5 * (1.0 - at))), at)
+        for k in range(2):
+            step = xyz[b, k] - xyz[a, k]
+            places[i, k] = xyz[a, k] + at * step
+            places[i, 2 + k] = xyz[a, k] + low * step
+            places[i, 4 + k] = xyz[a, k] + high * step
+
+
+@kernel
+def link_segments(follower: NDArray[np.int64], order: NDArray[np.int64], ends: NDArray[np.int64]) -> int:
+    """Pieces put one behind the other.
+
+    Parameters
+    ----------
+    follower
+        The piece that begins where a piece ends; -1: none. Changed where two pieces have one follower.
+    order
+        Filled with the pieces, chain by chain.
+    ends
+        Filled, shape (pieces, 2): where a chain stops in `order`, and 1 if it is closed.
+
+    Returns
+    -------
+    int
+        Number of chains: those with two ends first, then the closed ones.
+    """
+    n = follower.shape[0]
+    leader = np.full(n, -1, np.int64)
+    for i in range(n):
+        j = follower[i]
+        if j >= 0:
+            if leader[j] < 0:
+                leader[j] = i
+            else:
+                follower[i] = -1
+    used = np.zeros(n, np.bool_)
+    at, chains = 0, 0
+    for closed in range(2):
+        for i in range(n):
+            if used[i] or (closed == 0 and leader[i] >= 0):
+                continue
+            j = i
+            while j >= 0 and not used[j]:
+                used[j] = True
+                order[at] = j
+                at += 1
+                j = follower[j]
+            ends[chains, 0], ends[chains, 1] = at, closed
+            chains += 1
+    return chains
