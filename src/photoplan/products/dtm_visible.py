@@ -1,0 +1,307 @@
+"""Maps of what can be seen from points of a terrain model."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError, ResourceError, UsageError
+from photoplan.geometry.crs import same_crs, split_compound
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.geometry.local import earth_radius
+from photoplan.io.grid_writer import GridOptions, write_grid
+from photoplan.io.polygons import read_features
+from photoplan.io.product import check_output
+from photoplan.io.xy_table import read_xy_table
+from photoplan.products.open_terrain import OpenTerrain, open_terrain
+from photoplan.targets.map import MapTarget
+from photoplan.terrain.visibility import Observer, SightSettings, horizon, needed_heights
+
+__all__ = ["VisibleReport", "VisibleRequest", "VisibleRow", "dtm_visible", "own_grid", "read_grid"]
+
+TILE = 512
+#: Bytes of one post while one observer is looked at: heights, those relative to the eye, pyramid, result.
+POST_BYTES = 18
+ROLES = {
+    "x": ("x", "e", "east", "easting"),
+    "y": ("y", "n", "north", "northing"),
+    "h": ("h", "height", "eye"),
+    "name": ("name", "id", "point"),
+}
+
+
+@dataclass(frozen=True)
+class VisibleRequest:
+    """What is asked."""
+
+    model: Path
+    output: Path
+    points: tuple[tuple[float, float], ...] = ()
+    """X, Y of observers."""
+    file: Path | None = None
+    """More of them: a table with columns x, y and optionally name, h (eye above ground), or a vector file."""
+    height_observer: float = 1.7
+    """Eye above ground, metres."""
+    height_target: float = 0.0
+    radius: float = math.inf
+    refraction: float = 0.13
+    curvature: bool = True
+    minimum_height: bool = False
+    """Write the height above ground from which a place is seen, instead of whether it is."""
+    resolution: float | None = None
+    """Pixel of the map, metres; None: the model's mesh width."""
+    memory: int = 2 << 30
+    """Bytes that the grids may take."""
+    workers: int | None = None
+    crs: str | None = None
+    overwrite: bool = False
+
+
+@dataclass(frozen=True)
+class VisibleRow:
+    """Figures of one observer."""
+
+    name: str
+    X: float
+    Y: float
+    eye: float
+    """Height of the eye, metres."""
+    visible: float
+    """Area that is seen, m²."""
+    looked_at: float
+    """Area with heights inside the radius, m²."""
+    missing: float
+    """Area inside the radius and the map without heights, m²: it blocks nothing, and nothing is said about it."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        return {
+            "observer": self.name,
+            "x": self.X,
+            "y": self.Y,
+            "eye_height": self.eye,
+            "visible_area": self.visible,
+            "area": self.looked_at,
+            "area_without_model": self.missing,
+        }
+
+
+@dataclass(frozen=True)
+class VisibleReport:
+    """What came out."""
+
+    path: Path
+    bands: tuple[str, ...]
+    resolution: float
+    earth_radius: float
+    horizon: float
+    """Distance of the horizon of a smooth earth for the first observer, metres."""
+    rows: tuple[VisibleRow, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`; an infinite horizon (flat earth) is null."""
+        return {
+            "path": str(self.path),
+            "bands": list(self.bands),
+            "resolution": self.resolution,
+            "earth_radius": self.earth_radius,
+            "horizon": self.horizon if math.isfinite(self.horizon) else None,
+            "observers": [row.to_dict() for row in self.rows],
+        }
+
+
+def dtm_visible(request: VisibleRequest, progress: Callable[[int, int], None] | None = None) -> VisibleReport:
+    """Compute and write a visibility map.
+
+    Raises
+    ------
+    UsageError
+        The output exists or is an input, or a number makes no sense.
+    InputError
+        The model or the observers cannot be used.
+    ResourceError
+        The grid does not fit the memory.
+    """
+    inputs = [request.model, *([request.file] if request.file else [])]
+    check_output(request.output, inputs, overwrite=request.overwrite)
+    terrain = open_terrain(request.model, request.crs)
+    places = _places(request, terrain)
+    radius = earth_radius(split_compound(terrain.crs)[0], (places[0][1], places[0][2]))
+    sight = SightSettings(request.height_target, request.radius, request.curvature, request.refraction, radius)
+    grid = _grid(request, terrain, places)
+    _check_memory(grid, len(places), request)
+    heights = read_grid(terrain, grid)
+    bands, rows = _look(request, terrain, grid, heights, places, sight, progress)
+    names = [row.name for row in rows]
+    if len(rows) > 1:
+        names.insert(0, "least of all" if request.minimum_height else "count")
+    options = GridOptions(
+        tile=TILE,
+        workers=request.workers,
+        overwrite=request.overwrite,
+        inputs=inputs,
+        resampling="average" if request.minimum_height else "nearest",
+    )
+
+    def tile(window: Window) -> NDArray[Any]:
+        right, bottom = window.stop
+        return bands[:, window.row : bottom, window.col : right]
+
+    write_grid(request.output, grid, bands.dtype, len(bands), _nodata(request), tile, options)
+    far = horizon(rows[0].eye - float(terrain.surface.heights(np.array(places[0][1:3]))), sight)
+    return VisibleReport(request.output, tuple(names), grid.resolution, radius, far, tuple(rows))
+
+
+def _nodata(request: VisibleRequest) -> Any:
+    return "auto" if request.minimum_height else 255
+
+
+Place = tuple[str, float, float, float]
+"""Name, X, Y and height of the eye above ground."""
+
+
+def _places(request: VisibleRequest, terrain: OpenTerrain) -> list[Place]:
+    places = [(str(i + 1), x, y, request.height_observer) for i, (x, y) in enumerate(request.points)]
+    if request.file is not None:
+        places += _from_file(request.file, request.height_observer, terrain)
+    if not places:
+        raise UsageError("no observer; give --from X Y or --observers FILE")
+    if len(places) > 254:
+        raise UsageError(f"{len(places)} observers; at most 254 are counted in one map")
+    xmin, ymin, xmax, ymax = terrain.bounds
+    for name, x, y, height in places:
+        if not (math.isfinite(height) and height >= 0):
+            raise UsageError(f"observer {name}: eye {height} m above ground; zero or more metres are needed")
+        if not (xmin <= x <= xmax and ymin <= y <= ymax):
+            raise InputError(
+                f"observer {name} at {x:.10g} {y:.10g} is outside {terrain.path}, which covers {xmin:.10g} {ymin:.10g} "
+                f"{xmax:.10g} {ymax:.10g}"
+            )
+    return places
+
+
+def _from_file(path: Path, height: float, terrain: OpenTerrain) -> list[Place]:
+    if path.suffix.lower() in (".csv", ".txt", ".tsv", ".xyz", ".dat"):
+        table = read_xy_table(path, ROLES)
+        eyes, names = table.column("h"), table.texts("name")
+        own = [height if eyes is None or math.isnan(eyes[i]) else float(eyes[i]) for i in range(len(table.rows))]
+        return [
+            (names[i] if names else f"line {table.lines[i]}", float(x), float(y), own[i])
+            for i, (x, y) in enumerate(table.xy)
+        ]
+    read = read_features(path, "Point")
+    if read.crs is not None and not same_crs(read.crs, terrain.crs):
+        raise InputError(f"{path}: points in {read.crs}, the model is in {terrain.crs}; reproject them")
+    single = [item for item in read.items if item.geometry.geom_type == "Point"]
+    if len(single) < len(read.items):
+        raise InputError(f"{path}: holds multipoints; split them into points")
+    return [(item.name, item.geometry.x, item.geometry.y, height) for item in single]
+
+
+def _grid(request: VisibleRequest, terrain: OpenTerrain, places: Sequence[Place]) -> MapGrid:
+    """The part of the model that any observer looks at."""
+    xy = np.array([place[1:3] for place in places])
+    low = np.maximum(xy.min(axis=0) - request.radius, terrain.bounds[:2])
+    high = np.minimum(xy.max(axis=0) + request.radius, terrain.bounds[2:])
+    if request.resolution is not None:
+        bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+        return MapGrid.covering(bounds, request.resolution, terrain.crs)
+    return own_grid(terrain, (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
+
+
+def own_grid(terrain: OpenTerrain, low: tuple[float, float], high: tuple[float, float]) -> MapGrid:
+    """The grid of a model's own pixels between two corners: of a raster, the middles of the pixels are its posts."""
+    mesh, left, top = terrain.resolution, terrain.bounds[0], terrain.bounds[3]
+    col0, row0 = math.floor((low[0] - left) / mesh + 1e-6), math.floor((top - high[1]) / mesh + 1e-6)
+    col1, row1 = math.ceil((high[0] - left) / mesh - 1e-6), math.ceil((top - low[1]) / mesh - 1e-6)
+    return MapGrid(left + col0 * mesh, top - row0 * mesh, mesh, max(1, col1 - col0), max(1, row1 - row0), terrain.crs)
+
+
+def _check_memory(grid: MapGrid, count: int, request: VisibleRequest) -> None:
+    pixel = 4 if request.minimum_height else 1
+    need = grid.width * grid.height * (POST_BYTES + pixel * (count + (count > 1)))
+    if need > request.memory:
+        raise ResourceError(
+            f"{grid.width} × {grid.height} posts and {count} observers take {need / 2**30:.1f} GiB, allowed are "
+            f"{request.memory / 2**30:.1f}; give a --radius, a coarser --resolution, fewer observers or more --memory"
+        )
+
+
+def read_grid(terrain: OpenTerrain, grid: MapGrid) -> NDArray[np.float32]:
+    """Heights at all pixel centres of a grid, read by tiles; NaN = no surface."""
+    heights = np.empty((grid.height, grid.width), np.float32)
+    target = MapTarget(grid)
+    for window in grid.window.tiles(TILE):
+        right, bottom = window.stop
+        heights[window.row : bottom, window.col : right] = terrain.surface.relief(target, window)
+    return heights
+
+
+def _look(
+    request: VisibleRequest,
+    terrain: OpenTerrain,
+    grid: MapGrid,
+    heights: NDArray[np.float32],
+    places: Sequence[Place],
+    sight: SightSettings,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[NDArray[Any], list[VisibleRow]]:
+    """Bands of the map (sum or least first if there are several observers), and figures."""
+    several = len(places) > 1
+    kind = np.float32 if request.minimum_height else np.uint8
+    bands = np.zeros((len(places) + several, *heights.shape), kind)
+    rows = []
+    for i, (name, X, Y, above) in enumerate(places):
+        ground = float(terrain.surface.heights(np.array([X, Y])))
+        if not math.isfinite(ground):
+            raise InputError(f"observer {name} at {X:.10g} {Y:.10g}: {request.model} has no height there")
+        column, row = grid.to_pixel((X, Y))
+        observer = Observer(float(column), float(row), ground + above, name)
+        need = needed_heights(
+            heights, grid.resolution, observer, sight,
+            only_whether=not request.minimum_height, workers=request.workers or os.cpu_count() or 1,
+        )  # fmt: skip
+        known = np.isfinite(need) | np.isposinf(need)
+        seen = need <= request.height_target
+        bands[i + several] = need if request.minimum_height else np.where(known, seen, 255)
+        rows.append(_row(request, grid, heights, observer, known, seen, (X, Y)))
+        if progress is not None:
+            progress(1, heights.size)
+    if several:
+        each = bands[1:]
+        if request.minimum_height:
+            np.fmin.reduce(each, axis=0, out=bands[0])
+        else:
+            nobody = (each == 255).all(axis=0)
+            # Beyond the radius of one observer, but not of another: not seen by the one.
+            each[(each == 255) & ~nobody] = 0
+            bands[0] = np.where(nobody, 255, each.sum(axis=0))
+    return bands, rows
+
+
+def _row(
+    request: VisibleRequest,
+    grid: MapGrid,
+    heights: NDArray[np.float32],
+    observer: Observer,
+    known: NDArray[np.bool_],
+    seen: NDArray[np.bool_],
+    XY: tuple[float, float],
+) -> VisibleRow:
+    pixel = grid.resolution**2
+    across = np.square(np.arange(grid.width) - observer.column)
+    down = np.square(np.arange(grid.height) - observer.row)
+    holes = sum(
+        int((np.isnan(heights[j]) & (across + down[j] <= (request.radius / grid.resolution) ** 2)).sum())
+        for j in range(grid.height)
+    )
+    return VisibleRow(
+        observer.name, *XY, observer.eye, float(seen.sum()) * pixel, float(known.sum()) * pixel, holes * pixel
+    )

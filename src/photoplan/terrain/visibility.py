@@ -1,0 +1,137 @@
+"""What can be seen from a point over a grid of heights, with earth curvature and refraction."""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError, UsageError
+from photoplan.kernels.visibility import height_pyramid, sight_rows
+
+__all__ = ["Observer", "SightSettings", "curvature_drop", "horizon", "needed_heights"]
+
+#: Rows that one task of a thread computes.
+ROWS = 32
+
+
+@dataclass(frozen=True)
+class Observer:
+    """Where somebody looks from."""
+
+    column: float
+    """Column of the grid (0 = middle of the first pixel); need not be whole."""
+    row: float
+    eye: float
+    """Height of the eye in the height system of the grid, metres."""
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class SightSettings:
+    """How lines of sight run."""
+
+    target_height: float = 0.0
+    """Height of the targets above ground, metres."""
+    radius: float = math.inf
+    """Distance beyond which nothing is looked at, metres."""
+    curvature: bool = True
+    """Whether the earth is round."""
+    refraction: float = 0.13
+    """Coefficient of refraction k = earth radius / radius of the line of sight (Ecker 1991, §5.7.6)."""
+    earth_radius: float = 6_380_000.0
+    """Metres."""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.target_height) and self.target_height >= 0):
+            raise UsageError(f"target height {self.target_height} m; zero or a positive number of metres is needed")
+        if not self.radius > 0:
+            raise UsageError(f"radius {self.radius} m; a positive number of metres is needed")
+        if not -1 <= self.refraction < 1:
+            raise UsageError(f"refraction coefficient {self.refraction}; from -1 to below 1, usual is 0.13")
+        if not self.earth_radius > 0:
+            raise UsageError(f"earth radius {self.earth_radius} m; a positive number of metres is needed")
+
+    @property
+    def bend(self) -> float:
+        """Drop of the ground below the tangent line of sight per squared distance, 1/m."""
+        return (1.0 - self.refraction) / (2.0 * self.earth_radius) if self.curvature else 0.0
+
+
+def curvature_drop(distance: NDArray[np.float64] | float, settings: SightSettings) -> NDArray[np.float64]:
+    """By how much ground at a horizontal distance seems to be lower, metres: s² (1 − k) / 2R.
+
+    Earth curvature lowers it by s² / 2R (Ecker 1991, eq. 5.6), refraction raises it by k s² / 2R (eq. 5.7).
+    """
+    return np.asarray(np.square(distance) * settings.bend, float)
+
+
+def horizon(eye_height: float, settings: SightSettings) -> float:
+    """Distance of the horizon over a smooth earth, metres; infinite without curvature."""
+    return math.sqrt(eye_height / settings.bend) if settings.bend > 0 else math.inf
+
+
+def needed_heights(
+    heights: NDArray[np.float32],
+    mesh: float,
+    observer: Observer,
+    settings: SightSettings,
+    *,
+    only_whether: bool,
+    workers: int = 1,
+) -> NDArray[np.float32]:
+    """Height above ground from which every post of a grid can be seen.
+
+    Every line of sight is followed from the post to the eye and compared with bilinear terrain at all grid lines that
+    it crosses; blocks of meshes that lie below it are skipped by a pyramid of their maxima, which changes no result.
+    See `kernels.visibility` for what remains as error.
+
+    Parameters
+    ----------
+    heights : ndarray, shape (rows, cols), float32
+        NaN = no height; such places block nothing.
+    mesh : float
+        Distance of the posts, metres.
+    observer : Observer
+    settings : SightSettings
+    only_whether : bool
+        Ask only whether targets of the given height are seen: where they are not, the result is infinite. Several
+        times faster.
+    workers : int
+        Threads.
+
+    Returns
+    -------
+    ndarray, shape (rows, cols), float32
+        Metres, at least the target height; NaN where there is no height, and beyond the radius.
+
+    Raises
+    ------
+    InputError
+        The grid is too small, or the observer does not stand on it.
+    """
+    rows, columns = heights.shape
+    if rows < 2 or columns < 2:
+        raise InputError(f"a grid of {columns} × {rows} posts; lines of sight need at least two each way")
+    if not (-0.5 <= observer.column <= columns - 0.5 and -0.5 <= observer.row <= rows - 0.5):
+        raise InputError(f"observer {observer.name or ''} stands outside the terrain")
+    relative = np.empty(heights.shape, np.float32)
+    across = np.square(np.arange(columns) - observer.column)
+    for row in range(rows):
+        distance2 = (across + (row - observer.row) ** 2) * mesh**2
+        relative[row] = heights[row].astype(float) - observer.eye - distance2 * settings.bend
+    pyramid = height_pyramid(relative)
+    out = np.empty(heights.shape, np.float32)
+    eye = (float(observer.column), float(observer.row), settings.radius / mesh)
+
+    def part(first: int) -> None:
+        rows_here = (first, min(first + ROWS, rows))
+        sight_rows(relative, pyramid, eye, rows_here, float(settings.target_height), only_whether, out)
+
+    with ThreadPoolExecutor(workers, "photoplan") as pool:
+        # A list, so that an error of a thread is raised here.
+        list(pool.map(part, range(0, rows, ROWS)))
+    return out
