@@ -83,7 +83,7 @@ def unit_at(column: int, row: int, layout: UnitLayout = LAYOUT) -> Unit | None:
 
 def figures_of(unit: Unit | None, column: int, row: int) -> UnitFigures:
     """Invented figures, each unit its own."""
-    if unit is None:
+    if unit is None or np.isnan(unit.heights).all():
         return empty_figures(column, row)
     heights = unit.heights + unit.datum
     low, high = float(np.nanmin(heights)), float(np.nanmax(heights))

@@ -14,6 +14,7 @@ import pyogrio.raw
 import rasterio
 import shapely
 from numpy.typing import NDArray
+from rasterio.errors import RasterioError
 from rasterio.windows import Window as GdalWindow
 
 from photoplan.geometry.grid import Window
@@ -147,7 +148,7 @@ def write_heights(
     crs
         CRS of the layer.
     progress
-        Called with the number of tiles written.
+        Called with 1 for each strip of tiles.
     """
     width, height = layout.columns * meshes + 1, layout.rows * meshes + 1
     step = layout.side / meshes
@@ -165,18 +166,26 @@ def write_heights(
         "RASTER_DESCRIPTION": "heights of the posts, metres",
         "TILE_FORMAT": "TIFF",
     }
-    strips = Window(0, 0, -(-width // _STRIP), -(-height // _TILE))
-    with gdal_settings(), rasterio.open(path, "w", **profile) as file:
-        for strip in strips.tiles(1):
-            area = Window(strip.col * _STRIP, strip.row * _TILE, _STRIP, _TILE) & Window(0, 0, width, height)
-            posts = base_posts(layout, meshes, unit, area)
-            if posts is not None:
-                rounded = np.round(posts / np.float32(HEIGHTS_STEP)) * np.float32(HEIGHTS_STEP)
-                stored = np.where(np.isnan(rounded), np.float32(HEIGHTS_NODATA), rounded)
-                file.write(stored, 1, window=GdalWindow(area.col, area.row, area.width, area.height))
-            if progress is not None:
-                progress(1)
+    try:
+        with gdal_settings(), rasterio.open(path, "w", **profile) as file:
+            for area in _strips(width, height):
+                posts = base_posts(layout, meshes, unit, area)
+                if posts is not None:
+                    rounded = np.round(posts / np.float32(HEIGHTS_STEP)) * np.float32(HEIGHTS_STEP)
+                    stored = np.where(np.isnan(rounded), np.float32(HEIGHTS_NODATA), rounded)
+                    file.write(stored, 1, window=GdalWindow(area.col, area.row, area.width, area.height))
+                if progress is not None:
+                    progress(1)
+    except TypeError:
+        # rasterio stumbles over its own message where GDAL cannot write the place of a raster.
+        raise RasterioError("GDAL could not place the raster of heights") from None
     _finish_heights(path)
+
+
+def _strips(width: int, height: int) -> Iterator[Window]:
+    """The raster in parts of one row of tiles, so that none is written twice."""
+    for strip in Window(0, 0, -(-width // _STRIP), -(-height // _TILE)).tiles(1):
+        yield Window(strip.col * _STRIP, strip.row * _TILE, _STRIP, _TILE) & Window(0, 0, width, height)
 
 
 def _finish_heights(path: Path) -> None:

@@ -36,6 +36,8 @@ from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
 __all__ = ["ModelReader", "is_terrain_model", "unit_checksum"]
 
 _CHECKED = struct.Struct("<QQdd")
+_DAMAGED = (sqlite3.Error, UnicodeDecodeError)
+"""What SQLite raises for a damaged file; its message may quote bytes that are no text."""
 _HIGHEST = 1e6
 """No height of any body is beyond this, metres."""
 
@@ -53,7 +55,7 @@ def is_terrain_model(path: Path) -> bool:
                 return False
         with closing(_connect(path)) as db:
             return HEADER in _tables(db)
-    except (OSError, sqlite3.Error):
+    except (OSError, *_DAMAGED):
         return False
 
 
@@ -89,12 +91,12 @@ class ModelReader:
     def __post_init__(self) -> None:
         object.__setattr__(self, "path", Path(self.path))
         object.__setattr__(self, "_cache", UnitCache(self.cache_bytes))
-        object.__setattr__(self, "_own", _Connections(self.path))
+        object.__setattr__(self, "_own", _Connections(self.path, []))
         if not self.path.is_file():
             raise InputError(f"{self.path}: no such terrain model")
         try:
             text = _header_text(self._own.get())
-        except sqlite3.Error as error:
+        except _DAMAGED as error:
             raise self._no_model(str(error)) from error
         header = header_from_json(text, self.path)
         object.__setattr__(self, "header", header)
@@ -223,13 +225,13 @@ class ModelReader:
     def _tables(self) -> set[str]:
         try:
             return _tables(self._own.get())
-        except sqlite3.Error as error:
+        except _DAMAGED as error:
             raise self._no_model(str(error)) from error
 
     def _rows(self, query: str, *values: Any, limit: int = 50_000_000) -> list[tuple[Any, ...]]:
         try:
             return self._own.get().execute(query, values).fetchmany(limit)
-        except (sqlite3.Error, OverflowError) as error:
+        except (*_DAMAGED, OverflowError) as error:
             raise InputError(f"{self.path}: damaged ({error}); get a fresh copy of the file") from error
 
     def _no_model(self, reason: str) -> InputError:
@@ -240,11 +242,14 @@ class ModelReader:
 
 
 class _Connections(threading.local):
-    """One connection per thread, and per process where a process was forked; a connection must not be shared."""
+    """One connection per thread, and per process where a process was forked; a connection must not be shared.
 
-    def __init__(self, path: Path, identity: list[str] | None = None) -> None:
+    `identity` is one list for all threads: the identity of the model that was opened first, when it is known.
+    """
+
+    def __init__(self, path: Path, identity: list[str]) -> None:
         self.path = path
-        self.identity = [] if identity is None else identity
+        self.identity = identity
         self.process = -1
         self.db: sqlite3.Connection | None = None
 
@@ -274,6 +279,7 @@ def _connect(path: Path) -> sqlite3.Connection:
     waiting = path.with_name(path.name + "-wal")
     quiet = "" if waiting.exists() and waiting.stat().st_size else "&immutable=1"
     db = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro{quiet}", uri=True, check_same_thread=False)
+    db.text_factory = lambda raw: raw.decode(errors="replace")
     # What a stranger's file may do to us is bounded: no functions in its schema, no value larger than a unit.
     db.execute("PRAGMA trusted_schema = OFF")
     db.execute("PRAGMA cell_size_check = ON")
