@@ -89,7 +89,7 @@ def _in_mesh(
 
 
 @inner
-def _candidates(x: float, n: int) -> tuple[int, int]:
+def _candidates(x: float, n: int) -> tuple[Any, Any]:
     """First and last mesh that touches x (of n meshes)."""
     first = min(max(np.int64(np.floor(x - _ON_LINE)), 0), n - 1)
     last = min(max(np.int64(np.floor(x + _ON_LINE)), 0), n - 1)

@@ -152,8 +152,8 @@ class HybridSurface:
                 result[:] = self._at(XY.reshape(-1, 2), layer).reshape(result.shape)
             return results
         layout = self.source.layout
-        X = grid.left + (np.arange(window.col, window.stop[0]) + 0.5) * grid.resolution
-        Y = grid.top - (np.arange(window.row, window.stop[1]) + 0.5) * grid.resolution
+        X = grid.left + (np.arange(window.col, window.stop[0], dtype=np.float64) + 0.5) * grid.resolution
+        Y = grid.top - (np.arange(window.row, window.stop[1], dtype=np.float64) + 0.5) * grid.resolution
         x, y = (X - layout.left) / layout.side, (layout.top - Y) / layout.side
         for row, rows in _runs(y, layout.rows):
             for column, columns in _runs(x, layout.columns):
