@@ -1,0 +1,104 @@
+"""`photoplan dtm shade`: hillshade of a terrain model."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from photoplan.cli.options import json_option
+
+if TYPE_CHECKING:
+    from photoplan.products.dtm_shading import ShadingFacts
+
+__all__ = ["command", "light_options", "picture_options", "say", "take_light", "take_request"]
+
+
+def picture_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Model, grid, output and run of every picture of a terrain."""
+    path = click.Path(path_type=Path)
+    positive = click.FloatRange(0, min_open=True)
+    options = [
+        click.argument("model", type=path),
+        click.option("--resolution", type=positive, metavar="R", help="Pixel in metres [the model's mesh width]."),
+        click.option("--bounds", type=float, nargs=4, default=None, metavar="XMIN YMIN XMAX YMAX", help="Part [all]."),
+        click.option("--crs", help="CRS of a model that does not state it."),
+        click.option("-o", "--output", type=path, required=True, metavar="TIF", help="The GeoTIFF."),
+        click.option("--preview", type=path, metavar="PNG", help="A small picture to look at, too."),
+        click.option("--workers", type=click.IntRange(1), default=None, help="Tiles computed at once [all cores]."),
+        click.option("--overwrite", is_flag=True, help="Replace the output if it exists."),
+        json_option,
+        click.option("-q", "--quiet", is_flag=True, help="No talk on stderr."),
+    ]
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def light_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Where the light comes from."""
+    options = [
+        click.option("--azimuth", type=float, default=315.0, show_default=True, help="Sun, degrees from north."),
+        click.option("--altitude", type=float, default=45.0, show_default=True, help="Sun above horizon, degrees."),
+        click.option("--exaggeration", type=float, default=1.0, show_default=True, help="Factor of heights."),
+        click.option("--multidirectional", is_flag=True, help="Four suns instead of one."),
+    ]
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def take_light(options: dict[str, Any]) -> Any:
+    """The light, taken out of the options of a verb."""
+    from photoplan.terrain.shading import Light
+
+    names = ("azimuth", "altitude", "exaggeration", "multidirectional")
+    return Light(**{name: options.pop(name) for name in names})
+
+
+def take_request(options: dict[str, Any]) -> Any:
+    """The request, taken out of the options of a verb."""
+    from photoplan.products.dtm_shading import PictureRequest
+
+    names = ("model", "output", "resolution", "bounds", "crs", "preview", "overwrite", "workers")
+    return PictureRequest(**{name: options.pop(name) for name in names})
+
+
+def say(make: Callable[[Any], ShadingFacts], as_json: bool, quiet: bool) -> None:
+    """Make a picture under a progress bar, and print what came of it."""
+    from contextlib import ExitStack
+
+    from photoplan.cli.progress import progress
+
+    with ExitStack() as stack:
+        facts = make(lambda tiles: stack.enter_context(progress(tiles, quiet)))
+    if as_json:
+        click.echo(json.dumps(facts.to_dict(), indent=2))
+        return
+    click.echo(str(facts.path))
+    if facts.preview is not None:
+        click.echo(str(facts.preview))
+    if not quiet:
+        grid, settings = facts.grid, ", ".join(f"{k} {v}" for k, v in facts.settings.items() if k != "ramp_colours")
+        click.echo(
+            f"{facts.kind}: {grid.width} × {grid.height} pixels of {grid.resolution:g} m, {facts.valid_share:.1%} with "
+            f"terrain; {settings}",
+            err=True,
+        )
+
+
+@click.command("shade")
+@picture_options
+@light_options
+def command(as_json: bool, quiet: bool, **options: Any) -> None:
+    """Hillshade: grey values 1 to 255, 0 where MODEL has no terrain.
+
+    Slopes are those of the model's surface at each pixel, so breaklines stay sharp.
+    """
+    from photoplan.products.dtm_shading import make_picture, shade_picture
+
+    picture, request = shade_picture(take_light(options)), take_request(options)
+    say(lambda begin: make_picture(request, picture, begin), as_json, quiet)

@@ -1,0 +1,299 @@
+"""Pictures of a terrain model: hillshade, slope, aspect and height tints as GeoTIFFs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan import __version__
+from photoplan.errors import GeometryError, InputError, UsageError
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.io.fingerprint import fingerprint
+from photoplan.io.grid_writer import GridOptions, GridTile, write_grid
+from photoplan.io.product import ProductFacts, check_output
+from photoplan.io.quicklook import write_quicklook
+from photoplan.io.storage import Nodata
+from photoplan.products.open_terrain import OpenTerrain, open_terrain
+from photoplan.terrain import shading, shading_tints
+from photoplan.terrain.shading import Light, surface_slopes
+
+__all__ = ["Picture", "PictureRequest", "ShadingFacts", "aspect_picture", "make_picture", "shade_picture",
+           "slope_picture", "tint_picture"]  # fmt: skip
+
+#: From flat to steep, for slope classes.
+SLOPE_COLOURS = ((255, 255, 212), (254, 217, 142), (254, 153, 41), (204, 76, 2), (120, 30, 10))
+
+
+@dataclass(frozen=True)
+class PictureRequest:
+    """What every picture of a terrain needs."""
+
+    model: Path
+    output: Path
+    _: KW_ONLY
+    resolution: float | None = None
+    """Pixel, metres; None: the model's mesh width."""
+    bounds: tuple[float, float, float, float] | None = None
+    """xmin, ymin, xmax, ymax; None: all."""
+    crs: str | None = None
+    """CRS of a model that does not state its own."""
+    preview: Path | None = None
+    """A small PNG to look at."""
+    overwrite: bool = False
+    workers: int | None = None
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One kind of picture: how a tile is computed, and how it is stored."""
+
+    kind: str
+    dtype: str
+    bands: int
+    nodata: Nodata
+    settings: dict[str, Any]
+    """What it was made with: goes into the file's tags and the key of its run."""
+    tile: Callable[[OpenTerrain, MapGrid, Window], GridTile]
+    resampling: str = "average"
+    colours: dict[int, tuple[int, int, int]] | None = None
+
+
+@dataclass(frozen=True)
+class ShadingFacts:
+    """What was made."""
+
+    path: Path
+    preview: Path | None
+    kind: str
+    grid: MapGrid
+    settings: dict[str, Any]
+    valid_share: float
+    """Share of pixels with terrain, 0 to 1."""
+    bytes: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        return {
+            "path": str(self.path),
+            "preview": self.preview and str(self.preview),
+            "kind": self.kind,
+            **self.settings,
+            "resolution": self.grid.resolution,
+            "width": self.grid.width,
+            "height": self.grid.height,
+            "bounds": list(self.grid.bounds),
+            "valid_share": self.valid_share,
+            "bytes": self.bytes,
+        }
+
+
+def make_picture(
+    request: PictureRequest,
+    picture: Callable[[OpenTerrain, MapGrid], Picture],
+    begin: Callable[[int], Callable[[int, int], None]] | None = None,
+) -> ShadingFacts:
+    """Write a picture of a terrain model; a run that was killed is continued by the same request.
+
+    Parameters
+    ----------
+    request
+        What of, where to.
+    picture
+        Makes the kind of picture for the terrain and the grid: `shade_picture` and its like.
+    begin
+        Called with the number of tiles before the first one; returns what is called with the numbers of tiles and
+        pixels that are finished.
+
+    Raises
+    ------
+    UsageError
+        The output or the preview exists, or is an input; or a number makes no sense.
+    InputError
+        The model cannot be used, or has nothing inside the bounds.
+    ResourceError
+        The disk is full.
+    """
+    inputs = [request.model]
+    check_output(request.output, inputs, overwrite=request.overwrite)
+    if request.preview is not None:
+        if request.preview.resolve() == request.output.resolve():
+            raise UsageError(f"{request.preview}: the preview has the name of the output; choose another one")
+        check_output(request.preview, inputs, overwrite=request.overwrite)
+    terrain = open_terrain(request.model, request.crs)
+    grid = _grid(request, terrain)
+    made = picture(terrain, grid)
+    key = f"{__version__} {fingerprint(request.model).digest} {grid} {made.kind} {made.settings}"
+    options = GridOptions(
+        workers=request.workers,
+        overwrite=request.overwrite,
+        inputs=inputs,
+        progress=None if begin is None else begin(sum(1 for _ in grid.window.tiles(GridOptions().tile))),
+        resampling=made.resampling,
+        colours=made.colours,
+        run_key=key,
+        tags={"PHOTOPLAN_VERSION": __version__, "PHOTOPLAN_KIND": made.kind}
+        | {f"PHOTOPLAN_{name.upper()}": str(value) for name, value in made.settings.items()},
+    )
+
+    def tile(window: Window) -> GridTile:
+        return made.tile(terrain, grid, window)
+
+    facts: ProductFacts = write_grid(request.output, grid, made.dtype, made.bands, made.nodata, tile, options)
+    if request.preview is not None:
+        write_quicklook(request.output, request.preview, max_side=1200)
+    return ShadingFacts(request.output, request.preview, made.kind, grid, made.settings, facts.valid_share, facts.bytes)
+
+
+def _grid(request: PictureRequest, terrain: OpenTerrain) -> MapGrid:
+    bounds = request.bounds or terrain.bounds
+    grid = MapGrid.covering(bounds, request.resolution or terrain.resolution, terrain.crs)
+    a, b = terrain.bounds, grid.bounds
+    if not (a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]):
+        raise GeometryError(
+            f"bounds {' '.join(f'{v:.10g}' for v in bounds)} do not meet {terrain.path}, which covers "
+            f"{' '.join(f'{v:.10g}' for v in a)}"
+        )
+    return grid
+
+
+def shade_picture(light: Light) -> Callable[[OpenTerrain, MapGrid], Picture]:
+    """A hillshade: grey values 1 to 255, 0 where there is no terrain."""
+
+    def tile(terrain: OpenTerrain, grid: MapGrid, window: Window) -> GridTile:
+        slopes = surface_slopes(terrain.surface, grid, window)
+        return shading.grey(shading.hillshade(slopes, light))[None]
+
+    return lambda terrain, grid: Picture("hillshade", "uint8", 1, "auto", _light_settings(light), tile)
+
+
+def _light_settings(light: Light) -> dict[str, Any]:
+    return {
+        "azimuth": light.azimuth,
+        "altitude": light.altitude,
+        "exaggeration": light.exaggeration,
+        "multidirectional": light.multidirectional,
+    }
+
+
+def slope_picture(unit: str = "degrees", classes: tuple[float, ...] = ()) -> Callable[[OpenTerrain, MapGrid], Picture]:
+    """Slope in `degrees` or `percent` as float32; or the numbers of its classes, with colours.
+
+    Raises
+    ------
+    UsageError
+        The unit is unknown, or the limits of the classes do not rise.
+    """
+    if unit not in ("degrees", "percent"):
+        raise UsageError(f"slope in {unit!r}; allowed are degrees and percent")
+    measure = shading.slope_degrees if unit == "degrees" else shading.slope_percent
+    if classes:
+        shading.slope_classes(np.zeros((1, 1), np.float32), classes)
+
+    def tile(terrain: OpenTerrain, grid: MapGrid, window: Window) -> GridTile:
+        values = measure(surface_slopes(terrain.surface, grid, window))
+        return (shading.slope_classes(values, classes) if classes else values)[None]
+
+    settings = {"unit": unit, "classes": list(classes)}
+    if not classes:
+        return lambda terrain, grid: Picture("slope", "float32", 1, "auto", settings, tile)
+    at = np.linspace(0, len(SLOPE_COLOURS) - 1, len(classes) + 1)
+    mixed = [np.interp(at, range(len(SLOPE_COLOURS)), np.array(SLOPE_COLOURS)[:, k]) for k in range(3)]
+    table = {0: (0, 0, 0)} | {
+        i + 1: (int(r), int(g), int(b)) for i, (r, g, b) in enumerate(np.column_stack(mixed).tolist())
+    }
+    return lambda terrain, grid: Picture("slope classes", "uint8", 1, "auto", settings, tile, "mode", table)
+
+
+def aspect_picture() -> Callable[[OpenTerrain, MapGrid], Picture]:
+    """Aspect, degrees clockwise from north, -1 where it is flat."""
+
+    def tile(terrain: OpenTerrain, grid: MapGrid, window: Window) -> GridTile:
+        return shading.aspect(surface_slopes(terrain.surface, grid, window))[None]
+
+    return lambda terrain, grid: Picture("aspect", "float32", 1, "auto", {"unit": "degrees"}, tile, "nearest")
+
+
+def tint_picture(
+    ramp: str = "hypsometric",
+    span: tuple[float, float] | None = None,
+    steps: int | None = None,
+    light: Light | None = None,
+    strength: float = 0.6,
+) -> Callable[[OpenTerrain, MapGrid], Picture]:
+    """Height tints, red, green, blue, with a mask.
+
+    Parameters
+    ----------
+    ramp
+        A name of `shading_tints.RAMPS`, or a text file with lines `height red green blue`.
+    span
+        Heights of a built-in ramp's ends; None: those of the terrain inside the grid.
+    steps
+        Number of classes of a built-in ramp; 0 with a file: each height has the colour of the entry below it.
+        None: colours are interpolated.
+    light
+        Combine the tints with this hillshade.
+    strength
+        How much of it, 0 to 1.
+    """
+    if not 0 <= strength <= 1:
+        raise UsageError(f"strength {strength} of the hillshade; 0 to 1 are allowed")
+
+    def picture(terrain: OpenTerrain, grid: MapGrid) -> Picture:
+        colours = _ramp(terrain, grid, ramp, span, steps)
+
+        def tile(terrain: OpenTerrain, grid: MapGrid, window: Window) -> GridTile:
+            slopes = surface_slopes(terrain.surface, grid, window)
+            tints = colours(slopes.heights)
+            if light is not None:
+                tints = shading_tints.shaded(tints, shading.hillshade(slopes, light), light.level, strength)
+            return _bytes(tints)
+
+        settings = {
+            "ramp": ramp,
+            "heights": [float(colours.heights[0]), float(colours.heights[-1])],
+            "classed": colours.classed,
+            "ramp_colours": colours.colours.round(2).tolist(),
+        }
+        if light is not None:
+            settings |= _light_settings(light) | {"strength": strength}
+        return Picture("tints", "uint8", 3, "mask", settings, tile)
+
+    return picture
+
+
+def _bytes(tints: NDArray[np.float32]) -> GridTile:
+    empty = np.isnan(tints).any(axis=0)
+    return np.rint(np.where(empty, 0, np.clip(tints, 0, 255))).astype(np.uint8), np.asarray(~empty)
+
+
+def _ramp(
+    terrain: OpenTerrain, grid: MapGrid, name: str, span: tuple[float, float] | None, steps: int | None
+) -> shading_tints.Ramp:
+    if name not in shading_tints.RAMPS:
+        return _ramp_file(Path(name), steps is not None)
+    low, high = span if span is not None else terrain.surface.height_range(grid.bounds)
+    if not (math.isfinite(low) and math.isfinite(high)):
+        raise GeometryError(f"{terrain.path}: no heights inside the bounds; there is nothing to tint")
+    if span is None and low == high:
+        low, high = low - 0.5, high + 0.5
+    return shading_tints.built_in_ramp(name, low, high, steps)
+
+
+def _ramp_file(path: Path, classed: bool) -> shading_tints.Ramp:
+    try:
+        if path.stat().st_size > 1 << 20:
+            raise InputError(f"{path}: {path.stat().st_size} bytes are no colour ramp; lines `height red green blue`")
+        text = path.read_bytes().decode("utf-8")
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: is no text; a colour ramp has lines `height red green blue`") from None
+    except OSError as error:
+        built_in = ", ".join(shading_tints.RAMPS)
+        raise InputError(f"{path}: no such colour ramp ({error.strerror}); built in are {built_in}") from None
+    return shading_tints.parse_ramp(text, str(path), classed)
