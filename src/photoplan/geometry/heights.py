@@ -20,7 +20,7 @@ from pyproj.transformer import TransformerGroup
 from photoplan.errors import HeightSystemError, InputError
 from photoplan.geometry.crs import area_of, canonical_crs, crs_label, missing_grids, parse_crs
 
-__all__ = ["HeightStep", "check_height_system", "declared_pair", "height_label", "height_step"]
+__all__ = ["HeightStep", "check_height_system", "crs_with_heights", "declared_pair", "height_label", "height_step"]
 
 OPTIONS = (
     "ellipsoidal, EPSG:nnnn (a vertical CRS, such as EPSG:5773 for EGM96), or same (both inputs are in one system)"
@@ -170,6 +170,16 @@ def height_step(
     grids = tuple(g.short_name for o in best.operations or () for g in o.grids)
     accuracy = best.accuracy if best.accuracy is not None and best.accuracy >= 0 else None
     return HeightStep(crs, source, target, best.description, accuracy, grids, best.definition)
+
+
+def crs_with_heights(crs: str, system: str | None) -> str:
+    """A horizontal CRS together with a height system, as WKT: what a raster of heights states.
+
+    Where the system is not stated or only declared the same as another one's, the horizontal CRS alone.
+    """
+    if system is None or check_height_system(system) == "same":
+        return crs
+    return str(_with_heights(parse_crs(crs), check_height_system(system)).to_wkt())
 
 
 def _with_heights(horizontal: CRS, name: str) -> CRS:

@@ -1,0 +1,43 @@
+"""`photoplan dtm export`: a terrain model for other programs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photoplan.cli.options import json_option
+
+__all__ = ["command"]
+
+
+@click.command("export")
+@click.argument("model", type=click.Path(path_type=Path))
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="What to write, by its suffix.")
+@click.option("--resolution", type=click.FloatRange(0, min_open=True), metavar="R", help="Of a raster [finest width].")
+@click.option("--bounds", type=float, nargs=4, default=None, metavar="XMIN YMIN XMAX YMAX", help="Part of a raster.")
+@click.option("--sigma", type=click.Path(path_type=Path), metavar="TIF", help="Write the standard deviations too.")
+@click.option("--crs", help="CRS of a terrain file that does not state it.")
+@click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(as_json: bool, quiet: bool, **options: Any) -> None:
+    """Write MODEL as a raster (.tif), a triangulation (.obj, .ply, .xml = LandXML) or points (.xyz, .csv).
+
+    Triangulations hold walls as vertical triangles (LandXML cannot); points are the posts and the lines' vertices.
+    """
+    from photoplan.cli.progress import progress
+    from photoplan.products.dtm_export import ExportRequest, dtm_export, export_steps
+
+    request = ExportRequest(**options)
+    with progress(0 if quiet else export_steps(request), quiet) as report:
+        found = dtm_export(request, report)
+    if as_json:
+        click.echo(json.dumps(found.to_dict(), indent=2))
+        return
+    for path in found.paths:
+        click.echo(str(path))
+    if not quiet:
+        click.echo(" · ".join(f"{k.replace('_', ' ')} {v:.6g}" for k, v in found.figures.items()), err=True)

@@ -1,0 +1,36 @@
+"""`photoplan dtm info`: what a terrain model holds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from photoplan.cli.options import json_option
+
+__all__ = ["command"]
+
+
+@click.command("info")
+@click.argument("model", type=click.Path(path_type=Path))
+@click.option("--gross", is_flag=True, help="List the measurements that were flagged as gross errors.")
+@json_option
+def command(model: Path, gross: bool, as_json: bool) -> None:
+    """Show the figures of MODEL: units, lines, accuracy, gross errors. A raster is shown as by `photoplan info`."""
+    from photoplan.products.dtm_info import dtm_info
+
+    found = dtm_info(model)
+    if as_json:
+        click.echo(json.dumps(found.figures | ({"gross_errors": found.gross} if gross else {}), indent=2))
+        return
+    width = max(len(key) for key in found.facts)
+    for key, value in found.facts.items():
+        lines = value if isinstance(value, list) else [value]
+        for i, line in enumerate(lines):
+            click.echo(f"{key if i == 0 else '':<{width}}  {line}")
+    for g in found.gross if gross else ():
+        click.echo(
+            f"{g['name']}  {g['kind']}  X {g['x']:.3f} Y {g['y']:.3f} Z {g['z']:.3f}  residual {g['residual']:+.3f} m "
+            f"({g['normalised']:+.1f} σ, redundancy {g['redundancy']:.2f})"
+        )
