@@ -11,15 +11,17 @@ from typing import Any
 
 import numpy as np
 import pyogrio.raw
+import rasterio.features
 import shapely
 from numpy.typing import NDArray
 from pyogrio.errors import DataSourceError, FieldError, GeometryError
 
 from photoplan.errors import InputError, UsageError
+from photoplan.geometry.grid import MapGrid
 from photoplan.io.checks import check_plain_file
 from photoplan.io.disk import disk_error, sync_file, sync_folder
 
-__all__ = ["Feature", "Features", "read_features", "write_features"]
+__all__ = ["Feature", "Features", "label_polygons", "read_features", "write_features"]
 
 _MAGIC = {b"SQLite format 3\0": "GeoPackage", b"\x00\x00\x27\x0a": "Shapefile", b"fgb": "FlatGeobuf"}
 _KINDS = {
@@ -111,6 +113,17 @@ def _refuse_invalid(path: Path, items: Sequence[Feature]) -> None:
     ]
     if wrong:
         raise InputError(f"{path}: {len(wrong)} polygons cross themselves or overlap: {', '.join(wrong)}; repair them")
+
+
+def label_polygons(labels: NDArray[np.int32], grid: MapGrid) -> dict[int, Any]:
+    """Outline of every positive label of a grid, along the edges of its pixels, as a multipolygon."""
+    to_map = rasterio.Affine(grid.resolution, 0.0, grid.left, 0.0, -grid.resolution, grid.top)
+    parts: dict[int, list[Any]] = {}
+    shapes = rasterio.features.shapes(np.ascontiguousarray(labels, np.int32), mask=labels > 0, transform=to_map)
+    for outline, value in shapes:
+        shell, *holes = outline["coordinates"]
+        parts.setdefault(int(value), []).append(shapely.Polygon(shell, holes))
+    return {value: shapely.MultiPolygon(found) for value, found in sorted(parts.items())}
 
 
 def write_features(

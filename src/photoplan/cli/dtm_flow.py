@@ -1,0 +1,54 @@
+"""`photoplan dtm flow`: catchments and flow lengths."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photoplan.cli.options import BYTES, json_option
+
+__all__ = ["command"]
+
+
+@click.command("flow")
+@click.argument("model", type=click.Path(path_type=Path))
+@click.option("--resolution", type=click.FloatRange(0, min_open=True), help="Side of a cell, metres [mesh width].")
+@click.option("--outlets", type=click.Path(path_type=Path), help="Points (table x, y, name, or vector file).")
+@click.option("--snap", type=float, default=0.0, help="Move outlets to the largest flow within this, metres [0].")
+@click.option("--catchments", type=click.Path(path_type=Path), metavar="GPKG", help="Write the catchments as polygons.")
+@click.option("--method", type=click.Choice(["d8", "dinf"]), default="d8", help="How upstream areas are summed [d8].")
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, metavar="TIF", help="The raster.")
+@click.option("--memory", type=BYTES, default="2GB", show_default=True, metavar="SIZE", help="Stay under this.")
+@click.option("--workers", type=click.IntRange(1), default=None, help="Threads that write [all cores].")
+@click.option("--crs", help="CRS of a model that does not state it.")
+@click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(as_json: bool, quiet: bool, **options: Any) -> None:
+    """Upstream area, flow length, direction and catchment of every cell, in six bands of one raster.
+
+    Pits are filled first; how much that was is printed.
+    """
+    from photoplan.products.dtm_flow import BANDS, FlowRequest, dtm_flow
+
+    found = dtm_flow(FlowRequest(**options))
+    if as_json:
+        click.echo(json.dumps(found.to_dict(), indent=2))
+        return
+    click.echo(str(found.path))
+    if found.catchments is not None:
+        click.echo(str(found.catchments))
+    click.echo(
+        f"area {found.area:.8g} m², leaves by its edge {found.outflow:.8g} m²; "
+        f"pits filled on {found.pits:.6g} m² with {found.pit_volume:.6g} m³"
+    )
+    for row in found.rows:
+        click.echo(
+            f"outlet {row.name} at {row.X:.10g} {row.Y:.10g}: {row.area:.8g} m² upstream, {row.own:.8g} m² of its own, "
+            f"longest way {row.longest:.6g} m"
+        )
+    if not quiet:
+        click.echo(f"bands: {', '.join(BANDS)}; cells {found.resolution:g} m", err=True)
