@@ -1,0 +1,65 @@
+"""`photoplan dtm sample`: heights at points."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photoplan.cli.options import json_option
+
+__all__ = ["command"]
+
+
+@click.command("sample")
+@click.argument("model", type=click.Path(path_type=Path))
+@click.argument("points", type=click.Path(path_type=Path))
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, metavar="CSV", help="What to write.")
+@click.option("--x", metavar="NAME", help="Column of X, by name or number [x, east, easting].")
+@click.option("--y", metavar="NAME", help="Column of Y [y, north, northing].")
+@click.option("--delimiter", help="Comma, semicolon, tab or space [the one that splits the first line].")
+@click.option("--decimal-comma", is_flag=True, help="Numbers are written 1,5.")
+@click.option("--no-header", is_flag=True, help="The first line is a point; columns are numbers, X and Y 1 and 2.")
+@click.option("--names", nargs=2, default=("height", "sigma"), metavar="HEIGHT SIGMA", help="Names of the new columns.")
+@click.option("--digits", type=click.IntRange(0, 9), default=4, show_default=True, help="Decimals of the heights.")
+@click.option("--points-crs", metavar="CRS", help="CRS of the points [the model's].")
+@click.option("--crs", help="CRS of a terrain file that does not state it.")
+@click.option("--overwrite", is_flag=True, help="Replace the output if it exists.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(
+    x: str | None,
+    y: str | None,
+    delimiter: str | None,
+    decimal_comma: bool,
+    no_header: bool,
+    as_json: bool,
+    quiet: bool,
+    **options: Any,
+) -> None:
+    """Height of MODEL and its standard deviation at each of POINTS, a CSV file: its columns, `height` and `sigma`.
+
+    Both are empty where there is no model; a raster has no sigma.
+    """
+    from photoplan.geometry.crs import crs_label
+    from photoplan.geometry.heights import height_label
+    from photoplan.io.terrain_points import PointTableFormat
+    from photoplan.products.dtm_sample import SampleRequest, dtm_sample
+
+    spelled = {"comma": ",", "semicolon": ";", "tab": "\t", "\\t": "\t", "space": " "}
+    form = PointTableFormat(x, y, spelled.get(delimiter or "", delimiter), decimal_comma, not no_header)
+    found = dtm_sample(SampleRequest(form=form, **options))
+    if as_json:
+        click.echo(json.dumps(found.to_dict(), indent=2))
+        return
+    click.echo(str(found.path))
+    if not quiet:
+        sigma = f", sigma {found.sigma:.3f} m" if found.sigma == found.sigma else ""
+        heights = f" · {found.low:.3f} to {found.high:.3f} m{sigma}" if found.outside < found.points else ""
+        click.echo(
+            f"{found.points} points, {found.outside} without a model{heights} · {crs_label(found.crs)} · "
+            f"heights {height_label(found.height_system)}",
+            err=True,
+        )
