@@ -325,6 +325,7 @@ def spoilt_faces(name: str, value: Any) -> bytes:
         ("start", 10**9, "not in the order of the meshes"),
         ("start", -5, "not in the order of the meshes"),
         ("vertices", np.nan, "a vertex outside of the unit, or not finite"),
+        ("vertices", np.inf, "a vertex outside of the unit, or not finite"),
         ("vertices", 1e9, "a vertex outside of the unit, or not finite"),
     ],
 )

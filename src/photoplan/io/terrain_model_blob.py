@@ -149,7 +149,8 @@ def check_unit(unit: Unit, where: str) -> None:
             and low[1] >= unit.top - unit.side - slack
             and high[1] <= unit.top + slack
         )
-        if not (np.isfinite(faces.vertices).all() and inside):
+        # A vertex without height belongs to no triangle that has a surface.
+        if not inside or np.isinf(faces.vertices[:, 2]).any():
             raise InputError(f"{where}: a vertex outside of the unit, or not finite")
 
 

@@ -316,7 +316,8 @@ def _range_of(unit: Unit) -> tuple[float, float] | None:
     """Lowest and highest height of posts and triangles; None if the unit has no surface at all."""
     heights = unit.heights[np.isfinite(unit.heights)].astype(float) + unit.datum
     if unit.faces is not None and len(unit.faces.corners):
-        heights = np.append(heights, unit.faces.vertices[unit.faces.corners.ravel(), 2])
+        Z = unit.faces.vertices[unit.faces.corners.ravel(), 2]
+        heights = np.append(heights, Z[np.isfinite(Z)])
     return (float(heights.min()), float(heights.max())) if heights.size else None
 
 
