@@ -26,8 +26,9 @@ _PERCENT = 2.0, 98.0
 def write_quicklook(product: Path, picture: Path, *, max_side: int = 1600) -> Path:
     """Write a PNG of one product; transparent where it has no valid pixel.
 
-    Only the overview of a suitable size is read. Bytes are shown as they are; other types are stretched from the second
-    to the ninety-eighth percentile. One or two bands are shown grey, more as red, green, blue.
+    Only the overview of a suitable size is read. Bytes are shown as they are, with their colour table if there is one;
+    other types are stretched from the second to the ninety-eighth percentile. One or two bands are shown grey, more as
+    red, green, blue.
 
     Parameters
     ----------
@@ -128,6 +129,11 @@ def _look(path: Path, dataset: Any, width: int, height: int) -> NDArray[np.uint8
         raise InputError(f"{path}: cannot be read for a quick look ({first_cause(error)})") from error
     if pixels.dtype != np.uint8:
         pixels = _stretched(pixels, valid)
+    elif dataset.count == 1 and dataset.colorinterp[0] == rasterio.enums.ColorInterp.palette:
+        table = np.zeros((256, 3), np.uint8)
+        for value, colour in dataset.colormap(1).items():
+            table[value] = colour[:3]
+        pixels = np.moveaxis(table[pixels[0]], -1, 0)
     alpha = valid * np.uint8(255)
     return np.concatenate([np.broadcast_to(pixels, (3, height, width)) * valid, alpha[None]]).astype(np.uint8)
 

@@ -1,0 +1,72 @@
+"""`photoplan dtm contours`: contour lines of a terrain model."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photoplan.cli.options import json_option
+
+__all__ = ["command"]
+
+_PATH = click.Path(path_type=Path)
+_POSITIVE = click.FloatRange(0, min_open=True)
+
+
+@click.command("contours")
+@click.argument("model", type=_PATH)
+@click.option("--interval", type=_POSITIVE, required=True, metavar="M", help="Height between contours, metres.")
+@click.option("--base", type=float, default=0.0, show_default=True, help="Height that contours are counted from.")
+@click.option("--index", type=click.IntRange(0), default=5, show_default=True, help="Every N-th is an index contour.")
+@click.option("--smooth", is_flag=True, help="Smooth lines inside their band; they never cross.")
+@click.option("--simplify", is_flag=True, help="Leave out vertices inside the band; lines never cross.")
+@click.option("--band", type=click.FloatRange(0, 0.5, min_open=True, max_open=True), default=0.25, show_default=True,
+              help="Half width of the band, part of the interval.")  # fmt: skip
+@click.option("--shortest", type=click.FloatRange(0), default=0.0, help="Leave out lines shorter than this, metres.")
+@click.option("--bounds", type=float, nargs=4, default=None, metavar="XMIN YMIN XMAX YMAX", help="Part [all].")
+@click.option("--labels", is_flag=True, help="Places for labels: a second layer or file.")
+@click.option("--label-all", is_flag=True, help="Labels on every contour, not on index contours alone.")
+@click.option("--text-height", type=_POSITIVE, help="Height of labels, metres on the ground [1/200 of the extent].")
+@click.option("--label-spacing", type=_POSITIVE, help="Metres between labels of a line [60 text heights].")
+@click.option("--crs", help="CRS of a model that does not state it.")
+@click.option("-o", "--output", type=_PATH, required=True, metavar="FILE", help=".gpkg, .shp, .geojson or .dxf")
+@click.option("--preview", type=_PATH, metavar="PNG", help="A small picture to look at, too.")
+@click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(as_json: bool, quiet: bool, **options: Any) -> None:
+    """Contour lines on MODEL's own surface: they bend sharply at breaklines, end at borders and at walls.
+
+    Columns: height, is_index, depression. Higher ground is on a line's right. A post exactly at a level counts as above
+    it.
+    """
+    from contextlib import ExitStack
+
+    from photoplan.cli.progress import progress
+    from photoplan.products.dtm_contours import ContourRequest, make_contours
+    from photoplan.terrain.contours import ContourOptions
+
+    names = ("interval", "base", "index", "smooth", "simplify", "band", "shortest")
+    chosen = ContourOptions(**{name: options.pop(name) for name in names})
+    request = ContourRequest(options=chosen, **options)
+    with ExitStack() as stack:
+        facts = make_contours(request, lambda parts: stack.enter_context(progress(parts, quiet)))
+    if as_json:
+        click.echo(json.dumps(facts.to_dict(), indent=2))
+        return
+    for path in [*facts.files, *([facts.preview] if facts.preview else [])]:
+        click.echo(str(path))
+    if quiet:
+        return
+    if not facts.lines:
+        click.echo(f"no contour: no level of {chosen.base:g} + n × {chosen.interval:g} m is passed", err=True)
+        return
+    labels = "" if facts.text_height is None else f", {facts.labels} labels {facts.text_height:g} m high"
+    click.echo(
+        f"{facts.lines} contours from {facts.low:.10g} to {facts.high:.10g} m, {facts.length / 1000:.6g} km, "
+        f"{facts.vertices} vertices; {facts.closed} closed, {facts.depressions} round hollows{labels}",
+        err=True,
+    )
