@@ -63,7 +63,7 @@ def build_faces(
     nodes = mesh_nodes(unit, lines, neighbours or {})
     if nodes is None:
         return None
-    corners, mesh = _triangles(unit, nodes, domain)
+    corners, mesh = _triangles(unit, nodes, lines, domain)
     corners, mesh = _with_markers(unit, nodes, corners, mesh)
     if not len(corners):
         return None
@@ -74,17 +74,15 @@ def build_faces(
     return MeshFaces(np.ascontiguousarray(values[:, :3]), values[:, 3].astype(np.float32), numbers, start)
 
 
-def _triangles(unit: Unit, nodes: Nodes, domain: Any) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+def _triangles(
+    unit: Unit, nodes: Nodes, lines: Sequence[LineElement], domain: Any
+) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Node numbers of the triangles that count, and the mesh of each."""
     n = unit.meshes
     try:
         corners = constrained_faces(nodes.xy * [1.0, -1.0], nodes.edges)
     except GeometryError as error:
-        right, bottom = unit.left + unit.side, unit.top - unit.side
-        raise GeometryError(
-            f"computing unit X {unit.left} … {right}, Y {bottom} … {unit.top}: {error}. Look for lines that cross "
-            "there without a common point"
-        ) from error
+        raise GeometryError(_crossing(unit, lines)) from error
     middle = nodes.xy[corners].mean(axis=1)
     col, row = np.clip(np.floor(middle), 0, n - 1).astype(np.int64).T
     good = nodes.needed[row, col] & np.isfinite(nodes.values[corners, 2]).all(axis=1)
@@ -93,6 +91,24 @@ def _triangles(unit: Unit, nodes: Nodes, domain: Any) -> tuple[NDArray[np.int32]
         return corners, mesh
     inside = _inside(unit, middle, domain)
     return corners[inside], mesh[inside]
+
+
+def _crossing(unit: Unit, lines: Sequence[LineElement]) -> str:
+    """What to tell of lines that cross: the first pair that is found."""
+    place = f"computing unit X {unit.left} … {unit.left + unit.side}, Y {unit.top - unit.side} … {unit.top}"
+    advice = "lines may meet in common vertices only; insert one, or leave one of the lines out"
+    paths = [shapely.LineString(line.xyz[:, :2]) for line in lines]
+    for one, two in zip(*shapely.STRtree(paths).query(paths, predicate="intersects")):
+        if one > two:
+            continue
+        if one == two and not paths[one].is_simple:
+            return f"{place}: {lines[one].name} crosses or touches itself; {advice}"
+        common = shapely.get_coordinates(paths[one].intersection(paths[two])) if one < two else ()
+        vertices = {tuple(v) for v in lines[one].xyz[:, :2]} & {tuple(v) for v in lines[two].xyz[:, :2]}
+        bad = [point for point in common if tuple(point) not in vertices]
+        if bad:
+            return f"{place}: {lines[one].name} and {lines[two].name} meet at {bad[0][0]}, {bad[0][1]}; {advice}"
+    return f"{place}: pieces of lines lie upon each other; {advice}"
 
 
 def _inside(unit: Unit, middle: NDArray[np.float64], domain: Any) -> NDArray[np.bool_]:
