@@ -138,9 +138,8 @@ def test_both_sides_of_a_wall_and_one_height_at_its_free_end() -> None:
         surface, cut = model(layout, 5, [wall], lambda X, Y: 252.0 + 0 * X)
         assert surface.heights([(last, -5.7)]) == pytest.approx(251.5)
         mid = (cut[0].xyz[1:-1, :2] + cut[0].xyz[2:, :2]) / 2
-        assert (surface.heights(mid[:-1] + [0, 1e-5]) > 253).all() and (
-            surface.heights(mid[:-1] - [0, 1e-5]) < 252
-        ).all()
+        step = np.array([0, 1e-5])
+        assert (surface.heights(mid[:-1] + step) > 253).all() and (surface.heights(mid[:-1] - step) < 252).all()
         a, b = edge_points(surface, np.random.default_rng(0))
         assert np.abs(surface.heights(a) - surface.heights(b)).max() < 1e-4
 
@@ -198,8 +197,8 @@ def test_a_hole_of_just_one_mesh_is_a_hole() -> None:
 def test_lines_that_cross_or_lack_intersections_are_named() -> None:
     layout = UnitLayout(0, 0, 10.0, 1, 1)
     unit = plain_unit(layout, 0, 0, 1, rough)
-    a, b = line([(1, -1, 5.0), (9, -9, 5.0)]), line([(1, -9, 5.0), (9, -1, 5.0)])
-    with pytest.raises(GeometryError, match=r"unit X 0 … 10\.0.*cross"):
+    a, b = line([(1, -1, 5.0), (9, -9, 5.0)], name="kerb 7"), line([(1, -9, 5.0), (9, -1, 5.0)], name="kerb 9")
+    with pytest.raises(GeometryError, match=r"unit X 0\.0 … 10\.0.*kerb 7 and kerb 9 meet at 5\.0, -5\.0"):
         build_faces(unit, [a, b])
     fine = plain_unit(layout, 0, 0, 4, rough)
     with pytest.raises(InputError, match="ditch: the line crosses the grid"):
