@@ -15,9 +15,9 @@ import numpy as np
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain
 from photoplan.terrain.clean_borders import Finding, closed, domain_of, outside, unfit_rings
-from photoplan.terrain.clean_heights import Meeting, cut_at_walls, one_height
+from photoplan.terrain.clean_heights import Joined, Meeting, cut_at_walls, one_height
 from photoplan.terrain.clean_nodes import Network, make_network, noded, without_repeats
-from photoplan.terrain.clean_points import Points, join_to_lines, without_coincident
+from photoplan.terrain.clean_points import Points, join_to_lines, points_near, without_coincident
 
 __all__ = ["CLASS_SIGMAS", "Finding", "clean", "domain_of"]
 
@@ -32,6 +32,8 @@ CLASS_SIGMAS: Mapping[str, float] = {
 """Standard deviations that weigh heights against each other where nothing is stated, metres."""
 MAX_FINDINGS = 10_000
 """Findings of one kind that are listed; the others are counted."""
+ROUNDS = 10
+"""Rounds of joining points with lines; two are usual."""
 _FARTHEST = 1e8
 """Coordinates beyond this are in no projected CRS, metres."""
 
@@ -94,12 +96,8 @@ def clean(
     found += more
     net, more = _network(lines, tolerance, height_tolerance)
     found += more
-    net, points, joined, more = join_to_lines(net, lines, points, tolerance)
+    net, points, joined, more = _meet(net, lines, points, tolerance)
     found += more
-    net, places = noded(net, tolerance)
-    for X, Y in places:
-        text = f"lines too dense near X {X:.3f}, Y {Y:.3f}; vertices there were joined beyond {tolerance} m"
-        found.append(Finding("joined vertices", text, X, Y))
     found += _without_length(net, lines)
     sigma = np.array([sigmas[line.kind] if line.sigma is None else line.sigma for line in lines])
     net, meetings = one_height(net, lines, sigma, joined, height_tolerance)
@@ -147,6 +145,33 @@ def _network(lines: Sequence[MeasuredLine], tolerance: float, height_tolerance: 
             )
             found.append(Finding("repeated vertices", text, X, Y, (line.name,)))
     return net, found
+
+
+def _meet(
+    net: Network, lines: Sequence[MeasuredLine], points: Points, tolerance: float
+) -> tuple[Network, Points, Joined, list[Finding]]:
+    """Lines noded, and points on them made vertices."""
+    found: list[Finding] = []
+    parts: list[Joined] = []
+    near = points_near(net, points, 4 * tolerance)
+    reach = tolerance
+    for _ in range(ROUNDS):
+        net, points, joined, more = join_to_lines(net, lines, points, near, reach)
+        found += more
+        net, places = noded(net, tolerance)
+        for X, Y in places:
+            text = f"lines too dense near X {X:.3f}, Y {Y:.3f}; vertices there were joined beyond {tolerance} m"
+            found.append(Finding("joined vertices", text, X, Y))
+        if joined is None:
+            break
+        parts.append(joined)
+        # Lines that were led through points and crossings moved a little: points may have come to lie on them.
+        reach = tolerance / 4
+    joined = Joined.all(parts)
+    if joined.labels:
+        text = f"{len(joined.labels)} points lie on breaklines or form lines and became vertices of them"
+        found.append(Finding("points on lines", text))
+    return net, points, joined, found
 
 
 def _without_length(net: Network, lines: Sequence[MeasuredLine]) -> list[Finding]:

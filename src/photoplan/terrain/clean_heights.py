@@ -27,6 +27,16 @@ class Joined:
     sigma: NDArray[np.float64]
     labels: list[str]
 
+    @staticmethod
+    def all(parts: Sequence[Joined]) -> Joined:
+        """The points of all parts."""
+        return Joined(
+            np.concatenate([np.empty(0, np.int64), *(p.vertex for p in parts)]),
+            np.concatenate([np.empty(0), *(p.z for p in parts)]),
+            np.concatenate([np.empty(0), *(p.sigma for p in parts)]),
+            [label for p in parts for label in p.labels],
+        )
+
 
 @dataclass(frozen=True)
 class Meeting:
@@ -45,8 +55,8 @@ def one_height(
 ) -> tuple[Network, list[Meeting]]:
     """The network with one height wherever lines meet: the mean, weighted by the standard deviations.
 
-    Border lines and holes take the height of other lines where they meet, and never change it. Places of walls keep
-    their heights. Heights that differ by more than `tolerance` are returned one by one.
+    Border lines and holes take the height of other lines where they meet, and never change it. At walls heights stay
+    as they are. Heights that differ by more than `tolerance` are returned one by one.
     """
     terrain = np.array([line.kind in ("breakline", "formline") for line in lines], bool)
     wall = np.array([line.right is not None for line in lines], bool)
@@ -54,8 +64,10 @@ def one_height(
     z = net.z.copy()
     meetings: list[Meeting] = []
     mean = np.full(len(net.xy), np.nan)
+    # At a wall, lines have the height of the side that they come from: `cut_at_walls` gives it to them.
+    free = ~np.isin(net.vertex, list(_sides(net, lines).walls)) & ~wall[net.line] & ~np.isnan(z)
     for leading in (True, False):
-        place = np.flatnonzero((terrain[net.line] == leading) & ~wall[net.line] & ~np.isnan(z))
+        place = np.flatnonzero((terrain[net.line] == leading) & free)
         vertex, height, w = net.vertex[place], z[place], weight[net.line[place]]
         if leading:
             vertex, height = np.concatenate([vertex, joined.vertex]), np.concatenate([height, joined.z])
@@ -128,7 +140,9 @@ def cut_at_walls(
         if len(places) < 2:
             continue
         touching = line.right is None and line.kind in ("breakline", "formline")
-        if not touching or not any(int(v) in sides.walls for v in net.vertex[places]):
+        v = net.vertex[places].tolist()
+        meets = any(a in sides.walls for a in v) or any((min(a, b), max(a, b)) in sides.edges for a, b in pairwise(v))
+        if not touching or not meets:
             out.append(_line(line, net, places))
             continue
         out += _pieces(net, line, places, sides, tolerance, meetings)

@@ -16,7 +16,7 @@ from photoplan.terrain.clean_heights import LEAST_SIGMA, Joined
 from photoplan.terrain.clean_join import clusters
 from photoplan.terrain.clean_nodes import Insertions, Network, insert
 
-__all__ = ["Points", "join_to_lines", "without_coincident"]
+__all__ = ["Points", "join_to_lines", "points_near", "without_coincident"]
 
 CHUNK = 500_000
 """Points that are compared with lines at once."""
@@ -99,53 +99,90 @@ def without_coincident(points: Points, tolerance: float, height_tolerance: float
 
 
 def join_to_lines(
-    net: Network, lines: Sequence[MeasuredLine], points: Points, tolerance: float
-) -> tuple[Network, Points, Joined, list[Finding]]:
+    net: Network, lines: Sequence[MeasuredLine], points: Points, near: NDArray[np.int64], tolerance: float
+) -> tuple[Network, Points, Joined | None, list[Finding]]:
     """Points on breaklines and form lines become vertices of these.
 
-    Points on walls are left out and reported, since nobody knows to which side they belong. Points at a vertex of a
-    border line move to it by the millimetre that they are apart, and stay points.
+    Points on walls are left out and reported, since nobody knows to which side they belong. Points on a border line or
+    hole stay points, at the place of one of its vertices.
+
+    Parameters
+    ----------
+    near : ndarray of int
+        Points that can be on lines: those of `points_near`.
+
+    Returns
+    -------
+    Network, Points
+    Joined or None
+        What became vertices; None: no point is on a line any more.
+    list of Finding
     """
-    points = _at_border_vertices(net, lines, points, tolerance)
-    terrain = np.array([line.kind in ("breakline", "formline") for line in lines], bool)
     start = net.segments
-    start = start[terrain[net.line[start]]]
-    index, place = _hits(net, points, start, tolerance)
-    nothing = Joined(np.empty(0, np.int64), np.empty(0), np.empty(0), [])
-    if not len(index):
-        return net, points, nothing, []
+    near = near[points.keep[near]]
+    index, place = _hits(net, points.xyz, near, start, tolerance)
     which, whose = np.unique(index, return_inverse=True)
+    # A point at a vertex is done if it has its place and stays a point, as at border lines.
     used = np.unique(net.vertex[np.concatenate([start, start + 1])])
-    distance, nearest = cKDTree(net.xy[used]).query(points.xyz[which, :2], distance_upper_bound=tolerance)
+    distance, nearest = np.full(len(which), np.inf), np.zeros(len(which), np.int64)
+    if len(which):
+        distance, nearest = cKDTree(net.xy[used]).query(points.xyz[which, :2], distance_upper_bound=tolerance)
     free = ~np.isfinite(distance)
-    vertex = used[np.where(free, 0, nearest)]
-    wall_line = np.array([line.right is not None for line in lines], bool)
-    wall_vertex = np.zeros(len(net.xy), bool)
-    wall_vertex[net.vertex[wall_line[net.line]]] = True
-    on_wall = wall_vertex[vertex] & ~free
-    on_wall[whose[wall_line[net.line[place]]]] |= free[whose[wall_line[net.line[place]]]]
-    found = [_on_wall(points, int(k)) for k in which[on_wall]]
-    free &= ~on_wall
+    vertex = used[np.where(free, 0, nearest)] if len(which) else nearest
+    terrain, wall = _marks(net, lines, vertex, free, place, whose)
+    done = ~terrain & ~wall & (distance == 0)
+    if done.all():
+        return net, points, None, []
+    found = [_on_wall(points, int(k)) for k in which[wall]]
+    free &= ~wall
     vertex[free] = len(net.xy) + np.arange(int(free.sum()))
-    grown = replace(net, xy=np.concatenate([net.xy, points.xyz[which[free], :2]]))
+    net = replace(net, xy=np.concatenate([net.xy, points.xyz[which[free], :2]]))
     through = free[whose]
     if through.any():
-        a, b = grown.xy[net.vertex[place[through]]], grown.xy[net.vertex[place[through] + 1]]
-        along = ((grown.xy[vertex[whose[through]]] - a) * (b - a)).sum(axis=1) / ((b - a) ** 2).sum(axis=1)
-        grown, _, _ = insert(grown, Insertions(place[through], vertex[whose[through]], np.clip(along, 0, 1)))
-    kept = points.keep.copy()
-    kept[which] = False
-    taken = which[~on_wall]
-    labels = [points.label(int(k)) for k in taken]
-    if len(taken):
-        text = f"{len(taken)} points lie on breaklines or form lines and became vertices of them"
-        found.append(Finding("points on lines", text))
-    return (
-        grown,
-        replace(points, keep=kept),
-        Joined(vertex[~on_wall], points.xyz[taken, 2], points.sigma[taken], labels),
-        found,
+        at, own = place[through], vertex[whose[through]]
+        a, b = net.xy[net.vertex[at]], net.xy[net.vertex[at + 1]]
+        along = ((net.xy[own] - a) * (b - a)).sum(axis=1) / ((b - a) ** 2).sum(axis=1)
+        net, _, _ = insert(net, Insertions(at, own, np.clip(along, 0, 1)))
+    xyz, keep = points.xyz.copy(), points.keep.copy()
+    on_border = ~terrain & ~wall
+    xyz[which[on_border], :2] = net.xy[vertex[on_border]]
+    keep[which[~on_border]] = False
+    taken = terrain & ~wall
+    joined = Joined(
+        vertex[taken],
+        points.xyz[which[taken], 2],
+        points.sigma[which[taken]],
+        [points.label(int(k)) for k in which[taken]],
     )
+    return net, replace(points, xyz=xyz, keep=keep), joined, found
+
+
+def _marks(
+    net: Network,
+    lines: Sequence[MeasuredLine],
+    vertex: NDArray[np.int64],
+    free: NDArray[np.bool_],
+    place: NDArray[np.int64],
+    whose: NDArray[np.int64],
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """For each point: whether it is on a breakline or form line, and whether it is on a wall."""
+    out = []
+    for mark in (
+        np.array([line.kind in ("breakline", "formline") for line in lines], bool),
+        np.array([line.right is not None for line in lines], bool),
+    ):
+        at_vertex = np.zeros(len(net.xy), bool)
+        at_vertex[net.vertex[mark[net.line]]] = True
+        on_segment = np.zeros(len(vertex), bool)
+        on_segment[whose[mark[net.line[place]]]] = True
+        out.append(np.where(free, on_segment, at_vertex[vertex]))
+    return out[0], out[1]
+
+
+def points_near(net: Network, points: Points, distance: float) -> NDArray[np.int64]:
+    """Points that are kept and closer than `distance` to a line."""
+    candidates = np.flatnonzero(points.keep)
+    return np.unique(_hits(net, points.xyz, candidates, net.segments, distance)[0])
 
 
 def _on_wall(points: Points, k: int) -> Finding:
@@ -156,36 +193,21 @@ def _on_wall(points: Points, k: int) -> Finding:
 
 
 def _hits(
-    net: Network, points: Points, start: NDArray[np.int64], tolerance: float
+    net: Network, xyz: NDArray[np.float64], candidates: NDArray[np.int64], start: NDArray[np.int64], distance: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Points that lie on segments, and the place at which the segment starts."""
     none = np.empty(0, np.int64)
-    if not len(start) or not points.keep.any():
+    if not len(start) or not len(candidates):
         return none, none
     ends = net.xy[np.stack([net.vertex[start], net.vertex[start + 1]], axis=1)]
     origin = np.floor(ends[0, 0])
-    low, high = ends.min(axis=(0, 1)) - tolerance, ends.max(axis=(0, 1)) + tolerance
+    low, high = ends.min(axis=(0, 1)) - distance, ends.max(axis=(0, 1)) + distance
     tree = shapely.STRtree(shapely.linestrings(ends - origin))
-    candidates = np.flatnonzero(points.keep)
     found = [(none, none)]
     for at in range(0, len(candidates), CHUNK):
         part = candidates[at : at + CHUNK]
-        xy = points.xyz[part, :2]
+        xy = xyz[part, :2]
         part = part[((xy >= low) & (xy <= high)).all(axis=1)]
-        dots = shapely.points(points.xyz[part, :2] - origin)
-        p, s = tree.query(dots, predicate="dwithin", distance=tolerance)
+        p, s = tree.query(shapely.points(xyz[part, :2] - origin), predicate="dwithin", distance=distance)
         found.append((part[p], start[s]))
     return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
-
-
-def _at_border_vertices(net: Network, lines: Sequence[MeasuredLine], points: Points, tolerance: float) -> Points:
-    border = np.array([line.kind in ("border", "hole") for line in lines], bool)
-    used = np.unique(net.vertex[border[net.line]]) if len(lines) else np.empty(0, np.int64)
-    candidates = np.flatnonzero(points.keep)
-    if not len(used) or not len(candidates):
-        return points
-    hits = cKDTree(net.xy[used]).query(points.xyz[candidates, :2], distance_upper_bound=tolerance)
-    near = np.isfinite(hits[0])
-    xyz = points.xyz.copy()
-    xyz[candidates[near], :2] = net.xy[used[hits[1][near]]]
-    return replace(points, xyz=xyz)
