@@ -70,7 +70,8 @@ class PointTable:
     def __init__(self, path: Path, form: PointTableFormat = PointTableFormat()) -> None:
         self.path, self.form = Path(path), form
         with self._open() as file:
-            line, text = next(self._lines(file), (0, ""))
+            lines = self._lines(file)
+            line, text = next(lines, (0, ""))
             if not line:
                 raise InputError(f"{self.path}: holds no line with data")
             self.delimiter = form.delimiter or self._sniffed(text)
@@ -82,7 +83,7 @@ class PointTable:
                     "and which columns are X and Y if not the first two"
                 )
             self._x, self._y = self._column("x", line), self._column("y", line)
-            if form.header and next(self._lines(file), None) is None:
+            if form.header and next(lines, None) is None:
                 raise InputError(f"{self.path}: holds a header and no point")
 
     def parts(self, size: int) -> Iterator[PointPart]:
@@ -152,20 +153,19 @@ class PointTable:
             if not self.form.header:
                 wanted = "1" if axis == "x" else "2"
             else:
-                found = [i for i, name in enumerate(lower) if name in _NAMES[axis]]
-                if len(found) == 1:
-                    return found[0]
-                raise InputError(
-                    f"{self.path}:{line}: {'no' if not found else len(found)} column for {axis.upper()} among "
-                    f"{', '.join(self.names)[:200]}; name it with --{axis} NAME"
-                )
+                wanted = next((name for name in _NAMES[axis] if name in lower), None)
+                if wanted is None:
+                    raise InputError(
+                        f"{self.path}:{line}: no column for {axis.upper()} among {', '.join(self.names)[:200]}; name it "
+                        f"with --{axis} NAME"
+                    )
         found = [i for i, name in enumerate(lower) if name == wanted.casefold()]
         if len(found) == 1:
             return found[0]
         if wanted.isdigit() and 1 <= int(wanted) <= len(self.names):
             return int(wanted) - 1
         raise InputError(
-            f"{self.path}:{line}: {'no' if not found else len(found)} column {wanted!r} for {axis.upper()}; "
+            f"{self.path}:{line}: {len(found) or 'no'} columns {wanted!r} for {axis.upper()}; "
             f"the columns are {', '.join(self.names)[:200]}"
         )
 
