@@ -154,7 +154,7 @@ class TestSample:
             ("\n\n", "p.csv: holds no line with data"),
             ("", "p.csv: holds no line with data"),
             ("1,2\n3,4\n", "p.csv:1: the first line holds numbers"),
-            ("a,b\n3,4\n", "p.csv:1: no column for X among a, b; name it with --x NAME"),
+            ("a,b\n3,4\n", "p.csv:1: no column for X in a, b; name it with --x NAME"),
             ("x,easting,x,y\n3,4,5,6\n", "p.csv:1: 2 columns 'x' for X; the columns are x, easting, x, y"),
             ("x,y\n1_0,4\n", "p.csv:2: x = '1_0' is not a finite number"),
             ('x,y\n1,"2\n', "p.csv:2: cannot be split into columns"),

@@ -156,7 +156,7 @@ class PointTable:
                 wanted = next((name for name in _NAMES[axis] if name in lower), None)
                 if wanted is None:
                     raise InputError(
-                        f"{self.path}:{line}: no column for {axis.upper()} among {', '.join(self.names)[:200]}; name it "
+                        f"{self.path}:{line}: no column for {axis.upper()} in {', '.join(self.names)[:200]}; name it "
                         f"with --{axis} NAME"
                     )
         found = [i for i, name in enumerate(lower) if name == wanted.casefold()]
