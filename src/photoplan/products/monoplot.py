@@ -1,0 +1,261 @@
+"""Monoplotting with files: points or lines of an image of a project become ground points."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.rotation import rotation_from_angles
+from photoplan.io.disk import write_atomically
+from photoplan.io.orientation_table import angle_in_radians
+from photoplan.io.polygons import read_features, write_features
+from photoplan.io.product import check_output
+from photoplan.io.project import load_project
+from photoplan.io.project_model import Project
+from photoplan.io.xy_table import read_xy_table
+from photoplan.products.open_terrain import open_terrain
+from photoplan.products.scene import Scene, input_files, open_scene, pose_of
+from photoplan.surfaces.hybrid import HybridSurface
+from photoplan.terrain.monoplot import REASONS, GroundPoints, MonoplotErrors, monoplot
+
+__all__ = ["MonoplotReport", "MonoplotRequest", "monoplot_file"]
+
+#: Flatter than this the ray grazes the terrain: small errors move the point far, and not linearly. Radians.
+GRAZING = math.radians(5.0)
+ROLES = {"x": ("x", "column", "col"), "y": ("y", "row", "line"), "name": ("name", "id", "point")}
+COLUMNS = ("X", "Y", "Z", "sigma_X", "sigma_Y", "sigma_Z", "angle_deg", "reason")
+
+
+@dataclass(frozen=True)
+class MonoplotRequest:
+    """What is asked."""
+
+    project: Path
+    image: str
+    points: Path
+    """Table with columns x, y, or vector file with points or lines in pixels."""
+    output: Path
+    """Table of ground points."""
+    vectors: Path | None = None
+    """Points or lines in space, as a GeoPackage."""
+    gis_axes: bool = False
+    """Vector coordinates are those of a GIS that shows the image without georeference: (0, 0) is the upper-left corner,
+    y points up."""
+    sigma_image: float = 0.5
+    sigma_terrain: float | None = None
+    """Metres; None: the model's own."""
+    sigma_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sigma_angles: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of the three angles of the orientation, in the project's unit."""
+    overwrite: bool = False
+
+
+@dataclass(frozen=True)
+class MonoplotReport:
+    """What came out."""
+
+    output: Path
+    vectors: Path | None
+    points: int
+    met: int
+    reasons: dict[str, int]
+    """How many points have no ground point, by reason."""
+    grazing: int
+    through_holes: int
+    median_sigma: tuple[float, float, float] | None
+    height_system: str
+    notes: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        return {
+            "output": str(self.output),
+            "vectors": self.vectors and str(self.vectors),
+            "points": self.points,
+            "met": self.met,
+            "without_ground_point": self.reasons,
+            "grazing": self.grazing,
+            "through_holes": self.through_holes,
+            "median_sigma": self.median_sigma,
+            "height_system": self.height_system,
+            "notes": list(self.notes),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class _Given:
+    """Image points as the file has them."""
+
+    xy: NDArray[np.float64]
+    header: tuple[str, ...]
+    rows: Sequence[tuple[str, ...]]
+    line: NDArray[np.int64] | None
+    """Number of the line that each point belongs to; None: single points."""
+    names: tuple[str, ...]
+    """Of points, or of lines."""
+
+
+def monoplot_file(request: MonoplotRequest) -> MonoplotReport:
+    """Ground points of all image points of a file, written as a table.
+
+    Raises
+    ------
+    UsageError
+        An output exists or is an input, or a standard deviation makes no sense.
+    InputError
+        Project, image or points cannot be used.
+    """
+    project = load_project(request.project)
+    inputs = [request.project, request.points, *input_files(project)]
+    for path in (request.output, request.vectors):
+        if path is not None:
+            check_output(path, inputs, overwrite=request.overwrite)
+    if request.vectors is not None and request.vectors.suffix.lower() != ".gpkg":
+        raise UsageError(f"{request.vectors}: vectors are written as GeoPackage; give a name that ends with .gpkg")
+    name = _image_name(project, request.image)
+    given = _read(request)
+    scene = open_scene(project, name)
+    mesh, sigma = _mesh_and_sigma(project, scene)
+    if request.sigma_terrain is not None:
+        sigma = request.sigma_terrain
+    notes = []
+    if sigma is None:
+        notes.append("no standard deviations: the terrain has none of its own; give --sigma-terrain METRES")
+    pose = pose_of(project, project.image(name), scene.ground)
+    unit = project.orientation.angle_unit
+    errors = MonoplotErrors(
+        request.sigma_image,
+        sigma,
+        request.sigma_position,
+        tuple(float(a) for a in angle_in_radians(np.array(request.sigma_angles), unit)),  # type: ignore[arg-type]
+        _axes(pose.opk),
+    )
+    height_range = scene.surface.height_range(scene.terrain_bounds)
+    found = monoplot(scene.camera, given.xy, scene.surface, height_range, errors, mesh)
+    _write_table(request.output, given, found)
+    if request.vectors is not None:
+        _write_vectors(request.vectors, given, found, project.crs)
+    return _report(request, found, scene.ground.working_system, notes)
+
+
+def _image_name(project: Project, name: str) -> str:
+    """The project's name of an image that may be given with or without its suffix."""
+    names = [image.name for image in project.images]
+    fitting = [n for n in names if n == name] or [n for n in names if Path(n).stem == Path(name).stem]
+    return fitting[0] if len(fitting) == 1 else project.image(name).name
+
+
+def _mesh_and_sigma(
+    project: Project, scene: Scene
+) -> tuple[float, Callable[[NDArray[np.float64]], NDArray[np.float64]] | float | None]:
+    """Mesh width of the project's terrain and its standard deviation, if it knows one."""
+    if scene.ground.file is None:
+        return 1.0, None
+    terrain, _ = open_terrain(scene.ground.file, project.terrain.crs).in_crs(project.crs)
+    surface = terrain.surface
+    return terrain.resolution, surface.sigmas if isinstance(surface, HybridSurface) else None
+
+
+def _axes(opk: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Axes in ground space about which small changes of ω, φ and κ turn the camera: R = R_ω R_φ R_κ."""
+    omega, phi, _ = opk
+    about_omega = rotation_from_angles(np.array([omega, 0.0, 0.0]))
+    both = rotation_from_angles(np.array([omega, phi, 0.0]))
+    return np.stack([np.array([1.0, 0.0, 0.0]), about_omega[:, 1], both[:, 2]])
+
+
+def _read(request: MonoplotRequest) -> _Given:
+    """Image points of a table, or of all vertices of a vector file."""
+    if request.points.suffix.lower() in (".csv", ".txt", ".tsv", ".dat"):
+        table = read_xy_table(request.points, ROLES)
+        names = table.texts("name") or [str(i + 1) for i in range(len(table.rows))]
+        return _Given(table.xy, table.header, table.rows, None, tuple(names))
+    items = read_features(request.points, "Point", "LineString").items
+    kinds = {"Line" in item.geometry.geom_type for item in items}
+    if len(kinds) > 1:
+        raise InputError(f"{request.points}: holds points and lines; put them into two files")
+    parts = [(item.name, part) for item in items for part in shapely.get_parts(item.geometry)]
+    xy, line = shapely.get_coordinates([part for _, part in parts], return_index=True)
+    if request.gis_axes:
+        xy = np.column_stack([xy[:, 0] - 0.5, -xy[:, 1] - 0.5])
+    names = [parts[k][0] for k in line]
+    rows = [(name, repr(float(x)), repr(float(y))) for name, (x, y) in zip(names, xy)]
+    return _Given(xy, ("name", "x", "y"), rows, line if True in kinds else None, tuple(name for name, _ in parts))
+
+
+def _write_table(path: Path, given: _Given, found: GroundPoints) -> None:
+    """The columns of the input, then `COLUMNS`; fields without a value are empty."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*given.header, *COLUMNS])
+    degrees = np.degrees(found.angle)
+    for i, row in enumerate(given.rows):
+        numbers = [_text(v, 4) for v in (*found.XYZ[i], *found.sigmas[i])]
+        writer.writerow([*row, *numbers, _text(degrees[i], 2), _remark(found, i)])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, text.getvalue().encode())
+
+
+def _text(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else ""
+
+
+def _remark(found: GroundPoints, i: int) -> str:
+    """Why there is no point, or what is to be said about it."""
+    if found.reasons[i]:
+        return REASONS[str(found.reasons[i])]
+    said = ["grazing"] if found.angle[i] < GRAZING else []
+    return "; ".join(said + (["through a hole"] if found.hole[i] else []))
+
+
+def _write_vectors(path: Path, given: _Given, found: GroundPoints, crs: str) -> None:
+    there = np.isfinite(found.XYZ[:, 0])
+    sigma = found.sigmas
+    if given.line is None:
+        columns = {"name": np.array(given.names, object)[there]}
+        columns |= {f"sigma_{axis}": sigma[there, k] for k, axis in enumerate("XYZ")}
+        write_features(path, "Point Z", list(shapely.points(found.XYZ[there])), columns, crs, "ground_points")
+        return
+    shapes, names, worst = [], [], []
+    for run in _runs(given.line, there):
+        shapes.append(shapely.LineString(found.XYZ[run]))
+        names.append(given.names[given.line[run[0]]])
+        worst.append(float(np.linalg.norm(sigma[run], axis=1).max()))
+    columns = {"name": np.array(names, object), "largest_sigma": np.array(worst, float)}
+    write_features(path, "LineString Z", shapes, columns, crs, "ground_lines")
+
+
+def _runs(line: NDArray[np.int64], there: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
+    """Vertices of one line that follow each other and have ground points; two at least."""
+    index = np.flatnonzero(there)
+    breaks = np.flatnonzero((np.diff(index) > 1) | (np.diff(line[index]) != 0)) + 1
+    return [run for run in np.split(index, breaks) if len(run) > 1]
+
+
+def _report(request: MonoplotRequest, found: GroundPoints, height_system: str, notes: Sequence[str]) -> MonoplotReport:
+    met = found.reasons == ""
+    missed = {str(key): int((found.reasons == key).sum()) for key in np.unique(found.reasons[~met])}
+    sigmas = found.sigmas[np.isfinite(found.sigmas).all(axis=1)]
+    median = tuple(float(v) for v in np.median(sigmas, axis=0)) if len(sigmas) else None
+    return MonoplotReport(
+        request.output,
+        request.vectors,
+        len(met),
+        int(met.sum()),
+        {REASONS[key]: count for key, count in missed.items()},
+        int((found.angle[met] < GRAZING).sum()),
+        int(found.hole[met].sum()),
+        median,  # type: ignore[arg-type]
+        height_system,
+        tuple(notes),
+    )
