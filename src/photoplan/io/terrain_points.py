@@ -188,4 +188,4 @@ def _number(text: str, decimal_comma: bool) -> float | None:
     except ValueError:
         return None
     # float() takes 1_000 for a number; nobody who writes a table means it.
-    return value if np.isfinite(value) and abs(value) < 1e12 and "_" not in text else None
+    return value if abs(value) < 1e12 and "_" not in text else None

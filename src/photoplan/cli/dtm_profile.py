@@ -1,0 +1,51 @@
+"""`photoplan dtm profile`: heights along lines."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photoplan.cli.options import json_option
+
+__all__ = ["command"]
+
+
+@click.command("profile")
+@click.argument("model", type=click.Path(path_type=Path))
+@click.argument("lines", type=click.Path(path_type=Path))
+@click.option("-o", "--output", "outputs", type=click.Path(path_type=Path), required=True, multiple=True,
+              metavar="FILE", help=".csv, or .png for a picture; may be repeated.")  # fmt: skip
+@click.option("--tolerance", type=click.FloatRange(0, min_open=True), default=0.001, show_default=True,
+              metavar="M", help="Largest distance in height from the surface.")  # fmt: skip
+@click.option("--x", metavar="NAME", help="Column of X of a CSV, by name or number [x, east, easting].")
+@click.option("--y", metavar="NAME", help="Column of Y [y, north, northing].")
+@click.option("--line", "line_column", metavar="NAME", help="Column that tells lines apart [line, if there is one].")
+@click.option("--decimal-comma", is_flag=True, help="Numbers of a CSV are written 1,5.")
+@click.option("--crs", help="CRS of a terrain file that does not state it.")
+@click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(x: str | None, y: str | None, decimal_comma: bool, as_json: bool, quiet: bool, **options: Any) -> None:
+    """Profiles of MODEL over LINES: a vector file of lines, or a CSV of points along them, in the model's CRS.
+
+    There is a point wherever the surface bends: at grid lines, breaklines and edges of triangles; at a wall two.
+    """
+    from photoplan.io.terrain_points import PointTableFormat
+    from photoplan.products.dtm_profile import ProfileRequest, dtm_profile
+
+    request = ProfileRequest(form=PointTableFormat(x, y, None, decimal_comma), **options)
+    found = dtm_profile(request)
+    if as_json:
+        files = [str(path) for path in request.outputs]
+        click.echo(json.dumps({"files": files, "profiles": [p.to_dict() for p in found]}, indent=2))
+        return
+    for path in request.outputs:
+        click.echo(str(path))
+    if not quiet:
+        for p in found:
+            f = p.to_dict()
+            heights = "no surface" if f["low"] is None else f"{f['low']:.3f} to {f['high']:.3f} m"
+            click.echo(f"{p.name}: {f['length']:.2f} m, {f['points']} points, {heights}", err=True)

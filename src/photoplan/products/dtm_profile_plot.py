@@ -1,0 +1,97 @@
+"""A picture of profiles: heights over the distance, with their standard deviation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import UsageError
+
+__all__ = ["ProfilePlot"]
+
+MOST = 12
+"""Profiles of one picture at most."""
+_GROUND, _BAND = "#5b4a33", "#d9a441"
+
+
+class Drawn(Protocol):
+    """What is drawn."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def distance(self) -> NDArray[np.float64]: ...
+    @property
+    def heights(self) -> NDArray[np.float64]: ...
+    @property
+    def sigmas(self) -> NDArray[np.float64]: ...
+
+
+class ProfilePlot:
+    """Draws profiles; made before any work, so that a missing library is known at once.
+
+    Raises
+    ------
+    UsageError
+        When made: matplotlib is not installed.
+    """
+
+    def __init__(self) -> None:
+        try:
+            import matplotlib.figure  # noqa: PLC0415  # optional, and slow to import
+        except ImportError:
+            raise UsageError("a picture needs matplotlib; install it with: pip install 'photoplan[report]'") from None
+        self._figure = matplotlib.figure.Figure
+
+    def draw(self, path: Path, profiles: Sequence[Drawn]) -> None:
+        """Write a PNG: a panel for each profile, all in one scale.
+
+        Raises
+        ------
+        UsageError
+            There are too many profiles.
+        """
+        if len(profiles) > MOST:
+            raise UsageError(
+                f"{len(profiles)} lines; a picture shows at most {MOST}: give fewer, or write a .csv alone"
+            )
+        figure = self._figure(figsize=(10, 1.0 + 2.4 * len(profiles)), layout="constrained", dpi=110)
+        axes = figure.subplots(len(profiles), 1, squeeze=False)[:, 0]
+        span = max(_span(p.heights) for p in profiles)
+        length = max(float(p.distance[-1]) for p in profiles)
+        for panel, item in zip(axes, profiles):
+            _panel(panel, item, span, length)
+        axes[-1].set_xlabel("distance along the line [m]")
+        # The layout decides how large the panels are, and so how much heights are exaggerated.
+        figure.draw_without_rendering()
+        for panel, item in zip(axes, profiles):
+            box = panel.get_window_extent()
+            factor = (box.height / (1.1 * span)) / (box.width / length)
+            panel.set_title(f"{item.name}  (heights × {factor:.2g})", loc="left", fontsize=10)
+        figure.savefig(path, format="png")
+
+
+def _panel(panel: Any, item: Drawn, span: float, length: float) -> None:
+    d, z, s = item.distance, item.heights, item.sigmas
+    if np.isfinite(s).any():
+        panel.fill_between(d, z - 2 * s, z + 2 * s, color=_BAND, alpha=0.5, linewidth=0, label="± 2 σ")
+        panel.legend(loc="upper right", fontsize=8, frameon=False)
+    panel.plot(d, z, color=_GROUND, linewidth=1.2)
+    there = z[np.isfinite(z)]
+    middle = (float(there.min()) + float(there.max())) / 2 if there.size else 0.0
+    panel.set_ylim(middle - 0.55 * span, middle + 0.55 * span)
+    panel.set_xlim(0, length)
+    panel.set_ylabel("height [m]")
+    panel.ticklabel_format(useOffset=False)
+    panel.set_title(item.name, loc="left", fontsize=10)
+    panel.grid(alpha=0.3)
+
+
+def _span(heights: NDArray[np.float64]) -> float:
+    """Range of heights with room around it, metres."""
+    there = heights[np.isfinite(heights)]
+    return max(float(np.ptp(there)), 0.1) if there.size else 1.0
