@@ -40,8 +40,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     from photoplan.cli.progress import progress
     from photoplan.products.dtm_visible import VisibleRequest, dtm_visible
 
-    with progress(0, quiet) as report:
-        found = dtm_visible(VisibleRequest(**options), report)
+    found = dtm_visible(VisibleRequest(**options), lambda observers: progress(observers, quiet))
     if as_json:
         click.echo(json.dumps(found.to_dict(), indent=2))
         return

@@ -37,8 +37,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     from photoplan.cli.progress import progress
     from photoplan.products.dtm_volume import VolumeRequest, dtm_volume
 
-    with progress(0, quiet) as report:
-        found = dtm_volume(VolumeRequest(**options), report)
+    found = dtm_volume(VolumeRequest(**options), lambda windows: progress(windows, quiet))
     if as_json:
         click.echo(json.dumps(found.to_dict(), indent=2))
         return

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,10 @@ ROLES = {
     "h": ("h", "height", "eye"),
     "name": ("name", "id", "point"),
 }
+
+
+Report = Callable[[int, int], None]
+"""Called with the number of observers just finished and of the posts looked at."""
 
 
 @dataclass(frozen=True)
@@ -117,8 +122,12 @@ class VisibleReport:
         }
 
 
-def dtm_visible(request: VisibleRequest, progress: Callable[[int, int], None] | None = None) -> VisibleReport:
+def dtm_visible(
+    request: VisibleRequest, progress: Callable[[int], AbstractContextManager[Report]] | None = None
+) -> VisibleReport:
     """Compute and write a visibility map.
+
+    `progress` is given the number of observers, and opens a display of them.
 
     Raises
     ------
@@ -138,7 +147,8 @@ def dtm_visible(request: VisibleRequest, progress: Callable[[int, int], None] | 
     grid = _grid(request, terrain, places)
     _check_memory(grid, len(places), request)
     heights = read_grid(terrain, grid)
-    bands, rows = _look(request, terrain, grid, heights, places, sight, progress)
+    with nullcontext() if progress is None else progress(len(places)) as report:
+        bands, rows = _look(request, terrain, grid, heights, places, sight, report)
     names = [row.name for row in rows]
     if len(rows) > 1:
         names.insert(0, "least of all" if request.minimum_height else "count")
@@ -251,7 +261,7 @@ def _look(
     heights: NDArray[np.float32],
     places: Sequence[Place],
     sight: SightSettings,
-    progress: Callable[[int, int], None] | None,
+    report: Report | None,
 ) -> tuple[NDArray[Any], list[VisibleRow]]:
     """Bands of the map (sum or least first if there are several observers), and figures."""
     several = len(places) > 1
@@ -272,8 +282,8 @@ def _look(
         seen = need <= request.height_target
         bands[i + several] = need if request.minimum_height else np.where(known, seen, 255)
         rows.append(_row(request, grid, heights, observer, known, seen, (X, Y)))
-        if progress is not None:
-            progress(1, heights.size)
+        if report is not None:
+            report(1, heights.size)
     if several:
         each = bands[1:]
         if request.minimum_height:

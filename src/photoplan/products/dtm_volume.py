@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import shapely
@@ -18,6 +19,7 @@ from photoplan.io.grid_writer import GridOptions, write_grid
 from photoplan.io.polygons import Feature, read_features
 from photoplan.io.product import check_output
 from photoplan.products.open_terrain import OpenTerrain, open_terrain
+from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.volume import TILE, Volume, VolumeSettings, volume_between
 from photoplan.terrain.volume_sigma import ErrorModel, VolumeSigma, volume_sigma
@@ -25,11 +27,8 @@ from photoplan.terrain.volume_sigma import ErrorModel, VolumeSigma, volume_sigma
 __all__ = ["VolumeReport", "VolumeRequest", "VolumeRow", "dtm_volume"]
 
 
-@runtime_checkable
-class _WithSigmas(Protocol):
-    """A surface that knows how exact it is."""
-
-    def sigmas(self, XY: Any) -> NDArray[np.float64]: ...
+Report = Callable[[int, int], None]
+"""Called with the number of windows just finished and of their cells."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +107,12 @@ class VolumeReport:
         }
 
 
-def dtm_volume(request: VolumeRequest, progress: Callable[[int, int], None] | None = None) -> VolumeReport:
+def dtm_volume(
+    request: VolumeRequest, progress: Callable[[int], AbstractContextManager[Report]] | None = None
+) -> VolumeReport:
     """Volumes from terrain A to terrain B.
+
+    `progress` is given the number of windows that are expected, and opens a display of them.
 
     Raises
     ------
@@ -134,19 +137,34 @@ def dtm_volume(request: VolumeRequest, progress: Callable[[int, int], None] | No
     settings = VolumeSettings(cell, 0.0 if request.resolution else request.tolerance)
     errors, notes = _errors(request, a, b)
     rows = []
-    for item in items:
-        volume = volume_between(a.surface, b.surface, item.geometry, settings, progress)
-        sigma = None
-        if errors is not None:
-            sigma = volume_sigma(a.surface, b.surface, errors, item.geometry, cell, request.bias)
-            if sigma.unknown > 0:
-                notes.append(f"{item.name}: on {sigma.unknown:.6g} m² a model has no standard deviation")
-        rows.append(VolumeRow(item.name, volume, sigma))
-        if not volume.settled:
-            notes.append(f"{item.name}: not within the tolerance; see the change with the last halving of the cells")
+    with nullcontext() if progress is None else progress(_windows(items, cell)) as report:
+        for item in items:
+            volume = volume_between(a.surface, b.surface, item.geometry, settings, report)
+            sigma = None
+            if errors is not None:
+                sigma = volume_sigma(a.surface, b.surface, errors, item.geometry, cell, request.bias)
+            rows.append(VolumeRow(item.name, volume, sigma))
+    notes += [note for row in rows for note in _notes(row)]
     if request.difference is not None:
         _write_difference(request, a, b, items, cell, inputs)
     return VolumeReport(tuple(rows), system, tuple(notes), request.difference)
+
+
+def _windows(items: tuple[Feature, ...], cell: float) -> int:
+    """Windows of the first two rounds of the integration."""
+    sides = np.array([item.geometry.bounds for item in items])
+    counts = [np.ceil((sides[:, 2:] - sides[:, :2]) / (side * TILE)) + 1 for side in (cell, cell / 2)]
+    return int(sum(np.maximum(n - 1, 1).prod(axis=1).sum() for n in counts))
+
+
+def _notes(row: VolumeRow) -> list[str]:
+    """What is to be said about one polygon."""
+    notes = []
+    if row.sigma is not None and row.sigma.unknown > 0:
+        notes.append(f"{row.name}: on {row.sigma.unknown:.6g} m² a model has no standard deviation")
+    if not row.volume.settled:
+        notes.append(f"{row.name}: not within the tolerance; see the change with the last halving of the cells")
+    return notes
 
 
 def _one_system(a: OpenTerrain, b: OpenTerrain, declared: str | None) -> str:
@@ -197,8 +215,7 @@ def _errors(
 
 
 def _own(terrain: OpenTerrain) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
-    surface: object = terrain.surface
-    return surface.sigmas if isinstance(surface, _WithSigmas) else None
+    return terrain.surface.sigmas if isinstance(terrain.surface, HybridSurface) else None
 
 
 def _write_difference(

@@ -123,7 +123,7 @@ def monoplot(
     direction = _directions(camera, xy, XYZ[:, 2])
     normal = np.column_stack([-slope, np.ones(len(xy))])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    angle = np.arcsin(np.clip(-(normal * direction).sum(axis=1), -1, 1))
+    angle = np.where(np.isnan(XYZ[:, 0]), np.nan, np.arcsin(np.clip(-(normal * direction).sum(axis=1), -1, 1)))
     covariance = _covariance(camera, XYZ, slope, errors)
     return GroundPoints(XYZ, covariance, angle, _holes(camera, xy, XYZ, terrain, height_range[1]), reasons)
 
