@@ -152,8 +152,9 @@ def _delimiter(path: Path, data: list[tuple[int, str]], options: ReadOptions) ->
             rows = [split(text, delimiter) for _, text in data]
         except ValueError:
             continue
-        if len(rows[-1]) >= 3:
-            numbers = sum(_number(f, options.decimal_comma) is not None for f in rows[-1])
+        wide = [row for row in rows if len(row) >= 3]
+        if wide:
+            numbers = sum(_number(f, options.decimal_comma) is not None for f in wide[-1])
             equal = len({len(row) for row in rows}) == 1
             candidates.append((-2 * (numbers >= 3) - equal, delimiter))
     if not candidates:

@@ -196,7 +196,10 @@ def _merged(parts: Sequence[MeasuredTerrain]) -> MeasuredTerrain:
 
 def _heights(parts: Sequence[MeasuredTerrain], notes: list[str]) -> str | None:
     """The height system that all files state; None if one of them states none."""
-    stated = {p.height_system: p.files[0] for p in reversed(parts) if p.height_system is not None}
+    stated: dict[str, Path] = {}
+    for part in parts:
+        if part.height_system is not None:
+            stated.setdefault(part.height_system, part.files[0])
     if len(stated) > 1:
         given = ", ".join(f"{path} {name}" for name, path in stated.items())
         raise HeightSystemError(f"height systems differ: {given}; bring the files into one system beforehand")
