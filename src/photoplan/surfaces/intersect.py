@@ -9,8 +9,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import Camera
 from photoplan.surfaces.base import Surface
+from photoplan.surfaces.hybrid import HybridSurface
+from photoplan.surfaces.profile import profile
+from photoplan.surfaces.raster import RasterSurface
 
-__all__ = ["intersect"]
+__all__ = ["intersect", "intersect_strict"]
 
 
 def intersect(
@@ -70,6 +73,71 @@ def intersect(
     if there.any():
         found[there] = _at_height(camera, xy[there], (upper[there] + lower[there]) / 2)
     return found
+
+
+def intersect_strict(
+    camera: Camera,
+    xy: ArrayLike,
+    surface: HybridSurface | RasterSurface,
+    height_range: tuple[float, float],
+    tolerance: float = 0.001,
+) -> NDArray[np.float64]:
+    """First point of the surface that each image ray meets, from the profile of the surface below the ray.
+
+    No ridge and no wall is missed, however thin: where the ray meets the face of a wall, the point lies on it. Slower
+    than `intersect`: for single points, such as those that a person measures.
+
+    Parameters
+    ----------
+    camera : Camera
+    xy : array_like, shape (n, 2)
+        Image points in pixels.
+    surface : HybridSurface or RasterSurface
+        In the CRS of the camera.
+    height_range : (float, float)
+        Heights between which the surface is looked for, metres. In between, rays are taken as straight.
+    tolerance : float
+        Of the profile, metres.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        X, Y, Z; NaN where the ray does not meet the surface from above: it looks up, passes beyond the terrain, or
+        goes below the terrain through a gap or the model's border.
+    """
+    xy = np.asarray(xy, float)
+    low, high = height_range
+    high = min(high, float(camera.center[2]))
+    found = np.full((len(xy), 3), np.nan)
+    if not (np.isfinite([low, high]).all() and low <= high):
+        return found
+    # A little more on both sides, so that a level surface lies between.
+    upper = _at_height(camera, xy, np.full(len(xy), high + tolerance))
+    lower = _at_height(camera, xy, np.full(len(xy), low - tolerance))
+    for i in np.flatnonzero(np.isfinite(upper).all(axis=1) & np.isfinite(lower).all(axis=1)):
+        found[i] = _first_hit(surface, upper[i], lower[i], tolerance)
+    return found
+
+
+def _first_hit(
+    surface: HybridSurface | RasterSurface, upper: NDArray[np.float64], lower: NDArray[np.float64], tolerance: float
+) -> NDArray[np.float64]:
+    """Where the straight line from an upper to a lower point first comes down to the surface."""
+    nowhere = np.full(3, np.nan)
+    length = float(np.hypot(*(lower - upper)[:2]))
+    if length < tolerance * 1e-3:
+        height = float(surface.heights(upper[:2]))
+        return np.array([*upper[:2], height]) if lower[2] <= height <= upper[2] else nowhere
+    distance, _, _, Z = profile(surface, [upper[:2], lower[:2]], tolerance)
+    above = upper[2] + distance / length * (lower[2] - upper[2]) - Z
+    with np.errstate(invalid="ignore"):
+        hit = np.flatnonzero((above[:-1] >= 0) & (above[1:] <= 0))
+    if not hit.size:
+        return nowhere
+    k = hit[0]
+    drop = above[k] - above[k + 1]
+    t = (distance[k] + (distance[k + 1] - distance[k]) * (above[k] / drop if drop > 0 else 0.0)) / length
+    return np.asarray(upper + t * (lower - upper))
 
 
 def _at_height(camera: Camera, xy: NDArray[np.float64], height: NDArray[np.float64]) -> NDArray[np.float64]:
