@@ -15,14 +15,15 @@ from numpy.typing import NDArray
 from photoplan.io.terrain_model_read import ModelReader
 from photoplan.io.terrain_model_tables import GrossError, ModelHeader, empty_figures
 from photoplan.io.terrain_model_write import ModelParts, ModelWriter
-from photoplan.surfaces.units import LineElement, MeshFaces, Unit, UnitFigures, UnitLayout
+from photoplan.surfaces.mesh_faces import build_faces
+from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
 
 CRS = "EPSG:32633"
 LAYOUT = UnitLayout(500_000.0, 5_300_000.0, 40.0, 4, 3)
 EMPTY = (3, 1)
 """The unit that has no surface."""
 LINED = (1, 1)
-"""The unit with a wall along the diagonal of each of its meshes on the main diagonal."""
+"""The unit with a wall along its main diagonal."""
 WALL = 2.0
 """What the wall's right side is lower, metres."""
 
@@ -45,31 +46,18 @@ def grid_unit(
 
 
 def wall_unit(layout: UnitLayout, column: int, row: int, meshes: int) -> Unit:
-    """A unit whose main diagonal is a wall: south-west of it the surface is lower by `WALL`."""
+    """A unit whose main diagonal is a wall: at it, the surface south-west is lower by `WALL`."""
+    unit = grid_unit(layout, column, row, meshes)
+    return replace(unit, faces=build_faces(unit, [diagonal(layout, column, row, meshes)]))
 
-    def stepped(X: NDArray[np.float64], Y: NDArray[np.float64]) -> NDArray[np.float64]:
-        left, top = layout.corner(column, row)
-        return hills(X, Y) - WALL * ((X - left) < (top - Y) - 1e-6)
 
-    unit = grid_unit(layout, column, row, meshes, stepped)
-    width = unit.width
-    vertices: list[list[float]] = []
-    corners: list[list[int]] = []
-    start = np.zeros(meshes**2 + 1, np.int64)
-    for mesh in range(meshes**2):
-        r, c = divmod(mesh, meshes)
-        if r == c:
-            x0, y0 = unit.left + c * width, unit.top - r * width
-            x1, y1 = x0 + width, y0 - width
-            high = [[x0, y0], [x1, y1], [x1, y0]]
-            low = [[x0, y0], [x0, y1], [x1, y1]]
-            for part, drop in ((high, 0.0), (low, WALL)):
-                corners.append([len(vertices) + i for i in range(3)])
-                vertices += [[x, y, float(hills(np.array(x), np.array(y))) - drop] for x, y in part]
-        start[mesh + 1] = len(corners)
-    xyz = np.array(vertices)
-    faces = MeshFaces(xyz, np.full(len(xyz), 0.02, np.float32), np.array(corners, np.int32), start)
-    return replace(unit, faces=faces)
+def diagonal(layout: UnitLayout, column: int, row: int, meshes: int) -> LineElement:
+    """The wall along a unit's main diagonal: left of it, in its direction to the south-east, is high."""
+    left, top = layout.corner(column, row)
+    along = np.arange(meshes + 1) * layout.side / meshes
+    z = hills(left + along, top - along)
+    xyz, count = np.column_stack([left + along, top - along, z]), meshes + 1
+    return LineElement("wall Ä 7", "breakline", "W1", xyz, z - WALL, np.full(count, 0.02), np.ones(count, bool))
 
 
 def unit_at(column: int, row: int, layout: UnitLayout = LAYOUT) -> Unit | None:
@@ -92,12 +80,8 @@ def figures_of(unit: Unit | None, column: int, row: int) -> UnitFigures:
 
 
 def wall_line(layout: UnitLayout = LAYOUT) -> LineElement:
-    """The wall of the unit `LINED`: left of it, in its direction to the south-east, is high."""
-    left, top = layout.corner(*LINED)
-    along = np.arange(9) * layout.side / 8
-    z = hills(left + along, top - along)
-    xyz = np.column_stack([left + along, top - along, z])
-    return LineElement("wall Ä 7", "breakline", "W1", xyz, z - WALL, np.full(9, 0.02), np.ones(9, bool))
+    """The wall of the unit `LINED`."""
+    return diagonal(layout, *LINED, 8)
 
 
 def lines(layout: UnitLayout = LAYOUT) -> list[LineElement]:

@@ -76,7 +76,7 @@ def _terrain(terrain: Terrain) -> list[str]:
         "[terrain]",
         *_entries(
             [
-                ("file", terrain.file, "raster of heights (GeoTIFF, ASC)"),
+                ("file", terrain.file, "heights: GeoTIFF, ASC, or a terrain model (.gpkg)"),
                 ("height", terrain.height, "or one height everywhere"),
                 ("crs", terrain.crs, "its CRS, where the file does not state one"),
             ]
