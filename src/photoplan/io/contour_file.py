@@ -18,6 +18,7 @@ from pyogrio.errors import DataLayerError, DataSourceError
 
 from photoplan.errors import UsageError
 from photoplan.io.disk import disk_error, sync_file, sync_folder
+from photoplan.io.lock import FileLock
 from photoplan.io.product import check_output
 
 __all__ = ["FORMATS", "ContourRow", "LabelRow", "contour_files", "write_contours"]
@@ -110,15 +111,20 @@ def write_contours(
     ------
     UsageError
         The ending is unknown, a file exists or is an input, or the folder cannot be written.
+    RunLocked
+        Another run is writing the same file.
     ResourceError
         The disk is full.
     """
     files = contour_files(path, labels is not None)
     for file in files:
         check_output(file, inputs, overwrite=overwrite)
-    folder = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    folder = path.with_name(f".{path.name}.partial")
     try:
+        lock = FileLock(path.with_name(f".{path.name}.lock"))
+        lock.acquire()
         try:
+            # A run that was killed may have left its folder.
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir()
             if path.suffix.lower() == ".dxf":
@@ -132,6 +138,7 @@ def write_contours(
             sync_folder(path.parent)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
+            lock.release()
     except (DataSourceError, DataLayerError) as error:
         raise disk_error(path, OSError(None, str(error))) from error
     except OSError as error:

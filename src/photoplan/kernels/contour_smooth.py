@@ -17,6 +17,8 @@ from photoplan.kernels.jit import inner, kernel
 
 __all__ = ["smooth_line", "thin_line"]
 
+# A step towards the mean of the neighbours, and a part of it back, so that small rings shrink less.
+_INWARD, _OUTWARD = 0.5, -0.2
 # Below this sine the edge runs so nearly along the line that their intersection says nothing.
 _OBLIQUE = 0.2
 
@@ -28,7 +30,7 @@ def _cross(ax: float, ay: float, bx: float, by: float) -> float:
 
 @kernel
 def smooth_line(places: NDArray[np.float64], closed: bool, passes: int) -> None:
-    """Pull the vertices of a line towards the mean of their neighbours, inside their ranges.
+    """Pull the vertices of a line towards the mean of their neighbours and back, inside their ranges.
 
     Parameters
     ----------
@@ -38,11 +40,12 @@ def smooth_line(places: NDArray[np.float64], closed: bool, passes: int) -> None:
     closed
         The first vertex follows the last one (it is not repeated).
     passes
-        How often.
+        How often; even.
     """
     n = places.shape[0]
     moved = np.empty((n, 2))
-    for _ in range(passes):
+    for turn in range(passes):
+        step = _INWARD if turn % 2 == 0 else _OUTWARD
         for i in range(n):
             px, py = places[i, 0], places[i, 1]
             moved[i, 0], moved[i, 1] = px, py
@@ -51,8 +54,8 @@ def smooth_line(places: NDArray[np.float64], closed: bool, passes: int) -> None:
             if size == 0.0 or (not closed and (i == 0 or i == n - 1)):
                 continue
             before, after = (i - 1) % n, (i + 1) % n
-            mx = 0.25 * (places[before, 0] + places[after, 0]) + 0.5 * px - places[i, 2]
-            my = 0.25 * (places[before, 1] + places[after, 1]) + 0.5 * py - places[i, 3]
+            mx = (1.0 - step) * px + 0.5 * step * (places[before, 0] + places[after, 0]) - places[i, 2]
+            my = (1.0 - step) * py + 0.5 * step * (places[before, 1] + places[after, 1]) - places[i, 3]
             dx, dy = places[after, 0] - places[before, 0], places[after, 1] - places[before, 1]
             sine = _cross(ex, ey, dx, dy)
             if abs(sine) > _OBLIQUE * np.sqrt(size * (dx * dx + dy * dy)):

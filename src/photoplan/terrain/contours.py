@@ -38,7 +38,7 @@ __all__ = ["ContourLine", "ContourOptions", "trace_contours"]
 #: More pieces in one part mean an interval far below what the heights say.
 MOST_PIECES = 30_000_000
 #: Rounds of smoothing; the waves that it takes out are some vertices long.
-PASSES = 10
+PASSES = 20
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def trace_contours(parts: Iterable[SurfacePart], options: ContourOptions) -> Ite
         if part.row != joiner.row:
             yield from _lines(joiner.next_row(part.row), options, shortest)
         # Round a top exactly at a level runs a ring that only keeps off the post: nobody wants to see it.
-        shortest = max(options.shortest, 1e-3 * min(part.mesh))
+        shortest = max(options.shortest, min(1e-3 * min(part.mesh), 0.01))
         done = (joiner.add(chain) for chain in _chains(build_mesh(part, front), options))
         yield from _lines((chain for chain in done if chain is not None), options, shortest)
     yield from _lines(joiner.finish(), options, shortest)
