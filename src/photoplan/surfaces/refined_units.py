@@ -1,0 +1,262 @@
+"""A hybrid model with refined meshes inside polygons (Behr 1989, §6.1)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.surfaces.hybrid import HybridSurface
+from photoplan.surfaces.mesh_faces import build_faces, on_grid
+from photoplan.surfaces.refined import RefinedSurface
+from photoplan.surfaces.units import LineElement, Unit, UnitLayout, UnitSource
+
+__all__ = ["LinedUnits", "clip_line", "refine_units"]
+
+#: Vertices of clipped lines nearer than this, metres, are one.
+SAME = 1e-6
+#: A unit with more meshes along its side than this is meant otherwise.
+MOST_MESHES = 4096
+
+Index = tuple[int, int]
+_BESIDE = {"north": (0, -1), "south": (0, 1), "west": (-1, 0), "east": (1, 0)}
+
+
+@dataclass(frozen=True, eq=False)
+class LinedUnits:
+    """A hybrid model with its lines: what its triangles are built from."""
+
+    units: UnitSource
+    lines: Sequence[LineElement] = ()
+    domain: Any = None
+    """Shapely polygon or multipolygon outside which there are no triangles; None: everywhere."""
+
+
+def refine_units(
+    coarse: LinedUnits, fine: LinedUnits, polygons: Any, transition: float, width: float
+) -> tuple[dict[Index, Unit], tuple[LineElement, ...]]:
+    """The units of a coarse model that a finer one changes.
+
+    Units that the polygons touch get posts of the `RefinedSurface` on a finer grid: their own, halved until `width` is
+    reached. Inside the polygons the lines of the fine model count, their heights blended like the surface; outside
+    those of the coarse one. Units around get new triangles, since finer posts adjoin.
+
+    Parameters
+    ----------
+    coarse, fine : LinedUnits
+        Both in one CRS and height system; their layouts may differ.
+    polygons : shapely polygon or multipolygon
+    transition : float
+        Width of the band inside the border of the polygons in which the difference is blended in, metres.
+    width : float
+        Largest grid width of the units that the polygons touch, metres.
+
+    Returns
+    -------
+    units : dict of (column, row) to Unit
+        Those of the coarse layout that are new; all others stay as they are.
+    lines : tuple of LineElement
+        All lines of the refined model.
+
+    Raises
+    ------
+    InputError
+        The width is not positive or absurdly small, or what `RefinedSurface` and `build_faces` refuse.
+    """
+    layout = coarse.units.layout
+    if not (width > 0 and layout.side / width <= MOST_MESHES):
+        raise InputError(
+            f"grid width {width} m in units of {layout.side} m; between {layout.side / MOST_MESHES} m and the side "
+            "of a unit is needed"
+        )
+    blend = _Blend(HybridSurface(coarse.units), HybridSurface(fine.units), polygons, transition)
+    inner = _touched(layout, polygons)
+    around = _around(layout, inner)
+    old = {at: unit for at in sorted(around) if (unit := coarse.units.unit(*at)) is not None}
+    plain = {at: dataclasses.replace(unit, faces=None) for at, unit in old.items()}
+    for at in inner:
+        unit = blend.unit(layout, at, plain.get(at), width)
+        if unit is not None:
+            plain[at] = unit
+    changed = _around(layout, inner, 1)
+    lines = _lines(coarse, fine, blend, plain, changed)
+    domain = _domain(coarse.domain, fine.domain, polygons)
+    return {at: _with_faces(at, plain, layout, lines, domain) for at in sorted(changed & plain.keys())}, lines
+
+
+def clip_line(line: LineElement, polygons: Any, inside: bool) -> list[LineElement]:
+    """The parts of a line inside polygons, or outside; where it is cut, everything is linear between its vertices."""
+    path = shapely.LineString(line.xyz[:, :2])
+    cuts = shapely.get_coordinates(path.intersection(polygons.boundary))
+    steps = np.hypot(*np.diff(line.xyz[:, :2], axis=0).T)
+    along = np.append(0.0, np.cumsum(steps))
+    new = np.unique(shapely.line_locate_point(path, shapely.points(cuts))) if len(cuts) else np.empty(0)
+    if len(new):
+        after = np.clip(np.searchsorted(along, new), 1, len(along) - 1)
+        far = (np.abs(new - along[after]) > SAME) & (np.abs(new - along[after - 1]) > SAME)
+        new = new[far & (np.diff(new, prepend=-np.inf) > SAME)]
+    columns = [line.xyz, line.sigmas[:, None], line.on_grid[:, None]]
+    columns += [] if line.right is None else [line.right[:, None]]
+    table = np.concatenate(columns, axis=1)
+    inserted = np.stack([np.interp(new, along, column) for column in table.T], axis=1)
+    inserted[:, 4] = 0
+    order = np.argsort(np.concatenate([along, new]), kind="stable")
+    table = np.concatenate([table, inserted])[order]
+    middle = (table[1:, :2] + table[:-1, :2]) / 2
+    keep = shapely.intersects_xy(polygons, middle) == inside
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]]).astype(int)))
+    return [_element(line, table[a : b + 1]) for a, b in zip(ends[::2], ends[1::2])]
+
+
+def _element(line: LineElement, table: NDArray[np.float64]) -> LineElement:
+    right = None if line.right is None else np.ascontiguousarray(table[:, 5])
+    return dataclasses.replace(
+        line, xyz=table[:, :3].copy(), right=right, sigmas=table[:, 3].copy(), on_grid=table[:, 4] > 0
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Blend:
+    """Both surfaces and how they are joined."""
+
+    coarse: HybridSurface
+    fine: HybridSurface
+    polygons: Any
+    transition: float
+
+    @property
+    def surface(self) -> RefinedSurface:
+        return RefinedSurface(self.coarse, self.fine, self.polygons, self.transition)
+
+    def unit(self, layout: UnitLayout, at: Index, old: Unit | None, width: float) -> Unit | None:
+        """A unit with posts of the joined surface; None if there are none."""
+        left, top = layout.corner(*at)
+        meshes = old.meshes if old is not None else 1
+        while layout.side / meshes > width * (1 + 1e-9):
+            meshes *= 2
+        step = np.arange(meshes + 1) * (layout.side / meshes)
+        XY = np.stack(np.meshgrid(left + step, top - step), axis=-1)
+        heights = self.surface.heights(XY)
+        if not np.isfinite(heights).any():
+            return None
+        datum = old.datum if old is not None else float(np.rint(np.nanmean(heights)))
+        sigmas = np.where(np.isfinite(heights), self.sigmas(XY), np.nan)
+        return Unit(
+            left, top, layout.side, (heights - datum).astype(np.float32), sigmas.astype(np.float32), datum, None
+        )
+
+    def sigmas(self, XY: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Standard deviation of the joined surface: the two models err independently of each other."""
+        weights = self.surface.weights(XY)
+        coarse, fine = self.coarse.sigmas(XY), self.fine.sigmas(XY)
+        both = np.hypot((1 - weights) * coarse, weights * fine)
+        inner = np.where(np.isnan(fine), coarse, np.where(np.isnan(coarse), fine, both))
+        return np.asarray(np.where(np.isfinite(weights), inner, coarse))
+
+    def line(self, line: LineElement) -> LineElement:
+        """A line of the fine model with blended heights."""
+        XY = line.xyz[:, :2]
+        weights = np.nan_to_num(self.surface.weights(XY), nan=0.0)
+        coarse, sigma = self.coarse.heights(XY), self.coarse.sigmas(XY)
+        weights = np.where(np.isnan(coarse), 1.0, weights)
+        coarse, sigma = np.nan_to_num(coarse), np.nan_to_num(sigma)
+
+        def blended(Z: NDArray[np.float64]) -> NDArray[np.float64]:
+            return coarse + weights * (Z - coarse)
+
+        return dataclasses.replace(
+            line,
+            xyz=np.column_stack([XY, blended(line.xyz[:, 2])]),
+            right=None if line.right is None else blended(line.right),
+            sigmas=np.hypot((1 - weights) * sigma, weights * line.sigmas),
+        )
+
+
+def _touched(layout: UnitLayout, polygons: Any) -> set[Index]:
+    """Units that share an area with the polygons."""
+    xmin, ymin, xmax, ymax = polygons.bounds
+    columns = _span(xmin - layout.left, xmax - layout.left, layout.side, layout.columns)
+    rows = _span(layout.top - ymax, layout.top - ymin, layout.side, layout.rows)
+    shapely.prepare(polygons)
+    found = set()
+    for column in columns:
+        for row in rows:
+            left, top = layout.corner(column, row)
+            inset = layout.side * 1e-9
+            box = shapely.box(left + inset, top - layout.side + inset, left + layout.side - inset, top - inset)
+            if polygons.intersects(box):
+                found.add((column, row))
+    return found
+
+
+def _span(first: float, last: float, side: float, count: int) -> range:
+    return range(max(0, int(np.floor(first / side))), min(count - 1, int(np.floor(last / side))) + 1)
+
+
+def _around(layout: UnitLayout, units: Iterable[Index], reach: int = 2) -> set[Index]:
+    """Units, and those around them up to `reach` away."""
+    steps = range(-reach, reach + 1)
+    return {
+        (c + dc, r + dr)
+        for c, r in units
+        for dc in steps
+        for dr in steps
+        if 0 <= c + dc < layout.columns and 0 <= r + dr < layout.rows
+    }
+
+
+def _lines(
+    coarse: LinedUnits, fine: LinedUnits, blend: _Blend, plain: dict[Index, Unit], changed: set[Index]
+) -> tuple[LineElement, ...]:
+    """All lines of the refined model, with the intersections of the new grids."""
+    layout = coarse.units.layout
+    meshes = np.zeros((layout.rows, layout.columns), np.int64)
+    for (column, row), unit in plain.items():
+        meshes[row, column] = unit.meshes
+    corners = [layout.corner(*at) for at in changed]
+    zone = shapely.union_all([shapely.box(x, y - layout.side, x + layout.side, y) for x, y in corners])
+    lines: list[LineElement] = []
+    for line in coarse.lines:
+        path = shapely.LineString(line.xyz[:, :2])
+        if not path.intersects(zone):
+            lines.append(line)
+            continue
+        lines += [on_grid(part, layout, meshes) for part in clip_line(line, blend.polygons, inside=False)]
+    for line in fine.lines:
+        parts = clip_line(line, blend.polygons, inside=True)
+        lines += [blend.line(on_grid(part, layout, meshes)) for part in parts]
+    return tuple(lines)
+
+
+def _domain(coarse: Any, fine: Any, polygons: Any) -> Any:
+    """Inside the polygons the fine model's domain, outside the coarse one's; None: everywhere."""
+    if coarse is None and fine is None:
+        return None
+    everywhere = shapely.box(*(np.array(polygons.buffer(1e7).bounds)))
+    outer = (everywhere if coarse is None else coarse).difference(polygons)
+    inner = polygons if fine is None else polygons.intersection(fine)
+    return outer.union(inner)
+
+
+def _with_faces(
+    at: Index, plain: dict[Index, Unit], layout: UnitLayout, lines: Sequence[LineElement], domain: Any
+) -> Unit:
+    unit = plain[at]
+    near = layout.side * 1e-6
+    low = np.array([unit.left - near, unit.top - unit.side - near])
+    high = np.array([unit.left + unit.side + near, unit.top + near])
+    here = [
+        line
+        for line in lines
+        if (line.xyz[:, :2].max(axis=0) >= low).all() and (line.xyz[:, :2].min(axis=0) <= high).all()
+    ]
+    beside = {
+        side: plain[at[0] + dc, at[1] + dr] for side, (dc, dr) in _BESIDE.items() if (at[0] + dc, at[1] + dr) in plain
+    }
+    return dataclasses.replace(unit, faces=build_faces(unit, here, beside, domain))
