@@ -1,0 +1,156 @@
+"""Linear prediction in patches: one dense system for each neighbourhood, many right-hand sides."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.kernels.collocation import correlation, solve_transposed
+from photoplan.kernels.jit import inner, kernel
+from photoplan.kernels.patch_system import system, trend, usable
+
+__all__ = ["predict"]
+
+# Models of a patch with less weight than this are left out.
+_LEAST = 0.02
+
+
+@inner
+def _weight(d: float) -> float:
+    """Weight of a patch at distance d from its middle in halves of its leaf: 1 up to ½, 0 from 1½, smooth between."""
+    t = min(max(1.5 - abs(d), 0.0), 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+@kernel
+def predict(
+    xyz: NDArray[Any],
+    noise: NDArray[Any],
+    ids: NDArray[Any],
+    leaves: NDArray[Any],
+    targets: NDArray[Any],
+    wanted: NDArray[Any],
+    wanted_start: NDArray[Any],
+    lines: NDArray[Any],
+    start: NDArray[Any],
+    models: NDArray[Any],
+    shares: NDArray[Any],
+    sums: NDArray[Any],
+) -> int:
+    """Add each patch's prediction of its targets to `sums`; returns the number of patches without a solution.
+
+    Parameters
+    ----------
+    xyz : ndarray, shape (n, 3)
+        Data.
+    noise : ndarray, shape (n,)
+        Their variances (filter values squared); negative: not to be used.
+    ids : ndarray, shape (p, k), int
+        Data of each patch; negative entries are no data.
+    leaves : ndarray, shape (p, 3)
+        Middle and half side of each patch's leaf.
+    targets : ndarray, shape (t, 2)
+        Where heights are wanted.
+    wanted, wanted_start : ndarrays, int
+        Targets of patch i are wanted[wanted_start[i]:wanted_start[i + 1]].
+    lines, start : ndarrays
+        Vertices of all breaklines near, and where each begins.
+    models : ndarray, shape (p, m, 4)
+        Family, variance, half-value distance, gap between the sides of a line in half-value distances.
+    shares : ndarray, shape (p, m)
+        Weights of a patch's models, which add up to 1.
+    sums : ndarray, shape (t, 4)
+        Sums of w·height, w, w·standard deviation; and the shortest distance to a datum.
+
+    Notes
+    -----
+    The weight of a patch falls smoothly to zero at three quarters of a leaf's side from its middle, so that the sum
+    over patches is continuous; and with the predicted variance, so that the patch that knows more decides.
+    """
+    failed = 0
+    for patch in range(len(leaves)):
+        some = wanted[wanted_start[patch] : wanted_start[patch + 1]]
+        if len(some) == 0:
+            continue
+        data = usable(ids[patch], noise)
+        solved = False
+        for k in range(models.shape[1]):
+            if len(data) > 0 and shares[patch, k] > _LEAST:
+                u, at, at_points, b = system(
+                    xyz, noise, data, leaves[patch], targets[some], lines, start, models[patch, k]
+                )
+                if u.shape[0] > 0:
+                    solved = True
+                    w, near = _towards(at, at_points, models[patch, k])
+                    solve_transposed(u, w)
+                    _combine(
+                        w, b, at_points, near, models[patch, k], leaves[patch], shares[patch, k], targets, some, sums
+                    )
+        failed += 0 if solved else 1
+    return failed
+
+
+@kernel
+def _towards(at: NDArray[Any], at_points: NDArray[Any], model: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Covariances between data and targets (n, t), and the distance of each target to the nearest datum, metres."""
+    family, variance, length = int(model[0]), model[1], model[2]
+    n, m = len(at), len(at_points)
+    w = np.empty((n, m))
+    near = np.full(m, np.inf)
+    for i in range(n):
+        for j in range(m):
+            apart = 0.0
+            for k in range(2, at.shape[1]):
+                d = at[i, k] - at_points[j, k]
+                apart += d * d
+            dx, dy = at[i, 0] - at_points[j, 0], at[i, 1] - at_points[j, 1]
+            plain = dx * dx + dy * dy
+            near[j] = min(near[j], plain)
+            w[i, j] = variance * correlation(plain + apart, family)
+    return w, np.sqrt(near) * length
+
+
+@kernel
+def _combine(
+    w: NDArray[Any],
+    b: NDArray[Any],
+    at_points: NDArray[Any],
+    near: NDArray[Any],
+    model: NDArray[Any],
+    leaf: NDArray[Any],
+    part: float,
+    targets: NDArray[Any],
+    some: NDArray[Any],
+    sums: NDArray[Any],
+) -> None:
+    """Heights and variances of one patch's targets, added to the sums."""
+    n, m = w.shape
+    beta, inverse = trend(b)
+    height, explained = np.zeros(m), np.zeros(m)
+    cross = np.zeros((3, m))
+    for i in range(n):
+        b1, b2, b3 = b[i, 1], b[i, 2], b[i, 3]
+        rest = b[i, 0] - (b1 * beta[0] + b2 * beta[1] + b3 * beta[2])
+        for j in range(m):
+            value = w[i, j]
+            height[j] += value * rest
+            explained[j] += value * value
+            cross[0, j] += value * b1
+            cross[1, j] += value * b2
+            cross[2, j] += value * b3
+    for j in range(m):
+        x, y = at_points[j, 0], at_points[j, 1]
+        v0, v1, v2 = 1.0 - cross[0, j], x - cross[1, j], y - cross[2, j]
+        i0 = inverse[0, 0] * v0 + inverse[0, 1] * v1 + inverse[0, 2] * v2
+        i1 = inverse[1, 0] * v0 + inverse[1, 1] * v1 + inverse[1, 2] * v2
+        i2 = inverse[2, 0] * v0 + inverse[2, 1] * v1 + inverse[2, 2] * v2
+        spread = max(model[1] - explained[j] + v0 * i0 + v1 * i1 + v2 * i2, 1e-6 * model[1])
+        t = some[j]
+        share = _weight((targets[t, 0] - leaf[0]) / leaf[2]) * _weight((targets[t, 1] - leaf[1]) / leaf[2])
+        weight = share * part / spread
+        sums[t, 0] += weight * (height[j] + beta[0] + beta[1] * x + beta[2] * y)
+        sums[t, 1] += weight
+        sums[t, 2] += weight * np.sqrt(spread)
+        sums[t, 3] = min(sums[t, 3], near[j])

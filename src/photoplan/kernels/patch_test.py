@@ -1,0 +1,106 @@
+"""What the data of a patch say of each other: scores of covariance functions, and tests for gross errors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.kernels.collocation import solve_transposed
+from photoplan.kernels.jit import kernel
+from photoplan.kernels.patch_system import left_out, system, usable
+
+__all__ = ["score_models", "test_points"]
+
+# Points count with a normal weight of this many half sides of the leaf: far ones are other patches' matter.
+_FOCUS = 1.5
+
+
+@kernel
+def score_models(
+    xyz: NDArray[Any],
+    noise: NDArray[Any],
+    ids: NDArray[Any],
+    leaves: NDArray[Any],
+    points: int,
+    lines: NDArray[Any],
+    start: NDArray[Any],
+    models: NDArray[Any],
+    result: NDArray[Any],
+) -> None:
+    """How badly each model predicts every point of a patch from all others, result[patch, model].
+
+    The score is the sum of e²/v + log v over the points (numbers below `points`), e being the difference from the
+    prediction and v its variance: twice the negative logarithm of the predictive density.
+    """
+    for patch in range(len(leaves)):
+        data = usable(ids[patch], noise)
+        n = len(data)
+        m = np.searchsorted(data, points)
+        for k in range(models.shape[1]):
+            result[patch, k] = 0.0
+            if m == 0:
+                continue
+            u, _, _, b = system(xyz, noise, data, leaves[patch], np.empty((0, 2)), lines, start, models[patch, k])
+            if u.shape[0] == 0:
+                result[patch, k] = np.inf
+                continue
+            w = np.zeros((n, m))
+            for j in range(m):
+                w[j, j] = 1.0
+            solve_transposed(u, w)
+            weight, alpha = left_out(b, w)
+            total = 0.0
+            for j in range(m):
+                if weight[j] > 0.0:
+                    dx, dy = xyz[data[j], 0] - leaves[patch, 0], xyz[data[j], 1] - leaves[patch, 1]
+                    share = np.exp(-0.5 * (dx * dx + dy * dy) / (_FOCUS * leaves[patch, 2]) ** 2)
+                    total += share * (alpha[j] ** 2 / weight[j] - np.log(weight[j]))
+            result[patch, k] = total
+
+
+@kernel
+def test_points(
+    xyz: NDArray[Any],
+    noise: NDArray[Any],
+    ids: NDArray[Any],
+    leaves: NDArray[Any],
+    own: NDArray[Any],
+    own_start: NDArray[Any],
+    lines: NDArray[Any],
+    start: NDArray[Any],
+    models: NDArray[Any],
+    result: NDArray[Any],
+) -> int:
+    """Compare data with what their neighbours predict; returns the number of patches without a solution.
+
+    Parameters are those of `predict`; `own` holds data numbers of each leaf. `result`, shape (n, 3), receives for each
+    of them the residual against the filtered surface (metres), its redundancy (share of an error that shows in the
+    residual) and the normalised residual, which is also that of the prediction from all other data of the patch.
+    """
+    failed = 0
+    for patch in range(len(leaves)):
+        some = own[own_start[patch] : own_start[patch + 1]]
+        if len(some) == 0:
+            continue
+        data = usable(ids[patch], noise)
+        u, _, _, b = system(xyz, noise, data, leaves[patch], np.empty((0, 2)), lines, start, models[patch])
+        if u.shape[0] == 0:
+            failed += 1
+            continue
+        n, m = len(data), len(some)
+        w = np.zeros((n, m))
+        place = np.searchsorted(data, some)
+        for j in range(m):
+            if place[j] < n and data[place[j]] == some[j]:
+                w[place[j], j] = 1.0
+        solve_transposed(u, w)
+        weight, alpha = left_out(b, w)
+        for j in range(m):
+            if weight[j] > 0.0:
+                t = some[j]
+                result[t, 0] = noise[t] * alpha[j]
+                result[t, 1] = noise[t] * weight[j]
+                result[t, 2] = alpha[j] / np.sqrt(weight[j])
+    return failed

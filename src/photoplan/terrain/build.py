@@ -1,0 +1,223 @@
+"""A hybrid terrain model from measurements: from the stochastic model to units with their triangles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.surfaces.measured import MeasuredTerrain
+from photoplan.surfaces.mesh_faces import build_faces, on_grid, thin
+from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
+from photoplan.terrain.clean_borders import domain_of
+from photoplan.terrain.domain import Domain
+from photoplan.terrain.fit import Fit, each, fit
+from photoplan.terrain.observations import Observations, observe
+from photoplan.terrain.predict import predict_lines, predict_unit
+from photoplan.terrain.settings import BuildSettings
+
+__all__ = ["BuildPlan", "Built", "Steps", "build", "plan_build"]
+
+#: Gaps are bridged up to twice this many spacings.
+_REACH = 10.0
+#: Part of a unit's standard deviation by which a wider grid may change its surface.
+_ADAPT = 0.25
+#: Units of a model at most: a wider spread of points needs a wider grid.
+_MOST_UNITS = 1_000_000
+
+Steps = Callable[[str, int], Callable[[int], None]]
+"""Called with the name of a step and its number of parts; returns what is called with the parts that are done."""
+
+
+@dataclass(frozen=True, eq=False)
+class BuildPlan:
+    """What will be computed: looked at before anything is."""
+
+    seen: Observations
+    layout: UnitLayout
+    """Units, in the CRS of the measurements."""
+    width: float
+    """Finest grid width, metres."""
+    reach: float
+    """Gaps wider than twice this stay open, metres."""
+    polygon: Any | None
+    """Polygon of the border lines, in the CRS; None: there are none."""
+    settings: BuildSettings
+
+
+@dataclass(frozen=True, eq=False)
+class Built:
+    """A model in memory."""
+
+    plan: BuildPlan
+    fit: Fit
+    units: dict[tuple[int, int], Unit]
+    """Units that are not empty, by column and row."""
+    lines: tuple[LineElement, ...]
+    """With their intersections with the grid."""
+    figures: tuple[UnitFigures, ...] = field(default=())
+    """Of all units, row by row."""
+
+
+def plan_build(measured: MeasuredTerrain, settings: BuildSettings) -> BuildPlan:
+    """Grid width, units and borders for clean measurements.
+
+    Raises
+    ------
+    GeometryError
+        Fewer than three points, or all on one line.
+    InputError
+        The points are so far apart that the model would have too many units.
+    """
+    seen = observe(measured, settings)
+    width = settings.grid_width or _nice(0.75 * seen.spacing)
+    side = width * settings.unit_meshes
+    xy = np.vstack([seen.xyz[: seen.points, :2], seen.lines.xyz[:, :2]]) + seen.origin[:2]
+    low, high = np.floor(xy.min(axis=0) / side), np.ceil((xy.max(axis=0) + 1e-6 * side) / side)
+    columns, rows = np.maximum(high - low, 1).astype(int).tolist()
+    if columns * rows > _MOST_UNITS:
+        raise InputError(
+            f"points from {xy.min(axis=0)} to {xy.max(axis=0)} with a grid of {width:g} m make {columns} × {rows} "
+            f"units, at most {_MOST_UNITS} are allowed; is there a point far from all others? Else give --grid-width"
+        )
+    layout = UnitLayout(float(low[0] * side), float(high[1] * side), side, columns, rows)
+    reach = settings.reach or _REACH * seen.spacing
+    return BuildPlan(seen, layout, width, reach, domain_of(measured), settings)
+
+
+def _nice(width: float) -> float:
+    """The largest of 1, 2, 2.5, 5 times a power of ten that is not larger."""
+    power = 10.0 ** np.floor(np.log10(width))
+    return float(max(f * power for f in (1.0, 2.0, 2.5, 5.0) if f * power <= width * 1.0001))
+
+
+def build(plan: BuildPlan, workers: int = 1, steps: Steps | None = None) -> Built:
+    """Compute a model: covariance functions, gross errors, lines, posts, triangles."""
+    steps = steps or (lambda name, parts: lambda done: None)
+    settings, layout, seen = plan.settings, plan.layout, plan.seen
+    local = replace(layout, left=layout.left - seen.origin[0], top=layout.top - seen.origin[1])
+    count = layout.columns * layout.rows
+    found = fit(seen, local, settings, workers, steps("covariance functions and gross errors", 3 * count))
+    lines = predict_lines(found, workers)
+    domain = _domain(plan)
+    report = steps("heights", count)
+    posts = each(
+        lambda u: _thinned(plan, predict_unit(found, u, domain, settings.unit_meshes, plan.reach)),
+        range(count),
+        workers,
+        report,
+    )
+    units = {(u % layout.columns, u // layout.columns): unit for u, unit in enumerate(posts) if unit is not None}
+    meshes = np.zeros((layout.rows, layout.columns), np.int64)
+    for (column, row), unit in units.items():
+        meshes[row, column] = unit.meshes
+    lines = [on_grid(line, layout, meshes) for line in lines]
+    units = _with_faces(plan, units, lines, workers, steps)
+    return Built(plan, found, units, tuple(lines), tuple(_figures(plan, found, units, lines)))
+
+
+def _domain(plan: BuildPlan) -> Domain:
+    seen = plan.seen
+    data = seen.xyz[:, :2]
+    polygon = plan.polygon
+    if polygon is not None:
+        polygon = shapely.transform(polygon, lambda xy: xy - seen.origin[:2])
+    return Domain.of(data, seen.spacing, plan.reach, polygon)
+
+
+def _thinned(plan: BuildPlan, unit: Unit | None) -> Unit | None:
+    """The unit with the widest grid that still shows its surface."""
+    if unit is None or plan.settings.adapt == 0:
+        return unit
+    tolerance = plan.settings.adapt
+    if tolerance is None:
+        tolerance = _ADAPT * float(np.nanmean(unit.sigmas))
+    return thin(unit, tolerance)
+
+
+def _with_faces(
+    plan: BuildPlan,
+    units: dict[tuple[int, int], Unit],
+    lines: list[LineElement],
+    workers: int,
+    steps: Steps,
+) -> dict[tuple[int, int], Unit]:
+    layout = plan.layout
+    boxes = shapely.STRtree([shapely.LineString(line.xyz[:, :2]) for line in lines])
+    keys = list(units)
+
+    def one(number: int) -> Unit:
+        column, row = keys[number]
+        unit = units[column, row]
+        box = shapely.box(unit.left, unit.top - unit.side, unit.left + unit.side, unit.top)
+        some = [lines[k] for k in np.sort(boxes.query(box))]
+        around = {
+            "north": (column, row - 1),
+            "south": (column, row + 1),
+            "west": (column - 1, row),
+            "east": (column + 1, row),
+        }
+        neighbours = {side: units[key] for side, key in around.items() if key in units}
+        faces = build_faces(unit, some, neighbours, plan.polygon)
+        return replace(unit, faces=faces)
+
+    done = each(one, range(len(keys)), workers, steps("triangles", len(keys)))
+    assert layout.side > 0
+    return dict(zip(keys, done))
+
+
+def _figures(
+    plan: BuildPlan, found: Fit, units: dict[tuple[int, int], Unit], lines: list[LineElement]
+) -> list[UnitFigures]:
+    layout = plan.layout
+    passing = _passing(layout, lines)
+    figures = []
+    for number in range(layout.columns * layout.rows):
+        column, row = number % layout.columns, number // layout.columns
+        unit = units.get((column, row))
+        covariance, members = found.units[number], found.members[number]
+        gross = int((found.noise[members] < 0).sum())
+        z = found.residuals[members, 2][found.noise[members] >= 0]
+        z = z[np.isfinite(z)]
+        low = high = sigma = np.nan
+        if unit is not None:
+            heights = [unit.heights.ravel() + unit.datum]
+            heights += [] if unit.faces is None else [unit.faces.vertices[:, 2]]
+            everything = np.concatenate(heights)
+            low, high = float(np.nanmin(everything)), float(np.nanmax(everything))
+            sigma = float(np.sqrt(np.nanmean(unit.sigmas.astype(float) ** 2)))
+        figures.append(
+            UnitFigures(
+                column=column,
+                row=row,
+                meshes=0 if unit is None else unit.meshes,
+                low=low,
+                high=high,
+                points=len(members),
+                lines=int(passing[row, column]),
+                variance=covariance.variance,
+                length=covariance.length,
+                noise=covariance.noise,
+                sigma=sigma,
+                spread=float(z.std()) if len(z) >= 20 else np.nan,
+                gross=gross,
+            )
+        )
+    return figures
+
+
+def _passing(layout: UnitLayout, lines: list[LineElement]) -> NDArray[np.int64]:
+    """Number of lines that pass each unit."""
+    count = np.zeros((layout.rows, layout.columns), np.int64)
+    for line in lines:
+        middle = (line.xyz[1:, :2] + line.xyz[:-1, :2]) / 2
+        column = np.clip(((middle[:, 0] - layout.left) / layout.side).astype(int), 0, layout.columns - 1)
+        row = np.clip(((layout.top - middle[:, 1]) / layout.side).astype(int), 0, layout.rows - 1)
+        cells = np.unique(row * layout.columns + column)
+        count.flat[cells] += 1
+    return count

@@ -1,0 +1,207 @@
+"""Covariance functions estimated from the data of each computing unit, such that points predict each other best."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.kernels.fit_covariance import minimise
+from photoplan.kernels.sides import sides_of
+from photoplan.terrain.neighbours import Neighbours
+from photoplan.terrain.observations import Observations
+from photoplan.terrain.settings import FAMILIES, BuildSettings
+
+__all__ = ["LADDER", "Covariance", "estimate_all", "estimate_unit", "ladder", "near_lines"]
+
+#: Distance between the two sides of a breakline in half-value distances, by family: what is left of the correlation
+#: is 6 %, 8 % and 9 %.
+GAPS = (2.0, 2.5, 3.5)
+#: Within a unit the terrain may be smooth here and rough there: factors of variance and length from which each patch
+#: takes what suits its own points.
+LADDER = ((1.0, 1.0), (1.0, 0.5), (1.0, 0.25), (2.0, 0.25))
+#: Data of a block, blocks of a unit, and units from which the whole area's function is estimated.
+_BLOCK, _BLOCKS, _UNITS = 72, 3, 16
+#: A wide block takes every so-manieth of so many times as many points: it sees further.
+_WIDE = 4
+#: How far a unit's parameters are expected from those of the whole area: standard deviations of their logarithms.
+_EXPECTED = np.array([0.9, 0.6, 0.35])
+#: Bounds of the half-value distance in spacings of the points.
+_SHORTEST, _LONGEST = 0.5, 30.0
+#: Data further than this from their block's plane, in robust standard deviations, do not count in the estimation.
+_OUTLIER = 6.0
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """A covariance function: variance · correlation(distance / length), and the noise of mass points."""
+
+    family: int
+    """Number of the family, see `photoplan.terrain.settings.FAMILIES`."""
+    variance: float
+    """Of the signal, m²."""
+    length: float
+    """Distance at which the correlation is one half, metres."""
+    noise: float
+    """Standard deviation of mass points, metres: their filter value."""
+
+    @property
+    def name(self) -> str:
+        """Name of the family."""
+        return FAMILIES[self.family]
+
+    @property
+    def logs(self) -> NDArray[np.float64]:
+        """Logarithms of variance, length and noise variance."""
+        return np.log([self.variance, self.length, self.noise**2])
+
+
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """Data of some blocks as the likelihood takes them."""
+
+    d2: NDArray[np.float64]
+    sides: NDArray[np.float64]
+    b: NDArray[np.float64]
+    noise: NDArray[np.float64]
+
+
+def estimate_all(
+    seen: Observations, neighbours: Neighbours, members: Iterable[NDArray[np.int64]], settings: BuildSettings
+) -> Covariance:
+    """The covariance function of the whole area, from blocks of some of its units; of the likeliest family.
+
+    Parameters
+    ----------
+    members : iterable of ndarray
+        Numbers of the points of each unit that may be looked at.
+    """
+    parts = [_blocks(seen, neighbours, points) for points in _some(list(members))]
+    size = min(part.b.shape[1] for part in parts)
+    blocks = _join([_cut(part, size) for part in parts])
+    first, bounds = _start(seen, blocks, settings)
+    families = range(len(FAMILIES)) if settings.family == "auto" else [FAMILIES.index(settings.family)]
+    prior = np.stack([first, np.zeros(3), *bounds])
+    best = []
+    for family in families:
+        scaled = blocks.sides * GAPS[family] ** 2 / 4
+        logs, value = minimise(blocks.d2, scaled, blocks.b, blocks.noise, prior, first, family)
+        logs, value = minimise(blocks.d2, scaled, blocks.b, blocks.noise, prior, logs, family)
+        best.append((float(value), family, logs))
+    _, family, logs = min(best, key=lambda found: found[0])
+    return _covariance(family, logs)
+
+
+def estimate_unit(
+    seen: Observations, neighbours: Neighbours, points: NDArray[np.int64], whole: Covariance, settings: BuildSettings
+) -> Covariance:
+    """The covariance function of one unit, drawn to that of the whole area as far as its data say little."""
+    if len(points) < 10:
+        return whole
+    blocks = _blocks(seen, neighbours, points)
+    _, bounds = _start(seen, blocks, settings)
+    first = np.clip(whole.logs, *bounds)
+    prior = np.stack([first, 1 / _EXPECTED**2, *bounds])
+    scaled = blocks.sides * GAPS[whole.family] ** 2 / 4
+    logs, _ = minimise(blocks.d2, scaled, blocks.b, blocks.noise, prior, first, whole.family)
+    return _covariance(whole.family, logs)
+
+
+def ladder(covariance: Covariance) -> NDArray[np.float64]:
+    """The functions that a patch chooses from, as the kernels take them, shape (len(LADDER), 4)."""
+    family, variance, length = covariance.family, covariance.variance, covariance.length
+    return np.array([(family, variance * v, length * c, GAPS[family]) for v, c in LADDER], float)
+
+
+def _covariance(family: int, logs: NDArray[np.float64]) -> Covariance:
+    variance, length, noise = np.exp(logs)
+    return Covariance(family, float(variance), float(length), float(np.sqrt(noise)))
+
+
+def _some(members: list[NDArray[np.int64]]) -> list[NDArray[np.int64]]:
+    """Some units with enough points, spread evenly over all; if there are none, all points as one."""
+    rich = [points for points in members if len(points) >= _BLOCK]
+    if not rich:
+        return [np.concatenate(members)]
+    return rich[:: max(1, -(-len(rich) // _UNITS))]
+
+
+def _blocks(seen: Observations, neighbours: Neighbours, points: NDArray[np.int64]) -> _Blocks:
+    """Blocks around some of the points: close ones and, last, a wide one."""
+    rng = np.random.default_rng(int(points[0]) if len(points) else 0)
+    middles = seen.xyz[rng.choice(points, _BLOCKS) if len(points) else [0] * _BLOCKS, :2]
+    numbers = neighbours.query(middles)[:, :]
+    point_tree = neighbours.near[0]
+    chosen = []
+    for k, middle in enumerate(middles):
+        wide = _WIDE if k == _BLOCKS - 1 else 1
+        lines = numbers[k][numbers[k] >= seen.points][: _BLOCK // 3]
+        count = min(_BLOCK - len(lines), len(point_tree.numbers) // wide)
+        near = point_tree.tree.query(middle, k=np.arange(1, max(1, count * wide) + 1), p=np.inf)[1]
+        chosen.append(np.concatenate([point_tree.numbers[near[::wide]], lines])[:_BLOCK])
+    size = min(len(c) for c in chosen)
+    return _join([_block(seen, numbers[:size]) for numbers in chosen])
+
+
+def _block(seen: Observations, numbers: NDArray[np.int64]) -> _Blocks:
+    xyz = seen.xyz[numbers]
+    xy = xyz[:, :2] - xyz[:, :2].mean(axis=0)
+    d2 = ((xy[:, None] - xy[None]) ** 2).sum(axis=2)
+    vertices, start = near_lines(seen, xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0))
+    sides = np.zeros((len(numbers), max(1, len(start) - 1)))
+    if len(start) > 1:
+        sides_of(np.ascontiguousarray(xyz[:, :2]), vertices, start, len(start) - 1, sides)
+    apart = ((sides[:, None] - sides[None]) ** 2).sum(axis=2)
+    scale = max(float(np.sqrt(d2.max())), 1e-9)
+    b = np.column_stack([xyz[:, 2] - xyz[:, 2].mean(), np.ones(len(xy)), xy / scale])
+    given = seen.given[numbers]
+    known = ~np.isnan(given)
+    noise = np.column_stack([np.where(known, given, 0.0) ** 2, np.where(known, 0.0, seen.share[numbers]) ** 2])
+    rest = b[:, 0] - b[:, 1:] @ np.linalg.lstsq(b[:, 1:], b[:, 0], rcond=None)[0]
+    spread = 1.4826 * np.median(np.abs(rest - np.median(rest)))
+    wild = np.abs(rest - np.median(rest)) > _OUTLIER * spread
+    if spread > 0:
+        noise[wild, 0] = 1e6 * spread**2
+    return _Blocks(d2[None], apart[None], b[None], noise[None])
+
+
+def near_lines(
+    seen: Observations, low: NDArray[np.float64], high: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices and beginnings of the barriers whose rectangle meets a rectangle."""
+    vertices, start = seen.barriers
+    if len(start) < 2:
+        return vertices, start
+    boxes = seen.barrier_boxes
+    meets = (boxes[:, :2] <= high).all(axis=1) & (boxes[:, 2:] >= low).all(axis=1)
+    picked = np.flatnonzero(meets)
+    parts = [vertices[start[k] : start[k + 1]] for k in picked]
+    sizes = [len(part) for part in parts]
+    return np.vstack([np.empty((0, 2)), *parts]), np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+
+
+def _join(parts: list[_Blocks]) -> _Blocks:
+    return _Blocks(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("d2", "sides", "b", "noise")))
+
+
+def _cut(blocks: _Blocks, size: int) -> _Blocks:
+    return _Blocks(
+        blocks.d2[:, :size, :size], blocks.sides[:, :size, :size], blocks.b[:, :size], blocks.noise[:, :size]
+    )
+
+
+def _start(
+    seen: Observations, blocks: _Blocks, settings: BuildSettings
+) -> tuple[NDArray[np.float64], tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Logarithms to begin with and their bounds, from the size of the heights and the spacing."""
+    size = float(np.median(np.abs(blocks.b[..., 0]))) or 1.0
+    variance = size**2 + 1e-8
+    low = np.log([1e-8 * variance, _SHORTEST * seen.spacing, 1e-8 * variance])
+    high = np.log([1e4 * variance, _LONGEST * seen.spacing, variance])
+    first = np.log([0.3 * variance, 4 * seen.spacing, 0.01 * variance])
+    given = settings.filters.get("mass")
+    if given is not None:
+        low[2] = high[2] = first[2] = np.log(max(given, 1e-9) ** 2)
+    return first, (low, high)

@@ -1,0 +1,232 @@
+"""From measurements to a stochastic model: covariance functions, their choice in every patch, gross errors."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.kernels.patch_test import score_models, test_points
+from photoplan.surfaces.units import UnitLayout
+from photoplan.terrain.covariance import LADDER, Covariance, estimate_all, estimate_unit, ladder, near_lines
+from photoplan.terrain.leaves import Leaves, quadtree
+from photoplan.terrain.neighbours import Neighbours
+from photoplan.terrain.observations import Observations
+from photoplan.terrain.settings import BuildSettings
+
+__all__ = ["Fit", "Progress", "each", "fit", "patches_at"]
+
+Progress = Callable[[int], None]
+T = TypeVar("T")
+
+#: Rounds of looking for gross errors; each finds at most one in a patch.
+_ROUNDS = 12
+#: Residuals whose spread a unit's own ones must outweigh: its standard deviations follow their neighbours' till then.
+_EXPECTED_RESIDUALS = 50
+#: A point tells nothing of its error if less than this share of it shows in the residual.
+_LEAST_REDUNDANCY = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The stochastic model of a terrain, and what its points say of it."""
+
+    seen: Observations
+    layout: UnitLayout
+    """Units, relative to the origin of the observations."""
+    leaves: Leaves
+    neighbours: Neighbours
+    whole: Covariance
+    """Covariance function of the whole area."""
+    units: tuple[Covariance, ...]
+    """That of each unit, row by row."""
+    noise: NDArray[np.float64]
+    """Variances of all data, m²; negative: gross errors, which are not used."""
+    shares: NDArray[np.float64]
+    """Weight of each function of the ladder in every patch, shape (leaves, len(LADDER))."""
+    residuals: NDArray[np.float64]
+    """Residual (metres), redundancy and normalised residual of every point, shape (points, 3); NaN: not tested."""
+    spread: NDArray[np.float64]
+    """Spread of the normalised residuals in each unit, by which standard deviations are multiplied."""
+    members: tuple[NDArray[np.int64], ...]
+    """Points of each unit."""
+
+    @property
+    def gross(self) -> NDArray[np.int64]:
+        """Points flagged as gross errors."""
+        return np.flatnonzero(self.noise[: self.seen.points] < 0)
+
+    def models(self, leaves: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Functions of the given leaves, shape (n, len(LADDER), 4)."""
+        table = {unit: ladder(self.units[unit]) for unit in np.unique(self.leaves.unit[leaves]).tolist()}
+        return np.stack([table[unit] for unit in self.leaves.unit[leaves].tolist()])
+
+
+def each(function: Callable[[int], T], items: Sequence[int], workers: int, progress: Progress | None = None) -> list[T]:
+    """`function` of every item, by threads; results in order."""
+    lock = threading.Lock()
+
+    def run(item: int) -> T:
+        result = function(item)
+        if progress is not None:
+            with lock:
+                progress(1)
+        return result
+
+    with ThreadPoolExecutor(workers) as pool:
+        return list(pool.map(run, items))
+
+
+def patches_at(leaves: Leaves, some: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Middle and half side of leaves, shape (n, 3)."""
+    return np.column_stack([leaves.middle[some], leaves.half[some]])
+
+
+def fit(
+    seen: Observations, layout: UnitLayout, settings: BuildSettings, workers: int, progress: Progress | None = None
+) -> Fit:
+    """Estimate the covariance functions, choose among them in every patch, and flag gross errors.
+
+    `progress` is called with 1 three times for each unit.
+    """
+    vertices = seen.lines.xyz[:, :2]
+    leaves = quadtree(np.vstack([seen.xyz[: seen.points, :2], vertices]), layout, settings.unit_meshes)
+    order = leaves.order[leaves.order < seen.points]
+    neighbours = Neighbours.of(seen.xyz[:, :2], seen.points, order)
+    count = layout.columns * layout.rows
+    unit_of_point = _unit_of(seen.xyz[:, :2], layout)
+    members = _members(unit_of_point[: seen.points], count)
+    whole = estimate_all(seen, neighbours, members, settings)
+    units = each(
+        lambda u: estimate_unit(seen, neighbours, members[u], whole, settings), range(count), workers, progress
+    )
+    mass = np.array([unit.noise for unit in units])
+    found = Fit(
+        seen=seen,
+        layout=layout,
+        leaves=leaves,
+        neighbours=neighbours,
+        whole=whole,
+        units=tuple(units),
+        noise=seen.noise(mass[unit_of_point]),
+        shares=np.empty((len(leaves.half), len(LADDER))),
+        residuals=np.full((seen.points, 3), np.nan),
+        spread=np.ones(count),
+        members=tuple(members),
+    )
+    each(lambda u: _choose(found, u), range(count), workers, progress)
+    each(lambda u: _test(found, u, leaves.of_unit(u)), range(count), workers, progress)
+    if settings.gross > 0:
+        _flag(found, settings.gross, workers)
+    return replace(found, spread=_spread(found))
+
+
+def _unit_of(xy: NDArray[np.float64], layout: UnitLayout) -> NDArray[np.int64]:
+    column = np.clip(((xy[:, 0] - layout.left) / layout.side).astype(np.int64), 0, layout.columns - 1)
+    row = np.clip(((layout.top - xy[:, 1]) / layout.side).astype(np.int64), 0, layout.rows - 1)
+    unit: NDArray[np.int64] = row * layout.columns + column
+    return unit
+
+
+def _members(unit: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
+    order = np.argsort(unit, kind="stable")
+    return np.split(order, np.searchsorted(unit[order], np.arange(1, count)))
+
+
+def _lines_of(found: Fit, leaves: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Barriers near some leaves: far enough for the data of their patches."""
+    middle, half = found.leaves.middle[leaves], found.leaves.half[leaves]
+    margin = 8 * float(half.max()) + 20 * found.seen.spacing
+    return near_lines(found.seen, middle.min(axis=0) - margin, middle.max(axis=0) + margin)
+
+
+def _choose(found: Fit, unit: int) -> None:
+    """Weights of the ladder's functions in the patches of a unit."""
+    some = found.leaves.of_unit(unit)
+    ids = found.neighbours.query(found.leaves.middle[some])
+    scores = np.zeros((len(some), len(LADDER)))
+    lines = _lines_of(found, some)
+    patches = patches_at(found.leaves, some)
+    score_models(found.seen.xyz, found.noise, ids, patches, found.seen.points, *lines, found.models(some), scores)
+    scores -= np.where(np.isfinite(scores), scores, np.inf).min(axis=1, keepdims=True)
+    weight = np.exp(-scores / 2)
+    weight = np.where(np.isfinite(weight), weight, 0.0)
+    weight[weight.sum(axis=1) == 0] = 1.0
+    found.shares[some] = weight / weight.sum(axis=1, keepdims=True)
+
+
+def _test(found: Fit, unit: int, some: NDArray[np.int64]) -> None:
+    """Residuals of the points in some leaves of a unit."""
+    if not len(some):
+        return
+    leaves, points = found.leaves, found.seen.points
+    own = [leaves.order[leaves.first[k] : leaves.first[k] + leaves.count[k]] for k in some]
+    own = [numbers[numbers < points] for numbers in own]
+    start = np.concatenate([[0], np.cumsum([len(numbers) for numbers in own])])
+    if not start[-1]:
+        return
+    best = found.models(some)[np.arange(len(some)), found.shares[some].argmax(axis=1)]
+    ids = found.neighbours.query(leaves.middle[some])
+    test_points(
+        found.seen.xyz,
+        found.noise,
+        ids,
+        patches_at(leaves, some),
+        np.concatenate(own),
+        start,
+        *_lines_of(found, some),
+        best,
+        found.residuals,
+    )
+
+
+def _flag(found: Fit, limit: float, workers: int) -> None:
+    """Flag the worst point of each neighbourhood, test the neighbourhood again, until none is left (data snooping)."""
+    points = found.seen.points
+    for _ in range(_ROUNDS):
+        suspect = np.flatnonzero(
+            (np.abs(found.residuals[:, 2]) > limit)
+            & (found.residuals[:, 1] > _LEAST_REDUNDANCY)
+            & (found.noise[:points] >= 0)
+        )
+        if not len(suspect):
+            return
+        middles = found.seen.xyz[suspect, :2]
+        near = found.neighbours.near[0].query(middles)
+        size = np.where(found.noise[:points] >= 0, np.abs(found.residuals[:, 2]), 0.0)
+        worst = size[suspect] >= np.nan_to_num(size[near]).max(axis=1)
+        flagged = suspect[worst]
+        found.noise[flagged] = -1.0
+        again = _touched(found, flagged)
+        _test_again(found, again, workers)
+
+
+def _test_again(found: Fit, leaves: NDArray[np.int64], workers: int) -> None:
+    unit = found.leaves.unit[leaves]
+    each(lambda u: _test(found, u, leaves[unit == u]), np.unique(unit).tolist(), workers)
+
+
+def _touched(found: Fit, flagged: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Leaves near flagged points: those of the points nearest to them."""
+    near = np.unique(found.neighbours.near[0].query(found.seen.xyz[flagged, :2]))
+    leaf_of = np.empty(len(found.leaves.order), np.int64)
+    leaf_of[found.leaves.order] = np.repeat(np.arange(len(found.leaves.half)), found.leaves.count)
+    return np.unique(leaf_of[near])
+
+
+def _spread(found: Fit) -> NDArray[np.float64]:
+    """Spread of the normalised residuals of each unit's points, drawn to that of all where there are few."""
+    points = found.seen.points
+    good = (found.noise[:points] >= 0) & np.isfinite(found.residuals[:, 2])
+    z2 = found.residuals[:, 2] ** 2
+    if not good.any():
+        return np.ones(len(found.members))
+    whole = float(z2[good].mean())
+    sums = np.array([z2[m][good[m]].sum() for m in found.members])
+    counts = np.array([good[m].sum() for m in found.members])
+    return np.sqrt((sums + _EXPECTED_RESIDUALS * whole) / (counts + _EXPECTED_RESIDUALS))

@@ -1,0 +1,229 @@
+"""Measured terrain as the arrays that prediction works on."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from photoplan.errors import GeometryError
+from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain
+from photoplan.terrain.settings import SHARE, BuildSettings
+
+__all__ = ["Lines", "Observations", "observe", "spacing_of"]
+
+#: Points at which the spacing is measured.
+_SAMPLE = 20_000
+#: Copies of a breakline's points lie this part of the spacing beside it, one on each side.
+_BESIDE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Vertices of all lines in one array; the lines that separate their two sides come first."""
+
+    xyz: NDArray[np.float64]
+    """Vertices, shape (v, 3), relative to the origin; Z may be NaN in borders."""
+    right: NDArray[np.float64]
+    """Heights on the right, shape (v,); equal to Z but at two-sided breaklines."""
+    start: NDArray[np.int64]
+    """First vertex of each line, and v; shape (l + 1,)."""
+    separating: int
+    """Number of breaklines."""
+    lines: tuple[MeasuredLine, ...]
+    """The lines themselves, in this order."""
+    beside: NDArray[np.float64]
+    """Steps from each vertex to the left of its line, shape (v, 2), metres; zero at lines that do not separate."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Heights with their variances: points first, then the points of lines, those of breaklines once on each side."""
+
+    origin: NDArray[np.float64]
+    """X, Y, Z that all coordinates are relative to."""
+    xyz: NDArray[np.float64]
+    """Data, shape (n, 3), metres."""
+    points: int
+    """How many of them are mass points and spot heights."""
+    given: NDArray[np.float64]
+    """Standard deviations that are known, shape (n,), metres; NaN where the share of the mass points' is used."""
+    share: NDArray[np.float64]
+    """Standard deviation as a part of that of mass points, shape (n,)."""
+    group: NDArray[np.int32]
+    """Group of each point, shape (points,)."""
+    record: NDArray[np.int64]
+    """Place of each point in its group, shape (points,)."""
+    lines: Lines
+    barriers: tuple[NDArray[np.float64], NDArray[np.int64]]
+    """Vertices (v, 2) and beginnings of breaklines, cut so that no piece turns far."""
+    barrier_boxes: NDArray[np.float64]
+    """xmin, ymin, xmax, ymax of each of these pieces."""
+    spacing: float
+    """Side of the square that one point has to itself on average, metres."""
+
+    def noise(self, mass: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Variances of all data, shape (n,), m², from the standard deviation of mass points at each of them."""
+        return np.where(np.isnan(self.given), self.share * mass, self.given) ** 2
+
+
+def observe(measured: MeasuredTerrain, settings: BuildSettings) -> Observations:
+    """Arrays of clean measurements.
+
+    Raises
+    ------
+    GeometryError
+        There are fewer than three points, or all lie on one line.
+    """
+    lines = [line for line in measured.lines if line.kind == "breakline"]
+    others = [line for line in measured.lines if line.kind != "breakline"]
+    stacks = [group.xyz for group in measured.points] + [line.xyz for line in lines + others]
+    if not stacks:
+        raise GeometryError("no points and no lines; a terrain model needs at least three points")
+    everything = np.vstack(stacks)
+    heights = everything[np.isfinite(everything[:, 2])]
+    _check_rank(heights)
+    origin = np.array([*np.floor(everything[:, :2].mean(axis=0)), np.floor(heights[:, 2].mean())])
+    points = np.vstack([np.empty((0, 3)), *(group.xyz for group in measured.points)]) - origin
+    known = np.unique(heights[:, :2] - origin[:2], axis=0)
+    spacing = spacing_of(known)
+    table = _line_table(lines, others, origin, spacing)
+    data, given, share = _line_data(table, spacing, settings)
+    group_given = [_sigma(g.sigma, settings.filters.get(g.kind)) for g in measured.points]
+    sizes = [len(g.xyz) for g in measured.points]
+    barriers = _straight_pieces(table.xyz[: table.start[table.separating], :2], table.start[: table.separating + 1])
+    return Observations(
+        origin=origin,
+        xyz=np.vstack([points, data]),
+        points=len(points),
+        given=np.concatenate([np.repeat(group_given, sizes), given]),
+        share=np.concatenate([np.repeat([SHARE[g.kind] for g in measured.points], sizes), share]),
+        group=np.repeat(np.arange(len(sizes), dtype=np.int32), sizes),
+        record=np.concatenate([np.arange(n) for n in sizes]) if sizes else np.empty(0, np.int64),
+        lines=table,
+        barriers=barriers,
+        barrier_boxes=_boxes(*barriers),
+        spacing=spacing,
+    )
+
+
+def spacing_of(xy: NDArray[np.float64]) -> float:
+    """Side of the square that one of the points has to itself, metres: from the sixth neighbour, the median."""
+    neighbours = min(7, len(xy))
+    step = max(1, len(xy) // _SAMPLE)
+    distance = cKDTree(xy).query(xy[::step], k=[neighbours])[0]
+    return float(np.median(distance) * np.sqrt(np.pi / max(1, neighbours - 1)))
+
+
+def _check_rank(xyz: NDArray[np.float64]) -> None:
+    if len(xyz) < 3:
+        raise GeometryError(f"{len(xyz)} points with heights; a terrain model needs at least three")
+    centred = xyz[:, :2] - xyz[:, :2].mean(axis=0)
+    extent = np.linalg.svd(centred.T @ centred, compute_uv=False)
+    if extent[1] <= 1e-12 * extent[0]:
+        raise GeometryError("all points lie on one line: the slope across it is unknown; add points beside it")
+
+
+def _sigma(own: float | None, of_class: float | None) -> float:
+    value = own if own is not None else of_class
+    return np.nan if value is None else float(value)
+
+
+def _line_table(
+    lines: list[MeasuredLine], others: list[MeasuredLine], origin: NDArray[np.float64], spacing: float
+) -> Lines:
+    ordered = lines + others
+    xyz = np.vstack([np.empty((0, 3)), *(line.xyz for line in ordered)]) - origin
+    right = np.concatenate([np.empty(0), *(line.xyz[:, 2] if line.right is None else line.right for line in ordered)])
+    start = np.concatenate([[0], np.cumsum([len(line.xyz) for line in ordered])]).astype(np.int64)
+    beside = np.zeros((len(xyz), 2))
+    for k in range(len(lines)):
+        part = slice(start[k], start[k + 1])
+        beside[part] = _left_of(xyz[part, :2]) * spacing * _BESIDE
+    return Lines(xyz, right - origin[2], start, len(lines), tuple(ordered), beside)
+
+
+def _left_of(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit steps to the left of a polyline at its vertices, along the bisector."""
+    step = np.diff(xy, axis=0)
+    step /= np.maximum(np.linalg.norm(step, axis=1), 1e-12)[:, None]
+    closed = len(xy) > 3 and np.array_equal(xy[0], xy[-1])
+    before = np.vstack([step[-1:] if closed else step[:1], step])
+    after = np.vstack([step, step[:1] if closed else step[-1:]])
+    left = np.stack([-(before + after)[:, 1], (before + after)[:, 0]], axis=1)
+    size = np.linalg.norm(left, axis=1)
+    # Where a line turns back on itself, straight ahead is between its two sides.
+    left = np.where(size[:, None] < 1e-6, before, left)
+    return left / np.maximum(np.linalg.norm(left, axis=1), 1e-12)[:, None]
+
+
+def _line_data(
+    table: Lines, spacing: float, settings: BuildSettings
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Points along lines at most a spacing apart with their known standard deviations and shares."""
+    xyz, given, share = [np.empty((0, 3))], [np.empty(0)], [np.empty(0)]
+    for k, line in enumerate(table.lines):
+        part = slice(table.start[k], table.start[k + 1])
+        if not np.isfinite(table.xyz[part, 2]).all():
+            continue
+        columns = np.column_stack([table.xyz[part], table.right[part], table.beside[part]])
+        dense = _densify(columns, spacing)
+        sides = [dense[:, :3]]
+        if k < table.separating:
+            left, right = dense[:, :3].copy(), dense[:, [0, 1, 3]].copy()
+            left[:, :2] += dense[:, 4:]
+            right[:, :2] -= dense[:, 4:]
+            sides = [left, right]
+        for side in sides:
+            xyz.append(side)
+            given.append(np.full(len(side), _sigma(line.sigma, settings.filters.get(line.kind))))
+            share.append(np.full(len(side), SHARE[line.kind]))
+    return np.vstack(xyz), np.concatenate(given), np.concatenate(share)
+
+
+def _densify(rows: NDArray[np.float64], spacing: float) -> NDArray[np.float64]:
+    """Rows between the vertices of a line, so that no two are further apart than `spacing`."""
+    length = np.linalg.norm(np.diff(rows[:, :2], axis=0), axis=1)
+    count = np.maximum(1, np.ceil(length / spacing).astype(int))
+    segment = np.repeat(np.arange(len(length)), count)
+    t = (np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)) / count[segment]
+    between = rows[segment] + (rows[segment + 1] - rows[segment]) * t[:, None]
+    # Between vertices the line's own direction says where its sides are; the bisectors only hold at vertices.
+    step = np.diff(rows[:, :2], axis=0) / np.maximum(length, 1e-12)[:, None]
+    size = np.linalg.norm(rows[0, 4:])
+    inner = t > 0
+    between[inner, 4] = -step[segment[inner], 1] * size
+    between[inner, 5] = step[segment[inner], 0] * size
+    return np.vstack([between, rows[-1:]])
+
+
+def _straight_pieces(
+    xy: NDArray[np.float64], start: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Lines cut where they have turned by a right angle from where they began: no piece winds around a point."""
+    vertices: list[NDArray[np.float64]] = []
+    for first, last in itertools.pairwise(start):
+        line = xy[first:last]
+        step = np.diff(line, axis=0)
+        heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+        begin = 0
+        for k in range(1, len(heading)):
+            if abs(heading[k] - heading[begin]) > np.pi / 2:
+                vertices.append(line[begin : k + 1])
+                begin = k
+        vertices.append(line[begin:])
+    sizes = [len(v) for v in vertices]
+    return (
+        np.vstack([np.empty((0, 2)), *vertices]),
+        np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
+    )
+
+
+def _boxes(xy: NDArray[np.float64], start: NDArray[np.int64]) -> NDArray[np.float64]:
+    if len(start) < 2:
+        return np.empty((0, 4))
+    low, high = np.minimum.reduceat(xy, start[:-1]), np.maximum.reduceat(xy, start[:-1])
+    return np.concatenate([low, high], axis=1)

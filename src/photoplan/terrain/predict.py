@@ -1,0 +1,184 @@
+"""Heights and their standard deviations at the posts of units and along lines, by linear prediction."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.kernels.patch import predict
+from photoplan.surfaces.units import LineElement, Unit
+from photoplan.terrain.covariance import near_lines
+from photoplan.terrain.domain import Domain
+from photoplan.terrain.fit import Fit, Progress, each, patches_at
+
+__all__ = ["heights_at", "predict_lines", "predict_unit"]
+
+#: A patch reaches this many half sides from the middle of its leaf.
+_REACH = 1.5
+
+
+def heights_at(
+    fit: Fit, unit: int, xy: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Predicted heights of places (n, 2) in or near a unit.
+
+    Returns
+    -------
+    heights, sigmas, distances : ndarrays, shape (n,)
+        Relative to the observations' origin; standard deviation; distance to the nearest datum; metres. NaN where
+        nothing can be predicted.
+    """
+    sums = np.zeros((len(xy), 4))
+    sums[:, 3] = np.inf
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    some = _leaves_near(fit, unit, low, high)
+    middle, half = fit.leaves.middle[some], fit.leaves.half[some]
+    wanted, start = _targets(middle, _REACH * half, xy)
+    busy = np.diff(start) > 0
+    some, middle, half = some[busy], middle[busy], half[busy]
+    start = np.concatenate([[0], np.cumsum(np.diff(start)[busy])])
+    if len(some):
+        margin = 8 * float(half.max()) + 20 * fit.seen.spacing
+        lines = near_lines(fit.seen, low - margin, high + margin)
+        ids = fit.neighbours.query(middle)
+        patches = patches_at(fit.leaves, some)
+        predict(
+            fit.seen.xyz, fit.noise, ids, patches, xy, wanted, start, *lines, fit.models(some), fit.shares[some], sums
+        )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        heights, sigmas = sums[:, 0] / sums[:, 1], sums[:, 2] / sums[:, 1]
+    return heights, sigmas * fit.spread[unit], sums[:, 3]
+
+
+def _leaves_near(fit: Fit, unit: int, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Leaves of a unit and of the units beside it whose patches meet a rectangle."""
+    columns, rows = fit.layout.columns, fit.layout.rows
+    row, column = divmod(unit, columns)
+    near = [
+        fit.leaves.of_unit(r * columns + c)
+        for r in range(max(0, row - 1), min(rows, row + 2))
+        for c in range(max(0, column - 1), min(columns, column + 2))
+    ]
+    some = np.concatenate(near)
+    reach = _REACH * fit.leaves.half[some][:, None]
+    middle = fit.leaves.middle[some]
+    kept: NDArray[np.int64] = some[((middle + reach > low) & (middle - reach < high)).all(axis=1)]
+    return kept
+
+
+def _targets(
+    middle: NDArray[np.float64], reach: NDArray[np.float64], xy: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Places inside each square, as numbers and beginnings."""
+    order = np.argsort(xy[:, 1], kind="stable")
+    y = xy[order, 1]
+    first = np.searchsorted(y, middle[:, 1] - reach)
+    last = np.searchsorted(y, middle[:, 1] + reach)
+    found = []
+    for k in range(len(middle)):
+        band = order[first[k] : last[k]]
+        found.append(band[np.abs(xy[band, 0] - middle[k, 0]) < reach[k]])
+    sizes = [len(f) for f in found]
+    return (np.concatenate(found) if found else np.empty(0, np.int64)), np.concatenate([[0], np.cumsum(sizes)])
+
+
+def predict_unit(fit: Fit, unit: int, domain: Domain, meshes: int, reach: float) -> Unit | None:
+    """Posts of a unit, NaN outside the domain and far from data; None if there are none.
+
+    Heights are relative to the origin of the observations; the unit's place is absolute.
+    """
+    row, column = divmod(unit, fit.layout.columns)
+    left, top = fit.layout.corner(column, row)
+    step = fit.layout.side / meshes
+    k = np.arange(meshes + 1)
+    x, y = np.meshgrid(left + k * step, top - k * step)
+    xy = np.column_stack([x.ravel(), y.ravel()])
+    inside = domain.contains(xy)
+    if not inside.any():
+        return None
+    heights, sigmas = np.full(len(xy), np.nan), np.full(len(xy), np.nan)
+    heights[inside], sigmas[inside], distance = heights_at(fit, unit, xy[inside])
+    far = np.flatnonzero(inside)[distance > reach]
+    heights[far] = sigmas[far] = np.nan
+    if not np.isfinite(heights).any():
+        return None
+    shape = (meshes + 1, meshes + 1)
+    origin = fit.seen.origin
+    return Unit(
+        left + origin[0],
+        top + origin[1],
+        fit.layout.side,
+        heights.reshape(shape).astype(np.float32),
+        sigmas.reshape(shape).astype(np.float32),
+        float(origin[2]),
+    )
+
+
+def predict_lines(fit: Fit, workers: int, progress: Progress | None = None) -> list[LineElement]:
+    """Lines with filtered heights: at each vertex of a breakline the mean of what its two sides say, of a wall each.
+
+    Vertices that lines share have one height.
+    """
+    lines = fit.seen.lines
+    count = len(lines.xyz)
+    if not count:
+        return []
+    columns, rows = fit.layout.columns, fit.layout.rows
+    column = np.clip(((lines.xyz[:, 0] - fit.layout.left) / fit.layout.side).astype(int), 0, columns - 1)
+    row = np.clip(((fit.layout.top - lines.xyz[:, 1]) / fit.layout.side).astype(int), 0, rows - 1)
+    unit = row * columns + column
+    left, right = np.full((count, 2), np.nan), np.full((count, 2), np.nan)
+
+    def one(number: int) -> None:
+        some = np.flatnonzero(unit == number)
+        xy, beside = lines.xyz[some, :2], lines.beside[some]
+        heights, sigmas, _ = heights_at(fit, number, np.vstack([xy + beside, xy - beside]))
+        n = len(some)
+        left[some] = np.column_stack([heights[:n], sigmas[:n]])
+        right[some] = np.column_stack([heights[n:], sigmas[n:]])
+
+    each(one, np.unique(unit).tolist(), workers, progress)
+    return _elements(fit, left, right)
+
+
+def _elements(fit: Fit, left: NDArray[np.float64], right: NDArray[np.float64]) -> list[LineElement]:
+    lines = fit.seen.lines
+    walls = np.concatenate([np.full(len(line.xyz), line.right is not None) for line in lines.lines])
+    weight = 1 / np.maximum(np.stack([left[:, 1], right[:, 1]]), 1e-9) ** 2
+    both = (weight * np.stack([left[:, 0], right[:, 0]])).sum(axis=0) / weight.sum(axis=0)
+    sigma = (weight * np.stack([left[:, 1], right[:, 1]])).sum(axis=0) / weight.sum(axis=0)
+    both = np.where(np.isfinite(both), both, lines.xyz[:, 2])
+    both, sigma = _shared(lines.xyz[:, :2], both, sigma, ~walls)
+    origin = fit.seen.origin
+    found = []
+    for k, line in enumerate(lines.lines):
+        part = slice(lines.start[k], lines.start[k + 1])
+        wall = line.right is not None
+        heights = np.where(np.isfinite(left[part, 0]), left[part, 0], lines.xyz[part, 2]) if wall else both[part]
+        other = np.where(np.isfinite(right[part, 0]), right[part, 0], lines.right[part]) if wall else None
+        found.append(
+            LineElement(
+                line.name,
+                line.kind,
+                line.code,
+                np.column_stack([line.xyz[:, :2], heights + origin[2]]),
+                None if other is None else other + origin[2],
+                np.maximum(left[part, 1], right[part, 1]) if wall else sigma[part],
+                np.zeros(len(line.xyz), bool),
+            )
+        )
+    return found
+
+
+def _shared(
+    xy: NDArray[np.float64], heights: NDArray[np.float64], sigmas: NDArray[np.float64], free: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The mean at places that several lines share."""
+    _, place = np.unique(xy, axis=0, return_inverse=True)
+    place = place.ravel()
+    use = free & np.isfinite(heights)
+    number = np.bincount(place, use)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.bincount(place, np.where(use, heights, 0.0)) / number
+        spread = np.bincount(place, np.where(use, sigmas, 0.0)) / number
+    return np.where(use, mean[place], heights), np.where(use, spread[place], sigmas)
