@@ -115,6 +115,16 @@ def test_a_crossing_of_equal_height_is_silent() -> None:
     assert_meets_in_vertices(out)
 
 
+def test_heights_at_crossings_are_interpolated_along_the_line() -> None:
+    wall = line([[0, 0, 10], [8, 0, 18]], name="wall", right=np.array([0.0, 4.0]))
+    a = line([[0, 5, 10], [8, 5, 18]], name="a")
+    b = line([[2, -5, 12], [2, 20, 12]], name="b")
+    out, _ = cleaned(wall, a, b)
+    assert height_at(out, "a", 2, 5) == height_at(out, "b", 2, 5) == pytest.approx([12.0])
+    (kept,) = (x for x in out.lines if x.right is not None)
+    assert kept.xyz[1, 2] == pytest.approx(12.0) and kept.right is not None and kept.right[1] == pytest.approx(1.0)
+
+
 def test_fault_19_three_lines_through_one_place_get_one_vertex() -> None:
     star = [line([[-np.cos(t), -np.sin(t), 5], [np.cos(t), np.sin(t), 5]], name=str(t)) for t in (0.1, 1.1, 2.1)]
     out, _ = cleaned(*star)
