@@ -125,7 +125,10 @@ class ModelWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._log is not None:
-            self._log.close()
+            if self._log.finished:
+                self._log.close()
+            else:
+                self._log.remove()
             self._log = None
         self._lock.release()
 

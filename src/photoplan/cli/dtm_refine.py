@@ -1,0 +1,45 @@
+"""`photoplan dtm refine`: a finer model inside polygons."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photoplan.cli.options import json_option
+
+__all__ = ["command"]
+
+_PATH = click.Path(path_type=Path)
+
+
+@click.command("refine")
+@click.argument("coarse", type=_PATH)
+@click.argument("fine", type=_PATH)
+@click.option("--polygons", type=_PATH, required=True, metavar="FILE", help="Where the fine model counts.")
+@click.option("--transition", type=click.FloatRange(0), required=True, metavar="M",
+              help="Width of the band inside the polygons in which the two are joined.")  # fmt: skip
+@click.option("--width", type=click.FloatRange(0, min_open=True), metavar="M",
+              help="Largest grid width inside the polygons [the fine model's finest].")  # fmt: skip
+@click.option("--height-system", metavar="same", help="Declare that both models have the same height system.")
+@click.option("-o", "--output", type=_PATH, required=True, metavar="MODEL", help="The new model, a .gpkg.")
+@click.option("--overwrite", is_flag=True, help="Replace the model if it exists.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(as_json: bool, quiet: bool, **options: Any) -> None:
+    """Write the model COARSE with the model FINE inside polygons, joined without a step.
+
+    Inside a band along the polygons' border the difference of the two is blended in; outside nothing changes.
+    """
+    from photoplan.products.dtm_refine import RefineRequest, dtm_refine
+
+    found = dtm_refine(RefineRequest(**options))
+    if as_json:
+        click.echo(json.dumps(found.to_dict(), indent=2))
+        return
+    click.echo(str(found.path))
+    if not quiet:
+        change = f", largest change of a post {found.largest:.3f} m" if found.largest == found.largest else ""
+        click.echo(f"{found.changed} of {found.units} units are new{change}; {found.lines} lines", err=True)

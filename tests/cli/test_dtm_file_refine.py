@@ -1,0 +1,148 @@
+"""`photoplan dtm refine`: a finer model inside polygons, through the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tools.command import Here
+from tools.small_model import LAYOUT, grid_unit, hills, parts, write_units_of
+
+from photoplan.io.terrain_model_read import ModelReader
+from photoplan.io.terrain_model_tables import GrossError
+from photoplan.surfaces.hybrid import HybridSurface
+from photoplan.surfaces.units import LineElement, UnitLayout
+
+FINE = UnitLayout(500_030.0, 5_299_980.0, 20.0, 4, 3)
+"""Another chessboard: 80 m × 60 m inside the coarse one."""
+BUMP = 3.0
+INNER = (500_045.0, 5_299_935.0, 500_095.0, 5_299_965.0)
+"""xmin, ymin, xmax, ymax of the polygon."""
+BAND = 8.0
+
+
+def raised(X: np.ndarray, Y: np.ndarray) -> np.ndarray:
+    return hills(X, Y) + BUMP
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[Path, Path, Path]:
+    paths = tmp_path / "coarse.gpkg", tmp_path / "fine.gpkg", tmp_path / "where.geojson"
+    write_units_of(paths[0], LAYOUT, lambda c, r: grid_unit(LAYOUT, c, r, 8), height_system="EPSG:5773")
+    write_units_of(paths[1], FINE, lambda c, r: grid_unit(FINE, c, r, 16, raised), height_system="EPSG:5773")
+    xmin, ymin, xmax, ymax = INNER
+    ring = [[xmin, ymin], [xmax, ymin], [xmax, ymax], [xmin, ymax], [xmin, ymin]]
+    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32633"}}
+    feature = {"type": "Feature", "properties": {}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
+    paths[2].write_text(json.dumps({"type": "FeatureCollection", "crs": crs, "features": [feature]}))
+    return paths
+
+
+def test_fine_inside_coarse_outside_joined_between(
+    photoplan: Here, files: tuple[Path, Path, Path], tmp_path: Path
+) -> None:
+    coarse, fine, where = files
+    out = tmp_path / "refined.gpkg"
+    said = photoplan("dtm", "refine", coarse, fine, "--polygons", where, "--transition", BAND, "-o", out, "--json")
+    assert said.code == 0, said.err
+    report = json.loads(said.out)
+    assert report["largest_change"] == pytest.approx(BUMP, abs=0.05) and 0 < report["changed"] <= report["units"]
+    reader = ModelReader(out)
+    surface, before = HybridSurface(reader), HybridSurface(ModelReader(coarse))
+    rng = np.random.default_rng(8)
+    XY = rng.uniform([500_001, 5_299_881], [500_159, 5_299_999], (4000, 2))
+    xmin, ymin, xmax, ymax = INNER
+    inwards = np.minimum.reduce([XY[:, 0] - xmin, xmax - XY[:, 0], XY[:, 1] - ymin, ymax - XY[:, 1]])
+    z = surface.heights(XY)
+    # Away from the polygon by a unit's finer posts nothing is new; beside it only the grid is finer.
+    assert np.abs(z - before.heights(XY))[inwards < -60].max() < 1e-4
+    assert np.abs(z - hills(*XY.T))[inwards < 0].max() < 0.08
+    assert np.abs(z - raised(*XY.T))[inwards > BAND + 1.8].max() < 0.01
+    t = np.clip(inwards / BAND, 0, 1)
+    expected = hills(*XY.T) + BUMP * t * t * (3 - 2 * t)
+    assert np.abs(z - expected).max() < 0.1
+    assert reader.finest == FINE.side / 16 and reader.header.settings["refined"]["transition"] == BAND
+    assert [item["file"] for item in reader.header.inputs] == ["coarse.gpkg", "fine.gpkg", "where.geojson"]
+    figures = {(f.column, f.row): f for f in reader.figures()}
+    assert figures[1, 1].meshes == 32 and np.isnan(figures[1, 1].variance) and figures[1, 1].points == 11
+    assert figures[3, 0].meshes == 8 and figures[3, 0].variance == 4.0
+
+
+def test_gross_errors_and_lines_of_the_model_that_counts(files: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    from photoplan.io.terrain_model_write import ModelWriter
+    from photoplan.products.dtm_refine import RefineRequest, dtm_refine
+
+    inside, outside = (500_070.0, 5_299_950.0, 0.0), (500_010.0, 5_299_890.0, 0.0)
+
+    def with_lists(path: Path, layout: UnitLayout, name: str) -> None:
+        before = ModelReader(path)
+        units = {(c, r): before.unit(c, r) for c, r in before.units()}
+        figures = before.figures()
+        xmin, ymin, xmax, ymax = layout.bounds
+        xyz = np.array([[xmin + 1, (ymin + ymax) / 2, 150.0], [xmax - 1, (ymin + ymax) / 2, 150.0]])
+        line = LineElement(name, "formline", "", xyz, None, np.full(2, 0.1), np.zeros(2, bool))
+        gross = [GrossError(f"{name} {where}", "mass", xyz_, 1, 1, 9) for where, xyz_ in
+                 (("in", inside), ("out", outside))]  # fmt: skip
+        with ModelWriter(path, layout, name, overwrite=True) as writer:
+            for f in figures:
+                writer.add(units[f.column, f.row], f)
+            from photoplan.surfaces.mesh_faces import on_grid
+
+            meshes = np.full((layout.rows, layout.columns), figures[0].meshes)
+            header = replace(before.header, layout=layout)
+            cut = [on_grid(line, layout, meshes)]
+            writer.finish(replace(parts(layout), header=header, lines=cut, gross=gross, domain=None))
+
+    coarse, fine, where = files
+    with_lists(coarse, LAYOUT, "coarse")
+    with_lists(fine, FINE, "fine")
+    dtm_refine(RefineRequest(coarse, fine, where, tmp_path / "r.gpkg", BAND))
+    reader = ModelReader(tmp_path / "r.gpkg")
+    assert sorted(g.name for g in reader.gross()) == ["coarse out", "fine in"]
+    xmin, _, xmax, _ = INNER
+    for line in reader.lines():
+        x = line.xyz[:, 0]
+        if line.name == "fine":
+            assert xmin - 1e-6 <= x.min() and x.max() <= xmax + 1e-6
+        else:
+            assert x.max() <= xmin + 1e-6 or xmax - 1e-6 <= x.min()
+    assert {line.name for line in reader.lines()} == {"coarse", "fine"}
+
+
+def test_faults(photoplan: Here, files: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    coarse, fine, where = files
+    options = ("--polygons", where, "--transition", 5)
+    said = photoplan("dtm", "refine", coarse, fine, *options, "-o", coarse, "--overwrite")
+    assert said.code == 2 and "the output is the input" in said.err
+    other = tmp_path / "other.gpkg"
+    write_units_of(other, FINE, lambda c, r: grid_unit(FINE, c, r, 4), "EPSG:32632", height_system="EPSG:5773")
+    said = photoplan("dtm", "refine", coarse, other, *options, "-o", tmp_path / "o.gpkg")
+    assert said.code == 3 and "in EPSG:32632; build both in one CRS" in said.err
+    (tmp_path / "far.geojson").write_text(where.read_text().replace("5000", "4000"))
+    said = photoplan(
+        "dtm", "refine", coarse, fine, "--polygons", tmp_path / "far.geojson", "--transition", 5, "-o",
+        tmp_path / "o.gpkg"
+    )  # fmt: skip
+    assert said.code == 3 and "the polygons touch no unit" in said.err
+    said = photoplan("dtm", "refine", coarse, fine, *options, "-o", tmp_path / "o.tif")
+    assert said.code == 2 and "ends with .gpkg" in said.err
+    assert not [p for p in tmp_path.iterdir() if p.name.startswith(("o.", ".o."))]
+
+
+def test_fault_02_height_systems(photoplan: Here, files: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    coarse, _, where = files
+    other = tmp_path / "other.gpkg"
+    words = ("--polygons", where, "--transition", 5, "-o", tmp_path / "o.gpkg")
+    write_units_of(other, FINE, lambda c, r: grid_unit(FINE, c, r, 4), height_system="ellipsoidal")
+    said = photoplan("dtm", "refine", coarse, other, *words)
+    assert said.code == 3 and "EGM96" in said.err and "ellipsoidal" in said.err
+    other.unlink()
+    write_units_of(other, FINE, lambda c, r: grid_unit(FINE, c, r, 4))
+    said = photoplan("dtm", "refine", coarse, other, *words)
+    assert said.code == 3 and "other.gpkg: no height system stated" in said.err
+    said = photoplan("dtm", "refine", coarse, other, *words, "--height-system", "same")
+    assert said.code == 0 and ModelReader(tmp_path / "o.gpkg").header.height_system == "EPSG:5773"
