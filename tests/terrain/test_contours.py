@@ -13,6 +13,7 @@ from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.geometry.triangulation import constrained_faces
 from photoplan.surfaces.units import MeshFaces
+from photoplan.terrain import contours
 from photoplan.terrain.contours import ContourLine, ContourOptions, trace_contours
 from photoplan.terrain.contours_parts import SurfacePart, grid_parts
 
@@ -361,6 +362,23 @@ def test_smoothed_lines_never_cross(seed: int, simplify: bool) -> None:
     assert_apart(lines)
     assert len(lines) == len(before)
     assert sorted(line.height for line in lines) == sorted(line.height for line in before)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_lines_anywhere_inside_their_bands_never_cross(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What smoothing may do at worst: every vertex at a random place of its range, half of them at its ends."""
+    rng = np.random.default_rng(seed)
+
+    def anywhere(places: np.ndarray, closed: bool, passes: int) -> None:
+        s = np.clip(rng.uniform(-0.5, 1.5, (len(places), 1)), 0, 1)
+        places[:, :2] = places[:, 2:4] + s * (places[:, 4:6] - places[:, 2:4])
+
+    monkeypatch.setattr(contours, "smooth_line", anywhere)
+    heights = rough(seed, 30) if seed % 2 else rng.integers(0, 6, (31, 31)).astype(np.float32)
+    lines = traced(heights, interval=0.5, smooth=True, simplify=seed > 3, band=0.49)
+    assert_apart(lines)
+    off = [np.abs(bilinear(heights.astype(float), (1.0, 1.0), line.xy) - line.height).max() for line in lines]
+    assert 0.24 < max(off) <= 0.245 + 1e-6
 
 
 def test_smoothing_stays_in_its_band_and_turns_less() -> None:

@@ -6,7 +6,6 @@ import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +24,8 @@ __all__ = ["FORMATS", "ContourRow", "LabelRow", "contour_files", "write_contours
 
 #: Ending of the name and the driver that writes it.
 FORMATS = {".gpkg": "GPKG", ".shp": "ESRI Shapefile", ".geojson": "GeoJSON", ".json": "GeoJSON", ".dxf": "DXF"}
-#: Lines that are handed over at once.
-BATCH = 20_000
+#: Vertices of the lines that are handed over at once.
+BATCH = 500_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,9 +145,17 @@ def write_contours(
     return files
 
 
-def _batches(rows: Iterable[Any], size: int) -> Iterator[list[Any]]:
-    iterator = iter(rows)
-    while batch := list(islice(iterator, size)):
+def _batches(rows: Iterable[ContourRow], most: float) -> Iterator[list[ContourRow]]:
+    """Lines in batches of about so many vertices."""
+    batch: list[ContourRow] = []
+    vertices = 0
+    for row in rows:
+        batch.append(row)
+        vertices += len(row.xy)
+        if vertices >= most:
+            yield batch
+            batch, vertices = [], 0
+    if batch:
         yield batch
 
 
@@ -156,14 +163,13 @@ def _write_layers(
     files: list[Path], lines: Iterable[ContourRow], labels: Callable[[], Sequence[LabelRow]] | None, crs: str
 ) -> None:
     driver = FORMATS[files[0].suffix.lower()]
-    batch_size = 1 << 60 if driver == "GeoJSON" else BATCH
-    empty: list[list[ContourRow]] = [[]]
     written = False
-    for batch in _batches(lines, batch_size):
+    # GDAL cannot add to a GeoJSON without reading it again.
+    for batch in _batches(lines, np.inf if driver == "GeoJSON" else BATCH):
         _write_lines(files[0], driver, batch, crs, written)
         written = True
     if not written:
-        _write_lines(files[0], driver, empty[0], crs, False)
+        _write_lines(files[0], driver, [], crs, False)
     if labels is None:
         return
     found = labels()
