@@ -6,6 +6,7 @@ import csv
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -321,7 +322,7 @@ def _slow(
                 continue
             value = _number(fields[at], layout.decimal_comma)
             if value is None:
-                value = _missing(fields[at], role, lambda c=code, r=record: class_of(c, r), where, layout)
+                value = _missing(fields[at], role, partial(class_of, code, record), where, layout)
             if role == "sigma" and value < 0:
                 raise InputError(f"{where}: sigma = {fields[at]!r}; a standard deviation is zero or more")
             rows[role].append(value)
