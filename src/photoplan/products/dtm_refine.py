@@ -165,33 +165,26 @@ def _add(
         for column in range(layout.columns):
             at = column, row
             if at not in done:
-                unit = units.get(at) or coarse.unit(column, row)
+                old, new = coarse.unit(column, row), units.get(at)
                 figures = known.get(at, empty_figures(column, row))
-                writer.add(unit, _figures(units[at], figures, boxes) if at in units else figures)
+                writer.add(new or old, figures if new is None else _figures(new, old, figures, boxes))
             if progress is not None:
                 progress(1, 1)
 
 
-def _figures(unit: Unit, before: UnitFigures, lines: shapely.STRtree) -> UnitFigures:
-    """Figures of a unit that joins two models: what was estimated for one of them does not hold for it."""
+def _figures(unit: Unit, old: Unit | None, before: UnitFigures, lines: shapely.STRtree) -> UnitFigures:
+    """Figures of a new unit: where it joins two models, what was estimated for one of them does not hold for it."""
     low, high = unit_range(unit)
     known = unit.sigmas[np.isfinite(unit.sigmas)].astype(float)
     sigma = float(np.sqrt((known**2).mean())) if known.size else math.nan
     box = shapely.box(unit.left, unit.top - unit.side, unit.left + unit.side, unit.top)
     count = len(lines.query(box, predicate="intersects"))
+    after = replace(before, meshes=unit.meshes, low=low, high=high, lines=count, sigma=sigma)
+    if old is not None and np.array_equal(unit.heights, old.heights, equal_nan=True):
+        # Only its triangles are new: finer posts adjoin.
+        return after
     nan = math.nan
-    return replace(
-        before,
-        meshes=unit.meshes,
-        low=low,
-        high=high,
-        lines=count,
-        sigma=sigma,
-        variance=nan,
-        length=nan,
-        noise=nan,
-        spread=nan,
-    )
+    return replace(after, variance=nan, length=nan, noise=nan, spread=nan)
 
 
 def _parts(
