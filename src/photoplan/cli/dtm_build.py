@@ -1,0 +1,153 @@
+"""`photoplan dtm build`: a terrain model from measured points and lines."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from photoplan.cli.options import json_option
+
+if TYPE_CHECKING:
+    from photoplan.products.dtm_build import BuildReport, BuildRequest
+
+__all__ = ["command"]
+
+_PATH = click.Path(path_type=Path)
+_POSITIVE = click.FloatRange(0, min_open=True)
+#: Findings and gross errors that are shown; all are in the report, in the model and in --json.
+_SHOWN = 10
+
+
+@click.command("build")
+@click.argument("points", type=_PATH, nargs=-1, required=True)
+@click.option("-o", "--output", type=_PATH, required=True, metavar="MODEL", help="The model, a .gpkg.")
+@click.option("--grid-width", type=_POSITIVE, metavar="M", help="Finest grid width [from the spacing of the points].")
+@click.option("--adapt", type=click.FloatRange(0), metavar="M", help="Widen a unit's grid while its surface stays "
+              "within this; 0: never [a quarter of its standard deviation].")  # fmt: skip
+@click.option("--unit-meshes", type=int, default=64, show_default=True, help="Meshes along a unit's side.")
+@click.option("--filter", "filters", multiple=True, metavar="CLASS=M", help="Standard deviation of measurement of "
+              "mass, spot, breakline, formline, border or hole [mass: estimated; others: a share of it].")  # fmt: skip
+@click.option("--covariance", default="auto", show_default=True, help="auto, gaussian, matern or exponential.")
+@click.option("--gross", type=click.FloatRange(0), default=4.0, show_default=True, help="Normalised residual of gross "
+              "errors; 0: none is sought.")  # fmt: skip
+@click.option("--reach", type=_POSITIVE, metavar="M", help="Gaps over twice this stay open [10 spacings].")
+@click.option("--codes", type=_PATH, metavar="FILE", help="What codes mean: TOML or CSV with code, class, sigma.")
+@click.option("--columns", help="Columns of text files, such as x=East,y=North,z=Height,code=Art or x,y,z,-,code.")
+@click.option("--delimiter", help="Between columns: , ; tab or space [what fits].")
+@click.option("--decimal-comma", is_flag=True, help="Numbers are written 1,5.")
+@click.option("--attribute", help="Attribute of vector files that holds the code [kind, class or code].")
+@click.option("--layer", "layers", multiple=True, help="Layer or surface to read; may be repeated [all].")
+@click.option("--las-class", "las_classes", type=int, multiple=True, help="Class of LAS points; may be repeated [2].")
+@click.option("--tin-points", is_flag=True, help="Vertices of a LandXML triangulation as points, if it has no others.")
+@click.option("--nodata", type=float, help="Height that means none.")
+@click.option("--crs", help="CRS of files that state none.")
+@click.option("--height-system", help="Height system of files that state none: ellipsoidal or EPSG:nnnn.")
+@click.option("--workers", type=click.IntRange(1), help="Units computed at once [all cores].")
+@click.option("--report/--no-report", default=None, help="A page with plots beside the model [if matplotlib is there].")
+@click.option("--dry-run", is_flag=True, help="Read, clean and plan; print it and stop.")
+@click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
+    """Predict a terrain model from POINTS: files of points and lines (text, LAS, LandXML, GeoPackage, Shapefile, DXF).
+
+    Least-squares collocation filters the points; slopes break at breaklines. The same command continues a run that was
+    interrupted while it wrote.
+    """
+    from contextlib import ExitStack
+
+    from photoplan.cli.progress import progress
+    from photoplan.products.dtm_build import describe_plan, dtm_build, load
+    from photoplan.terrain.build import plan_build
+
+    request = _request(options)
+
+    def talk(text: str) -> None:
+        if not quiet:
+            click.echo(text, err=True)
+
+    if dry_run:
+        measured, findings, crs, system = load(request)
+        click.echo(describe_plan(plan_build(measured, request.settings), measured, crs, system))
+        for finding in findings:
+            click.echo(f"  {finding.kind}: {finding.text}")
+        return
+    with ExitStack() as stack:
+
+        def steps(name: str, parts: int) -> Any:
+            stack.close()
+            talk(f"  {name} …")
+            bar = stack.enter_context(progress(parts, quiet))
+            return lambda done: bar(done, 0)
+
+        built = dtm_build(request, steps, talk)
+    if as_json:
+        click.echo(json.dumps(built.to_dict(), indent=2, ensure_ascii=False))
+        return
+    click.echo(str(built.path))
+    if built.page is not None:
+        click.echo(str(built.page))
+    for line in _summary(built):
+        talk(line)
+
+
+def _request(options: dict[str, Any]) -> BuildRequest:
+    import psutil
+
+    from photoplan.io.terrain_files import CodeTable, ReadOptions, read_code_table
+    from photoplan.products.dtm_build import BuildRequest
+    from photoplan.terrain.settings import BuildSettings
+
+    codes = options.pop("codes")
+    delimiter = options.pop("delimiter")
+    reading = ReadOptions(
+        columns=options.pop("columns"),
+        delimiter={"tab": "\t", "space": " "}.get(delimiter, delimiter),
+        decimal_comma=options.pop("decimal_comma"),
+        codes=read_code_table(codes) if codes else CodeTable(),
+        attribute=options.pop("attribute"),
+        layers=options.pop("layers") or None,
+        las_classes=options.pop("las_classes") or None,
+        tin_points=options.pop("tin_points"),
+        nodata=options.pop("nodata"),
+        crs=options.pop("crs"),
+    )
+    settings = BuildSettings(
+        grid_width=options.pop("grid_width"),
+        unit_meshes=options.pop("unit_meshes"),
+        adapt=options.pop("adapt"),
+        family=options.pop("covariance"),
+        filters=dict(_filter(text) for text in options.pop("filters")),
+        gross=options.pop("gross"),
+        reach=options.pop("reach"),
+    )
+    workers = options.pop("workers") or psutil.cpu_count() or 1
+    return BuildRequest(inputs=options.pop("points"), options=reading, settings=settings, workers=workers, **options)
+
+
+def _filter(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
+    try:
+        return name.strip(), float(value)
+    except ValueError:
+        raise click.BadParameter(f"{text!r}; write for example --filter mass=0.15") from None
+
+
+def _summary(built: BuildReport) -> list[str]:
+    f = built.figures
+    lines = [
+        f"{f['points']} points in {f['seconds']:.1f} s · {f['units']} units, grid "
+        + ", ".join(f"{width} m ({count})" for width, count in f["grid_widths"].items()),
+        f"covariance {f['covariance']}: signal ±{f['variance'] ** 0.5:.3f} m, half at {f['length']:.2f} m · "
+        f"mass points ±{f['noise']:.3f} m · posts ±{f['sigma'] or 0:.3f} m · normalised residuals {f['spread'] or 0:.2f}",
+    ]
+    if built.gross:
+        lines.append(f"{len(built.gross)} gross errors, left out:")
+        lines += [f"  {g.name}: {g.residual:+.3f} m, {abs(g.normalised):.1f} σ" for g in built.gross[:_SHOWN]]
+    if built.findings:
+        lines.append(f"{len(built.findings)} findings in the measurements:")
+        lines += [f"  {finding.kind}: {finding.text}" for finding in built.findings[:_SHOWN]]
+    return lines + [f"  {note}" for note in built.notes[:_SHOWN]]
