@@ -253,8 +253,6 @@ def _fast(layout: Layout, lines: list[str], records: NDArray[np.int64]) -> Block
     """Columns by NumPy's reader; None where anything is unusual."""
     texts = [r for r in layout.roles if r not in NUMBERS]
     if layout.decimal_comma:
-        if texts:
-            return None
         lines = [text.replace(",", ".") for text in lines]
     of_column = {at: role for role, at in layout.roles.items()}
     plain = len(of_column) == layout.width and not texts
@@ -286,8 +284,8 @@ def _fast(layout: Layout, lines: list[str], records: NDArray[np.int64]) -> Block
     found: dict[str, list[str] | None] = dict.fromkeys(("code", "line", "name"))
     for role in texts:
         values = column(role).tolist()
-        if max(map(len, values)) >= TEXT:
-            return None
+        if max(map(len, values)) >= TEXT or (layout.decimal_comma and any("." in v for v in values)):
+            return None  # the text may be cut off, or its point may have been a comma
         found[role] = [v.strip() for v in values]
     return Block(
         xyz,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -115,8 +116,9 @@ def domain_of(measured: MeasuredTerrain) -> Any | None:
         west, south, east, north = _bounds(measured)
         reach = max(east - west, north - south, 1.0)
         area = shapely.box(west - reach, south - reach, east + reach, north + reach)
-    for kind, ring in valid:
-        area = shapely.union(area, ring) if kind == "border" else shapely.difference(area, ring)
+    for kind, run in groupby(valid, key=lambda item: item[0]):
+        together = shapely.union_all([ring for _, ring in run])
+        area = shapely.union(area, together) if kind == "border" else shapely.difference(area, together)
     return _areas(shapely.make_valid(area))
 
 

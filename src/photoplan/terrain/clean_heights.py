@@ -162,9 +162,10 @@ class _Walls:
 def _sides(net: Network, lines: Sequence[MeasuredLine]) -> _Walls:
     walls: dict[int, tuple[int, int, float, float, str]] = {}
     edges: set[tuple[int, int]] = set()
+    bounds = np.searchsorted(net.line, np.arange(len(lines) + 1))
     for number in (k for k, line in enumerate(lines) if line.right is not None):
-        places = np.flatnonzero(net.line == number).tolist()
-        v = net.vertex[places].tolist()
+        places = range(bounds[number], bounds[number + 1])
+        v = net.vertex[places.start : places.stop].tolist()
         edges |= {(min(a, b), max(a, b)) for a, b in pairwise(v)}
         closed = len(v) > 3 and v[0] == v[-1]
         for k, place in enumerate(places):
