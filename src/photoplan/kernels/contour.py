@@ -129,6 +129,26 @@ def _root(z0: float, z1: float, bend: float, level: float) -> float:
     return first if abs(first - 0.5) <= abs(second - 0.5) else second
 
 
+@inner
+def _range(slope: float, bend: float, band: float, at: float) -> tuple[Any, Any]:
+    """The stretch of an edge round `at` in which the height is within the band of that there.
+
+    It is connected, so that stretches of two levels, which have no height in common, lie in the order of the levels.
+    """
+    low, high = -at, 1.0 - at
+    for c in (band, -band):
+        inside = slope * slope + 4.0 * bend * c
+        if inside < 0.0:
+            continue
+        q = -0.5 * (slope + (1.0 if slope >= 0.0 else -1.0) * np.sqrt(inside))
+        for d in (q / bend if bend != 0.0 else 0.0, -c / q if q != 0.0 else 0.0):
+            if d > 0.0:
+                high = min(high, d)
+            elif d < 0.0:
+                low = max(low, d)
+    return at + low, at + high
+
+
 @kernel
 def cross_edges(
     xyz: NDArray[np.float64],
@@ -166,13 +186,7 @@ def cross_edges(
         at = min(max(_root(za, zb, bend, inside), 0.0), 1.0)
         low, high = at, at
         if band > 0.0 and not fixed[i]:
-            below, above = level - band, level + band
-            if za <= zb:
-                low = _root(za, zb, bend, below) if below > za else 0.0
-                high = _root(za, zb, bend, above) if above < zb else 1.0
-            else:
-                low = _root(za, zb, bend, above) if above < za else 0.0
-                high = _root(za, zb, bend, below) if below > zb else 1.0
+            low, high = _range(zb - za - bend + 2.0 * bend * at, bend, band, at)
             low = min(max(low, min(MARGIN, 0.5 * at)), at)
             high = max(min(high, 1.0 - min(MARGIN, 0.5 * (1.0 - at))), at)
         for k in range(2):
