@@ -82,6 +82,7 @@ def test_fault_18_points_are_read_however_they_are_written(write: Write, text: s
         ("x,y,z\n1,2,-9999\n4,5,6\n", "nodata"),
         ("x,y,z\n1,2,30000\n4,5,6\n", "record 2.*height 30000"),
         ("x,x,y,z\n1,1,2,3\n", "2 columns for x"),
+        ("7 2.5 3.5 9.5\n8 2.6 3.6 9.6\n9 2.7 3.7 9.7\n", r"p\.csv:1: the first column counts"),
     ],
 )
 def test_fault_18_what_cannot_be_read_is_named_with_its_line(write: Write, text: str | bytes, message: str) -> None:
@@ -94,6 +95,15 @@ def test_fault_18_a_bad_line_far_inside_a_large_file_is_named(write: Write) -> N
     rows[444_443] = "7 8 oops"
     with pytest.raises(InputError, match=r"p\.csv:444444: z = 'oops'"):
         read_measured([write("\n".join(rows))])
+
+
+def test_numbers_keep_all_their_digits(write: Write) -> None:
+    rng = np.random.default_rng(8)
+    table = np.column_stack([rng.uniform(2e7, 2.1e7, 500), rng.normal(0, 1e-5, 500), rng.uniform(-1e3, 8e3, 500)])
+    text = "\n".join(" ".join(map(repr, row)) for row in table.tolist())
+    for options in (ReadOptions(), ReadOptions(decimal_comma=True)):
+        written = text.replace(".", ",") if options.decimal_comma else text
+        np.testing.assert_array_equal(read_measured([write(written)], options).points[0].xyz, table)
 
 
 def test_records_are_lines_of_the_file_across_blocks(write: Write) -> None:

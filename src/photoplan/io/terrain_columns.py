@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +111,11 @@ def find_layout(path: Path, lines: list[str], options: ReadOptions) -> Layout | 
         commented = [(n, _roles_of(split(t, delimiter), None)) for n, t in head[-1:] if len(t) < 1000 and '"' not in t]
         if commented and isinstance(commented[0][1], dict):
             return Layout(delimiter, commented[0][1], len(fields), 0, comma)
+        if len(fields) > 3 and _are_numbers_of_points([_fields(path, item, delimiter) for item in data[:SNIFFED]]):
+            raise InputError(
+                f"{path}:{data[0][0]}: the first column counts 1 by 1 like numbers of points, and there is no header; "
+                "declare the columns, for example name,x,y,z (or x,y,z,code if it is X)"
+            )
         return _by_order(path, data[0][0], fields, delimiter, comma)
     found = _roles_of(fields, renamed)
     if isinstance(found, str):
@@ -119,6 +125,13 @@ def find_layout(path: Path, lines: list[str], options: ReadOptions) -> Layout | 
             + _comma_hint(fields, comma)
         )
     return Layout(delimiter, found, len(fields), data[0][0], comma)
+
+
+def _are_numbers_of_points(rows: list[list[str]]) -> bool:
+    first = [row[0] for row in rows]
+    if len(first) < 3 or not all(re.fullmatch(r"\d{1,9}", text) for text in first):
+        return False
+    return all(int(b) - int(a) == 1 for a, b in pairwise(first))
 
 
 def _by_order(path: Path, line: int, fields: list[str], delimiter: str, comma: bool) -> Layout:
