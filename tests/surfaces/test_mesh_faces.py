@@ -37,14 +37,14 @@ def area(surface: HybridSurface) -> tuple[float, float]:
     return covered, meshes
 
 
-def edge_points(surface: HybridSurface, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def edge_points(surface: HybridSurface, rng: np.random.Generator, away: float = 3e-9) -> tuple[np.ndarray, np.ndarray]:
     """Points on both sides of all mesh edges, 3 nm from them, inside the model."""
     xmin, ymin, xmax, ymax = surface.source.layout.bounds
     one, two = [], []
     for unit in surface.source.units.values():
         n = unit.meshes
         t, k = rng.uniform(0, n, (n + 1) * 30), np.repeat(np.arange(n + 1), 30)
-        for col, row, step in ((k, t, (3e-9, 0)), (t, k, (0, 3e-9))):
+        for col, row, step in ((k, t, (away, 0)), (t, k, (0, away))):
             XY = np.stack([unit.left + col * unit.width, unit.top - row * unit.width], axis=1)
             one.append(XY - step)
             two.append(XY + step)
@@ -64,6 +64,12 @@ def test_the_surface_is_continuous_and_exact_along_lines(seed: int) -> None:
     a, b = edge_points(surface, rng)
     gap = np.abs(surface.heights(a) - surface.heights(b))
     assert gap.max() < 5e-5  # float32 posts above each unit's datum, and 6 nm of the steepest triangle
+    # Farther away the points are in two units beyond doubt: the difference is a slope, which halves with the distance,
+    # but for single points that have a wall between them.
+    a, b = edge_points(surface, rng, 2e-5)
+    far = np.abs(surface.heights(a) - surface.heights(b))
+    near = np.abs(surface.heights(0.75 * a + 0.25 * b) - surface.heights(0.25 * a + 0.75 * b))
+    assert ((far > 0.02) & (near > 0.6 * far)).mean() < 0.004
     covered, meshes = area(surface)
     assert covered == pytest.approx(meshes, rel=1e-9)
     xmin, ymin, xmax, ymax = LAYOUT.bounds

@@ -66,16 +66,17 @@ def mesh_nodes(unit: Unit, lines: Sequence[LineElement], neighbours: Mapping[Sid
     loose_xy = _joined(loose.xy, SAME * n)
     line_xy[inside] = loose_xy[: loose.lines]
     posts = _posts(unit)
-    post_values = posts.copy()
-    _lines_on_posts(loose_xy[: loose.lines], loose.values[: loose.lines], post_values)
-    needed = _needed(loose_xy, loose.lines, np.isfinite(post_values[..., 2]))
+    valid = np.isfinite(posts[..., 2])
+    col, row = _on_posts(loose_xy[: loose.lines][np.isfinite(loose.values[: loose.lines, 2])])
+    valid[row, col] = True
+    needed = _needed(loose_xy, loose.lines, valid)
     if not needed.any():
         return None
     row, col = np.nonzero(_touching_posts(needed))
     of_needed = _touches(loose_xy, needed)
     # First the lines: where they meet a post of this or another unit, they count.
     all_xy = np.concatenate([loose_xy[of_needed], np.stack([col, row], axis=1).astype(float)])
-    all_values = np.concatenate([loose.values[of_needed], post_values[row, col]])
+    all_values = np.concatenate([loose.values[of_needed], posts[row, col]])
     first, number = _unique(all_xy)
     xy, values = all_xy[first], all_values[first]
     _first_heights(all_values, number, values)
@@ -154,12 +155,10 @@ def _posts(unit: Unit) -> NDArray[np.float64]:
     return np.stack([X, Y, unit.heights + np.float64(unit.datum), unit.sigmas.astype(float)], axis=-1)
 
 
-def _lines_on_posts(xy: NDArray[np.float64], values: NDArray[np.float64], posts: NDArray[np.float64]) -> None:
-    """Posts on a line take the line's height."""
-    on = (xy == np.rint(xy)).all(axis=1) & np.isfinite(values[:, 2])
-    col, row = xy[on].astype(np.int64).T
-    # The first of several lines counts, so it is written last.
-    posts[row[::-1], col[::-1]] = values[on][::-1]
+def _on_posts(xy: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Column and row of the posts that points lie on."""
+    col, row = xy[(xy == np.rint(xy)).all(axis=1)].astype(np.int64).T
+    return col, row
 
 
 def _needed(xy: NDArray[np.float64], lines: int, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
