@@ -113,6 +113,9 @@ def test_labels_keep_apart_and_off_crooked_parts() -> None:
     assert [label.X > 400 for label in places] == [True]
     assert Labeller(4.0, 1000.0, 0).place(ContourLine(10.0, zigzag, True)) == []
     assert Labeller(4.0, 50.0, 0).place(ring(1.0)) == []
+    # Twelve metres of text on a circle of 10 m would leave it by 1.8 m; of 30 m, by 0.6 m.
+    assert Labeller(4.0, 1000.0, 0).place(ring(10.0, 1200.0)) == []
+    assert len(Labeller(4.0, 1000.0, 0).place(ring(30.0, 1200.0))) == 1
 
 
 @pytest.mark.parametrize(
