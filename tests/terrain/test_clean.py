@@ -326,6 +326,15 @@ def test_fault_19_any_lines_can_be_triangulated_after_cleaning(case: tuple[Measu
     assert not any(f.kind in ("crossing heights", "joined vertices") for f in found)
 
 
+def test_work_that_does_not_end_is_ended_by_joining_vertices(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("photoplan.terrain.clean_nodes.ROUNDS", 1)
+    rng = np.random.default_rng(7)
+    lines = [line(np.column_stack([rng.uniform(0, 0.02, (3, 2)), np.zeros(3)]), name=str(i)) for i in range(40)]
+    out, found = cleaned(*lines)
+    assert {f.kind for f in found} >= {"joined vertices"}
+    assert_meets_in_vertices(out)
+
+
 def test_cleaning_does_not_depend_on_the_order_of_lines_far_from_each_other() -> None:
     rng = np.random.default_rng(5)
     lines = [line(np.column_stack([rng.uniform(-50, 50, (4, 2)), np.full(4, 3.0)]), name=str(i)) for i in range(30)]

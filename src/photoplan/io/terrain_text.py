@@ -164,7 +164,7 @@ def _terrain(
     lines: list[MeasuredLine] = []
     alone = np.empty(0, np.int64)
     if on_line.any():
-        lines, alone = _make_lines(path, columns, on_line, line, right, codes.texts, ids.texts, classes)
+        lines, alone = _make_lines(path, columns, on_line, line, right, (codes.texts, ids.texts), classes)
         if len(alone):
             some = ", ".join(str(r) for r in records[alone[:5]])
             notes.append(
@@ -193,11 +193,11 @@ def _make_lines(
     on_line: NDArray[np.bool_],
     ids: NDArray[np.int32] | None,
     right: NDArray[np.float64] | None,
-    codes: list[str],
-    id_texts: list[str],
+    texts: tuple[list[str], list[str]],
     classes: list[CodeClass],
 ) -> tuple[list[MeasuredLine], NDArray[np.int64]]:
-    """Lines, and the rows of those that would have one vertex."""
+    """Lines, and the rows of those that would have one vertex; `texts` are codes and line ids by their numbers."""
+    codes, id_texts = texts
     rows = np.flatnonzero(on_line)
     code = np.zeros(len(columns.xyz), np.int32) if columns.codes is None else columns.codes
     step = np.diff(rows) > 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -75,7 +75,12 @@ def one_height(
         own, low, high = _means(vertex, height, w, len(net.xy))
         mean = np.where(np.isnan(mean), own, mean)
         different = np.flatnonzero(high - low > tolerance)
-        meetings += _meetings(net, lines, joined, different, vertex, height, place, mean)
+        owner = net.line[place]
+
+        def name(k: int, owner: NDArray[np.int64] = owner) -> str:
+            return lines[owner[k]].name if k < len(owner) else joined.labels[k - len(owner)]
+
+        meetings += _meetings(net, name, different, vertex, height, mean)
         z[place] = mean[net.vertex[place]]
     return replace(net, z=z), meetings
 
@@ -98,23 +103,20 @@ def _means(
 
 def _meetings(
     net: Network,
-    lines: Sequence[MeasuredLine],
-    joined: Joined,
+    name: Callable[[int], str],
     different: NDArray[np.int64],
     vertex: NDArray[np.int64],
     z: NDArray[np.float64],
-    place: NDArray[np.int64],
     mean: NDArray[np.float64],
 ) -> list[Meeting]:
+    """Meetings at the vertices `different`, from the vertex and height of every entry and the name of each."""
     if not len(different):
         return []
     at = np.flatnonzero(np.isin(vertex, different))
     at = at[np.argsort(vertex[at], kind="stable")]
     out = []
     for part in np.split(at, np.flatnonzero(np.diff(vertex[at])) + 1):
-        names = [
-            lines[net.line[place[k]]].name if k < len(place) else joined.labels[k - len(place)] for k in part.tolist()
-        ]
+        names = [name(k) for k in part.tolist()]
         seen = dict(zip(names, z[part].tolist()))  # a line that passes twice is named once, unless it is alone
         pairs = list(seen.items()) if len(seen) > 1 else list(zip(names, z[part].tolist()))
         v = int(vertex[part[0]])
