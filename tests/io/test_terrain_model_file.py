@@ -149,6 +149,21 @@ def test_raster_of_many_tiles_with_edges_between_units(tmp_path: Path) -> None:
     assert np.abs(heights - plane(X, Y)).max() < 1e-3
 
 
+def test_raster_where_one_of_two_units_has_no_edge(tmp_path: Path) -> None:
+    """Posts on the edge of two units: the one that has a height there counts, whichever is written last."""
+    layout = UnitLayout(0.0, 0.0, 10.0, 3, 1)
+
+    def unit(column: int, row: int) -> Unit:
+        whole = grid_unit(layout, column, row, 10, plane, 0.0)
+        heights = whole.heights.copy()
+        if column == 1:
+            heights[:, [0, -1]] = np.nan
+        return replace(whole, heights=heights)
+
+    with rasterio.open(write_units_of(tmp_path / "m.gpkg", layout, unit).path) as file:
+        assert not np.ma.getmaskarray(file.read(1, masked=True)).any()
+
+
 def inside(X: np.ndarray, Y: np.ndarray, unit: tuple[int, int], margin: float) -> np.ndarray:
     """Whether points lie in a unit, or no farther than the margin from it."""
     left, top = LAYOUT.corner(*unit)
@@ -210,10 +225,11 @@ def test_opened_in_a_gis_meanwhile(model: ModelReader, tmp_path: Path) -> None:
     path.write_bytes(model.path.read_bytes())
     with closing(sqlite3.connect(path)) as db:
         db.execute("PRAGMA journal_mode = WAL")
-        db.execute("UPDATE gpkg_contents SET description = 'seen' WHERE table_name = 'units'")
+        db.execute("UPDATE photoplan_terrain SET content = replace(content, 'gaussian', 'seen')")
         db.commit()
         assert path.with_name("m.gpkg-wal").stat().st_size > 0
-        assert same_unit(ModelReader(path).unit(0, 0), unit_at(0, 0))
+        reader = ModelReader(path)
+        assert same_unit(reader.unit(0, 0), unit_at(0, 0)) and reader.header.family == "seen"
     assert same_unit(ModelReader(path).unit(0, 0), unit_at(0, 0))
 
 

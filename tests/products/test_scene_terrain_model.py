@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,16 +12,20 @@ import pytest
 import rasterio
 from tools.command import edit
 from tools.small_block import CRS, DEM_STEP, Block
-from tools.small_model import write_units_of
+from tools.small_model import grid_unit, write_units_of
 
 from photoplan.errors import HeightSystemError, InputError
+from photoplan.geometry.crs import crs_step
+from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.project import load_project
 from photoplan.io.terrain_model_read import ModelReader
 from photoplan.products.check import check_project
 from photoplan.products.execution import Run, execute
+from photoplan.products.init import InitRequest, init_project
 from photoplan.products.orthophoto import plan_orthophotos
-from photoplan.products.scene import ground_of
+from photoplan.products.scene import ground_of, open_scene
 from photoplan.surfaces.units import Unit, UnitLayout
+from photoplan.targets.map import MapTarget
 
 MESHES = 9
 """Seven by six units of nine meshes hold 64 × 55 posts of the block's 64 × 60."""
@@ -84,16 +91,66 @@ def test_check_takes_a_model(small: Block) -> None:
     assert ground_of(load_project(small.project)).bounds == reader.layout.bounds
 
 
-def test_a_model_in_another_crs(small: Block, tmp_path: Path) -> None:
-    """Terrain in ETRS89 under a project in WGS 84: the operation is recorded, heights stay."""
-    target = ground_of(load_project(small.project)).surface
-    model_of(small.terrain, small.folder / "model.gpkg", crs="EPSG:25833")
+def test_a_model_in_another_crs(small: Block) -> None:
+    """Terrain of UTM zone 32 under a project of zone 33: a plane there is met wherever a point of zone 33 lies."""
+    step = crs_step("EPSG:32633", "EPSG:32632")
+    x0, y0 = np.floor(step(np.array([500_300.0, 5_300_200.0])))
+    layout = UnitLayout(x0 - 1000, y0 + 1000, 100.0, 20, 20)
+
+    def plane(X: np.ndarray, Y: np.ndarray) -> np.ndarray:
+        return 100 + 0.01 * (X - x0) - 0.02 * (Y - y0)
+
+    path = small.folder / "model.gpkg"
+    write_units_of(path, layout, lambda c, r: grid_unit(layout, c, r, 4, plane, 100.0), "EPSG:32632")
     edit(small.project, "dem.tif", "model.gpkg")
     ground = ground_of(load_project(small.project))
-    assert ground.file == (small.folder / "model.gpkg").resolve()
-    XY = np.array([[500_300.0, 5_300_200.0]])
+    assert ground.file == path.resolve()
     assert [step.source for step in ground.operations] == ["EPSG:32633"]
-    assert ground.surface.heights(XY) == pytest.approx(target.heights(XY), abs=1e-3)
+    XY = np.array([500_300.0, 5_300_200.0]) + np.random.default_rng(1).uniform(-300, 300, (50, 2))
+    assert ground.surface.heights(XY) == pytest.approx(plane(*step(XY).T), abs=1e-5)
+    relief = ground.surface.relief(MapTarget(MapGrid.covering((500_290, 5_300_190, 500_310, 5_300_210), 1.0, CRS)),
+                                   Window(0, 0, 20, 20))  # fmt: skip
+    X, Y = np.meshgrid(500_290.5 + np.arange(20), 5_300_209.5 - np.arange(20))
+    assert relief == pytest.approx(plane(*np.moveaxis(step(np.stack([X, Y], axis=-1)), -1, 0)), abs=1e-3)
+
+
+def test_init_takes_a_model(small: Block) -> None:
+    """CRS and height system come from the model's header; the project it writes can be opened."""
+    model_of(small.terrain, small.folder / "model.gpkg", height_system="EPSG:5773")
+    request = InitRequest(
+        folder=small.folder,
+        images=(str(small.folder / "images" / "*"),),
+        camera=small.camera,
+        orientation=small.orientation,
+        terrain=str(small.folder / "model.gpkg"),
+        crs=CRS,
+        orientation_height_system="EPSG:5773",
+        overwrite=True,
+    )
+    path = init_project(request).path
+    project = load_project(path)
+    assert project.terrain.file == "model.gpkg" and project.terrain.crs is None
+    assert ground_of(project).height_systems == ("EPSG:5773", "EPSG:5773")
+
+
+def test_dask_workers_read_units_themselves(small: Block, tmp_path: Path) -> None:
+    """A scene's address is opened from its text alone, as in another process, and gives the same heights."""
+    model_of(small.terrain, small.folder / "model.gpkg")
+    edit(small.project, "dem.tif", "model.gpkg")
+    scene = open_scene(load_project(small.project), "one")
+    XY = np.array([[500_300.0, 5_300_200.0]])
+    here = scene.surface.heights(XY)
+    command = "import pickle, sys; a, XY = pickle.load(sys.stdin.buffer); print(float(a.open().surface.heights(XY)[0]))"
+    done = subprocess.run(
+        [sys.executable, "-c", command], input=pickle.dumps((scene.address, XY)), capture_output=True, check=True
+    )
+    assert float(done.stdout) == here[0]
+    (small.folder / "model.gpkg").unlink()
+    model_of(small.terrain, small.folder / "model.gpkg", family="another")
+    done = subprocess.run(
+        [sys.executable, "-c", command], input=pickle.dumps((scene.address, XY)), capture_output=True, check=False
+    )
+    assert b"has changed since the run was planned" in done.stderr
 
 
 class TestFault02HeightSystems:

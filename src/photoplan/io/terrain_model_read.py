@@ -213,7 +213,7 @@ class ModelReader:
         ranges = np.full((layout.rows, layout.columns, 2), np.nan)
         meshes: Counter[int] = Counter()
         flat = ranges.reshape(-1, 2)
-        for number, low, high, count in self._rows(f"SELECT id, low, high, meshes FROM {UNITS}", limit=len(flat) + 1):
+        for number, low, high, count in self._each(f"SELECT id, low, high, meshes FROM {UNITS}"):
             good = isinstance(number, int) and isinstance(count, int) and 0 <= number < len(flat) and count > 0
             if not (good and isinstance(low, float) and isinstance(high, float) and -_HIGHEST < low <= high < _HIGHEST):
                 raise InputError(f"{self.path}: unit {number}: heights {low} to {high}; get a fresh copy of the file")
@@ -228,9 +228,13 @@ class ModelReader:
         except _DAMAGED as error:
             raise self._no_model(str(error)) from error
 
-    def _rows(self, query: str, *values: Any, limit: int = 50_000_000) -> list[tuple[Any, ...]]:
+    def _rows(self, query: str, *values: Any) -> list[tuple[Any, ...]]:
+        return list(self._each(query, *values))
+
+    def _each(self, query: str, *values: Any) -> Iterator[tuple[Any, ...]]:
+        """Rows of a query, one after the other."""
         try:
-            return self._own.get().execute(query, values).fetchmany(limit)
+            yield from self._own.get().execute(query, values)
         except (*_DAMAGED, OverflowError) as error:
             raise InputError(f"{self.path}: damaged ({error}); get a fresh copy of the file") from error
 
