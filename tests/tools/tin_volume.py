@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from photoplan.surfaces.measured import Tin
 
-__all__ = ["exact_volume", "read_landxml_tin", "tin_heights", "tin_outline", "tin_posts"]
+__all__ = ["exact_volume", "faces_near", "read_landxml_tin", "tin_heights", "tin_outline", "tin_posts"]
 
 
 def read_landxml_tin(path: Path) -> Tin:
@@ -92,6 +92,13 @@ def tin_outline(tin: Tin) -> shapely.Geometry:
     origin = tin.xyz[:, :2].mean(axis=0)
     whole = shapely.union_all(shapely.polygons(_triangles(tin, origin)[..., :2]))
     return shapely.transform(whole, lambda xy: xy + origin)
+
+
+def faces_near(tin: Tin, place: shapely.Geometry, distance: float) -> Tin:
+    """The triangles within a distance of a place."""
+    plans = shapely.polygons(tin.xyz[tin.faces][..., :2])
+    shapely.prepare(wide := place.buffer(distance))
+    return Tin(tin.xyz, tin.faces[shapely.intersects(wide, plans)])
 
 
 def tin_posts(tin: Tin, left: float, top: float, mesh: float, shape: tuple[int, int]) -> NDArray[np.float64]:

@@ -29,7 +29,7 @@ __all__ = ["VisibleReport", "VisibleRequest", "VisibleRow", "dtm_visible", "own_
 
 TILE = 512
 #: Bytes of one post while one observer is looked at: heights, those relative to the eye, pyramid, result.
-POST_BYTES = 18
+POST_BYTES = 28
 ROLES = {
     "x": ("x", "e", "east", "easting"),
     "y": ("y", "n", "north", "northing"),
