@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 import struct
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -365,6 +367,20 @@ def test_walls_and_polygons_of_a_geopackage(tmp_path: Path) -> None:
         read_measured([path], ReadOptions(layers=("x",)))
     with pytest.raises(InputError, match="no attribute 'art'"):
         read_measured([path], ReadOptions(attribute="art"))
+
+
+def test_fault_07_a_query_instead_of_a_table_is_refused(tmp_path: Path) -> None:
+    path = vector(tmp_path / "a.gpkg", ["POINT Z (1 2 3)"], "real", n=[1])
+    with closing(sqlite3.connect(path)) as db, db:
+        endless = "WITH RECURSIVE c(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM c) SELECT i AS fid, geom FROM c, real"
+        db.execute(f"CREATE VIEW bomb AS {endless}")
+        for table in ("gpkg_contents", "gpkg_geometry_columns"):
+            names = [row[1] for row in db.execute(f"PRAGMA table_info({table})")]
+            values = ", ".join("'bomb'" if n in ("table_name", "identifier") else n for n in names)
+            db.execute(f"INSERT INTO {table} SELECT {values} FROM {table}")
+    with pytest.raises(InputError, match="bomb is a view"):
+        read_measured([path])
+    assert read_measured([path], ReadOptions(layers=("real",))).count == 1
 
 
 def test_two_heights_for_three_vertices_are_refused(tmp_path: Path) -> None:

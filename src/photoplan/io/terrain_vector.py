@@ -10,8 +10,10 @@ for all) is two-sided. M values are not read.
 from __future__ import annotations
 
 import re
+import sqlite3
 import warnings
 from collections import Counter
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -107,6 +109,7 @@ def _check_drawing_units(path: Path, options: ReadOptions) -> None:
 def _layers(path: Path, options: ReadOptions, drawing: bool) -> list[str]:
     if drawing:
         return ["entities"]
+    views = _views(path)
     try:
         names = [str(name) for name, kind in pyogrio.list_layers(str(path)) if kind is not None]
     except _ERRORS as error:
@@ -119,7 +122,26 @@ def _layers(path: Path, options: ReadOptions, drawing: bool) -> list[str]:
         names = chosen
     if not names:
         raise InputError(f"{path}: holds no layer with geometry")
+    if views & {name.casefold() for name in names}:
+        raise InputError(
+            f"{path}: layer {', '.join(n for n in names if n.casefold() in views)} is a view (a query, which may have "
+            "no end), not a table; store it as a table (ogr2ogr), or choose other layers"
+        )
     return names
+
+
+def _views(path: Path) -> set[str]:
+    """Names of the views of a GeoPackage in small letters; nothing for other formats."""
+    with path.open("rb") as file:
+        if file.read(6) != b"SQLite":
+            return set()
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as db:
+            return {
+                str(name).casefold() for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'view'")
+            }
+    except sqlite3.Error as error:
+        raise InputError(f"{path}: cannot be opened ({error}); get a fresh copy") from None
 
 
 def _layer(
