@@ -14,6 +14,7 @@ from tools.dem_file import X0, Y0, write_dem
 from tools.small_model import write_small
 
 from photoplan.io import disk
+from photoplan.io.lock import FileLock
 
 
 def hill_height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -172,3 +173,19 @@ def test_fault_04_a_full_disk_leaves_the_old_file(
     assert out.read_bytes() == b"old"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["c.gpkg", "hill.tif"]
     assert disk.free_megabytes(tmp_path) > 0
+
+
+def test_fault_03_what_a_killed_run_left_is_cleared_away(hill: Path, tmp_path: Path, photoplan: Any) -> None:
+    left = tmp_path / ".c.gpkg.partial"
+    left.mkdir()
+    (left / "c.gpkg").write_bytes(b"torn")
+    said = photoplan("dtm", "contours", hill, "--interval", 5, "-o", tmp_path / "c.gpkg", "-q")
+    assert said.code == 0, said.err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["c.gpkg", "hill.tif"]
+
+
+def test_fault_26_two_runs_on_one_output(hill: Path, tmp_path: Path, photoplan: Any) -> None:
+    with FileLock(tmp_path / ".c.gpkg.lock"):
+        said = photoplan("dtm", "contours", hill, "--interval", 5, "-o", tmp_path / "c.gpkg")
+        assert said.code == 2 and "another run" in said.err
+    assert [p.name for p in tmp_path.iterdir()] == ["hill.tif"]

@@ -39,6 +39,8 @@ __all__ = ["ContourLine", "ContourOptions", "trace_contours"]
 MOST_PIECES = 30_000_000
 #: Rounds of smoothing; the waves that it takes out are some vertices long.
 PASSES = 20
+#: Part of what is left of a band beside a line in which it is simplified: so that smooth lines stay smooth.
+THIN = 0.2
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class ContourOptions:
     smooth: bool = False
     """Pull lines smooth inside their bands."""
     simplify: bool = False
-    """Leave out vertices that lines inside their bands do not need."""
+    """Leave out vertices that a line does not need to stay within a fifth of the way to the ends of its band."""
     band: float = 0.25
     """Half width of the bands in which lines are smoothed and simplified, as a part of the interval, below 0.5."""
     shortest: float = 0.0
@@ -206,7 +208,10 @@ def _lines(chains: Iterable[Chain], options: ContourOptions, shortest: float) ->
             smooth_line(places, chain.closed, PASSES)
         if options.simplify and len(places) > 3:
             keep = np.empty(len(places), np.bool_)
-            if thin_line(places, chain.closed, keep) >= (3 if chain.closed else 2):
+            near = places.copy()
+            for ends in (slice(2, 4), slice(4, 6)):
+                near[:, ends] = places[:, :2] + THIN * (places[:, ends] - places[:, :2])
+            if thin_line(near, chain.closed, keep) >= (3 if chain.closed else 2):
                 places = places[keep]
         xy = np.ascontiguousarray(places[:, :2])
         if chain.closed:
