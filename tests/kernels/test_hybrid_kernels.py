@@ -11,7 +11,7 @@ from photoplan.kernels.sample_grid import sample_lattice
 FRAME = (100.0, 200.0, 0.5)
 
 
-def faces(n: int, rng: np.random.Generator, part: float):
+def some_faces(n: int, rng: np.random.Generator, part: float):
     """Some meshes of n × n cut into four triangles at a point inside."""
     vertices, corners, start = [], [], [0]
     for r in range(n):
@@ -44,7 +44,7 @@ def naive(vertices, corners, X: float, Y: float) -> float:
 def test_scan_and_search_agree(step: float, part: float) -> None:
     n = 3
     rng = np.random.default_rng(int(step * 100 + part * 10))
-    vertices, corners, start = faces(n, rng, part)
+    vertices, corners, start = some_faces(n, rng, part)
     bump = rng.uniform(0, 1, len(vertices)) * (np.arange(len(vertices)) % 5 == 4)  # middles leave the plane
     values = vertices[:, 2] + bump
     posts = height(*np.meshgrid(100 + 2 * np.arange(n + 1.0), 200 - 2 * np.arange(n + 1.0))).astype(np.float32)
@@ -52,11 +52,13 @@ def test_scan_and_search_agree(step: float, part: float) -> None:
     count = int(n / step) + 1
     result = sample_lattice(posts, 0.0, step, count, 0.0, step, count)
     plain = result.copy()
-    scan_faces(result, (0.0, step, 0.0, step), n, FRAME, vertices, values, corners, start)
+    frame = (*FRAME, n)
+    faces = (np.column_stack([vertices[:, :2], values]), corners, start)
+    scan_faces(result, (0.0, step, 0.0, step), frame, *faces)
     at = np.arange(count) * step
     xy = np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
     single = np.empty(len(xy))
-    sample_hybrid(posts, vertices, values, corners, start, FRAME, xy, single)
+    sample_hybrid(posts, *faces, frame, xy, single)
     np.testing.assert_allclose(result.reshape(-1), single, atol=1e-5)
     assert np.isfinite(result).all()
     raised = np.column_stack([vertices, bump])
@@ -70,5 +72,5 @@ def test_where_triangles_leave_a_gap_there_is_no_value() -> None:
     posts = np.zeros((2, 2), np.float32)
     xy = np.array([(0.2, 0.8), (0.8, 0.2), (0.5, 0.5), (1.0, 0.5)])
     result = np.empty(4)
-    sample_hybrid(posts, vertices, vertices[:, 2].copy(), corners, start, FRAME, xy, result)
+    sample_hybrid(posts, vertices, corners, start, (*FRAME, 1), xy, result)
     np.testing.assert_array_equal(result, [1, np.nan, 1, np.nan])

@@ -1,7 +1,8 @@
 """Values of a computing unit whose meshes are bilinear or made of triangles.
 
 Positions are in meshes: x to the right from the unit's left edge, y downwards from its upper edge. `frame` = (X of the
-left edge, Y of the upper edge, meshes per metre) takes vertices there. A point on an edge (to 1e-7 of a mesh) belongs
+left edge, Y of the upper edge, meshes per metre, meshes along a side) takes vertices there. Vertices are X, Y and a
+value (k, 3); `corners` and `start` are those of `MeshFaces`. A point on an edge (to 1e-7 of a mesh) belongs
 to a triangle on either side, so that no point is lost between two; where the triangles differ (two-sided breaklines)
 the one whose vertices have the lower numbers counts, which is the left one of the line.
 """
@@ -20,6 +21,9 @@ __all__ = ["sample_hybrid", "scan_faces"]
 
 _ON_FACE = 1e-7
 _ON_LINE = 1e-6
+Frame = tuple[float, float, float, int]
+Lattice = tuple[float, float, float, float]
+
 # Heights of two triangles at one pixel that differ by more than this, metres, are those of a wall.
 _WALL = 1e-3
 
@@ -29,7 +33,7 @@ def _weights(
     vertices: NDArray[np.float64],
     corners: NDArray[np.int32],
     f: int,
-    frame: tuple[float, float, float],
+    frame: Frame,
     x: float,
     y: float,
 ) -> tuple[Any, Any, Any, Any]:
@@ -67,22 +71,21 @@ def _weights(
 @inner
 def _in_mesh(
     vertices: NDArray[np.float64],
-    values: NDArray[Any],
     corners: NDArray[np.int32],
     first: int,
     last: int,
-    frame: tuple[float, float, float],
+    frame: Frame,
     x: float,
     y: float,
 ) -> tuple[Any, Any]:
-    """Value at a point among triangles first … last − 1, and the key of the triangle; NaN, −2 if it is in none."""
+    """Value at a point among triangles first … last − 1, and the key of its triangle; NaN, −2 if it is in none."""
     best, found = -2, np.nan
     for f in range(first, last):
         wa, wb, wc, key = _weights(vertices, corners, f, frame, x, y)
         if key == -2 or (best >= 0 and key >= best):
             continue
-        value = wa * values[corners[f, 0]] + wb * values[corners[f, 1]] + wc * values[corners[f, 2]]
-        best, found = key, value
+        found = wa * vertices[corners[f, 0], 2] + wb * vertices[corners[f, 1], 2] + wc * vertices[corners[f, 2], 2]
+        best = key
         if key == -1:
             break
     return found, best
@@ -99,15 +102,14 @@ def _candidates(x: float, n: int) -> tuple[Any, Any]:
 @inner
 def _on_faces(
     vertices: NDArray[np.float64],
-    values: NDArray[Any],
     corners: NDArray[np.int32],
     start: NDArray[np.int64],
-    n: int,
-    frame: tuple[float, float, float],
+    frame: Frame,
     x: float,
     y: float,
 ) -> tuple[Any, Any]:
     """Value on the triangles of all meshes that touch a point, and whether all of these meshes have triangles."""
+    n = frame[3]
     c0, c1 = _candidates(x, n)
     r0, r1 = _candidates(y, n)
     found, best, every = np.nan, -2, True
@@ -117,7 +119,7 @@ def _on_faces(
             if start[m + 1] == start[m]:
                 every = False
                 continue
-            value, key = _in_mesh(vertices, values, corners, start[m], start[m + 1], frame, x, y)
+            value, key = _in_mesh(vertices, corners, start[m], start[m + 1], frame, x, y)
             if key != -2 and (best == -2 or key < best):
                 found, best = value, key
     return found, every
@@ -127,25 +129,24 @@ def _on_faces(
 def sample_hybrid(
     posts: NDArray[np.float32],
     vertices: NDArray[np.float64],
-    values: NDArray[np.float64],
     corners: NDArray[np.int32],
     start: NDArray[np.int64],
-    frame: tuple[float, float, float],
+    frame: Frame,
     xy: NDArray[np.float64],
     result: NDArray[np.float64],
 ) -> None:
     """Values at scattered points.
 
-    posts (n + 1, n + 1) and values (k,) of the vertices refer to one datum; xy (p, 2) are positions inside the unit in
+    posts (n + 1, n + 1) and the values of the vertices refer to one datum; xy (p, 2) are positions inside the unit in
     meshes; result (p,) is filled, NaN where there is no surface.
     """
-    n = posts.shape[0] - 1
+    n = frame[3]
     for i in range(xy.shape[0]):
         x, y = xy[i, 0], xy[i, 1]
         result[i] = np.nan
         if not (x >= -_ON_LINE and y >= -_ON_LINE and x <= n + _ON_LINE and y <= n + _ON_LINE):
             continue
-        found, every = _on_faces(vertices, values, corners, start, n, frame, x, y)
+        found, every = _on_faces(vertices, corners, start, frame, x, y)
         if found == found or every:
             result[i] = found
         else:
@@ -175,9 +176,7 @@ def _all_faces(start: NDArray[np.int64], n: int, x: float, y: float) -> bool:
 
 
 @inner
-def _clear(
-    result: NDArray[np.float32], start: NDArray[np.int64], n: int, lattice: tuple[float, float, float, float]
-) -> None:
+def _clear(result: NDArray[np.float32], start: NDArray[np.int64], n: int, lattice: Lattice) -> None:
     """NaN at all pixels that belong to meshes with triangles only."""
     x0, dx, y0, dy = lattice
     for r in range(n):
@@ -213,14 +212,63 @@ def _cut(xa: float, ya: float, xb: float, yb: float, y: float, span: tuple[float
     return low, high
 
 
+@inner
+def _fill(
+    result: NDArray[np.float32],
+    box: tuple[Any, Any, Any, Any],
+    scale: tuple[float, float, float, float, float, float],
+    frame: Frame,
+    vertices: NDArray[np.float64],
+    corners: NDArray[np.int32],
+    f: int,
+) -> Any:
+    """Triangle f scanned over the pixels of `box` (first and last column, first and last row) that it covers.
+
+    scale: pixels per metre, of the first pixel, and of the tolerance, along x and along y. Infinite where another
+    triangle has written another height; returns whether there is such a pixel.
+    """
+    sx, ox, tx, sy, oy, ty = scale
+    a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
+    ya = (frame[1] - vertices[a, 1]) * sy - oy
+    yb = (frame[1] - vertices[b, 1]) * sy - oy
+    yc = (frame[1] - vertices[c, 1]) * sy - oy
+    upper, lower = min(ya, yb, yc), max(ya, yb, yc)
+    v0, v1 = max(np.int64(np.ceil(upper - ty)), box[2]), min(np.int64(np.floor(lower + ty)), box[3])
+    if v0 > v1:
+        return False
+    xa = (vertices[a, 0] - frame[0]) * sx - ox
+    xb = (vertices[b, 0] - frame[0]) * sx - ox
+    xc = (vertices[c, 0] - frame[0]) * sx - ox
+    area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
+    if area == 0.0 or np.ceil(min(xa, xb, xc) - tx) > np.floor(max(xa, xb, xc) + tx):
+        return False
+    za, zb, zc = vertices[a, 2], vertices[b, 2], vertices[c, 2]
+    gx = ((zb - za) * (yc - ya) - (zc - za) * (yb - ya)) / area
+    gy = ((zc - za) * (xb - xa) - (zb - za) * (xc - xa)) / area
+    lowest, highest = min(za, zb, zc), max(za, zb, zc)
+    tie = False
+    for j in range(v0, v1 + 1):
+        y = min(max(np.float64(j), upper), lower)
+        span = _cut(xb, yb, xc, yc, y, _cut(xa, ya, xb, yb, y, (np.inf, -np.inf)))
+        low, high = _cut(xc, yc, xa, ya, y, span)
+        u0, u1 = max(np.int64(np.ceil(low - tx)), box[0]), min(np.int64(np.floor(high + tx)), box[1])
+        for i in range(u0, u1 + 1):
+            z = min(max(za + gx * (i - xa) + gy * (j - ya), lowest), highest)
+            old = result[j, i]
+            if old != old:
+                result[j, i] = z
+            elif abs(old - z) > _WALL:
+                result[j, i] = np.inf
+                tie = True
+    return tie
+
+
 @kernel
 def scan_faces(
     result: NDArray[np.float32],
-    lattice: tuple[float, float, float, float],
-    n: int,
-    frame: tuple[float, float, float],
+    lattice: Lattice,
+    frame: Frame,
     vertices: NDArray[np.float64],
-    values: NDArray[np.float64],
     corners: NDArray[np.int32],
     start: NDArray[np.int64],
 ) -> None:
@@ -230,55 +278,24 @@ def scan_faces(
     (x0 + i · dx, y0 + j · dy) in meshes. Pixels in meshes with triangles get their value, NaN where there is none.
     """
     x0, dx, y0, dy = lattice
-    ny, nx = result.shape
+    n = frame[3]
     _clear(result, start, n, lattice)
-    sx, sy = frame[2] / dx, frame[2] / dy
-    tx, ty = _ON_FACE / dx, _ON_FACE / dy
-    ox, oy = x0 / dx, y0 / dy
+    scale = (frame[2] / dx, x0 / dx, _ON_FACE / dx, frame[2] / dy, y0 / dy, _ON_FACE / dy)
+    ties = False
     for r in range(n):
-        j0, j1 = _pixels(r, r + 1, y0, dy, ny)
+        j0, j1 = _pixels(r, r + 1, y0, dy, result.shape[0])
         if j0 > j1:
             continue
-        for m in range(r * n, r * n + n):
+        for c in range(n):
+            m = r * n + c
             if start[m + 1] == start[m]:
                 continue
-            i0, i1 = _pixels(m - r * n, m - r * n + 1, x0, dx, nx)
-            if i0 > i1:
-                continue
-            for f in range(start[m], start[m + 1]):
-                a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
-                ya = (frame[1] - vertices[a, 1]) * sy - oy
-                yb = (frame[1] - vertices[b, 1]) * sy - oy
-                yc = (frame[1] - vertices[c, 1]) * sy - oy
-                upper, lower = min(ya, yb, yc), max(ya, yb, yc)
-                v0, v1 = max(np.int64(np.ceil(upper - ty)), j0), min(np.int64(np.floor(lower + ty)), j1)
-                if v0 > v1:
-                    continue
-                xa = (vertices[a, 0] - frame[0]) * sx - ox
-                xb = (vertices[b, 0] - frame[0]) * sx - ox
-                xc = (vertices[c, 0] - frame[0]) * sx - ox
-                if np.ceil(min(xa, xb, xc) - tx) > np.floor(max(xa, xb, xc) + tx):
-                    continue
-                area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
-                if area == 0.0:
-                    continue
-                za, zb, zc = values[a], values[b], values[c]
-                gx = ((zb - za) * (yc - ya) - (zc - za) * (yb - ya)) / area
-                gy = ((zc - za) * (xb - xa) - (zb - za) * (xc - xa)) / area
-                lowest, highest = min(za, zb, zc), max(za, zb, zc)
-                for j in range(v0, v1 + 1):
-                    y = min(max(np.float64(j), upper), lower)
-                    span = _cut(xa, ya, xb, yb, y, (np.inf, -np.inf))
-                    span = _cut(xb, yb, xc, yc, y, span)
-                    low, high = _cut(xc, yc, xa, ya, y, span)
-                    u0, u1 = max(np.int64(np.ceil(low - tx)), i0), min(np.int64(np.floor(high + tx)), i1)
-                    for i in range(u0, u1 + 1):
-                        z = min(max(za + gx * (i - xa) + gy * (j - ya), lowest), highest)
-                        old = result[j, i]
-                        if old != old:
-                            result[j, i] = z
-                        elif abs(old - z) > _WALL:
-                            px, py = x0 + i * dx, y0 + j * dy
-                            z, _ = _on_faces(vertices, values, corners, start, n, frame, px, py)
-                            if z == z:
-                                result[j, i] = z
+            i0, i1 = _pixels(c, c + 1, x0, dx, result.shape[1])
+            if i0 <= i1:
+                for f in range(start[m], start[m + 1]):
+                    ties |= _fill(result, (i0, i1, j0, j1), scale, frame, vertices, corners, f)
+    if ties:
+        for j in range(result.shape[0]):
+            for i in range(result.shape[1]):
+                if np.isinf(result[j, i]):
+                    result[j, i], _ = _on_faces(vertices, corners, start, frame, x0 + i * dx, y0 + j * dy)

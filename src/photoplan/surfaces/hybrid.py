@@ -198,16 +198,12 @@ def _runs(x: NDArray[np.float64], count: int) -> Iterator[tuple[int, slice]]:
             yield unit, slice(int(first), int(last))
 
 
-def _frame(unit: Unit) -> tuple[float, float, float]:
-    return unit.left, unit.top, unit.meshes / unit.side
+def _frame(unit: Unit) -> tuple[float, float, float, int]:
+    return float(unit.left), float(unit.top), float(unit.meshes / unit.side), unit.meshes
 
 
 def _layer(unit: Unit, layer: Layer) -> tuple[NDArray[np.float32], float]:
     return (unit.heights, unit.datum) if layer == "heights" else (unit.sigmas, 0.0)
-
-
-def _vertex_values(faces: MeshFaces, layer: Layer, datum: float) -> NDArray[np.float64]:
-    return faces.vertices[:, 2] - datum if layer == "heights" else faces.sigmas.astype(float)
 
 
 def _unit_values(unit: Unit, XY: NDArray[np.float64], layer: Layer) -> NDArray[np.float64]:
@@ -217,10 +213,7 @@ def _unit_values(unit: Unit, XY: NDArray[np.float64], layer: Layer) -> NDArray[n
     xy = np.stack([XY[:, 0] - frame[0], frame[1] - XY[:, 1]], axis=-1) * frame[2]
     faces = unit.faces or _no_faces(unit.meshes)
     result = np.empty(len(xy))
-    vertices, corners, start = _plain(faces)
-    sample_hybrid(
-        np.ascontiguousarray(posts), vertices, _vertex_values(faces, layer, datum), corners, start, frame, xy, result
-    )
+    sample_hybrid(np.ascontiguousarray(posts), *_plain(faces, layer, datum), frame, xy, result)
     result += datum
     return result
 
@@ -235,19 +228,17 @@ def _unit_lattice(
     ny, nx = result.shape
     part = sample_lattice(posts, x0, step, nx, y0, step, ny)
     if unit.faces is not None:
-        vertices, corners, start = _plain(unit.faces)
-        values = _vertex_values(unit.faces, layer, datum)
-        scan_faces(part, (x0, step, y0, step), unit.meshes, frame, vertices, values, corners, start)
+        scan_faces(part, (x0, step, y0, step), frame, *_plain(unit.faces, layer, datum))
     np.add(part, datum, out=result, casting="unsafe")
 
 
-def _plain(faces: MeshFaces) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int64]]:
-    """Arrays of one layout in memory: the kernels are compiled once."""
-    return (
-        np.ascontiguousarray(faces.vertices, np.float64),
-        np.ascontiguousarray(faces.corners, np.int32),
-        np.ascontiguousarray(faces.start, np.int64),
-    )
+def _plain(
+    faces: MeshFaces, layer: Layer, datum: float
+) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int64]]:
+    """X, Y and value above the datum of the vertices, and the triangles, always with one layout in memory."""
+    vertices = np.array(faces.vertices, np.float64, order="C")
+    vertices[:, 2] = vertices[:, 2] - datum if layer == "heights" else faces.sigmas
+    return vertices, np.ascontiguousarray(faces.corners, np.int32), np.ascontiguousarray(faces.start, np.int64)
 
 
 def _no_faces(meshes: int) -> MeshFaces:
