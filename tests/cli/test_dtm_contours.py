@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ import shapely
 from tools.dem_file import X0, Y0, write_dem
 from tools.small_model import write_small
 
+from photoplan.errors import UsageError
 from photoplan.io import disk
+from photoplan.io.contour_file import ContourRow, write_contours
 from photoplan.io.lock import FileLock
 
 
@@ -189,3 +192,14 @@ def test_fault_26_two_runs_on_one_output(hill: Path, tmp_path: Path, photoplan: 
         said = photoplan("dtm", "contours", hill, "--interval", 5, "-o", tmp_path / "c.gpkg")
         assert said.code == 2 and "another run" in said.err
     assert [p.name for p in tmp_path.iterdir()] == ["hill.tif"]
+
+
+def test_fault_13_the_writer_refuses_before_it_takes_a_line(tmp_path: Path) -> None:
+    def lines() -> Iterator[ContourRow]:
+        raise AssertionError("a line was asked for")
+        yield
+
+    (tmp_path / "c_labels.shp").write_bytes(b"old")
+    with pytest.raises(UsageError, match="exists already"):
+        write_contours(tmp_path / "c.shp", lines(), list, "EPSG:32633")
+    assert [p.name for p in tmp_path.iterdir()] == ["c_labels.shp"]

@@ -92,7 +92,8 @@ def test_a_sphere_converges_with_the_square_of_the_pixel() -> None:
         normal = np.stack([X, Y, f(X, Y)], axis=-1) / 50
         worst.append(np.abs(shade - normal @ light.directions[0]).max())
     assert worst[0] < 0.002
-    assert worst[0] / worst[1] > 3.7  # the last one meets the rounding of float32 heights
+    # The outermost pixels, where it is worst, move outwards with n: a little less than 16.
+    assert worst[0] / worst[2] > 12
 
 
 def test_invariances() -> None:
