@@ -97,7 +97,8 @@ def read_xy_table(path: Path, roles: Mapping[str, Sequence[str]]) -> XYTable:
 
 def _split(path: Path, line: int, text: str, delimiter: str) -> tuple[str, ...]:
     try:
-        fields = next(csv.reader([text.strip()], delimiter=delimiter, skipinitialspace=True, strict=True))
+        # Tabs at the end of a line are empty fields, spaces are not.
+        fields = next(csv.reader([text.strip(" ")], delimiter=delimiter, skipinitialspace=True, strict=True))
     except (csv.Error, StopIteration) as error:
         raise InputError(f"{path}:{line}: cannot be split into columns ({error})") from None
     return tuple(field.strip() for field in fields)
