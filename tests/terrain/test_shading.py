@@ -140,7 +140,7 @@ def test_a_breakline_shows_in_the_pixels_that_it_passes_only() -> None:
 
 def test_the_border_of_the_surface_is_shaded_too() -> None:
     """A plane that ends inside pixels: its slope reaches as far as pixel centres have heights; NaN beyond."""
-    surface = Formula(lambda X, Y: np.where(X + 0.3 * Y < 1612.0, 0.2 * X + 0.1 * Y, np.nan))
+    surface = Formula(lambda X, Y: np.where((X + 0.3 * Y < 1612) & (X - 0.2 * Y > 604), 0.2 * X + 0.1 * Y, np.nan))
     slopes = shading.surface_slopes(surface, GRID, GRID.window)
     empty = np.isnan(slopes.heights)
     np.testing.assert_array_equal(np.isnan(slopes.gradient[0]), empty)
