@@ -110,7 +110,7 @@ def _write_obj(path: Path, parts: Iterator[MeshPart], name: str) -> None:
             f"# photoplan {__version__}: terrain model, X east, Y north, Z up, metres\no {_word(name)}\n".encode()
         )
         for item in parts:
-            file.write(_text("v %.4f %.4f %.4f\n", item.vertices))
+            file.write(_text("v %.5f %.5f %.4f\n", item.vertices))
             file.write(_text("f %d %d %d\n", np.concatenate([item.faces, item.walls]) + 1))
 
 
@@ -165,7 +165,7 @@ def _write_landxml(path: Path, parts: Iterator[MeshPart], name: str) -> None:
         for item in parts:
             # LandXML has north before east.
             numbered = np.column_stack([count + 1 + np.arange(len(item.vertices)), item.vertices[:, [1, 0, 2]]])
-            file.write(_text('<P id="%d">%.4f %.4f %.4f</P>\n', numbered))
+            file.write(_text('<P id="%d">%.5f %.5f %.4f</P>\n', numbered))
             faces.write(_text("<F>%d %d %d</F>\n", item.faces + 1))
             count += len(item.vertices)
         file.write(b"</Pnts>\n<Faces>\n")

@@ -20,8 +20,10 @@ from photoplan.surfaces.units import Unit, UnitSource
 
 __all__ = ["MeshPart", "mesh_parts", "unit_mesh"]
 
-_SAME = 5e-4
-"""Vertices closer than this are one, metres: posts are kept to a fraction of it."""
+_SAME = 2e-5
+"""Vertices closer than this in the plane, metres, and …"""
+_SAME_HEIGHT = 5e-4
+"""… closer than this in height are one: posts are stored to a fraction of it, places are known far better."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +85,8 @@ def unit_mesh(unit: Unit) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArr
 def _joined(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
     """For each vertex the first that lies at its place."""
     there = np.flatnonzero(np.isfinite(vertices[:, 2]))
-    pairs = there[cKDTree(vertices[there]).query_pairs(_SAME, output_type="ndarray")].reshape(-1, 2)
+    scaled = vertices[there] / [_SAME, _SAME, _SAME_HEIGHT]
+    pairs = there[cKDTree(scaled - scaled.min(axis=0)).query_pairs(1.0, output_type="ndarray")].reshape(-1, 2)
     first = np.arange(len(vertices))
     if len(pairs):
         graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(vertices),) * 2)
@@ -161,6 +164,7 @@ class _SharedNumbers:
             for r in {row, row + int(near[1])}:
                 for kept in (self._here, self._above):
                     for x, y, z, number in kept.get((c, r), ()):
-                        if abs(x - xyz[0]) < _SAME and abs(y - xyz[1]) < _SAME and abs(z - xyz[2]) < _SAME:
+                        same = abs(x - xyz[0]) < _SAME and abs(y - xyz[1]) < _SAME
+                        if same and abs(z - xyz[2]) < _SAME_HEIGHT:
                             return number
         return -1
