@@ -30,9 +30,8 @@ def test_what_is_written_is_read(tmp_path, kind):
     read = read_features(path, "Polygon", "LineString", "Point")
     assert [item.name for item in read.items] == ["north", "süd"] and read.crs == CRS
     assert all(shapely.equals_exact(item.geometry, shape) for item in read.items)
-    assert np.array_equal(
-        shapely.get_coordinates(read.items[0].geometry, True), shapely.get_coordinates(shape, True), True
-    )
+    found, given = (shapely.get_coordinates(g, include_z=True) for g in (read.items[0].geometry, shape))
+    np.testing.assert_array_equal(found, given)
     assert [p.name for p in tmp_path.iterdir()] == ["a.gpkg"], "nothing else is left"
 
 

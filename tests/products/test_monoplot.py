@@ -232,6 +232,12 @@ def test_wrong_use(small, tmp_path, capsys):
     points, out = tmp_path / "p.csv", tmp_path / "out.csv"
     points.write_text("x,y\n10,10\n")
     assert run(["init", str(small.folder), *small.init_options(), "--overwrite", "--height-system", "same"]) == 0
+    far = tmp_path / "far.csv"
+    far.write_text("x,y\n-50,10\n")
+    capsys.readouterr()
+    assert run(["monoplot", str(small.project), "one", str(far), "-o", str(tmp_path / "far_out.csv")]) == 0
+    said = capsys.readouterr()
+    assert "0 of 1" in said.out and "1 without: outside the image" in said.out and "camera at" in said.err
     bad = tmp_path / "bad.csv"
     bad.write_text("x,y\n10\n")
     for image, file, target, extra, code, text in [

@@ -142,6 +142,10 @@ def monoplot_file(request: MonoplotRequest) -> MonoplotReport:
     )
     height_range = scene.surface.height_range(scene.terrain_bounds)
     found = monoplot(scene.camera, given.xy, scene.surface, height_range, errors, mesh)
+    if (found.reasons != "").all():
+        bounds = " ".join(f"{v:.8g}" for v in scene.terrain_bounds)
+        center = " ".join(f"{v:.8g}" for v in scene.camera.center)
+        notes.append(f"no point is on the ground; camera at {center}, terrain in its reach {bounds}")
     _write_table(request.output, given, found)
     if request.vectors is not None:
         _write_vectors(request.vectors, given, found, project.crs)
