@@ -61,7 +61,7 @@ class ProfilePlot:
             )
         figure = self._figure(figsize=(10, 1.0 + 2.4 * len(profiles)), layout="constrained", dpi=110)
         axes = figure.subplots(len(profiles), 1, squeeze=False)[:, 0]
-        span = max(_span(p.heights) for p in profiles)
+        span = max(high - low for low, high in map(_range, profiles))
         length = max(float(p.distance[-1]) for p in profiles)
         for panel, item in zip(axes, profiles):
             _panel(panel, item, span, length)
@@ -81,8 +81,8 @@ def _panel(panel: Any, item: Drawn, span: float, length: float) -> None:
         panel.fill_between(d, z - 2 * s, z + 2 * s, color=_BAND, alpha=0.5, linewidth=0, label="± 2 σ")
         panel.legend(loc="upper right", fontsize=8, frameon=False)
     panel.plot(d, z, color=_GROUND, linewidth=1.2)
-    there = z[np.isfinite(z)]
-    middle = (float(there.min()) + float(there.max())) / 2 if there.size else 0.0
+    low, high = _range(item)
+    middle = (low + high) / 2
     panel.set_ylim(middle - 0.55 * span, middle + 0.55 * span)
     panel.set_xlim(0, length)
     panel.set_ylabel("height [m]")
@@ -91,7 +91,12 @@ def _panel(panel: Any, item: Drawn, span: float, length: float) -> None:
     panel.grid(alpha=0.3)
 
 
-def _span(heights: NDArray[np.float64]) -> float:
-    """Range of heights with room around it, metres."""
-    there = heights[np.isfinite(heights)]
-    return max(float(np.ptp(there)), 0.1) if there.size else 1.0
+def _range(item: Drawn) -> tuple[float, float]:
+    """Lowest and highest of all that is drawn, at least 0.1 m apart."""
+    band = 2 * np.nan_to_num(item.sigmas)
+    drawn = np.concatenate([item.heights - band, item.heights + band])
+    drawn = drawn[np.isfinite(drawn)]
+    if not drawn.size:
+        return 0.0, 1.0
+    low, high = float(drawn.min()), float(drawn.max())
+    return (low, high) if high - low > 0.1 else (low - 0.05, high + 0.05)
