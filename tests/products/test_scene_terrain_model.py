@@ -133,7 +133,7 @@ def test_init_takes_a_model(small: Block) -> None:
     assert ground_of(project).height_systems == ("EPSG:5773", "EPSG:5773")
 
 
-def test_dask_workers_read_units_themselves(small: Block, tmp_path: Path) -> None:
+def test_other_processes_read_units_themselves(small: Block, tmp_path: Path) -> None:
     """A scene's address is opened from its text alone, as in another process, and gives the same heights."""
     model_of(small.terrain, small.folder / "model.gpkg")
     edit(small.project, "dem.tif", "model.gpkg")
