@@ -20,9 +20,12 @@ __all__ = ["Front", "PartMesh", "build_mesh"]
 SAME_PLACE = 1e-6
 #: … and in height. Posts are kept in float32 above a datum of their unit; walls are higher.
 SAME_HEIGHT = 2e-4
+#: … where two parts meet: neighbouring units of a model agree to about a millimetre.
+SAME_BORDER = 2e-3
 #: A vertex of a breakline is looked for up to here, metres.
 ON_LINE = 1e-5
 _SCALE = np.array([SAME_PLACE, SAME_PLACE, SAME_HEIGHT])
+_BORDER_SCALE = np.array([SAME_PLACE, SAME_PLACE, SAME_BORDER])
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +109,7 @@ class Front:
         known = [n for n in neighbours if n is not None]
         if known and len(xyz):
             theirs = np.concatenate([n[0] for n in known])
-            distance, nearest = cKDTree(theirs / _SCALE).query(xyz / _SCALE, distance_upper_bound=2.0)
+            distance, nearest = cKDTree(theirs / _BORDER_SCALE).query(xyz / _BORDER_SCALE, distance_upper_bound=1.5)
             same = np.isfinite(distance)
             xyz = xyz.copy()
             xyz[same] = theirs[nearest[same]]
