@@ -31,7 +31,7 @@ _SHOWN = 10
 @click.option("--filter", "filters", multiple=True, metavar="CLASS=M", help="Standard deviation of measurement of "
               "mass, spot, breakline, formline, border or hole [mass: estimated; others: a share of it].")  # fmt: skip
 @click.option("--covariance", default="auto", show_default=True, help="auto, gaussian, matern or exponential.")
-@click.option("--gross", type=click.FloatRange(0), default=4.0, show_default=True, help="Normalised residual of gross "
+@click.option("--gross", type=click.FloatRange(0), default=5.0, show_default=True, help="Normalised residual of gross "
               "errors; 0: none is sought.")  # fmt: skip
 @click.option("--reach", type=_POSITIVE, metavar="M", help="Gaps over twice this stay open [10 spacings].")
 @click.option("--codes", type=_PATH, metavar="FILE", help="What codes mean: TOML or CSV with code, class, sigma.")
@@ -142,7 +142,8 @@ def _summary(built: BuildReport) -> list[str]:
         f"{f['points']} points in {f['seconds']:.1f} s · {f['units']} units, grid "
         + ", ".join(f"{width} m ({count})" for width, count in f["grid_widths"].items()),
         f"covariance {f['covariance']}: signal ±{f['variance'] ** 0.5:.3f} m, half at {f['length']:.2f} m · "
-        f"mass points ±{f['noise']:.3f} m · posts ±{f['sigma'] or 0:.3f} m · normalised residuals {f['spread'] or 0:.2f}",
+        f"mass points ±{f['noise']:.3f} m · posts ±{f['sigma'] or 0:.3f} m · "
+        f"normalised residuals {f['spread'] or 0:.2f}",
     ]
     if built.gross:
         lines.append(f"{len(built.gross)} gross errors, left out:")

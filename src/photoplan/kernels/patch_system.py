@@ -39,12 +39,17 @@ def system(
     n, m = len(ids), len(points)
     family, variance, length, gap = int(model[0]), model[1], model[2], model[3]
     xy = np.empty((n + m, 2))
-    box = np.array([leaf[0], leaf[1], leaf[0], leaf[1]])
-    for i in range(n + m):
+    # Which parts of lines count depends on the patch alone, not on what is asked of it: units that share a post then
+    # get the same height for it.
+    reach = 1.5 * leaf[2]
+    box = np.array([leaf[0] - reach, leaf[1] - reach, leaf[0] + reach, leaf[1] + reach])
+    for i in range(n):
         for c in range(2):
-            value = xyz[ids[i], c] if i < n else points[i - n, c]
+            value = xyz[ids[i], c]
             xy[i, c] = value
             box[c], box[2 + c] = min(box[c], value), max(box[2 + c], value)
+    for i in range(m):
+        xy[n + i, 0], xy[n + i, 1] = points[i, 0], points[i, 1]
     pieces = 0
     vertices, piece_start = np.empty((0, 2)), np.zeros(1, np.int64)
     if len(start) > 1:

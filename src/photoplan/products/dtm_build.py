@@ -177,11 +177,11 @@ def _height_system(measured: MeasuredTerrain, declared: str | None) -> str | Non
 def _check_memory(measured: MeasuredTerrain) -> None:
     vertices = sum(len(line.xyz) for line in measured.lines)
     needed = (measured.count + vertices) * _BYTES_PER_POINT
-    there = psutil.virtual_memory().available
-    if needed > there:
+    free = psutil.virtual_memory().available
+    if needed > free:
         raise ResourceError(
-            f"{measured.count} points need about {needed >> 20} MiB, {there >> 20} MiB are free; build parts of the area "
-            "and join them with `photoplan dtm refine`, or thin the points"
+            f"{measured.count} points need about {needed >> 20} MiB, {free >> 20} MiB are free; build parts of the "
+            "area and join them with `photoplan dtm refine`, or thin the points"
         )
 
 

@@ -25,6 +25,8 @@ __all__ = ["BuildPlan", "Built", "Steps", "build", "plan_build"]
 
 #: Gaps are bridged up to twice this many spacings.
 _REACH = 10.0
+#: Finest grid width in spacings of the points, before it is made a round number.
+_WIDTH = 0.6
 #: Part of a unit's standard deviation by which a wider grid may change its surface.
 _ADAPT = 0.25
 #: Units of a model at most: a wider spread of points needs a wider grid.
@@ -75,7 +77,7 @@ def plan_build(measured: MeasuredTerrain, settings: BuildSettings) -> BuildPlan:
         The points are so far apart that the model would have too many units.
     """
     seen = observe(measured, settings)
-    width = settings.grid_width or _nice(0.75 * seen.spacing)
+    width = settings.grid_width or _nice(_WIDTH * seen.spacing)
     side = width * settings.unit_meshes
     xy = np.vstack([seen.xyz[: seen.points, :2], seen.lines.xyz[:, :2]]) + seen.origin[:2]
     low, high = np.floor(xy.min(axis=0) / side), np.ceil((xy.max(axis=0) + 1e-6 * side) / side)
@@ -154,7 +156,8 @@ def _with_faces(
     def one(number: int) -> Unit:
         column, row = keys[number]
         unit = units[column, row]
-        box = shapely.box(unit.left, unit.top - unit.side, unit.left + unit.side, unit.top)
+        edge = 1e-6 * unit.side  # a line on the border, rounded by one bit, still touches
+        box = shapely.box(unit.left - edge, unit.top - unit.side - edge, unit.left + unit.side + edge, unit.top + edge)
         some = [lines[k] for k in np.sort(boxes.query(box))]
         around = {
             "north": (column, row - 1),

@@ -17,8 +17,8 @@ from photoplan.terrain.settings import FAMILIES, BuildSettings
 __all__ = ["LADDER", "Covariance", "estimate_all", "estimate_unit", "ladder", "near_lines"]
 
 #: Distance between the two sides of a breakline in half-value distances, by family: what is left of the correlation
-#: is 6 %, 8 % and 9 %.
-GAPS = (2.0, 2.5, 3.5)
+#: is 6 %, 15 % and 18 %.
+GAPS = (2.0, 2.0, 2.5)
 #: Within a unit the terrain may be smooth here and rough there: factors of variance and length from which each patch
 #: takes what suits its own points.
 LADDER = ((1.0, 1.0), (1.0, 0.5), (1.0, 0.25), (2.0, 0.25))
@@ -27,7 +27,7 @@ _BLOCK, _BLOCKS, _UNITS = 72, 3, 16
 #: A wide block takes every so-manieth of so many times as many points: it sees further.
 _WIDE = 4
 #: How far a unit's parameters are expected from those of the whole area: standard deviations of their logarithms.
-_EXPECTED = np.array([0.9, 0.6, 0.35])
+_EXPECTED = np.array([0.5, 0.35, 0.3])
 #: Bounds of the half-value distance in spacings of the points.
 _SHORTEST, _LONGEST = 0.5, 30.0
 #: Data further than this from their block's plane, in robust standard deviations, do not count in the estimation.

@@ -19,11 +19,15 @@ from photoplan.terrain.neighbours import Neighbours
 from photoplan.terrain.observations import Observations
 from photoplan.terrain.settings import BuildSettings
 
-__all__ = ["Fit", "Progress", "each", "fit", "patches_at"]
+__all__ = ["REACH", "Fit", "Progress", "each", "fit", "lines_of", "patches_at"]
 
 Progress = Callable[[int], None]
 T = TypeVar("T")
 
+#: Scores count less than a likelihood would: neighbouring points are no independent witnesses.
+_TEMPER = 0.5
+#: A patch reaches this many half sides from the middle of its leaf (see the weights in `photoplan.kernels.patch`).
+REACH = 1.5
 #: Rounds of looking for gross errors; each finds at most one in a patch.
 _ROUNDS = 12
 #: Residuals whose spread a unit's own ones must outweigh: its standard deviations follow their neighbours' till then.
@@ -138,11 +142,15 @@ def _members(unit: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
     return np.split(order, np.searchsorted(unit[order], np.arange(1, count)))
 
 
-def _lines_of(found: Fit, leaves: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Barriers near some leaves: far enough for the data of their patches."""
-    middle, half = found.leaves.middle[leaves], found.leaves.half[leaves]
-    margin = 8 * float(half.max()) + 20 * found.seen.spacing
-    return near_lines(found.seen, middle.min(axis=0) - margin, middle.max(axis=0) + margin)
+def lines_of(
+    found: Fit, patches: NDArray[np.float64], ids: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Barriers that any of the patches can meet, from their squares and their data."""
+    data = found.seen.xyz[ids.ravel()[ids.ravel() >= 0], :2]
+    reach = REACH * patches[:, 2:]
+    low = np.minimum(data.min(axis=0), (patches[:, :2] - reach).min(axis=0))
+    high = np.maximum(data.max(axis=0), (patches[:, :2] + reach).max(axis=0))
+    return near_lines(found.seen, low, high)
 
 
 def _choose(found: Fit, unit: int) -> None:
@@ -150,11 +158,11 @@ def _choose(found: Fit, unit: int) -> None:
     some = found.leaves.of_unit(unit)
     ids = found.neighbours.query(found.leaves.middle[some])
     scores = np.zeros((len(some), len(LADDER)))
-    lines = _lines_of(found, some)
     patches = patches_at(found.leaves, some)
+    lines = lines_of(found, patches, ids)
     score_models(found.seen.xyz, found.noise, ids, patches, found.seen.points, *lines, found.models(some), scores)
     scores -= np.where(np.isfinite(scores), scores, np.inf).min(axis=1, keepdims=True)
-    weight = np.exp(-scores / 2)
+    weight = np.exp(-_TEMPER * scores / 2)
     weight = np.where(np.isfinite(weight), weight, 0.0)
     weight[weight.sum(axis=1) == 0] = 1.0
     found.shares[some] = weight / weight.sum(axis=1, keepdims=True)
@@ -172,14 +180,15 @@ def _test(found: Fit, unit: int, some: NDArray[np.int64]) -> None:
         return
     best = found.models(some)[np.arange(len(some)), found.shares[some].argmax(axis=1)]
     ids = found.neighbours.query(leaves.middle[some])
+    patches = patches_at(leaves, some)
     test_points(
         found.seen.xyz,
         found.noise,
         ids,
-        patches_at(leaves, some),
+        patches,
         np.concatenate(own),
         start,
-        *_lines_of(found, some),
+        *lines_of(found, patches, ids),
         best,
         found.residuals,
     )

@@ -7,14 +7,10 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.patch import predict
 from photoplan.surfaces.units import LineElement, Unit
-from photoplan.terrain.covariance import near_lines
 from photoplan.terrain.domain import Domain
-from photoplan.terrain.fit import Fit, Progress, each, patches_at
+from photoplan.terrain.fit import REACH, Fit, Progress, each, lines_of, patches_at
 
 __all__ = ["heights_at", "predict_lines", "predict_unit"]
-
-#: A patch reaches this many half sides from the middle of its leaf.
-_REACH = 1.5
 
 
 def heights_at(
@@ -33,15 +29,14 @@ def heights_at(
     low, high = xy.min(axis=0), xy.max(axis=0)
     some = _leaves_near(fit, unit, low, high)
     middle, half = fit.leaves.middle[some], fit.leaves.half[some]
-    wanted, start = _targets(middle, _REACH * half, xy)
+    wanted, start = _targets(middle, REACH * half, xy)
     busy = np.diff(start) > 0
     some, middle, half = some[busy], middle[busy], half[busy]
     start = np.concatenate([[0], np.cumsum(np.diff(start)[busy])])
     if len(some):
-        margin = 8 * float(half.max()) + 20 * fit.seen.spacing
-        lines = near_lines(fit.seen, low - margin, high + margin)
         ids = fit.neighbours.query(middle)
         patches = patches_at(fit.leaves, some)
+        lines = lines_of(fit, patches, ids)
         predict(
             fit.seen.xyz, fit.noise, ids, patches, xy, wanted, start, *lines, fit.models(some), fit.shares[some], sums
         )
@@ -60,7 +55,7 @@ def _leaves_near(fit: Fit, unit: int, low: NDArray[np.float64], high: NDArray[np
         for c in range(max(0, column - 1), min(columns, column + 2))
     ]
     some = np.concatenate(near)
-    reach = _REACH * fit.leaves.half[some][:, None]
+    reach = REACH * fit.leaves.half[some][:, None]
     middle = fit.leaves.middle[some]
     kept: NDArray[np.int64] = some[((middle + reach > low) & (middle - reach < high)).all(axis=1)]
     return kept

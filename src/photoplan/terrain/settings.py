@@ -17,7 +17,7 @@ FAMILIES: tuple[Family, ...] = get_args(Family)
 """Families of covariance functions; the place of each is its number in the kernels."""
 
 #: Filter values of classes that are not given, as parts of that of mass points: lines and spots are measured with care.
-SHARE = {"mass": 1.0, "spot": 0.5, "breakline": 0.6, "formline": 0.6, "border": 0.6, "hole": 0.6}
+SHARE = {"mass": 1.0, "spot": 0.3, "breakline": 0.3, "formline": 0.3, "border": 0.3, "hole": 0.3}
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class BuildSettings:
     filters: dict[str, float] = field(default_factory=dict)
     """Filter value (standard deviation of measurement, metres) by class of points or lines. Mass points that have none
     are estimated from the data, other classes take their share (`SHARE`) of it."""
-    gross: float = 4.0
+    gross: float = 5.0
     """Normalised residual beyond which a point is a gross error and left out; 0: none is sought."""
     reach: float | None = None
     """Gaps wider than twice this are not bridged, metres; None: ten times the spacing of the points."""
