@@ -1,0 +1,105 @@
+"""Fitted covariance functions beside what the data show: is the stochastic model that of these points?"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.kernels.sides import sides_of
+from photoplan.report.build_report import CovarianceFacts
+from photoplan.terrain.covariance import Covariance, near_lines
+from photoplan.terrain.fit import Fit
+from photoplan.terrain.settings import FAMILIES
+
+__all__ = ["correlation_at", "covariance_facts"]
+
+#: Neighbourhoods that are looked at, points of each, and classes of distance.
+_BLOCKS, _POINTS, _CLASSES = 160, 60, 14
+#: Argument at which (1 + t) exp(−t) is one half.
+_MATERN_HALF = 1.6783469900166605
+
+
+def correlation_at(family: str, t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Correlation at distances in half-value distances: ½ at 1."""
+    if family == "gaussian":
+        return np.asarray(np.exp(-np.log(2) * t**2))
+    if family == "matern":
+        return np.asarray((1 + _MATERN_HALF * t) * np.exp(-_MATERN_HALF * t))
+    return np.asarray(np.exp(-np.log(2) * t))
+
+
+def covariance_facts(fit: Fit) -> CovarianceFacts:
+    """Fitted functions over distance, and the covariance of the points' heights above local planes.
+
+    A plane through a neighbourhood takes a part of the signal with it. So the fitted functions are not compared with
+    the products of residuals r = P z themselves, but their expectation is, P (C + N) Pᵀ.
+    """
+    reach = 4.0 * fit.whole.length
+    distance = np.linspace(0.0, reach, 81)
+    curves = np.array([_curve(unit, distance) for unit, m in zip(fit.units, fit.members) if len(m) >= 10])
+    if not len(curves):
+        curves = _curve(fit.whole, distance)[None]
+    low, high = np.percentile(curves, [10, 90], axis=0)
+    pairs = [_block(fit, leaf) for leaf in _leaves(fit)]
+    d, product, expected = (
+        (np.concatenate([np.empty(0), *parts]) for parts in zip(*pairs)) if pairs else [np.empty(0)] * 3
+    )
+    edge = float(np.percentile(d, 90)) if len(d) else reach
+    number = np.clip((d / edge * _CLASSES).astype(int), 0, _CLASSES)
+    count = np.bincount(number, minlength=_CLASSES + 1)[:_CLASSES]
+
+    def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.bincount(number, values, minlength=_CLASSES + 1)[:_CLASSES] / count)
+
+    return CovarianceFacts(
+        distance, _curve(fit.whole, distance), low, high, mean(d), mean(product), mean(expected), count
+    )
+
+
+def _curve(covariance: Covariance, distance: NDArray[np.float64]) -> NDArray[np.float64]:
+    return covariance.variance * correlation_at(covariance.name, distance / covariance.length)
+
+
+def _leaves(fit: Fit) -> list[int]:
+    """Leaves that hold points, spread evenly over the area."""
+    rich = np.flatnonzero(fit.leaves.count >= 3)
+    some: list[int] = rich[:: max(1, -(-len(rich) // _BLOCKS))].tolist()
+    return some
+
+
+def _block(fit: Fit, leaf: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Distances of all pairs of a neighbourhood's points, products of their residuals, and these products' means."""
+    seen = fit.seen
+    tree = fit.neighbours.near[0]
+    near = np.atleast_1d(tree.tree.query(fit.leaves.middle[leaf], k=min(_POINTS, len(tree.numbers)))[1])
+    some = tree.numbers[near]
+    some = some[(some < seen.points) & (fit.noise[some] >= 0)]
+    if len(some) < 8:
+        return np.empty(0), np.empty(0), np.empty(0)
+    xy = seen.xyz[some, :2]
+    centred = xy - xy.mean(axis=0)
+    plane = np.column_stack([np.ones(len(xy)), centred / max(float(np.abs(centred).max()), 1e-9)])
+    q = np.linalg.qr(plane)[0]
+    without = np.eye(len(xy)) - q @ q.T
+    r = without @ (seen.xyz[some, 2] - seen.xyz[some, 2].mean())
+    expected = without @ (_matrix(fit, leaf, xy) + np.diag(fit.noise[some])) @ without
+    first, second = np.triu_indices(len(xy), 1)
+    d = np.hypot(*(xy[first] - xy[second]).T)
+    return d, r[first] * r[second], expected[first, second]
+
+
+def _matrix(fit: Fit, leaf: int, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Covariances of the signal at places (n, 2), by the functions that the leaf's patch uses."""
+    d2 = ((xy[:, None] - xy[None]) ** 2).sum(axis=2)
+    vertices, start = near_lines(fit.seen, xy.min(axis=0), xy.max(axis=0))
+    apart = np.zeros_like(d2)
+    if len(start) > 1:
+        sides = np.zeros((len(xy), len(start) - 1))
+        sides_of(np.ascontiguousarray(xy), vertices, start, len(start) - 1, sides)
+        apart = ((sides[:, None] - sides[None]) ** 2).sum(axis=2)
+    total = np.zeros_like(d2)
+    for share, (family, variance, length, gap) in zip(fit.shares[leaf], fit.models(np.array([leaf]))[0]):
+        t = np.sqrt(d2 / length**2 + apart * gap**2 / 4)
+        total += share * variance * correlation_at(FAMILIES[int(family)], t)
+    return total

@@ -1,0 +1,338 @@
+"""The report of a built terrain model: one HTML file that says how good the model is, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.report.page import Cell, figure, headline, page, section, table
+from photoplan.report.plots import LINE_WORDS, Plots
+
+__all__ = ["BuildFacts", "CovarianceFacts", "FilterEffect", "GrossError", "Note", "ReportMap", "build_report"]
+
+#: Rows of a list at most: more are counted.
+MOST_ROWS = 2000
+#: Notes of one kind that are spelled out.
+MOST_NOTES = 50
+
+
+@dataclass(frozen=True, eq=False)
+class ReportMap:
+    """Heights and standard deviations of a model on the pixels of a small map."""
+
+    left: float
+    """X of the outer left edge, metres."""
+    top: float
+    """Y of the outer upper edge, metres."""
+    resolution: float
+    """Side of a pixel, metres."""
+    heights: NDArray[np.float32]
+    """Shape (rows, columns), row 0 in the north, metres; NaN: no surface."""
+    sigmas: NDArray[np.float32]
+    """Standard deviations, the same shape."""
+    lines: tuple[tuple[str, NDArray[np.float64]], ...] = ()
+    """Kind and vertices (n, 2) of lines, metres."""
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Left, right, bottom, top, metres."""
+        rows, columns = self.heights.shape
+        return (
+            self.left,
+            self.left + columns * self.resolution,
+            self.top - rows * self.resolution,
+            self.top,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class CovarianceFacts:
+    """Covariance over distance: what was fitted, and what the data show."""
+
+    distance: NDArray[np.float64]
+    """Shape (n,), metres, from 0."""
+    whole: NDArray[np.float64]
+    """The function of the whole area, shape (n,), m²."""
+    low: NDArray[np.float64]
+    """The tenth and the ninetieth of a hundred units at each distance, shape (n,), m²."""
+    high: NDArray[np.float64]
+    classes: NDArray[np.float64]
+    """Mean distance of the pairs of each class, shape (k,), metres."""
+    empirical: NDArray[np.float64]
+    """Mean product of the pairs' residuals from a plane, shape (k,), m²; NaN: no pairs."""
+    expected: NDArray[np.float64]
+    """What the fitted functions let expect of these means, shape (k,), m²."""
+    pairs: NDArray[np.int64]
+    """Pairs in each class, shape (k,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class FilterEffect:
+    """Measured minus filtered heights of one class."""
+
+    name: str
+    """What the class is called."""
+    count: int
+    """Members of the class, of which `xy` may be a part."""
+    sigma: float
+    """Filter value, metres; NaN: differs within the class."""
+    xy: NDArray[np.float64]
+    """Places, shape (n, 2), metres."""
+    differences: NDArray[np.float64]
+    """Shape (n,), metres; NaN: no surface there."""
+
+
+@dataclass(frozen=True)
+class GrossError:
+    """A point that was left out."""
+
+    name: str
+    X: float
+    Y: float
+    height: float
+    """As measured, metres."""
+    difference: float
+    """Measured height minus the model's, metres; NaN: no surface there."""
+    normalised: float
+    """Difference from what its neighbours predict, in standard deviations."""
+
+
+@dataclass(frozen=True)
+class Note:
+    """Something found in the measurements, and what was done about it."""
+
+    kind: str
+    text: str
+    X: float = float("nan")
+    Y: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class BuildFacts:
+    """All that the report shows."""
+
+    title: str
+    crs: str
+    """Name of the CRS and the height system."""
+    counts: tuple[tuple[str, int], ...]
+    """Classes of points and lines with their numbers."""
+    units: int
+    """Computing units that have a surface."""
+    empty: int
+    """Units that have none."""
+    widths: tuple[tuple[float, int], ...]
+    """Grid widths, metres, and the number of units that have each."""
+    family: str
+    """Family of the covariance functions."""
+    variance: float
+    """Of the whole area's function, m²."""
+    length: float
+    """Its half-value distance, metres."""
+    noise: float
+    """Filter value of mass points in the whole area, metres."""
+    sigma: float
+    """Root mean square of the standard deviations of posts, metres."""
+    spread: float
+    """Spread of the normalised residuals; NaN: too few points."""
+    seconds: float
+    map: ReportMap
+    normalised: NDArray[np.float64]
+    """Normalised residuals of points that were used, or a sample of them."""
+    covariance: CovarianceFacts
+    effects: tuple[FilterEffect, ...]
+    gross: tuple[GrossError, ...]
+    notes: tuple[Note, ...] = ()
+    """What cleaning found."""
+    settings: tuple[tuple[str, str], ...] = ()
+    inputs: tuple[tuple[str, str], ...] = ()
+    """Files, and what there is to say of each."""
+    limit: float = field(default=float("nan"))
+    """Normalised residual beyond which a point was a gross error."""
+
+
+def build_report(facts: BuildFacts, plots: Plots) -> str:
+    """The report as one HTML document without links to anything outside it.
+
+    Names and texts are escaped; what they contain is shown and never obeyed.
+    """
+    parts = [
+        headline(_headline(facts)),
+        section("The surface", _surface(facts, plots)),
+        section("How well the model fits its points", _fit(facts, plots)),
+        section("What the filter did", _effect(facts, plots)),
+        section("Gross errors", _gross(facts, plots)),
+        section("What was found in the measurements", _notes(facts)),
+        section("Inputs and settings", _record(facts)),
+    ]
+    return page(facts.title, facts.crs, parts)
+
+
+def _headline(facts: BuildFacts) -> list[tuple[str, str, str]]:
+    """Figure, what it is, and what to compare it with."""
+    points = sum(count for kind, count in facts.counts if "point" in kind or "spot" in kind)
+    lines = sum(count for _, count in facts.counts) - points
+    widths = ", ".join(f"{width:g} m in {_number(count)}" for width, count in facts.widths)
+    return [
+        (_number(points), "points", "; ".join(f"{kind} {_number(n)}" for kind, n in facts.counts if n)),
+        (_number(lines), "lines", "with their intersections with the grid"),
+        (_number(facts.units), "computing units", f"{widths}; {_number(facts.empty)} units are empty"),
+        (_metres(facts.sigma), "standard deviation of heights", "root mean square over all posts"),
+        (_metres(facts.noise), "noise of mass points", "their filter value"),
+        (
+            f"{np.sqrt(facts.variance):.3g} m",
+            "standard deviation of the signal",
+            f"{facts.family} covariance function, half its value at {facts.length:.3g} m",
+        ),
+        (_plain(facts.spread, 2), "spread of normalised residuals", "1 where the stochastic model fits"),
+        (
+            _number(len(facts.gross)),
+            "gross errors",
+            "none were sought" if facts.limit == 0 else f"beyond {facts.limit:g} standard deviations, left out",
+        ),
+        (_time(facts.seconds), "to build the model", ""),
+    ]
+
+
+def _surface(facts: BuildFacts, plots: Plots) -> list[str]:
+    kinds = [LINE_WORDS.get(kind, kind) for kind in sorted({kind for kind, _ in facts.map.lines})]
+    return [
+        figure(
+            plots.heights(facts.map),
+            "Map of heights",
+            f"Heights, shaded as if lit from the north-west. {'Lines: ' + ', '.join(kinds) + '. ' if kinds else ''}"
+            "White: no surface, outside the border lines or too far from data.",
+        ),
+        figure(
+            plots.sigmas(facts.map),
+            "Map of standard deviations",
+            "Standard deviation of the predicted height. It grows where points are sparse and towards the edges.",
+        ),
+    ]
+
+
+def _fit(facts: BuildFacts, plots: Plots) -> list[str]:
+    return [
+        figure(
+            plots.normalised(facts.normalised, facts.limit),
+            "Histogram of normalised residuals",
+            "Difference of each point from what its neighbours predict, in its standard deviations, beside the normal "
+            "curve. A narrower histogram means that standard deviations are too large, a wider one that they are too "
+            "small. The model's standard deviations have been multiplied by the spread of each unit.",
+        ),
+        figure(
+            plots.covariance(facts.covariance),
+            "Covariance functions",
+            "Left: the fitted function of the whole area, and the range of eight in ten units. Right: covariance of "
+            "the heights above a plane through each neighbourhood (dots), and what the fitted functions let expect of "
+            "it after the same plane is taken away (line).",
+        ),
+    ]
+
+
+def _effect(facts: BuildFacts, plots: Plots) -> list[str]:
+    effects = [effect for effect in facts.effects if np.isfinite(effect.differences).any()]
+    if not effects:
+        return ["<p>No point or line with heights lies on the surface.</p>"]
+    rows = []
+    for effect in facts.effects:
+        d = effect.differences[np.isfinite(effect.differences)]
+        figures = [_number(effect.count), _plain(effect.sigma)]
+        if len(d):
+            figures += [_plain(float(d.mean()), sign=True)]
+            figures += [_plain(float(v)) for v in (np.sqrt((d**2).mean()), np.abs(d).max())]
+        else:
+            figures += ["–"] * 3
+        row: list[str | Cell] = [effect.name, *(Cell(text, number=True) for text in figures)]
+        rows.append(row)
+    shown = sum(len(effect.differences) for effect in effects)
+    every = sum(effect.count for effect in effects)
+    sample = f" Shown are {_number(shown)} of {_number(every)} heights, evenly taken." if shown < every else ""
+    return [
+        table(["class", "number", "filter value m", "mean m", "root mean square m", "largest m"], rows),
+        figure(
+            plots.filter_histograms(effects),
+            "Histograms of measured minus filtered heights",
+            f"Measured minus filtered heights by class; gross errors are not among them.{sample}",
+        ),
+        figure(
+            plots.filter_map(effects, facts.map),
+            "Map of measured minus filtered heights",
+            "Places of one colour that hang together are features that the filter took for noise, or errors of a whole "
+            "series of measurements.",
+        ),
+    ]
+
+
+def _gross(facts: BuildFacts, plots: Plots) -> list[str]:
+    if not facts.gross:
+        return ["<p>None were sought.</p>" if facts.limit == 0 else "<p>None was found.</p>"]
+    order = sorted(facts.gross, key=lambda g: -abs(g.normalised))
+    rows: list[Sequence[str | Cell]] = [
+        [
+            Cell(str(k), number=True),
+            g.name,
+            *(Cell(text, number=True) for text in (f"{g.X:.2f}", f"{g.Y:.2f}", f"{g.height:.3f}")),
+            Cell(_plain(g.difference, 3, sign=True), number=True),
+            Cell(_plain(g.normalised, 1, sign=True), number=True),
+        ]
+        for k, g in enumerate(order[:MOST_ROWS], 1)
+    ]
+    head = ["no.", "point", "X m", "Y m", "height m", "above the model m", "normalised residual"]
+    parts = [
+        "<p>Points that differ from what their neighbours predict by more than the limit. They were not used. Look at "
+        "the largest first: one wrong point can make good neighbours look wrong.</p>",
+        figure(
+            plots.gross(order, facts.map),
+            "Map of gross errors",
+            "Where gross errors lie; the largest have the numbers of the list.",
+        ),
+        table(head, rows),
+    ]
+    if len(order) > MOST_ROWS:
+        parts.append(f"<p>and {_number(len(order) - MOST_ROWS)} more, with smaller normalised residuals.</p>")
+    return parts
+
+
+def _notes(facts: BuildFacts) -> list[str]:
+    if not facts.notes:
+        return ["<p>Nothing: lines meet in common points, no two points coincide.</p>"]
+    rows: list[Sequence[str | Cell]] = []
+    for kind in dict.fromkeys(note.kind for note in facts.notes):
+        some = [note for note in facts.notes if note.kind == kind]
+        for k, note in enumerate(some[:MOST_NOTES]):
+            place = f"{note.X:.2f}, {note.Y:.2f}" if np.isfinite([note.X, note.Y]).all() else ""
+            rows.append([kind if k == 0 else "", note.text, Cell(place, number=True)])
+        if len(some) > MOST_NOTES:
+            rows.append(["", f"and {_number(len(some) - MOST_NOTES)} more of this kind", ""])
+    return [table(["kind", "finding", "X, Y m"], rows)]
+
+
+def _record(facts: BuildFacts) -> list[str]:
+    return [
+        table(["input", ""], [list(row) for row in facts.inputs]),
+        table(["setting", "value"], [list(row) for row in facts.settings]),
+    ]
+
+
+def _number(value: int) -> str:
+    """With thin spaces between thousands."""
+    return f"{value:,}".replace(",", "\u202f")
+
+
+def _metres(value: float) -> str:
+    return f"{value:.3f} m" if np.isfinite(value) else "–"
+
+
+def _plain(value: float, digits: int = 3, sign: bool = False) -> str:
+    if not np.isfinite(value):
+        return "–"
+    return (f"{value:+.{digits}f}" if sign else f"{value:.{digits}f}").replace("-", "−")
+
+
+def _time(seconds: float) -> str:
+    if seconds < 100:
+        return f"{seconds:.1f} s"
+    return f"{int(seconds // 60)} min {seconds % 60:.0f} s"

@@ -1,0 +1,292 @@
+"""Plots of reports, as PNG in memory: colours that are told apart by colour-blind readers, units on all axes."""
+
+from __future__ import annotations
+
+import importlib
+import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import UsageError
+
+if TYPE_CHECKING:
+    from photoplan.report.build_report import CovarianceFacts, FilterEffect, GrossError, ReportMap
+
+__all__ = ["LINE_WORDS", "Plots"]
+
+#: What lines of each kind are called.
+LINE_WORDS = {"breakline": "breaklines", "formline": "form lines", "border": "border lines", "hole": "holes"}
+
+#: Colours of Okabe and Ito.
+BLUE, RED, ORANGE, GREEN, PURPLE, SKY = "#0072B2", "#D55E00", "#E69F00", "#009E73", "#CC79A7", "#56B4E9"
+INK, SOFT = "#1c2730", "#5c6b77"
+LINE_COLOURS = {"breakline": "#7a1f00", "formline": PURPLE, "border": INK, "hole": INK}
+STYLE = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9,
+    "axes.edgecolor": SOFT,
+    "axes.labelcolor": INK,
+    "xtick.color": SOFT,
+    "ytick.color": SOFT,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e3e8eb",
+    "grid.linewidth": 0.7,
+    "legend.frameon": False,
+    "axes.unicode_minus": True,
+    "text.parse_math": False,
+}
+_DPI, _WIDTH = 150, 7.2
+#: Numbers in the map of gross errors.
+_NUMBERED = 30
+#: Points in a map at most.
+_DOTS = 60_000
+
+
+class Plots:
+    """Draws; made before any work, so that a missing library is known at once.
+
+    Raises
+    ------
+    UsageError
+        When made: matplotlib is not installed.
+    """
+
+    def __init__(self) -> None:
+        try:
+            self._mpl: Any = importlib.import_module("matplotlib")
+            for part in ("cm", "colors", "figure", "ticker"):
+                importlib.import_module(f"matplotlib.{part}")
+        except ImportError:
+            raise UsageError(
+                "a report needs matplotlib; install it with: pip install 'photoplan[report]', or leave the report out"
+            ) from None
+
+    def heights(self, area: ReportMap) -> bytes:
+        """Heights as shaded tints, with lines."""
+        with self._mpl.rc_context(STYLE):
+            fig, axes = self._map(area)
+            low, high = _limits(area.heights, 0.5)
+            norm = self._mpl.colors.Normalize(low, high)
+            tints = _lighter(self._mpl, "cividis")
+            rgb = tints(norm(np.nan_to_num(area.heights, nan=low)))[..., :3] * _shade(area)[..., None]
+            rgb[~np.isfinite(area.heights)] = 1.0
+            axes.imshow(np.clip(rgb, 0, 1), extent=area.extent, interpolation="nearest")
+            self._lines(axes, area)
+            self._bar(fig, axes, tints, norm, "height m")
+            return _png(fig)
+
+    def sigmas(self, area: ReportMap) -> bytes:
+        """Standard deviations."""
+        with self._mpl.rc_context(STYLE):
+            fig, axes = self._map(area)
+            low, high = _limits(area.sigmas, 1.0)
+            norm = self._mpl.colors.Normalize(max(0.0, low), high)
+            tints = self._mpl.colormaps["viridis_r"]
+            axes.imshow(area.sigmas, extent=area.extent, cmap=tints, norm=norm, interpolation="nearest")
+            self._bar(fig, axes, tints, norm, "standard deviation m", extend="both")
+            return _png(fig)
+
+    def normalised(self, values: NDArray[np.float64], limit: float) -> bytes:
+        """Histogram of normalised residuals with the normal curve."""
+        with self._mpl.rc_context(STYLE):
+            fig = self._mpl.figure.Figure(figsize=(_WIDTH, 2.9), layout="constrained")
+            axes = fig.subplots()
+            z = values[np.isfinite(values)]
+            edge = 5.0
+            bins = np.linspace(-edge, edge, 81 if len(z) > 2000 else 41)
+            if len(z):
+                weight = np.full(len(z), 1 / (len(z) * (bins[1] - bins[0])))
+                axes.hist(np.clip(z, -edge, edge), bins=bins, weights=weight, color=SKY, label="points")
+                axes.text(0.01, 0.93, f"mean {z.mean():+.2f}, spread {z.std():.2f}", transform=axes.transAxes, va="top")
+            t = np.linspace(-edge, edge, 301)
+            axes.plot(t, np.exp(-(t**2) / 2) / np.sqrt(2 * np.pi), color=RED, linewidth=1.5, label="normal curve")
+            if 0 < limit < edge:
+                for side in (-limit, limit):
+                    axes.axvline(side, color=SOFT, linestyle=":", linewidth=1.0)
+                axes.annotate("limit", (limit, 0.3), (3, 0), textcoords="offset points", color=SOFT, fontsize=8)
+            axes.set(
+                xlim=(-edge, edge), xlabel="normalised residual (all beyond ±5 in the last class)", ylabel="density"
+            )
+            axes.legend(loc="upper right")
+            return _png(fig)
+
+    def covariance(self, facts: CovarianceFacts) -> bytes:
+        """Fitted functions, and the test by the covariance of residuals."""
+        with self._mpl.rc_context(STYLE):
+            fig = self._mpl.figure.Figure(figsize=(_WIDTH, 3.1), layout="constrained")
+            fitted, test = fig.subplots(1, 2)
+            square = 1e4
+            fitted.fill_between(
+                facts.distance,
+                facts.low * square,
+                facts.high * square,
+                color=SKY,
+                alpha=0.4,
+                linewidth=0,
+                label="units",
+            )
+            fitted.plot(facts.distance, facts.whole * square, color=BLUE, linewidth=1.8, label="whole area")
+            fitted.set(title="fitted functions", xlabel="distance m", ylabel="covariance cm²")
+            fitted.set(xlim=(0, facts.distance[-1]), ylim=(0, None))
+            fitted.legend(loc="upper right")
+            known = facts.pairs > 0
+            size = 12 + 40 * facts.pairs[known] / max(1, facts.pairs.max())
+            test.axhline(0, color=SOFT, linewidth=0.8)
+            test.plot(facts.classes[known], facts.expected[known] * square, color=BLUE, linewidth=1.8, label="expected")
+            test.scatter(
+                facts.classes[known], facts.empirical[known] * square, s=size, color=RED, zorder=3, label="measured"
+            )
+            test.set(title="heights above local planes", xlabel="distance m", xlim=(0, None))
+            test.legend(loc="upper right")
+            return _png(fig)
+
+    def filter_histograms(self, effects: Sequence[FilterEffect]) -> bytes:
+        """A histogram for each class, all in one scale."""
+        with self._mpl.rc_context(STYLE):
+            columns = min(3, len(effects))
+            rows = -(-len(effects) // columns)
+            fig = self._mpl.figure.Figure(figsize=(_WIDTH, 0.4 + 2.0 * rows), layout="constrained")
+            panels = fig.subplots(rows, columns, squeeze=False, sharex=True).ravel()
+            reach = 100 * _reach(effects)
+            for panel, effect in zip(panels, effects):
+                d = 100 * effect.differences[np.isfinite(effect.differences)]
+                bins = np.linspace(-reach, reach, 51)
+                weights = np.full(len(d), 100 / len(d))
+                panel.hist(np.clip(d, -reach, reach), bins=bins, weights=weights, color=BLUE)
+                panel.axvline(0, color=INK, linewidth=0.8)
+                panel.set_title(effect.name)
+                panel.set(xlabel="measured − filtered cm", xlim=(-reach, reach))
+            for panel in panels[::columns]:
+                panel.set_ylabel("share %")
+            for panel in panels[len(effects) :]:
+                panel.set_visible(False)
+            return _png(fig)
+
+    def filter_map(self, effects: Sequence[FilterEffect], area: ReportMap) -> bytes:
+        """Where heights were changed, and which way."""
+        with self._mpl.rc_context(STYLE):
+            fig, axes = self._map(area)
+            _grey_relief(axes, area)
+            xy = np.concatenate([effect.xy for effect in effects])
+            d = 100 * np.concatenate([effect.differences for effect in effects])
+            step = max(1, -(-len(d) // _DOTS))
+            known = np.flatnonzero(np.isfinite(d))[::step]
+            reach = 100 * _reach(effects)
+            norm = self._mpl.colors.Normalize(-reach, reach)
+            tints = self._mpl.colormaps["RdBu"]
+            size = float(np.clip(3e4 / max(1, len(known)), 0.6, 14))
+            axes.scatter(
+                *xy[known].T, c=d[known], cmap=tints, norm=norm, s=size, linewidths=0, rasterized=True, zorder=3
+            )
+            self._bar(fig, axes, tints, norm, "measured − filtered cm", extend="both")
+            return _png(fig)
+
+    def gross(self, errors: Sequence[GrossError], area: ReportMap) -> bytes:
+        """Gross errors on the relief; those above the model point up, those below it down."""
+        with self._mpl.rc_context(STYLE):
+            fig, axes = self._map(area)
+            _grey_relief(axes, area)
+            xy = np.array([(error.X, error.Y) for error in errors])
+            up = np.array([error.normalised > 0 for error in errors])
+            for some, marker, colour, name in ((up, "^", RED, "too high"), (~up, "v", BLUE, "too low")):
+                if some.any():
+                    axes.scatter(
+                        *xy[some].T, marker=marker, s=28, color=colour, edgecolor="white", linewidth=0.5, label=name
+                    )
+            for k, (x, y) in enumerate(xy[:_NUMBERED], 1):
+                axes.annotate(str(k), (x, y), (4, 3), textcoords="offset points", fontsize=7.5, color=INK, zorder=5)
+            fig.legend(loc="outside lower center", ncols=2)
+            return _png(fig)
+
+    def _map(self, area: ReportMap) -> tuple[Any, Any]:
+        """A figure with one panel of the map's proportions and map coordinates along it."""
+        left, right, bottom, top = area.extent
+        ratio = (top - bottom) / (right - left)
+        height = float(np.clip(5.9 * ratio, 2.2, 8.2)) + 0.7
+        fig = self._mpl.figure.Figure(figsize=(_WIDTH, height), layout="constrained")
+        axes = fig.subplots()
+        axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="X m", ylabel="Y m")
+        axes.grid(False)
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_locator(self._mpl.ticker.MaxNLocator(5, steps=[1, 2, 5, 10]))
+            axis.set_major_formatter(self._mpl.ticker.FuncFormatter(lambda v, _: f"{v:.12g}"))
+        axes.tick_params(axis="y", labelrotation=90)
+        for label in axes.get_yticklabels():
+            label.set_verticalalignment("center")
+        return fig, axes
+
+    def _bar(self, fig: Any, axes: Any, tints: Any, norm: Any, label: str, extend: str = "neither") -> None:
+        colours = self._mpl.cm.ScalarMappable(norm, tints)
+        bar = fig.colorbar(colours, ax=axes, shrink=0.8, aspect=28, pad=0.02, extend=extend)
+        bar.set_label(label)
+        bar.outline.set_visible(False)
+
+    def _lines(self, axes: Any, area: ReportMap) -> None:
+        module = importlib.import_module("matplotlib.collections")
+        for kind in sorted({kind for kind, _ in area.lines}):
+            some = [xy for k, xy in area.lines if k == kind]
+            dashes = {"formline": "--", "hole": ":"}.get(kind, "-")
+            axes.add_collection(
+                module.LineCollection(
+                    some,
+                    colors=LINE_COLOURS.get(kind, INK),
+                    linewidths=0.5,
+                    linestyles=dashes,
+                    label=LINE_WORDS.get(kind, kind),
+                )
+            )
+        if area.lines:
+            axes.figure.legend(loc="outside lower center", ncols=4)
+
+
+def _png(fig: Any) -> bytes:
+    buffer = io.BytesIO()
+    fig.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def _limits(values: NDArray[np.float32], percent: float) -> tuple[float, float]:
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return 0.0, 1.0
+    low, high = np.percentile(known, [percent, 100 - percent])
+    return float(low), float(max(high, low + 1e-6 * max(1.0, abs(low)) + 1e-4))
+
+
+def _reach(effects: Sequence[FilterEffect]) -> float:
+    """Difference that nearly all stay below, metres."""
+    every = np.abs(np.concatenate([effect.differences for effect in effects]))
+    return max(float(np.nanpercentile(every, 99.5)), 1e-4)
+
+
+def _shade(area: ReportMap) -> NDArray[np.float64]:
+    """Brightness of the surface lit from the north-west at 45°, relative to level ground; 1 where it is unknown."""
+    z = area.heights.astype(float)
+    if min(z.shape) < 2:
+        return np.ones(z.shape)
+    low, high = _limits(area.heights, 0.5)
+    # Flat land is exaggerated so that its forms show.
+    size = np.hypot(*z.shape) * area.resolution
+    factor = float(np.clip(0.05 * size / (high - low), 1.0, 8.0))
+    south, east = np.gradient(z * factor, area.resolution)
+    light = (1.0 + (east + south) * np.sqrt(0.5)) / np.sqrt(1.0 + east**2 + south**2)
+    return np.nan_to_num(np.clip(0.35 + 0.65 * light, 0.25, 1.25), nan=1.0)
+
+
+def _grey_relief(axes: Any, area: ReportMap) -> None:
+    grey = np.clip(0.86 * _shade(area), 0, 1)
+    grey[~np.isfinite(area.heights)] = 1.0
+    axes.imshow(grey, extent=area.extent, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+
+
+def _lighter(mpl: Any, name: str) -> Any:
+    """A colour map mixed with white, as a ground for shading and lines."""
+    colours = mpl.colormaps[name](np.linspace(0, 1, 256))
+    colours[:, :3] = 0.62 * colours[:, :3] + 0.38
+    return mpl.colors.ListedColormap(colours)

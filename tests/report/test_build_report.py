@@ -1,0 +1,252 @@
+"""The report of a built model: true figures, safe text, complete files, bounded work."""
+
+import re
+import sys
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from photoplan.errors import ResourceError, UsageError
+from photoplan.kernels.collocation import correlation
+from photoplan.products import dtm_report, dtm_report_covariance
+from photoplan.report.build_report import build_report
+from photoplan.report.page import text
+from photoplan.report.plots import Plots
+from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
+from photoplan.terrain.build import build, plan_build
+from photoplan.terrain.clean import Finding, clean
+from photoplan.terrain.settings import FAMILIES, BuildSettings
+
+pytest.importorskip("matplotlib")
+
+HOSTILE = '<script>alert("1")</script><img src=x onerror=alert(1)>\u202e $\\frac{1}{0}$ ]]>'
+NOISE = 0.05
+
+
+class Page(HTMLParser):
+    """Tags, addresses and text of a document."""
+
+    def __init__(self, document):
+        super().__init__()
+        self.tags, self.addresses, self.words = [], [], []
+        self.feed(document)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        self.addresses += [v for k, v in attrs if k in ("src", "href", "srcset", "action", "data")]
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+
+@pytest.fixture(scope="module")
+def measured():
+    """A slope with a noise of 5 cm, a breakline, and one point 3 m too high with a hostile name."""
+    rng = np.random.default_rng(5)
+    xy = rng.uniform(0, 100, (700, 2)) + np.array([300_000, 5_000_000])
+    z = 200 + 0.1 * (xy[:, 0] - 300_000) + 0.6 * np.sin((xy[:, 1] - 5_000_000) / 9)
+    z += rng.normal(0, NOISE, len(z))
+    middle = int(np.hypot(*(xy - (300_050, 5_000_060)).T).argmin())
+    z[middle] += 3.0
+    names = np.array([f"P{k}" for k in range(len(z))], object)
+    names[middle] = HOSTILE
+    group = PointGroup("survey.csv", "mass", np.column_stack([xy, z]), np.arange(1, len(z) + 1), names=names)
+    y = np.linspace(5, 95, 19)
+    line = np.column_stack([np.full(19, 300_030.0), 5_000_000 + y, 203 + 0.6 * np.sin(y / 9)])
+    lines = (MeasuredLine(f"edge {HOSTILE}", "breakline", line),)
+    return clean(MeasuredTerrain((group,), lines, crs="EPSG:32633", notes=(f"note {HOSTILE}",)))[0]
+
+
+@pytest.fixture(scope="module")
+def built(measured):
+    return build(plan_build(measured, BuildSettings(unit_meshes=16)), 2)
+
+
+@pytest.fixture(scope="module")
+def facts(built, measured):
+    findings = [Finding("crossing heights", f"{HOSTILE} meets {k}", 300_010.0, 5_000_010.0) for k in range(60)]
+    return dtm_report.build_facts("model", built, measured, findings, (), 12.3)
+
+
+@pytest.fixture(scope="module")
+def document(facts):
+    return build_report(facts, Plots())
+
+
+def test_nothing_outside_the_document_is_asked_for(document):
+    page = Page(document)
+    assert len(page.addresses) == 7
+    assert all(address.startswith("data:image/png;base64,") for address in page.addresses)
+    assert not {tag for tag, _ in page.tags} & {"script", "link", "iframe", "object", "embed", "form", "a"}
+    assert "url(" not in document and "@import" not in document
+    policy = [attrs["content"] for tag, attrs in page.tags if attrs.get("http-equiv") == "Content-Security-Policy"]
+    assert policy == ["default-src 'none'; img-src data:; style-src 'unsafe-inline'"]
+
+
+def test_names_are_shown_and_not_obeyed(document):
+    page = Page(document)
+    assert not [attrs for _, attrs in page.tags if any(name.startswith("on") for name in attrs)]
+    shown = "".join(page.words)
+    assert shown.count('<script>alert("1")</script>') >= 3
+    assert "\u202e" not in document
+
+
+@pytest.mark.parametrize("character", ["\u202e", "\u2066", "\x00", "\x1b", "\ufeff"])
+def test_characters_that_turn_or_hide_text_are_replaced(character):
+    assert text(f"a{character}b") == "a\ufffdb"
+
+
+def test_the_gross_error_is_listed_with_its_name_and_size(facts, document):
+    assert len(facts.gross) == 1
+    error = facts.gross[0]
+    assert HOSTILE in error.name
+    assert error.difference == pytest.approx(3.0, abs=0.15)
+    assert abs(error.normalised) > 5
+    assert text(error.name) in document and f"+{error.difference:.3f}" in document
+
+
+def test_measured_minus_filtered_heights_are_the_noise(facts):
+    mass, line = facts.effects
+    assert (mass.name, mass.count) == ("mass points", 699)
+    assert np.sqrt(np.nanmean(mass.differences**2)) == pytest.approx(NOISE, rel=0.15)
+    assert line.name == "vertices of breaklines" and np.abs(line.differences).max() < 0.05
+    # A point's place and its difference belong together: heights along x rise by a tenth.
+    assert abs(np.corrcoef(mass.xy[:, 0], mass.differences)[0, 1]) < 0.15
+
+
+def test_headline_figures(facts, document):
+    assert dict(facts.counts)["mass points"] == 700
+    assert facts.units == sum(n for _, n in facts.widths) == 16
+    assert facts.noise == pytest.approx(NOISE, rel=0.3)
+    assert 0.8 < facts.spread < 1.2
+    for words in ("700", "12.3 s", f"{facts.noise:.3f} m", facts.family):
+        assert words in "".join(Page(document).words)
+
+
+def test_the_map_lies_where_the_points_are(facts, built):
+    from photoplan.surfaces.hybrid import HybridSurface
+    from photoplan.surfaces.memory_units import MemoryUnits
+
+    area = facts.map
+    left, right, bottom, top = area.extent
+    assert left == pytest.approx(300_000, abs=6) and right == pytest.approx(300_100, abs=6)
+    assert bottom == pytest.approx(5_000_000, abs=6) and top == pytest.approx(5_000_100, abs=6)
+    surface = HybridSurface(MemoryUnits(built.plan.layout, built.units))
+    row, column = 300, 200
+    place = (left + (column + 0.5) * area.resolution, top - (row + 0.5) * area.resolution)
+    assert area.heights[row, column] == pytest.approx(float(surface.heights(place)), abs=1e-3)
+    assert area.sigmas[row, column] == pytest.approx(float(surface.sigmas(place)), abs=1e-4)
+
+
+def test_many_findings_are_counted(document):
+    assert "and 10 more of this kind" in document
+
+
+def test_the_same_model_has_the_same_report(facts, document):
+    assert build_report(facts, Plots()) == document
+
+
+def test_every_plot_names_its_units(facts):
+    """Axes of all plots: drawn again with the labels collected."""
+    import matplotlib.axes
+
+    seen = []
+    plots = Plots()
+    original = matplotlib.axes.Axes.set
+
+    def spy(self, **options):
+        seen.extend(options[k] for k in ("xlabel", "ylabel") if k in options)
+        return original(self, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(matplotlib.axes.Axes, "set", spy)
+        plots.heights(facts.map), plots.covariance(facts.covariance), plots.filter_histograms(facts.effects)
+    assert {"X m", "Y m", "distance m", "covariance cm²", "measured − filtered cm"} <= set(seen)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_correlation_is_that_of_the_prediction(family):
+    t = np.linspace(0, 4, 30)
+    plain = getattr(correlation, "py_func", correlation)
+    kernel = [plain(d**2, FAMILIES.index(family)) for d in t]
+    np.testing.assert_allclose(dtm_report_covariance.correlation_at(family, t), kernel, atol=1e-12)
+
+
+def test_expected_products_are_the_mean_of_simulated_ones(built):
+    """If the fitted function is the terrain's, residuals from the plane have just these products on average."""
+    fit = built.fit
+    leaf = dtm_report_covariance._leaves(fit)[5]
+    _, _, expected = dtm_report_covariance._block(fit, leaf)
+    seen = fit.seen
+    points = np.arange(seen.points)
+    covariance = dtm_report_covariance._matrix(fit, leaf, seen.xyz[points, :2])
+    noise = np.sqrt(np.abs(fit.noise[points]))
+    root = np.linalg.cholesky(covariance + 1e-9 * covariance[0, 0] * np.eye(len(points)))
+    rng = np.random.default_rng(0)
+    total, runs = np.zeros_like(expected), 400
+    for _ in range(runs):
+        xyz = seen.xyz.copy()
+        xyz[points, 2] = root @ rng.normal(size=len(points)) + noise * rng.normal(size=len(points))
+        total += dtm_report_covariance._block(replace(fit, seen=replace(seen, xyz=xyz)), leaf)[1]
+    mean = total / runs
+    size = np.abs(expected).max()
+    assert np.abs(mean - expected).max() < 0.25 * size
+    # On average over pairs of one size the agreement is closer by far.
+    slope = (mean * expected).sum() / (expected**2).sum()
+    assert slope == pytest.approx(1.0, abs=0.05)
+
+
+def test_covariance_classes_use_all_pairs_once(facts):
+    c = facts.covariance
+    assert (np.diff(c.classes[c.pairs > 0]) > 0).all()
+    assert c.whole[0] == pytest.approx(facts.variance)
+    assert c.whole[np.argmin(np.abs(c.distance - facts.length))] == pytest.approx(facts.variance / 2, rel=0.05)
+    assert (c.low <= c.high).all()
+
+
+def test_without_matplotlib_the_message_says_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(UsageError, match=r"pip install 'photoplan\[report\]'"):
+        dtm_report.check_report()
+
+
+def test_a_full_disk_leaves_the_old_report(built, measured, tmp_path, monkeypatch):
+    import errno
+    from pathlib import Path
+
+    path = tmp_path / "model.report.html"
+    path.write_text("old")
+
+    def full(self, content):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(ResourceError):
+        dtm_report.write_report(path, built, measured, (), (), 1.0)
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["model.report.html"]
+
+
+def test_work_is_bounded(built, measured, monkeypatch):
+    monkeypatch.setattr(dtm_report, "_SAMPLE", 50)
+    monkeypatch.setattr(dtm_report, "_RESIDUALS", 60)
+    monkeypatch.setattr(dtm_report, "_VERTICES", 20)
+    monkeypatch.setattr(dtm_report, "_SIDE", 64)
+    facts = dtm_report.build_facts("model", built, measured, (), (), 1.0)
+    assert len(facts.effects[0].differences) <= 50 and facts.effects[0].count == 699
+    assert len(facts.normalised) <= 60
+    assert max(facts.map.heights.shape) <= 65
+    assert sum(len(xy) for _, xy in facts.map.lines) <= 22
+
+
+def test_file_is_named_and_titled_after_the_model(built, measured, tmp_path):
+    path = tmp_path / "dam.report.html"
+    source = tmp_path / "survey <1>.csv"
+    source.write_text("x")
+    dtm_report.write_report(path, built, measured, (), (source,), 1.0)
+    page = path.read_text("utf-8")
+    assert re.search("<h1>dam</h1>", page)
+    assert "survey &lt;1&gt;.csv" in page
+    assert [p.name for p in sorted(tmp_path.iterdir())] == ["dam.report.html", "survey <1>.csv"]
