@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from collocation_twin import covariance, stacked
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kernels.collocation_twin import covariance, stacked
 
 from photoplan.kernels.collocation import EXPONENTIAL, GAUSSIAN, MATERN, correlation, factorise, solve_transposed
 from photoplan.kernels.jit import kernel

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import shapely
+from collocation_twin import side, stacked
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kernels.collocation_twin import side, stacked
 from numpy.typing import NDArray
 
 from photoplan.kernels.sides import clip_lines, sides_of
@@ -74,7 +76,7 @@ def test_a_line_drawn_the_other_way_round_has_opposite_sides() -> None:
 
 
 def test_further_vertices_on_a_line_change_nothing() -> None:
-    dense = np.vstack([np.linspace(a, b, 6)[:-1] for a, b in zip(BENT, BENT[1:])] + [BENT[-1:]])
+    dense = np.vstack([np.linspace(a, b, 6)[:-1] for a, b in itertools.pairwise(BENT)] + [BENT[-1:]])
     xy = np.random.default_rng(4).uniform(-5, 15, (40, 2))
     np.testing.assert_allclose(sides(xy, dense), sides(xy, BENT), atol=1e-12)
 
