@@ -27,16 +27,16 @@ _SHOWN = 10
 @click.option("--grid-width", type=_POSITIVE, metavar="M", help="Finest grid width [from the spacing of the points].")
 @click.option("--adapt", type=click.FloatRange(0), metavar="M", help="Widen a unit's grid while its surface stays "
               "within this; 0: never [a quarter of its standard deviation].")  # fmt: skip
-@click.option("--unit-meshes", type=int, default=64, show_default=True, help="Meshes along a unit's side.")
+@click.option("--unit-meshes", type=int, default=64, show_default=True, help="Meshes of a unit's side: a power of two.")
 @click.option("--filter", "filters", multiple=True, metavar="CLASS=M", help="Standard deviation of measurement of "
               "mass, spot, breakline, formline, border or hole [mass: estimated; others: a share of it].")  # fmt: skip
 @click.option("--covariance", default="auto", show_default=True, help="auto, gaussian, matern or exponential.")
 @click.option("--gross", type=click.FloatRange(0), default=5.0, show_default=True, help="Normalised residual of gross "
               "errors; 0: none is sought.")  # fmt: skip
 @click.option("--reach", type=_POSITIVE, metavar="M", help="Gaps over twice this stay open [10 spacings].")
-@click.option("--codes", type=_PATH, metavar="FILE", help="What codes mean: TOML or CSV with code, class, sigma.")
+@click.option("--codes", type=_PATH, metavar="FILE", help="Codes and layers: TOML, or CSV with code, class, sigma.")
 @click.option("--columns", help="Columns of text files, such as x=East,y=North,z=Height,code=Art or x,y,z,-,code.")
-@click.option("--delimiter", help="Between columns: , ; tab or space [what fits].")
+@click.option("--delimiter", help="Comma, semicolon, tab or space [what fits].")
 @click.option("--decimal-comma", is_flag=True, help="Numbers are written 1,5.")
 @click.option("--attribute", help="Attribute of vector files that holds the code [kind, class or code].")
 @click.option("--layer", "layers", multiple=True, help="Layer or surface to read; may be repeated [all].")
@@ -105,7 +105,7 @@ def _request(options: dict[str, Any]) -> BuildRequest:
     delimiter = options.pop("delimiter")
     reading = ReadOptions(
         columns=options.pop("columns"),
-        delimiter={"tab": "\t", "space": " "}.get(delimiter, delimiter),
+        delimiter={"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}.get(delimiter, delimiter),
         decimal_comma=options.pop("decimal_comma"),
         codes=read_code_table(codes) if codes else CodeTable(),
         attribute=options.pop("attribute"),
