@@ -11,6 +11,7 @@ import matplotlib as mpl
 import numpy as np
 import resampling_kernels as kernels
 from draw_idea import draw_idea
+from draw_road import draw_road
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -149,6 +150,7 @@ FIGURES = {
     "homogeneous-anchors": draw_homogeneous,
     "resampling-kernels": draw_kernels,
     "anchor-residual": draw_residual,
+    "road-edge": draw_road,
 }
 
 

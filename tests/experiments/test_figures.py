@@ -13,6 +13,7 @@ mpl = pytest.importorskip("matplotlib")
         ("homogeneous-anchors", {"steps": 3}),
         ("resampling-kernels", {"steps": 21}),
         ("anchor-residual", {"samples": 3, "steps": 3}),
+        ("road-edge", {}),
     ],
 )
 def test_figure(name, sizes, tmp_path):

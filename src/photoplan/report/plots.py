@@ -216,9 +216,6 @@ class Plots:
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_locator(self._mpl.ticker.MaxNLocator(5, steps=[1, 2, 5, 10]))
             axis.set_major_formatter(self._mpl.ticker.FuncFormatter(lambda v, _: f"{v:.12g}"))
-        axes.tick_params(axis="y", labelrotation=90)
-        for label in axes.get_yticklabels():
-            label.set_verticalalignment("center")
         return fig, axes
 
     def _bar(self, fig: Any, axes: Any, tints: Any, norm: Any, label: str, extend: str = "neither") -> None:
