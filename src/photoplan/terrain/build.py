@@ -26,7 +26,7 @@ __all__ = ["BuildPlan", "Built", "Steps", "build", "plan_build"]
 #: Gaps are bridged up to twice this many spacings.
 _REACH = 10.0
 #: Finest grid width in spacings of the points, before it is made a round number.
-_WIDTH = 0.6
+_WIDTH = 0.5
 #: Part of a unit's standard deviation by which a wider grid may change its surface.
 _ADAPT = 0.25
 #: Units of a model at most: a wider spread of points needs a wider grid.

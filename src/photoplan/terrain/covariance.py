@@ -21,7 +21,7 @@ __all__ = ["LADDER", "Covariance", "estimate_all", "estimate_unit", "ladder", "n
 GAPS = (2.0, 2.0, 2.5)
 #: Within a unit the terrain may be smooth here and rough there: factors of variance and length from which each patch
 #: takes what suits its own points.
-LADDER = ((1.0, 1.0), (1.0, 0.5), (1.0, 0.25), (2.0, 0.25))
+LADDER = ((1.0, 1.0), (1.0, 0.5), (1.0, 0.25), (1.0, 0.125), (2.0, 0.125))
 #: Data of a block, blocks of a unit, and units from which the whole area's function is estimated.
 _BLOCK, _BLOCKS, _UNITS = 72, 3, 16
 #: A wide block takes every so-manieth of so many times as many points: it sees further.

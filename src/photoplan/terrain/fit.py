@@ -24,14 +24,14 @@ __all__ = ["REACH", "Fit", "Progress", "each", "fit", "lines_of", "patches_at"]
 Progress = Callable[[int], None]
 T = TypeVar("T")
 
-#: Scores count less than a likelihood would: neighbouring points are no independent witnesses.
-_TEMPER = 0.5
 #: A patch reaches this many half sides from the middle of its leaf (see the weights in `photoplan.kernels.patch`).
 REACH = 1.5
 #: Rounds of looking for gross errors; each finds at most one in a patch.
 _ROUNDS = 12
 #: Residuals whose spread a unit's own ones must outweigh: its standard deviations follow their neighbours' till then.
 _EXPECTED_RESIDUALS = 50
+#: Points within so many spacings support each other if both deviate by more than so many standard deviations.
+_CLOSE, _CLEAR = 1.5, 2.0
 #: A point tells nothing of its error if less than this share of it shows in the residual.
 _LEAST_REDUNDANCY = 0.02
 
@@ -124,7 +124,7 @@ def fit(
         members=tuple(members),
     )
     each(lambda u: _choose(found, u), range(count), workers, progress)
-    each(lambda u: _test(found, u, leaves.of_unit(u)), range(count), workers, progress)
+    each(lambda u: _test(found, leaves.of_unit(u), False, found.residuals), range(count), workers, progress)
     if settings.gross > 0:
         _flag(found, settings.gross, workers)
     return replace(found, spread=_spread(found))
@@ -162,14 +162,14 @@ def _choose(found: Fit, unit: int) -> None:
     lines = lines_of(found, patches, ids)
     score_models(found.seen.xyz, found.noise, ids, patches, found.seen.points, *lines, found.models(some), scores)
     scores -= np.where(np.isfinite(scores), scores, np.inf).min(axis=1, keepdims=True)
-    weight = np.exp(-_TEMPER * scores / 2)
+    weight = np.exp(-scores / 2)
     weight = np.where(np.isfinite(weight), weight, 0.0)
     weight[weight.sum(axis=1) == 0] = 1.0
     found.shares[some] = weight / weight.sum(axis=1, keepdims=True)
 
 
-def _test(found: Fit, unit: int, some: NDArray[np.int64]) -> None:
-    """Residuals of the points in some leaves of a unit."""
+def _test(found: Fit, some: NDArray[np.int64], rough: bool, residuals: NDArray[np.float64]) -> None:
+    """Residuals of the points in some leaves, by the best function of each patch or by the roughest of the ladder."""
     if not len(some):
         return
     leaves, points = found.leaves, found.seen.points
@@ -178,7 +178,8 @@ def _test(found: Fit, unit: int, some: NDArray[np.int64]) -> None:
     start = np.concatenate([[0], np.cumsum([len(numbers) for numbers in own])])
     if not start[-1]:
         return
-    best = found.models(some)[np.arange(len(some)), found.shares[some].argmax(axis=1)]
+    chosen = len(LADDER) - 1 if rough else found.shares[some].argmax(axis=1)
+    models = found.models(some)[np.arange(len(some)), chosen]
     ids = found.neighbours.query(leaves.middle[some])
     patches = patches_at(leaves, some)
     test_points(
@@ -189,43 +190,64 @@ def _test(found: Fit, unit: int, some: NDArray[np.int64]) -> None:
         np.concatenate(own),
         start,
         *lines_of(found, patches, ids),
-        best,
-        found.residuals,
+        models,
+        residuals,
     )
 
 
 def _flag(found: Fit, limit: float, workers: int) -> None:
-    """Flag the worst point of each neighbourhood, test the neighbourhood again, until none is left (data snooping)."""
+    """Flag the worst point of each neighbourhood, test the neighbourhood again, until none is left (data snooping).
+
+    A point that fits no smooth surface may still show what the terrain is like: a ditch or a stone that no line
+    describes. It is an error only if it contradicts its neighbours on the roughest terrain that is considered, too,
+    and if no neighbour deviates as it does.
+    """
     points = found.seen.points
+    confirmed = np.full((points, 3), np.nan)
+    cleared = np.zeros(points, bool)
     for _ in range(_ROUNDS):
-        suspect = np.flatnonzero(
-            (np.abs(found.residuals[:, 2]) > limit)
-            & (found.residuals[:, 1] > _LEAST_REDUNDANCY)
-            & (found.noise[:points] >= 0)
-        )
+        used = (found.noise[:points] >= 0) & ~cleared
+        wild = (np.abs(found.residuals[:, 2]) > limit) & (found.residuals[:, 1] > _LEAST_REDUNDANCY)
+        suspect = np.flatnonzero(used & wild)
         if not len(suspect):
             return
-        middles = found.seen.xyz[suspect, :2]
-        near = found.neighbours.near[0].query(middles)
+        _test_again(found, _leaf_of(found)[suspect], True, confirmed, workers)
+        fine = ~(np.abs(confirmed[suspect, 2]) > limit) | _supported(found, suspect)
+        cleared[suspect[fine]] = True
+        suspect = suspect[~fine]
+        if not len(suspect):
+            return
+        near = found.neighbours.near[0].query(found.seen.xyz[suspect, :2])
         size = np.where(found.noise[:points] >= 0, np.abs(found.residuals[:, 2]), 0.0)
-        worst = size[suspect] >= np.nan_to_num(size[near]).max(axis=1)
-        flagged = suspect[worst]
+        flagged = suspect[size[suspect] >= np.nan_to_num(size[near]).max(axis=1)]
         found.noise[flagged] = -1.0
-        again = _touched(found, flagged)
-        _test_again(found, again, workers)
+        touched = np.unique(found.neighbours.near[0].query(found.seen.xyz[flagged, :2]))
+        _test_again(found, _leaf_of(found)[touched], False, found.residuals, workers)
 
 
-def _test_again(found: Fit, leaves: NDArray[np.int64], workers: int) -> None:
+def _supported(found: Fit, suspect: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether another point close by deviates clearly and to the same side."""
+    near = found.neighbours.near[0].query(found.seen.xyz[suspect, :2])
+    apart = np.linalg.norm(found.seen.xyz[near, :2] - found.seen.xyz[suspect, None, :2], axis=2)
+    close = (apart <= _CLOSE * found.seen.spacing) & (near != suspect[:, None])
+    same = found.residuals[near, 2] * np.sign(found.residuals[suspect, 2])[:, None] > _CLEAR
+    supported: NDArray[np.bool_] = (close & same).any(axis=1)
+    return supported
+
+
+def _test_again(
+    found: Fit, leaves: NDArray[np.int64], rough: bool, residuals: NDArray[np.float64], workers: int
+) -> None:
+    leaves = np.unique(leaves)
     unit = found.leaves.unit[leaves]
-    each(lambda u: _test(found, u, leaves[unit == u]), np.unique(unit).tolist(), workers)
+    each(lambda u: _test(found, leaves[unit == u], rough, residuals), np.unique(unit).tolist(), workers)
 
 
-def _touched(found: Fit, flagged: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Leaves near flagged points: those of the points nearest to them."""
-    near = np.unique(found.neighbours.near[0].query(found.seen.xyz[flagged, :2]))
-    leaf_of = np.empty(len(found.leaves.order), np.int64)
-    leaf_of[found.leaves.order] = np.repeat(np.arange(len(found.leaves.half)), found.leaves.count)
-    return np.unique(leaf_of[near])
+def _leaf_of(found: Fit) -> NDArray[np.int64]:
+    """Leaf of every point and vertex."""
+    leaf = np.empty(len(found.leaves.order), np.int64)
+    leaf[found.leaves.order] = np.repeat(np.arange(len(found.leaves.half)), found.leaves.count)
+    return leaf
 
 
 def _spread(found: Fit) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ FAMILIES: tuple[Family, ...] = get_args(Family)
 """Families of covariance functions; the place of each is its number in the kernels."""
 
 #: Filter values of classes that are not given, as parts of that of mass points: lines and spots are measured with care.
-SHARE = {"mass": 1.0, "spot": 0.3, "breakline": 0.3, "formline": 0.3, "border": 0.3, "hole": 0.3}
+SHARE = {"mass": 1.0, "spot": 0.4, "breakline": 0.4, "formline": 0.4, "border": 0.4, "hole": 0.4}
 
 
 @dataclass(frozen=True)
