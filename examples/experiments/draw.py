@@ -11,6 +11,7 @@ import matplotlib as mpl
 import numpy as np
 import resampling_kernels as kernels
 from draw_idea import draw_idea
+from draw_prediction import draw_prediction
 from draw_road import draw_road
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -146,6 +147,7 @@ def draw_residual(samples: int = 9, steps: int = 9) -> Figure:
 
 FIGURES = {
     "one-idea": draw_idea,
+    "linear-prediction": draw_prediction,
     "anchor-interpolation": draw_anchor_interpolation,
     "homogeneous-anchors": draw_homogeneous,
     "resampling-kernels": draw_kernels,

@@ -9,6 +9,7 @@ mpl = pytest.importorskip("matplotlib")
     ("name", "sizes"),
     [
         ("one-idea", {}),
+        ("linear-prediction", {"steps": 21}),
         ("anchor-interpolation", {"steps": 5}),
         ("homogeneous-anchors", {"steps": 3}),
         ("resampling-kernels", {"steps": 21}),

@@ -1,43 +1,88 @@
-"""The reference pages name every option and entry that exists, and none that does not."""
+"""The reference pages name every option and entry that exists, and none that does not; examples parse."""
 
 import importlib
 import json
 import re
+import shlex
 from pathlib import Path
 
+import click
 import pytest
 
+from photoplan.cli.dtm import VERBS as DTM_VERBS
 from photoplan.cli.main import VERBS
 from photoplan.io.project import project_schema
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
-PAGE = (DOCS / "reference" / "command-line.md").read_text("utf-8")
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+PAGES = [*sorted(DOCS.rglob("*.md")), ROOT / "README.md"]
 #: Options of other programs on the pages.
 OTHERS = {"--help"}
+#: Verbs as they are typed, and the page that explains them; `dtm` itself is a group of verbs without options.
+PLACES = {verb: "command-line" for verb in VERBS if verb != "dtm"} | {f"dtm {verb}": "dtm" for verb in DTM_VERBS}
 
 
 def long_options(text):
-    return set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", text))
+    return set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", text))
+
+
+def command_of(verb):
+    return importlib.import_module(f"photoplan.cli.{verb.replace(' ', '_')}").command
 
 
 def options_of(verb):
-    command = importlib.import_module(f"photoplan.cli.{verb}").command
-    spelled = [o for parameter in command.params for o in (*parameter.opts, *parameter.secondary_opts)]
+    spelled = [o for parameter in command_of(verb).params for o in (*parameter.opts, *parameter.secondary_opts)]
     return {o for o in spelled if o.startswith("--")}
 
 
-@pytest.mark.parametrize("verb", VERBS)
-def test_options_of_a_verb(verb):
-    section = re.search(rf"^## photoplan {verb}$(.*?)(?=^## |\Z)", PAGE, re.M | re.S)
+def section_of(verb):
+    page = (DOCS / "reference" / f"{PLACES[verb]}.md").read_text("utf-8")
+    section = re.search(rf"^## photoplan {verb}$(.*?)(?=^## |\Z)", page, re.M | re.S)
     assert section, f"no section on {verb}"
+    return section[1]
+
+
+def examples():
+    """Calls of photoplan in blocks of the pages: page, verb, arguments. Lines that only show a form are left out."""
+    for page in PAGES:
+        text = page.read_text("utf-8")
+        for block in re.findall(r"^```(?:console|text|bash)?\n(.*?)^```$", text, re.M | re.S):
+            for line in block.replace("\\\n", " ").splitlines():
+                call = re.match(r"(?:\$ )?(?:\.venv/bin/)?photoplan (.*)", line)
+                if not call or re.search(r"…|\[options\]|\[-", call[1]):
+                    continue
+                words = shlex.split(re.split(r"\s+#", call[1])[0])
+                verb = " ".join(words[:2]) if words[0] == "dtm" else words[0]
+                yield pytest.param(verb, words[len(verb.split()) :], id=f"{page.stem}: {call[1][:40]}")
+
+
+EXAMPLES = list(examples())
+
+
+@pytest.mark.parametrize("verb", PLACES)
+def test_options_of_a_verb(verb):
     elsewhere = {"run": {"--plan"}}.get(verb, set())
-    assert long_options(section[1]) - elsewhere == options_of(verb)
+    assert long_options(section_of(verb)) - elsewhere == options_of(verb)
 
 
-@pytest.mark.parametrize("page", sorted(DOCS.rglob("*.md")), ids=lambda p: p.stem)
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)
 def test_no_page_names_an_option_that_does_not_exist(page):
-    known = set.union(*(options_of(verb) for verb in VERBS)) | OTHERS
+    known = set.union(*(options_of(verb) for verb in PLACES)) | OTHERS
     assert long_options(page.read_text("utf-8")) <= known
+
+
+def test_examples_of_all_verbs_of_terrain_models_are_found():
+    verbs = {parameter.values[0] for parameter in EXAMPLES}
+    assert {f"dtm {verb}" for verb in DTM_VERBS} | {"monoplot", "ortho", "check", "init"} <= verbs
+
+
+@pytest.mark.parametrize(("verb", "arguments"), EXAMPLES)
+def test_example_is_understood(verb, arguments):
+    assert verb in PLACES, f"photoplan has no verb {verb!r}"
+    try:
+        command_of(verb).make_context(verb, list(arguments))
+    except click.UsageError as error:
+        pytest.fail(f"photoplan {verb}: {error.format_message()}")
 
 
 def test_every_entry_of_the_project_file_is_explained():
