@@ -1,10 +1,10 @@
 """The same orthophoto by photoplan, orthority and gdalwarp: CPU seconds, wall seconds, peak memory, agreement.
 
-    python bench/run.py [--quick] [--repeat N] [--json FILE]
+    python bench/run.py [--quick] [--large] [--repeat N] [--json FILE]
 
 One real aerial frame, enlarged 6 and 12 times; cubic, three bands, uncompressed, no overviews, one thread where the
 program lets itself be told. Whole processes are measured, from start to end. Runs of the programs alternate, medians
-are compared. Whatever is missing (a program, the data) is named and its rows are left out.
+are compared. Whatever is missing (a program, the data) is named and its rows are left out. Terrain models follow (terrain.py).
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ import rasterio
 from agreement import compare
 from prepare import DATA, LARGE, SMALL, WORK, Source, prepare
 from programs import Bounds, Missing, Program, gdalwarp, orthority, photoplan
+from terrain import report_terrain
 
 HERE = Path(__file__).resolve().parent
 MIB = 2**20
@@ -173,7 +174,10 @@ def machine() -> str:
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="the smaller size only (27 Mpx)")
+    parser.add_argument("--quick", action="store_true", help="the smaller sizes only (27 Mpx, 100 000 points)")
+    parser.add_argument(
+        "--large", action="store_true", help="also a terrain of ten million points (a quarter of an hour)"
+    )
     parser.add_argument("--repeat", type=int, default=3, metavar="N", help="runs of each program [3]")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
     return parser.parse_args()
@@ -197,6 +201,8 @@ def main() -> int:
             entries = [Entry(p, few if p.name.startswith("gdalwarp") else n) for p in available(makers)]
             results["sizes"].append(compare_at(source, entries))
             report(results["sizes"][-1])
+    WORK.mkdir(exist_ok=True)
+    results["terrain"] = report_terrain(options.quick, options.large)
     if options.json:
         options.json.write_text(json.dumps(results, indent=2) + "\n")
     return 0
