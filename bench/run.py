@@ -4,7 +4,8 @@
 
 One real aerial frame, enlarged 6 and 12 times; cubic, three bands, uncompressed, no overviews, one thread where the
 program lets itself be told. Whole processes are measured, from start to end. Runs of the programs alternate, medians
-are compared. Whatever is missing (a program, the data) is named and its rows are left out. Terrain models follow (terrain.py).
+are compared. Whatever is missing (a program, the data) is named and its rows are left out. Terrain models from
+measured points follow (terrain.py).
 """
 
 from __future__ import annotations

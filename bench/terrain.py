@@ -40,7 +40,7 @@ SECONDS_TARGET, MEMORY_TARGET, RATIO_TARGET = 120.0, 2048.0, 12.0
 NEAR = 2.0
 #: Noise of the analytic points, metres; their spacing; places at which the surface is compared.
 NOISE, SPACING, PLACES = 0.10, 2.0, 20_000
-#: v.surf.rst gets no more points than these: its time would be that of all others together.
+#: v.surf.rst gets no more points than these: it then takes a minute and a half already.
 MOST_RST = 100_000
 
 
@@ -212,7 +212,7 @@ def report_terrain(quick: bool = False, large: bool = False) -> dict:
     found["analytic 100 000"] = compare(analytic(MOST_RST), [ours, *others])
     if quick:
         return found
-    # A TIN of a million points is a matter of seconds; v.surf.rst would take hours.
+    # A TIN of a million points is a matter of seconds; v.surf.rst would take a quarter of an hour.
     found["analytic 1 000 000"] = million = compare(analytic(1_000_000), [ours, others[0]])
     if "wall" in million["photoplan"]:
         verdict(million["photoplan"]["wall"], SECONDS_TARGET, "one million points: seconds")

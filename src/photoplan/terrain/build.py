@@ -27,6 +27,7 @@ __all__ = ["BuildPlan", "Built", "Steps", "build", "plan_build"]
 _REACH = 10.0
 #: Finest grid width in spacings of the points, before it is made a round number.
 _WIDTH = 0.5
+_ROUND = (1.0, 1.25, 1.6, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
 #: Part of a unit's standard deviation by which a wider grid may change its surface.
 _ADAPT = 0.25
 #: Units of a model at most: a wider spread of points needs a wider grid.
@@ -93,9 +94,9 @@ def plan_build(measured: MeasuredTerrain, settings: BuildSettings) -> BuildPlan:
 
 
 def _nice(width: float) -> float:
-    """The largest of 1, 2, 2.5, 5 times a power of ten that is not larger."""
+    """The largest round number that is not larger."""
     power = 10.0 ** np.floor(np.log10(width))
-    return float(max(f * power for f in (1.0, 2.0, 2.5, 5.0) if f * power <= width * 1.0001))
+    return float(max(f * power for f in _ROUND if f * power <= width))
 
 
 def build(plan: BuildPlan, workers: int = 1, steps: Steps | None = None) -> Built:

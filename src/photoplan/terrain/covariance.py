@@ -23,7 +23,9 @@ GAPS = (2.0, 2.0, 2.5)
 #: takes what suits its own points.
 LADDER = ((1.0, 1.0), (1.0, 0.5), (1.0, 0.25), (1.0, 0.125), (2.0, 0.125))
 #: Data of a block, blocks of a unit, and units from which the whole area's function is estimated.
-_BLOCK, _BLOCKS, _UNITS = 72, 3, 16
+_BLOCK, _BLOCKS, _UNITS = 72, 3, 48
+#: A family of rougher surfaces is taken only if it lowers the score of a block by this much.
+_CLEARLY = 0.5
 #: A wide block takes every so-manieth of so many times as many points: it sees further.
 _WIDE = 4
 #: How far a unit's parameters are expected from those of the whole area: standard deviations of their logarithms.
@@ -71,7 +73,7 @@ class _Blocks:
 def estimate_all(
     seen: Observations, neighbours: Neighbours, members: Iterable[NDArray[np.int64]], settings: BuildSettings
 ) -> Covariance:
-    """The covariance function of the whole area, from blocks of some of its units; of the likeliest family.
+    """The covariance function of the whole area, from blocks of some of its units; of the family that predicts best.
 
     Parameters
     ----------
@@ -84,14 +86,16 @@ def estimate_all(
     first, bounds = _start(seen, blocks, settings)
     families = range(len(FAMILIES)) if settings.family == "auto" else [FAMILIES.index(settings.family)]
     prior = np.stack([first, np.zeros(3), *bounds])
-    best = []
+    best: tuple[float, Covariance] | None = None
     for family in families:
         scaled = blocks.sides * GAPS[family] ** 2 / 4
         logs, value = minimise(blocks.d2, scaled, blocks.b, blocks.noise, prior, first, family)
         logs, value = minimise(blocks.d2, scaled, blocks.b, blocks.noise, prior, logs, family)
-        best.append((float(value), family, logs))
-    _, family, logs = min(best, key=lambda found: found[0])
-    return _covariance(family, logs)
+        score = float(value) / len(blocks.b)
+        if best is None or score < best[0] - _CLEARLY:
+            best = score, _covariance(family, logs)
+    assert best is not None
+    return best[1]
 
 
 def estimate_unit(

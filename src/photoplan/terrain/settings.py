@@ -32,7 +32,7 @@ class BuildSettings:
     """A unit's grid is widened while its surface stays within this, metres; 0: all units have the finest width;
     None: a quarter of the unit's mean standard deviation."""
     family: Family | Literal["auto"] = "auto"
-    """Family of the covariance function; auto: the likeliest."""
+    """Family of the covariance function; auto: the one that predicts the points best from each other."""
     filters: dict[str, float] = field(default_factory=dict)
     """Filter value (standard deviation of measurement, metres) by class of points or lines. Mass points that have none
     are estimated from the data, other classes take their share (`SHARE`) of it."""
