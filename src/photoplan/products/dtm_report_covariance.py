@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +17,10 @@ __all__ = ["correlation_at", "covariance_facts"]
 
 #: Neighbourhoods that are looked at, points of each, and classes of distance.
 _BLOCKS, _POINTS, _CLASSES = 160, 60, 14
+#: So many times as many neighbourhoods are tried, since breaklines part some.
+_ROUNDS = 8
+#: Squared difference of side coordinates from which points lie on two sides of a breakline; 4 across its middle.
+_PARTED = 0.4
 #: Argument at which (1 + t) exp(−t) is one half.
 _MATERN_HALF = 1.6783469900166605
 
@@ -32,7 +38,9 @@ def covariance_facts(fit: Fit) -> CovarianceFacts:
     """Fitted functions over distance, and the covariance of the points' heights above local planes.
 
     A plane through a neighbourhood takes a part of the signal with it. So the fitted functions are not compared with
-    the products of residuals r = P z themselves, but their expectation is, P (C + N) Pᵀ.
+    the products of residuals r = P z themselves, but their expectation is, P (C + N) Pᵀ. Neighbourhoods that
+    breaklines part are left out: the functions let their two sides differ as they like, and it is the points of the
+    line that tie them together.
     """
     reach = 4.0 * fit.whole.length
     distance = np.linspace(0.0, reach, 81)
@@ -40,7 +48,8 @@ def covariance_facts(fit: Fit) -> CovarianceFacts:
     if not len(curves):
         curves = _curve(fit.whole, distance)[None]
     low, high = np.percentile(curves, [10, 90], axis=0)
-    pairs = [_block(fit, leaf) for leaf in _leaves(fit)]
+    blocks = (_block(fit, leaf) for leaf in _leaves(fit))
+    pairs = list(itertools.islice((block for block in blocks if len(block[0])), _BLOCKS))
     d, product, expected = (
         (np.concatenate([np.empty(0), *parts]) for parts in zip(*pairs)) if pairs else [np.empty(0)] * 3
     )
@@ -62,10 +71,10 @@ def _curve(covariance: Covariance, distance: NDArray[np.float64]) -> NDArray[np.
 
 
 def _leaves(fit: Fit) -> list[int]:
-    """Leaves that hold points, spread evenly over the area."""
+    """Leaves that hold points, in an order in which the first of them already cover the area evenly."""
     rich = np.flatnonzero(fit.leaves.count >= 3)
-    some: list[int] = rich[:: max(1, -(-len(rich) // _BLOCKS))].tolist()
-    return some
+    step = max(1, -(-len(rich) // _BLOCKS))
+    return [leaf for first in range(min(step, _ROUNDS)) for leaf in rich[first::step].tolist()]
 
 
 def _block(fit: Fit, leaf: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -78,6 +87,8 @@ def _block(fit: Fit, leaf: int) -> tuple[NDArray[np.float64], NDArray[np.float64
     if len(some) < 8:
         return np.empty(0), np.empty(0), np.empty(0)
     xy = seen.xyz[some, :2]
+    if _apart(fit, xy).max() > _PARTED:
+        return np.empty(0), np.empty(0), np.empty(0)
     centred = xy - xy.mean(axis=0)
     plane = np.column_stack([np.ones(len(xy)), centred / max(float(np.abs(centred).max()), 1e-9)])
     q = np.linalg.qr(plane)[0]
@@ -89,15 +100,19 @@ def _block(fit: Fit, leaf: int) -> tuple[NDArray[np.float64], NDArray[np.float64
     return d, r[first] * r[second], expected[first, second]
 
 
+def _apart(fit: Fit, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Squared differences of the side coordinates of places (n, 2): not zero where breaklines part them."""
+    vertices, start = near_lines(fit.seen, xy.min(axis=0), xy.max(axis=0))
+    sides = np.zeros((len(xy), max(1, len(start) - 1)))
+    if len(start) > 1:
+        sides_of(np.ascontiguousarray(xy), vertices, start, len(start) - 1, sides)
+    return np.asarray(((sides[:, None] - sides[None]) ** 2).sum(axis=2))
+
+
 def _matrix(fit: Fit, leaf: int, xy: NDArray[np.float64]) -> NDArray[np.float64]:
     """Covariances of the signal at places (n, 2), by the functions that the leaf's patch uses."""
     d2 = ((xy[:, None] - xy[None]) ** 2).sum(axis=2)
-    vertices, start = near_lines(fit.seen, xy.min(axis=0), xy.max(axis=0))
-    apart = np.zeros_like(d2)
-    if len(start) > 1:
-        sides = np.zeros((len(xy), len(start) - 1))
-        sides_of(np.ascontiguousarray(xy), vertices, start, len(start) - 1, sides)
-        apart = ((sides[:, None] - sides[None]) ** 2).sum(axis=2)
+    apart = _apart(fit, xy)
     total = np.zeros_like(d2)
     for share, (family, variance, length, gap) in zip(fit.shares[leaf], fit.models(np.array([leaf]))[0]):
         t = np.sqrt(d2 / length**2 + apart * gap**2 / 4)
