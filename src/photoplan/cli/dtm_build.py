@@ -146,9 +146,9 @@ def _summary(built: BuildReport) -> list[str]:
         f"normalised residuals {f['spread'] or 0:.2f}",
     ]
     if built.gross:
-        lines.append(f"{len(built.gross)} gross errors, left out:")
+        lines.append(f"gross errors, left out: {len(built.gross)}")
         lines += [f"  {g.name}: {g.residual:+.3f} m, {abs(g.normalised):.1f} σ" for g in built.gross[:_SHOWN]]
     if built.findings:
-        lines.append(f"{len(built.findings)} findings in the measurements:")
+        lines.append(f"findings in the measurements: {len(built.findings)}")
         lines += [f"  {finding.kind}: {finding.text}" for finding in built.findings[:_SHOWN]]
     return lines + [f"  {note}" for note in built.notes[:_SHOWN]]

@@ -129,7 +129,12 @@ def same_crs(a: str, b: str) -> bool:
         return True
     first, second = (parse_crs(t) for t in (a, b))
     first, second = (c.sub_crs_list[0] if c.is_compound else c for c in (first, second))
-    return bool(first.equals(second, ignore_axis_order=True))
+    if first.equals(second, ignore_axis_order=True):
+        return True
+    # Two versions of the EPSG register may name the datum differently; the number says that it is one CRS.
+    numbers = [c.to_authority() if c.to_epsg(min_confidence=100) else None for c in (first, second)]
+    stated = [c.to_json_dict().get("id") for c in (first, second)]
+    return (numbers[0] is not None and numbers[0] == numbers[1]) or (stated[0] is not None and stated[0] == stated[1])
 
 
 @dataclass(frozen=True)

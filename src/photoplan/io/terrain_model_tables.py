@@ -51,7 +51,7 @@ class GrossError:
     xyz: tuple[float, float, float]
     """X, Y, Z as measured, metres."""
     residual: float
-    """Measured height less the predicted one, metres."""
+    """Measured height less that of the surface without this measurement, metres."""
     redundancy: float
     """Share of an error that shows in the residual, 0 to 1."""
     normalised: float

@@ -11,8 +11,10 @@ from photoplan.kernels.collocation import correlation, factorise, solve_transpos
 from photoplan.kernels.jit import inner, kernel
 from photoplan.kernels.sides import clip_lines, sides_of
 
-__all__ = ["left_out", "system", "trend", "usable"]
+__all__ = ["WORST", "left_out", "system", "trend", "usable"]
 
+#: Squared normalised residuals count up to this in scores: no covariance function is to bend towards a blunder.
+WORST = 12.0
 _JITTER = 1e-8
 # A prior for the slope of the trend so weak that it only matters where all data lie on one line.
 _SLOPE_WEIGHT = 1e-4

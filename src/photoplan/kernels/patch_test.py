@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.collocation import solve_transposed
 from photoplan.kernels.jit import kernel
-from photoplan.kernels.patch_system import left_out, system, usable
+from photoplan.kernels.patch_system import WORST, left_out, system, usable
 
 __all__ = ["score_models", "test_points"]
 
@@ -56,7 +56,7 @@ def score_models(
                 if weight[j] > 0.0:
                     dx, dy = xyz[data[j], 0] - leaves[patch, 0], xyz[data[j], 1] - leaves[patch, 1]
                     share = np.exp(-0.5 * (dx * dx + dy * dy) / (_FOCUS * leaves[patch, 2]) ** 2)
-                    total += share * (alpha[j] ** 2 / weight[j] - np.log(weight[j]))
+                    total += share * (min(alpha[j] ** 2 / weight[j], WORST) - np.log(weight[j]))
             result[patch, k] = total
 
 

@@ -35,7 +35,7 @@ def describe_model(reader: ModelReader) -> dict[str, Any]:
     if f["family"]:
         facts["covariance"] = f"{f['family']}, half length {_number(f['length'])} m, signal {_number(f['signal'])} m"
     facts["accuracy"] = (
-        f"posts {_number(f['sigma'])} m, points after filtering {_number(f['noise'])} m, spread of normalised "
+        f"posts {_number(f['sigma'])} m, mass points as measured {_number(f['noise'])} m, spread of normalised "
         f"residuals {_number(f['spread'])}"
     )
     facts["gross errors"] = f["gross"]

@@ -116,6 +116,10 @@ def dtm_build(
         The disk is full, or the points need more memory than there is.
     """
     started = time.perf_counter()
+    if request.output.suffix.lower() != ".gpkg":
+        raise UsageError(f"{request.output}: a terrain model is a GeoPackage; give it a name that ends with .gpkg")
+    if not request.output.resolve().parent.is_dir():
+        raise UsageError(f"{request.output}: no such folder; make it first")
     check_output(request.output, request.inputs, overwrite=request.overwrite)
     _check_report(request)
     measured, findings, crs, system = load(request)
@@ -153,12 +157,16 @@ def describe_plan(plan: BuildPlan, measured: MeasuredTerrain, crs: str, system: 
     """One line on what will be computed."""
     layout = plan.layout
     kinds = Counter(line.kind for line in measured.lines)
-    lines = ", ".join(f"{count} {kind}s" for kind, count in kinds.items()) or "no lines"
+    lines = ", ".join(_many(count, kind) for kind, count in kinds.items()) or "no lines"
     return (
         f"{measured.count} points, {lines} · spacing {plan.seen.spacing:.3g} m · grid {plan.width:g} m, "
         f"{layout.columns} × {layout.rows} units of {layout.side:g} m · gaps over {2 * plan.reach:.3g} m stay open · "
         f"{crs_label(crs)}, heights {height_label(system)}"
     )
+
+
+def _many(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def _height_system(measured: MeasuredTerrain, declared: str | None) -> str | None:
@@ -203,7 +211,9 @@ def _gross(built: Built, measured: MeasuredTerrain) -> list[GrossError]:
         place = int(seen.record[k])
         X, Y, Z = group.xyz[place].tolist()
         residual, redundancy, normalised = residuals[k].tolist()
-        found.append(GrossError(group.label(place), group.kind, (X, Y, Z), residual, redundancy, normalised))
+        # The filtered surface still leans towards the point: without it, it would lie this far away.
+        away = residual / redundancy
+        found.append(GrossError(group.label(place), group.kind, (X, Y, Z), away, redundancy, normalised))
     return sorted(found, key=lambda g: -abs(g.normalised))
 
 
@@ -223,7 +233,7 @@ def _totals(built: Built, measured: MeasuredTerrain, findings: Sequence[Finding]
         "variance": whole.variance,
         "length": whole.length,
         "noise": whole.noise,
-        "sigma": float(np.sqrt(np.mean([f.sigma**2 for f in there]))) if there else None,
+        "sigma": float(np.sqrt(np.nanmean([f.sigma**2 for f in there]))) if there else None,
         "spread": float(z.std()) if len(z) else None,
         "gross": gross,
         "findings": len(findings),

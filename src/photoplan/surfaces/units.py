@@ -118,7 +118,7 @@ class UnitFigures:
     length: float
     """Distance at which the covariance function has fallen to half, metres."""
     noise: float
-    """Standard deviation of mass points after filtering, metres: their filter value, given or estimated."""
+    """Standard deviation of measurement of mass points, metres: their filter value, given or estimated."""
     sigma: float
     """Root mean square of the posts' standard deviations, metres."""
     spread: float

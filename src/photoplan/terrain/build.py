@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -79,6 +81,9 @@ def plan_build(measured: MeasuredTerrain, settings: BuildSettings) -> BuildPlan:
     """
     seen = observe(measured, settings)
     width = settings.grid_width or _nice(_WIDTH * seen.spacing)
+    if any(np.isnan(line.xyz[:, 2]).any() for line in measured.lines):
+        measured = _with_dense_borders(measured, width)
+        seen = observe(measured, settings)
     side = width * settings.unit_meshes
     xy = np.vstack([seen.xyz[: seen.points, :2], seen.lines.xyz[:, :2]]) + seen.origin[:2]
     low, high = np.floor(xy.min(axis=0) / side), np.ceil((xy.max(axis=0) + 1e-6 * side) / side)
@@ -91,6 +96,33 @@ def plan_build(measured: MeasuredTerrain, settings: BuildSettings) -> BuildPlan:
     layout = UnitLayout(float(low[0] * side), float(high[1] * side), side, columns, rows)
     reach = settings.reach or _REACH * seen.spacing
     return BuildPlan(seen, layout, width, reach, domain_of(measured), settings)
+
+
+def _with_dense_borders(measured: MeasuredTerrain, width: float) -> MeasuredTerrain:
+    """Borders without heights with vertices at most a mesh apart: their heights are predicted there, not in between.
+
+    Where a border runs along another line it keeps that line's vertices.
+    """
+    sides: Counter[tuple[tuple[float, float], tuple[float, float]]] = Counter()
+    for line in measured.lines:
+        ends = [tuple(v) for v in line.xyz[:, :2].tolist()]
+        sides.update((min(a, b), max(a, b)) for a, b in itertools.pairwise(ends))
+    lines = []
+    for line in measured.lines:
+        if np.isfinite(line.xyz[:, 2]).all():
+            lines.append(line)
+            continue
+        rows = [line.xyz[:1]]
+        for a, b in itertools.pairwise(line.xyz):
+            side = tuple(a[:2].tolist()), tuple(b[:2].tolist())
+            length = float(np.hypot(*(b - a)[:2]))
+            count = 1 if sides[min(side), max(side)] > 1 else max(1, int(np.ceil(length / width)))
+            t = np.arange(1, count)[:, None] / count
+            between = a + (b - a) * t
+            between[:, 2] = np.nan
+            rows += [between, b[None]]
+        lines.append(replace(line, xyz=np.vstack(rows)))
+    return replace(measured, lines=tuple(lines))
 
 
 def _nice(width: float) -> float:
@@ -140,7 +172,9 @@ def _thinned(plan: BuildPlan, unit: Unit | None) -> Unit | None:
     tolerance = plan.settings.adapt
     if tolerance is None:
         tolerance = _ADAPT * float(np.nanmean(unit.sigmas))
-    return thin(unit, tolerance)
+    thinned = thin(unit, tolerance)
+    # A unit of single posts, without a whole mesh, has nothing that a wider grid could keep.
+    return thinned if np.isfinite(thinned.heights).any() else unit
 
 
 def _with_faces(
