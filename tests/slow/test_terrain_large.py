@@ -36,7 +36,7 @@ def test_a_million_points_need_at_most_2_gb(tmp_path: Path) -> None:
     assert facts["points"] > 0.99 * COUNT and facts["gross"] < 0.005 * COUNT
     assert peak <= 2 * 10**9
     places = rng.uniform(10, SIDE - 10, (50_000, 2))
-    error = HybridSurface(ModelReader(out)).heights(places + (EAST, NORTH)) - hills(*places.T)
+    error = HybridSurface(ModelReader(out)).heights(places + np.array([EAST, NORTH])) - hills(*places.T)
     assert np.isfinite(error).all() and np.sqrt(np.mean(error**2)) < 0.6 * NOISE
 
 
