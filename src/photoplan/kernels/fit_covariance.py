@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.collocation import correlation, factorise, solve_transposed
 from photoplan.kernels.jit import kernel
-from photoplan.kernels.patch_system import WORST, left_out
+from photoplan.kernels.patch_system import left_out, misfit
 
 __all__ = ["block_score", "minimise"]
 
@@ -68,7 +68,7 @@ def block_score(
     for j in range(scored):
         if not weight[j] > 0.0:
             return np.inf
-        total += min(alpha[j] ** 2 / weight[j], WORST) - np.log(weight[j])
+        total += misfit(alpha[j], weight[j])
     return total
 
 

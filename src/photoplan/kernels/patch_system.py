@@ -11,10 +11,11 @@ from photoplan.kernels.collocation import correlation, factorise, solve_transpos
 from photoplan.kernels.jit import inner, kernel
 from photoplan.kernels.sides import clip_lines, sides_of
 
-__all__ = ["WORST", "left_out", "system", "trend", "usable"]
+__all__ = ["left_out", "misfit", "system", "trend", "usable"]
 
-#: Squared normalised residuals count up to this in scores: no covariance function is to bend towards a blunder.
-WORST = 12.0
+# Squared normalised differences count with their logarithm beyond this: no covariance function is to bend towards a
+# blunder.
+_KNEE = 16.0
 _JITTER = 1e-8
 # A prior for the slope of the trend so weak that it only matters where all data lie on one line.
 _SLOPE_WEIGHT = 1e-4
@@ -142,3 +143,16 @@ def left_out(b: NDArray[Any], w: NDArray[Any]) -> tuple[NDArray[Any], NDArray[An
             for q in range(3):
                 weight[j] -= cross[p, j] * inverse[p, q] * cross[q, j]
     return weight, alpha
+
+
+@inner
+def misfit(alpha: float, weight: float) -> float:
+    """Twice the negative logarithm of the density of a datum, predicted from the others; see `left_out`.
+
+    The difference from the prediction is alpha / weight, its variance 1 / weight. The density is normal up to four
+    standard deviations; beyond, its logarithm falls slowly only.
+    """
+    square = alpha * alpha / weight
+    if square > _KNEE:
+        square = _KNEE * (1.0 + np.log(square / _KNEE))
+    return square - np.log(weight)

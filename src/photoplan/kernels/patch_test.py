@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.collocation import solve_transposed
 from photoplan.kernels.jit import kernel
-from photoplan.kernels.patch_system import WORST, left_out, system, usable
+from photoplan.kernels.patch_system import left_out, misfit, system, usable
 
 __all__ = ["score_models", "test_points"]
 
@@ -31,7 +31,7 @@ def score_models(
 ) -> None:
     """How badly each model predicts every point of a patch from all others, result[patch, model].
 
-    The score is the sum of e²/v + log v over the points (numbers below `points`), e being the difference from the
+    The score is the sum of misfits over the points (numbers below `points`), e being the difference from the
     prediction and v its variance: twice the negative logarithm of the predictive density.
     """
     for patch in range(len(leaves)):
@@ -56,7 +56,7 @@ def score_models(
                 if weight[j] > 0.0:
                     dx, dy = xyz[data[j], 0] - leaves[patch, 0], xyz[data[j], 1] - leaves[patch, 1]
                     share = np.exp(-0.5 * (dx * dx + dy * dy) / (_FOCUS * leaves[patch, 2]) ** 2)
-                    total += share * (min(alpha[j] ** 2 / weight[j], WORST) - np.log(weight[j]))
+                    total += share * misfit(alpha[j], weight[j])
             result[patch, k] = total
 
 

@@ -124,7 +124,7 @@ def fit(
         members=tuple(members),
     )
     each(lambda u: _choose(found, u), range(count), workers, progress)
-    each(lambda u: _test(found, leaves.of_unit(u), False, found.residuals), range(count), workers, progress)
+    each(lambda u: _test(found, leaves.of_unit(u)), range(count), workers, progress)
     if settings.gross > 0:
         _flag(found, settings.gross, workers)
     return replace(found, spread=_spread(found))
@@ -168,8 +168,8 @@ def _choose(found: Fit, unit: int) -> None:
     found.shares[some] = weight / weight.sum(axis=1, keepdims=True)
 
 
-def _test(found: Fit, some: NDArray[np.int64], rough: bool, residuals: NDArray[np.float64]) -> None:
-    """Residuals of the points in some leaves, by the best function of each patch or by the roughest of the ladder."""
+def _test(found: Fit, some: NDArray[np.int64]) -> None:
+    """Residuals of the points in some leaves, by the best function of each patch."""
     if not len(some):
         return
     leaves, points = found.leaves, found.seen.points
@@ -178,8 +178,7 @@ def _test(found: Fit, some: NDArray[np.int64], rough: bool, residuals: NDArray[n
     start = np.concatenate([[0], np.cumsum([len(numbers) for numbers in own])])
     if not start[-1]:
         return
-    chosen = len(LADDER) - 1 if rough else found.shares[some].argmax(axis=1)
-    models = found.models(some)[np.arange(len(some)), chosen]
+    models = found.models(some)[np.arange(len(some)), found.shares[some].argmax(axis=1)]
     ids = found.neighbours.query(leaves.middle[some])
     patches = patches_at(leaves, some)
     test_points(
@@ -191,7 +190,7 @@ def _test(found: Fit, some: NDArray[np.int64], rough: bool, residuals: NDArray[n
         start,
         *lines_of(found, patches, ids),
         models,
-        residuals,
+        found.residuals,
     )
 
 
@@ -199,11 +198,9 @@ def _flag(found: Fit, limit: float, workers: int) -> None:
     """Flag the worst point of each neighbourhood, test the neighbourhood again, until none is left (data snooping).
 
     A point that fits no smooth surface may still show what the terrain is like: a ditch or a stone that no line
-    describes. It is an error only if it contradicts its neighbours on the roughest terrain that is considered, too,
-    and if no neighbour deviates as it does.
+    describes. It is an error only if no neighbour deviates as it does.
     """
     points = found.seen.points
-    confirmed = np.full((points, 3), np.nan)
     cleared = np.zeros(points, bool)
     for _ in range(_ROUNDS):
         used = (found.noise[:points] >= 0) & ~cleared
@@ -211,18 +208,20 @@ def _flag(found: Fit, limit: float, workers: int) -> None:
         suspect = np.flatnonzero(used & wild)
         if not len(suspect):
             return
-        _test_again(found, _leaf_of(found)[suspect], True, confirmed, workers)
-        fine = ~(np.abs(confirmed[suspect, 2]) > limit) | _supported(found, suspect)
-        cleared[suspect[fine]] = True
-        suspect = suspect[~fine]
+        supported = _supported(found, suspect)
+        cleared[suspect[supported]] = True
+        suspect = suspect[~supported]
         if not len(suspect):
             return
         near = found.neighbours.near[0].query(found.seen.xyz[suspect, :2])
         size = np.where(found.noise[:points] >= 0, np.abs(found.residuals[:, 2]), 0.0)
         flagged = suspect[size[suspect] >= np.nan_to_num(size[near]).max(axis=1)]
+        if not len(flagged):
+            return
         found.noise[flagged] = -1.0
         touched = np.unique(found.neighbours.near[0].query(found.seen.xyz[flagged, :2]))
-        _test_again(found, _leaf_of(found)[touched], False, found.residuals, workers)
+        leaves = np.unique(_leaf_of(found)[touched])
+        _test_again(found, leaves, workers)
 
 
 def _supported(found: Fit, suspect: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -235,12 +234,9 @@ def _supported(found: Fit, suspect: NDArray[np.int64]) -> NDArray[np.bool_]:
     return supported
 
 
-def _test_again(
-    found: Fit, leaves: NDArray[np.int64], rough: bool, residuals: NDArray[np.float64], workers: int
-) -> None:
-    leaves = np.unique(leaves)
+def _test_again(found: Fit, leaves: NDArray[np.int64], workers: int) -> None:
     unit = found.leaves.unit[leaves]
-    each(lambda u: _test(found, leaves[unit == u], rough, residuals), np.unique(unit).tolist(), workers)
+    each(lambda u: _test(found, leaves[unit == u]), np.unique(unit).tolist(), workers)
 
 
 def _leaf_of(found: Fit) -> NDArray[np.int64]:
