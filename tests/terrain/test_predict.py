@@ -37,14 +37,7 @@ class TestPlane:
             "even",
             "dense and thin",
             "profiles",
-            pytest.param(
-                "with lines",
-                marks=pytest.mark.xfail(
-                    strict=True,
-                    reason="copies beside a breakline keep its height: slope × 1e-3 spacings, 5e-4 m; _BESIDE = 1e-6 "
-                    "gives 5e-7 m",
-                ),
-            ),
+            "with lines",
         ]
     )
     def model(self, request: pytest.FixtureRequest) -> Built:

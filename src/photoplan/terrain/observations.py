@@ -18,7 +18,7 @@ __all__ = ["Lines", "Observations", "observe", "spacing_of"]
 #: Points at which the spacing is measured.
 _SAMPLE = 20_000
 #: Copies of a breakline's points lie this part of the spacing beside it, one on each side.
-_BESIDE = 1e-3
+_BESIDE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
