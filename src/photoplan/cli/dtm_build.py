@@ -80,7 +80,7 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
         def steps(name: str, parts: int) -> Any:
             stack.close()
             talk(f"  {name} …")
-            bar = stack.enter_context(progress(parts, quiet))
+            bar = stack.enter_context(progress(parts, quiet, "units"))
             return lambda done: bar(done, 0)
 
         built = dtm_build(request, steps, talk)

@@ -20,8 +20,8 @@ class Report(Protocol):
 
 
 @contextmanager
-def progress(total: int, quiet: bool) -> Iterator[Report]:
-    """A bar with tiles, rate and time left; nothing where stderr is no terminal or `quiet`."""
+def progress(total: int, quiet: bool, parts: str = "tiles") -> Iterator[Report]:
+    """A bar with parts, their rate if they have pixels, and time left; nothing without a terminal or if `quiet`."""
     if quiet or not sys.stderr.isatty():
         yield lambda tiles, pixels: None
         return
@@ -30,14 +30,14 @@ def progress(total: int, quiet: bool) -> Iterator[Report]:
 
     started = time.perf_counter()
     done = 0
-    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("tiles  {task.fields[rate]}"), TimeRemainingColumn())
+    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=total, rate="")
+        task = bar.add_task("", total=total, rate=parts)
 
         def report(tiles: int, pixels: int, /) -> None:
             nonlocal done
             done += pixels
             rate = done / 1e6 / max(time.perf_counter() - started, 1e-6)
-            bar.update(task, advance=tiles, rate=f"{rate:.0f} Mpx/s")
+            bar.update(task, advance=tiles, rate=f"{parts}  {rate:.0f} Mpx/s" if done else parts)
 
         yield report

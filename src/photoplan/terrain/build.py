@@ -172,9 +172,10 @@ def _thinned(plan: BuildPlan, unit: Unit | None) -> Unit | None:
     tolerance = plan.settings.adapt
     if tolerance is None:
         tolerance = _ADAPT * float(np.nanmean(unit.sigmas))
-    thinned = thin(unit, tolerance)
-    # A unit of single posts, without a whole mesh, has nothing that a wider grid could keep.
-    return thinned if np.isfinite(thinned.heights).any() else unit
+    valid = np.isfinite(unit.heights)
+    whole = valid[1:, 1:] & valid[1:, :-1] & valid[:-1, 1:] & valid[:-1, :-1]
+    # Single posts at the edge of the data, without a whole mesh, leave nothing that a wider grid could keep.
+    return thin(unit, tolerance) if whole.any() else unit
 
 
 def _with_faces(
