@@ -60,7 +60,7 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     from contextlib import ExitStack
 
     from photoplan.cli.progress import progress
-    from photoplan.products.dtm_build import describe_plan, dtm_build, load
+    from photoplan.products.dtm_build import describe_plan, dtm_build, load, plan_facts
     from photoplan.terrain.build import plan_build
 
     request = _request(options)
@@ -71,7 +71,11 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
 
     if dry_run:
         measured, findings, crs, system = load(request)
-        click.echo(describe_plan(plan_build(measured, request.settings), measured, crs, system))
+        plan = plan_build(measured, request.settings)
+        if as_json:
+            click.echo(json.dumps(plan_facts(plan, measured, findings, crs, system), indent=2, ensure_ascii=False))
+            return
+        click.echo(describe_plan(plan, measured, crs, system))
         for finding in findings:
             click.echo(f"  {finding.kind}: {finding.text}")
         return

@@ -30,7 +30,7 @@ from photoplan.terrain.build import BuildPlan, Built, Steps, build, plan_build
 from photoplan.terrain.clean import Finding, clean
 from photoplan.terrain.settings import BuildSettings
 
-__all__ = ["BuildReport", "BuildRequest", "describe_plan", "dtm_build", "load"]
+__all__ = ["BuildReport", "BuildRequest", "describe_plan", "dtm_build", "load", "plan_facts"]
 
 #: Bytes that a build needs for each point, measured; more than the machine has is refused before any work.
 _BYTES_PER_POINT = 700
@@ -163,6 +163,25 @@ def describe_plan(plan: BuildPlan, measured: MeasuredTerrain, crs: str, system: 
         f"{layout.columns} × {layout.rows} units of {layout.side:g} m · gaps over {2 * plan.reach:.3g} m stay open · "
         f"{crs_label(crs)}, heights {height_label(system)}"
     )
+
+
+def plan_facts(
+    plan: BuildPlan, measured: MeasuredTerrain, findings: Sequence[Finding], crs: str, system: str | None
+) -> dict[str, Any]:
+    """What will be computed, as plain values for `--json`."""
+    return {
+        "points": measured.count,
+        "lines": dict(Counter(line.kind for line in measured.lines)),
+        "spacing": round(plan.seen.spacing, 4),
+        "grid_width": plan.width,
+        "units": [plan.layout.columns, plan.layout.rows],
+        "unit_side": plan.layout.side,
+        "bounds": list(plan.layout.bounds),
+        "widest_gap": 2 * plan.reach,
+        "crs": crs_label(crs),
+        "height_system": system,
+        "findings": [{"kind": f.kind, "text": f.text, "X": f.X, "Y": f.Y} for f in findings],
+    }
 
 
 def _many(count: int, what: str) -> str:

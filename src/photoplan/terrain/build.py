@@ -128,7 +128,7 @@ def _with_dense_borders(measured: MeasuredTerrain, width: float) -> MeasuredTerr
 def _nice(width: float) -> float:
     """The largest round number that is not larger."""
     power = 10.0 ** np.floor(np.log10(width))
-    return float(max(f * power for f in _ROUND if f * power <= width))
+    return round(float(max(f * power for f in _ROUND if f * power <= width)), 12)
 
 
 def build(plan: BuildPlan, workers: int = 1, steps: Steps | None = None) -> Built:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from photoplan.kernels.patch import predict
 from photoplan.surfaces.units import LineElement, Unit
@@ -42,7 +43,17 @@ def heights_at(
         )
     with np.errstate(invalid="ignore", divide="ignore"):
         heights, sigmas = sums[:, 0] / sums[:, 1], sums[:, 2] / sums[:, 1]
-    return heights, sigmas * fit.spread[unit], sums[:, 3]
+    return heights, sigmas * _spread_at(fit, xy), sums[:, 3]
+
+
+def _spread_at(fit: Fit, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Factor of standard deviations at places, linear between the middles of units: else they would step at borders."""
+    layout = fit.layout
+    spread = fit.spread.reshape(layout.rows, layout.columns)
+    column = (xy[:, 0] - layout.left) / layout.side - 0.5
+    row = (layout.top - xy[:, 1]) / layout.side - 0.5
+    factor: NDArray[np.float64] = map_coordinates(spread, [row, column], order=1, mode="nearest")
+    return factor
 
 
 def _leaves_near(fit: Fit, unit: int, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.int64]:
