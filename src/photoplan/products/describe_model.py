@@ -42,7 +42,7 @@ def describe_model(reader: ModelReader) -> dict[str, Any]:
     if f["inputs"]:
         facts["inputs"] = [str(item.get("file", item)) for item in f["inputs"]]
     if f["settings"]:
-        facts["settings"] = [f"{key} = {"auto" if value is None else value}" for key, value in f["settings"].items()]
+        facts["settings"] = [f"{key} = {'auto' if value is None else value}" for key, value in f["settings"].items()]
     facts["layers"] = ", ".join(f["layers"])
     return facts
 
