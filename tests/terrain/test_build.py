@@ -202,7 +202,9 @@ class TestWall:
         wall = along(30.0, lambda XY: np.full(len(XY), 100.0), y=EVERY[::-1], right=np.full(61, 100.0 + self.HIGH))
         turned = built(terrain(with_heights(GROUND, height, NOISE), wall))
         away = INNER[np.abs(INNER[:, 0] - 30) > 0.01]
-        np.testing.assert_allclose(directly(turned, away)[0], directly(model, away)[0], atol=0.5 * NOISE)
+        # Not to the bit: which of two equally near line points enter a block or a patch depends on their order.
+        change = directly(turned, away)[0] - directly(model, away)[0]
+        assert np.sqrt(np.mean(change**2)) < 0.2 * NOISE and np.abs(change).max() < NOISE
 
 
 def test_a_form_line_bends_smoothly_and_is_met() -> None:

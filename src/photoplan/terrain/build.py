@@ -47,7 +47,7 @@ class BuildPlan:
     layout: UnitLayout
     """Units, in the CRS of the measurements."""
     width: float
-    """Finest grid width, metres."""
+    """Grid width, metres; half of it in units that breaklines pass, unless a width was asked for."""
     reach: float
     """Gaps wider than twice this stay open, metres."""
     polygon: Any | None
@@ -141,8 +141,9 @@ def build(plan: BuildPlan, workers: int = 1, steps: Steps | None = None) -> Buil
     lines = predict_lines(found, workers)
     domain = _domain(plan)
     report = steps("heights", count)
+    meshes_of = settings.unit_meshes * _finer(plan, lines).ravel()
     posts = each(
-        lambda u: _thinned(plan, predict_unit(found, u, domain, settings.unit_meshes, plan.reach)),
+        lambda u: _thinned(plan, predict_unit(found, u, domain, int(meshes_of[u]), plan.reach)),
         range(count),
         workers,
         report,
@@ -163,6 +164,17 @@ def _domain(plan: BuildPlan) -> Domain:
     if polygon is not None:
         polygon = shapely.transform(polygon, lambda xy: xy - seen.origin[:2])
     return Domain.of(data, seen.spacing, plan.reach, polygon)
+
+
+def _finer(plan: BuildPlan, lines: list[LineElement]) -> NDArray[np.int64]:
+    """Factor of the meshes along each unit's side, shape (rows, columns): 2 where breaklines pass, if no width is asked for.
+
+    Beside a breakline the surface bends more than elsewhere.
+    """
+    if plan.settings.grid_width is not None:
+        return np.ones((plan.layout.rows, plan.layout.columns), np.int64)
+    passing = _passing(plan.layout, [line for line in lines if line.kind == "breakline"])
+    return np.where(passing > 0, 2, 1)
 
 
 def _thinned(plan: BuildPlan, unit: Unit | None) -> Unit | None:

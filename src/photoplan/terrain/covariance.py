@@ -25,7 +25,7 @@ LADDER = ((1.0, 1.0), (1.0, 0.5), (1.0, 0.25), (1.0, 0.125), (2.0, 0.125))
 #: Data of a block, blocks of a unit, and units from which the whole area's function is estimated.
 _BLOCK, _BLOCKS, _UNITS = 72, 3, 48
 #: A family of rougher surfaces is taken only if it lowers the score of a block by this much.
-_CLEARLY = 0.5
+_CLEARLY = 0.75
 #: A wide block takes every so-manieth of so many times as many points: it sees further.
 _WIDE = 4
 #: How far a unit's parameters are expected from those of the whole area: standard deviations of their logarithms.

@@ -17,7 +17,7 @@ FAMILIES: tuple[Family, ...] = get_args(Family)
 """Families of covariance functions; the place of each is its number in the kernels."""
 
 #: Filter values of classes that are not given, as parts of that of mass points: lines and spots are measured with care.
-SHARE = {"mass": 1.0, "spot": 0.4, "breakline": 0.4, "formline": 0.4, "border": 0.4, "hole": 0.4}
+SHARE = {"mass": 1.0, "spot": 0.25, "breakline": 0.25, "formline": 0.25, "border": 0.25, "hole": 0.25}
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class BuildSettings:
     """All that decides a model beside its data."""
 
     grid_width: float | None = None
-    """Finest side of a mesh, metres; None: from the density of the points."""
+    """Finest side of a mesh, metres; None: from the density of the points, and half of that beside breaklines."""
     unit_meshes: int = 64
     """Meshes of the finest width along the side of a computing unit; a power of two."""
     adapt: float | None = None
