@@ -167,7 +167,7 @@ def _domain(plan: BuildPlan) -> Domain:
 
 
 def _finer(plan: BuildPlan, lines: list[LineElement]) -> NDArray[np.int64]:
-    """Factor of the meshes along each unit's side, shape (rows, columns): 2 where breaklines pass, if no width is asked for.
+    """Factor of the meshes along units' sides (rows, columns): 2 where breaklines pass and no width is asked for.
 
     Beside a breakline the surface bends more than elsewhere.
     """
