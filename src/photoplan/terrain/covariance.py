@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.kernels.fit_covariance import minimise
+from photoplan.kernels.fit_covariance import block_score, minimise
 from photoplan.kernels.sides import sides_of
 from photoplan.terrain.neighbours import Neighbours
 from photoplan.terrain.observations import Observations
@@ -24,8 +24,9 @@ GAPS = (2.0, 2.0, 2.5)
 LADDER = ((1.0, 1.0), (1.0, 0.5), (1.0, 0.25), (1.0, 0.125), (2.0, 0.125))
 #: Data of a block, blocks of a unit, and units from which the whole area's function is estimated.
 _BLOCK, _BLOCKS, _UNITS = 72, 3, 48
-#: A family of rougher surfaces is taken only if it lowers the score of a block by this much.
-_CLEARLY = 0.75
+#: A family of rougher surfaces is taken if it lowers the mean score of a block by this much, or by less if it lowers
+#: that of most blocks.
+_MUCH, _CLEARLY, _MOST = 1.5, 0.8, 0.55
 #: A wide block takes every so-manieth of so many times as many points: it sees further.
 _WIDE = 4
 #: How far a unit's parameters are expected from those of the whole area: standard deviations of their logarithms.
@@ -86,16 +87,22 @@ def estimate_all(
     first, bounds = _start(seen, blocks, settings)
     families = range(len(FAMILIES)) if settings.family == "auto" else [FAMILIES.index(settings.family)]
     prior = np.stack([first, np.zeros(3), *bounds])
-    best: tuple[float, Covariance] | None = None
+    best: tuple[NDArray[np.float64], Covariance] | None = None
     for family in families:
         scaled = blocks.sides * GAPS[family] ** 2 / 4
-        logs, value = minimise(blocks.d2, scaled, blocks.b, blocks.noise, prior, first, family)
-        logs, value = minimise(blocks.d2, scaled, blocks.b, blocks.noise, prior, logs, family)
-        score = float(value) / len(blocks.b)
-        if best is None or score < best[0] - _CLEARLY:
-            best = score, _covariance(family, logs)
+        logs, _ = minimise(blocks.d2, scaled, blocks.b, blocks.noise, prior, first, family)
+        logs, _ = minimise(blocks.d2, scaled, blocks.b, blocks.noise, prior, logs, family)
+        each = zip(blocks.d2, scaled, blocks.b, blocks.noise)
+        scores = np.array([block_score(*block, np.exp(logs), family) for block in each])
+        if best is None or _clearly_better(best[0] - scores):
+            best = scores, _covariance(family, logs)
     assert best is not None
     return best[1]
+
+
+def _clearly_better(gain: NDArray[np.float64]) -> bool:
+    """Whether blocks gain much by a rougher family, or most of them clearly: a few ditches are no reason."""
+    return bool(gain.mean() > _MUCH or (gain.mean() > _CLEARLY and (gain > 0).mean() > _MOST))
 
 
 def estimate_unit(
