@@ -89,7 +89,7 @@ def command(
         "images": [i.name for i in result.project.images],
         "crs": result.project.crs,
         "height_systems": {
-            "terrain": result.project.terrain.height_system,
+            "terrain": result.project.terrain and result.project.terrain.height_system,
             "orientation": result.project.orientation.height_system,
         },
         "without_orientation": list(result.without_orientation),

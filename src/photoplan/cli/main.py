@@ -18,6 +18,13 @@ __all__ = ["main", "run"]
 #: Verb and its one-line help, in the order of a job; the command is `photoplan.cli.<verb>:command`.
 VERBS = {
     "init": "Write a project file from the files you have.",
+    "convert": "Orientations from one file format to another.",
+    "fiducials": "Find the fiducial marks of film scans.",
+    "interior": "Interior orientation of film scans from their marks.",
+    "tie": "Find tie points between images.",
+    "control": "Propose control points from an orthophoto and heights.",
+    "resect": "Orient single images by control points.",
+    "adjust": "Adjust a block of images (bundle adjustment).",
     "check": "Validate a project and print what to expect of it.",
     "ortho": "Make orthophotos.",
     "run": "Execute a plan written by `ortho --plan`.",
@@ -38,7 +45,8 @@ VERBS = {
 def photoplan() -> None:
     """Photographs with known geometry become measurable pictures.
 
-    A job goes: init → check → ortho. Results are printed on stdout, talk and progress on stderr.
+    A job goes: init → (fiducials → tie → adjust) → check → ortho. Results are printed on stdout, talk and progress
+    on stderr.
     Exit codes: 0 done, 1 failed, 2 wrong use, 3 bad input, 4 finished with failed tiles, 5 out of disk or memory,
     130 interrupted.
     """

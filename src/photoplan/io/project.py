@@ -50,7 +50,8 @@ def parse_project(data: dict[str, Any], folder: Path, source: str, text: str = "
     except ValidationError as error:
         raise InputError(explain(error, data, source, text)) from None
     require_projected_metres(project.crs, f"{source}: crs")
-    for table, name in (("terrain", project.terrain.height_system), ("orientation", project.orientation.height_system)):
+    terrain = None if project.terrain is None else project.terrain.height_system
+    for table, name in (("terrain", terrain), ("orientation", project.orientation.height_system)):
         if name is not None:
             check_height_system(name, f"{source}: [{table}] height_system")
     return project

@@ -42,9 +42,13 @@ def fiducial_fit(camera: described.FilmCamera, image: Image) -> FiducialFit:
     GeometryError
         The marks lie on a line.
     """
+    if not image.fiducials:
+        raise InputError(
+            f"image {image.name!r}: the fiducial marks of its scan are not measured; `photoplan fiducials` finds them"
+        )
     fit = {"affine": fit_affine, "bilinear": fit_bilinear}[camera.interior]
     try:
-        return fit(camera.fiducials_mm, image.fiducials or {}, mirrored=camera.mirrored)
+        return fit(camera.fiducials_mm, image.fiducials, mirrored=camera.mirrored)
     except InputError as error:
         raise type(error)(f"image {image.name!r}: {error}") from None
 

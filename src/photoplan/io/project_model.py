@@ -25,12 +25,23 @@ from photoplan.io.camera_model import (
 )
 from photoplan.io.names import check_input_name, resolve_input, unique_stems
 
-__all__ = ["ANGLE_UNITS", "Image", "Orientation", "OrthoDefaults", "Project", "Terrain"]
+__all__ = [
+    "ANGLE_UNITS",
+    "Adjustment",
+    "Image",
+    "Observations",
+    "Orientation",
+    "OrthoDefaults",
+    "Parameter",
+    "Project",
+    "Terrain",
+]
 
 #: Angle units and the size of one unit in radians' common measure, a full circle.
 ANGLE_UNITS = {"deg": 360.0, "gon": 400.0, "rad": 6.283185307179586}
 
 InputName = Annotated[str, Field(max_length=4000)]
+NotNegative = Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)]
 
 
 class Image(Entry):
@@ -40,10 +51,15 @@ class Image(Entry):
     """Products are called after it."""
     file: InputName
     camera: Name
-    center: Triple
-    """Projection centre X0, Y0, Z0 in the project's CRS and the orientation's height system, metres."""
-    angles: Triple
+    center: Triple | None = None
+    """Projection centre X0, Y0, Z0 in the project's CRS and the orientation's height system, metres; None: the image
+    is not oriented yet."""
+    angles: Triple | None = None
     """Three angles in the sequence and unit that [orientation] states."""
+    sigma_center: tuple[NotNegative, NotNegative, NotNegative] | None = None
+    """Standard deviations of the projection centre, metres, as `photoplan adjust` and `resect` found them."""
+    sigma_angles: tuple[NotNegative, NotNegative, NotNegative] | None = None
+    """Standard deviations of the angles, in their unit."""
     fiducials: Fiducials | None = None
     """Measured fiducial marks of a film scan: name = [column, row], pixels."""
     size: tuple[Pixels, Pixels] | None = None
@@ -53,6 +69,27 @@ class Image(Entry):
     @classmethod
     def _file(cls, text: str) -> str:
         return _plain_file(text)
+
+    @model_validator(mode="after")
+    def _both(self) -> Self:
+        if (self.center is None) != (self.angles is None):
+            raise ValueError("center and angles go together: give both, or none for an image that is not oriented")
+        return self
+
+    @property
+    def pose_numbers(self) -> tuple[Triple, Triple]:
+        """Projection centre and angles as stated.
+
+        Raises
+        ------
+        InputError
+            The image is not oriented.
+        """
+        if self.center is None or self.angles is None:
+            raise InputError(
+                f"image {self.name!r} has no orientation; `photoplan resect` or `photoplan adjust` determines it"
+            )
+        return self.center, self.angles
 
 
 class Terrain(Entry):
@@ -86,6 +123,53 @@ class Orientation(Entry):
     refraction: Annotated[bool, Strict()] = False
 
 
+class Observations(Entry):
+    """Files of measurements that determine orientations, and their accuracy where the files do not state it."""
+
+    image_points: tuple[InputName, ...] = ()
+    """Measured image points: point, image, column, row."""
+    control: tuple[InputName, ...] = ()
+    """Ground points, control and check."""
+    positions: InputName | None = None
+    """Table of observed projection centres, with or without attitudes."""
+    sigma_image: Positive = 0.5
+    """Standard deviation of an image coordinate, pixels."""
+    sigma_control: tuple[NotNegative, NotNegative] | None = None
+    """Standard deviation of control: each horizontal coordinate, height, metres."""
+    sigma_position: tuple[Positive, Positive] | None = None
+    """Standard deviation of observed positions: each horizontal coordinate, height, metres."""
+    sigma_attitude: Positive | None = None
+    """Standard deviation of observed attitudes, in the unit of [orientation]; None: attitudes are not observations."""
+
+    @field_validator("image_points", "control")
+    @classmethod
+    def _files(cls, files: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(_plain_file(text) for text in files)
+
+    @field_validator("positions")
+    @classmethod
+    def _positions(cls, text: str | None) -> str | None:
+        return None if text is None else _plain_file(text)
+
+
+Parameter = Literal["c", "x0", "y0", "k1", "k2", "k3", "p1", "p2", "b1", "b2"]
+
+
+class Adjustment(Entry):
+    """What `photoplan adjust` estimates besides orientations and points; options of the command override it."""
+
+    calibrate: dict[Name, tuple[Parameter, ...]] = Field(default_factory=dict)
+    """Parameters of each camera that are unknowns."""
+    lever_arm: Triple = (0.0, 0.0, 0.0)
+    """Antenna minus projection centre in camera axes (x right, y up, z towards the viewer), metres."""
+    lever_arm_sigma: NotNegative = 0.0
+    """Its standard deviation, metres; 0: it is held fixed."""
+    drift: Literal["none", "shift", "linear"] = "none"
+    """Drift of observed positions in each strip: none, a shift, or a shift and a change linear in time."""
+    boresight: Annotated[bool, Strict()] = False
+    """Whether three small rotations between the observed attitudes and the camera are unknowns."""
+
+
 class OrthoDefaults(Entry):
     """Defaults of `photoplan ortho`; options of the command override them."""
 
@@ -110,8 +194,10 @@ class Project(Entry):
 
     format: Literal[1] = 1
     crs: Annotated[str, Field(min_length=1, max_length=20_000)]
-    terrain: Terrain
+    terrain: Terrain | None = None
     orientation: Orientation = Orientation()
+    observations: Observations = Observations()
+    adjustment: Adjustment = Adjustment()
     cameras: dict[Name, Camera]
     images: tuple[Image, ...]
     ortho: OrthoDefaults = OrthoDefaults()
@@ -132,11 +218,27 @@ class Project(Entry):
                 known = ", ".join(map(repr, self.cameras)) or "none"
                 raise ValueError(f"{where}: camera {image.camera!r} is not described; cameras are {known}")
             _check_film(image, self.cameras[image.camera], where)
+        unknown = [name for name in self.adjustment.calibrate if name not in self.cameras]
+        if unknown:
+            raise ValueError(f"[adjustment] calibrate: camera {unknown[0]!r} is not described")
         try:
             unique_stems(i.name for i in self.images)
         except InputError as error:
             raise ValueError(str(error)) from None
         return self
+
+    @property
+    def ground(self) -> Terrain:
+        """The [terrain] entry.
+
+        Raises
+        ------
+        InputError
+            The project has none: it was made to determine orientations.
+        """
+        if self.terrain is None:
+            raise InputError("the project states no [terrain]; give file or height there")
+        return self.terrain
 
     def resolve(self, file: str) -> Path:
         """Absolute path of an entry `file`, relative ones from the project's folder."""
@@ -196,13 +298,15 @@ def _plain_file(text: str) -> str:
 
 
 def _check_film(image: Image, camera: FrameCamera | FilmCamera, where: str) -> None:
-    """A film scan needs enough of the camera's marks, and no others; a digital image needs none."""
+    """Marks of a film scan are the camera's, and enough or not yet measured; a digital image has none."""
     if isinstance(camera, FrameCamera):
         if image.fiducials is not None:
             raise ValueError(f'{where}: fiducials are given, but camera {image.camera!r} is digital (type = "frame")')
         return
-    if not image.fiducials:
-        raise ValueError(f"{where}: film camera {image.camera!r} needs the measured fiducials of this scan")
+    if image.size is None and camera.size is None:
+        raise ValueError(f"{where}: size = [width, height] of the scan is stated neither here nor for its camera")
+    if image.fiducials is None:
+        return
     unknown = [n for n in image.fiducials if n not in camera.fiducials_mm]
     if unknown:
         raise ValueError(
@@ -216,5 +320,3 @@ def _check_film(image: Image, camera: FrameCamera | FilmCamera, where: str) -> N
             f"{where}: {len(image.fiducials)} fiducial marks measured, {camera.interior} needs {needed}; "
             f"missing {', '.join(missing)}"
         )
-    if image.size is None and camera.size is None:
-        raise ValueError(f"{where}: size = [width, height] of the scan is stated neither here nor for its camera")

@@ -10,7 +10,15 @@ from typing import Any
 from pydantic import BaseModel
 
 from photoplan.io.camera_model import FilmCamera, FrameCamera
-from photoplan.io.project_model import Image, Orientation, OrthoDefaults, Project, Terrain
+from photoplan.io.project_model import (
+    Adjustment,
+    Image,
+    Observations,
+    Orientation,
+    OrthoDefaults,
+    Project,
+    Terrain,
+)
 
 __all__ = ["project_text", "toml_key", "toml_value"]
 
@@ -47,8 +55,10 @@ def project_text(project: Project) -> str:
         "# Horizontal CRS of everything in this file and of the products: projected, in metres.",
         f"crs = {toml_value(project.crs)}",
         "",
-        *_terrain(project.terrain),
+        *(_terrain(project.terrain) if project.terrain is not None else ["# [terrain] is needed for products.", ""]),
         *_orientation(project.orientation),
+        *_observations(project.observations),
+        *_adjustment(project.adjustment),
         *_ortho(project.ortho),
     ]
     for name, camera in project.cameras.items():
@@ -99,6 +109,46 @@ def _orientation(orientation: Orientation) -> list[str]:
                 ("refraction", orientation.refraction, "correct image points for a standard atmosphere"),
             ]
         ),
+        "",
+    ]
+
+
+def _observations(observations: Observations) -> list[str]:
+    if observations == Observations():
+        return []
+    comments = {
+        "image_points": "measured image points: point, image, column, row",
+        "control": "ground points, control and check",
+        "positions": "table of observed projection centres, with or without attitudes",
+        "sigma_image": "standard deviation of an image coordinate, pixels",
+        "sigma_control": "[horizontal, height], metres, where the file does not state it",
+        "sigma_position": "[horizontal, height], metres",
+        "sigma_attitude": "in the unit of [orientation]; attitudes are observations only with it",
+    }
+    given = observations.model_dump(exclude_none=True)
+    return [
+        "# Measurements from which `photoplan resect` and `photoplan adjust` determine orientations.",
+        "[observations]",
+        *_entries((key, value, comments[key]) for key, value in given.items() if value != ()),
+        "",
+    ]
+
+
+def _adjustment(adjustment: Adjustment) -> list[str]:
+    if adjustment == Adjustment():
+        return []
+    comments = {
+        "calibrate": "parameters of each camera that are unknowns: c, x0, y0, k1 …",
+        "lever_arm": "antenna minus projection centre in camera axes, metres",
+        "lever_arm_sigma": "its standard deviation; 0: held fixed",
+        "drift": '"none", "shift" or "linear" for each strip',
+        "boresight": "whether rotations between observed attitudes and camera are unknowns",
+    }
+    given = adjustment.model_dump(exclude_none=True)
+    return [
+        "# What `photoplan adjust` estimates besides orientations and points.",
+        "[adjustment]",
+        *_entries((key, value, comments[key]) for key, value in given.items()),
         "",
     ]
 

@@ -10,6 +10,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_label
 from photoplan.io.plan_file import read_plan_tables
 from photoplan.io.project import load_project
+from photoplan.io.project_model import Terrain
 from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.terrain_model_read import ModelReader, is_terrain_model
 from photoplan.products.describe_model import describe_model
@@ -44,12 +45,16 @@ def _project(path: Path) -> dict[str, Any]:
     return {
         "project": str(path),
         "crs": crs_label(project.crs),
-        "terrain": project.terrain.file or f"one height, {project.terrain.height} m",
+        "terrain": _terrain(project.terrain),
         "cameras": [f"{name}: {camera.type}, lens {camera.lens.type}" for name, camera in project.cameras.items()],
         "orientation": f"{project.orientation.rotation}, {project.orientation.angle_unit}, "
         f"earth curvature {project.orientation.earth_curvature}",
         "images": [f"{image.name}: {image.file}" for image in project.images],
     }
+
+
+def _terrain(terrain: Terrain | None) -> str:
+    return "none" if terrain is None else terrain.file or f"one height, {terrain.height} m"
 
 
 def _plan(path: Path) -> dict[str, Any]:

@@ -165,7 +165,7 @@ def _mesh_and_sigma(
     """Mesh width of the project's terrain and its standard deviation, if it knows one."""
     if scene.ground.file is None:
         return 1.0, None
-    terrain, _ = open_terrain(scene.ground.file, project.terrain.crs).in_crs(project.crs)
+    terrain, _ = open_terrain(scene.ground.file, project.ground.crs).in_crs(project.crs)
     surface = terrain.surface
     return terrain.resolution, surface.sigmas if isinstance(surface, HybridSurface) else None
 

@@ -358,6 +358,6 @@ def view_of(image: Image, camera: FrameCamera | FilmCamera, orientation: Orienta
     xy = np.concatenate([[middle, middle + half, middle - half], np.column_stack([x, y])])
     t = lens.undistort(interior.tangent_to_pixel.inverse(xy))
     pixel = float(np.linalg.norm(t[1] - t[2]))
-    angles = angle_in_radians(np.array(image.angles), orientation.angle_unit)
+    angles = angle_in_radians(np.array(image.pose_numbers[1]), orientation.angle_unit)
     points = np.delete(t, [1, 2], axis=0)
     return View(image.name, np.asarray(center, float), angles, orientation.rotation, points, pixel)

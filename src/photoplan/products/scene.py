@@ -99,7 +99,7 @@ class Scene:
 def input_files(project: Project) -> list[Path]:
     """All files that a project names; nothing that is written may replace one of them."""
     files = [image.file for image in project.images]
-    files += [] if project.terrain.file is None else [project.terrain.file]
+    files += [] if project.terrain is None or project.terrain.file is None else [project.terrain.file]
     return [project.resolve(file) for file in files]
 
 
@@ -115,8 +115,8 @@ def open_scene(project: Project, name: str) -> Scene:
     image = project.image(name)
     alone = project.model_copy(update={"images": (image,), "cameras": {image.camera: project.cameras[image.camera]}})
     files = [project.resolve(image.file)]
-    if project.terrain.file is not None:
-        files.append(project.resolve(project.terrain.file))
+    if project.ground.file is not None:
+        files.append(project.resolve(project.ground.file))
     digests = tuple((str(path), _digest(str(path), _stamp(path))) for path in files)
     return _open(
         SceneAddress(alone.model_dump_json(exclude={"ortho"}, exclude_none=True), str(project.folder), digests)
@@ -175,10 +175,10 @@ def ground_of(project: Project) -> Ground:
     """
     orientation = project.orientation
     strict = orientation.earth_curvature == "strict"
-    file = project.terrain.file
+    file = project.ground.file
     stamp = (0, 0) if file is None else _stamp(project.resolve(file))
     return _ground(
-        _GroundAddress(project.terrain, orientation.height_system, strict, project.crs, str(project.folder), stamp)
+        _GroundAddress(project.ground, orientation.height_system, strict, project.crs, str(project.folder), stamp)
     )
 
 
@@ -219,8 +219,9 @@ class _Undulation:
 def pose_of(project: Project, image: Image, ground: Ground) -> Pose:
     """Exterior orientation of an image, in the height system that the ground has."""
     orientation = project.orientation
-    angles = angle_in_radians(np.array(image.angles), orientation.angle_unit)
-    center = np.array(image.center, float)
+    stated, turned = image.pose_numbers
+    angles = angle_in_radians(np.array(turned), orientation.angle_unit)
+    center = np.array(stated, float)
     center[2] = height_step(ground.height_systems[1], ground.working_system, project.crs)(center)
     return Pose(center, rotation_from_angles(angles, orientation.rotation))
 

@@ -1,0 +1,1 @@
+"""Matching: features, tie points, patches found again in other images."""

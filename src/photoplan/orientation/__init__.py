@@ -1,0 +1,1 @@
+"""Orientation: fiducial marks, interior orientation, resection, intersection, bundle adjustment."""
