@@ -105,7 +105,7 @@ def test_every_entry_of_the_project_file_is_explained():
     page = (DOCS / "reference" / "project-file.md").read_text("utf-8")
     tables = [schema, *schema["$defs"].values()]
     entries = {name for table in tables for name in table.get("properties", {})}
-    headings = {"terrain", "orientation", "ortho", "cameras", "images"}
+    headings = {"terrain", "orientation", "observations", "adjustment", "ortho", "cameras", "images"}
     missing = {e for e in entries if f"`{e}`" not in page and not (e in headings and f"[{e}" in page)}
     assert not missing - {"type"}
 

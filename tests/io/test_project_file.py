@@ -217,7 +217,8 @@ def test_values_are_frozen_and_the_schema_is_json(tmp_path: Path) -> None:
         project(tmp_path).crs = "EPSG:1"  # type: ignore[misc]
     schema = json.loads(project_schema())
     assert "folder" not in schema["properties"]
-    assert {"crs", "terrain", "orientation", "cameras", "images", "ortho", "format"} == set(schema["properties"])
+    tables = {"terrain", "orientation", "observations", "adjustment", "cameras", "images", "ortho"}
+    assert tables | {"crs", "format"} == set(schema["properties"])
 
 
 def test_json_round_trip_for_workers(tmp_path: Path) -> None:
