@@ -13,11 +13,12 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
+from photoplan.io.orientation_block import OrientationBlock, OrientationFormat, common_losses
 from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.plain_files import read_text
 from photoplan.io.project_model import ANGLE_UNITS
 
-__all__ = ["HEADERS", "read"]
+__all__ = ["FORMAT", "HEADERS", "read"]
 
 #: Header names (in small letters) of every role.
 HEADERS = {
@@ -172,7 +173,9 @@ def _why_no_header(row: _Row, renamed: dict[str, str] | None, path: Path) -> str
     where = f"{path}:{row.line}"
     header = [f.casefold() for f in row.fields]
     if sum(bool(_NUMBER.fullmatch(f)) for f in row.fields) >= 3:
-        return f"{where}: no header; declare the columns, for example --columns name,x,y,z,omega,phi,kappa"
+        return (
+            f"{where}: no header; declare the columns, for example --columns name,x,y,z,omega,phi,kappa, or the format"
+        )
     if "latitude" in header or "longitude" in header:
         return f"{where}: positions are geographic; transform them into a projected CRS in metres beforehand"
     if "roll" in header or "pitch" in header:
@@ -230,3 +233,34 @@ def _sidecar(path: Path) -> tuple[Path | None, str | None, str | None]:
     text = read_text(side, 100_000).strip()
     parse_crs(text, str(side))
     return side, *split_compound(text)
+
+
+def _delimiter_safe(name: str) -> str:
+    """A field of comma-separated text, quoted where it must be."""
+    return '"' + name.replace('"', '""') + '"' if any(c in name for c in ',"') or name != name.strip() else name
+
+
+def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
+    """Comma-separated table with ω, φ, κ in degrees, camera to ground, and its ``.prj`` where a CRS is known."""
+    table = block.table
+    named = any(image.camera for image in table.images)
+    lines = ["name,x,y,z,omega,phi,kappa" + (",camera" if named else "")]
+    for image, angles in zip(table.images, block.angles("opk", "deg")):
+        numbers = [repr(float(v)) for v in (*image.center, *angles)]
+        camera = [_delimiter_safe(image.camera or "")] if named else []
+        lines.append(",".join([_delimiter_safe(image.name), *numbers, *camera]))
+    texts = {path: "\n".join(lines) + "\n"}
+    if table.crs is not None:
+        texts[path.with_suffix(".prj")] = table.crs + "\n"
+    return texts
+
+
+FORMAT = OrientationFormat(
+    name="csv",
+    title="table of text",
+    # Whatever no other format claims is read as a table.
+    sniff=lambda path, head: False,
+    read=lambda path, form: OrientationBlock(read(path, form)),
+    render=render,
+    losses=lambda block: common_losses(block, cameras=False, crs=True),
+)

@@ -1,35 +1,145 @@
-"""Exterior orientations from files of any known format."""
+"""The registry of file formats for orientations: reading and writing files of any of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
-from photoplan.io import orientation_csv, orientation_opensfm, orientation_toml
+from photoplan.errors import InputError, UsageError
+from photoplan.io.disk import disk_error, write_atomically
+from photoplan.io.orientation_block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation_table import OrientationTable, TableFormat
 
-__all__ = ["ORIENTATION_FORMATS", "read_orientation"]
+__all__ = [
+    "FORMATS",
+    "choose_format",
+    "orientation_format",
+    "read_orientation",
+    "read_orientation_block",
+    "write_orientation",
+]
 
-#: Reader of every format, by file suffix; any other suffix is read as a table of text.
-ORIENTATION_FORMATS: dict[str, Callable[[Path, TableFormat], OrientationTable]] = {
-    ".toml": orientation_toml.read,
-    ".json": orientation_opensfm.read,
+#: Module of every format, by name; each defines `FORMAT` (see `photoplan.io.orientation_block`).
+FORMATS: dict[str, str] = {
+    "csv": "photoplan.io.orientation_csv",
+    "toml": "photoplan.io.orientation_toml",
+    "opensfm": "photoplan.io.orientation_opensfm",
 }
 
+#: Formats whose reader says what is wrong with a file that no format claims, by suffix; else it is a table of text.
+_BY_SUFFIX = {".toml": "toml", ".json": "opensfm"}
 
-def read_orientation(path: str | Path, form: TableFormat | None = None) -> OrientationTable:
-    """Orientation table of a file: own TOML, ``reconstruction.json`` of OpenSfM, or a table of text.
+#: Bytes of a file that formats are recognised by.
+HEAD = 65_536
 
-    Parameters
-    ----------
-    path : str or Path
-    form : TableFormat, optional
-        What a table of text does not say of itself: columns, angle unit, rotation.
+
+def orientation_format(name: str) -> OrientationFormat:
+    """The format of a name.
+
+    Raises
+    ------
+    UsageError
+        There is none.
+    """
+    if name not in FORMATS:
+        raise UsageError(f"orientation format {name!r}; allowed are {', '.join(FORMATS)}")
+    found: OrientationFormat = import_module(FORMATS[name]).FORMAT
+    return found
+
+
+def choose_format(path: Path, form: TableFormat) -> OrientationFormat:
+    """The one format that a file is of, by its content.
 
     Raises
     ------
     InputError
-        The file cannot be used.
+        It cannot be read, or it may be of several formats.
     """
-    path = Path(path)
-    return ORIENTATION_FORMATS.get(path.suffix.lower(), orientation_csv.read)(path, form or TableFormat())
+    if form.columns is not None:
+        # Only a table has columns to be declared.
+        return orientation_format("csv")
+    head = _head(path)
+    claiming = [f for f in map(orientation_format, FORMATS) if f.sniff(path, head)]
+    if len(claiming) > 1:
+        kinds = ", ".join(f"{f.name} ({f.title})" for f in claiming)
+        raise InputError(f"{path}: its content does not tell which format it is: {kinds}; say it with --format")
+    return claiming[0] if claiming else orientation_format(_BY_SUFFIX.get(path.suffix.lower(), "csv"))
+
+
+def _head(path: Path) -> str:
+    if path.is_dir():
+        return ""
+    try:
+        with path.open("rb") as file:
+            raw = file.read(HEAD)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    return raw.decode("utf-8-sig", errors="replace").replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_orientation_block(
+    path: str | Path, form: TableFormat | None = None, format: str | None = None
+) -> OrientationBlock:
+    """Oriented images of a file, with cameras where it holds them.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file, or the folder of a format that has several files.
+    form : TableFormat, optional
+        What a table of text does not say of itself: columns, angle unit, rotation.
+    format : str, optional
+        One of `FORMATS`; None: by the content.
+
+    Raises
+    ------
+    InputError
+        The file cannot be used, or it may be of several formats.
+    UsageError
+        The format is unknown.
+    """
+    path, form = Path(path), form or TableFormat()
+    return (choose_format(path, form) if format is None else orientation_format(format)).read(path, form)
+
+
+def read_orientation(path: str | Path, form: TableFormat | None = None, format: str | None = None) -> OrientationTable:
+    """Orientation table of a file; see `read_orientation_block`."""
+    return read_orientation_block(path, form, format).table
+
+
+def write_orientation(block: OrientationBlock, path: str | Path, format: str, *, overwrite: bool = False) -> list[Path]:
+    """Write a block in a format; each file appears complete or not at all.
+
+    Returns
+    -------
+    list of Path
+        The files.
+
+    Raises
+    ------
+    UsageError
+        The format is not written, or a file exists; nothing is written then.
+    InputError
+        Something is not known that the format needs.
+    ResourceError
+        The disk is full.
+    """
+    render = orientation_format(format).render
+    if render is None:
+        raise UsageError(f"orientation format {format} is read only; written are {', '.join(written_formats())}")
+    texts = render(block, Path(path))
+    present = [str(file) for file in texts if file.exists()]
+    if present and not overwrite:
+        raise UsageError(f"{', '.join(present)}: exists; give --overwrite to replace it, or another name")
+    for file, text in texts.items():
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise disk_error(file.parent, error) from None
+        write_atomically(file, text.encode())
+    return list(texts)
+
+
+def written_formats() -> list[str]:
+    """Names of the formats that can be written."""
+    return [name for name in FORMATS if orientation_format(name).render is not None]

@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
+from photoplan.io.orientation_block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.plain_files import finite, read_json
 
-__all__ = ["read", "rotation_from_axis_angle"]
+__all__ = ["FORMAT", "read", "rotation_from_axis_angle"]
 
 #: From camera axes x right, y down, z forwards to x right, y up, z backwards, and back.
 FLIP = np.diag([1.0, -1.0, -1.0])
@@ -86,3 +87,11 @@ def _image(name: str, shot: Any, path: Path) -> OrientedImage:
         (float(angles[0]), float(angles[1]), float(angles[2])),
         str(camera) if camera is not None else None,
     )
+
+
+FORMAT = OrientationFormat(
+    name="opensfm",
+    title="reconstruction.json of OpenSfM",
+    sniff=lambda path, head: path.suffix.lower() == ".json" and '"shots"' in head,
+    read=lambda path, form: OrientationBlock(read(path, form)),
+)

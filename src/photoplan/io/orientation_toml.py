@@ -15,12 +15,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.io.camera_model import Fiducials, Name, Triple
+from photoplan.io.orientation_block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.project_errors import explain
 from photoplan.io.project_model import Orientation
 from photoplan.io.toml_file import read_toml
 
-__all__ = ["read"]
+__all__ = ["FORMAT", "read"]
 
 
 class _Line(BaseModel):
@@ -63,3 +64,11 @@ def read(path: Path, form: TableFormat) -> OrientationTable:
     return OrientationTable(
         path, images, file.orientation.angle_unit, file.orientation.rotation, crs=crs, height_system=heights
     )
+
+
+FORMAT = OrientationFormat(
+    name="toml",
+    title="photoplan's own TOML",
+    sniff=lambda path, head: path.suffix.lower() == ".toml",
+    read=lambda path, form: OrientationBlock(read(path, form)),
+)
