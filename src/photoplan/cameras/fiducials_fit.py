@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 from photoplan.cameras.plane import Affine2D, Bilinear2D
 from photoplan.errors import GeometryError, InputError
 
-__all__ = ["FiducialFit", "Marks", "fit_affine", "fit_bilinear"]
+__all__ = ["MODELS", "FiducialFit", "Marks", "fit_affine", "fit_bilinear", "fit_marks", "fit_similarity"]
 
 #: Marks as name → (x, y), or as rows (name, x, y) of a file, in which a name may by mistake occur twice.
 Marks = Mapping[str, tuple[float, float]] | Iterable[tuple[str, float, float]]
 
 _Design = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+#: Transformations and how many marks each needs. A similarity could do with two, but two marks check nothing.
+MODELS = {"similarity": 3, "affine": 3, "bilinear": 4}
 
 #: Film shrinks by a few parts in ten thousand; residuals beyond this part of the marks' extent are blunders.
 BLUNDER = 0.005
@@ -39,18 +42,34 @@ class FiducialFit:
     sigma0: float
     """Standard deviation of one measured coordinate, pixels; NaN without redundancy."""
     covariance: NDArray[np.float64]
-    """Of the coefficients, in the transformation's order, shape (6, 6) or (8, 8); NaN without redundancy."""
+    """Of the coefficients, in the transformation's order, shape (6, 6) or (8, 8); NaN without redundancy. Of a
+    similarity, whose six coefficients are functions of four, it has rank 4."""
     missing: tuple[str, ...]
     """Calibrated marks that were not measured."""
+    model: str = "affine"
+    """One of `MODELS`."""
 
     def __str__(self) -> str:
-        kind = "affine" if isinstance(self.transformation, Affine2D) else "bilinear"
         check = f"sigma0 {self.sigma0:.3f} px" if self.redundancy else "no redundancy: the marks are not checked"
-        lines = [f"{kind} interior orientation from {len(self.names)} fiducial marks, {check}"]
+        lines = [f"{self.model} interior orientation from {len(self.names)} fiducial marks, {check}"]
         lines += [f"  {n:>8}  vx {v[0]:+8.3f}  vy {v[1]:+8.3f} px" for n, v in zip(self.names, self.residuals)]
         if self.missing:
             lines.append(f"  not measured: {', '.join(self.missing)}")
         return "\n".join(lines)
+
+
+def fit_marks(model: str, plane_mm: Marks, scan_px: Marks, *, mirrored: bool = False) -> FiducialFit:
+    """`fit_similarity`, `fit_affine` or `fit_bilinear`, by the name of the model.
+
+    Raises
+    ------
+    InputError
+        There is no such model; and see `fit_affine`.
+    """
+    fits = {"similarity": fit_similarity, "affine": fit_affine, "bilinear": fit_bilinear}
+    if model not in fits:
+        raise InputError(f"interior orientation {model!r}; allowed are {', '.join(fits)}")
+    return fits[model](plane_mm, scan_px, mirrored=mirrored)
 
 
 def fit_affine(plane_mm: Marks, scan_px: Marks, *, mirrored: bool = False) -> FiducialFit:
@@ -74,10 +93,10 @@ def fit_affine(plane_mm: Marks, scan_px: Marks, *, mirrored: bool = False) -> Fi
     GeometryError
         The marks lie on a line.
     """
-    common = _pair(plane_mm, scan_px, 3, "affine")
-    coefficients, covariance, residuals, sigma0 = _adjust(common.plane, common.scan, _affine_design)
-    _check_marks(common, residuals, coefficients, mirrored)
-    return _result(common, Affine2D(*coefficients), residuals, sigma0, covariance)
+    common = _pair(plane_mm, scan_px, "affine")
+    found = _adjust(common.plane, common.scan, _affine_design)
+    _check_marks(common, found.residuals, found.unknowns, mirrored)
+    return _result(common, Affine2D(*found.unknowns), found, "affine")
 
 
 def fit_bilinear(plane_mm: Marks, scan_px: Marks, *, mirrored: bool = False) -> FiducialFit:
@@ -86,11 +105,34 @@ def fit_bilinear(plane_mm: Marks, scan_px: Marks, *, mirrored: bool = False) -> 
     Four marks determine it without any check, so they are first compared with an affine transformation. Parameters
     and errors are those of `fit_affine`, with at least four marks.
     """
-    common = _pair(plane_mm, scan_px, 4, "bilinear")
-    affine, _, affine_residuals, _ = _adjust(common.plane, common.scan, _affine_design)
-    _check_marks(common, affine_residuals, affine, mirrored)
-    coefficients, covariance, residuals, sigma0 = _adjust(common.plane, common.scan, _bilinear_design)
-    return _result(common, Bilinear2D(*coefficients), residuals, sigma0, covariance)
+    common = _pair(plane_mm, scan_px, "bilinear")
+    affine = _adjust(common.plane, common.scan, _affine_design)
+    _check_marks(common, affine.residuals, affine.unknowns, mirrored)
+    found = _adjust(common.plane, common.scan, _bilinear_design)
+    return _result(common, Bilinear2D(*found.unknowns), found, "bilinear")
+
+
+def fit_similarity(plane_mm: Marks, scan_px: Marks, *, mirrored: bool = False) -> FiducialFit:
+    """Similarity (shift, rotation, one scale; turned over, where the scan is) from image plane to scan.
+
+    x' = p x + q y + s, y' = q x − p y + t, since rows run down and y runs up; of a mirrored scan x' = p x − q y + s,
+    y' = q x + p y + t. It serves where film and scanner are known to be true to scale, and marks few or bad. Marks are
+    first compared with an affine transformation. Parameters and errors are those of `fit_affine`; an `InputError` also
+    tells scales that differ in x and y by more than film does.
+    """
+    common = _pair(plane_mm, scan_px, "similarity")
+    affine = _adjust(common.plane, common.scan, _affine_design)
+    _check_marks(common, affine.residuals, affine.unknowns, mirrored)
+    found = _adjust_similarity(common.plane, common.scan, mirrored)
+    off = np.linalg.norm(found.residuals, axis=1)
+    limit = BLUNDER * float(np.ptp(common.scan, axis=0).max())
+    if off.max() > limit:
+        listed = ", ".join(f"{n} {v:.1f}" for n, v in zip(common.names, off))
+        raise InputError(
+            f"fiducial marks: a similarity leaves residuals (px: {listed}) above {limit:.1f} px. Either a mark is "
+            "wrong, or the scan's pixels are not square: then use an affine transformation"
+        )
+    return _result(common, Affine2D(*found.unknowns), found, "similarity")
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,18 +143,30 @@ class _Pairs:
     missing: tuple[str, ...]
 
 
-def _result(
-    common: _Pairs,
-    transformation: Affine2D | Bilinear2D,
-    residuals: NDArray[np.float64],
-    sigma0: float,
-    covariance: NDArray[np.float64],
-) -> FiducialFit:
-    redundancy = residuals.size - len(covariance)
-    return FiducialFit(transformation, common.names, residuals, redundancy, sigma0, covariance, common.missing)
+@dataclass(frozen=True, eq=False)
+class _Adjusted:
+    unknowns: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    residuals: NDArray[np.float64]
+    redundancy: int
+    sigma0: float
 
 
-def _pair(plane_mm: Marks, scan_px: Marks, least: int, kind: str) -> _Pairs:
+def _result(common: _Pairs, transformation: Affine2D | Bilinear2D, found: _Adjusted, model: str) -> FiducialFit:
+    return FiducialFit(
+        transformation,
+        common.names,
+        found.residuals,
+        found.redundancy,
+        found.sigma0,
+        found.covariance,
+        common.missing,
+        model,
+    )
+
+
+def _pair(plane_mm: Marks, scan_px: Marks, model: str) -> _Pairs:
+    least = MODELS[model]
     plane, scan = _table(plane_mm, "calibrated"), _table(scan_px, "measured")
     unknown = [name for name in scan if name not in plane]
     if unknown:
@@ -123,7 +177,7 @@ def _pair(plane_mm: Marks, scan_px: Marks, least: int, kind: str) -> _Pairs:
     missing = tuple(name for name in plane if name not in scan)
     if len(names) < least:
         raise InputError(
-            f"{len(names)} fiducial marks ({_list(names) or 'none'}) for {kind} interior orientation; "
+            f"{len(names)} fiducial marks ({_list(names) or 'none'}) for {model} interior orientation; "
             f"{least} are needed. Not measured: {_list(missing) or 'none'}"
         )
     P, p = np.array([plane[n] for n in names]), np.array([scan[n] for n in names])
@@ -161,24 +215,43 @@ def _bilinear_design(xy: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.column_stack([xy, xy[:, 0] * xy[:, 1], np.ones(len(xy))])
 
 
-def _adjust(
-    plane: NDArray[np.float64], scan: NDArray[np.float64], design: _Design
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
-    """Least squares with one design for columns and rows: coefficients, covariance, residuals, sigma0."""
+def _adjust(plane: NDArray[np.float64], scan: NDArray[np.float64], design: _Design) -> _Adjusted:
+    """Least squares with one design for columns and rows."""
     A = design(plane)
+    unknowns, Q = _solve(A, scan)
+    residuals = A @ unknowns - scan
+    redundancy, sigma0 = _spread(residuals, unknowns.size)
+    return _Adjusted(unknowns.T.ravel(), np.kron(np.eye(2), Q) * sigma0**2, residuals, redundancy, sigma0)
+
+
+def _adjust_similarity(plane: NDArray[np.float64], scan: NDArray[np.float64], mirrored: bool) -> _Adjusted:
+    """Least squares with columns and rows in one; unknowns are the six coefficients of an affine transformation."""
+    turn = 1.0 if mirrored else -1.0
+    # Coefficients a1 … a6 of p, q, s, t.
+    J = np.array([[1, 0, 0, 0], [0, -turn, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [turn, 0, 0, 0], [0, 0, 0, 1]], float)
+    A = np.kron(np.eye(2), _affine_design(plane)) @ J
+    unknowns, Q = _solve(A, scan.T.ravel())
+    residuals = (A @ unknowns).reshape(2, -1).T - scan
+    redundancy, sigma0 = _spread(residuals, 4)
+    return _Adjusted(J @ unknowns, J @ Q @ J.T * sigma0**2, residuals, redundancy, sigma0)
+
+
+def _solve(A: NDArray[np.float64], observed: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Unknowns and their cofactors."""
     # Columns of very different size (1 and x y) are brought to one length.
     length = np.linalg.norm(A, axis=0)
     U, s, Vt = np.linalg.svd(A / length, full_matrices=False)
     if s[-1] < 1e-9 * s[0]:
         raise GeometryError("the fiducial marks do not determine the transformation; marks at other places are needed")
     inverse = Vt.T / s
-    unknowns = (inverse @ (U.T @ scan)) / length[:, None]
-    residuals = A @ unknowns - scan
-    redundancy = scan.size - unknowns.size
-    sigma0 = math.sqrt(float((residuals**2).sum()) / redundancy) if redundancy else math.nan
-    Q = (inverse @ inverse.T) / np.outer(length, length)
-    covariance = np.kron(np.eye(2), Q) * sigma0**2
-    return unknowns.T.ravel(), covariance, residuals, sigma0
+    unknowns = ((inverse @ (U.T @ observed)).T / length).T
+    return unknowns, (inverse @ inverse.T) / np.outer(length, length)
+
+
+def _spread(residuals: NDArray[np.float64], unknowns: int) -> tuple[int, float]:
+    """Redundancy and sigma0."""
+    redundancy = residuals.size - unknowns
+    return redundancy, math.sqrt(float((residuals**2).sum()) / redundancy) if redundancy else math.nan
 
 
 def _check_marks(common: _Pairs, residuals: NDArray[np.float64], affine: NDArray[np.float64], mirrored: bool) -> None:
@@ -209,8 +282,8 @@ def _exchanged(common: _Pairs, limit: float, mirrored: bool) -> list[str]:
     for i, j in itertools.combinations(range(len(common.names)), 2):
         order = list(range(len(common.names)))
         order[i], order[j] = j, i
-        affine, _, residuals, _ = _adjust(common.plane, common.scan[order], _affine_design)
-        if np.linalg.norm(residuals, axis=1).max() <= limit and _has_handedness(affine, mirrored):
+        found = _adjust(common.plane, common.scan[order], _affine_design)
+        if np.linalg.norm(found.residuals, axis=1).max() <= limit and _has_handedness(found.unknowns, mirrored):
             pairs.append(f"{common.names[i]!r} and {common.names[j]!r}")
     return pairs
 
@@ -238,7 +311,7 @@ def _suspect(common: _Pairs) -> str:
     left = []
     for k in range(n):
         rest = np.arange(n) != k
-        left.append(_adjust(common.plane[rest], common.scan[rest], _affine_design)[3])
+        left.append(_adjust(common.plane[rest], common.scan[rest], _affine_design).sigma0)
     return f"{common.names[int(np.argmin(left))]!r} is wrong"
 
 

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Strict, Tag, field_validator, model_validator
 
+from photoplan.cameras.fiducials_fit import MODELS
 from photoplan.errors import InputError
 
 __all__ = [
@@ -202,7 +203,7 @@ class FilmCamera(Entry):
     """Calibrated fiducial marks: name = [x, y], x right and y upwards, millimetres."""
     principal_point_mm: Pair = (0.0, 0.0)
     """Principal point of the calibration report in the system of the fiducial marks."""
-    interior: Literal["affine", "bilinear"] = "affine"
+    interior: Literal["similarity", "affine", "bilinear"] = "affine"
     mirrored: Annotated[bool, Strict()] = False
     """Whether the film was scanned through its back, so that left and right are exchanged."""
     size: tuple[Pixels, Pixels] | None = None
@@ -221,7 +222,7 @@ class FilmCamera(Entry):
     def _enough(self) -> Self:
         if self.lens.type == "brown" and self.lens.unit == "px":
             raise ValueError("unit px has no meaning for the lens of a film camera; allowed are tangent and mm")
-        needed = {"affine": 3, "bilinear": 4}[self.interior]
+        needed = MODELS[self.interior]
         if len(self.fiducials_mm) < needed:
             raise ValueError(f"{len(self.fiducials_mm)} fiducial marks; {self.interior} needs at least {needed}")
         return self

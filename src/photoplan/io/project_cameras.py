@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from photoplan.cameras.fiducials_fit import FiducialFit, fit_affine, fit_bilinear
+from photoplan.cameras.fiducials_fit import FiducialFit, fit_marks
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
 from photoplan.cameras.lenses.brown import Brown
@@ -46,9 +46,8 @@ def fiducial_fit(camera: described.FilmCamera, image: Image) -> FiducialFit:
         raise InputError(
             f"image {image.name!r}: the fiducial marks of its scan are not measured; `photoplan fiducials` finds them"
         )
-    fit = {"affine": fit_affine, "bilinear": fit_bilinear}[camera.interior]
     try:
-        return fit(camera.fiducials_mm, image.fiducials, mirrored=camera.mirrored)
+        return fit_marks(camera.interior, camera.fiducials_mm, image.fiducials, mirrored=camera.mirrored)
     except InputError as error:
         raise type(error)(f"image {image.name!r}: {error}") from None
 

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, Strict, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
+from photoplan.cameras.fiducials_fit import MODELS
 from photoplan.errors import InputError, UsageError
 from photoplan.io.camera_model import (
     Camera,
@@ -313,7 +314,7 @@ def _check_film(image: Image, camera: FrameCamera | FilmCamera, where: str) -> N
             f"{where}: fiducial marks {', '.join(unknown)} are not among those of camera {image.camera!r}:"
             f" {', '.join(camera.fiducials_mm)}"
         )
-    needed = {"affine": 3, "bilinear": 4}[camera.interior]
+    needed = MODELS[camera.interior]
     if len(image.fiducials) < needed:
         missing = [n for n in camera.fiducials_mm if n not in image.fiducials]
         raise ValueError(

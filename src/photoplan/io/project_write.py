@@ -192,7 +192,7 @@ def _film(name: str, camera: FilmCamera) -> list[str]:
         ("type", camera.type, "scanned film; each image states its measured fiducial marks"),
         ("camera_constant_mm", camera.camera_constant_mm, ""),
         ("principal_point_mm", camera.principal_point_mm, "in the system of the fiducial marks, x right, y up"),
-        ("interior", camera.interior, '"affine" or "bilinear": scan to image coordinates'),
+        ("interior", camera.interior, '"similarity", "affine" or "bilinear": from the marks to the scan'),
         ("mirrored", camera.mirrored, "true if the film was scanned through its back"),
         ("size", camera.size, "width and height of the scans, pixels"),
         ("fiducials_mm", camera.fiducials_mm, "calibrated marks: name = [x, y]"),

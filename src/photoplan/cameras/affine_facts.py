@@ -1,0 +1,119 @@
+"""What an interior orientation means: scales, pixel sizes, directions of the axes, shear, shrinkage of the film."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.cameras.plane import Affine2D, Bilinear2D
+from photoplan.errors import InputError
+
+__all__ = ["AffineFacts", "Shrinkage", "affine_facts", "film_shrinkage", "residuals_on_film"]
+
+
+@dataclass(frozen=True)
+class AffineFacts:
+    """The derivative of a plane transformation, taken apart."""
+
+    scale: tuple[float, float]
+    """Pixels per unit of the image plane along its x and its y axis (Behr 1989, app. B: scale factors)."""
+    pixel_size: tuple[float, float]
+    """The inverse: how far one pixel reaches along the plane's x and y axis, in the plane's unit (Behr: pixel size)."""
+    direction_x: float
+    """Direction of the plane's x axis in the scan, counted from columns to rows, that is clockwise as one looks at the
+    scan, 0 to 2 π (Behr: rotation of the x axis)."""
+    direction_y: float
+    """Direction of the plane's y axis in the same way; 3 π / 2 for a scan that is upright."""
+    shear: float
+    """Angle between the two axes minus a right angle, radians."""
+    mirrored: bool
+    """Whether the scan shows the plane through its back."""
+
+    @property
+    def rotation(self) -> float:
+        """How far the picture is turned in the scan, clockwise, −π to π: x and y axis in the mean.
+
+        0: x to the right, y up. Of a mirrored scan, that of its x axis.
+        """
+        if self.mirrored:
+            return _half_turn(self.direction_x)
+        return _half_turn(self.direction_x - self.shear / 2)
+
+
+@dataclass(frozen=True)
+class Shrinkage:
+    """How much shorter the film is than when its camera was calibrated, as parts of the length."""
+
+    x: float
+    """Along the image's x axis; negative where it has grown."""
+    y: float
+    """Along its y axis."""
+
+    @property
+    def mean(self) -> float:
+        """Of both axes."""
+        return (self.x + self.y) / 2
+
+
+def affine_facts(transformation: Affine2D | Bilinear2D, at: ArrayLike = (0.0, 0.0)) -> AffineFacts:
+    """Take a transformation from image plane (y up) to scan (rows down) apart.
+
+    Parameters
+    ----------
+    transformation : Affine2D or Bilinear2D
+    at : array_like, shape (2,)
+        Where in the plane; an affine transformation is the same everywhere.
+    """
+    x, y = transformation.derivative(np.asarray(at, float)).T
+    scale = float(np.hypot(*x)), float(np.hypot(*y))
+    direction_x, direction_y = (math.atan2(v[1], v[0]) % math.tau for v in (x, y))
+    mirrored = transformation.determinant > 0
+    # From x to y it is a quarter turn anticlockwise, of a mirrored scan clockwise.
+    turn = _half_turn(direction_y - direction_x) * (1.0 if mirrored else -1.0)
+    size = 1.0 / scale[0], 1.0 / scale[1]
+    return AffineFacts(scale, size, direction_x, direction_y, turn - math.pi / 2, mirrored)
+
+
+def film_shrinkage(transformation: Affine2D | Bilinear2D, pitch: tuple[float, float]) -> Shrinkage:
+    """Shrinkage of the film since its calibration, if the scanner's sampling distance is known.
+
+    It includes what the scanner errs: only that of a calibrated scanner is true to some hundredths of a permille.
+
+    Parameters
+    ----------
+    transformation : Affine2D or Bilinear2D
+        From image plane to scan.
+    pitch : (float, float)
+        Distance of two columns and of two rows on the film, in the unit of the image plane.
+    """
+    if not all(math.isfinite(p) and p > 0 for p in pitch):
+        raise InputError(f"sampling distance {pitch} of the scan; two positive numbers are needed")
+    on_film = np.asarray(pitch, float)[:, None] * transformation.derivative(np.zeros(2))
+    x, y = 1.0 - np.linalg.norm(on_film, axis=0)
+    return Shrinkage(float(x), float(y))
+
+
+def residuals_on_film(
+    transformation: Affine2D | Bilinear2D, plane: ArrayLike, residuals: ArrayLike
+) -> NDArray[np.float64]:
+    """Residuals in the scan as residuals in the image plane: x right, y up, in its unit, shape (n, 2).
+
+    Parameters
+    ----------
+    transformation : Affine2D or Bilinear2D
+        From image plane to scan.
+    plane : array_like, shape (n, 2)
+        Where they are, image plane.
+    residuals : array_like, shape (n, 2)
+        Column and row, pixels.
+    """
+    J = transformation.derivative(np.asarray(plane, float))
+    return np.linalg.solve(J, np.asarray(residuals, float)[..., None])[..., 0]
+
+
+def _half_turn(angle: float) -> float:
+    """The same direction from −π to π."""
+    return math.remainder(angle, math.tau)
