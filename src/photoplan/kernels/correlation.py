@@ -1,0 +1,101 @@
+"""Correlation coefficient of a template over a window (Behr 1989, eq. 4.1), weighted and with missing pixels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.kernels.jit import inner, kernel
+
+__all__ = ["correlate"]
+
+_FLAT = 1e-10
+
+
+@inner
+def _coefficient(n, sg, sgg, st, stt, sgt):
+    """r from weighted sums of grey values g and template t; NaN where one of them does not vary."""
+    vg = sgg - sg * sg / n
+    vt = stt - st * st / n
+    if vg <= _FLAT * max(sgg, 1.0) or vt <= _FLAT * max(stt, 1.0):
+        return np.nan
+    return (sgt - sg * st / n) / np.sqrt(vg * vt)
+
+
+@kernel
+def correlate(image: NDArray[Any], template: NDArray[Any], weights: NDArray[Any], least: float, out: NDArray[Any]):
+    """out[r, c] = correlation coefficient with the template's first pixel on image[r, c] (Behr 1989, eq. 4.1).
+
+    The sums run over columns inside, template pixels outside: neighbouring positions are computed at once.
+
+    Parameters
+    ----------
+    image : ndarray, shape (h, w)
+        Grey values; NaN: not compared.
+    template, weights : ndarrays, shape (a, b)
+        The template and the weight of each of its pixels; 0: not compared.
+    least : float
+        Share of the weights that must lie on valid pixels; elsewhere the result is NaN.
+    out : ndarray, shape (h − a + 1, w − b + 1)
+        Receives the coefficients, −1 to 1; NaN where the grey values do not vary.
+    """
+    rows, columns = out.shape
+    height, width = template.shape
+    total, mean, count = 0.0, 0.0, 0
+    for i in range(height):
+        for j in range(width):
+            total += weights[i, j]
+    for r in range(image.shape[0]):
+        for c in range(image.shape[1]):
+            if not np.isnan(image[r, c]):
+                mean += image[r, c]
+                count += 1
+    # About the mean: the sums of squares then do not cancel.
+    mean = mean / max(count, 1)
+    whole = count == image.size
+    grey = np.zeros(image.shape, np.float32)
+    there = np.ones(image.shape, np.float32)
+    for r in range(image.shape[0]):
+        for c in range(image.shape[1]):
+            if np.isnan(image[r, c]):
+                there[r, c] = 0.0
+            else:
+                grey[r, c] = image[r, c] - mean
+    n, st, stt = np.zeros(columns), np.zeros(columns), np.zeros(columns)
+    sg, sgg, sgt = np.zeros(columns), np.zeros(columns), np.zeros(columns)
+    for r in range(rows):
+        n[:], st[:], stt[:], sg[:], sgg[:], sgt[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in range(height):
+            line, known = grey[r + i], there[r + i]
+            for j in range(width):
+                w = np.float64(weights[i, j])
+                if w <= 0.0:
+                    continue
+                t = np.float64(template[i, j])
+                if whole:
+                    n[0] += w
+                    st[0] += w * t
+                    stt[0] += w * t * t
+                    for c in range(columns):
+                        g = np.float64(line[c + j])
+                        sg[c] += w * g
+                        sgg[c] += w * g * g
+                        sgt[c] += w * t * g
+                else:
+                    for c in range(columns):
+                        g = np.float64(line[c + j])
+                        v = w * np.float64(known[c + j])
+                        n[c] += v
+                        st[c] += v * t
+                        stt[c] += v * t * t
+                        sg[c] += w * g
+                        sgg[c] += w * g * g
+                        sgt[c] += w * t * g
+        for c in range(columns):
+            k = 0 if whole else c
+            if n[k] <= 0.0 or n[k] < least * total:
+                out[r, c] = np.nan
+            else:
+                out[r, c] = _coefficient(n[k], sg[c], sgg[c], st[k], stt[k], sgt[c])
