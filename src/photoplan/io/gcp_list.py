@@ -1,0 +1,181 @@
+"""Control measured for OpenDroneMap: ``gcp_list.txt``.
+
+The first line is the CRS: ``EPSG:32632``, a PROJ string, or ``WGS84 UTM 32N``. Every other line is one measurement:
+``X Y Z column row image [name]``, separated by white space; further words are not used. Z may be ``NaN``: the point has
+no known height. Lines without a name belong to one point where their coordinates are equal, and get a name from their
+order.
+
+Pixels: OpenSfM, which computes with these files, takes (column + 0.5, row + 0.5) as the distance from the image's
+upper-left corner, so that (0, 0) is the centre of the upper-left pixel as it is here; nothing is added.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from photoplan.cameras.observed import GroundPoints, ImagePoints
+from photoplan.errors import InputError
+from photoplan.geometry.crs import canonical_crs, crs_label, crs_step, parse_crs, same_crs, split_compound
+from photoplan.io.disk import write_atomically
+from photoplan.io.names import match_key
+from photoplan.io.plain_files import read_text
+
+__all__ = ["GcpList", "read_gcp_list", "write_gcp_list"]
+
+MAX_BYTES = 100_000_000
+_UTM = re.compile(r"WGS\s*84\s+UTM\s+(\d{1,2})\s*([NS])", re.I)
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+
+
+@dataclass(frozen=True, eq=False)
+class GcpList:
+    """What such a file holds."""
+
+    crs: str
+    """Horizontal CRS of the ground points."""
+    ground: GroundPoints
+    """All as control; standard deviations are not stated."""
+    points: ImagePoints
+    """Their measurements."""
+
+
+@dataclass(frozen=True)
+class _Line:
+    number: int
+    XYZ: tuple[float, float, float]
+    xy: tuple[float, float]
+    image: str
+    name: str | None
+
+
+def read_gcp_list(path: Path, crs: str | None = None) -> GcpList:
+    """Control and its measurements.
+
+    Parameters
+    ----------
+    path : Path
+    crs : str, optional
+        Projected CRS that the points are wanted in; that of the file otherwise.
+
+    Raises
+    ------
+    InputError
+        A line cannot be read, a point has two positions or is measured in an image twice (file and line are named), or
+        no exact transformation into `crs` is known.
+    """
+    path = Path(path)
+    lines = [(n, text.strip()) for n, text in enumerate(read_text(path, MAX_BYTES).split("\n"), 1) if text.strip()]
+    if not lines:
+        raise InputError(f"{path}: holds no line with data")
+    own = _crs(f"{path}:{lines[0][0]}", lines[0][1])
+    rows = [_line(path, number, text) for number, text in lines[1:] if not text.startswith("#")]
+    if not rows:
+        raise InputError(f"{path}: holds a CRS and no measurement")
+    names = _names(rows)
+    places: dict[str, _Line] = {}
+    measured: dict[tuple[str, str], int] = {}
+    spelled: dict[str, str] = {}
+    for row, name in zip(rows, names):
+        first = places.setdefault(name, row)
+        if not np.array_equal(first.XYZ, row.XYZ, equal_nan=True):
+            raise InputError(f"{path}:{row.number}: point {name!r} has other coordinates than in line {first.number}")
+        key = match_key(row.image)
+        spelled.setdefault(key, row.image)
+        at = measured.setdefault((name, key), row.number)
+        if at != row.number:
+            raise InputError(
+                f"{path}:{row.number}: point {name!r} is measured in image {row.image!r} in line {at} already; keep "
+                "one of the measurements"
+            )
+    XYZ = np.array([row.XYZ for row in places.values()], float)
+    if crs is not None and not same_crs(own, crs):
+        XYZ[:, :2] = crs_step(own, crs)(XYZ[:, :2])
+        own = crs
+    elif parse_crs(own).is_geographic:
+        raise InputError(
+            f"{path}: points are geographic ({crs_label(own)}); say which projected CRS they are wanted in"
+        )
+    ground = GroundPoints(tuple(places), XYZ, np.full((len(places), 3), np.nan), np.zeros(len(places), bool))
+    table = [(name, spelled[match_key(row.image)], *row.xy) for row, name in zip(rows, names)]
+    return GcpList(own, ground, ImagePoints.from_rows(table))
+
+
+def write_gcp_list(path: Path, gcps: GcpList) -> None:
+    """Write such a file; ground points without a measurement are left out, as the file has no place for them.
+
+    Raises
+    ------
+    InputError
+        A name holds white space, which separates columns here, or a point has no horizontal position.
+    ResourceError, UsageError
+        The disk is full, or the folder cannot be written to.
+    """
+    points, place = gcps.points, dict(zip(gcps.ground.names, gcps.ground.XYZ))
+    lines = [canonical_crs(gcps.crs)]
+    for k in range(len(points)):
+        name, image = points.points[points.point[k]], points.images[points.image[k]]
+        if name not in place:
+            continue
+        if re.search(r"\s", name + image):
+            raise InputError(f"{points.label(k)}: gcp_list.txt has no names with white space; rename it")
+        if np.isnan(place[name][:2]).any():
+            raise InputError(f"ground point {name!r} has no horizontal position; gcp_list.txt needs one")
+        X, Y, Z = (f"{v:.4f}" if np.isfinite(v) else "NaN" for v in place[name])
+        col, row = (f"{v:.10g}" for v in points.xy[k])
+        lines.append(" ".join([X, Y, Z, col, row, image, name]))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, ("\n".join(lines) + "\n").encode())
+
+
+def _crs(where: str, text: str) -> str:
+    utm = _UTM.fullmatch(text)
+    if utm:
+        zone = int(utm[1])
+        if not 1 <= zone <= 60:
+            raise InputError(f"{where}: UTM zone {zone}; zones are 1 to 60")
+        return f"EPSG:{32600 + zone + 100 * (utm[2].upper() == 'S')}"
+    if len(text.split()) >= 6 and sum(bool(_NUMBER.fullmatch(word)) for word in text.split()[:5]) == 5:
+        raise InputError(f"{where}: the first line is a measurement; it must state the CRS, such as EPSG:32632")
+    parse_crs(text, where)
+    return split_compound(text)[0]
+
+
+def _line(path: Path, number: int, text: str) -> _Line:
+    words = text.split()
+    if len(words) < 6:
+        raise InputError(f"{path}:{number}: {len(words)} words; X Y Z column row image are needed")
+    values = []
+    for what, word in zip(("X", "Y", "Z", "column", "row"), words):
+        if what == "Z" and word.casefold() == "nan":
+            values.append(np.nan)
+            continue
+        if not _NUMBER.fullmatch(word):
+            hint = "; write decimals with a point" if "," in word else ""
+            raise InputError(f"{path}:{number}: {what} = {word[:40]!r} is not a number{hint}")
+        values.append(float(word))
+    X, Y, Z, col, row = values
+    return _Line(number, (X, Y, Z), (col, row), words[5], words[6] if len(words) > 6 else None)
+
+
+def _names(rows: list[_Line]) -> list[str]:
+    """Names of the points; those without one are called after the order of their places."""
+    places: dict[tuple[str, ...], str] = {}
+    taken = {row.name for row in rows}
+    out = []
+    for row in rows:
+        if row.name is not None:
+            out.append(row.name)
+            continue
+        key = tuple(repr(v) for v in row.XYZ)
+        if key not in places:
+            number = len(places) + 1
+            while f"gcp_{number}" in taken:
+                number += 1
+            places[key] = f"gcp_{number}"
+            taken.add(places[key])
+        out.append(places[key])
+    return out

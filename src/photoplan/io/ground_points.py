@@ -1,0 +1,207 @@
+"""Ground points — control and check — in text tables and GeoPackages.
+
+A table names its columns in the first line: name, x, y, z, then as far as known sigma or sigma_xy and sigma_z or
+sigma_x, sigma_y and sigma_z (metres), and role (control or check). An empty z makes horizontal control, empty x and y
+make height control. Files without a header, such as the .app files of the French mapping agency (name, class, X, Y, Z),
+are read with declared columns: ``"name,-,x,y,z"``.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyogrio.raw
+import shapely
+from numpy.typing import NDArray
+from pyogrio.errors import DataSourceError, FieldError, GeometryError
+
+from photoplan.cameras.observed import GroundPoints
+from photoplan.errors import InputError
+from photoplan.geometry.crs import crs_label, parse_crs, same_crs, split_compound
+from photoplan.io.checks import check_plain_file
+from photoplan.io.disk import write_atomically
+from photoplan.io.named_table import TableColumns, read_named_table
+from photoplan.io.plain_files import read_text
+
+__all__ = ["read_ground_points", "write_ground_points"]
+
+_ROLES = {
+    "name": ("name", "point", "id", "label", "gcp", "point_id", "marker"),
+    "x": ("x", "x0", "e", "east", "easting", "x_m"),
+    "y": ("y", "y0", "n", "north", "northing", "y_m"),
+    "z": ("z", "z0", "h", "height", "altitude", "alt", "elevation", "z_m"),
+    "sigma": ("sigma",),
+    "sigma_xy": ("sigma_xy", "sigma_h"),
+    "sigma_x": ("sigma_x", "sx"),
+    "sigma_y": ("sigma_y", "sy"),
+    "sigma_z": ("sigma_z", "sz", "sigma_v"),
+    "role": ("role", "type", "use"),
+}
+_NEEDED = ("name", "x", "y", "z")
+_SIGMAS = ("sigma", "sigma_xy", "sigma_x", "sigma_y", "sigma_z")
+_CHECK = {"": False, "control": False, "gcp": False, "check": True, "checkpoint": True, "check point": True}
+
+
+def read_ground_points(
+    path: Path, *, crs: str | None = None, columns: str | None = None, decimal_comma: bool = False
+) -> GroundPoints:
+    """Ground points of a table or of the first layer of a GeoPackage with points.
+
+    Parameters
+    ----------
+    path : Path
+    crs : str, optional
+        The CRS that the points must be in, where the file (or a ``.prj`` beside it) states one.
+    columns : str, optional
+        Columns of a table in their order where it does not name them; ``-`` for one that is not used.
+    decimal_comma : bool
+        Whether a table writes numbers as 1,5.
+
+    Returns
+    -------
+    GroundPoints
+        Coordinates NaN where the field is empty, standard deviations NaN where none is stated.
+
+    Raises
+    ------
+    InputError
+        A line or feature cannot be read, a name is given twice, or the CRS is another one; file and line are named.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".gpkg":
+        return _from_layer(path, crs)
+    _check_crs(path, _sidecar(path), crs)
+    table = read_named_table(path, TableColumns(_ROLES, _NEEDED, (), columns, decimal_comma))
+    names = table.names("name")
+    XYZ = np.stack([table.numbers(axis, empty=True) for axis in ("x", "y", "z")], axis=1)
+    return _points(names, XYZ, lambda role: table.numbers(role, empty=True), table.texts("role"), table.where)
+
+
+def _points(
+    names: Sequence[str],
+    XYZ: NDArray[np.float64],
+    numbers: Callable[[str], NDArray[np.float64]],
+    roles: Sequence[str],
+    where: Callable[[int], str],
+) -> GroundPoints:
+    seen: dict[str, int] = {}
+    check = np.zeros(len(names), bool)
+    for k, (name, role) in enumerate(zip(names, roles)):
+        if name in seen:
+            raise InputError(f"{where(k)}: ground point {name!r} is given twice; keep one of them")
+        seen[name] = k
+        if role.strip().casefold() not in _CHECK:
+            raise InputError(f"{where(k)}: role {role[:40]!r} of ground point {name!r}; allowed are control and check")
+        check[k] = _CHECK[role.strip().casefold()]
+        known = np.isfinite(XYZ[k])
+        if known[0] != known[1] or not known.any():
+            raise InputError(
+                f"{where(k)}: ground point {name!r} has {'X' if known[0] else 'Y' if known[1] else 'nothing'} alone; "
+                "give X, Y and Z, or X and Y, or Z"
+            )
+    both, plane, x, y, z = (numbers(role) for role in _SIGMAS)
+    sigma = np.stack([_first(x, plane, both), _first(y, plane, both), _first(z, both)], axis=1)
+    bad = np.flatnonzero((sigma < 0).any(axis=1))
+    if len(bad):
+        k = int(bad[0])
+        raise InputError(
+            f"{where(k)}: standard deviation of ground point {names[k]!r} is {np.nanmin(sigma[k]):g} m; give 0 (fixed) "
+            "or more"
+        )
+    return GroundPoints(tuple(names), XYZ, sigma, check)
+
+
+def _first(*columns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The first of several columns that has a value, row by row."""
+    out = columns[0]
+    for column in columns[1:]:
+        out = np.where(np.isnan(out), column, out)
+    return out
+
+
+def _sidecar(path: Path) -> str | None:
+    """CRS of a ``.prj`` beside a table."""
+    side = next((p for p in (path.with_suffix(".prj"), path.with_suffix(".PRJ")) if p.is_file()), None)
+    if side is None:
+        return None
+    text = read_text(side, 100_000).strip()
+    parse_crs(text, str(side))
+    return split_compound(text)[0]
+
+
+def _check_crs(path: Path, own: str | None, wanted: str | None) -> None:
+    if own is not None and wanted is not None and not same_crs(split_compound(own)[0], wanted):
+        raise InputError(
+            f"{path}: ground points in {crs_label(own)}, the project is in {crs_label(wanted)}; transform them"
+        )
+
+
+def _from_layer(path: Path, crs: str | None) -> GroundPoints:
+    path = check_plain_file(path, "ground points")
+    try:
+        meta, _, wkb, values = pyogrio.raw.read(os.fspath(path.resolve()), force_2d=False)
+        shapes = shapely.from_wkb(wkb)
+    except (DataSourceError, FieldError, GeometryError, shapely.errors.ShapelyError, ValueError, RuntimeError) as error:
+        raise InputError(f"{path}: cannot be read ({' '.join(str(error).split())[:200]})") from error
+    _check_crs(path, meta["crs"], crs)
+
+    def where(k: int) -> str:
+        return f"{path}: feature {k + 1}"
+
+    if not len(shapes):
+        raise InputError(f"{path}: holds no point")
+    for k, shape in enumerate(shapes):
+        if shape is None or shape.geom_type != "Point" or shape.is_empty:
+            kind = "without geometry" if shape is None or shape.is_empty else f"a {shape.geom_type}"
+            raise InputError(f"{where(k)} is {kind}; ground points are single points")
+    fields = dict(zip((name.casefold() for name in meta["fields"]), values))
+    own = next((fields[n] for n in _ROLES["name"] if n in fields), None)
+    if own is None:
+        raise InputError(f"{path}: no field with names; one called {' or '.join(_ROLES['name'])} is needed")
+    names = [_text(v) for v in own]
+    if not all(names):
+        raise InputError(f"{where(names.index(''))} has no name; give it one")
+    XYZ = np.stack([shapely.get_x(shapes), shapely.get_y(shapes), shapely.get_z(shapes)], axis=1)
+
+    def numbers(role: str) -> NDArray[np.float64]:
+        column = next((fields[n] for n in _ROLES[role] if n in fields), None)
+        return np.full(len(names), np.nan) if column is None else _floats(path, role, column)
+
+    roles = next((fields[n] for n in _ROLES["role"] if n in fields), [""] * len(names))
+    return _points(names, XYZ, numbers, [_text(v) for v in roles], where)
+
+
+def _text(value: Any) -> str:
+    return "" if value is None or value != value else str(value).strip()
+
+
+def _floats(path: Path, role: str, column: NDArray[Any]) -> NDArray[np.float64]:
+    try:
+        return np.asarray(column, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{path}: field {role} does not hold numbers; make it a field of numbers") from None
+
+
+def write_ground_points(path: Path, points: GroundPoints) -> None:
+    """Write ground points as a table with header; it appears complete or not at all.
+
+    Raises
+    ------
+    ResourceError, UsageError
+        The disk is full, or the folder cannot be written to.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*_NEEDED, "sigma_x", "sigma_y", "sigma_z", "role"])
+    for k, name in enumerate(points.names):
+        numbers = ["" if np.isnan(v) else f"{v:.4f}" for v in points.XYZ[k]]
+        numbers += ["" if np.isnan(v) else f"{v:.6g}" for v in points.sigma[k]]
+        writer.writerow([name, *numbers, "check" if points.check[k] else "control"])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, text.getvalue().encode())

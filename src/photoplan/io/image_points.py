@@ -1,0 +1,134 @@
+"""Image points in text tables: point, image, column and row, with or without standard deviations.
+
+With a header that names the columns, or without one in the order ``point image x y [sigma | sigma_x sigma_y]``. Points
+are in pixels, (0, 0) the centre of the upper-left pixel. One image may be written with or without folder and suffix.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from photoplan.cameras.observed import ImagePoints
+from photoplan.errors import InputError
+from photoplan.io.disk import write_atomically
+from photoplan.io.named_table import NamedTable, TableColumns, read_named_table
+from photoplan.io.names import match_key
+
+__all__ = ["named_as", "read_image_points", "write_image_points"]
+
+_ROLES = {
+    "point": ("point", "name", "point_id", "id", "gcp", "track"),
+    "image": ("image", "photo", "file", "filename", "image_name", "cliche"),
+    "x": ("x", "column", "col", "x_px", "column_px"),
+    "y": ("y", "row", "line", "y_px", "row_px"),
+    "sigma": ("sigma", "sigma_px"),
+    "sigma_x": ("sigma_x", "sigma_col", "sigma_column"),
+    "sigma_y": ("sigma_y", "sigma_row", "sigma_line"),
+}
+_NEEDED = ("point", "image", "x", "y")
+_ORDERS = (_NEEDED, (*_NEEDED, "sigma"), (*_NEEDED, "sigma_x", "sigma_y"))
+
+
+def read_image_points(path: Path, *, columns: str | None = None, decimal_comma: bool = False) -> ImagePoints:
+    """Measured image points of a table.
+
+    Parameters
+    ----------
+    path : Path
+    columns : str, optional
+        Columns in their order, as in ``"image,point,-,x,y"``, where the table does not say.
+    decimal_comma : bool
+        Whether numbers are written 1,5.
+
+    Returns
+    -------
+    ImagePoints
+        Images under the name that their first line has; standard deviations NaN where the table states none.
+
+    Raises
+    ------
+    InputError
+        A line cannot be read, or a point is measured twice in an image; the message names the line.
+    """
+    table = read_named_table(Path(path), TableColumns(_ROLES, _NEEDED, _ORDERS, columns, decimal_comma))
+    points, images = table.names("point"), table.names("image")
+    keys = [match_key(name) for name in images]
+    spelled: dict[str, str] = {}
+    for key, name in zip(keys, images):
+        spelled.setdefault(key, name)
+    point_at = {name: k for k, name in enumerate(dict.fromkeys(points))}
+    image_at = {key: k for k, key in enumerate(spelled)}
+    image = np.array([image_at[key] for key in keys], np.int64)
+    point = np.array([point_at[name] for name in points], np.int64)
+    _refuse_twice(table, image * len(point_at) + point, points, images)
+    xy = np.stack([table.numbers("x"), table.numbers("y")], axis=1)
+    return ImagePoints(tuple(spelled.values()), tuple(point_at), image, point, xy, _sigma(table))
+
+
+def _sigma(table: NamedTable) -> np.ndarray:
+    both = table.numbers("sigma", empty=True)
+    sigma = np.stack([table.numbers("sigma_x", empty=True), table.numbers("sigma_y", empty=True)], axis=1)
+    sigma = np.where(np.isnan(sigma), both[:, None], sigma)
+    bad = np.flatnonzero((sigma <= 0).any(axis=1))
+    if len(bad):
+        k = int(bad[0])
+        raise InputError(f"{table.where(k)}: standard deviation {sigma[k].tolist()} px; it must be positive")
+    return np.asarray(sigma, float)
+
+
+def _refuse_twice(table: NamedTable, key: np.ndarray, points: Sequence[str], images: Sequence[str]) -> None:
+    order = np.argsort(key, kind="stable")
+    same = np.flatnonzero(np.diff(key[order]) == 0)
+    if len(same):
+        first, second = order[same[0]], order[same[0] + 1]
+        raise InputError(
+            f"{table.where(second)}: point {points[second]!r} is measured in image {images[second]!r} in line "
+            f"{table.lines[first]} already; keep one of the measurements"
+        )
+
+
+def named_as(points: ImagePoints, names: Sequence[str]) -> tuple[ImagePoints, tuple[str, ...]]:
+    """The measurements with the images' names written as in `names`, and the images that are not among these.
+
+    Names are compared without folder and suffix. Images that are not known keep their name.
+
+    Raises
+    ------
+    InputError
+        Two images of the points are one image of `names`.
+    """
+    known = {match_key(name): name for name in names}
+    renamed = [known.get(match_key(image), image) for image in points.images]
+    unknown = tuple(image for image in points.images if match_key(image) not in known)
+    if len(set(renamed)) < len(renamed):
+        twice = next(name for name in renamed if renamed.count(name) > 1)
+        raise InputError(f"image points: two images are called {twice!r} by their base name; rename one of them")
+    return ImagePoints(tuple(renamed), points.points, points.image, points.point, points.xy, points.sigma), unknown
+
+
+def write_image_points(path: Path, points: ImagePoints) -> None:
+    """Write measurements as a table with header; it appears complete or not at all.
+
+    Standard deviations are written where one is known.
+
+    Raises
+    ------
+    ResourceError, UsageError
+        The disk is full, or the folder cannot be written to.
+    """
+    stated = bool(np.isfinite(points.sigma).any())
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*_NEEDED, *(("sigma_x", "sigma_y") if stated else ())])
+    for k in range(len(points)):
+        row = [points.points[points.point[k]], points.images[points.image[k]], *(f"{v:.10g}" for v in points.xy[k])]
+        if stated:
+            row += ["" if np.isnan(v) else f"{v:.6g}" for v in points.sigma[k]]
+        writer.writerow(row)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, text.getvalue().encode())

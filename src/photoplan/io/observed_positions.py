@@ -1,0 +1,232 @@
+"""Observed positions of the antenna (GNSS), with or without attitudes (IMU), from tables of text.
+
+A table names its columns in the first line: name, x, y, z, then as far as known omega, phi, kappa, sigma or sigma_xy
+and sigma_z or sigma_x, sigma_y, sigma_z (metres), sigma_angle (one, in the unit of the angles), strip and time
+(seconds, or ISO 8601). Files of other formats are read as orientations: all exposures are then one strip in the order
+of the file.
+"""
+
+from __future__ import annotations
+
+import datetime
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.observed import ObservedAttitudes, ObservedPositions
+from photoplan.errors import InputError
+from photoplan.geometry.crs import crs_label, parse_crs, same_crs, split_compound
+from photoplan.geometry.rotation import rotation_from_angles
+from photoplan.io.named_table import NamedTable, TableColumns, read_named_table
+from photoplan.io.names import match_key
+from photoplan.io.orientation_file import read_orientation
+from photoplan.io.orientation_table import TableFormat, angle_in_radians
+from photoplan.io.plain_files import read_text
+from photoplan.io.project_model import ANGLE_UNITS
+
+__all__ = ["PositionTable", "read_observed_positions"]
+
+_ROLES = {
+    "name": ("name", "nom", "image", "image_name", "filename", "file", "photo", "label", "id"),
+    "x": ("x", "x0", "e", "east", "easting"),
+    "y": ("y", "y0", "n", "north", "northing"),
+    "z": ("z", "z0", "h", "height", "altitude", "alt"),
+    "omega": ("omega", "ω", "o"),
+    "phi": ("phi", "φ", "p"),
+    "kappa": ("kappa", "κ", "k"),
+    "sigma": ("sigma",),
+    "sigma_xy": ("sigma_xy", "sigma_h"),
+    "sigma_x": ("sigma_x", "sx"),
+    "sigma_y": ("sigma_y", "sy"),
+    "sigma_z": ("sigma_z", "sz", "sigma_v"),
+    "sigma_angle": ("sigma_angle", "sigma_attitude"),
+    "strip": ("strip", "line", "flight_line", "run"),
+    "time": ("time", "t", "gps_time", "seconds", "timestamp"),
+}
+_NEEDED = ("name", "x", "y", "z")
+_TEXTS = (".csv", ".txt", ".tsv", ".dat", ".opk")
+
+
+@dataclass(frozen=True, eq=False)
+class PositionTable:
+    """Observed positions and attitudes of a file, as it states them."""
+
+    path: Path
+    images: tuple[str, ...]
+    XYZ: NDArray[np.float64]
+    """Shape (n, 3), metres."""
+    sigma: NDArray[np.float64]
+    """Standard deviations, shape (n, 3), metres; NaN: not stated."""
+    R_ground_camera: NDArray[np.float64] | None
+    """Shape (n, 3, 3); None: the file has no attitudes."""
+    sigma_angle: NDArray[np.float64]
+    """Standard deviation of each attitude, shape (n,), radians; NaN: not stated."""
+    strip: tuple[str, ...]
+    """Name of each image's strip; ``"all"`` where the file states none."""
+    time: NDArray[np.float64]
+    """Seconds; the running number of the line where the file states none."""
+
+    def positions(self, sigma: tuple[float, float] | None = None) -> ObservedPositions:
+        """The positions; those without a standard deviation get `sigma` (horizontal coordinates, height; metres).
+
+        Raises
+        ------
+        InputError
+            No standard deviation is stated for a position.
+        """
+        default = np.full(3, np.nan) if sigma is None else np.array([sigma[0], sigma[0], sigma[1]])
+        full = np.where(np.isnan(self.sigma), default, self.sigma)
+        lost = np.flatnonzero(np.isnan(full).any(axis=1))
+        if len(lost):
+            raise InputError(
+                f"{self.path}: image {self.images[lost[0]]!r}: the accuracy of observed positions is not stated; give "
+                "sigma_position = [horizontal, height] in [observations], or columns sigma_x, sigma_y, sigma_z"
+            )
+        return ObservedPositions(self.images, self.XYZ, full, self.strip, self.time)
+
+    def attitudes(self, sigma: float | None = None) -> ObservedAttitudes | None:
+        """The attitudes that have a standard deviation, or get `sigma` (radians); None if none has."""
+        if self.R_ground_camera is None:
+            return None
+        full = np.where(np.isnan(self.sigma_angle), np.nan if sigma is None else sigma, self.sigma_angle)
+        keep = np.flatnonzero(np.isfinite(full))
+        if not len(keep):
+            return None
+        names = tuple(self.images[k] for k in keep)
+        return ObservedAttitudes(names, self.R_ground_camera[keep], full[keep, None])
+
+
+def read_observed_positions(
+    path: Path, form: TableFormat | None = None, *, crs: str | None = None, columns: str | None = None
+) -> PositionTable:
+    """Observed positions of a file.
+
+    Parameters
+    ----------
+    path : Path
+        Table of text, or a file of any format of orientations.
+    form : TableFormat, optional
+        Unit and order of the angles, decimal sign.
+    crs : str, optional
+        The CRS that positions must be in, where the file states one.
+    columns : str, optional
+        Columns of a table in their order where it does not name them; ``-`` for one that is not used.
+
+    Raises
+    ------
+    InputError
+        A line cannot be read, an image is given twice, or the CRS is another one; file and line are named.
+    """
+    path, form = Path(path), form or TableFormat()
+    if path.suffix.lower() not in _TEXTS:
+        return _from_orientation(path, form, crs)
+    _check_crs(path, crs)
+    table = read_named_table(path, TableColumns(_ROLES, _NEEDED, (), columns, form.decimal_comma))
+    names = table.names("name")
+    first: dict[str, int] = {}
+    for k, name in enumerate(names):
+        at = first.setdefault(match_key(name), k)
+        if at != k:
+            raise InputError(
+                f"{table.where(k)}: image {name!r} is given in line {table.lines[at]} already; keep one of the lines"
+            )
+    XYZ = np.stack([table.numbers(axis) for axis in ("x", "y", "z")], axis=1)
+    strips = tuple(text or "all" for text in table.texts("strip"))
+    sigma_angle = angle_in_radians(table.numbers("sigma_angle", empty=True), form.angle_unit)
+    _positive(table, "sigma_angle", sigma_angle)
+    return PositionTable(
+        path, tuple(names), XYZ, _sigma(table), _rotations(table, form), sigma_angle, strips, _times(table)
+    )
+
+
+def _sigma(table: NamedTable) -> NDArray[np.float64]:
+    every, plane = (table.numbers(role, empty=True) for role in ("sigma", "sigma_xy"))
+    out = []
+    for role in ("sigma_x", "sigma_y", "sigma_z"):
+        own = table.numbers(role, empty=True)
+        if role != "sigma_z":
+            own = np.where(np.isnan(own), plane, own)
+        out.append(np.where(np.isnan(own), every, own))
+        _positive(table, role, out[-1])
+    return np.stack(out, axis=1)
+
+
+def _positive(table: NamedTable, role: str, values: NDArray[np.float64]) -> None:
+    bad = np.flatnonzero(values <= 0)
+    if len(bad):
+        raise InputError(f"{table.where(int(bad[0]))}: {role} = {values[bad[0]]:g}; it must be positive")
+
+
+def _rotations(table: NamedTable, form: TableFormat) -> NDArray[np.float64] | None:
+    roles = ("omega", "phi", "kappa")
+    there = [role for role in roles if role in table.roles]
+    if not there:
+        return None
+    if len(there) < 3:
+        raise InputError(f"{table.path}: columns {', '.join(there)} alone; omega, phi and kappa go together")
+    angles = {role[0]: table.numbers(role) for role in roles}
+    for letter, values in angles.items():
+        far = np.flatnonzero(np.abs(values) > ANGLE_UNITS[form.angle_unit] * (1 + 1e-9))
+        if len(far):
+            raise InputError(
+                f"{table.where(int(far[0]))}: angle {letter} = {values[far[0]]:g} is more than a full circle in "
+                f"{form.angle_unit}; state the unit as angle_unit in [orientation]"
+            )
+    stated = angle_in_radians(np.stack([angles[letter] for letter in form.rotation], axis=1), form.angle_unit)
+    R = np.stack([rotation_from_angles(a, form.rotation) for a in stated])
+    return R if form.direction == "camera-to-ground" else np.swapaxes(R, 1, 2)
+
+
+def _times(table: NamedTable) -> NDArray[np.float64]:
+    if "time" not in table.roles:
+        return np.arange(len(table.rows), dtype=float)
+    texts = table.texts("time")
+    if not any(re.match(r"\d{4}-\d\d-\d\d", text) for text in texts):
+        return table.numbers("time")
+    out = []
+    for k, text in enumerate(texts):
+        try:
+            moment = datetime.datetime.fromisoformat(text)
+        except ValueError:
+            raise InputError(f"{table.where(k)}: time {text[:40]!r}; seconds or ISO 8601 are needed") from None
+        out.append(moment.replace(tzinfo=moment.tzinfo or datetime.UTC).timestamp())
+    return np.array(out)
+
+
+def _check_crs(path: Path, crs: str | None) -> None:
+    side = next((p for p in (path.with_suffix(".prj"), path.with_suffix(".PRJ")) if p.is_file()), None)
+    if side is None or crs is None:
+        return
+    text = read_text(side, 100_000).strip()
+    parse_crs(text, str(side))
+    _same(path, split_compound(text)[0], crs)
+
+
+def _same(path: Path, own: str, crs: str) -> None:
+    if not same_crs(own, crs):
+        raise InputError(
+            f"{path}: positions in {crs_label(own)}, the project is in {crs_label(crs)}; `photoplan convert` "
+            "transforms them"
+        )
+
+
+def _from_orientation(path: Path, form: TableFormat, crs: str | None) -> PositionTable:
+    table = read_orientation(path, form)
+    if table.origin is not None:
+        raise InputError(f"{path}: positions refer to a local system; `photoplan convert` brings them into the CRS")
+    if table.crs is not None and crs is not None:
+        _same(path, table.crs, crs)
+    n = len(table.images)
+    return PositionTable(
+        path,
+        tuple(image.name for image in table.images),
+        table.centers,
+        np.full((n, 3), np.nan),
+        table.rotations,
+        np.full(n, np.nan),
+        ("all",) * n,
+        np.arange(n, dtype=float),
+    )
