@@ -221,7 +221,8 @@ def _adjust(plane: NDArray[np.float64], scan: NDArray[np.float64], design: _Desi
     unknowns, Q = _solve(A, scan)
     residuals = A @ unknowns - scan
     redundancy, sigma0 = _spread(residuals, unknowns.size)
-    return _Adjusted(unknowns.T.ravel(), np.kron(np.eye(2), Q) * sigma0**2, residuals, redundancy, sigma0)
+    covariance = np.asarray(np.kron(np.eye(2), Q) * sigma0**2, float)
+    return _Adjusted(unknowns.T.ravel(), covariance, residuals, redundancy, sigma0)
 
 
 def _adjust_similarity(plane: NDArray[np.float64], scan: NDArray[np.float64], mirrored: bool) -> _Adjusted:
