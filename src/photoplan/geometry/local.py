@@ -148,6 +148,19 @@ class LocalFrame:
         """East, north, up to map X, Y and height; inverse of `to_local` (to the rounding of coordinates, 1e-9 m)."""
         return self._projection.from_geocentric(np.asarray(enu, float) @ self._R_local_earth + self._origin)
 
+    @property
+    def R_local_earth(self) -> NDArray[np.float64]:
+        """Takes geocentric axes to east, north, up, shape (3, 3)."""
+        return self._R_local_earth
+
+    def to_geocentric(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """Map X, Y and ellipsoidal height to geocentric coordinates of the map's own datum; shapes (..., 3)."""
+        return self._projection.geocentric(np.asarray(XYZ, float))[0]
+
+    def from_geocentric(self, xyz: ArrayLike) -> NDArray[np.float64]:
+        """Geocentric coordinates of the map's own datum to map X, Y and ellipsoidal height; shapes (..., 3)."""
+        return self._projection.from_geocentric(np.asarray(xyz, float))
+
     def jacobian(self, XYZ: ArrayLike) -> NDArray[np.float64]:
         """∂(east, north, up) / ∂(X, Y, height), shape (..., 3, 3), to 1e-10.
 

@@ -55,7 +55,7 @@ class NoLens(Entry):
 
 
 class BrownLens(Entry):
-    """Brown's lens: radial k1–k3, decentring p1–p2, affinity b1 and shear b2."""
+    """Brown's lens: radial k1–k4, decentring p1–p2, affinity b1 and shear b2."""
 
     type: Literal["brown"]
     unit: Literal["tangent", "mm", "px"] = "tangent"
@@ -71,6 +71,7 @@ class BrownLens(Entry):
     p2: Number = 0.0
     b1: Number = 0.0
     b2: Number = 0.0
+    k4: Number = 0.0
 
 
 class OpenCVLens(Entry):

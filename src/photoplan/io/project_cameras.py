@@ -111,9 +111,9 @@ def _brown(lens: described.BrownLens, camera: described.FrameCamera | described.
         c = _camera_constant(camera)
     elif lens.unit == "px" and isinstance(camera, described.FrameCamera):
         c = camera.focal[0]
-    made = Brown.from_image_units(c, k=(lens.k1, lens.k2, lens.k3), p=(lens.p1, lens.p2), b=(lens.b1, lens.b2))
+    made = Brown.from_image_units(c, k=(lens.k1, lens.k2, lens.k3, lens.k4), p=(lens.p1, lens.p2), b=(lens.b1, lens.b2))
     if lens.y_axis == "down":
-        k = (made.k1, made.k2, made.k3)
+        k = (made.k1, made.k2, made.k3, made.k4)
         made = Brown.from_y_down(k=k, p=(made.p1, made.p2), b=(made.b1, made.b2))
     return Reversed(made) if lens.meaning == "correction" else made
 

@@ -17,12 +17,12 @@ __all__ = ["Brown"]
 
 @dataclass(frozen=True)
 class Brown:
-    """Radial k1–k3, decentring p1–p2, affinity b1 and shear b2, as *distortion* of tangent coordinates, y up.
+    """Radial k1–k4, decentring p1–p2, affinity b1 and shear b2, as *distortion* of tangent coordinates, y up.
 
     ::
 
-        xd = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + p1 (r² + 2x²) + 2 p2 x y
-        yd = y (1 + k1 r² + k2 r⁴ + k3 r⁶) + p2 (r² + 2y²) + 2 p1 x y
+        xd = x (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) + p1 (r² + 2x²) + 2 p2 x y
+        yd = y (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) + p2 (r² + 2y²) + 2 p1 x y
         x' = xd (1 + b1) + yd b2
         y' = yd
 
@@ -38,6 +38,7 @@ class Brown:
     p2: float = 0.0
     b1: float = 0.0
     b2: float = 0.0
+    k4: float = 0.0
 
     def __post_init__(self) -> None:
         if not all(math.isfinite(v) for v in astuple(self)):
@@ -60,8 +61,8 @@ class Brown:
         ----------
         c : float
             Camera constant in the unit of the coefficients: millimetres (k1 in mm⁻², p1 in mm⁻¹) or pixels.
-        k : tuple of up to three floats
-            k1 [unit⁻²], k2 [unit⁻⁴], k3 [unit⁻⁶].
+        k : tuple of up to four floats
+            k1 [unit⁻²], k2 [unit⁻⁴], k3 [unit⁻⁶], k4 [unit⁻⁸].
         p : (float, float)
             p1, p2 [unit⁻¹].
         b : (float, float)
@@ -69,21 +70,22 @@ class Brown:
         """
         if not (math.isfinite(c) and c > 0):
             raise InputError(f"camera constant {c}; a positive number in the unit of the coefficients is needed")
-        if len(k) > 3:
-            raise InputError(f"{len(k)} radial coefficients {k}; Brown's lens has at most three")
-        k1, k2, k3 = (*k, 0.0, 0.0, 0.0)[:3]
-        return cls(k1 * c**2, k2 * c**4, k3 * c**6, p[0] * c, p[1] * c, *b)
+        if len(k) > 4:
+            raise InputError(f"{len(k)} radial coefficients {k}; Brown's lens has at most four")
+        k1, k2, k3, k4 = (*k, 0.0, 0.0, 0.0, 0.0)[:4]
+        return cls(k1 * c**2, k2 * c**4, k3 * c**6, p[0] * c, p[1] * c, *b, k4 * c**8)
 
     @classmethod
     def from_y_down(
         cls,
         *,
-        k: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        k: tuple[float, ...] = (),
         p: tuple[float, float] = (0.0, 0.0),
         b: tuple[float, float] = (0.0, 0.0),
     ) -> Brown:
         """From coefficients of the same formula in a system with y down; only p2 and b2 change their sign."""
-        return cls(*k, p[0], -p[1], b[0], -b[1])
+        k1, k2, k3, k4 = (*k, 0.0, 0.0, 0.0, 0.0)[:4]
+        return cls(k1, k2, k3, p[0], -p[1], b[0], -b[1], k4)
 
     def distort(self, t: ArrayLike) -> NDArray[np.float64]:
         """Ideal to real tangent coordinates, shapes (..., 2)."""
@@ -102,7 +104,7 @@ class Brown:
         """∂ distort(t) / ∂ t, shape (..., 2, 2)."""
         t = np.asarray(t, float)
         r2 = _radius2(t)
-        slope = self.k1 + r2 * (2.0 * self.k2 + r2 * 3.0 * self.k3)
+        slope = self.k1 + r2 * (2.0 * self.k2 + r2 * (3.0 * self.k3 + r2 * 4.0 * self.k4))
         J = decentred_jacobian(t, self._factor(t), slope, self.p1, self.p2)
         if self.b1 or self.b2:
             J[..., 0, :] += self.b1 * J[..., 0, :] + self.b2 * J[..., 1, :]
@@ -110,7 +112,7 @@ class Brown:
 
     def _factor(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
         r2 = _radius2(t)
-        return 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        return 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * (self.k3 + r2 * self.k4)))
 
 
 def _radius2(t: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,0 +1,162 @@
+"""Points and axes carried between maps, geocentric coordinates and local tangential systems.
+
+Programs of computer vision orient images in a Cartesian system: geocentric, or east, north, up about a point.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pyproj import Transformer
+
+from photoplan.errors import InputError
+from photoplan.geometry.crs import crs_label, crs_step, parse_crs, require_projected_metres, topocentric_poses
+from photoplan.geometry.local import LocalFrame
+
+__all__ = [
+    "enu_axes",
+    "geocentric_of_geodetic",
+    "geocentric_poses",
+    "geodetic_of_geocentric",
+    "is_local_crs",
+    "is_wgs84_geographic",
+    "legacy_wkt",
+    "map_poses",
+    "topocentric_of_map",
+]
+
+_Floats = NDArray[np.float64]
+
+
+def enu_axes(latitude: float, longitude: float) -> _Floats:
+    """R_enu_earth (3, 3): geocentric axes to east, north, up at a point, degrees."""
+    S, C = np.sin(np.radians(latitude)), np.cos(np.radians(latitude))
+    s, c = np.sin(np.radians(longitude)), np.cos(np.radians(longitude))
+    return np.array([[-s, c, 0.0], [-S * c, -S * s, C], [C * c, C * s, S]])
+
+
+def geocentric_of_geodetic(point: tuple[float, float, float]) -> _Floats:
+    """Geocentric coordinates (3,) of latitude, longitude (degrees) and ellipsoidal height, WGS 84."""
+    lat, lon, h = point
+    return np.array(_to_earth().transform(lon, lat, h), np.float64)
+
+
+def geodetic_of_geocentric(xyz: ArrayLike) -> tuple[float, float, float]:
+    """Latitude, longitude (degrees) and ellipsoidal height of a geocentric point (3,), WGS 84."""
+    x, y, z = np.asarray(xyz, float).tolist()
+    lon, lat, h = _to_earth().transform(x, y, z, direction="INVERSE")
+    return float(lat), float(lon), float(h)
+
+
+def _to_earth() -> Transformer:
+    return Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84"
+    )
+
+
+def map_poses(crs: str, xyz: ArrayLike) -> tuple[_Floats, _Floats]:
+    """Geocentric points (n, 3) of the datum of a projected CRS as map points, with the map's axes there.
+
+    Returns
+    -------
+    XYZ : ndarray, shape (n, 3)
+        Map coordinates and ellipsoidal heights, metres.
+    R_earth_map : ndarray, shape (n, 3, 3)
+        Grid east, grid north and up at each point (columns) in geocentric axes.
+
+    Raises
+    ------
+    InputError
+        The CRS is not a projected one in metres, or a point has no place in it.
+    """
+    xyz = np.asarray(xyz, float).reshape(-1, 3)
+    frame = _frame_at(crs, xyz)
+    XYZ = frame.from_geocentric(xyz)
+    if not np.isfinite(XYZ).all():
+        x, y, z = xyz[~np.isfinite(XYZ).all(axis=1)][0]
+        raise InputError(
+            f"geocentric point {x:.3f}, {y:.3f}, {z:.3f} has no place in {crs_label(crs)}; is it the right CRS?"
+        )
+    return XYZ, frame.R_local_earth.T @ frame.axes(XYZ)
+
+
+def geocentric_poses(crs: str, XYZ: ArrayLike) -> tuple[_Floats, _Floats]:
+    """Map points with ellipsoidal heights (n, 3) as geocentric points, with the map's axes there; see `map_poses`."""
+    XYZ = np.asarray(XYZ, float).reshape(-1, 3)
+    frame = LocalFrame(crs, (float(XYZ[:, 0].mean()), float(XYZ[:, 1].mean())))
+    return frame.to_geocentric(XYZ), frame.R_local_earth.T @ frame.axes(XYZ)
+
+
+def _frame_at(crs: str, xyz: _Floats) -> LocalFrame:
+    """A local system of the CRS near geocentric points."""
+    projected = require_projected_metres(crs)
+    if projected.geodetic_crs is None or projected.ellipsoid is None:
+        raise InputError(f"CRS {crs_label(crs)!r} has no ellipsoid; a projected CRS of the earth is needed")
+    b = projected.ellipsoid.semi_minor_metre or projected.ellipsoid.semi_major_metre
+    to_degrees = Transformer.from_pipeline(
+        f"+proj=pipeline +step +inv +proj=cart +a={projected.ellipsoid.semi_major_metre!r} +b={b!r} "
+        "+step +proj=unitconvert +xy_in=rad +xy_out=deg"
+    )
+    lon, lat, _ = to_degrees.transform(*xyz.mean(axis=0))
+    # The datum's own meridian: longitudes of the ellipsoid count from Greenwich in every geocentric system.
+    meridian = projected.prime_meridian.longitude if projected.prime_meridian is not None else 0.0
+    unit = projected.geodetic_crs.axis_info[0].unit_conversion_factor / np.radians(1.0)
+    forward = Transformer.from_crs(projected.geodetic_crs, projected, always_xy=True)
+    X, Y = forward.transform((lon - meridian) / unit, lat / unit)
+    if not np.isfinite([X, Y]).all():
+        raise InputError(f"geocentric points near {lat:.4f}°, {lon:.4f}° have no place in {crs_label(crs)}")
+    return LocalFrame(crs, (float(X), float(Y)))
+
+
+def topocentric_of_map(origin: tuple[float, float, float], crs: str, XYZ: ArrayLike) -> tuple[_Floats, _Floats]:
+    """Inverse of `photoplan.geometry.crs.topocentric_poses`: map points with height as east, north, up.
+
+    Parameters
+    ----------
+    origin : tuple of float
+        Latitude and longitude in degrees (WGS 84) and ellipsoidal height.
+    crs : str
+        Projected CRS in metres.
+    XYZ : array_like, shape (n, 3)
+        Map coordinates and ellipsoidal heights.
+
+    Returns
+    -------
+    enu : ndarray, shape (n, 3)
+        Metres.
+    R_map_enu : ndarray, shape (n, 3, 3)
+        Takes the local system's axes to map axes at each point.
+    """
+    require_projected_metres(crs)
+    XYZ = np.asarray(XYZ, float).reshape(-1, 3)
+    lonlat = crs_step(crs, "EPSG:4326")(XYZ[:, :2])
+    earth = np.column_stack(_to_earth().transform(lonlat[:, 0], lonlat[:, 1], XYZ[:, 2]))
+    enu = (earth - geocentric_of_geodetic(origin)) @ enu_axes(*origin[:2]).T
+    for _ in range(2):
+        # The two ways through the projection differ by rounding; the step back is the one that readers take.
+        back, R = topocentric_poses(origin, crs, enu)
+        enu = enu + np.einsum("nji,nj->ni", R, XYZ - back)
+    return enu, topocentric_poses(origin, crs, enu)[1]
+
+
+def is_local_crs(text: str) -> bool:
+    """Whether a text is the WKT of a local system, one without any relation to the earth."""
+    return text.strip().upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS"))
+
+
+def is_wgs84_geographic(text: str, where: str) -> bool:
+    """Whether a CRS states latitude and longitude on WGS 84, or on a datum that coincides with it within metres."""
+    crs = parse_crs(text, where)
+    if not crs.is_geographic or crs.ellipsoid is None:
+        return False
+    same = abs(crs.ellipsoid.semi_major_metre - 6378137.0) < 1e-3
+    return same and abs((crs.ellipsoid.inverse_flattening or 0.0) - 298.2572) < 1e-3
+
+
+def legacy_wkt(text: str, where: str = "CRS") -> str:
+    """WKT of the first version on one line, which older programs read; where there is none, of the second."""
+    crs = parse_crs(text, where)
+    try:
+        return str(crs.to_wkt("WKT1_GDAL"))
+    except Exception:  # pyproj raises different errors for what WKT 1 cannot express
+        return str(crs.to_wkt())
