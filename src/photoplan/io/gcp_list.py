@@ -24,7 +24,7 @@ from photoplan.io.disk import write_atomically
 from photoplan.io.names import match_key
 from photoplan.io.plain_files import read_text
 
-__all__ = ["GcpList", "read_gcp_list", "write_gcp_list"]
+__all__ = ["GcpList", "is_gcp_list", "read_gcp_list", "write_gcp_list"]
 
 MAX_BYTES = 100_000_000
 _UTM = re.compile(r"WGS\s*84\s+UTM\s+(\d{1,2})\s*([NS])", re.I)
@@ -179,3 +179,15 @@ def _names(rows: list[_Line]) -> list[str]:
             taken.add(places[key])
         out.append(places[key])
     return out
+
+
+def is_gcp_list(path: Path) -> bool:
+    """Whether a text file begins with a CRS, as these files do and tables do not."""
+    if path.suffix.lower() != ".txt":
+        return False
+    try:
+        with path.open("rb") as file:
+            first = file.read(1000).decode("utf-8-sig", errors="replace").lstrip().split("\n")[0].strip()
+    except OSError:
+        return False
+    return bool(_UTM.fullmatch(first) or re.match(r"EPSG:\d+$|\+proj=", first, re.I))

@@ -1,0 +1,249 @@
+"""Cameras of a project as the bundle adjustment takes them, and its result as entries of the project."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.interior import Interior
+from photoplan.cameras.lenses.brown import Brown
+from photoplan.cameras.lenses.none import NoLens
+from photoplan.cameras.lenses.opencv import OpenCV
+from photoplan.cameras.lenses.reversed import Reversed
+from photoplan.errors import UsageError
+from photoplan.io import camera_model as described
+from photoplan.io.project_cameras import lens_of
+from photoplan.orientation.block import PARAMETERS, AdjustedCamera, BlockCamera
+
+__all__ = ["Calibrated", "block_camera", "calibrated", "camera_entries", "parse_calibrate"]
+
+Description = described.FrameCamera | described.FilmCamera
+
+#: Parameters that every camera has; the others are its lens's.
+INTERIOR = ("c", "x0", "y0")
+#: OpenCV's y axis points down: its p2 is p1 of a lens with y up, and its p1 is −p2.
+_OPENCV = {"p1": ("p2", -1.0), "p2": ("p1", 1.0)}
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """Parameters of a camera that were unknowns, by the names and in the units of the project file."""
+
+    name: str
+    parameters: tuple[str, ...]
+    units: tuple[str, ...]
+    """px, mm, or empty."""
+    before: NDArray[np.float64]
+    after: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    """Shape (k, k); NaN without covariance."""
+
+    @property
+    def sigma(self) -> NDArray[np.float64]:
+        """Standard deviations, shape (k,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def correlation(self) -> NDArray[np.float64]:
+        """Shape (k, k)."""
+        s = self.sigma
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return self.covariance / np.outer(s, s)
+
+
+def parse_calibrate(options: Sequence[str], cameras: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Parameters of cameras from options ``CAMERA=c,x0,y0,k1``; the name may be left out where there is one camera.
+
+    Raises
+    ------
+    UsageError
+        A camera is not in the project, or a parameter is unknown.
+    """
+    found: dict[str, tuple[str, ...]] = {}
+    for option in options:
+        name, equals, listed = option.rpartition("=")
+        if not equals and len(cameras) == 1:
+            name = cameras[0]
+        if name not in cameras:
+            raise UsageError(
+                f"--calibrate {option!r}: cameras of the project are {', '.join(map(repr, cameras))}; write "
+                "CAMERA=c,x0,y0,k1"
+            )
+        parameters = tuple(dict.fromkeys(p.strip() for p in listed.split(",") if p.strip()))
+        unknown = [p for p in parameters if p not in PARAMETERS]
+        if unknown or not parameters:
+            raise UsageError(f"--calibrate {option!r}: {unknown[:1] or 'nothing'}; allowed are {', '.join(PARAMETERS)}")
+        found[name] = parameters
+    return found
+
+
+def block_camera(name: str, camera: Description, interior: Interior, free: Sequence[str]) -> BlockCamera:
+    """A camera of the block.
+
+    Parameters
+    ----------
+    name : str
+        For messages.
+    camera : FrameCamera or FilmCamera
+        Its description in the project.
+    interior : Interior
+        Interior orientation of one of its images.
+    free : sequence of str
+        Parameters that are unknowns, by the names that the project's lens gives them.
+
+    Raises
+    ------
+    UsageError
+        The lens is not described by the coefficients that should be free.
+    """
+    lens = lens_of(camera)
+    own = [p for p in free if p not in INTERIOR]
+    if own and isinstance(lens, Reversed):
+        raise UsageError(
+            f"camera {name!r}: {', '.join(own)} cannot be unknowns, as its lens is stated as a correction (meaning = "
+            '"correction"); free c, x0, y0 only, or begin without distortion: lens = { type = "none" }'
+        )
+    if own and not isinstance(lens, Brown | OpenCV | NoLens):
+        raise UsageError(
+            f"camera {name!r}: {', '.join(own)} cannot be unknowns, as its lens ({camera.lens.type}) is not described "
+            'by them; free c, x0, y0 only, or begin without distortion: lens = { type = "none" }'
+        )
+    missing = [p for p in own if p in ("b1", "b2")]
+    if missing and isinstance(lens, OpenCV):
+        raise UsageError(f'camera {name!r}: an OpenCV lens has no {", ".join(missing)}; a lens of type "brown" has')
+    names = [_OPENCV.get(p, (p, 1.0))[0] if isinstance(lens, OpenCV) else p for p in free]
+    ordered = tuple(p for p in PARAMETERS if p in names)
+    return BlockCamera(interior.c, interior.principal_point, lens, ordered)
+
+
+def calibrated(camera: Description, start: BlockCamera, found: AdjustedCamera) -> Calibrated:
+    """The result of a camera that had free parameters."""
+    lens = found.lens
+    names, units, before, after, scales = [], [], [], [], []
+    unit, to_row = _unit(camera)
+    for p in found.free:
+        own, scale = p, 1.0
+        if isinstance(lens, OpenCV) and p in ("p1", "p2"):
+            own, scale = next((name, sign) for name, (other, sign) in _OPENCV.items() if other == p)
+        if p in INTERIOR:
+            old, new = _interior(camera, start, found)
+            scale = {"y0": to_row}.get(p, 1.0)
+            value = (old[INTERIOR.index(p)], new[INTERIOR.index(p)])
+            if p == "c" and _constant_in_pixels_of_mm(camera):
+                scale = value[1] / found.c
+        else:
+            value = (float(getattr(start.lens, own, 0.0)), float(getattr(lens, own)))
+        names.append(own)
+        units.append(unit[p] if p in INTERIOR else "")
+        before.append(value[0])
+        after.append(value[1])
+        scales.append(scale)
+    S = np.array(scales)
+    covariance = found.covariance * np.outer(S, S)
+    order = np.argsort([PARAMETERS.index(n) for n in names])
+    pick = np.ix_(order, order)
+    return Calibrated(
+        found.name,
+        tuple(names[k] for k in order),
+        tuple(units[k] for k in order),
+        np.array(before)[order],
+        np.array(after)[order],
+        covariance[pick],
+    )
+
+
+def camera_entries(camera: Description, start: BlockCamera, found: AdjustedCamera) -> dict[str, Any]:
+    """Entries of the camera in the project file after the adjustment: they give the adjusted camera exactly."""
+    if not found.free:
+        return {}
+    _, new = _interior(camera, start, found)
+    entries: dict[str, Any] = {}
+    constant, x0, y0 = new
+    if isinstance(camera, described.FrameCamera) and camera.focal_px is not None:
+        fx, fy = camera.focal
+        entries["focal_px"] = constant if fx == fy else [constant, constant * fy / fx]
+    else:
+        entries["camera_constant_mm"] = constant
+    if {"x0", "y0"} & set(found.free):
+        entries["principal_point_px" if _in_pixels(camera) else "principal_point_mm"] = [x0, y0]
+    if "c" not in found.free:
+        entries = {k: v for k, v in entries.items() if k.startswith("principal")}
+    lens = _lens_entry(camera, start, found)
+    if lens is not None:
+        entries["lens"] = lens
+    return entries
+
+
+def _in_pixels(camera: Description) -> bool:
+    """Whether the interior orientation is computed in pixels; see `photoplan.io.project_cameras.interior_of`."""
+    if isinstance(camera, described.FilmCamera):
+        return False
+    return camera.camera_constant_mm is None or camera.principal_point_px is not None
+
+
+def _constant_in_pixels_of_mm(camera: Description) -> bool:
+    return _in_pixels(camera) and isinstance(camera, described.FrameCamera) and camera.camera_constant_mm is not None
+
+
+def _unit(camera: Description) -> tuple[dict[str, str], float]:
+    """Unit of c, x0, y0 in the project, and what turns y0 into rows."""
+    if not _in_pixels(camera):
+        return dict.fromkeys(INTERIOR, "mm"), 1.0
+    assert isinstance(camera, described.FrameCamera)
+    fx, fy = camera.focal
+    c = "mm" if _constant_in_pixels_of_mm(camera) else "px"
+    return {"c": c, "x0": "px", "y0": "px"}, -fy / fx
+
+
+def _interior(
+    camera: Description, start: BlockCamera, found: AdjustedCamera
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """c, x0, y0 before and after, as the project states them: principal point as column and row, or in millimetres."""
+    if not _in_pixels(camera):
+        return (start.c, *start.principal_point), (found.c, *found.principal_point)
+    assert isinstance(camera, described.FrameCamera)
+    col, row = camera.principal_point
+    _, to_row = _unit(camera)
+    factor = 1.0
+    if _constant_in_pixels_of_mm(camera):
+        assert camera.camera_constant_mm is not None
+        factor = camera.camera_constant_mm / start.c
+    x, y = found.principal_point
+    x_start, y_start = start.principal_point
+    old = (start.c * factor, col, row)
+    return old, (found.c * factor, col + x - x_start, row + to_row * (y - y_start))
+
+
+def _lens_entry(camera: Description, start: BlockCamera, found: AdjustedCamera) -> dict[str, Any] | None:
+    """The lens as the project file states it; None where its entry stays right."""
+    lens = camera.lens
+    own = [p for p in found.free if p not in INTERIOR]
+    if own and isinstance(found.lens, Brown):
+        return _brown(found.lens)
+    if own and isinstance(found.lens, OpenCV):
+        values = {key: getattr(found.lens, key) for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")}
+        return {"type": "opencv", **{k: v for k, v in values.items() if v}}
+    if found.c == start.c:
+        return None
+    # The lens stays; entries that depend on the camera constant are written for the new one.
+    if isinstance(lens, described.BrownLens) and lens.unit != "tangent":
+        inner = found.lens.lens if isinstance(found.lens, Reversed) else found.lens
+        assert isinstance(inner, Brown)
+        meaning = {"meaning": "correction"} if isinstance(found.lens, Reversed) else {}
+        return {**_brown(inner), **meaning}
+    if isinstance(lens, described.RadialTableLens):
+        factor = found.c / start.c
+        entry: dict[str, Any] = {"type": lens.type, "distortion_um": [v * factor for v in lens.distortion_um]}
+        if lens.radii_mm is not None:
+            return {**entry, "radii_mm": [v * factor for v in lens.radii_mm]}
+        return {**entry, "angles_deg": list(lens.angles_deg or ())}
+    return None
+
+
+def _brown(lens: Brown) -> dict[str, Any]:
+    values: Mapping[str, float] = {key: getattr(lens, key) for key in ("k1", "k2", "k3", "p1", "p2", "b1", "b2")}
+    return {"type": "brown", **{k: v for k, v in values.items() if v}}
