@@ -19,7 +19,7 @@ OSL_1785_ANGLES = (7.5, 15.0, 22.7, 30.0, 35.0, 40.0)
 OSL_1785_MICROMETRES = (3.0, 4.0, 1.0, -3.0, -4.0, 3.0)
 OSL_1785_C = 152.299
 
-BROWN = Brown(-0.12, 0.03, -0.004, 1.1e-3, -7e-4, 3e-4, -2e-4)
+BROWN = Brown(-0.12, 0.03, -0.004, 1.1e-3, -7e-4, 3e-4, -2e-4, 2e-3)
 LENSES: dict[str, Lens] = {
     "none": NoLens(),
     "brown": BROWN,

@@ -136,8 +136,7 @@ def frame_camera(form: OpenCVForm | AgisoftForm, where: str) -> FrameCamera:
         if not form.fisheye:
             lens |= {"p1": form.p[0], "p2": form.p[1]}
     else:
-        fx = fy = form.f
-        point = tuple((s - 1) / 2 + o for s, o in zip(form.size, form.offset))
+        point = (form.size[0] - 1) / 2 + form.offset[0], (form.size[1] - 1) / 2 + form.offset[1]
         lens, (fx, fy) = _agisoft_lens(form, where)
     if lens["type"] != "opencv_fisheye" and not any(v for key, v in lens.items() if key[0] in "kpb"):
         lens = {"type": "none"}
