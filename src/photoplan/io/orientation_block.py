@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.rotation import angles_from_rotation
 from photoplan.io.camera_model import FilmCamera, FrameCamera, NoLens
-from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat
+from photoplan.io.orientation_table import Direction, OrientationTable, OrientedImage, TableFormat
 from photoplan.io.project_model import ANGLE_UNITS
 
 __all__ = ["Loss", "LossKind", "OrientationBlock", "OrientationFormat", "common_losses", "without_lenses"]
@@ -48,6 +48,8 @@ class OrientationBlock:
     """Image files by image name, as stated (relative to the orientation file, or absolute); not all are known."""
     sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     """Width and height in pixels by image name, where the camera does not state them."""
+    matrix: Direction | None = None
+    """What rotation matrices do in a file that is written, where its format leaves that open; None: as is usual."""
 
     def __post_init__(self) -> None:
         names = {image.name for image in self.table.images}

@@ -24,6 +24,11 @@ FORMATS: dict[str, str] = {
     "csv": "photoplan.io.orientation_csv",
     "toml": "photoplan.io.orientation_toml",
     "opensfm": "photoplan.io.orientation_opensfm",
+    "patb": "photoplan.io.orientation_patb",
+    "bingo": "photoplan.io.orientation_bingo",
+    "bluh": "photoplan.io.orientation_bluh",
+    "inpho": "photoplan.io.orientation_inpho",
+    "metashape": "photoplan.io.orientation_metashape",
 }
 
 #: Formats whose reader says what is wrong with a file that no format claims, by suffix; else it is a table of text.

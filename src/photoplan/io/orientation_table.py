@@ -41,6 +41,25 @@ class TableFormat:
     """Order of rotations, the first is the primary one. It is not the order of columns: each angle has its own."""
     direction: Direction = "camera-to-ground"
     """What the matrix of the angles does; ``ground-to-camera`` tables are transposed."""
+    declared: frozenset[str] = frozenset()
+    """Which of angle_unit, rotation and direction a user declared with the value that is the default here as well: a
+    file format with other conventions of its own then gives way."""
+
+    def conventions(self, angle_unit: str, rotation: str, direction: Direction) -> tuple[str, str, Direction]:
+        """Angle unit, rotation and direction for a format that defines its own: those, unless others are declared."""
+        return (
+            self.angle_unit if self._is_declared("angle_unit", "deg") else angle_unit,
+            self.rotation if self._is_declared("rotation", "opk") else rotation,
+            self.direction if self.declares_direction else direction,
+        )
+
+    @property
+    def declares_direction(self) -> bool:
+        """Whether a user declared what the rotation does."""
+        return self._is_declared("direction", "camera-to-ground")
+
+    def _is_declared(self, name: str, default: str) -> bool:
+        return name in self.declared or getattr(self, name) != default
 
     def __post_init__(self) -> None:
         if self.angle_unit not in ANGLE_UNITS:

@@ -20,7 +20,7 @@ from photoplan.io.project_model import (
     Terrain,
 )
 
-__all__ = ["project_text", "toml_key", "toml_value"]
+__all__ = ["camera_lines", "project_text", "toml_key", "toml_value"]
 
 
 def toml_key(name: str) -> str:
@@ -62,7 +62,7 @@ def project_text(project: Project) -> str:
         *_ortho(project.ortho),
     ]
     for name, camera in project.cameras.items():
-        lines += _frame(name, camera) if isinstance(camera, FrameCamera) else _film(name, camera)
+        lines += camera_lines(name, camera)
     lines += [
         "# One entry per image: `name` is what products are called after, `center` is X0, Y0, Z0 of the projection",
         "# centre, `angles` are in the sequence and unit of [orientation].",
@@ -170,6 +170,11 @@ def _ortho(ortho: OrthoDefaults) -> list[str]:
         ),
         "",
     ]
+
+
+def camera_lines(name: str, camera: FrameCamera | FilmCamera) -> list[str]:
+    """The ``[cameras.NAME]`` table of a camera."""
+    return _frame(name, camera) if isinstance(camera, FrameCamera) else _film(name, camera)
 
 
 def _frame(name: str, camera: FrameCamera) -> list[str]:

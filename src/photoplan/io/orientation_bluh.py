@@ -1,0 +1,59 @@
+"""Orientation files of BLUH, the bundle adjustment of the University of Hannover.
+
+A line for each image: name, X0, Y0, Z0 in metres, φ, ω, κ in gon; φ about Y is the primary rotation, then ω, then κ
+(K. Jacobsen, program system BLUH, user manual). Files of other make look the same, so the format has to be stated.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from photoplan.errors import InputError
+from photoplan.io.orientation_block import OrientationBlock, OrientationFormat, common_losses
+from photoplan.io.orientation_table import Direction, TableFormat
+from photoplan.io.orientation_text import angle_block, one_word, word_lines
+
+__all__ = ["FORMAT", "read", "render"]
+
+#: Angle unit, rotation, direction.
+OWN: tuple[str, str, Direction] = ("gon", "pok", "camera-to-ground")
+COLUMNS = 7
+
+
+def read(path: Path, form: TableFormat) -> OrientationBlock:
+    """Block of a file; `form` only where it declares other conventions.
+
+    Raises
+    ------
+    InputError
+        A line does not hold a name and six numbers; the message names it.
+    """
+    rows = []
+    for line in word_lines(path):
+        if len(line.words) < COLUMNS:
+            raise InputError(
+                f"{line.where}: {len(line.words)} columns; a line of BLUH holds name, X, Y, Z, phi, omega, kappa"
+            )
+        # What follows are standard deviations or a camera's number.
+        rows.append((line, line.words[0], line.words[1:COLUMNS]))
+    return angle_block(path, form, rows, OWN)
+
+
+def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
+    """The text of a file."""
+    lines = []
+    for image, angles in zip(block.table.images, block.angles("pok", "gon")):
+        X, Y, Z = image.center
+        p, o, k = angles
+        lines.append(f"{one_word(image.name, path):<20} {X:14.4f} {Y:14.4f} {Z:12.4f} {p:14.8f} {o:14.8f} {k:14.8f}")
+    return {path: "\n".join(lines) + "\n"}
+
+
+FORMAT = OrientationFormat(
+    name="bluh",
+    title="orientation file of BLUH",
+    sniff=lambda path, head: False,
+    read=read,
+    render=render,
+    losses=lambda block: common_losses(block, cameras=False),
+)
