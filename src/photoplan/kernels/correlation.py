@@ -54,7 +54,6 @@ def correlate(image: NDArray[Any], template: NDArray[Any], weights: NDArray[Any]
                 count += 1
     # About the mean: the sums of squares then do not cancel.
     mean = mean / max(count, 1)
-    whole = count == image.size
     grey = np.zeros(image.shape, np.float32)
     there = np.ones(image.shape, np.float32)
     for r in range(image.shape[0]):
@@ -63,39 +62,66 @@ def correlate(image: NDArray[Any], template: NDArray[Any], weights: NDArray[Any]
                 there[r, c] = 0.0
             else:
                 grey[r, c] = image[r, c] - mean
-    n, st, stt = np.zeros(columns), np.zeros(columns), np.zeros(columns)
-    sg, sgg, sgt = np.zeros(columns), np.zeros(columns), np.zeros(columns)
+    sums = np.zeros((6, columns))
     for r in range(rows):
-        n[:], st[:], stt[:], sg[:], sgg[:], sgt[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        first, last = _whole(there, r, height, width, columns)
+        _correlate_row(grey, there, template, weights, r, (0, first, False), least * total, sums, out)
+        _correlate_row(grey, there, template, weights, r, (first, last, True), least * total, sums, out)
+        _correlate_row(grey, there, template, weights, r, (last, columns, False), least * total, sums, out)
+
+
+@kernel
+def _whole(there, r, height, width, columns):
+    """First and last + 1 of the longest run of places in row r whose pixels are all valid."""
+    begin, end, start, known = 0, 0, 0, 0
+    for c in range(columns + width - 1):
+        whole = True
         for i in range(height):
-            line, known = grey[r + i], there[r + i]
-            for j in range(width):
-                w = np.float64(weights[i, j])
-                if w <= 0.0:
-                    continue
-                t = np.float64(template[i, j])
-                if whole:
-                    n[0] += w
-                    st[0] += w * t
-                    stt[0] += w * t * t
-                    for c in range(columns):
-                        g = np.float64(line[c + j])
-                        sg[c] += w * g
-                        sgg[c] += w * g * g
-                        sgt[c] += w * t * g
-                else:
-                    for c in range(columns):
-                        g = np.float64(line[c + j])
-                        v = w * np.float64(known[c + j])
-                        n[c] += v
-                        st[c] += v * t
-                        stt[c] += v * t * t
-                        sg[c] += w * g
-                        sgg[c] += w * g * g
-                        sgt[c] += w * t * g
-        for c in range(columns):
-            k = 0 if whole else c
-            if n[k] <= 0.0 or n[k] < least * total:
-                out[r, c] = np.nan
+            if there[r + i, c] == 0.0:
+                whole = False
+                break
+        known = known + 1 if whole else 0
+        if known >= width:
+            start = c - known + 1
+            if c - width + 2 - start > end - begin:
+                begin, end = start, c - width + 2
+    return begin, end
+
+
+@kernel
+def _correlate_row(grey, there, template, weights, r, part, least, sums, out):
+    """Coefficients of places part[0] to part[1] of a row; part[2]: all their pixels are valid."""
+    begin, end, whole = part
+    if end <= begin:
+        return
+    sg, sgg, sgt, n, st, stt = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
+    sums[:] = 0.0
+    for i in range(template.shape[0]):
+        line, known = grey[r + i], there[r + i]
+        for j in range(template.shape[1]):
+            w = np.float64(weights[i, j])
+            if w <= 0.0:
+                continue
+            t = np.float64(template[i, j])
+            wt = w * t
+            for c in range(begin, end):
+                g = np.float64(line[c + j])
+                sg[c] += w * g
+                sgg[c] += w * g * g
+                sgt[c] += wt * g
+            if whole:
+                n[begin] += w
+                st[begin] += wt
+                stt[begin] += wt * t
             else:
-                out[r, c] = _coefficient(n[k], sg[c], sgg[c], st[k], stt[k], sgt[c])
+                for c in range(begin, end):
+                    v = np.float64(known[c + j])
+                    n[c] += w * v
+                    st[c] += wt * v
+                    stt[c] += wt * t * v
+    for c in range(begin, end):
+        k = begin if whole else c
+        if n[k] <= 0.0 or n[k] < least:
+            out[r, c] = np.nan
+        else:
+            out[r, c] = _coefficient(n[k], sg[c], sgg[c], st[k], stt[k], sgt[c])

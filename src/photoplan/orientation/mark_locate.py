@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,12 @@ class Location:
     """Top of the paraboloid (Behr 1989, eq. 4.4), in the window's pixels."""
     match: Match | None
     """Result of least-squares matching; None: it did not converge."""
+
+    def moved(self, columns: float, rows: float) -> Location:
+        """The same in pixels of an image in which the window begins at (columns, rows)."""
+        peak = self.peak and replace(self.peak, x=self.peak.x + columns, y=self.peak.y + rows)
+        match = self.match and replace(self.match, x=self.match.x + columns, y=self.match.y + rows)
+        return replace(self, x=self.x + columns, y=self.y + rows, peak=peak, match=match)
 
 
 def correlation_surface(
