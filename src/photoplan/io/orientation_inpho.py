@@ -40,8 +40,9 @@ from photoplan.io.plain_files import build, read_text
 __all__ = ["FORMAT", "read"]
 
 MAX_BYTES = 200_000_000
-#: Side of the angles' agreement that settles what the matrix does: boresight angles and drift stay below, degrees.
-AGREE = 10.0
+#: Largest median difference of matrices and angles that settles what the matrices do: boresight angles and errors of
+#: observed attitudes stay below, degrees.
+AGREE = 3.0
 #: Row products of an affine transformation without shear, and of a rotation that is none.
 SQUARE = 1e-6
 
@@ -199,9 +200,9 @@ def _direction(poses: list[_Pose], file: _File, form: TableFormat, path: Path) -
     """What the matrices do: as declared, or as the angles of `$INS` tell."""
     if form.declares_direction:
         return form.direction
-    unit = _ANGLE_UNITS.get((file.other.text("$ANGULAR_UNITS") or "deg").lower(), np.pi / 180)
+    unit = _ANGLE_UNITS.get((file.other.text("$ANGULAR_UNITS") or "deg").lower(), np.nan)
     angles = {}
-    for section in file.navigation:
+    for section in file.navigation if np.isfinite(unit) else ():
         name, ins = section.text("$PHOTO_NUM"), section.get("$INS")
         if name is not None and ins is not None:
             words = ins.value.split()[:3]

@@ -139,10 +139,10 @@ def angle_block(
     for line, name, words in rows:
         X, Y, Z, phi, omega, kappa = numbers(words, line.where, f"image {name!r}: X, Y, Z, phi, omega, kappa", 6)
         named = {"p": phi, "o": omega, "k": kappa}
-        for letter, value in named.items():
+        for what, value in zip(("phi", "omega", "kappa"), named.values()):
             if abs(value) > ANGLE_UNITS[unit] * (1 + 1e-9):
                 raise InputError(
-                    f"{line.where}: image {name!r}: {letter} = {value:g} is more than a full circle in {unit}; declare "
+                    f"{line.where}: image {name!r}: {what} = {value:g} is more than a full circle in {unit}; declare "
                     "the angle unit of the file with --angle-unit"
                 )
         a, b, c = (named[letter] for letter in rotation)

@@ -1,0 +1,131 @@
+"""BLUH and BINGO: φ, ω, κ in gon with φ primary; hand-written files after the programs' descriptions."""
+
+from math import pi
+
+import numpy as np
+import pytest
+from tools.orientation_blocks import GROUND, block, our_pixels, phi_omega_kappa, pixels_of_matrix
+
+from photoplan.errors import InputError
+from photoplan.io.orientation_file import read_orientation, read_orientation_block, write_orientation
+from photoplan.io.orientation_table import TableFormat
+
+FORMATS = {"bluh": "", "bingo": "ORIA "}
+#: φ, ω, κ in gon.
+LINES = {
+    "4711": (512345.678, 5274112.875, 2630.44, -1.3894, 0.8331, 98.3333),
+    "4712": (513000.125, 5274100.5, 2641.0625, 7.9167, -13.8889, -101.1111),
+}
+
+
+def text(keyword, lines=LINES):
+    rows = [f"{keyword}{name} " + "  ".join(map(str, values)) for name, values in lines.items()]
+    return "\n".join(rows) + "\n"
+
+
+@pytest.mark.parametrize(("name", "keyword"), FORMATS.items())
+def test_ground_points_fall_on_the_pixels_of_the_collinearity_equations(tmp_path, name, keyword):
+    path = tmp_path / "block.dat"
+    path.write_text(text(keyword))
+    table = read_orientation(path, format=name)
+    expected = []
+    for X, Y, Z, *pok in LINES.values():
+        p, o, k = (v * pi / 200 for v in pok)
+        expected.append(pixels_of_matrix(phi_omega_kappa(p, o, k), (X, Y, Z)))
+    np.testing.assert_allclose(our_pixels(table), expected, atol=1e-6)
+    assert [i.center for i in table.images] == [v[:3] for v in LINES.values()]
+    assert table.notes == ("block.dat: angles read as gon, rotation pok, camera to ground",)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_written_and_read_again(tmp_path, name):
+    made = block()
+    (path,) = write_orientation(made, tmp_path / "out.ori", name)
+    again = read_orientation(path, format=name)
+    np.testing.assert_allclose(again.centers, made.table.centers, atol=5.1e-5)
+    # Eight decimals of a gon are 1.6e-10 radians.
+    np.testing.assert_allclose(again.rotations, made.table.rotations, atol=2e-10)
+    np.testing.assert_allclose(our_pixels(again), our_pixels(made.table), atol=2e-3)
+    assert [i.name for i in again.images] == [i.name for i in made.table.images]
+    # What was read is written without change.
+    (second,) = write_orientation(read_orientation_block(path, format=name), tmp_path / "second.ori", name)
+    assert second.read_text() == path.read_text()
+
+
+def test_bingo_is_recognised_and_bluh_is_not(tmp_path):
+    bingo, bluh = tmp_path / "itera.dat", tmp_path / "dapor.dat"
+    bingo.write_text("C comment\nPARA 1 2 3\n" + text("ORIA "))
+    bluh.write_text(text(""))
+    assert len(read_orientation(bingo).images) == 2
+    with pytest.raises(InputError, match=r"dapor\.dat:1: no header; declare the columns.*or the format"):
+        read_orientation(bluh)
+
+
+def test_other_conventions_are_declared(tmp_path):
+    path = tmp_path / "block.ori"
+    path.write_text("a 0 0 1000 1 2 3\n")
+    table = read_orientation(path, TableFormat(angle_unit="rad", rotation="kpo", direction="ground-to-camera"), "bluh")
+    assert (table.angle_unit, table.rotation, table.direction) == ("rad", "kpo", "ground-to-camera")
+    assert table.images[0].angles == (3.0, 1.0, 2.0)
+    # The value that is the default of tables has to be declared expressly.
+    assert read_orientation(path, TableFormat(angle_unit="deg"), "bluh").angle_unit == "gon"
+    declared = TableFormat(angle_unit="deg", rotation="opk", declared=frozenset({"angle_unit", "rotation"}))
+    table = read_orientation(path, declared, "bluh")
+    assert (table.angle_unit, table.rotation) == ("deg", "opk")
+    assert table.images[0].angles == (2.0, 1.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("", "holds no image"),
+        ("a 1 2 3 4 5\n", r":1: 6 columns"),
+        ("a 1 2 3 4 5 6\nb 1 2 nan 4 5 6\n", r":2: image 'b': X, Y, Z, phi, omega, kappa = 'nan' is not a number"),
+        ("a 1 2 3 4 5 401\n", r":1: image 'a': kappa = 401 is more than a full circle in gon"),
+        ("a 1 2 3 4 5 6\r\na 1 2 3 4 5 6\r\n", r"'a' is given twice \(lines 1 and 2\)"),
+        ("a 1,5 2 3 4 5 6\n", "'1,5' is not a number"),
+        ("a 1 2 1e999 4 5 6\n", "'1e999' is not a number"),
+        (b"\xe4 1 2 3 4 5 6\n", ":1: not UTF-8"),
+        ("a 1 2 3 4 5 6\n\x00", ":2: holds a zero byte"),
+    ],
+)
+def test_fault_18_broken_files_name_the_line(tmp_path, content, says):
+    path = tmp_path / "b.ori"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(InputError, match=says):
+        read_orientation(path, format="bluh")
+
+
+def test_fault_18_bingo_names_the_line(tmp_path):
+    path = tmp_path / "b.dat"
+    path.write_text("ORIA a 1 2 3 4 5 6\nORIA b 1 2 3\n")
+    with pytest.raises(InputError, match=r":2: image 'b': .* 3 values; 6 numbers"):
+        read_orientation(path, format="bingo")
+    path.write_text("GEOIN\n")
+    with pytest.raises(InputError, match="no line begins with ORIA"):
+        read_orientation(path, format="bingo")
+
+
+def test_fortran_exponents_and_further_columns(tmp_path):
+    path = tmp_path / "b.ori"
+    path.write_text("a 1.5D+03 2 3 .4 -5. +6 0.01 0.01 0.01\n")
+    image = read_orientation(path, format="bluh").images[0]
+    assert image.center == (1500.0, 2.0, 3.0)
+    assert image.angles == (0.4, -5.0, 6.0)
+
+
+def test_names_with_blanks_are_refused_before_anything_is_written(tmp_path):
+    from dataclasses import replace
+
+    made = block()
+    images = tuple(replace(i, name=i.name.replace("_", " ")) for i in made.table.images)
+    blank = replace(made, table=replace(made.table, images=images))
+    for name in FORMATS:
+        with pytest.raises(InputError, match="has a blank in its name"):
+            write_orientation(blank, tmp_path / "x.ori", name)
+    assert not list(tmp_path.iterdir())
+
+
+def test_points_of_the_tests_are_in_front():
+    assert len(GROUND) == 3
+    assert np.isfinite(our_pixels(block().table)).all()
