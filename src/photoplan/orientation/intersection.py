@@ -1,0 +1,260 @@
+"""Intersection: ground points from the rays of two or more oriented images, many points at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.errors import UsageError
+from photoplan.geometry.pose import Pose
+from photoplan.orientation.p3p import bearings
+
+__all__ = ["REASONS", "Intersected", "Rays", "intersect"]
+
+Array = NDArray[np.float64]
+
+#: Why a point has no coordinates, by its code in `Intersected.reason`.
+REASONS = ("", "fewer than two rays", "rays nearly parallel", "behind a camera", "rays do not meet")
+#: Points that are computed at once.
+_CHUNK = 200_000
+_ITERATIONS = 8
+#: Points with more rays are cleaned by their largest normalised residual, others by leaving out each ray in turn.
+_MANY = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Measurements of points in oriented images."""
+
+    image: NDArray[np.int64]
+    """Image of each ray, (m,), an index into the poses."""
+    point: NDArray[np.int64]
+    """Point of each ray, (m,), from 0."""
+    tangents: Array
+    """Ideal tangent coordinates (x, y) / c, (m, 2), x right, y up; NaN: the ray is not used."""
+    sigma: Array
+    """Standard deviations of these, (m, 2)."""
+
+    def __post_init__(self) -> None:
+        m = len(self.image)
+        object.__setattr__(self, "image", np.asarray(self.image, np.int64))
+        object.__setattr__(self, "point", np.asarray(self.point, np.int64))
+        object.__setattr__(self, "tangents", np.asarray(self.tangents, float).reshape(m, 2))
+        object.__setattr__(self, "sigma", np.broadcast_to(np.asarray(self.sigma, float), (m, 2)))
+        if len(self.point) != m or not (self.sigma > 0).all():
+            raise UsageError("rays need one point each and positive standard deviations")
+
+    def at(self, index: ArrayLike) -> Rays:
+        """The rays at `index` (mask or numbers)."""
+        k = np.asarray(index)
+        return Rays(self.image[k], self.point[k], self.tangents[k], self.sigma[k])
+
+
+@dataclass(frozen=True, eq=False)
+class Intersected:
+    """Result of `intersect`."""
+
+    XYZ: Array
+    """(n, 3), metres; NaN where a point is not determined."""
+    covariance: Array
+    """(n, 3, 3), m², from the rays' stated standard deviations, poses taken as free of error; NaN as XYZ."""
+    rays: NDArray[np.int64]
+    """Rays that take part, (n,)."""
+    used: NDArray[np.bool_]
+    """Which rays take part, (m,)."""
+    reason: NDArray[np.int8]
+    """Index into `REASONS`, (n,); 0: the point is determined."""
+
+    def counts(self) -> dict[str, int]:
+        """How many points have no coordinates, by reason."""
+        return {REASONS[k]: int((self.reason == k).sum()) for k in range(1, len(REASONS)) if (self.reason == k).any()}
+
+
+@dataclass(frozen=True, eq=False)
+class _Cameras:
+    """Poses as arrays, with coordinates about their middle."""
+
+    R: Array
+    centers: Array
+
+
+def intersect(
+    poses: Sequence[Pose],
+    rays: Rays,
+    count: int | None = None,
+    *,
+    critical: float = 4.0,
+    min_angle: float = 0.0035,
+) -> Intersected:
+    """Points where rays meet, by least squares of the image coordinates.
+
+    The start is the point nearest to all rays. A ray that does not fit is taken out where the others tell which one it
+    is: every ray is left out in turn, and only one of these points may fit (three rays or more).
+
+    Parameters
+    ----------
+    poses : sequence of Pose
+        In a Cartesian system.
+    rays : Rays
+    count : int, optional
+        Number of points [the largest index + 1].
+    critical : float
+        Normalised residual from which a ray does not fit.
+    min_angle : float
+        Radians; rays that all lie within it are taken as parallel.
+    """
+    n = int(rays.point.max(initial=-1)) + 1 if count is None else count
+    middle = np.mean([p.center for p in poses], axis=0) if poses else np.zeros(3)
+    cameras = _Cameras(
+        np.array([p.R_ground_camera for p in poses]).reshape(-1, 3, 3),
+        np.array([p.center - middle for p in poses]).reshape(-1, 3),
+    )
+    used = np.asarray(np.isfinite(rays.tangents).all(axis=1))
+    found = Intersected(
+        np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan), np.zeros(n, np.int64), used, np.ones(n, np.int8)
+    )
+    order = np.flatnonzero(used)
+    order = order[np.argsort(rays.point[order], kind="stable")]
+    starts = np.searchsorted(rays.point[order], np.arange(0, n, _CHUNK))
+    for first, (a, b) in zip(range(0, n, _CHUNK), zip(starts, [*starts[1:], len(order)])):
+        part = order[a:b]
+        size = min(_CHUNK, n - first)
+        mine = rays.at(part)
+        mine = replace(mine, point=mine.point - first)
+        done = _cleaned(cameras, mine, size, critical, min_angle)
+        where = slice(first, first + size)
+        found.XYZ[where], found.covariance[where] = done.XYZ + middle, done.covariance
+        found.rays[where], found.reason[where] = done.rays, done.reason
+        used[part] = done.used
+    return found
+
+
+def _cleaned(cameras: _Cameras, rays: Rays, n: int, critical: float, min_angle: float) -> Intersected:
+    """Points of all rays; then rays that do not fit leave, one of a point at a time."""
+    used = np.ones(len(rays.point), bool)
+    found, worst, size = _solved(cameras, rays, n, min_angle)
+    while True:
+        suspect = (found.reason == 0) & (size > critical)
+        suspect |= (found.reason == 3) & (found.rays > 2)
+        if not suspect.any():
+            break
+        found.reason[suspect] = 4
+        mine = np.flatnonzero(used & suspect[rays.point])
+        leaving = _leaving(cameras, rays.at(mine), worst[mine], critical, min_angle)
+        if not leaving.any():
+            break
+        used[mine[leaving]] = False
+        again = np.zeros(n, bool)
+        again[rays.point[mine[leaving]]] = True
+        keep = np.flatnonzero(used & again[rays.point])
+        numbers, local = np.unique(rays.point[keep], return_inverse=True)
+        better, w, s = _solved(cameras, replace(rays.at(keep), point=local.reshape(-1)), len(numbers), min_angle)
+        found.XYZ[numbers], found.covariance[numbers] = better.XYZ, better.covariance
+        found.rays[numbers], found.reason[numbers] = better.rays, better.reason
+        worst[keep], size[numbers] = w, s
+    lost = found.reason > 0
+    found.XYZ[lost] = np.nan
+    found.covariance[lost] = np.nan
+    return replace(found, used=used)
+
+
+def _leaving(cameras: _Cameras, rays: Rays, worst: Array, critical: float, min_angle: float) -> NDArray[np.bool_]:
+    """Which rays of points that do not fit have to leave: none or one of each point."""
+    leaving = np.zeros(len(rays.point), bool)
+    _, first, count = np.unique(rays.point, return_index=True, return_counts=True)
+    for k in np.flatnonzero(count > _MANY):
+        part = slice(first[k], first[k] + count[k])
+        leaving[first[k] + int(np.nan_to_num(worst[part], nan=np.inf).argmax())] = True
+    few = np.flatnonzero((count > 2) & (count <= _MANY))
+    if not len(few):
+        return leaving
+    # Every ray that is left out makes a point of its own.
+    left = np.concatenate([first[k] + np.arange(count[k]) for k in few])
+    groups = np.concatenate([np.repeat(first[k], count[k]) for k in few])
+    sizes = np.concatenate([np.repeat(count[k], count[k]) for k in few])
+    ray = np.repeat(groups, sizes) + (np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes))
+    trial = np.repeat(np.arange(len(left)), sizes)
+    keep = ray != np.repeat(left, sizes)
+    found, _, size = _solved(cameras, replace(rays.at(ray[keep]), point=trial[keep]), len(left), min_angle)
+    size = np.where(found.reason == 0, size, np.inf)
+    at = 0
+    for k in few:
+        sizes_here = size[at : at + count[k]]
+        fits = sizes_here <= critical
+        best = int(sizes_here.argmin())
+        if fits.sum() == 1 or (not fits.any() and count[k] > 4 and np.isfinite(sizes_here[best])):
+            leaving[first[k] + best] = True
+        at += int(count[k])
+    return leaving
+
+
+def _solved(cameras: _Cameras, rays: Rays, n: int, min_angle: float) -> tuple[Intersected, Array, Array]:
+    """Points (n,), largest normalised residual of each ray (m,) and of each point (n,)."""
+    R, C = cameras.R[rays.image], cameras.centers[rays.image]
+    at = rays.point
+    with np.errstate(all="ignore"):
+        number = np.bincount(at, minlength=n)
+        X, spread = _nearest(R, C, rays, n, number)
+        for _ in range(_ITERATIONS):
+            v, J, _ = _residuals(R, C, rays, X)
+            N = _sums(np.einsum("mki,mkj->mij", J, J), at, n)
+            rhs = _sums(np.einsum("mki,mk->mi", J, v), at, n)
+            step, _ = _inverse_times(N, rhs)
+            step = np.where(np.isfinite(step), step, 0.0)
+            X = X - step
+            far = np.abs(X).max(initial=1.0)
+            if np.abs(step).max(initial=0.0) < 1e-9 + 1e-13 * far:
+                break
+        v, J, depth = _residuals(R, C, rays, X)
+        N = _sums(np.einsum("mki,mkj->mij", J, J), at, n)
+        _, covariance = _inverse_times(N, np.zeros((n, 3)))
+        q = 1.0 - np.einsum("mki,mij,mkj->mk", J, covariance[at], J)
+        normalised = np.where(q > 1e-6, np.abs(v) / np.sqrt(np.maximum(q, 1e-12)), 0.0)
+    worst = np.where(np.isfinite(normalised).all(axis=1), normalised.max(axis=1), np.inf)
+    size = np.zeros(n)
+    np.maximum.at(size, at, worst)
+    behind = np.zeros(n, bool)
+    np.logical_or.at(behind, at, ~(depth > 0))
+    reason = np.zeros(n, np.int8)
+    reason[behind] = 3
+    reason[~(spread > min_angle**2 / 4.0) | ~np.isfinite(covariance).all(axis=(1, 2))] = 2
+    reason[number < 2] = 1
+    return Intersected(X, covariance, number, np.ones(len(at), bool), reason), worst, size
+
+
+def _nearest(R: Array, C: Array, rays: Rays, n: int, number: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Points nearest to all their rays (n, 3), and the smallest eigenvalue of the rays' spread (n,)."""
+    d = np.einsum("mij,mj->mi", R, bearings(rays.tangents))
+    across = np.eye(3) - d[:, :, None] * d[:, None, :]
+    N = _sums(across, rays.point, n)
+    X, _ = _inverse_times(N, _sums(np.einsum("mij,mj->mi", across, C), rays.point, n))
+    # Two of the eigenvalues of the mean are near one where the third, (angle / 2)² for two rays, is small.
+    spread = np.linalg.det(N / np.maximum(number, 1)[:, None, None])
+    return X, np.asarray(spread, float)
+
+
+def _residuals(R: Array, C: Array, rays: Rays, X: Array) -> tuple[Array, Array, Array]:
+    """Computed minus measured tangents (m, 2) and derivatives (m, 2, 3) in units of σ, and depths (m,)."""
+    p = np.einsum("mji,mj->mi", R, X[rays.point] - C)
+    depth = -p[:, 2]
+    t = p[:, :2] / depth[:, None]
+    J = (np.swapaxes(R, 1, 2)[:, :2] + t[:, :, None] * R[:, None, :, 2]) / depth[:, None, None]
+    return (t - rays.tangents) / rays.sigma, J / rays.sigma[:, :, None], depth
+
+
+def _sums(values: Array, at: NDArray[np.int64], n: int) -> Array:
+    """Sums (n, …) of values (m, …) by index."""
+    flat = values.reshape(len(values), -1)
+    columns = [np.asarray(np.bincount(at, flat[:, k], minlength=n), float) for k in range(flat.shape[1])]
+    return np.stack(columns, axis=-1).reshape(n, *values.shape[1:])
+
+
+def _inverse_times(N: Array, rhs: Array) -> tuple[Array, Array]:
+    """N⁻¹ rhs (n, 3) and N⁻¹ (n, 3, 3) of symmetric matrices, by cofactors; NaN or infinite where singular."""
+    a, b, c = N[:, 0], N[:, 1], N[:, 2]
+    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-1)
+    inverse = cofactors / (a * cofactors[:, :, 0]).sum(axis=-1)[:, None, None]
+    return np.einsum("nij,nj->ni", inverse, rhs), inverse
