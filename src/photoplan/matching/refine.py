@@ -1,0 +1,281 @@
+"""Tie points refined by least-squares matching of every image point against the track's reference image."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from photoplan.kernels.patch_match import CONVERGED, CORRELATION, RESULTS, match_patches, spline_coefficients
+from photoplan.matching.grey import Grey, patches_at
+from photoplan.matching.tracks import Tracks
+
+__all__ = [
+    "Matched",
+    "RefineSettings",
+    "Refined",
+    "disc",
+    "local_affines",
+    "match_between",
+    "reference_points",
+    "refine_tracks",
+]
+
+#: Neighbours whose features tell how two images are turned and scaled against each other at a place.
+_NEIGHBOURS = 15
+#: Patches that are matched at once.
+_CHUNK = 500
+#: A reference may be so much coarser than the finest image of its track.
+_NEARLY_FINEST = 0.8
+
+Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
+
+
+@dataclass(frozen=True)
+class RefineSettings:
+    """How patches are matched and which results count."""
+
+    radius: int = 10
+    """Of the round patch in the reference image, pixels."""
+    search: float = 4.0
+    """How far from its feature a point may be found, pixels."""
+    correlation: float = 0.8
+    """Least correlation of the patches after matching."""
+    sigma: float = 0.2
+    """Largest standard deviation of a coordinate, pixels."""
+    settled: float = 1e-3
+    """Displacement below which the iteration ends, pixels."""
+    iterations: int = 30
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """Results of matching n patches between two images."""
+
+    xy: NDArray[np.float64]
+    """Column and row in the second image, (n, 2); NaN where the patch was not found."""
+    affine: NDArray[np.float64]
+    """From offsets in the first to offsets in the second image, (n, 2, 2)."""
+    correlation: NDArray[np.float64]
+    """(n,)."""
+    covariance: NDArray[np.float64]
+    """Of `xy` as the fit has it, (n, 2, 2), square pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """Refined tracks and what became of the others."""
+
+    tracks: Tracks
+    unsettled: int
+    """Image points whose patch was not found (no texture, no convergence, at the image's edge)."""
+    unlike: int
+    """Image points left out for their correlation."""
+    uncertain: int
+    """Image points left out for their standard deviation."""
+    correlation: float
+    """Median of the correlations of those that are kept."""
+
+
+def disc(radius: int) -> NDArray[np.float64]:
+    """Weights of a round patch, shape (2 radius + 1, 2 radius + 1)."""
+    v, u = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+    return (u * u + v * v <= (radius + 0.5) ** 2).astype(float)
+
+
+def match_between(
+    images: tuple[Grey, Grey],
+    at: NDArray[np.int64],
+    start: tuple[NDArray[np.float64], NDArray[np.float64]],
+    settings: RefineSettings,
+    weights: NDArray[np.float64] | None = None,
+) -> Matched:
+    """Match patches round whole pixels of the first image in the second image.
+
+    Parameters
+    ----------
+    images : pair of Grey
+    at : ndarray, shape (n, 2)
+        Column and row in the first image.
+    start : pair of ndarrays
+        Approximate position in the second image (n, 2), and affine from the first to the second image (n, 2, 2).
+    settings : RefineSettings
+    weights : ndarray, shape (n, m, m), optional
+        Of the template's pixels; the whole disc if it is None.
+    """
+    n, m = len(at), 2 * settings.radius + 1
+    results = np.full((n, RESULTS), np.nan)
+    round_patch = disc(settings.radius)
+    limits = np.array([settings.iterations, settings.settled, settings.search])
+    order = np.lexsort((start[0][:, 0], start[0][:, 1] // 256)) if n else np.empty(0, int)
+    for chunk in (order[k : k + _CHUNK] for k in range(0, n, _CHUNK)):
+        templates = patches_at(images[0], at[chunk] - settings.radius, m).astype(float)
+        whole = np.isfinite(templates[:, round_patch > 0]).all(axis=1)
+        reach = float(np.linalg.norm(start[1][chunk], axis=(1, 2), ord=2).max()) * settings.radius + settings.search
+        half = int(np.ceil(reach)) + 4
+        middle = np.rint(start[0][chunk]).astype(np.int64)
+        windows = patches_at(images[1], middle - half, 2 * half + 1).astype(float)
+        known = np.isfinite(windows)
+        mean = np.nanmean(np.where(known.any(axis=(1, 2))[:, None, None], windows, 0.0), axis=(1, 2))
+        windows = np.where(known, windows, mean[:, None, None])
+        spline_coefficients(windows)
+        found = np.zeros((len(chunk), RESULTS))
+        found[:, :2] = start[0][chunk] - middle + half
+        found[:, 2:6] = start[1][chunk].reshape(-1, 4)
+        w = np.broadcast_to(round_patch, templates.shape) if weights is None else weights[chunk]
+        match_patches(np.nan_to_num(templates), np.ascontiguousarray(w), windows, limits, found)
+        good = (found[:, -1] == CONVERGED) & whole & _on_known(known, found, settings.radius)
+        found[:, :2] += middle - half
+        results[chunk[good]] = found[good]
+    return Matched(
+        results[:, :2],
+        results[:, 2:6].reshape(-1, 2, 2),
+        results[:, CORRELATION],
+        results[:, [9, 10, 10, 11]].reshape(-1, 2, 2),
+    )
+
+
+def _on_known(known: NDArray[np.bool_], found: NDArray[np.float64], radius: int) -> NDArray[np.bool_]:
+    """Whether the middle and the rim of the matched patches lie on pixels that have a value."""
+    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    rim = (radius + 2) * np.stack([np.cos(turn), np.sin(turn)])
+    at = found[:, :2, None] + found[:, 2:6].reshape(-1, 2, 2) @ np.concatenate([rim, rim / 2, np.zeros((2, 1))], axis=1)
+    side = known.shape[1]
+    whole = np.rint(np.nan_to_num(at, nan=-1.0)).astype(np.int64)
+    inside = ((whole >= 0) & (whole < side)).all(axis=1)
+    col, row = np.clip(whole, 0, side - 1).transpose(1, 0, 2)
+    return (inside & known[np.arange(len(found))[:, None], row, col]).all(axis=1)
+
+
+def reference_points(tracks: Tracks, sizes: Sequence[tuple[int, int]]) -> NDArray[np.int64]:
+    """Row of the reference point of each track: of the images in which it is seen finest, the most central one.
+
+    A feature's scale in pixels is larger in an image of finer resolution.
+    """
+    size = np.array(sizes, float).reshape(-1, 2)[tracks.image]
+    off = np.linalg.norm((tracks.xy - (size - 1) / 2) / size, axis=1)
+    finest = np.zeros(tracks.count)
+    np.maximum.at(finest, tracks.track, tracks.scale)
+    coarse = tracks.scale < _NEARLY_FINEST * finest[tracks.track]
+    order = np.lexsort((off, coarse, tracks.track))
+    return order[np.searchsorted(tracks.track[order], np.arange(tracks.count))]
+
+
+def local_affines(tracks: Tracks, first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.float64]:
+    """How the second image is turned and scaled against the first one at points of both, shape (n, 2, 2).
+
+    A single feature's direction and scale are rough; medians over the neighbours are taken.
+
+    Parameters
+    ----------
+    tracks : Tracks
+    first, second : ndarrays, shape (n,)
+        Rows of the two images' points of the same tracks.
+    """
+    turn = tracks.angle[second] - tracks.angle[first]
+    ratio = np.log(tracks.scale[second] / tracks.scale[first])
+    k = min(_NEIGHBOURS, len(first))
+    _, near = cKDTree(tracks.xy[first]).query(tracks.xy[first], k=k)
+    near = near.reshape(len(first), k)
+    # Medians of angles: about the direction where most of them are.
+    mean = np.angle(np.exp(1j * turn)[near].mean(axis=1))
+    turn = mean + np.median(np.angle(np.exp(1j * (turn[near] - mean[:, None]))), axis=1)
+    scale = np.exp(np.median(ratio[near], axis=1))
+    c, s = scale * np.cos(turn), scale * np.sin(turn)
+    return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+
+
+def refine_tracks(
+    tracks: Tracks, images: Sequence[Grey], settings: RefineSettings, factor: float = 1.0, run: Map = map
+) -> Refined:
+    """Match all points of every track against its reference.
+
+    The reference point becomes the whole pixel nearest to its feature. Half of the variance of a matched position is
+    the reference's: both images have noise. A track's reference gets the mean of these halves.
+
+    Parameters
+    ----------
+    tracks : Tracks
+    images : sequence of Grey
+    settings : RefineSettings
+    factor : float
+        Standard deviations of the fit are multiplied by this, see `photoplan.matching.loops`.
+    run : callable
+        Does the work image by image, as `map` does: it may use threads.
+    """
+    reference = reference_points(tracks, [g.size for g in images])
+    tasks = [(a, b, first, second) for a, b, first, second in _image_pairs(tracks, reference)]
+
+    def work(task: tuple[int, int, NDArray[np.int64], NDArray[np.int64]]) -> Matched:
+        a, b, first, second = task
+        return _match_points(tracks, images, (a, b), (first, second), settings)
+
+    xy = tracks.xy.copy()
+    xy[reference] = np.rint(xy[reference])
+    variance = np.full((len(tracks), 2), np.nan)
+    correlation = np.full(len(tracks), np.nan)
+    for (_, _, _, second), found in zip(tasks, run(work, tasks)):
+        xy[second], correlation[second] = found.xy, found.correlation
+        variance[second] = found.covariance[:, [0, 1], [0, 1]] / 2 * factor**2
+    return _accepted(tracks, reference, (xy, variance, correlation), settings)
+
+
+def _image_pairs(
+    tracks: Tracks, reference: NDArray[np.int64]
+) -> Iterator[tuple[int, int, NDArray[np.int64], NDArray[np.int64]]]:
+    """Reference image, other image, and the rows of their points in common tracks."""
+    other = np.setdiff1d(np.arange(len(tracks)), reference)
+    first = reference[tracks.track[other]]
+    key = np.stack([tracks.image[first], tracks.image[other]], axis=1)
+    pairs, which = np.unique(key, axis=0, return_inverse=True)
+    which = which.reshape(-1)
+    for k, (a, b) in enumerate(pairs):
+        rows = which == k
+        yield int(a), int(b), first[rows], other[rows]
+
+
+def _match_points(
+    tracks: Tracks,
+    images: Sequence[Grey],
+    pair: tuple[int, int],
+    rows: tuple[NDArray[np.int64], NDArray[np.int64]],
+    settings: RefineSettings,
+) -> Matched:
+    first, second = rows
+    affine = local_affines(tracks, first, second)
+    at = np.rint(tracks.xy[first]).astype(np.int64)
+    near = tracks.xy[second] + np.einsum("nij,nj->ni", affine, at - tracks.xy[first])
+    return match_between((images[pair[0]], images[pair[1]]), at, (near, affine), settings)
+
+
+def _accepted(
+    tracks: Tracks,
+    reference: NDArray[np.int64],
+    found: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    settings: RefineSettings,
+) -> Refined:
+    xy, variance, correlation = found
+    is_reference = np.zeros(len(tracks), bool)
+    is_reference[reference] = True
+    settled = np.isfinite(correlation)
+    alike = settled & (correlation >= settings.correlation)
+    sure = alike & (variance.max(axis=1) <= settings.sigma**2)
+    count = np.bincount(tracks.track[sure], minlength=tracks.count)
+    for k in range(2):
+        total = np.bincount(tracks.track[sure], variance[sure, k], minlength=tracks.count)
+        variance[reference, k] = total / np.maximum(count, 1)
+    keep = sure | (is_reference & (count > 0)[tracks.track])
+    sigma = np.sqrt(np.where(keep[:, None], variance, np.nan))
+    refined = Tracks(tracks.track, tracks.image, xy, tracks.scale, tracks.angle, sigma)
+    others = ~is_reference
+    return Refined(
+        refined.where(keep),
+        int((others & ~settled).sum()),
+        int((settled & ~alike).sum()),
+        int((alike & ~sure).sum()),
+        float(np.median(correlation[sure])) if sure.any() else float("nan"),
+    )

@@ -1,0 +1,121 @@
+"""Points that several images have in common, from the verified matches of pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from photoplan.matching.features import Features
+from photoplan.matching.verify import PairMatches
+
+__all__ = ["Tracks", "TracksFound", "build_tracks", "connected_parts"]
+
+#: Features of one image closer than this are one point (pixels of the full image, at full scale).
+SAME_PLACE = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Image points and the track that each belongs to; a track has one point in an image."""
+
+    track: NDArray[np.int64]
+    """Track of each image point, (n,); numbers from 0 without gaps, points of one track side by side."""
+    image: NDArray[np.int64]
+    """Index of its image, (n,)."""
+    xy: NDArray[np.float64]
+    """Column and row, (n, 2), pixels."""
+    scale: NDArray[np.float64]
+    """Scale of the feature, (n,), pixels."""
+    angle: NDArray[np.float64]
+    """Direction of the feature, (n,), radians from column towards row axis."""
+    sigma: NDArray[np.float64]
+    """Standard deviation of column and row, (n, 2), pixels; NaN: not known."""
+
+    def __len__(self) -> int:
+        return len(self.track)
+
+    @property
+    def count(self) -> int:
+        """Number of tracks."""
+        return int(self.track[-1]) + 1 if len(self.track) else 0
+
+    @property
+    def rays(self) -> NDArray[np.int64]:
+        """Image points of each track."""
+        return np.bincount(self.track, minlength=self.count)
+
+    def where(self, keep: NDArray[Any]) -> Tracks:
+        """The points at `keep` (mask); tracks with fewer than two points left are dropped."""
+        keep = np.asarray(keep, bool)
+        left = np.bincount(self.track[keep], minlength=self.count)
+        keep = keep & (left >= 2)[self.track]
+        _, track = np.unique(self.track[keep], return_inverse=True)
+        rest = (getattr(self, n)[keep] for n in ("image", "xy", "scale", "angle", "sigma"))
+        return Tracks(track.reshape(-1).astype(np.int64), *rest)
+
+    def of_tracks(self, keep: NDArray[np.bool_]) -> Tracks:
+        """The tracks where `keep` (one per track) is true."""
+        return self.where(keep[self.track])
+
+
+@dataclass(frozen=True, eq=False)
+class TracksFound:
+    """Tracks, and how many were not taken."""
+
+    tracks: Tracks
+    ambiguous: int
+    """Tracks that had points at two places of one image: dropped as a whole."""
+
+
+def build_tracks(features: Sequence[Features], pairs: Sequence[PairMatches], same: float = SAME_PLACE) -> TracksFound:
+    """Join matches that share a feature.
+
+    Parameters
+    ----------
+    features : sequence of Features
+        Of each image.
+    pairs : sequence of PairMatches
+        Verified matches.
+    same : float
+        Features of one image that are closer than this are the same point: a place with several directions.
+    """
+    start = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype(np.int64)
+    total = int(start[-1])
+    none = np.empty(0, np.int64)
+    a = np.concatenate([none, *(start[p.first] + p.features[:, 0] for p in pairs)])
+    b = np.concatenate([none, *(start[p.second] + p.features[:, 1] for p in pairs)])
+    graph = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(total, total))
+    _, label = connected_components(graph, directed=False)
+    used = np.zeros(total, bool)
+    used[a] = used[b] = True
+    index = np.flatnonzero(used)
+    image = np.repeat(np.arange(len(features)), np.diff(start))[index]
+    xy = np.concatenate([np.empty((0, 2)), *(f.xy for f in features)])[index]
+    scale = np.concatenate([np.empty(0), *(f.scale for f in features)])[index]
+    angle = np.concatenate([np.empty(0), *(f.angle for f in features)])[index]
+    _, track = np.unique(label[index], return_inverse=True)
+    order = np.lexsort((scale, image, track))
+    track, image, xy, scale, angle = (v[order] for v in (track.reshape(-1), image, xy, scale, angle))
+    again = np.concatenate([[False], (track[1:] == track[:-1]) & (image[1:] == image[:-1])]) if len(track) else used[:0]
+    apart = np.concatenate([[0.0], np.linalg.norm(np.diff(xy, axis=0), axis=1)]) if len(track) else scale
+    bad = np.zeros(int(track.max()) + 1 if len(track) else 0, bool)
+    bad[track[again & (apart > same)]] = True
+    every = Tracks(track.astype(np.int64), image, xy, scale, angle, np.full((len(track), 2), np.nan))
+    return TracksFound(every.where(~again & ~bad[track]), int(bad.sum()))
+
+
+def connected_parts(count: int, tracks: Tracks) -> list[list[int]]:
+    """Images that hang together by tracks, the largest part first; an image without any is a part of its own."""
+    total = count + tracks.count
+    graph = coo_matrix((np.ones(len(tracks), np.int8), (tracks.image, count + tracks.track)), shape=(total, total))
+    _, label = connected_components(graph, directed=False)
+    parts: dict[int, list[int]] = {}
+    for image in range(count):
+        parts.setdefault(int(label[image]), []).append(image)
+    return sorted(parts.values(), key=len, reverse=True)

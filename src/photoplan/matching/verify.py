@@ -1,0 +1,141 @@
+"""Whether the matches of a pair of images obey the geometry of two central projections."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.interior import Interior
+from photoplan.cameras.lenses.base import Lens
+from photoplan.matching.features import opencv
+
+__all__ = ["Calibration", "PairMatches", "VerifySettings", "verify_pair"]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What is known of the rays of an image."""
+
+    interior: Interior
+    lens: Lens
+
+    def tangents(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Image points (n, 2) as ideal tangent coordinates (n, 2); NaN where the lens has none."""
+        return self.lens.undistort(self.interior.tangent_to_pixel.inverse(xy))
+
+    @property
+    def focal(self) -> float:
+        """Pixels per unit of tangent in the middle of the image."""
+        return float(np.sqrt(abs(np.linalg.det(self.interior.tangent_to_pixel.derivative(np.zeros(2))))))
+
+
+@dataclass(frozen=True)
+class VerifySettings:
+    """When a pair counts as verified."""
+
+    threshold: float = 2.0
+    """Distance from the epipolar line up to which a match fits, pixels."""
+    least: int = 16
+    """Matches that must fit."""
+    share: float = 0.25
+    """Part of all matches of the pair that must fit."""
+
+
+@dataclass(frozen=True, eq=False)
+class PairMatches:
+    """Verified matches of two images."""
+
+    first: int
+    second: int
+    """Indices of the images."""
+    features: NDArray[np.int64]
+    """Indices of features in first and second image, shape (n, 2)."""
+    tried: int
+    """Matches before verification."""
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+
+def verify_pair(
+    xy: tuple[NDArray[np.float64], NDArray[np.float64]],
+    calibrations: tuple[Calibration | None, Calibration | None],
+    settings: VerifySettings,
+) -> NDArray[np.bool_]:
+    """Which matches fit one geometry of the pair; none of them if it is not verified.
+
+    With both cameras known the geometry is the essential matrix of the tangents (Nistér 2004), else the fundamental
+    matrix. Flat ground is no obstacle: it leaves the essential matrix two solutions which contain the same points, and
+    where it leaves the fundamental matrix undetermined, the points of a homography are taken instead.
+
+    Parameters
+    ----------
+    xy : pair of ndarrays, shape (n, 2)
+        Matched image points of the first and the second image, pixels.
+    calibrations : pair
+        Interior orientation and lens of each, None where they are not known.
+    settings : VerifySettings
+
+    Returns
+    -------
+    ndarray, shape (n,)
+    """
+    count = len(xy[0])
+    none = np.zeros(count, bool)
+    if count < settings.least:
+        return none
+    a, b = calibrations
+    if a is not None and b is not None:
+        fits = _essential((a.tangents(xy[0]), b.tangents(xy[1])), settings.threshold / ((a.focal + b.focal) / 2))
+    else:
+        fits = _fundamental(xy, settings.threshold)
+    enough = fits.sum() >= max(settings.least, settings.share * count)
+    return fits if enough else none
+
+
+def _essential(t: tuple[NDArray[np.float64], NDArray[np.float64]], threshold: float) -> NDArray[np.bool_]:
+    cv2 = opencv()
+    known = np.isfinite(t[0]).all(axis=1) & np.isfinite(t[1]).all(axis=1)
+    fits = np.zeros(len(known), bool)
+    p, q = t[0][known], t[1][known]
+    if len(p) < 6:
+        return fits
+    E, inliers = cv2.findEssentialMat(
+        p, q, np.eye(3), method=cv2.USAC_MAGSAC, prob=0.9999, threshold=threshold, maxIters=5000
+    )
+    if E is None or inliers is None or E.shape != (3, 3):
+        return fits
+    index = np.flatnonzero(known)
+    # A finer solution may be found from all inliers of the first one; its own threshold decides, not a soft one.
+    fits[index] = _sampson(E, p, q) <= threshold
+    return fits
+
+
+def _fundamental(xy: tuple[NDArray[np.float64], NDArray[np.float64]], threshold: float) -> NDArray[np.bool_]:
+    cv2 = opencv()
+    p, q = (np.ascontiguousarray(v) for v in xy)
+    fits = np.zeros(len(p), bool)
+    F, _ = cv2.findFundamentalMat(p, q, cv2.USAC_MAGSAC, threshold, 0.9999, 10000)
+    if F is not None and F.shape == (3, 3):
+        fits = _sampson(F, p, q) <= threshold
+    H, _ = cv2.findHomography(p, q, cv2.USAC_MAGSAC, 2 * threshold, maxIters=5000, confidence=0.9999)
+    if H is not None and H.shape == (3, 3):
+        moved = np.concatenate([p, np.ones((len(p), 1))], axis=1) @ H.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            flat = np.linalg.norm(moved[:, :2] / moved[:, 2:] - q, axis=1) <= 2 * threshold
+        if flat.sum() >= 0.8 * fits.sum():
+            return flat
+    return fits
+
+
+def _sampson(F: NDArray[np.float64], p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance of matches from their epipolar lines, to first order (Hartley and Zisserman 2004, eq. 11.9)."""
+    one = np.ones((len(p), 1))
+    a, b = np.concatenate([p, one], axis=1), np.concatenate([q, one], axis=1)
+    line_b, line_a = a @ F.T, b @ F
+    gap = np.abs((b * line_b).sum(axis=1))
+    scale = np.sqrt((line_a[:, :2] ** 2).sum(axis=1) + (line_b[:, :2] ** 2).sum(axis=1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(scale > 0, np.sqrt(2) * gap / scale, np.inf)
