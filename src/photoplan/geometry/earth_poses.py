@@ -15,6 +15,7 @@ from photoplan.geometry.local import LocalFrame
 
 __all__ = [
     "enu_axes",
+    "enu_poses",
     "geocentric_of_geodetic",
     "geocentric_poses",
     "geodetic_of_geocentric",
@@ -46,6 +47,31 @@ def geodetic_of_geocentric(xyz: ArrayLike) -> tuple[float, float, float]:
     x, y, z = np.asarray(xyz, float).tolist()
     lon, lat, h = _to_earth().transform(x, y, z, direction="INVERSE")
     return float(lat), float(lon), float(h)
+
+
+def enu_poses(geodetic: ArrayLike) -> tuple[tuple[float, float, float], _Floats, _Floats]:
+    """Points given by latitude and longitude as one tangential system about their middle.
+
+    Parameters
+    ----------
+    geodetic : array_like, shape (n, 3)
+        Latitude, longitude (degrees, WGS 84) and ellipsoidal height.
+
+    Returns
+    -------
+    origin : tuple of float
+        Latitude, longitude (degrees) and ellipsoidal height of the system's origin.
+    enu : ndarray, shape (n, 3)
+        The points, metres.
+    R : ndarray, shape (n, 3, 3)
+        East, north and up *at each point* (columns) in the axes of the system.
+    """
+    points = np.asarray(geodetic, float).reshape(-1, 3)
+    earth = np.column_stack(_to_earth().transform(points[:, 1], points[:, 0], points[:, 2]))
+    origin = geodetic_of_geocentric(earth.mean(axis=0))
+    axes = enu_axes(*origin[:2])
+    own = np.stack([enu_axes(lat, lon).T for lat, lon in points[:, :2]])
+    return origin, (earth - geocentric_of_geodetic(origin)) @ axes.T, axes @ own
 
 
 def _to_earth() -> Transformer:

@@ -16,11 +16,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
+from photoplan.io.camera_opensfm import cameras_of
 from photoplan.io.orientation_block import OrientationBlock, OrientationFormat
+from photoplan.io.orientation_opensfm_write import losses, render
 from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.plain_files import finite, read_json
 
-__all__ = ["FORMAT", "read", "rotation_from_axis_angle"]
+__all__ = ["FORMAT", "read", "read_block", "rotation_from_axis_angle"]
 
 #: From camera axes x right, y down, z forwards to x right, y up, z backwards, and back.
 FLIP = np.diag([1.0, -1.0, -1.0])
@@ -89,9 +91,27 @@ def _image(name: str, shot: Any, path: Path) -> OrientedImage:
     )
 
 
+def read_block(path: Path, form: TableFormat) -> OrientationBlock:
+    """The same table with the cameras of the file, where it describes them.
+
+    Raises
+    ------
+    InputError
+        See `read`, or a camera's model is not supported.
+    """
+    table = read(path, form)
+    contents = read_json(path)
+    cameras = {}
+    if all(isinstance(r.get("cameras"), dict) for r in contents):
+        cameras = cameras_of(contents, path)
+    return OrientationBlock(table, cameras)
+
+
 FORMAT = OrientationFormat(
     name="opensfm",
     title="reconstruction.json of OpenSfM",
     sniff=lambda path, head: path.suffix.lower() == ".json" and '"shots"' in head,
-    read=lambda path, form: OrientationBlock(read(path, form)),
+    read=read_block,
+    render=render,
+    losses=losses,
 )

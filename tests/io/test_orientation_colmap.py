@@ -1,0 +1,177 @@
+"""COLMAP's text model: the sample of its documentation (colmap.github.io/format.html, BSD-3-Clause), and its models."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from format_examples import assert_same, block_of, frame, pixels, round_trip
+from scipy.spatial.transform import Rotation
+
+from photoplan.errors import InputError
+from photoplan.io.orientation_colmap import read_points
+from photoplan.io.orientation_file import orientation_format, read_orientation_block
+
+CAMERAS = """# Camera list with one line of data per camera:
+#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
+# Number of cameras: 3
+1 SIMPLE_PINHOLE 3072 2304 2559.81 1536 1152
+2 PINHOLE 3072 2304 2560.56 2560.56 1536 1152
+3 SIMPLE_RADIAL 3072 2304 2559.69 1536 1152 -0.0218531
+"""
+IMAGES = """# Image list with two lines of data per image:
+#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME
+#   POINTS2D[] as (X, Y, POINT3D_ID)
+# Number of images: 2, mean observations per image: 2
+1 0.851773 0.0165051 0.503764 -0.142941 -0.737434 1.02973 3.74354 1 P1180141.JPG
+2362.39 248.498 58396 1784.7 268.254 59027 1784.7 268.254 -1
+2 0.851773 0.0165051 0.503764 -0.142941 -0.737434 1.02973 3.74354 1 P1180142.JPG
+1190.83 663.957 23056 1258.77 640.354 59070
+"""
+POINTS = """# 3D point list with one line of data per point:
+#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)
+# Number of points: 3, mean track length: 3.3334
+63390 1.67241 0.292931 0.609726 115 121 122 1.33927 16 6542 15 7345 6 6714 14 7227
+63376 2.01848 0.108877 -0.0260841 102 209 250 1.73449 16 6519 15 7322 14 7212 8 3991
+63371 1.71102 0.28566 0.53475 245 251 249 0.612829 118 4140 117 4473
+"""
+
+
+def model(folder: Path, cameras: str = CAMERAS, images: str = IMAGES) -> Path:
+    (folder / "cameras.txt").write_text(cameras)
+    (folder / "images.txt").write_text(images)
+    (folder / "points3D.txt").write_text(POINTS)
+    return folder
+
+
+def test_the_documentations_sample(tmp_path: Path) -> None:
+    block = read_orientation_block(model(tmp_path))
+    assert [i.name for i in block.table.images] == ["P1180141.JPG", "P1180142.JPG"]
+    assert list(block.cameras) == ["1"]  # the others are of no image
+    camera: Any = block.cameras["1"]
+    assert (camera.size, camera.focal, camera.lens.type) == ((3072, 2304), (2559.81, 2559.81), "none")
+    # 1536 of 3072 px from the corner is the middle of the image, half a pixel less from the first pixel's centre.
+    assert camera.principal_point == (1535.5, 1151.5)
+    # The projection centre is −Rᵀ T: R of the quaternion written out after Hamilton.
+    w, x, y, z = np.array([0.851773, 0.0165051, 0.503764, -0.142941]) / np.linalg.norm(
+        [0.851773, 0.0165051, 0.503764, -0.142941]
+    )
+    R = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    np.testing.assert_allclose(block.table.centers[0], -R.T @ [-0.737434, 1.02973, 3.74354], atol=1e-12)
+    # One of the sample's points, projected after the documentation: x right, y down, z forwards.
+    X = np.array([1.67241, 0.292931, 0.609726])
+    p = R @ X + [-0.737434, 1.02973, 3.74354]
+    seen = np.array([2559.81 * p[0] / p[2] + 1536, 2559.81 * p[1] / p[2] + 1152]) - 0.5
+    np.testing.assert_allclose(pixels(block, X), seen, atol=1e-8)
+    assert "states no CRS" in block.table.notes[0]
+
+
+def test_the_samples_points(tmp_path: Path) -> None:
+    points = read_points(model(tmp_path))
+    assert points.XYZ["63376"] == (2.01848, 0.108877, -0.0260841)
+    assert points.measured.points == ("58396", "59027", "23056", "59070")
+    np.testing.assert_allclose(points.measured.xy[0], [2361.89, 247.998])
+    twice = IMAGES.replace("268.254 -1", "268.254 58396")
+    assert read_points(model(tmp_path, images=twice)).repeated == 1
+
+
+P = {"f": 900.0, "fx": 900.0, "fy": 905.0, "cx": 503.0, "cy": 371.5, "k1": -0.08, "k2": 0.02, "p1": 1e-3, "p2": -2e-3}
+P |= {"k3": 4e-3, "k4": 0.03, "k5": -2e-3, "k6": 1e-3}
+
+
+def opencv(x: float, y: float, p: dict[str, float]) -> tuple[float, float]:
+    r2 = x * x + y * y
+    g = (1 + p["k1"] * r2 + p["k2"] * r2**2 + p["k3"] * r2**3) / (1 + p["k4"] * r2 + p["k5"] * r2**2 + p["k6"] * r2**3)
+    dx = 2 * p["p1"] * x * y + p["p2"] * (r2 + 2 * x * x)
+    dy = p["p1"] * (r2 + 2 * y * y) + 2 * p["p2"] * x * y
+    return x * g + dx, y * g + dy
+
+
+def fisheye(x: float, y: float, p: dict[str, float]) -> tuple[float, float]:
+    r = float(np.hypot(x, y))
+    q = np.arctan(r)
+    d = q * (1 + p["k1"] * q**2 + p["k2"] * q**4 + p["k3"] * q**6 + p["k4"] * q**8)
+    return x * d / r, y * d / r
+
+
+MODELS = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_models_see_the_documented_pixels(tmp_path: Path, name: str) -> None:
+    given = MODELS[name].split()
+    q = Rotation.from_rotvec([0.2, -0.4, 1.3])
+    t = np.array([1.0, -2.0, 30.0])
+    w = np.roll(q.as_quat(), 1)
+    cameras = f"7 {name} 1000 750 {' '.join(repr(P[n]) for n in given)}\n"
+    images = f"3 {' '.join(map(repr, w.tolist()))} {' '.join(map(repr, t.tolist()))} 7 a folder/b c.jpg\n\n"
+    block = read_orientation_block(model(tmp_path, cameras, images) / "images.txt", format="colmap")
+    assert block.table.images[0].name == "a folder/b c.jpg"
+    p = {n: P[n] if n in given else 0.0 for n in P}
+    fx, fy = (P["f"], P["f"]) if "f" in given else (P["fx"], P["fy"])
+    for X in np.random.default_rng(2).uniform(-8, 8, (20, 3)):
+        x, y, z = q.as_matrix() @ X + t
+        xd, yd = (fisheye if "FISHEYE" in name else opencv)(x / z, y / z, p)
+        np.testing.assert_allclose(pixels(block, X), [fx * xd + p["cx"] - 0.5, fy * yd + p["cy"] - 0.5], atol=1e-8)
+
+
+@pytest.mark.parametrize("lens", ["none", "brown", "opencv", "rational", "fisheye"])
+def test_round_trip(tmp_path: Path, lens: str) -> None:
+    block = block_of({"x": frame(lens), "y": frame("opencv")}, middle=(100.0, 200.0, 90.0))
+    again = round_trip(block, tmp_path / "sparse", "colmap")
+    assert_same(block, again)
+    assert [i.camera for i in again.table.images] == ["1", "2", "1", "2", "1"]
+    assert sorted(p.name for p in (tmp_path / "sparse").iterdir()) == ["cameras.txt", "images.txt", "points3D.txt"]
+
+
+def test_losses() -> None:
+    losses = orientation_format("colmap").losses
+    block = block_of({"x": frame("brown with shear")}, crs="EPSG:32632", height_system="ellipsoidal")
+    assert [x.kind for x in losses(block)] == ["lens", "crs", "height_system", "other"]
+
+
+@pytest.mark.parametrize(
+    ("cameras", "images", "says"),
+    [
+        (CAMERAS.replace("SIMPLE_PINHOLE", "FOV"), IMAGES, r"cameras\.txt:4: camera model 'FOV' is not supported"),
+        (CAMERAS.replace("2559.81 ", ""), IMAGES, r"cameras\.txt:4: .*5 numbers"),
+        (CAMERAS.replace("2559.81", "-1"), IMAGES, r"cameras\.txt:4: .*greater than 0"),
+        (CAMERAS.replace("2 PIN", "1 PIN"), IMAGES, r"cameras\.txt:5: camera 1 is given twice"),
+        (CAMERAS, IMAGES.replace("0.851773", "0.1"), r"images\.txt:5: image 'P1180141.JPG': the quaternion"),
+        (CAMERAS, IMAGES.replace(" 1 P1180142", " 9 P1180142"), "camera '9' of image 'P1180142.JPG' is not described"),
+        (CAMERAS, IMAGES.replace("1.02973", "x"), r"images\.txt:5: .*numbers are needed"),
+        (
+            CAMERAS,
+            IMAGES.replace("\n2362.39 248.498 58396 1784.7 268.254 59027 1784.7 268.254 -1", ""),
+            r"images\.txt:7: 6 col",
+        ),
+        (CAMERAS, "", "holds no image"),
+    ],
+)
+def test_fault_18_broken_models(tmp_path: Path, cameras: str, images: str, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        read_orientation_block(model(tmp_path, cameras, images), format="colmap")
+
+
+def test_a_binary_model_says_how_to_convert_it(tmp_path: Path) -> None:
+    (tmp_path / "images.bin").write_bytes(b"\0")
+    with pytest.raises(InputError, match="colmap model_converter --output_type TXT"):
+        read_orientation_block(tmp_path, format="colmap")
