@@ -99,7 +99,7 @@ class AdjustSettings:
     """Whether observations that do not fit lose weight while iterating (Huber, then a redescending function)."""
     critical: float = 4.0
     """Normalised residual from which an observation is taken out as a gross error."""
-    variance_components: bool = False
+    variance_components: bool = True
     """Whether the groups' standard deviations are estimated and used."""
     iterations: int = 40
     """Most iterations."""
@@ -180,7 +180,7 @@ class Adjusted:
     """Residuals divided by their standard deviations, (k, 2)."""
     rejected: NDArray[np.bool_]
     """Measurements that were taken out as gross errors, (k,); `residuals` and `normalised` then are those against the
-    result without them."""
+    result without them, NaN where their point or image had not enough left."""
     ground_residuals: NDArray[np.float64]
     """Adjusted minus given coordinates of every ground point, (g, 3), metres; NaN: not known or not seen."""
     ground_normalised: NDArray[np.float64]

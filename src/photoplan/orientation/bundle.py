@@ -1,12 +1,197 @@
-"""Bundle block adjustment."""
+"""Bundle block adjustment: orientations, points and cameras from all observations at once, by least squares.
+
+The unknowns are exterior orientations, ground points and, where they are free, parameters of cameras, lever arm,
+boresight and drift. Points are eliminated (Schur complement), what remains is sparse and solved by SciPy. Gross errors
+are found in two ways: first by weights that fall with the residual, from whatever start; then by data snooping
+(Baarda 1968): each residual against its own standard deviation, the worst of each point first.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import GeometryError
+from photoplan.orientation.active import Active
 from photoplan.orientation.block import Adjusted, AdjustSettings, Block
+from photoplan.orientation.bundle_model import Model, build_model
+from photoplan.orientation.bundle_normal import reduce_normals
+from photoplan.orientation.bundle_rank import check_rank
+from photoplan.orientation.bundle_result import result_of
+from photoplan.orientation.bundle_robust import first_taken_out, robust_weights, snooped, weights_of
+from photoplan.orientation.bundle_rows import linearise, residuals_of, whitened
+from photoplan.orientation.bundle_select import Selection, select, start_points
+from photoplan.orientation.bundle_solution import solution_of
+from photoplan.orientation.bundle_state import State, start_state
 
-__all__ = ["adjust_block"]
+__all__ = ["Progress", "adjust_block"]
+
+#: Called after each iteration: its number, and the root mean square of the weighted residuals.
+Progress = Callable[[int, float], None]
+
+_Floats = NDArray[np.float64]
+
+#: Largest step at the end, in units of each unknown's own standard deviation (the others fixed).
+_CONVERGED = 1e-3
+#: The same for the robust start, and its least number of iterations.
+_ROUGHLY, _LEAST = 0.5, 8
+#: Largest relative change of the sum of squares at the end.
+_SETTLED = 1e-9
+#: Rounds of data snooping, and of variance components.
+_ROUNDS, _COMPONENTS = 8, 6
+#: Damping (part of the diagonal) after a step that made things worse, and when to give up.
+_FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e6
 
 
-def adjust_block(block: Block, settings: AdjustSettings | None = None) -> Adjusted:
-    """Least-squares adjustment of all observations of a block; to be written."""
-    raise NotImplementedError
+def adjust_block(block: Block, settings: AdjustSettings | None = None, progress: Progress | None = None) -> Adjusted:
+    """Adjust a block of images.
+
+    Parameters
+    ----------
+    block : Block
+        In a Cartesian system.
+    settings : AdjustSettings, optional
+    progress : callable, optional
+        Told after each iteration.
+
+    Raises
+    ------
+    GeometryError
+        The observations do not determine the unknowns; the message names them. Or no image has enough points, or the
+        iterations do not converge.
+    InputError, UsageError
+        A standard deviation is missing, or a parameter cannot be free.
+    """
+    settings = settings or AdjustSettings()
+    loop = _Loop(settings.iterations, progress or (lambda number, rms: None))
+    active = Active.all_of(block)
+    selection, XYZ, lost = _selected(block, active, frozenset())
+    model = build_model(block, selection.images, selection.measured, selection.points)
+    state = start_state(model, [block.images[k].pose for k in selection.images], XYZ)
+    _check(model, state, active)
+    if settings.robust:
+        state = loop.run(model, state, active, robust=True)
+        active = first_taken_out(model, whitened(model, residuals_of(model, state)), active, settings.critical)
+    for turn in range(_ROUNDS):
+        model, state, selection = _rebuilt(block, model, state, active, lost)
+        state = loop.run(model, state, active)
+        solution = solution_of(model, state, weights_of(model, active), settings.covariance)
+        if not settings.robust or turn == _ROUNDS - 1:
+            break
+        next_active = snooped(model, state, solution.judged(), active, settings.critical)
+        if next_active.equals(active):
+            break
+        active = next_active
+    factors: _Floats | None = None
+    for _ in range(_COMPONENTS if settings.variance_components else 0):
+        factors = solution.factors()
+        state = loop.run(model, state, active, factors=factors)
+        solution = solution_of(model, state, weights_of(model, active, factors), settings.covariance)
+        if np.allclose(solution.factors(), factors, rtol=0.02):
+            break
+    check_rank(model, state, solution.reduced)
+    return result_of(block, selection, solution, active, loop.count)
+
+
+def _selected(block: Block, active: Active, lost: frozenset[str]) -> tuple[Selection, _Floats, frozenset[str]]:
+    """What takes part, start values of its points, and the points whose rays are parallel."""
+    while True:
+        selection = select(block, active, lost)
+        if not selection.images or not selection.points:
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in selection.left_out[:5])
+            raise GeometryError(f"no image has enough measured points to be adjusted ({reasons or 'no measurements'})")
+        XYZ, parallel = start_points(block, selection)
+        if not parallel:
+            return selection, XYZ, lost
+        lost |= parallel
+
+
+def _check(model: Model, state: State, active: Active) -> None:
+    rows, _ = linearise(model, state, np.sqrt(weights_of(model, active)))
+    check_rank(model, state, reduce_normals(rows, len(model.point_names)))
+
+
+def _rebuilt(
+    block: Block, model: Model, state: State, active: Active, lost: frozenset[str]
+) -> tuple[Model, State, Selection]:
+    """The model without what was taken out; unknowns keep their values, points that come back are intersected."""
+    selection = select(block, active, lost)
+    if not selection.images or not selection.points:
+        raise GeometryError(
+            "gross errors leave no image with enough points; are image points and images the same block?"
+        )
+    made = build_model(block, selection.images, selection.measured, selection.points)
+    place = {name: k for k, name in enumerate(model.image_names)}
+    poses = state.poses()
+    start = [
+        poses[place[n]] if n in place else block.images[k].pose for n, k in zip(made.image_names, selection.images)
+    ]
+    points = {name: k for k, name in enumerate(model.point_names)}
+    XYZ = np.full((len(made.point_names), 3), np.nan)
+    old = np.array([points.get(n, -1) for n in made.point_names], np.int64)
+    XYZ[old >= 0] = state.XYZ[old[old >= 0]]
+    if (old < 0).any():
+        fresh, _ = start_points(block, selection)
+        XYZ[old < 0] = fresh[old < 0]
+    return made, state.carried(model, made, start, XYZ), selection
+
+
+class _Loop:
+    """Iterations to the minimum; counts them over all rounds."""
+
+    def __init__(self, most: int, progress: Progress) -> None:
+        self.count = 0
+        self._most, self._progress = most, progress
+
+    def run(
+        self, model: Model, state: State, active: Active, robust: bool = False, factors: _Floats | None = None
+    ) -> State:
+        """The state where the weighted sum of squares is least (Levenberg–Marquardt)."""
+        base = weights_of(model, active, factors)
+        damping, cost = 0.0, np.inf
+        for turn in range(self._most):
+            e = whitened(model, residuals_of(model, state))
+            weight = base * robust_weights(model, e, turn) if robust else base
+            weight = np.where(np.isfinite(e), weight, 0.0)
+            before = _cost(e, weight)
+            rows, _ = linearise(model, state, np.sqrt(weight))
+            while True:
+                reduced = reduce_normals(rows, len(model.point_names), damping)
+                step, points = reduced.solve()
+                moved = state.moved(model, step, points)
+                after = _cost(whitened(model, residuals_of(model, moved)), weight)
+                if after <= before * (1.0 + 1e-9) + 1e-12:
+                    break
+                damping = max(10.0 * damping, _FIRST_DAMPING)
+                if damping > _MOST_DAMPING:
+                    raise GeometryError(
+                        "the adjustment does not converge: no step makes the residuals smaller. Are start "
+                        "orientations, image points and control of the same block?"
+                    )
+            damping = 0.0 if damping <= _FIRST_DAMPING else damping / 10.0
+            state = moved
+            self.count += 1
+            self._progress(self.count, float(np.sqrt(after / max(1.0, float((weight > 0).sum())))))
+            largest = float(np.abs(step / reduced.scale).max()) if len(step) else 0.0
+            settled = abs(cost - after) <= _SETTLED * after or after < 1e-18 * len(e)
+            if damping == 0.0 and (largest < _CONVERGED or settled) and not robust:
+                return state
+            if robust and turn >= _LEAST and largest < _ROUGHLY:
+                return state
+            cost = after
+        if robust:
+            return state
+        raise GeometryError(
+            f"the adjustment has not converged after {self._most} iterations (largest step {largest:.2g} standard "
+            "deviations); are all free parameters determined?"
+        )
+
+
+def _cost(e: _Floats, weight: _Floats) -> float:
+    """Weighted sum of squares; infinite when a point that counts has come behind a camera."""
+    counted = weight > 0
+    if not np.isfinite(e[counted]).all():
+        return np.inf
+    return float((weight[counted] * e[counted] ** 2).sum())

@@ -1,0 +1,199 @@
+"""Observations that do not fit: their weights while iterating, and which are taken out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.orientation.active import Active
+from photoplan.orientation.bundle_model import Model
+from photoplan.orientation.bundle_rows import residuals_of_all
+from photoplan.orientation.bundle_state import State
+
+__all__ = [
+    "Judged",
+    "Kinds",
+    "first_taken_out",
+    "kinds_of",
+    "robust_scale",
+    "robust_weights",
+    "snooped",
+    "weights_of",
+]
+
+_Floats = NDArray[np.float64]
+
+#: Kinds of rows: what a group of observations is called, and the unit of its residuals.
+Kinds = tuple[tuple[str, str], ...]
+
+#: Iterations with Huber's weights before gross errors may lose all influence.
+_HUBER = 5
+#: Where the weights begin to fall, in standard deviations.
+_HUBER_LIMIT, _FALL = 2.0, 3.0
+#: An observation that was taken out comes back when its residual is below this part of the critical value.
+_BACK = 0.75
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """What data snooping looks at, of all rows."""
+
+    e: _Floats
+    """Residuals divided by the standard deviations that were stated."""
+    normalised: _Floats
+    """Residuals divided by their own standard deviations."""
+    weight: _Floats
+    scales: _Floats
+    """Of each group (`kinds_of`): standard deviation of its residuals in units of the stated ones."""
+
+
+def kinds_of(model: Model) -> tuple[Kinds, NDArray[np.int64]]:
+    """Groups of observations, and the group of each row; rows of what is known beforehand are not listed."""
+    kinds: list[tuple[str, str]] = [(f"image points, camera {name}", "px") for name in model.camera_names]
+    of = [np.repeat(model.camera_of[model.image], 2)]
+    at = len(kinds)
+    kinds += [("control, horizontal", "m"), ("control, height", "m")]
+    of.append(at + (model.ground_axis == 2))
+    block = model.block
+    if block.positions is not None:
+        at = len(kinds)
+        kinds += [("observed positions, horizontal", "m"), ("observed positions, height", "m")]
+        of.append(np.tile([at, at, at + 1], len(model.position)))
+    if block.attitudes is not None:
+        kinds.append(("observed attitudes", "rad"))
+        of.append(np.full(3 * len(model.attitude), len(kinds) - 1))
+    return tuple(kinds), np.concatenate(of).astype(np.int64)
+
+
+def weights_of(model: Model, active: Active, factors: _Floats | None = None) -> _Floats:
+    """Weights of all rows: 0 for what is taken out, 1 / factor² for its group's variance factor."""
+    _, of = kinds_of(model)
+    weight = np.ones(len(of))
+    if factors is not None:
+        weight = 1.0 / factors[of] ** 2
+    k, c, p = len(model.image), len(model.ground), len(model.position)
+    weight[2 * k : 2 * k + c] *= active.ground[model.ground, model.ground_axis]
+    if p:
+        weight[2 * k + c : 2 * k + c + 3 * p] *= np.repeat(active.position[model.position_row], 3)
+    return np.concatenate([weight, np.ones(_priors(model))])
+
+
+def _priors(model: Model) -> int:
+    block = model.block
+    known = sum(p in block.cameras[n].prior_sigma for n in model.camera_names for p in block.cameras[n].free)
+    return known + (3 if model.columns.lever >= 0 else 0)
+
+
+def robust_scale(e: _Floats, kind: tuple[str, str]) -> float:
+    """Standard deviation of a group's whitened residuals, that one in five gross errors hardly moves.
+
+    Image points may be better than stated. Control, positions and attitudes may not: many of them are checked so little
+    that their residuals are small for that reason alone. Fewer than 20 residuals count as stated: 1.
+    """
+    e = e[np.isfinite(e)]
+    if len(e) < 20:
+        return 1.0
+    return max(1.4826 * float(np.median(np.abs(e))), 1e-9 if kind[1] == "px" else 1.0)
+
+
+def robust_weights(model: Model, e: _Floats, turn: int) -> _Floats:
+    """Weights that fall with the residual: Huber's at first, then Geman and McClure's.
+
+    Both coordinates of an image point, and all of an observed position, have one weight.
+    """
+    size = _sizes(model, e)
+    weight = np.ones(len(e))
+    kinds, of = kinds_of(model)
+    stretch = _stretch(model)
+    for k in range(len(kinds)):
+        mine = np.flatnonzero(of == k)
+        # Sizes of two or three coordinates are longer than single ones; the scale is that of the single ones.
+        s = size[mine] / (robust_scale(e[mine], kinds[k]) * stretch)
+        weight[mine] = (
+            _HUBER_LIMIT / np.maximum(s, _HUBER_LIMIT) if turn < _HUBER else 1.0 / (1 + (s / _FALL) ** 2) ** 2
+        )
+    return np.nan_to_num(weight)
+
+
+def _stretch(model: Model) -> float:
+    """How much longer errors are than residuals, in the mean: unknowns take a part of the errors."""
+    rows = 2 * len(model.image) + len(model.ground) + 3 * (len(model.position) + len(model.attitude))
+    unknowns = model.columns.count + 3 * len(model.point_names)
+    return float(np.sqrt(rows / max(rows - unknowns, 0.05 * rows)))
+
+
+def _sizes(model: Model, e: _Floats) -> _Floats:
+    """Length of the whitened residual that each row is part of, in units of one coordinate's."""
+    size = np.abs(e)
+    k, c, p = len(model.image), len(model.ground), len(model.position)
+    pairs = e[: 2 * k].reshape(-1, 2)
+    size[: 2 * k] = np.repeat(np.sqrt((pairs**2).mean(axis=1)), 2)
+    threes = e[2 * k + c : 2 * k + c + 3 * p].reshape(-1, 3)
+    size[2 * k + c : 2 * k + c + 3 * p] = np.repeat(np.sqrt((threes**2).mean(axis=1)), 3)
+    return size
+
+
+def first_taken_out(model: Model, e: _Floats, active: Active, critical: float) -> Active:
+    """Take out what does not fit the robust estimate."""
+    size = np.abs(e)
+    kinds, of = kinds_of(model)
+    for k in range(len(kinds)):
+        mine = np.flatnonzero(of == k)
+        size[mine] /= robust_scale(e[mine], kinds[k]) * _stretch(model)
+    size[~np.isfinite(size)] = np.inf
+    # Where residuals are small beside the errors this is too strict, so it takes twice as much here; data snooping does
+    # the rest.
+    bad = size[: len(of)] > 2.0 * critical
+    return _without(model, active, bad)
+
+
+def _without(model: Model, active: Active, bad: NDArray[np.bool_]) -> Active:
+    """Take out the observations whose rows are bad."""
+    k, c, p = len(model.image), len(model.ground), len(model.position)
+    image, ground, position = active.image.copy(), active.ground.copy(), active.position.copy()
+    image[model.observation[bad[: 2 * k].reshape(-1, 2).any(axis=1)]] = False
+    rows = np.flatnonzero(bad[2 * k : 2 * k + c])
+    ground[model.ground[rows], model.ground_axis[rows]] = False
+    position[model.position_row[bad[2 * k + c : 2 * k + c + 3 * p].reshape(-1, 3).any(axis=1)]] = False
+    return Active(image, ground, position)
+
+
+def snooped(model: Model, state: State, judged: Judged, active: Active, critical: float) -> Active:
+    """Data snooping: the worst measurement of each point is taken out, and what fits again comes back.
+
+    Only the largest normalised residual of a point is judged at a time, since a gross error spreads over the
+    residuals of its point's other measurements.
+    """
+    _, of = kinds_of(model)
+    size = np.nan_to_num(np.abs(judged.normalised[: len(of)]))
+    size[judged.weight[: len(of)] == 0] = 0.0
+    k, c = len(model.image), len(model.ground)
+    bad = size > critical
+    point = np.concatenate([np.repeat(model.point, 2), model.ground_point])
+    worst = np.zeros(len(model.point_names))
+    np.maximum.at(worst, point, size[: 2 * k + c])
+    bad[: 2 * k + c] &= size[: 2 * k + c] >= worst[point]
+    out = _without(model, active, bad)
+    return _brought_back(model, state, judged, active, out, critical * _BACK)
+
+
+def _brought_back(model: Model, state: State, judged: Judged, before: Active, after: Active, limit: float) -> Active:
+    """Observations that were out before and fit now."""
+    block, scales = model.block, judged.scales
+    _, of = kinds_of(model)
+    residuals = residuals_of_all(model, state)
+    image = after.image.copy()
+    camera = {name: k for k, name in enumerate(model.camera_names)}
+    of_image = {b.name: camera.get(b.camera, -1) for b in block.images}
+    kind = np.array([of_image.get(n, -1) for n in block.observations.images], np.int64)[block.observations.image]
+    with np.errstate(invalid="ignore"):
+        size = np.abs(residuals / block.observations.sigma).max(axis=1) / scales[kind]
+    image |= ~before.image & (kind >= 0) & (np.nan_to_num(size, nan=np.inf) < limit)
+    ground, position = after.ground.copy(), after.position.copy()
+    rows = np.arange(2 * len(model.image), 2 * len(model.image) + len(model.ground))
+    fits = np.abs(judged.e[rows]) / scales[of[rows]] < limit
+    out = ~before.ground[model.ground, model.ground_axis]
+    ground[model.ground[fits & out], model.ground_axis[fits & out]] = True
+    return Active(image, ground, position)
