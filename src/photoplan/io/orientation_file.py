@@ -29,6 +29,9 @@ FORMATS: dict[str, str] = {
     "bluh": "photoplan.io.orientation_bluh",
     "inpho": "photoplan.io.orientation_inpho",
     "metashape": "photoplan.io.orientation_metashape",
+    "opk": "photoplan.io.orientation_opk",
+    "odm": "photoplan.io.orientation_odm",
+    "colmap": "photoplan.io.orientation_colmap",
 }
 
 #: Formats whose reader says what is wrong with a file that no format claims, by suffix; else it is a table of text.
