@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 
 from photoplan.errors import InputError
-from photoplan.io.orientation_block import Loss, OrientationBlock, OrientationFormat, common_losses
+from photoplan.io.orientation_block import Loss, OrientationBlock, OrientationFormat, common_losses, require_map
 from photoplan.io.orientation_table import Direction, TableFormat
 from photoplan.io.orientation_text import angle_block, one_word, word_lines
 
@@ -43,6 +43,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
 
 def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     """The text of a file."""
+    require_map(block, path)
     lines = []
     for image, angles in zip(block.table.images, block.angles("pok", "gon")):
         X, Y, Z = image.center
@@ -67,4 +68,6 @@ FORMAT = OrientationFormat(
     read=read,
     render=render,
     losses=_losses,
+    suffix=".dat",
+    angles=True,
 )

@@ -20,7 +20,15 @@ from photoplan.io.camera_model import FilmCamera, FrameCamera, NoLens
 from photoplan.io.orientation_table import Direction, OrientationTable, OrientedImage, TableFormat
 from photoplan.io.project_model import ANGLE_UNITS
 
-__all__ = ["Loss", "LossKind", "OrientationBlock", "OrientationFormat", "common_losses", "without_lenses"]
+__all__ = [
+    "Loss",
+    "LossKind",
+    "OrientationBlock",
+    "OrientationFormat",
+    "common_losses",
+    "require_map",
+    "without_lenses",
+]
 
 LossKind = Literal["lens", "camera", "film", "crs", "height_system", "other"]
 
@@ -122,6 +130,25 @@ class OrientationFormat:
     nothing itself. Raises InputError where something that the format needs is not known. None: read only."""
     losses: Callable[[OrientationBlock], Iterable[Loss]] = lambda block: ()
     """What of a block the format cannot hold."""
+    suffix: str = ".txt"
+    """Of a file that the user gives no name; empty for a folder."""
+    angles: bool = False
+    """Whether files hold three angles that could mean something else than they are taken for."""
+
+
+def require_map(block: OrientationBlock, path: Path) -> None:
+    """Refuse a block in a local tangential system, for formats that cannot state its origin.
+
+    Raises
+    ------
+    InputError
+        Positions and rotations refer to such a system.
+    """
+    if block.table.origin is not None:
+        raise InputError(
+            f"{path}: the orientations of {block.table.file} are in a local system that this format cannot state; "
+            "carry them into a map with --crs EPSG:nnnn"
+        )
 
 
 def without_lenses(block: OrientationBlock) -> OrientationBlock:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from photoplan.errors import InputError
-from photoplan.io.orientation_block import OrientationBlock, OrientationFormat, common_losses
+from photoplan.io.orientation_block import OrientationBlock, OrientationFormat, common_losses, require_map
 from photoplan.io.orientation_table import Direction, TableFormat
 from photoplan.io.orientation_text import angle_block, one_word, word_lines
 
@@ -41,6 +41,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
 
 def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     """The text of a file."""
+    require_map(block, path)
     lines = []
     for image, angles in zip(block.table.images, block.angles("pok", "gon")):
         X, Y, Z = image.center
@@ -56,4 +57,6 @@ FORMAT = OrientationFormat(
     read=read,
     render=render,
     losses=lambda block: common_losses(block, cameras=False),
+    suffix=".ori",
+    angles=True,
 )

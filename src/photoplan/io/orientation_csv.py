@@ -13,7 +13,7 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
-from photoplan.io.orientation_block import OrientationBlock, OrientationFormat, common_losses
+from photoplan.io.orientation_block import OrientationBlock, OrientationFormat, common_losses, require_map
 from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.plain_files import read_text
 from photoplan.io.project_model import ANGLE_UNITS
@@ -242,6 +242,7 @@ def _delimiter_safe(name: str) -> str:
 
 def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     """Comma-separated table with ω, φ, κ in degrees, camera to ground, and its ``.prj`` where a CRS is known."""
+    require_map(block, path)
     table = block.table
     named = any(image.camera for image in table.images)
     lines = ["name,x,y,z,omega,phi,kappa" + (",camera" if named else "")]
@@ -263,4 +264,6 @@ FORMAT = OrientationFormat(
     read=lambda path, form: OrientationBlock(read(path, form)),
     render=render,
     losses=lambda block: common_losses(block, cameras=False, crs=True),
+    suffix=".csv",
+    angles=True,
 )

@@ -328,4 +328,5 @@ FORMAT = OrientationFormat(
     read=read,
     render=render,
     losses=losses,
+    suffix=".prj",
 )

@@ -12,7 +12,7 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.io.camera_model import FilmCamera, FrameCamera
-from photoplan.io.orientation_block import Loss, OrientationBlock, common_losses
+from photoplan.io.orientation_block import Loss, OrientationBlock, common_losses, require_map
 from photoplan.io.orientation_table import Direction, OrientedImage
 from photoplan.io.orientation_text import DIRECTIONS
 
@@ -44,6 +44,7 @@ def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     InputError
         No camera is known: the format states a camera constant with every image.
     """
+    require_map(block, path)
     if not block.cameras:
         raise InputError(f"{path}: an Inpho project states a camera constant with every image; give --camera FILE")
     lines = ["$PROJECT 5.0.0", f"  $PROJECT_NAME : {_word(path.stem)}", "  $ANGULAR_UNITS : deg", "$END"]

@@ -15,7 +15,7 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.io.camera_model import FilmCamera
-from photoplan.io.orientation_block import Loss, OrientationBlock, OrientationFormat, common_losses
+from photoplan.io.orientation_block import Loss, OrientationBlock, OrientationFormat, common_losses, require_map
 from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.orientation_text import (
     DIRECTIONS,
@@ -77,6 +77,7 @@ def _image(first: Words, second: Words, third: Words, form: TableFormat) -> Orie
 
 def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     """The text of a file; the camera constant in millimetres where it is known, an empty field else."""
+    require_map(block, path)
     lines = []
     for image, R in zip(block.table.images, block.table.rotations):
         M = R.T if block.matrix == "ground-to-camera" else R
@@ -122,4 +123,5 @@ FORMAT = OrientationFormat(
     read=read,
     render=render,
     losses=_losses,
+    suffix=".ori",
 )

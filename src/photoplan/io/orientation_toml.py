@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.io.camera_model import Camera, Fiducials, Name, Pixels, Triple
-from photoplan.io.orientation_block import OrientationBlock, OrientationFormat
+from photoplan.io.orientation_block import OrientationBlock, OrientationFormat, require_map
 from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.project_errors import explain
 from photoplan.io.project_model import Orientation
@@ -96,6 +96,7 @@ def read_block(path: Path, form: TableFormat) -> OrientationBlock:
 
 def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     """The text of a file; numbers that are camera to ground already stay as they are."""
+    require_map(block, path)
     table = block.table
     unit, order = (table.angle_unit, table.rotation) if table.direction == "camera-to-ground" else ("deg", "opk")
     lines = ["# Orientations of photoplan; lengths are metres unless the name of an entry says otherwise."]
@@ -127,4 +128,6 @@ FORMAT = OrientationFormat(
     sniff=lambda path, head: path.suffix.lower() == ".toml",
     read=read_block,
     render=render,
+    suffix=".toml",
+    angles=True,
 )
