@@ -155,8 +155,8 @@ focal_px = 90
 
 
 def test_unknown_suffix_lists_the_formats(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"\.toml, \.yaml, \.yml, \.json"):
-        read_cameras(write(tmp_path, "camera.xml", "<x/>"))
+    with pytest.raises(InputError, match=r"\.toml, \.yaml, \.yml, \.json, \.xml, \.cam, \.txt"):
+        read_cameras(write(tmp_path, "camera.dat", "x"))
 
 
 ODM = {

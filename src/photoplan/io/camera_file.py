@@ -7,21 +7,54 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from photoplan.errors import InputError
-from photoplan.io import camera_opensfm, camera_toml, camera_yaml
+from photoplan.io import (
+    camera_opencv,
+    camera_opensfm,
+    camera_pix4d,
+    camera_toml,
+    camera_yaml,
+    orientation_colmap,
+    orientation_metashape,
+    orientation_pix4d,
+)
 from photoplan.io.camera_model import FilmCamera, FrameCamera
+from photoplan.io.orientation_table import TableFormat
+from photoplan.io.plain_files import read_text
 
 __all__ = ["CAMERA_FORMATS", "CameraFile", "read_cameras"]
+
+
+def _text(path: Path) -> dict[str, FrameCamera | FilmCamera]:
+    """Cameras of one of the formats whose files end in ``.txt``."""
+    head = read_text(path, 1 << 30)[:65_536]
+    if head.lstrip().lower().startswith("filename imagewidth"):
+        return dict(orientation_pix4d.read(path, TableFormat()).cameras)
+    if "CAMERA_ID, MODEL" in head or path.name == "cameras.txt":
+        return orientation_colmap.read_cameras(path)
+    raise InputError(
+        f"{path}: no camera format; of text files, COLMAP's cameras.txt and Pix4D's calibrated_camera_parameters.txt "
+        "describe cameras"
+    )
+
+
+def _yaml(path: Path) -> dict[str, FrameCamera | FilmCamera]:
+    return camera_opencv.read(path) if camera_opencv.is_opencv(path) else camera_yaml.read(path)
+
+
+def _json(path: Path) -> dict[str, FrameCamera | FilmCamera]:
+    return camera_opencv.read(path) if camera_opencv.is_opencv(path) else camera_opensfm.read(path)
+
 
 #: Reader of every format, by file suffix.
 CAMERA_FORMATS: dict[str, Callable[[Path], dict[str, FrameCamera | FilmCamera]]] = {
     ".toml": camera_toml.read,
-    ".yaml": camera_yaml.read,
-    ".yml": camera_yaml.read,
-    ".json": camera_opensfm.read,
+    ".yaml": _yaml,
+    ".yml": _yaml,
+    ".json": _json,
+    ".xml": orientation_metashape.read_cameras,
+    ".cam": camera_pix4d.read,
+    ".txt": _text,
 }
-
-#: Formats whose cameras are independent of the resolution of the images.
-_NORMALISED = (".json",)
 
 
 @dataclass(frozen=True)
@@ -36,7 +69,8 @@ class CameraFile:
 
 
 def read_cameras(path: str | Path) -> CameraFile:
-    """Cameras of a file: own TOML, YAML (orthority's layout), or JSON of OpenSfM and OpenDroneMap.
+    """Cameras of a file: own TOML, YAML (orthority's layout, OpenCV), JSON of OpenSfM and OpenDroneMap, Metashape's
+    ``cameras.xml``, Pix4D's ``.cam`` and ``calibrated_camera_parameters.txt``, COLMAP's ``cameras.txt``.
 
     Raises
     ------
@@ -50,4 +84,4 @@ def read_cameras(path: str | Path) -> CameraFile:
     cameras = CAMERA_FORMATS[suffix](path)
     if not cameras:
         raise InputError(f"{path}: describes no camera")
-    return CameraFile(path, cameras, suffix in _NORMALISED)
+    return CameraFile(path, cameras, suffix == ".json" and not camera_opencv.is_opencv(path))

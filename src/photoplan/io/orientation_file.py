@@ -29,6 +29,7 @@ FORMATS: dict[str, str] = {
     "bluh": "photoplan.io.orientation_bluh",
     "inpho": "photoplan.io.orientation_inpho",
     "metashape": "photoplan.io.orientation_metashape",
+    "pix4d": "photoplan.io.orientation_pix4d",
     "opk": "photoplan.io.orientation_opk",
     "odm": "photoplan.io.orientation_odm",
     "colmap": "photoplan.io.orientation_colmap",

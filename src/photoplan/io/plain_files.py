@@ -14,7 +14,7 @@ from pydantic import BaseModel, ValidationError
 from photoplan.errors import InputError
 from photoplan.io.project_errors import explain
 
-__all__ = ["build", "finite", "read_json", "read_text", "read_yaml"]
+__all__ = ["build", "finite", "parse_yaml", "read_json", "read_text", "read_yaml"]
 
 #: Levels of nesting that any of our formats could need.
 MAX_DEPTH = 32
@@ -59,7 +59,11 @@ def read_yaml(path: Path, max_bytes: int = 200_000) -> Any:
     InputError
         The file is not such YAML.
     """
-    text = read_text(path, max_bytes)
+    return parse_yaml(read_text(path, max_bytes), path)
+
+
+def parse_yaml(text: str, path: Path) -> Any:
+    """Plain contents of YAML text that was read from `path`; see `read_yaml`."""
     try:
         depth = 0
         for event in yaml.parse(text, yaml.SafeLoader):

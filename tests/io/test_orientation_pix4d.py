@@ -1,0 +1,220 @@
+"""Pix4D's parameter files, by hand after its knowledge base and the specification of its open format (OPF).
+
+One image's numbers (DSC_0157) are those that Pix4D itself wrote into both of its files, as a public source shows them;
+they tie the two forms, the offset and the rotation together. The offset is the difference of the two positions, the
+CRS is made up.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from format_examples import assert_same, block_of, frame, pixels, round_trip
+from pyproj import CRS
+from scipy.spatial.transform import Rotation
+
+from photoplan.errors import InputError
+from photoplan.io.camera_file import read_cameras
+from photoplan.io.orientation_file import orientation_format, read_orientation_block
+
+EXTERNAL = """imageName X Y Z Omega Phi Kappa
+DSC_0157.JPG 332081.126000 3488911.819856 4093.688402 -2.946680 3.053212 119.804001
+"""
+FULL = """fileName imageWidth imageHeight
+camera matrix K [3x3]
+radial distortion [3x1]
+tangential distortion [2x1]
+camera position t [3x1]
+camera rotation R [3x3]
+camera model m = K [R|-Rt] X
+
+DSC_0157.JPG 7360 4912
+7363.51850023951465118444 0 3686.33719996831450771424
+0 7363.51850023951465118444 2439.04083412635009153746
+0 0 1
+-0.09005921067656787182 0.10773972435740564180 -0.01257054987797603419
+-0.00029570539858373248 -0.00027422056492206067
+114.12600004808672338186 378.81985574952466322429 -2.31159761431545440757
+-0.49632901575943477734 0.86794436424468834890 -0.01816834310427051929
+0.86649900151927328196 0.49400145706385401034 -0.07170802455019638366
+-0.05326338781351704077 -0.05133362440616233424 -0.99726018196053234366
+"""
+OFFSET = "331967.000 3488533.000 4096.000\n"
+STEM = "p_calibrated"
+
+
+def project(folder: Path, *, full: bool = True, offset: bool = True) -> Path:
+    (folder / "p_wkt.prj").write_text(CRS("EPSG:32648").to_wkt("WKT1_GDAL"))
+    if full:
+        (folder / f"{STEM}_camera_parameters.txt").write_text(FULL)
+    if offset:
+        (folder / "p_offset.xyz").write_text(OFFSET)
+    path = folder / f"{STEM}_external_camera_parameters.txt"
+    path.write_text(EXTERNAL)
+    return path
+
+
+def test_both_files_of_pix4d_state_one_orientation(tmp_path: Path) -> None:
+    external = read_orientation_block(project(tmp_path))
+    full = read_orientation_block(tmp_path / f"{STEM}_camera_parameters.txt")
+    for block in (external, full):
+        assert block.table.crs == "EPSG:32648"
+        assert [i.name for i in block.table.images] == ["DSC_0157.JPG"]
+    # The external file is printed with six digits.
+    np.testing.assert_allclose(external.table.centers, full.table.centers, atol=1e-6)
+    np.testing.assert_allclose(external.table.rotations, full.table.rotations, atol=2e-8)
+    assert external.cameras == full.cameras
+    assert any("cameras from p_calibrated_camera_parameters.txt" in n for n in external.table.notes)
+
+
+def lens(x: Any, y: Any, k: Any, t: Any) -> Any:
+    r2 = x * x + y * y
+    g = 1 + k[0] * r2 + k[1] * r2**2 + k[2] * r2**3
+    return (
+        x * g + 2 * t[0] * x * y + t[1] * (r2 + 2 * x * x),
+        y * g + 2 * t[1] * x * y + t[0] * (r2 + 2 * y * y),
+    )
+
+
+def test_the_full_file_sees_the_pixels_of_its_own_formula(tmp_path: Path) -> None:
+    """m = K [R | −R t] X with the distortion between R and K, the corner of the image at (0, 0)."""
+    project(tmp_path)
+    block = read_orientation_block(tmp_path / f"{STEM}_camera_parameters.txt")
+    rows = [np.array(line.split(), float) for line in FULL.splitlines()[9:]]
+    K, k, tangential, t, R = np.array(rows[:3]), rows[3], rows[4], rows[5], np.array(rows[6:9])
+    offset = np.array(OFFSET.split(), float)
+    X = t + np.random.default_rng(0).uniform([-800, -800, -2400], [800, 800, -1900], (50, 3))
+    p = (X - t) @ R.T
+    assert (p[:, 2] > 0).all()
+    xd, yd = lens(p[:, 0] / p[:, 2], p[:, 1] / p[:, 2], k, tangential)
+    m = np.stack([xd, yd, np.ones(50)], axis=1) @ K.T
+    np.testing.assert_allclose(pixels(block, X + offset), m[:, :2] - 0.5, atol=1e-5)
+
+
+def test_the_external_file_sees_the_pixels_of_its_documentation(tmp_path: Path) -> None:
+    """OPF: R_x(ω) R_y(φ) R_z(κ) takes the image's axes right, top, back to the map's."""
+    block = read_orientation_block(project(tmp_path))
+    T = np.array([332081.126, 3488911.819856, 4093.688402])
+    R = Rotation.from_euler("XYZ", [-2.946680, 3.053212, 119.804001], degrees=True).as_matrix()
+    X = T + np.random.default_rng(1).uniform([-800, -800, -2400], [800, 800, -1900], (50, 3))
+    right, top, back = ((X - T) @ R).T
+    k, t = (
+        (-0.09005921067656787, 0.10773972435740564, -0.012570549877976034),
+        (-0.00029570539858373248, -0.00027422056492206067),
+    )
+    xd, yd = lens(right / -back, -top / -back, k, t)
+    f = 7363.518500239515
+    expected = np.stack([f * xd + 3686.3371999683145, f * yd + 2439.04083412635], axis=1) - 0.5
+    np.testing.assert_allclose(pixels(block, X), expected, atol=1e-6)
+
+
+def test_without_the_offset_positions_are_relative(tmp_path: Path) -> None:
+    project(tmp_path, offset=False)
+    table = read_orientation_block(tmp_path / f"{STEM}_camera_parameters.txt").table
+    assert table.centers[0, 0] == pytest.approx(114.126)
+    assert any("relative to p_offset.xyz, which is not there" in n for n in table.notes)
+
+
+CAM = """Pix4D camera calibration file 0
+
+#Focal Length mm assuming a sensor width of 17.49998592000000030566x13.12498944000000200560mm
+F 15.01175404934517487732
+#Principal Point mm
+Px 8.48210511970419922534
+Py 6.33434629978042273990
+#Symmetrical Lens Distortion Coeffs
+K1 0.03833474118270804865
+K2 -0.01750917966495743258
+K3 0.02049798716391852335
+#Tangential Lens Distortion Coeffs
+T1 0.00240851666319534747
+T2 0.00292562392135245920
+"""
+
+
+def test_the_cam_file(tmp_path: Path) -> None:
+    """A sample from the documentation of EasyIDP (MIT), whose images have 4608 × 3456 px."""
+    path = tmp_path / "p_pix4d_calibrated_internal_camera_parameters.cam"
+    path.write_text(CAM)
+    with pytest.raises(InputError, match=r"size of the images in pixels; it is read from p_calibrated_internal"):
+        read_cameras(path)
+    (tmp_path / "p_calibrated_internal_camera_parameters.cam").write_text(
+        "camera_calibration_file 0\n\n#Image size 4608x3456 pixel\nFOCAL 15.01\n"
+    )
+    camera: Any = read_cameras(path).cameras["camera 0"]
+    assert camera.size == (4608, 3456)
+    pixel = 17.49998592 / 4608
+    np.testing.assert_allclose(camera.focal, 15.01175404934517487732 / pixel, rtol=1e-12)
+    np.testing.assert_allclose(
+        camera.principal_point, (8.482105119704199 / pixel - 0.5, 6.334346299780423 / pixel - 0.5)
+    )
+    lens = camera.lens
+    assert (lens.k1, lens.k2, lens.k3) == (0.03833474118270804865, -0.01750917966495743258, 0.02049798716391852335)
+    assert (lens.p1, lens.p2) == (0.00240851666319534747, 0.00292562392135245920)
+    with pytest.raises(InputError, match="not Pix4D's own camera file"):
+        read_cameras(tmp_path / "p_calibrated_internal_camera_parameters.cam")
+    # With the external file alone the camera comes from here.
+    block = read_orientation_block(project(tmp_path, full=False))
+    assert list(block.cameras) == ["camera 0"]
+
+
+@pytest.mark.parametrize("lens", ["none", "opencv"])
+@pytest.mark.parametrize("crs", ["EPSG:32632", None])
+def test_round_trip(tmp_path: Path, lens: str, crs: str | None) -> None:
+    square = {"focal_px": 3100.0}
+    block = block_of({"x": frame(lens, **square), "y": frame("opencv", **square, size=(2000, 1000))}, crs=crs)
+    again = round_trip(block, tmp_path / f"q_{STEM[2:]}_external_camera_parameters.txt", "pix4d")
+    assert_same(block, again)
+    assert again.table.crs == crs
+    full = read_orientation_block(tmp_path / "q_calibrated_camera_parameters.txt")
+    assert_same(block, full, position=2e-9)
+    cam = read_cameras(tmp_path / "q_pix4d_calibrated_internal_camera_parameters.cam").cameras
+    assert [c.size for c in cam.values()] == [(4000, 3000), (2000, 1000)]
+    first: Any = cam["camera 0"]
+    np.testing.assert_allclose(first.focal, 3100.0, rtol=1e-12)
+    np.testing.assert_allclose(first.principal_point, (2010.25, 1480.5), rtol=1e-12)
+
+
+def test_losses() -> None:
+    losses = orientation_format("pix4d").losses
+    square = block_of({"x": frame("opencv", focal_px=900.0)}, crs="EPSG:32632")
+    assert list(losses(square)) == []
+    assert [x.kind for x in losses(block_of({"x": frame("fisheye")}))] == ["lens", "other"]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda t: t.replace(" 119.804001", ""), r"external_camera_parameters\.txt:2: "),
+        (lambda t: t.replace("119.804001", "inf"), r"external_camera_parameters\.txt:2: inf given"),
+        (lambda t: t.replace("imageName", "image"), "begins neither"),
+        (lambda t: t.split("\n")[0], "holds no image"),
+    ],
+)
+def test_fault_18_broken_external_files(tmp_path: Path, change: Any, says: str) -> None:
+    path = project(tmp_path, full=False)
+    path.write_text(change(EXTERNAL))
+    with pytest.raises(InputError, match=says):
+        read_orientation_block(path, format="pix4d")
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda t: t[: t.rindex("-0.05326")], r"camera_parameters\.txt:17: 9 lines follow"),
+        (lambda t: t.replace("0 0 1\n", "0 0 1 2\n"), r"camera_parameters\.txt:12: .*3 numbers"),
+        (lambda t: t.replace("-0.99726018196053234366", "0.99726018196053234366"), r":16: .*right-handed"),
+        (lambda t: t.replace("7360 4912", "7360"), r":9: .*width and height"),
+        (lambda t: t.replace("7363.51850023951465118444 0 ", "7363.5 2.0 "), r":10: .*sheared"),
+        (lambda t: t.replace("7363.51850023951465118444", "-7363"), "greater than 0"),
+    ],
+)
+def test_fault_18_broken_full_files(tmp_path: Path, change: Any, says: str) -> None:
+    project(tmp_path)
+    path = tmp_path / f"{STEM}_camera_parameters.txt"
+    path.write_text(change(FULL))
+    with pytest.raises(InputError, match=says):
+        read_orientation_block(path, format="pix4d")
