@@ -100,7 +100,7 @@ def _constant(block: OrientationBlock, image: OrientedImage) -> float | None:
 def _losses(block: OrientationBlock) -> list[Loss]:
     lost = common_losses(block, cameras=False)
     direction = DIRECTIONS[block.matrix or "camera-to-ground"]
-    lost.append(Loss("other", f"not what the rotation matrix does; it is written {direction}"))
+    lost.append(Loss("other", f"no word on what the rotation matrix does; it is written {direction}"))
     return lost
 
 

@@ -34,7 +34,7 @@ from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.terrain_model_read import ModelReader, is_terrain_model
 from photoplan.products.init_match import camera_name, image_files, match_images, some
 
-__all__ = ["InitRequest", "InitResult", "init_project", "make_project"]
+__all__ = ["InitRequest", "InitResult", "init_project", "make_project", "placed"]
 
 LENS_NAMES = {
     "none": "no distortion",
@@ -56,7 +56,7 @@ class InitRequest:
     camera: Path
     """File with cameras: TOML, YAML or JSON."""
     orientation: Path
-    """File with orientations: TOML, JSON or a table of text."""
+    """File with orientations, of any format of `photoplan.io.orientation_file`."""
     terrain: str
     """Raster of heights, or one height in metres."""
     crs: str | None = None
@@ -70,7 +70,9 @@ class InitRequest:
     orientation_height_system: str | None = None
     """Declares the orientation's, also against what its file states."""
     form: TableFormat = field(default_factory=TableFormat)
-    """How a table of text is to be read."""
+    """What the orientation file does not say of itself."""
+    format: str | None = None
+    """Format of the orientation file; None: by its content."""
     earth_curvature: str = "none"
     """none, correction or strict."""
     refraction: bool = False
@@ -130,7 +132,7 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
     """The project of the given files, without writing anything; see `init_project`."""
     files = image_files(request.images)
     cameras = read_cameras(request.camera)
-    table = read_orientation(request.orientation, request.form)
+    table = read_orientation(request.orientation, request.form, request.format)
     pairs, lonely_files, lonely_names = match_images(files, table)
     infos = {file: read_info(file) for file, _ in pairs}
     terrain, terrain_info = _terrain(request)
@@ -140,7 +142,7 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
         talk(line)
     systems = _height_systems(request, table, terrain_info)
     talk(f"  height systems: terrain {height_label(systems[0])}, orientation {height_label(systems[1])}")
-    centers, angles = _placed(table, crs, systems[1])
+    centers, angles = placed(table, crs, systems[1])
     _check_joined(systems, crs, centers)
     rows = {image.name: k for k, image in enumerate(table.images)}
     images = []
@@ -263,7 +265,7 @@ def _height_systems(request: InitRequest, table: OrientationTable, terrain: _Ter
     return declared_pair(terrain_system, orientation_system)
 
 
-def _placed(table: OrientationTable, crs: str, system: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def placed(table: OrientationTable, crs: str, system: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Projection centres (n, 3) and ω, φ, κ in degrees (n, 3) in the project's CRS."""
     if table.origin is not None:
         centers, axes = topocentric_poses(table.origin, crs, table.centers)

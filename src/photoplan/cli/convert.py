@@ -1,0 +1,108 @@
+"""`photoplan convert`: orientations from one file format to another."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photoplan.cli.options import json_option
+from photoplan.cli.orientation_options import DIRECTIONS, reading_options, table_format
+
+__all__ = ["command"]
+
+
+@click.command("convert")
+@click.argument("orientation", type=click.Path(path_type=Path))
+@click.option("--to", "target", metavar="FORMAT", help="Format to write: csv, toml, patb, bingo, bluh, inpho, …")
+@click.option("--camera", type=click.Path(path_type=Path), help="Cameras (TOML, YAML, JSON) [the orientation's].")
+@reading_options
+@click.option(
+    "--camera-axes",
+    type=click.Choice(["up-back", "down-forward"]),
+    default="up-back",
+    show_default=True,
+    help="The file's camera axes y and z; down-forward as in computer vision.",
+)
+@click.option(
+    "--image-turned",
+    "turned",
+    type=click.Choice(["0", "90", "180", "270"]),
+    default="0",
+    show_default=True,
+    help="Degrees by which images are turned against the file's camera axes, counter-clockwise.",
+)
+@click.option("--crs", metavar="CRS", help="CRS to write; declares that of a file that states none.")
+@click.option("--matrix", type=click.Choice(DIRECTIONS), help="What written rotation matrices do (patb, inpho).")
+@click.option("--drop-lens", is_flag=True, help="Write cameras without a lens that the format does not know.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="File, or folder of several [beside the input].")
+@click.option("--list-readings", is_flag=True, help="Only list the readings of the file that fit measured points.")
+@click.option("--image-points", type=click.Path(path_type=Path), help="Measured image points, for --list-readings.")
+@click.option("--control", type=click.Path(path_type=Path), help="Their ground points, for --list-readings.")
+@click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(
+    orientation: Path,
+    target: str | None,
+    list_readings: bool,
+    image_points: Path | None,
+    control: Path | None,
+    turned: str,
+    as_json: bool,
+    quiet: bool,
+    **options: Any,
+) -> None:
+    """Write ORIENTATION, an orientation file or a project, in another format.
+
+    What the other format cannot hold is said on stderr. A lens that it does not know is refused unless --drop-lens.
+    """
+    from photoplan.products.convert import ConvertRequest
+
+    form = table_format(options)
+    request = ConvertRequest(orientation, target or "csv", form=form, turned=int(turned), **options)
+    if list_readings:
+        if image_points is None or control is None:
+            raise click.UsageError("--list-readings needs --image-points FILE and --control FILE")
+        _list(request, image_points, control, as_json, quiet)
+        return
+    if target is None:
+        raise click.UsageError("say the format to write with --to FORMAT")
+    if image_points is not None or control is not None:
+        raise click.UsageError("--image-points and --control go with --list-readings")
+    _convert(request, as_json, quiet)
+
+
+def _convert(request: Any, as_json: bool, quiet: bool) -> None:
+    from photoplan.products.convert import convert_orientation
+
+    done = convert_orientation(request)
+    if as_json:
+        click.echo(json.dumps(done.to_dict(), indent=2, ensure_ascii=False))
+    else:
+        for file in done.files:
+            click.echo(str(file))
+    if not quiet:
+        click.echo(f"  {done.images} images, from {done.source_format} to {done.target_format}", err=True)
+        for note in done.notes:
+            click.echo(f"  {note}", err=True)
+        for loss in done.lost:
+            click.echo(f"  {done.target_format} holds {loss.text}", err=True)
+
+
+def _list(request: Any, image_points: Path, control: Path, as_json: bool, quiet: bool) -> None:
+    from photoplan.products.convert_readings import list_readings
+
+    found = list_readings(request, image_points, control)
+    if as_json:
+        click.echo(json.dumps(found.to_dict(), indent=2, ensure_ascii=False))
+    else:
+        for fits, readings in (("fits", found.fitting), ("", found.others)):
+            for r in readings:
+                click.echo(f"{r.median:10.2f} px  {fits:4}  {found.options(r.reading)}")
+    if not quiet:
+        click.echo(f"  medians of {found.points} points in {found.images} images", err=True)
+        for note in found.notes:
+            click.echo(f"  {note}", err=True)
