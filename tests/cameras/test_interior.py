@@ -170,6 +170,18 @@ def test_shrinkage_is_along_the_film_however_it_lies_in_the_scanner(turn: float)
         film_shrinkage(transformation, (0.0, 0.02))
 
 
+@pytest.mark.parametrize("model", MODELS)
+def test_sigma_of_the_shrinkage_describes_the_scatter_of_many_scans(model: str) -> None:
+    truth = film(0.4, (50.0, 40.0) if model != "similarity" else (50.0, 50.0))
+    fits = [fit_marks(model, EIGHT, scan(truth, 0.2, seed)) for seed in range(400)]
+    found = [film_shrinkage(f.transformation, (0.02, 0.02), f.covariance) for f in fits]
+    spread = np.array([(s.x, s.y) for s in found]).std(axis=0)
+    np.testing.assert_allclose(spread, np.sqrt(np.mean([np.square(s.sigma) for s in found], axis=0)), rtol=0.12)
+    assert math.isnan(film_shrinkage(truth, (0.02, 0.02)).sigma[0])
+    three = fit_affine(EIGHT, {n: scan(truth)[n] for n in "123"})
+    assert math.isnan(film_shrinkage(truth, (0.02, 0.02), three.covariance).sigma[1])
+
+
 def test_residuals_on_film_are_the_plane_points_that_move_by_them() -> None:
     truth = Bilinear2D(49.97, 0.31, 8e-4, 5780.2, 0.29, -50.02, -6e-4, 5795.7)
     plane = np.array(list(EIGHT.values()))

@@ -51,6 +51,8 @@ class Shrinkage:
     """Along the image's x axis; negative where it has grown."""
     y: float
     """Along its y axis."""
+    sigma: tuple[float, float] = (math.nan, math.nan)
+    """Standard deviations of both, from the adjustment of the marks; NaN: not known."""
 
     @property
     def mean(self) -> float:
@@ -77,7 +79,11 @@ def affine_facts(transformation: Affine2D | Bilinear2D, at: ArrayLike = (0.0, 0.
     return AffineFacts(scale, size, direction_x, direction_y, turn - math.pi / 2, mirrored)
 
 
-def film_shrinkage(transformation: Affine2D | Bilinear2D, pitch: tuple[float, float]) -> Shrinkage:
+def film_shrinkage(
+    transformation: Affine2D | Bilinear2D,
+    pitch: tuple[float, float],
+    covariance: NDArray[np.float64] | None = None,
+) -> Shrinkage:
     """Shrinkage of the film since its calibration, if the scanner's sampling distance is known.
 
     It includes what the scanner errs: only that of a calibrated scanner is true to some hundredths of a permille.
@@ -88,12 +94,23 @@ def film_shrinkage(transformation: Affine2D | Bilinear2D, pitch: tuple[float, fl
         From image plane to scan.
     pitch : (float, float)
         Distance of two columns and of two rows on the film, in the unit of the image plane.
+    covariance : ndarray, shape (6, 6) or (8, 8), optional
+        Of the coefficients, as `FiducialFit` has it.
     """
     if not all(math.isfinite(p) and p > 0 for p in pitch):
         raise InputError(f"sampling distance {pitch} of the scan; two positive numbers are needed")
     on_film = np.asarray(pitch, float)[:, None] * transformation.derivative(np.zeros(2))
-    x, y = 1.0 - np.linalg.norm(on_film, axis=0)
-    return Shrinkage(float(x), float(y))
+    length = np.linalg.norm(on_film, axis=0)
+    sigma = (math.nan, math.nan)
+    if covariance is not None:
+        # Coefficients of x, of y: the first two of each row of the transformation.
+        second = len(covariance) // 2
+        along = on_film / length * np.asarray(pitch, float)[:, None]
+        parts = (covariance[np.ix_([k, k + second], [k, k + second])] for k in (0, 1))
+        variances = [float(along[:, k] @ part @ along[:, k]) for k, part in enumerate(parts)]
+        sigma = (math.sqrt(variances[0]), math.sqrt(variances[1]))
+    x, y = 1.0 - length
+    return Shrinkage(float(x), float(y), sigma)
 
 
 def residuals_on_film(
