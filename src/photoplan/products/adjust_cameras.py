@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -245,5 +246,5 @@ def _lens_entry(camera: Description, start: BlockCamera, found: AdjustedCamera) 
 
 
 def _brown(lens: Brown) -> dict[str, Any]:
-    values: Mapping[str, float] = {key: getattr(lens, key) for key in ("k1", "k2", "k3", "p1", "p2", "b1", "b2")}
+    values = {field.name: getattr(lens, field.name) for field in dataclasses.fields(lens)}
     return {"type": "brown", **{k: v for k, v in values.items() if v}}

@@ -15,7 +15,7 @@ from photoplan.errors import UsageError
 if TYPE_CHECKING:
     from photoplan.report.build_report import CovarianceFacts, FilterEffect, GrossError, ReportMap
 
-__all__ = ["LINE_WORDS", "Plots"]
+__all__ = ["LINE_WORDS", "Plots", "png"]
 
 #: What lines of each kind are called.
 LINE_WORDS = {"breakline": "breaklines", "formline": "form lines", "border": "border lines", "hole": "holes"}
@@ -79,7 +79,7 @@ class Plots:
             axes.imshow(np.clip(rgb, 0, 1), extent=area.extent, interpolation="nearest")
             self._lines(axes, area)
             self._bar(fig, axes, tints, norm, "height m")
-            return _png(fig)
+            return png(fig)
 
     def sigmas(self, area: ReportMap) -> bytes:
         """Standard deviations."""
@@ -90,7 +90,7 @@ class Plots:
             tints = self._mpl.colormaps["viridis_r"]
             axes.imshow(area.sigmas, extent=area.extent, cmap=tints, norm=norm, interpolation="nearest")
             self._bar(fig, axes, tints, norm, "standard deviation m", extend="both")
-            return _png(fig)
+            return png(fig)
 
     def normalised(self, values: NDArray[np.float64], limit: float) -> bytes:
         """Histogram of normalised residuals with the normal curve."""
@@ -114,7 +114,7 @@ class Plots:
                 xlim=(-edge, edge), xlabel="normalised residual (all beyond ±5 in the last class)", ylabel="density"
             )
             axes.legend(loc="upper right")
-            return _png(fig)
+            return png(fig)
 
     def covariance(self, facts: CovarianceFacts) -> bytes:
         """Fitted functions, and the test by the covariance of residuals."""
@@ -144,7 +144,7 @@ class Plots:
             )
             test.set(title="heights above local planes", xlabel="distance m", xlim=(0, None))
             test.legend(loc="upper right")
-            return _png(fig)
+            return png(fig)
 
     def filter_histograms(self, effects: Sequence[FilterEffect]) -> bytes:
         """A histogram for each class, all in one scale."""
@@ -166,7 +166,7 @@ class Plots:
                 panel.set_ylabel("share %")
             for panel in panels[len(effects) :]:
                 panel.set_visible(False)
-            return _png(fig)
+            return png(fig)
 
     def filter_map(self, effects: Sequence[FilterEffect], area: ReportMap) -> bytes:
         """Where heights were changed, and which way."""
@@ -185,7 +185,7 @@ class Plots:
                 *xy[known].T, c=d[known], cmap=tints, norm=norm, s=size, linewidths=0, rasterized=True, zorder=3
             )
             self._bar(fig, axes, tints, norm, "measured − filtered cm", extend="both")
-            return _png(fig)
+            return png(fig)
 
     def gross(self, errors: Sequence[GrossError], area: ReportMap) -> bytes:
         """Gross errors on the relief; those above the model point up, those below it down."""
@@ -202,7 +202,7 @@ class Plots:
             for k, (x, y) in enumerate(xy[:_NUMBERED], 1):
                 axes.annotate(str(k), (x, y), (4, 3), textcoords="offset points", fontsize=7.5, color=INK, zorder=5)
             fig.legend(loc="outside lower center", ncols=2)
-            return _png(fig)
+            return png(fig)
 
     def _map(self, area: ReportMap) -> tuple[Any, Any]:
         """A figure with one panel of the map's proportions and map coordinates along it."""
@@ -242,7 +242,8 @@ class Plots:
             axes.figure.legend(loc="outside lower center", ncols=4)
 
 
-def _png(fig: Any) -> bytes:
+def png(fig: Any) -> bytes:
+    """A figure as PNG, without the name of the program that drew it."""
     buffer = io.BytesIO()
     fig.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
     return buffer.getvalue()

@@ -1,0 +1,103 @@
+"""`photoplan adjust`: bundle adjustment of a project."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from photoplan.cli.options import json_option
+
+if TYPE_CHECKING:
+    from photoplan.products.adjust import AdjustReport
+
+__all__ = ["command"]
+
+#: Gross errors and notes that are named; the rest is in the report.
+_SHOWN = 20
+
+
+@click.command("adjust")
+@click.argument("project", type=click.Path(path_type=Path))
+@click.option("--calibrate", multiple=True, metavar="CAMERA=c,x0,…", help="Parameters that are unknowns [as stated].")
+@click.option("--images", multiple=True, metavar="NAME", help="Only these; * and ? allowed, may be repeated [all].")
+@click.option("--no-robust", is_flag=True, help="Seek no gross errors.")
+@click.option("--critical", type=float, default=4.0, show_default=True, help="Normalised residual of a gross error.")
+@click.option("--variance-components", is_flag=True, help="Estimate the accuracy of each group, and use it.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Report [PROJECT/adjustment].")
+@click.option("--dry-run", is_flag=True, help="Adjust and print the figures; write nothing.")
+@click.option("--overwrite", is_flag=True, help="Replace an older report.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(as_json: bool, quiet: bool, no_robust: bool, **options: Any) -> None:
+    """Orientations, points and cameras from all measurements of a project at once.
+
+    Measurements are the files that [observations] names. Orientations and calibrated cameras are written into the
+    project file (the one before is kept as *.previous.toml), a report and the points into the output folder.
+    """
+    from photoplan.products.adjust import AdjustRequest, adjust_project
+
+    def talk(text: str) -> None:
+        if not quiet:
+            click.echo(text, err=True)
+
+    terminal = sys.stderr.isatty() and not quiet
+
+    def progress(number: int, rms: float) -> None:
+        if terminal:
+            click.echo(f"\r  iteration {number} · weighted residuals {rms:.4g} \033[K", err=True, nl=False)
+
+    report = adjust_project(AdjustRequest(robust=not no_robust, **options), talk, progress)
+    if terminal:
+        click.echo("\r\033[K", err=True, nl=False)
+    if as_json:
+        click.echo(json.dumps(report.to_dict(), indent=2, ensure_ascii=False))
+    else:
+        for path in report.written:
+            click.echo(str(path))
+        for line in _figures(report):
+            click.echo(line)
+    for line in _talk(report):
+        talk(line)
+
+
+def _figures(report: AdjustReport) -> list[str]:
+    f = report.facts
+    lines = [
+        f"sigma0 {f.sigma0:.3f} · image residuals {f.rms_pixels:.3f} px rms · redundancy {f.redundancy} · "
+        f"{f.unknowns} unknowns · {f.iterations} iterations · {f.seconds:.1f} s",
+        f"{len(f.images)} images, {f.points} points adjusted · {f.rejected} gross errors taken out",
+    ]
+    width = max((len(g.name) for g in f.groups), default=0)
+    for g in f.groups:
+        lines.append(f"  {g.name:<{width}}  {g.count:>7}  rms {g.rms:>9.4g} {g.unit:<3}  found/stated {g.factor:.2f}")
+    for camera in f.cameras:
+        for k, name in enumerate(camera.parameters):
+            change = camera.after[k] - camera.before[k]
+            value = f"{camera.after[k]:.8g} {camera.units[k]}".rstrip()
+            lines.append(f"  camera {camera.name}: {name} {value} ± {camera.sigma[k]:.2g} (change {change:+.3g})")
+    if f.check is not None:
+        c = f.check
+        count = max(c.horizontal, c.vertical)
+        lines.append(f"check points: RMSE_H {c.rmse_h:.3f} m, RMSE_V {c.rmse_v:.3f} m, {count} points (ASPRS 2023)")
+        lines += [f"  warning: {text}" for text in c.warnings]
+    return lines
+
+
+def _talk(report: AdjustReport) -> list[str]:
+    f = report.facts
+    lines = [f"gross error: {m.what}: {m.residual}, {abs(m.normalised):.1f} sigma" for m in f.gross[:_SHOWN]]
+    if len(f.gross) > _SHOWN:
+        lines.append(f"and {len(f.gross) - _SHOWN} more gross errors; all are in report.json")
+    if f.left_out:
+        reasons: dict[str, int] = {}
+        for _, reason in f.left_out:
+            reasons[reason] = reasons.get(reason, 0) + 1
+        lines += [f"left out: {count} × {reason}" for reason, count in reasons.items()]
+    lines += list(f.notes)
+    if report.orientations:
+        lines.append(f"orientations of {report.orientations} images written into the project")
+    return lines
