@@ -44,6 +44,8 @@ class Model:
 
     block: Block
     image_names: tuple[str, ...]
+    image_rows: _Index
+    """Number of each image in `block.images`, (n,)."""
     camera_names: tuple[str, ...]
     camera_of: _Index
     """Camera of each image, (n,)."""
@@ -139,6 +141,7 @@ def build_model(block: Block, images: list[int], measured: _Index, points: list[
     return Model(
         block=block,
         image_names=tuple(image_index),
+        image_rows=np.array(images, np.int64),
         camera_names=camera_names,
         camera_of=np.array([camera_names.index(b.camera) for b in chosen], np.int64),
         plane=np.array([_bilinear(b.plane_to_pixel) for b in chosen]).reshape(-1, 8),

@@ -28,8 +28,6 @@ from photoplan.products.adjust_block import (
     adjust_prepared,
     map_result,
     prepare,
-    start_poses,
-    without_start,
 )
 from photoplan.products.adjust_cameras import camera_entries, parse_calibrate
 from photoplan.products.adjust_inputs import AdjustInputs, read_inputs
@@ -121,17 +119,15 @@ def adjust_project(
     inputs = read_inputs(project, names)
     if plots is not None:
         _refuse_inputs(request, inputs.files)
-    started = time.perf_counter()
-    starts, missing = start_poses(inputs)
-    if missing:
-        raise without_start(missing)
+    begun = time.perf_counter()
+    inputs, starts = started(inputs)
     prepared = prepare(inputs, starts, free)
     talk(_used(prepared))
     settings = AdjustSettings(request.robust, request.critical, request.variance_components)
     prepared, adjusted = adjust_prepared(prepared, settings, partial(adjust_block, progress=progress))
     result = map_result(prepared, adjusted)
     title = f"Bundle adjustment of {request.project.resolve().parent.name}"
-    facts = build_facts(title, result, settings, time.perf_counter() - started)
+    facts = build_facts(title, result, settings, time.perf_counter() - begun)
     data = facts_json(facts, result)
     if plots is None:
         return AdjustReport((), facts, 0, data)

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from photoplan.cameras.observed import GroundPoints
 from photoplan.errors import InputError
 from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles
-from photoplan.io.orientation_table import angle_in_radians
+from photoplan.geometry.rotation import angles_from_rotation
 from photoplan.io.project_cameras import interior_of
 from photoplan.io.project_model import ANGLE_UNITS, Project
 from photoplan.orientation.block import Adjusted, AdjustSettings, Block, BlockCamera, BlockImage
@@ -20,9 +19,8 @@ from photoplan.orientation.bundle import adjust_block
 from photoplan.products.adjust_cameras import Calibrated, block_camera, calibrated
 from photoplan.products.adjust_frame import BlockFrame, angle_derivatives, block_frame, make_bend, nadir_heights
 from photoplan.products.adjust_inputs import AdjustInputs
-from photoplan.products.init_match import some
 
-__all__ = ["MapResult", "Prepared", "adjust_prepared", "map_result", "prepare", "start_poses", "without_start"]
+__all__ = ["MapResult", "Prepared", "adjust_prepared", "map_result", "prepare"]
 
 _Floats = NDArray[np.float64]
 Adjuster = Callable[[Block, AdjustSettings], Adjusted]
@@ -68,23 +66,6 @@ class MapResult:
     """Computed minus observed, (p, 3), metres."""
     cameras: tuple[Calibrated, ...]
     """Those that had unknowns."""
-
-
-def start_poses(inputs: AdjustInputs) -> tuple[dict[str, Pose], list[str]]:
-    """Start orientations (map poses) that the project or the observed positions and attitudes give, and the images
-    without."""
-    orientation = inputs.project.orientation
-    found: dict[str, Pose] = {}
-    table = inputs.table
-    row = {} if table is None or table.R_ground_camera is None else {n: k for k, n in enumerate(table.images)}
-    for image in inputs.images:
-        if image.center is not None and image.angles is not None:
-            angles = angle_in_radians(np.array(image.angles), orientation.angle_unit)
-            found[image.name] = Pose(np.array(image.center, float), rotation_from_angles(angles, orientation.rotation))
-        elif image.name in row and table is not None and table.R_ground_camera is not None:
-            k = row[image.name]
-            found[image.name] = Pose(table.XYZ[k], table.R_ground_camera[k])
-    return found, [image.name for image in inputs.images if image.name not in found]
 
 
 def prepare(inputs: AdjustInputs, starts: Mapping[str, Pose], free: Mapping[str, Sequence[str]]) -> Prepared:
@@ -257,12 +238,4 @@ def _cameras(project: Project, block: Block, adjusted: Adjusted) -> tuple[Calibr
         calibrated(project.cameras[found.name], block.cameras[found.name], found)
         for found in adjusted.cameras
         if found.free
-    )
-
-
-def without_start(names: Sequence[str]) -> InputError:
-    """What to say where images have no start orientation."""
-    return InputError(
-        f"{len(names)} images have no orientation to start from: {some(list(names))}; give center and angles, or "
-        "observed positions with attitudes, or control for `photoplan resect`"
     )

@@ -1,0 +1,99 @@
+"""Where the adjustment of a project begins: known orientations, and those found from control and tie points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from photoplan.errors import GeometryError
+from photoplan.geometry.pose import Pose
+from photoplan.geometry.rotation import rotation_from_angles
+from photoplan.io.orientation_table import angle_in_radians
+from photoplan.io.project_cameras import interior_of
+from photoplan.orientation.block import BlockCamera
+from photoplan.orientation.start import StartImage, start_block
+from photoplan.products.adjust_cameras import block_camera
+from photoplan.products.adjust_frame import block_frame
+from photoplan.products.adjust_inputs import AdjustInputs
+from photoplan.products.init_match import some
+
+__all__ = ["known_poses", "started"]
+
+
+def known_poses(inputs: AdjustInputs) -> dict[str, Pose]:
+    """Orientations (map poses) that the project states, or observed positions together with attitudes."""
+    orientation = inputs.project.orientation
+    found: dict[str, Pose] = {}
+    table = inputs.table
+    row = {} if table is None or table.R_ground_camera is None else {n: k for k, n in enumerate(table.images)}
+    for image in inputs.images:
+        if image.center is not None and image.angles is not None:
+            angles = angle_in_radians(np.array(image.angles), orientation.angle_unit)
+            found[image.name] = Pose(np.array(image.center, float), rotation_from_angles(angles, orientation.rotation))
+        elif image.name in row and table is not None and table.R_ground_camera is not None:
+            k = row[image.name]
+            found[image.name] = Pose(table.XYZ[k], table.R_ground_camera[k])
+    return found
+
+
+def started(inputs: AdjustInputs) -> tuple[AdjustInputs, dict[str, Pose]]:
+    """A map pose for every image; images that cannot be oriented are taken out, with a note that names them.
+
+    Raises
+    ------
+    GeometryError
+        No image can be oriented.
+    InputError
+        An interior orientation cannot be made (fiducial marks missing), or height systems cannot be joined.
+    """
+    known = known_poses(inputs)
+    if len(known) == len(inputs.images):
+        return inputs, known
+    found, reasons = _found(inputs, known)
+    images = tuple(image for image in inputs.images if image.name in found)
+    if not images:
+        why = "; ".join(f"{name}: {reason}" for name, reason in list(reasons.items())[:3])
+        raise GeometryError(
+            f"no image can be oriented ({why}); give more control or tie points, observed positions, or center and "
+            "angles to start from"
+        )
+    notes = list(inputs.notes)
+    without = [image.name for image in inputs.images if image.name not in known]
+    oriented = [name for name in without if name in found]
+    if oriented:
+        notes.append(f"{len(oriented)} images were oriented from control and tie points to begin with")
+    lost = [name for name in without if name not in found]
+    if lost:
+        why = "; ".join(dict.fromkeys(reasons.get(name, "no reason is known") for name in lost))
+        notes.append(f"{len(lost)} images could not be oriented and are left out: {some(lost)} ({why})")
+    names = [image.name for image in images]
+    return replace(inputs, images=images, points=inputs.points.of_images(names), notes=tuple(notes)), found
+
+
+def _found(inputs: AdjustInputs, known: Mapping[str, Pose]) -> tuple[dict[str, Pose], dict[str, str]]:
+    project, ground = inputs.project, inputs.ground
+    places = [ground.XYZ, *(pose.center[None] for pose in known.values())]
+    if inputs.positions is not None:
+        places.append(inputs.positions.XYZ)
+    every = np.concatenate(places)
+    if not np.isfinite(every[:, :2]).all(axis=1).any():
+        raise GeometryError(
+            "nothing says where the block is: give control points, observed positions, or center and angles of images"
+        )
+    frame = block_frame(project, every)
+    cameras: dict[str, BlockCamera] = {}
+    images = []
+    for image in inputs.images:
+        camera = project.cameras[image.camera]
+        interior = interior_of(camera, image)
+        cameras.setdefault(image.camera, block_camera(image.camera, camera, interior, ()))
+        pose = frame.pose(known[image.name]) if image.name in known else None
+        images.append(StartImage(image.name, image.camera, interior.plane_to_pixel, pose))
+    full = ground.where(np.isfinite(ground.XYZ).all(axis=1))
+    positions = None if inputs.positions is None else frame.positions(inputs.positions)
+    sigma = float(np.median(inputs.points.sigma))
+    result = start_block(cameras, images, inputs.points, frame.ground(full, full.XYZ), positions, sigma)
+    poses = {name: frame.map_pose(pose) for name, pose in result.poses.items()}
+    return {**poses, **known}, dict(result.left_out)
