@@ -87,11 +87,9 @@ def test_the_true_reading_is_the_only_one_that_fits(reading):
     results = judge_readings(stated(names, centers, R, reading), sights)
     assert len(results) == 3 * 6 * 2 * 2 * 4 * 2 * 2
     fits = fitting(results)
-    # Some readings are the same rotation in other words; every one that fits predicts what the true one does.
-    assert reading in [f.reading for f in fits]
+    assert fits[0].reading == reading
     # The median length of two normal errors of 0.3 px is 0.3 · √(2 ln 2) px.
     assert fits[0].median == pytest.approx(0.3 * np.sqrt(2 * np.log(2)), rel=0.25)
-    assert next(f.reading for f in fits) == reading
     assert all(r.median > 1.5 * fits[0].median for r in results if r not in fits)
 
 
@@ -202,7 +200,8 @@ def test_ign_borea_columns_in_another_order_are_no_other_rotation(shared, borea)
     columns = "name=NOM,x=X,y=Y,z=Z,omega=O,phi=P,kappa=K"
     other = read_orientation(shared / "data" / "ign_borea" / "23FD1305_alt_NCPOKXYZ.OPK", TableFormat(columns=columns))
     by_name = {i.name: i for i in table.images}
-    assert len(other.images) == 7
-    for image in other.images:
+    known = [image for image in other.images if image.name in by_name]
+    assert (len(other.images), len(known)) == (7, 5)
+    for image in known:
         assert image.angles == by_name[image.name].angles
         assert image.center == by_name[image.name].center
