@@ -33,6 +33,7 @@ from photoplan.products.adjust_cameras import camera_entries, parse_calibrate
 from photoplan.products.adjust_inputs import AdjustInputs, read_inputs
 from photoplan.products.adjust_json import facts_json
 from photoplan.products.adjust_report import build_facts, point_layers
+from photoplan.products.adjust_start import started
 from photoplan.products.scene import input_files
 from photoplan.report.adjust_facts import AdjustFacts
 from photoplan.report.adjust_plots import AdjustPlots
