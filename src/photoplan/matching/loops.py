@@ -136,7 +136,7 @@ def _step(
     at, to_first, covariance = state
     first, second = rows
     affine = local_affines(tracks, first, second)
-    known = np.isfinite(at).all(axis=1)
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(at).all(axis=1), np.bool_)
     whole = np.rint(np.where(known[:, None], at, 0.0)).astype(np.int64)
     near = tracks.xy[second] + np.einsum("nij,nj->ni", affine, whole - tracks.xy[first])
     weights = latin_weights(settings.radius, np.where(known[:, None, None], to_first, np.eye(2)), part)

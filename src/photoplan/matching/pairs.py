@@ -143,10 +143,10 @@ def match_features(a: Features, b: Features, ratio: float = 0.85, guide: Guide |
 
 
 def _far(guide: Guide, rows: slice, b: Features) -> NDArray[np.bool_]:
-    expected = guide.xy[rows]
-    dx = expected[:, None, 0] - b.xy[None, :, 0]
-    dy = expected[:, None, 1] - b.xy[None, :, 1]
-    return ~(dx * dx + dy * dy <= guide.radius**2)
+    expected, there = guide.xy[rows].astype(np.float32), b.xy.astype(np.float32)
+    dx = expected[:, None, 0] - there[None, :, 0]
+    dy = expected[:, None, 1] - there[None, :, 1]
+    return ~(dx * dx + dy * dy <= np.float32(guide.radius**2))
 
 
 def _clear_best(likeness: NDArray[np.float32], b: Features, ratio: float) -> NDArray[np.int64]:

@@ -101,7 +101,7 @@ def build_tracks(features: Sequence[Features], pairs: Sequence[PairMatches], sam
     angle = np.concatenate([np.empty(0), *(f.angle for f in features)])[index]
     _, track = np.unique(label[index], return_inverse=True)
     order = np.lexsort((scale, image, track))
-    track, image, xy, scale, angle = (v[order] for v in (track.reshape(-1), image, xy, scale, angle))
+    track, image, xy, scale, angle = track.reshape(-1)[order], image[order], xy[order], scale[order], angle[order]
     again = np.concatenate([[False], (track[1:] == track[:-1]) & (image[1:] == image[:-1])]) if len(track) else used[:0]
     apart = np.concatenate([[0.0], np.linalg.norm(np.diff(xy, axis=0), axis=1)]) if len(track) else scale
     bad = np.zeros(int(track.max()) + 1 if len(track) else 0, bool)

@@ -97,8 +97,8 @@ def verify_pair(
 
 def _essential(t: tuple[NDArray[np.float64], NDArray[np.float64]], threshold: float) -> NDArray[np.bool_]:
     cv2 = opencv()
-    known = np.isfinite(t[0]).all(axis=1) & np.isfinite(t[1]).all(axis=1)
-    fits = np.zeros(len(known), bool)
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(np.concatenate(t, axis=1)).all(axis=1), np.bool_)
+    fits: NDArray[np.bool_] = np.zeros(len(known), np.bool_)
     p, q = t[0][known], t[1][known]
     if len(p) < 6:
         return fits
@@ -116,7 +116,7 @@ def _essential(t: tuple[NDArray[np.float64], NDArray[np.float64]], threshold: fl
 def _fundamental(xy: tuple[NDArray[np.float64], NDArray[np.float64]], threshold: float) -> NDArray[np.bool_]:
     cv2 = opencv()
     p, q = (np.ascontiguousarray(v) for v in xy)
-    fits = np.zeros(len(p), bool)
+    fits: NDArray[np.bool_] = np.zeros(len(p), np.bool_)
     F, _ = cv2.findFundamentalMat(p, q, cv2.USAC_MAGSAC, threshold, 0.9999, 10000)
     if F is not None and F.shape == (3, 3):
         fits = _sampson(F, p, q) <= threshold

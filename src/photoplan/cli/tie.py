@@ -1,0 +1,101 @@
+"""`photoplan tie`: tie points between the images of a project."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from photoplan.cli.options import json_option
+
+if TYPE_CHECKING:
+    from photoplan.products.tie import TieReport
+
+__all__ = ["command"]
+
+
+@click.command("tie")
+@click.argument("project", type=click.Path(path_type=Path))
+@click.option("--images", "images", multiple=True, metavar="NAME", help="Image or pattern; may be repeated [all].")
+@click.option("--pairs", default="auto", show_default=True, metavar="auto|all|FILE", help="Which images are compared.")
+@click.option("--scale", type=float, help="Look for features in images reduced to this, e.g. 0.5 [by their size].")
+@click.option("--features", type=int, default=4000, show_default=True, help="Features per image.")
+@click.option("--per-image", type=int, default=500, show_default=True, help="Tie points that an image is to have.")
+@click.option("--no-refine", is_flag=True, help="Features as they are, without least-squares matching.")
+@click.option("--ignore-orientation", is_flag=True, help="Work as if no image had a position.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), metavar="CSV", help="[tie_points.csv by the project]")
+@click.option("--no-picture", is_flag=True, help="Do not write a picture beside the output.")
+@click.option("--workers", type=click.IntRange(1), default=None, help="Images worked on at once [all cores].")
+@click.option("--dry-run", is_flag=True, help="Open the images, choose pairs and stop.")
+@click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(as_json: bool, quiet: bool, **options: Any) -> None:
+    """Find points that several images of PROJECT have in common.
+
+    They are written as a table (point, image, column, row, standard deviations), which becomes an entry of
+    [observations] in PROJECT. Images that hang together with no other are named.
+    """
+    import psutil
+
+    from photoplan.cli.progress import progress
+    from photoplan.products.tie import TieRequest, find_ties
+
+    options["refine"] = not options.pop("no_refine")
+    options["use_orientation"] = not options.pop("ignore_orientation")
+    options["picture"] = not options.pop("no_picture")
+    options["workers"] = options["workers"] or psutil.cpu_count() or 1
+    request = TieRequest(**options)
+    found = find_ties(request, lambda words, count: progress(count, quiet or as_json, words))
+    if as_json:
+        click.echo(json.dumps(found.to_dict(), indent=2))
+    elif found.output is None:
+        click.echo(f"{len(found.images)} images, {found.pairs or 'not yet known number of'} pairs: {found.chosen}")
+    else:
+        click.echo(str(found.output))
+        if found.picture is not None:
+            click.echo(str(found.picture))
+        _print(found)
+    if not quiet:
+        _talk(found)
+
+
+def _print(found: TieReport) -> None:
+    rows = [
+        ("images", f"{len(found.images)}, features at scale 1/{found.factor}"),
+        ("pairs", f"{found.pairs} tried ({found.chosen}), {found.verified} verified"),
+        ("tracks", f"{found.tracks} found, {found.ambiguous} ambiguous ones dropped"),
+        ("tie points", f"{found.points}, standard deviation {found.sigma:.2f} px (median)"),
+        ("  in images", ", ".join(f"{rays}: {count}" for rays, count in found.rays.items())),
+    ]
+    if found.refined is not None and found.loops is not None:
+        r, loops = found.refined, found.loops
+        origin = f"from {loops.count} loops" if loops.measured else "assumed, too few loops"
+        rows += [
+            (
+                "refinement",
+                f"correlation {r.correlation:.2f} (median), sigma of the fit × {loops.factor:.2f} ({origin})",
+            ),
+            ("  left out", f"{r.unsettled} not found, {r.unlike} unlike, {r.uncertain} uncertain"),
+        ]
+    for what, text in rows:
+        click.echo(f"{what:12} {text}")
+    width = max(map(len, found.per_image))
+    click.echo(f"{'image':{width}}  points")
+    for name, count in found.per_image.items():
+        click.echo(f"{name:{width}}  {count:6}")
+
+
+def _talk(found: TieReport) -> None:
+    for note in found.notes:
+        click.echo(note, err=True)
+    if len(found.parts) > 1:
+        click.echo(
+            f"no overlap: {len(found.unconnected)} of {len(found.images)} images do not hang together with the others:",
+            err=True,
+        )
+        for part in found.parts[1:]:
+            click.echo(f"  {', '.join(part)}", err=True)
+        click.echo("they cannot be adjusted together; give --pairs all, more --features, or leave them out", err=True)
