@@ -51,11 +51,13 @@ def simulate(
     start: tuple[float, float] = (3.0, 0.003),
     tilt: float = 0.03,
     cross: bool = False,
+    base: float = 0.4,
 ) -> Simulated:
     """A block of strips over rolling terrain, 60 % by 30 % overlap.
 
-    `start` is the error of the start orientations (metres, radians), `gross` the part of the measurements with errors of
-    5 to 200 pixels. With `cross` the last strip is flown across at another height.
+    `start` is the error of the start orientations (metres, radians), `gross` the part of the measurements with errors
+    of 20 standard deviations to 200 pixels. With `cross` the last strip is flown across at another height;
+    `base` is the distance of exposures in parts of the image on the ground.
     """
     rng = np.random.default_rng(seed)
     lens = lens or Brown()
@@ -65,7 +67,7 @@ def simulate(
     for s in range(strips):
         for i in range(images):
             across = cross and s == strips - 1
-            X, Y = (0.5 * width, 0.4 * length * i) if across else (0.7 * width * s, 0.4 * length * i)
+            X, Y = (0.5 * width, base * length * i) if across else (0.7 * width * s, base * length * i)
             kappa = np.pi / 2 if across else np.pi * (s % 2)
             angles = rng.normal(0, tilt, 2)
             Z = height * (1.3 if across else 1.0) + rng.normal(0, 10)

@@ -20,7 +20,7 @@ from photoplan.orientation.bundle_model import Model, build_model
 from photoplan.orientation.bundle_normal import reduce_normals
 from photoplan.orientation.bundle_rank import check_rank
 from photoplan.orientation.bundle_result import result_of
-from photoplan.orientation.bundle_robust import first_taken_out, robust_weights, snooped, weights_of
+from photoplan.orientation.bundle_robust import first_taken_out, robust_weights, snooped, softened, weights_of
 from photoplan.orientation.bundle_rows import linearise, residuals_of, whitened
 from photoplan.orientation.bundle_select import Selection, select, start_points
 from photoplan.orientation.bundle_solution import solution_of
@@ -73,7 +73,7 @@ def adjust_block(block: Block, settings: AdjustSettings | None = None, progress:
     _check(model, state, active)
     if settings.robust:
         state = loop.run(model, state, active, robust=True)
-        active = first_taken_out(model, whitened(model, residuals_of(model, state)), active, settings.critical)
+        active = first_taken_out(model, state, active, settings.critical)
     for turn in range(_ROUNDS):
         model, state, selection = _rebuilt(block, model, state, active, lost)
         state = loop.run(model, state, active)
@@ -150,10 +150,12 @@ class _Loop:
     ) -> State:
         """The state where the weighted sum of squares is least (Levenberg–Marquardt)."""
         base = weights_of(model, active, factors)
+        if robust:
+            base = base * softened(model, state)
         damping, cost = 0.0, np.inf
         for turn in range(self._most):
             e = whitened(model, residuals_of(model, state))
-            weight = base * robust_weights(model, e, turn) if robust else base
+            weight = base * robust_weights(model, e * np.sqrt(base), turn) if robust else base
             weight = np.where(np.isfinite(e), weight, 0.0)
             before = _cost(e, weight)
             rows, _ = linearise(model, state, np.sqrt(weight))

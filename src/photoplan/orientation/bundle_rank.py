@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import identity
@@ -38,7 +36,8 @@ def check_rank(model: Model, state: State, reduced: Reduced) -> None:
         return
     # Back from scaled unknowns to metres, radians and the cameras' units.
     directions = vectors[:, null] * reduced.scale[:, None]
-    names = _datum(model, state, directions) or [_spelled(model, d, reduced.scale) for d in vectors[:, null].T]
+    names = _datum(model, state, directions, reduced.scale)
+    names = names or [_spelled(model, d, reduced.scale) for d in vectors[:, null].T]
     raise GeometryError(
         f"the observations leave {int(null.sum())} direction{'s' if null.sum() > 1 else ''} of the unknowns free: "
         + "; ".join(dict.fromkeys(names))
@@ -63,7 +62,7 @@ def _smallest(reduced: Reduced) -> tuple[_Floats, _Floats]:
     return values, vectors
 
 
-def _datum(model: Model, state: State, directions: _Floats) -> list[str]:
+def _datum(model: Model, state: State, directions: _Floats, reduced_scale: _Floats) -> list[str]:
     """Names of the block's motions among the undetermined directions; empty if there are others."""
     n = model.columns.images
     middle = state.centers.mean(axis=0)
@@ -84,6 +83,9 @@ def _datum(model: Model, state: State, directions: _Floats) -> list[str]:
     motions["scale of the block"] = grow
     part = directions[: 6 * n] / np.tile([size] * 3 + [1.0] * 3, n)[:, None]
     basis, _ = np.linalg.qr(part)
+    # A direction in which a camera, a lever arm or a drift changes too is no motion of the block.
+    if np.abs(directions[6 * n :] / reduced_scale[6 * n :, None]).max(initial=0.0) > 0.01:
+        return []
     named = []
     for name, motion in motions.items():
         v = (motion / ([size] * 3 + [1.0] * 3)).ravel()
@@ -94,19 +96,31 @@ def _datum(model: Model, state: State, directions: _Floats) -> list[str]:
 
 
 def _spelled(model: Model, direction: _Floats, scale: _Floats) -> str:
-    """The unknowns with the largest part in a direction of scaled unknowns."""
+    """The unknowns with a part in a direction of scaled unknowns; those of images by their kind."""
+    images = model.columns.images
     share = direction**2
-    order = np.argsort(-share)[:6]
-    wanted = [int(k) for k in order if share[k] > 0.05 * share[order[0]]]
-    step = direction * scale
-    return " with ".join(f"{_name(model, k)} ({step[k]:+.2g})" for k in wanted)
+    of_images = share[: 6 * images].reshape(images, 6)
+    parts: list[tuple[float, str]] = []
+    for k, kind in enumerate(("X0", "Y0", "Z0", "rotation about x", "rotation about y", "rotation about z")):
+        total = float(of_images[:, k].sum())
+        if total > 0.02:
+            parts.append((total, f"{kind} of {_images(model, of_images[:, k])}"))
+    # Few against many: a camera's share is small, but it is the point.
+    for column in np.flatnonzero(share[6 * images :] > 1e-6) + 6 * images:
+        parts.append((1.0, f"{_name(model, int(column))} ({direction[column] * scale[column]:+.2g})"))
+    return " with ".join(text for _, text in sorted(parts, key=lambda p: -p[0]))
+
+
+def _images(model: Model, share: _Floats) -> str:
+    """The images with a large share, by name where they are few."""
+    large = np.flatnonzero(share > 0.1 * share.max())
+    names = ", ".join(repr(model.image_names[k]) for k in large[:3])
+    return f"image{'s' if len(large) > 1 else ''} {names}" + (f" and {len(large) - 3} more" if len(large) > 3 else "")
 
 
 def _name(model: Model, column: int) -> str:
+    """Name of an unknown that is not an image's."""
     columns = model.columns
-    if column < 6 * columns.images:
-        what = ("X0", "Y0", "Z0", "rotation about x", "rotation about y", "rotation about z")[column % 6]
-        return f"{what} of image {model.image_names[column // 6]!r}"
     for name, first in columns.cameras.items():
         free = model.block.cameras[name].free
         if first <= column < first + len(free):
@@ -115,7 +129,5 @@ def _name(model: Model, column: int) -> str:
         return f"lever arm {'xyz'[column - columns.lever]}"
     if 0 <= columns.boresight <= column < columns.boresight + 3:
         return f"boresight about {'xyz'[column - columns.boresight]}"
-    for name, first in columns.strips.items():
-        if first <= column < first + 6:
-            return f"drift of strip {name!r} in {'XYZ'[(column - first) % 3]}"
-    return f"unknown {column}" if math.isfinite(column) else ""
+    name, first = next((n, f) for n, f in columns.strips.items() if f <= column < f + 6)
+    return f"drift of strip {name!r} in {'XYZ'[(column - first) % 3]}"

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from photoplan.orientation.active import Active
 from photoplan.orientation.bundle_model import Model
-from photoplan.orientation.bundle_rows import residuals_of_all
+from photoplan.orientation.bundle_rows import residuals_of, residuals_of_all, whitened
 from photoplan.orientation.bundle_state import State
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "robust_scale",
     "robust_weights",
     "snooped",
+    "softened",
     "weights_of",
 ]
 
@@ -28,6 +29,8 @@ _Floats = NDArray[np.float64]
 #: Kinds of rows: what a group of observations is called, and the unit of its residuals.
 Kinds = tuple[tuple[str, str], ...]
 
+#: Standard deviation of softened control in units of an image point's on the ground.
+_SOFT = 3.0
 #: Iterations with Huber's weights before gross errors may lose all influence.
 _HUBER = 5
 #: Where the weights begin to fall, in standard deviations.
@@ -78,6 +81,23 @@ def weights_of(model: Model, active: Active, factors: _Floats | None = None) -> 
     if p:
         weight[2 * k + c : 2 * k + c + 3 * p] *= np.repeat(active.position[model.position_row], 3)
     return np.concatenate([weight, np.ones(_priors(model))])
+
+
+def softened(model: Model, state: State) -> _Floats:
+    """Weights that make control no better than what image points say of the ground, while gross errors are sought.
+
+    A wrong control point of high weight would otherwise draw its image points along, and these would look wrong.
+    """
+    out = np.ones(2 * len(model.image) + len(model.ground) + 3 * (len(model.position) + len(model.attitude)))
+    out = np.concatenate([out, np.ones(_priors(model))])
+    distance = np.linalg.norm(state.XYZ[model.point] - state.centers[model.image], axis=1)
+    pixel = np.sqrt(np.abs(model.plane[:, 0] * model.plane[:, 5] - model.plane[:, 1] * model.plane[:, 4]))
+    c = np.array([camera.c for camera in state.cameras])[model.camera_of] * pixel
+    blur = _SOFT * float(np.median(model.sigma.mean(axis=1) * distance / c[model.image]))
+    sigma = 1.0 / np.linalg.norm(model.ground_white, axis=1)
+    k = 2 * len(model.image)
+    out[k : k + len(model.ground)] = sigma**2 / (sigma**2 + blur**2)
+    return out
 
 
 def _priors(model: Model) -> int:
@@ -135,8 +155,9 @@ def _sizes(model: Model, e: _Floats) -> _Floats:
     return size
 
 
-def first_taken_out(model: Model, e: _Floats, active: Active, critical: float) -> Active:
-    """Take out what does not fit the robust estimate."""
+def first_taken_out(model: Model, state: State, active: Active, critical: float) -> Active:
+    """Take out what does not fit the robust estimate at `state`."""
+    e = whitened(model, residuals_of(model, state)) * np.sqrt(softened(model, state))
     size = np.abs(e)
     kinds, of = kinds_of(model)
     for k in range(len(kinds)):
@@ -196,4 +217,8 @@ def _brought_back(model: Model, state: State, judged: Judged, before: Active, af
     fits = np.abs(judged.e[rows]) / scales[of[rows]] < limit
     out = ~before.ground[model.ground, model.ground_axis]
     ground[model.ground[fits & out], model.ground_axis[fits & out]] = True
+    if len(model.position):
+        rows = 2 * len(model.image) + len(model.ground) + np.arange(3 * len(model.position))
+        fits = (np.abs(judged.e[rows]) / scales[of[rows]]).reshape(-1, 3).max(axis=1) < limit
+        position[model.position_row[fits & ~before.position[model.position_row]]] = True
     return Active(image, ground, position)

@@ -91,7 +91,11 @@ def _residuals(model: Model, state: State, rays: _Rays) -> Residuals:
     block = model.block
     image = rays.px - model.xy
     if block.bend is not None:
-        image = image + block.bend(model.image, state.poses(), state.XYZ[model.point])
+        # The bend knows the images by their number in the block, of which some may not take part.
+        poses = [b.pose for b in block.images]
+        for row, pose in zip(model.image_rows, state.poses()):
+            poses[row] = pose
+        image = image + block.bend(model.image_rows[model.image], tuple(poses), state.XYZ[model.point])
     off = state.XYZ[model.ground_point] - np.nan_to_num(block.ground.XYZ[model.ground])
     ground = (model.ground_white * off).sum(axis=1)
     position, attitude = np.empty((0, 3)), np.empty((0, 3))
@@ -156,9 +160,11 @@ def linearise(model: Model, state: State, weight: _Floats) -> tuple[Rows, Residu
     if block.attitudes is not None and len(model.attitude):
         J_sigma = 1.0 / block.attitudes.sigma[model.attitude_row][:, :, None]
         n = len(model.attitude)
-        put(at, 6 * model.attitude + 3, np.broadcast_to(state.boresight.T, (n, 3, 3)) * J_sigma)
+        # log(exp(e) exp(δ)) = e + (1 + [e]× / 2) δ + …, and a rotation before the boresight is turned by it.
+        by_turn = np.eye(3) + 0.5 * skew(found.attitude)
+        put(at, 6 * model.attitude + 3, by_turn @ state.boresight.T * J_sigma)
         if columns.boresight >= 0:
-            put(at, np.full(n, columns.boresight), np.broadcast_to(np.eye(3), (n, 3, 3)) * J_sigma)
+            put(at, np.full(n, columns.boresight), by_turn * J_sigma)
     at += 3 * len(model.attitude)
     prior, at_columns, prior_white = _priors(model, state)
     of_rows.append((prior_white, at + np.arange(len(prior)), at_columns))

@@ -47,14 +47,15 @@ def select(block: Block, active: Active, undetermined: frozenset[str] = frozense
     seen = block.observations
     index = {b.name: k for k, b in enumerate(block.images)}
     image_of = np.array([index.get(n, -1) for n in seen.images], np.int64)[seen.image]
-    known = _known(block)
+    known = _known(block, active.ground)
     keep = active.image & (image_of >= 0)
     keep &= ~np.array([n in undetermined for n in seen.points], bool)[seen.point]
     direct = _direct(block, active.position)
     images_out: dict[str, str] = {}
     while True:
         rays = np.bincount(seen.point[keep], minlength=len(seen.points))
-        enough = (rays >= 1) & ((rays >= 2) | (known >= 1)) & (2 * rays + known >= 3)
+        # One ray and a height determine a point too, but check nothing.
+        enough = (rays >= 2) | ((rays == 1) & (known == 3))
         keep_points = keep & enough[seen.point]
         per_image = np.bincount(image_of[keep_points], minlength=len(block.images))
         poor = [k for k in range(len(block.images)) if per_image[k] < 3 and k not in direct]
@@ -77,10 +78,10 @@ def _reason(rays: int) -> str:
     return "point seen in one image only" if rays == 1 else "point without measurements that can be used"
 
 
-def _known(block: Block) -> _Index:
-    """Known control coordinates of each point of the observations."""
+def _known(block: Block, active: NDArray[np.bool_]) -> _Index:
+    """Control coordinates that take part, of each point of the observations."""
     coordinates = {
-        name: int(np.isfinite(block.ground.XYZ[k]).sum())
+        name: int((np.isfinite(block.ground.XYZ[k]) & active[k]).sum())
         for k, name in enumerate(block.ground.names)
         if not block.ground.check[k]
     }
@@ -155,7 +156,7 @@ def intersect(
     directions = np.where(good_rays[:, None], directions, 0.0)
     projector = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     XYZ = np.full((count, 3), np.nan)
-    determined: NDArray[np.bool_] = np.zeros(count, bool)
+    determined = np.zeros(count, bool)
     for turn in range(rounds):
         w = weight * good_rays
         N = np.empty((count, 3, 3))
@@ -178,4 +179,5 @@ def intersect(
         scale = max(float(np.nanmedian(angle[good_rays])) if good_rays.any() else 0.0, 1e-12)
         # Far rays count less, as their error across is larger; gross errors hardly count.
         weight = np.nan_to_num(1.0 / np.maximum(distance, 1e-9) ** 2 / (1.0 + (angle / (3.0 * scale)) ** 2) ** 2)
-    return XYZ, np.asarray(determined & np.isfinite(XYZ).all(axis=1))
+    good: NDArray[np.bool_] = determined & np.isfinite(XYZ).all(axis=1)
+    return XYZ, good
