@@ -72,7 +72,7 @@ def affine_facts(transformation: Affine2D | Bilinear2D, at: ArrayLike = (0.0, 0.
     x, y = transformation.derivative(np.asarray(at, float)).T
     scale = float(np.hypot(*x)), float(np.hypot(*y))
     direction_x, direction_y = (math.atan2(v[1], v[0]) % math.tau for v in (x, y))
-    mirrored = transformation.determinant > 0
+    mirrored = bool(transformation.determinant > 0)
     # From x to y it is a quarter turn anticlockwise, of a mirrored scan clockwise.
     turn = _half_turn(direction_y - direction_x) * (1.0 if mirrored else -1.0)
     size = 1.0 / scale[0], 1.0 / scale[1]

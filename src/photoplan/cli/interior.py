@@ -1,0 +1,59 @@
+"""`photoplan interior`: interior orientation of film scans from their measured marks."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photoplan.cli.options import json_option
+
+__all__ = ["command"]
+
+
+@click.command("interior")
+@click.argument("project", type=click.Path(path_type=Path))
+@click.option("--images", "images", multiple=True, metavar="NAME", help="Image or pattern; may be repeated [all film].")
+@click.option(
+    "--model",
+    type=click.Choice(["similarity", "affine", "bilinear"]),
+    help="From marks to scan [what the camera states].",
+)
+@click.option("--scan-resolution", metavar="DPI|UM", help="Such as 1200dpi or 21um [what the files state].")
+@click.option("--report", type=click.Path(path_type=Path), metavar="HTML", help="Figures and plots as a page.")
+@click.option("--plot", type=click.Path(path_type=Path), metavar="PNG", help="Residual vectors.")
+@click.option("--write", is_flag=True, help="Make --model that of the cameras in the project file.")
+@click.option("--overwrite", is_flag=True, help="Replace report and plot if they exist.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(images: tuple[str, ...], as_json: bool, quiet: bool, **options: Any) -> None:
+    """Residuals, sigma0, scales, shear and film shrinkage of the scans in PROJECT.
+
+    An image whose marks are missing, exchanged, mirrored or wrong does not stop the others; they are listed at the end
+    (exit code 4).
+    """
+    from photoplan.errors import InputError, TilesFailed
+    from photoplan.products.interior import InteriorRequest, interior_orientations
+
+    found = interior_orientations(InteriorRequest(images=images or None, **options))
+    if as_json:
+        click.echo(json.dumps(found.to_dict(), indent=2, ensure_ascii=False))
+    else:
+        for image in found.images:
+            click.echo(str(image))
+        for path in (found.report, found.plot):
+            if path is not None:
+                click.echo(str(path))
+    if not quiet:
+        if found.unmeasured:
+            click.echo(f"marks not measured in {', '.join(found.unmeasured)}: photoplan fiducials finds them", err=True)
+        for camera in found.written:
+            click.echo(f"camera {camera!r}: interior = {options['model']!r} written to the project", err=True)
+    if found.refused and not found.images:
+        raise InputError("\n".join(found.refused.values()))
+    if found.refused:
+        listed = "\n".join(f"  {reason}" for reason in found.refused.values())
+        total = len(found.refused) + len(found.images)
+        raise TilesFailed(f"{len(found.refused)} of {total} images failed:\n{listed}")

@@ -1,0 +1,273 @@
+"""Interior orientation of a project's film scans from their measured marks: figures, plots, choice of a model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.affine_facts import AffineFacts, Shrinkage, affine_facts, film_shrinkage, residuals_on_film
+from photoplan.cameras.fiducials_fit import MODELS, FiducialFit
+from photoplan.errors import GeometryError, InputError, UsageError
+from photoplan.io.camera_model import FilmCamera
+from photoplan.io.disk import write_atomically
+from photoplan.io.product import check_output
+from photoplan.io.project import load_project
+from photoplan.io.project_cameras import fiducial_fit
+from photoplan.io.project_edit import ProjectChanges, edit_project
+from photoplan.io.project_model import Image, Project
+from photoplan.io.scan_pitch import parse_pitch, read_pitch
+from photoplan.products.scene import input_files
+from photoplan.report.interior import InteriorPlots, ResidualPanel, interior_report
+
+__all__ = ["ImageInterior", "InteriorRequest", "InteriorResult", "interior_orientations"]
+
+#: A film that seems to have changed by more was not scanned with the pitch that its file states.
+UNBELIEVABLE = 0.01
+
+
+@dataclass(frozen=True)
+class InteriorRequest:
+    """What is asked."""
+
+    project: Path
+    images: tuple[str, ...] | None = None
+    """Names or patterns; None: all film scans."""
+    model: str | None = None
+    """One of `MODELS`; None: what the camera states."""
+    scan_resolution: str | None = None
+    """Such as ``1200dpi`` or ``21um``; None: as the files state it."""
+    report: Path | None = None
+    """HTML."""
+    plot: Path | None = None
+    """PNG."""
+    write: bool = False
+    """Whether the model becomes that of the cameras."""
+    overwrite: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class ImageInterior:
+    """Interior orientation of one scan."""
+
+    image: str
+    camera: str
+    fit: FiducialFit
+    facts: AffineFacts
+    """In millimetres and pixels."""
+    plane_mm: NDArray[np.float64]
+    """Calibrated places of the marks that were used, shape (n, 2)."""
+    residuals_um: NDArray[np.float64]
+    """Transformed minus measured, on the film: x right, y up, shape (n, 2), micrometres."""
+    pitch: tuple[float, float] | None
+    """Sampling distance of the scan, millimetres; None: not known, or not believable."""
+    shrinkage: Shrinkage | None
+    note: str | None = None
+
+    @property
+    def sigma0_um(self) -> float:
+        """Standard deviation of one measured coordinate on the film; NaN without redundancy."""
+        return self.fit.sigma0 * 1000 * math.sqrt(self.facts.pixel_size[0] * self.facts.pixel_size[1])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        fit, facts, shrinkage = self.fit, self.facts, self.shrinkage
+        marks = [
+            {"name": n, "x_mm": p[0], "y_mm": p[1], "residual_px": v.tolist(), "residual_um": u.tolist()}
+            for n, p, v, u in zip(fit.names, self.plane_mm.tolist(), fit.residuals, self.residuals_um)
+        ]
+        coefficients = {k: float(getattr(fit.transformation, k)) for k in fit.transformation.__dataclass_fields__}
+        return {
+            "image": self.image,
+            "camera": self.camera,
+            "model": fit.model,
+            "marks": marks,
+            "missing": list(fit.missing),
+            "redundancy": fit.redundancy,
+            "sigma0_px": _plain(fit.sigma0),
+            "sigma0_um": _plain(self.sigma0_um),
+            "mm_to_px": coefficients,
+            "scale_px_per_mm": list(facts.scale),
+            "pixel_um": [1000 * s for s in facts.pixel_size],
+            "rotation_deg": math.degrees(facts.rotation),
+            "shear_mrad": 1000 * facts.shear,
+            "mirrored": facts.mirrored,
+            "scan_pitch_um": self.pitch and [1000 * p for p in self.pitch],
+            "shrinkage_permille": shrinkage and [1000 * shrinkage.x, 1000 * shrinkage.y],
+            "sigma_shrinkage_permille": shrinkage and [_plain(1000 * s) for s in shrinkage.sigma],
+            "note": self.note,
+        }
+
+    def __str__(self) -> str:
+        fit, facts = self.fit, self.facts
+        check = (
+            f"sigma0 {fit.sigma0:.3f} px = {self.sigma0_um:.1f} µm" if fit.redundancy else "not checked (no redundancy)"
+        )
+        lines = [f"{self.image}  {fit.model}, {len(fit.names)} marks: {check}"]
+        lines += [
+            f"  {name:>8}  vx {u[0]:+8.1f}  vy {u[1]:+8.1f} µm   {v[0]:+8.3f} {v[1]:+8.3f} px"
+            for name, u, v in zip(fit.names, self.residuals_um, fit.residuals)
+        ]
+        x, y = (1000 * s for s in facts.pixel_size)
+        turned = "mirrored, turned" if facts.mirrored else "turned"
+        lines.append(
+            f"  pixel {x:.3f} × {y:.3f} µm · {turned} {math.degrees(facts.rotation):+.3f}° · "
+            f"shear {1000 * facts.shear:+.3f} mrad"
+        )
+        if self.shrinkage is not None and self.pitch is not None:
+            s, (px, py) = self.shrinkage, self.pitch
+            sigma = "" if math.isnan(s.sigma[0]) else f" (±{1000 * s.sigma[0]:.3f}, ±{1000 * s.sigma[1]:.3f})"
+            lines.append(
+                f"  film shrinkage x {1000 * s.x:+.3f} ‰  y {1000 * s.y:+.3f} ‰{sigma}, if a pixel of the scanner "
+                f"is {1000 * px:.3f} × {1000 * py:.3f} µm"
+            )
+        if fit.missing:
+            lines.append(f"  not measured: {', '.join(fit.missing)}")
+        if self.note:
+            lines.append(f"  {self.note}")
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True, eq=False)
+class InteriorResult:
+    """What came out."""
+
+    images: tuple[ImageInterior, ...]
+    unmeasured: tuple[str, ...]
+    """Film scans whose marks are not measured yet."""
+    refused: dict[str, str]
+    """Film scans whose marks cannot be right, and why."""
+    written: tuple[str, ...]
+    """Cameras whose model was set in the project file."""
+    report: Path | None
+    plot: Path | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        return {
+            "images": [image.to_dict() for image in self.images],
+            "unmeasured": list(self.unmeasured),
+            "refused": self.refused,
+            "written": list(self.written),
+            "report": self.report and str(self.report),
+            "plot": self.plot and str(self.plot),
+        }
+
+
+def interior_orientations(request: InteriorRequest) -> InteriorResult:
+    """Interior orientation of every film scan of a project whose marks are measured.
+
+    Scans with marks that cannot be right are listed in the result, the others are computed all the same; the project
+    file is changed only if none is refused.
+
+    Raises
+    ------
+    UsageError
+        An output exists, matplotlib is missing, `write` without a model, or the resolution is not understood.
+    InputError
+        The project has no film scan, or none with measured marks.
+    """
+    if request.write and request.model is None:
+        raise UsageError("--write sets the model of the cameras; say which with --model")
+    pitch = None if request.scan_resolution is None else parse_pitch(request.scan_resolution)
+    project = load_project(request.project)
+    for path in (request.report, request.plot):
+        if path is not None:
+            check_output(path, [request.project, *input_files(project)], overwrite=request.overwrite)
+    plots = InteriorPlots() if request.report or request.plot else None
+    scans = _scans(project, request)
+    unmeasured = tuple(image.name for image in scans if not image.fiducials)
+    if len(unmeasured) == len(scans):
+        raise InputError(
+            f"{request.project}: no fiducial marks are measured in {', '.join(unmeasured[:5])}; "
+            "`photoplan fiducials` finds them"
+        )
+    found, refused = [], {}
+    for image in scans:
+        if image.fiducials:
+            try:
+                found.append(_interior(project, image, request.model, pitch))
+            except InputError as error:
+                refused[image.name] = str(error)
+    if plots is not None and found:
+        _draw(request, found, refused, plots)
+    written = _write(request, found) if request.write and not refused else ()
+    drawn = bool(found)
+    return InteriorResult(
+        tuple(found),
+        unmeasured,
+        refused,
+        written,
+        request.report if drawn else None,
+        request.plot if drawn else None,
+    )
+
+
+def _scans(project: Project, request: InteriorRequest) -> list[Image]:
+    chosen = [project.image(name) for name in project.select(request.images)]
+    scans = [image for image in chosen if isinstance(project.cameras[image.camera], FilmCamera)]
+    if not scans:
+        raise InputError(
+            f'{request.project}: none of {len(chosen)} images is the scan of a film (camera with type = "film"); '
+            "digital images need no interior orientation"
+        )
+    return scans
+
+
+def _interior(project: Project, image: Image, model: str | None, pitch: tuple[float, float] | None) -> ImageInterior:
+    camera = project.cameras[image.camera]
+    assert isinstance(camera, FilmCamera)
+    if model is not None:
+        if len(camera.fiducials_mm) < MODELS[model]:
+            raise GeometryError(
+                f"image {image.name!r}: camera {image.camera!r} has {len(camera.fiducials_mm)} fiducial marks; "
+                f"{model} needs {MODELS[model]}"
+            )
+        camera = camera.model_copy(update={"interior": model})
+    fit = fiducial_fit(camera, image)
+    plane = np.array([camera.fiducials_mm[name] for name in fit.names])
+    on_film = 1000 * residuals_on_film(fit.transformation, plane, fit.residuals)
+    facts = affine_facts(fit.transformation)
+    plain = ImageInterior(image.name, image.camera, fit, facts, plane, on_film, None, None)
+    if pitch is None:
+        try:
+            pitch = read_pitch(project.resolve(image.file))
+        except InputError:
+            return replace(plain, note="film shrinkage is not known: the scan cannot be opened")
+        if pitch is None:
+            return replace(plain, note="film shrinkage is not known: the file states no resolution; --scan-resolution")
+        shrinkage = film_shrinkage(fit.transformation, pitch, fit.covariance)
+        if max(abs(shrinkage.x), abs(shrinkage.y)) > UNBELIEVABLE:
+            note = (
+                f"film shrinkage is not known: the file says {25.4 / pitch[0]:.4g} dpi, its marks say "
+                f"{25.4 * facts.scale[0]:.4g} dpi; --scan-resolution"
+            )
+            return replace(plain, note=note)
+    return replace(plain, pitch=pitch, shrinkage=film_shrinkage(fit.transformation, pitch, fit.covariance))
+
+
+def _draw(
+    request: InteriorRequest, found: Sequence[ImageInterior], refused: dict[str, str], plots: InteriorPlots
+) -> None:
+    panels = [ResidualPanel(i.image, i.fit.names, i.plane_mm, i.residuals_um) for i in found]
+    if request.plot is not None:
+        write_atomically(request.plot, plots.residuals(panels))
+    if request.report is not None:
+        pairs = list(zip(panels, (i.to_dict() for i in found)))
+        title = f"Interior orientation · {request.project.resolve().parent.name}"
+        write_atomically(request.report, interior_report(title, pairs, refused, plots).encode("utf-8", "replace"))
+
+
+def _write(request: InteriorRequest, found: Sequence[ImageInterior]) -> tuple[str, ...]:
+    cameras = tuple(dict.fromkeys(i.camera for i in found))
+    edit_project(request.project, ProjectChanges(cameras={name: {"interior": request.model} for name in cameras}))
+    return cameras
+
+
+def _plain(value: float) -> float | None:
+    return value if math.isfinite(value) else None
