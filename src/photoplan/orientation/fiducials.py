@@ -140,12 +140,14 @@ def find_fiducials(scan: Scan, layout: MarkLayout, known: FiducialSearch = Fiduc
     placements, notes = _search(scan, layout, known, turns)
     if not placements:
         raise InputError(_nothing(layout, scan, known))
-    first = placements[0]
     ties = _ties(placements)
     chosen = _usual(ties, known)
     measured = measure_marks(scan, layout, chosen, known.least_correlation)
+    better = _better_turn(scan, layout, known, measured) if measured.missed else None
+    if better is not None:
+        notes.append(better)
     if len(measured.found) < 3:
-        raise InputError(_too_few(layout, measured, known, len(first.found)))
+        raise InputError(_too_few(layout, measured, better))
     measured, dropped = _without_false(layout, measured, chosen.turn)
     turn, fit, names, said = _decide(layout, measured, ties, chosen, known)
     return _result(layout, measured, (turn, fit, names), (*notes, *said, *dropped))
@@ -337,13 +339,31 @@ def _nothing(layout: MarkLayout, scan: Scan, known: FiducialSearch) -> str:
     )
 
 
-def _too_few(layout: MarkLayout, measured: Measured, known: FiducialSearch, coarse: int) -> str:
+def _better_turn(scan: Scan, layout: MarkLayout, known: FiducialSearch, measured: Measured) -> str | None:
+    """What to say if the scan is turned in a way that was excluded, but fits more marks; None: it is not."""
+    excluded = tuple(
+        t for t in TURNS if known.rotation not in (None, t.rotation) or known.mirrored not in (None, t.mirrored)
+    )
+    if not excluded:
+        return None
+    search = Search(scan, layout, excluded, (measured.placement.negative,), STATED_TOLERANCE)
+    others = search_placements(search, [measured.placement.pixel_mm])
+    best = max(others, key=lambda p: (len(p.found), p.score), default=None)
+    if best is None or len(best.found) < 3 or len(best.found) <= len(measured.found) or not _convincing(best, layout):
+        return None
+    return (
+        f"turned by {measured.placement.turn}, as stated, the scan shows {len(measured.found)} of {len(layout.names)} "
+        f"marks; turned by {best.turn} it would show {len(best.found)}: check --rotation and --mirrored"
+    )
+
+
+def _too_few(layout: MarkLayout, measured: Measured, better: str | None) -> str:
     lost = []
     for name, (r, reason) in measured.missed.items():
         x, y = measured.expected[name]
         lost.append(f"{name!r} ({reason}{f', best correlation {r:.2f}' if math.isfinite(r) else ''}, {x:.0f} {y:.0f})")
     found = ", ".join(f"{n!r} ({at.correlation:.2f})" for n, at in measured.found.items()) or "none"
-    hint = "" if known.rotation is None and known.mirrored is None else "; leave out --rotation and --mirrored"
+    hint = "" if better is None else f" ({better})"
     return (
         f"{len(measured.found)} of {len(layout.names)} fiducial marks found, three are needed. Found: {found}. "
         f"Not found: {'; '.join(lost)}. Check that the camera's marks look as described{hint}, or measure by hand"

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
 from photoplan.errors import InputError
 from photoplan.kernels.correlation import correlate
+from photoplan.orientation.mark_drawn import draw
 from photoplan.orientation.mark_match import Match, fine_template, match_template
 from photoplan.orientation.mark_paraboloid import Peak, paraboloid_peak
-from photoplan.orientation.mark_template import Template, render
+from photoplan.orientation.mark_template import Template
 
 __all__ = ["AGREE", "BLURS", "LEAST_CORRELATION", "Location", "best_blur", "correlation_surface", "locate_mark"]
 
@@ -116,7 +117,7 @@ def locate_mark(
     InputError
         The image is smaller than the mark.
     """
-    surface, (ox, oy) = correlation_surface(image, render(pattern, mm_to_pixel, negative=negative, blur_px=blur_px))
+    surface, (ox, oy) = correlation_surface(image, draw(pattern, mm_to_pixel, negative=negative, blur_px=blur_px))
     if near is not None:
         rows, columns = np.indices(surface.shape)
         far = np.hypot(columns + ox - near[0], rows + oy - near[1]) > near[2]
@@ -150,7 +151,7 @@ def best_blur(
     """Highest correlation within a pixel of a place, for each of `BLURS`."""
     found = []
     for blur in BLURS:
-        template = render(pattern, mm_to_pixel, negative=negative, blur_px=blur)
+        template = draw(pattern, mm_to_pixel, negative=negative, blur_px=blur)
         a, b = template.values.shape
         col, row = (math.floor(at[k] - template.reference[k]) - 1 for k in (0, 1))
         part = image[max(row, 0) : row + a + 4, max(col, 0) : col + b + 4]

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
 from photoplan.kernels.template_match import sample_template
-from photoplan.orientation.mark_template import render
+from photoplan.orientation.mark_drawn import draw
 
 __all__ = ["FineTemplate", "Match", "fine_template", "match_template"]
 
@@ -72,15 +72,20 @@ def fine_template(
     negative : bool
         Whether dark and bright are exchanged.
     """
-    coarse = render(pattern, mm_to_pixel, negative=negative, blur_px=0.0)
+    coarse = draw(pattern, mm_to_pixel, negative=negative, blur_px=0.0)
     over = 4 if max(coarse.values.shape) < 400 else 2 if max(coarse.values.shape) < 800 else 1
     # An area and a Gaussian of the same variance do not differ by more than a thousandth once they are blurred.
     sigma = over * math.sqrt(blur_px**2 + _PIXEL)
-    drawn = render(pattern, over * np.asarray(mm_to_pixel, float), negative=negative, blur_px=sigma)
-    known = drawn.weights > 0.5
+    drawn = draw(pattern, over * np.asarray(mm_to_pixel, float), negative=negative, blur_px=sigma)
+    pad = math.ceil((_FAR + 1) * over)
+    known = np.pad(drawn.weights > 0.5, pad)
     # Cubic sampling reaches two samples far.
     mask = ndimage.binary_erosion(known, np.ones((5, 5), bool), border_value=0)
-    return FineTemplate(drawn.values.astype(np.float64), mask.astype(np.float64), drawn.reference, over)
+    # Pixels near the border of what is compared leave it while the template moves: they find the nearest tone there.
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    values = np.pad(drawn.values.astype(np.float64), pad)[tuple(nearest)]
+    x, y = drawn.reference
+    return FineTemplate(values, mask.astype(np.float64), (x + pad, y + pad), over)
 
 
 def match_template(image: NDArray[np.floating], template: FineTemplate, x: float, y: float) -> Match | None:
@@ -105,41 +110,72 @@ def match_template(image: NDArray[np.floating], template: FineTemplate, x: float
         None if the iteration does not converge near the start, or too little of the template lies on the image.
     """
     grey = np.asarray(image, np.float64)
-    sampled = np.empty((4, *grey.shape))
+    start = (x, y)
+    fitted = None
+    # The pixels that are compared are chosen at the start, and once more where that has led.
+    for _ in range(2):
+        fitted = _fit(grey, template, (x, y), start)
+        if fitted is None:
+            return None
+        x, y = fitted.x, fitted.y
+    assert fitted is not None
+    return _result(fitted)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitted:
+    """Where the iteration ended: place, design, unknowns, grey values, template values, pixels that are compared."""
+
+    x: float
+    y: float
+    A: NDArray[np.float64]
+    unknowns: NDArray[np.float64]
+    grey: NDArray[np.float64]
+    T: NDArray[np.float64]
+    used: NDArray[np.bool_]
+    iterations: int
+
+
+def _fit(
+    image: NDArray[np.float64], template: FineTemplate, at: tuple[float, float], start: tuple[float, float]
+) -> _Fitted | None:
+    """Least squares with the pixels that the template covers at a place; None if it does not converge."""
+    x, y = at
+    sampled = np.empty((4, *image.shape))
     _sample(template, x, y, sampled)
-    used = (sampled[3] > 0.5) & np.isfinite(grey)
+    used = (sampled[3] > 0.5) & np.isfinite(image)
     if used.sum() < max(30, 0.5 * template.mask.sum() / template.over**2):
         return None
     rows, columns = np.nonzero(used)
-    g = grey[used]
-    start = (x, y)
-    gain = 0.0
+    g = image[used]
+    flat = np.column_stack([np.ones_like(g), columns - at[0], rows - at[1]])
+    gain = float(np.linalg.lstsq(np.column_stack([sampled[0][used], flat]), g, rcond=None)[0][0])
     for iteration in range(1, _ITERATIONS + 1):
-        _sample(template, x, y, sampled)
-        T, Tx, Ty = sampled[0][used], sampled[1][used], sampled[2][used]
-        if iteration == 1:
-            gain = float(np.cov(T, g)[0, 1] / max(np.var(T), 1e-12)) or 1.0
-        A = np.column_stack([-gain * Tx, -gain * Ty, T, np.ones_like(T), columns - start[0], rows - start[1]])
-        try:
-            N_inverse = np.linalg.inv(A.T @ A)
-        except np.linalg.LinAlgError:
+        T, Tx, Ty = (layer[used] for layer in sampled[:3])
+        A = np.column_stack([-gain * Tx, -gain * Ty, T, flat])
+        unknowns, _, rank, _ = np.linalg.lstsq(A, g, rcond=None)
+        if rank < A.shape[1]:
             return None
-        unknowns = N_inverse @ (A.T @ g)
+        step = np.clip(unknowns[:2], -0.5, 0.5)
         gain = float(unknowns[2])
-        step = unknowns[:2]
-        x, y = x + float(np.clip(step[0], -1, 1)), y + float(np.clip(step[1], -1, 1))
+        x, y = x + float(step[0]), y + float(step[1])
         if max(abs(x - start[0]), abs(y - start[1])) > _FAR or not math.isfinite(x + y):
             return None
-        if max(abs(step)) < _SMALL:
-            break
-    else:
-        return None
+        if np.abs(step).max() < _SMALL:
+            return _Fitted(x, y, A, unknowns, g, T, used, iteration)
+        _sample(template, x, y, sampled)
+    return None
+
+
+def _result(fitted: _Fitted) -> Match:
+    A, unknowns, g, T = fitted.A, fitted.unknowns, fitted.grey, fitted.T
     residuals = A @ unknowns - g
     sigma0 = math.sqrt(float(residuals @ residuals) / (len(g) - len(unknowns)))
-    covariance = _covariance(A @ N_inverse, residuals, used, sigma0)
-    trend = A[:, 2:] @ unknowns[2:] - gain * T
-    r = float(np.corrcoef(T, g - trend)[0, 1]) if np.ptp(T) > 0 and np.ptp(g) > 0 else 0.0
-    return Match(x, y, covariance, gain, r, sigma0, iteration)
+    influence = A @ np.linalg.inv(A.T @ A)
+    covariance = _covariance(influence, residuals, fitted.used, sigma0)
+    trend = A[:, 3:] @ unknowns[3:]
+    r = float(np.corrcoef(T, g - trend)[0, 1]) if np.ptp(T) > 0 and np.ptp(g - trend) > 0 else 0.0
+    return Match(fitted.x, fitted.y, covariance, float(unknowns[2]), r, sigma0, fitted.iterations)
 
 
 def _sample(template: FineTemplate, x: float, y: float, out: NDArray[np.float64]) -> None:

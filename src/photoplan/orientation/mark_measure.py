@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
+from photoplan.orientation.mark_drawn import draw
 from photoplan.orientation.mark_layout import FILM, MarkLayout, Placement, fit_placement
 from photoplan.orientation.mark_locate import BLURS, Location, best_blur, locate_mark
 from photoplan.orientation.mark_search import Scan
-from photoplan.orientation.mark_template import render
 
 __all__ = ["Measured", "mark_window", "measure_marks"]
 
@@ -116,7 +116,7 @@ def _round(
 
 def _locate(scan: Scan, layout: MarkLayout, k: int, look: _Look, radius: float) -> Location | None:
     pattern, (x, y) = layout.patterns[k], look.expected[k]
-    template = render(pattern, look.matrix, negative=look.negative, blur_px=look.blur_px)
+    template = draw(pattern, look.matrix, negative=look.negative, blur_px=look.blur_px)
     a, b = template.values.shape
     # Three pixels more than the search needs, for the neighbourhood of the maximum and for matching.
     half = tuple(math.ceil(max(r + 1, s - r) + radius) + 4 for r, s in zip(template.reference, (b, a)))
@@ -142,7 +142,7 @@ def _blur(scan: Scan, layout: MarkLayout, look: _Look, found: Mapping[str, Locat
     sums = np.zeros(len(BLURS))
     for name, at in found.items():
         k = layout.names.index(name)
-        template = render(layout.patterns[k], look.matrix, blur_px=0.0)
+        template = draw(layout.patterns[k], look.matrix, blur_px=0.0)
         half = tuple(
             s // 2 + math.ceil(abs(r - s / 2)) + 5 for r, s in zip(template.reference, template.values.shape[::-1])
         )

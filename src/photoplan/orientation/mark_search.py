@@ -13,9 +13,10 @@ from scipy import ndimage
 
 from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
 from photoplan.geometry.grid import Window
+from photoplan.orientation.mark_drawn import draw
 from photoplan.orientation.mark_layout import FLOOR, MarkLayout, Placement, Turn, combine
 from photoplan.orientation.mark_locate import correlation_surface
-from photoplan.orientation.mark_template import Template, render
+from photoplan.orientation.mark_template import Template
 
 __all__ = ["Scan", "Search", "pixel_sizes", "search_placements"]
 
@@ -143,7 +144,7 @@ def _surface(search: Search, k: int, turn: Turn, pixel_mm: float, factor: int) -
 
 def _template(search: Search, pattern: MarkPattern | MarkExample, turn: Turn, coarse_mm: float) -> tuple[int, Template]:
     """Number and template of a pattern; turns that leave it as it is share one."""
-    made = render(pattern, turn.matrix / coarse_mm, blur_px=0.7)
+    made = draw(pattern, turn.matrix / coarse_mm, blur_px=0.7)
     for number, (owner, size, other) in enumerate(search._templates):
         same = owner == id(pattern) and size == coarse_mm and other.values.shape == made.values.shape
         if same and np.allclose(other.values, made.values, atol=0.02) and np.allclose(other.weights, made.weights):
