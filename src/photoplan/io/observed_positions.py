@@ -3,7 +3,7 @@
 A table names its columns in the first line: name, x, y, z, then as far as known omega, phi, kappa, sigma or sigma_xy
 and sigma_z or sigma_x, sigma_y, sigma_z (metres), sigma_angle (one, in the unit of the angles), strip and time
 (seconds, or ISO 8601). Files of other formats are read as orientations: all exposures are then one strip in the order
-of the file.
+of the file. A folder of images gives the positions that EXIF and XMP state.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from photoplan.geometry.crs import crs_label, parse_crs, same_crs, split_compoun
 from photoplan.geometry.rotation import rotation_from_angles
 from photoplan.io.named_table import NamedTable, TableColumns, read_named_table
 from photoplan.io.names import match_key
+from photoplan.io.orientation_exif import map_positions, read_folder
 from photoplan.io.orientation_file import read_orientation
 from photoplan.io.orientation_table import TableFormat, angle_in_radians
 from photoplan.io.plain_files import read_text
@@ -107,7 +108,7 @@ def read_observed_positions(
     Parameters
     ----------
     path : Path
-        Table of text, or a file of any format of orientations.
+        Table of text, a file of any format of orientations, or a folder of images with GPS positions in EXIF or XMP.
     form : TableFormat, optional
         Unit and order of the angles, decimal sign.
     crs : str, optional
@@ -121,6 +122,8 @@ def read_observed_positions(
         A line cannot be read, an image is given twice, or the CRS is another one; file and line are named.
     """
     path, form = Path(path), form or TableFormat()
+    if path.is_dir() and crs is not None and not (path / "images.txt").is_file():
+        return _from_images(path, crs)
     if path.suffix.lower() not in _TEXTS:
         return _from_orientation(path, form, crs)
     _check_crs(path, crs)
@@ -211,6 +214,17 @@ def _same(path: Path, own: str, crs: str) -> None:
             f"{path}: positions in {crs_label(own)}, the project is in {crs_label(crs)}; `photoplan convert` "
             "transforms them"
         )
+
+
+def _from_images(path: Path, crs: str) -> PositionTable:
+    """Positions that drones write into their images, with the receiver's standard deviations and times."""
+    images = read_folder(path)
+    n = len(images)
+    sigma = np.array([m.sigma or (np.nan,) * 3 for m in images], float).reshape(n, 3)
+    times = [m.time for m in images]
+    time = np.array(times, float) if all(t is not None for t in times) else np.arange(n, dtype=float)
+    names = tuple(m.file.name for m in images)
+    return PositionTable(path, names, map_positions(images, crs), sigma, None, np.full(n, np.nan), ("all",) * n, time)
 
 
 def _from_orientation(path: Path, form: TableFormat, crs: str | None) -> PositionTable:

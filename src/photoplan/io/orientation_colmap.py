@@ -243,4 +243,4 @@ def _sniff(path: Path, head: str) -> bool:
     return "IMAGE_ID, QW, QX, QY, QZ" in head or "CAMERA_ID, MODEL, WIDTH, HEIGHT" in head
 
 
-FORMAT = OrientationFormat("colmap", "COLMAP model as text", _sniff, read, _render, _losses)
+FORMAT = OrientationFormat("colmap", "COLMAP model as text", _sniff, read, _render, _losses, suffix="")

@@ -31,6 +31,7 @@ FORMATS: dict[str, str] = {
     "metashape": "photoplan.io.orientation_metashape",
     "pix4d": "photoplan.io.orientation_pix4d",
     "opk": "photoplan.io.orientation_opk",
+    "exif": "photoplan.io.orientation_exif",
     "odm": "photoplan.io.orientation_odm",
     "colmap": "photoplan.io.orientation_colmap",
 }

@@ -253,4 +253,4 @@ def _sniff(path: Path, head: str) -> bool:
     return "<document" in head and "<chunk" in head and path.suffix.lower() == ".xml"
 
 
-FORMAT = OrientationFormat("metashape", "Metashape cameras.xml", _sniff, read, render, losses)
+FORMAT = OrientationFormat("metashape", "Metashape cameras.xml", _sniff, read, render, losses, suffix=".xml")

@@ -147,4 +147,4 @@ def _sniff(path: Path, head: str) -> bool:
     return '"FeatureCollection"' in head and '"translation"' in head and '"rotation"' in head
 
 
-FORMAT = OrientationFormat("odm", "OpenDroneMap shots.geojson", _sniff, read, _render, _losses)
+FORMAT = OrientationFormat("odm", "OpenDroneMap shots.geojson", _sniff, read, _render, _losses, suffix=".geojson")

@@ -114,4 +114,5 @@ FORMAT = OrientationFormat(
     read=read_block,
     render=render,
     losses=losses,
+    suffix=".json",
 )

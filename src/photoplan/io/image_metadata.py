@@ -1,0 +1,223 @@
+"""What cameras and drones write into their images: position, attitude, time, focal length.
+
+Positions are those of EXIF's GPS directory (latitude, longitude, altitude; WGS 84 unless it names another datum), or
+of the XMP of the maker, which has more digits. Attitudes are DJI's gimbal angles in XMP: north, east, down, rotation
+order ZYX (DJI Mavic 3E/3T User Manual, "Photo File"). Accuracies are DJI's (RtkStdLon, RtkStdLat, RtkStdHgt) or those
+of Pix4D's ``Camera`` schema.
+
+Heights are as the maker means them: EXIF's altitude is above sea level by its definition, but many cameras write the
+ellipsoidal or a barometric height into it. The height system has to be declared.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+from photoplan.errors import InputError
+from photoplan.io.exif import ExifValue, read_exif
+from photoplan.io.xml_file import parse_xml
+
+__all__ = ["ImageMetadata", "read_image_metadata"]
+
+_DJI = "dji.com/drone-dji"
+_CAMERA = "pix4d.com/camera"
+_MM_PER_UNIT = {2.0: 25.4, 3.0: 10.0, 4.0: 1.0, 5.0: 0.001}
+"""Millimetres of EXIF's FocalPlaneResolutionUnit: inch, centimetre, millimetre, micrometre."""
+_FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)
+
+
+@dataclass(frozen=True)
+class ImageMetadata:
+    """What an image states of itself; None: it does not."""
+
+    file: Path
+    size: tuple[int, int] | None = None
+    """Width and height in pixels."""
+    position: tuple[float, float, float] | None = None
+    """Latitude, longitude (degrees) and altitude (metres)."""
+    datum: str | None = None
+    """Datum that EXIF names; None: WGS 84 as it is customary."""
+    relative_altitude: float | None = None
+    """Height above the place of take-off, metres."""
+    sigma: tuple[float, float, float] | None = None
+    """Standard deviation of east, north and height, metres, as the receiver states them."""
+    yaw_pitch_roll: tuple[float, float, float] | None = None
+    """Of the viewing direction, degrees: yaw clockwise from north, pitch −90 straight down and 0 to the horizon, roll
+    clockwise about the viewing direction."""
+    focal_length_mm: float | None = None
+    sensor_size_mm: tuple[float, float] | None = None
+    """From the resolution in the focal plane, or from the 35 mm equivalent of the focal length (to about 1 %)."""
+    camera: str | None = None
+    """Maker and model."""
+    time: float | None = None
+    """Seconds since 1970 by the camera's clock (taken as UTC)."""
+    display: int = 1
+    """EXIF's Orientation: how a viewer turns the image (1: not at all, 3: by 180°). Pixels are read as stored, and
+    attitudes are those of the sensor; only programs that turned the pixels make a difference."""
+
+
+def read_image_metadata(path: str | Path) -> ImageMetadata:
+    """Metadata of a JPEG or TIFF image; pixels are not read.
+
+    Raises
+    ------
+    InputError
+        The file is neither, its header is damaged, or it states a position that is not on the earth.
+    """
+    path = Path(path)
+    exif, packet = read_exif(path)
+    dji, schema = _xmp(packet, path)
+    size = _size(exif)
+    focal = _number(exif, "FocalLength")
+    names = [n for n in (_text(exif, "Make"), _text(exif, "Model")) if n]
+    return ImageMetadata(
+        path,
+        size,
+        _position(exif, dji, path),
+        _text(exif, "GPSMapDatum"),
+        _float(dji.get("RelativeAltitude")),
+        _sigma(exif, dji, schema),
+        _attitude(dji),
+        focal,
+        _sensor(exif, size, focal),
+        " ".join(names) or None,
+        _time(exif),
+        int(_number(exif, "Orientation") or 1),
+    )
+
+
+def _xmp(packet: str | None, path: Path) -> tuple[dict[str, str], dict[str, str]]:
+    """Properties of DJI's schema and of Pix4D's ``Camera`` schema."""
+    found: tuple[dict[str, str], dict[str, str]] = ({}, {})
+    if not packet:
+        return found
+    # The packet is padded with blanks and zero bytes, and framed by processing instructions.
+    text = re.sub(r"<\?xpacket[^>]*\?>", "", packet.replace("\0", "")).strip()
+    if not text:
+        return found
+    for name, value in _properties(parse_xml(text, f"{path}: XMP")):
+        for schema, into in zip((_DJI, _CAMERA), found):
+            if schema in name:
+                into[name.rpartition("}")[2]] = value
+    return found
+
+
+def _properties(root: Element) -> Iterator[tuple[str, str]]:
+    """Names with namespace, and values, of attributes and of elements with text."""
+    for element in root.iter():
+        yield from element.attrib.items()
+        if element.text and element.text.strip():
+            yield str(element.tag), element.text.strip()
+        else:
+            # A list is a container with items.
+            items = [i.text.strip() for i in element.iter() if i is not element and i.text and i.text.strip()]
+            if items and len(items) <= 10:
+                yield str(element.tag), ",".join(items)
+
+
+def _float(text: str | None) -> float | None:
+    try:
+        value = float(text or "")
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def _number(exif: dict[str, ExifValue], name: str) -> float | None:
+    value = exif.get(name)
+    if isinstance(value, str) or not value or not math.isfinite(value[0]):
+        return None
+    return float(value[0])
+
+
+def _text(exif: dict[str, ExifValue], name: str) -> str | None:
+    value = exif.get(name)
+    return value.strip() or None if isinstance(value, str) else None
+
+
+def _size(exif: dict[str, ExifValue]) -> tuple[int, int] | None:
+    for names in (("PixelXDimension", "PixelYDimension"), ("ImageWidth", "ImageLength")):
+        width, height = (_number(exif, n) for n in names)
+        if width and height:
+            return int(width), int(height)
+    return None
+
+
+def _position(exif: dict[str, ExifValue], dji: dict[str, str], path: Path) -> tuple[float, float, float] | None:
+    lat = _degrees(exif, "GPSLatitude", "S")
+    lon = _degrees(exif, "GPSLongitude", "W")
+    altitude = _number(exif, "GPSAltitude")
+    if altitude is not None and _number(exif, "GPSAltitudeRef") in (1.0, 3.0):
+        altitude = -altitude  # below the reference: sea level, or (since EXIF 3.0) the ellipsoid
+    # The maker's own numbers have more digits; one of DJI's names is misspelled in many drones.
+    own = _float(dji.get("GpsLatitude")), _float(dji.get("GpsLongitude", dji.get("GpsLongtitude")))
+    if own[0] is not None and own[1] is not None and own != (0.0, 0.0):
+        lat, lon = own
+    height = _float(dji.get("AbsoluteAltitude"))
+    altitude = height if height is not None else altitude
+    if lat is None or lon is None or altitude is None:
+        return None
+    if abs(lat) > 90 or abs(lon) > 180:
+        raise InputError(f"{path}: latitude {lat}, longitude {lon} are not on the earth; its GPS entries are damaged")
+    return lat, lon, altitude
+
+
+def _degrees(exif: dict[str, ExifValue], name: str, negative: str) -> float | None:
+    value = exif.get(name)
+    if isinstance(value, str) or not value or not all(math.isfinite(v) for v in value):
+        return None
+    degrees = sum(v / 60.0**k for k, v in enumerate(value[:3]))
+    sign = _text(exif, f"{name}Ref") or ""
+    return -degrees if sign.upper().startswith(negative) else degrees
+
+
+def _sigma(
+    exif: dict[str, ExifValue], dji: dict[str, str], schema: dict[str, str]
+) -> tuple[float, float, float] | None:
+    east, north, up = (_float(dji.get(f"RtkStd{n}")) for n in ("Lon", "Lat", "Hgt"))
+    if east is None or north is None:
+        east = north = _float(schema.get("GPSXYAccuracy")) or _number(exif, "GPSHPositioningError")
+        up = _float(schema.get("GPSZAccuracy"))
+    if not (east and north and up) or min(east, north, up) <= 0:
+        return None
+    return east, north, up
+
+
+def _attitude(dji: dict[str, str]) -> tuple[float, float, float] | None:
+    gimbal = [_float(dji.get(f"Gimbal{n}Degree")) for n in ("Yaw", "Pitch", "Roll")]
+    if gimbal[0] is not None and gimbal[1] is not None:
+        return gimbal[0], gimbal[1], gimbal[2] or 0.0
+    return None
+
+
+def _sensor(
+    exif: dict[str, ExifValue], size: tuple[int, int] | None, focal: float | None
+) -> tuple[float, float] | None:
+    if size is None:
+        return None
+    per_x, per_y = (_number(exif, f"FocalPlane{a}Resolution") for a in "XY")
+    unit = _MM_PER_UNIT.get(_number(exif, "FocalPlaneResolutionUnit") or 2.0)
+    if per_x and per_y and unit:
+        return size[0] / per_x * unit, size[1] / per_y * unit
+    equivalent = _number(exif, "FocalLengthIn35mmFilm")
+    if focal and equivalent:
+        diagonal = _FULL_FRAME_DIAGONAL * focal / equivalent
+        scale = diagonal / math.hypot(*size)
+        return size[0] * scale, size[1] * scale
+    return None
+
+
+def _time(exif: dict[str, ExifValue]) -> float | None:
+    text = _text(exif, "DateTimeOriginal") or _text(exif, "DateTime")
+    try:
+        moment = datetime.datetime.strptime(text or "", "%Y:%m:%d %H:%M:%S").replace(tzinfo=datetime.UTC)
+    except ValueError:
+        return None
+    fraction = _text(exif, "SubSecTimeOriginal") or ""
+    return moment.timestamp() + (float(f"0.{fraction}") if fraction.isdigit() else 0.0)
