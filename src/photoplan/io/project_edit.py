@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -52,25 +51,27 @@ def edit_project(path: Path, changes: ProjectChanges) -> Project:
         The disk is full, or the folder cannot be written to.
     """
     text = read_text(path, MAX_BYTES)
+    before = path.read_bytes()
+    line_end = "\r\n" if b"\r\n" in before else "\n"
     try:
         document = tomlkit.parse(text)
     except TOMLKitError as error:
         raise InputError(f"{path}: not valid TOML: {error}") from None
     _set_images(document, changes.images, path)
     for name, entries in changes.cameras.items():
-        cameras = document.get("cameras", {})
+        cameras = _table(document.get("cameras", {}), f"{path}: cameras")
         if name not in cameras:
             raise InputError(f"{path}: camera {name!r} is not in the project")
-        _set(cameras[name], entries)
+        _set(_table(cameras[name], f"{path}: cameras.{name}"), entries)
     for name, entries in changes.tables.items():
         if name not in document:
             document.add(name, tomlkit.table())
-        _set(document[name], entries)
+        _set(_table(document[name], f"{path}: {name}"), entries)
     changed = document.as_string()
     project = parse_project(document.unwrap(), path.resolve().parent, str(path), changed)
     if changed != text:
-        shutil.copyfile(path, path.with_suffix(".previous.toml"))
-        write_atomically(path, changed.encode())
+        write_atomically(path.with_suffix(".previous.toml"), before)
+        write_atomically(path, changed.replace("\n", line_end).encode())
     return project
 
 
@@ -78,11 +79,17 @@ def _set_images(document: tomlkit.TOMLDocument, images: Mapping[str, Mapping[str
     listed = document.get("images", [])
     if not isinstance(listed, AoT | list):
         raise InputError(f"{path}: images must be written as [[images]]")
-    tables = {str(table.get("name")): table for table in listed}
+    tables = {str(_table(t, f"{path}: images[{k}]").get("name")): t for k, t in enumerate(listed, 1)}
     for name, entries in images.items():
         if name not in tables:
             raise InputError(f"{path}: image {name!r} is not in the project")
         _set(tables[name], entries)
+
+
+def _table(value: Any, what: str) -> Any:
+    if not isinstance(value, Mapping):
+        raise InputError(f"{what}: a table is needed")
+    return value
 
 
 def _set(table: Table, entries: Mapping[str, Any]) -> None:
