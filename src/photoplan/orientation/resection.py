@@ -16,7 +16,7 @@ from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
 from photoplan.cameras.lenses.field import field_limited
-from photoplan.errors import GeometryError
+from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.pose import Pose
 from photoplan.orientation.direct import DirectPose, moved, resect_direct, tangent_derivatives
 from photoplan.orientation.resection_model import CameraOf, MeasuredPoints, Resected, ResectSettings
@@ -141,7 +141,7 @@ def _start(task: _Task, interior: Interior, near: Pose | None) -> tuple[_State, 
         tried = replace(interior, c=float(factor * width))
         try:
             found = _direct(task, tried, near)
-        except GeometryError as error:
+        except InputError as error:  # a lens may fold back within the wide field of a short camera constant
             reason = str(error)
             continue
         r = _pixels(task, _State(found.pose, tried))
@@ -261,15 +261,12 @@ def _square(equations: _Equations, use: NDArray[np.bool_]) -> float:
 
 def _cleaned(task: _Task, state: _State, use: NDArray[np.bool_]) -> Resected:
     """Adjustment with data snooping: points leave one by one, and come back when they fit."""
-    n, u = len(task.points), 6 + len(task.settings.free)
+    u = 6 + len(task.settings.free)
     seen: set[bytes] = set()
     while True:
         state, equations = _adjusted(task, state, use)
         if not np.isfinite(equations.v[use]).all():
-            raise GeometryError(
-                f"image {task.name!r}: the adjustment of its {n} control points does not converge with all points in "
-                "front of the camera; check point names and the camera constant"
-            )
+            raise GeometryError(f"image {task.name!r}: {_why_not(task, state, use)}")
         tests = _tested(task, equations, use)
         largest = np.nan_to_num(np.abs(tests.normalised), nan=0.0).max(axis=1)
         limit = task.settings.critical * tests.scale
@@ -285,6 +282,22 @@ def _cleaned(task: _Task, state: _State, use: NDArray[np.bool_]) -> Resected:
             break
         use = changed
     return _result(task, state, equations, use, tests)
+
+
+def _why_not(task: _Task, state: _State, use: NDArray[np.bool_]) -> str:
+    """Why an adjustment ended with points that have no image."""
+    lost = use & ~np.isfinite(_pixels(task, state)).all(axis=1)
+    central = project(FrameCamera(state.interior, task.lens, state.pose), task.points.XYZ)
+    if task.camera_of is not None and np.isfinite(central[lost]).all():
+        names = ", ".join(task.points.names[k] for k in np.flatnonzero(lost)[:5])
+        return (
+            f"{int(lost.sum())} points ({names}) have no image with the earth curvature that is asked for: as a "
+            "correction it is not defined for points above the camera; ask for strict"
+        )
+    return (
+        f"the adjustment of its {len(use)} control points does not converge with all points in front of the camera; "
+        "check point names and the camera constant"
+    )
 
 
 @dataclass(frozen=True, eq=False)

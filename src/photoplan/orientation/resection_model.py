@@ -40,7 +40,7 @@ class MeasuredPoints:
         n = len(self.names)
         for name, shape in (("xy", (n, 2)), ("sigma", (n, 2)), ("XYZ", (n, 3)), ("covariance", (n, 3, 3))):
             value = np.array(np.broadcast_to(np.asarray(getattr(self, name), float), shape))
-            bad = ~np.isfinite(value).reshape(n, -1).all(axis=1)
+            bad = ~np.isfinite(value).all(axis=tuple(range(1, value.ndim)))
             if bad.any():
                 raise InputError(f"point {self.names[int(bad.argmax())]!r}: its {name} is not finite")
             value.setflags(write=False)

@@ -1,0 +1,106 @@
+"""`photoplan resect`: orient single images by control points."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from photoplan.cli.options import json_option
+
+if TYPE_CHECKING:
+    from photoplan.products.resect import ResectResult
+    from photoplan.products.resect_image import ResectedImage
+
+__all__ = ["command"]
+
+_SIGN = {"deg": "°", "gon": " gon", "rad": " rad"}
+_DIGITS = {"deg": 4, "gon": 4, "rad": 6}
+_FILE = click.Path(path_type=Path)
+
+
+@click.command("resect")
+@click.argument("project", type=_FILE)
+@click.option("--images", multiple=True, metavar="NAME", help="Names or patterns [all with 3 control points or more].")
+@click.option("--image-points", multiple=True, type=_FILE, metavar="FILE", help="Instead of the project's.")
+@click.option("--control", multiple=True, type=_FILE, metavar="FILE", help="Instead of the project's.")
+@click.option("--sigma-image", type=click.FloatRange(0, min_open=True), help="Of image points, pixels [the project's].")
+@click.option("--sigma-control", type=click.FloatRange(0), nargs=2, metavar="XY Z", help="Metres [the project's].")
+@click.option("--free", metavar="c,x0,y0", help="Parameters of the camera that are unknowns; one image only.")
+@click.option("--unknown-camera-constant", is_flag=True, help="Not even about known; one image only.")
+@click.option("--critical", type=click.FloatRange(2, 20), default=4.0, show_default=True,
+              help="Normalised residual from which a point is a gross error.")  # fmt: skip
+@click.option("--report", type=_FILE, metavar="HTML", help="Residuals with pictures.")
+@click.option("--overwrite", is_flag=True, help="Replace a report that exists.")
+@click.option("--dry-run", is_flag=True, help="Do not write into the project.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(as_json: bool, quiet: bool, free: str | None, **options: Any) -> None:
+    """Exterior orientation of single images by control points, without start values.
+
+    Writes center, angles and their standard deviations into PROJECT. An image that fails does not stop the others;
+    they are listed at the end (exit code 4).
+    """
+    from photoplan.cli.progress import progress
+    from photoplan.errors import InputError, TilesFailed
+    from photoplan.products.resect import ResectRequest, resect_project
+
+    parameters = tuple(dict.fromkeys(p.strip() for p in (free or "").split(",") if p.strip()))
+    request = ResectRequest(free=parameters, **options)
+    with progress(0, quiet, "images") as advance:
+        result = resect_project(request, lambda _: advance(1, 0))
+    if as_json:
+        click.echo(json.dumps(result.to_dict(), indent=2, ensure_ascii=False))
+    else:
+        _show(result)
+    if not quiet:
+        _talk(result)
+    if result.failed:
+        total = len(result.failed) + len(result.images)
+        listed = "\n".join(f"  {reason}" for reason in result.failed.values())
+        if not result.images:
+            raise InputError("\n".join(result.failed.values()))
+        raise TilesFailed(f"{len(result.failed)} of {total} images could not be oriented:\n{listed}")
+
+
+def _show(result: ResectResult) -> None:
+    for image in result.images:
+        for line in _lines(image):
+            click.echo(line)
+    if result.report is not None:
+        click.echo(str(result.report))
+
+
+def _lines(image: ResectedImage) -> list[str]:
+    """An image with its parameters and their standard deviations."""
+    found, unit = image.found, image.angle_unit
+    used = int((~found.rejected).sum())
+    sign, digits = _SIGN[unit], _DIGITS[unit]
+    center = zip(("X0", "Y0", "Z0"), image.center, image.sigma_center)
+    angles = zip(image.angle_names, image.angles, image.sigma_angles)
+    lines = [
+        f"{image.image.name}  {used} points · redundancy {found.redundancy} · sigma0 {found.sigma0:.3g} · "
+        f"rms {found.rms:.2f} px",
+        "  " + "  ".join(f"{name} {value:.3f} ±{sigma:.3f} m" for name, value, sigma in center),
+        "  " + "  ".join(f"{name} {value:.{digits}f} ±{sigma:.{digits}f}{sign}" for name, value, sigma in angles),
+    ]
+    if image.calibrated is not None:
+        c = image.calibrated
+        rows = zip(c.parameters, c.after, c.sigma, c.units)
+        lines.append("  " + "  ".join(f"{name} {value:.4f} ±{sigma:.4f} {u}" for name, value, sigma, u in rows))
+    return lines + [f"  {line}" for line in image.gross_errors]
+
+
+def _talk(result: ResectResult) -> None:
+    for note in result.notes:
+        click.echo(note, err=True)
+    for image in result.images:
+        for note in image.notes:
+            click.echo(f"{image.image.name}: {note}", err=True)
+    if result.left_out:
+        names = ", ".join(result.left_out[:5]) + (" …" if len(result.left_out) > 5 else "")
+        click.echo(f"{len(result.left_out)} images have fewer than 3 control points: {names}", err=True)
+    if result.written:
+        click.echo(f"{result.project}: orientation of {len(result.images)} images written", err=True)
