@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Strict, Tag, f
 
 from photoplan.cameras.fiducials_fit import MODELS
 from photoplan.errors import InputError
+from photoplan.io.mark_model import EachMark, Marks
 
 __all__ = [
     "BrownLens",
@@ -195,6 +196,15 @@ class FrameCamera(Entry):
         return col + self.principal_point_mm[0] / px, row - self.principal_point_mm[1] / py
 
 
+def _all_described(fiducials: Fiducials, marks: EachMark) -> None:
+    described = set(marks.__pydantic_extra__)
+    unknown, bare = sorted(described - set(fiducials)), sorted(set(fiducials) - described)
+    if unknown:
+        raise ValueError(f"marks describes {', '.join(unknown)}; fiducials_mm has {', '.join(fiducials)}")
+    if bare:
+        raise ValueError(f"marks does not describe fiducial mark {', '.join(bare)}")
+
+
 class FilmCamera(Entry):
     """A film camera whose photographs were scanned; each image states where its fiducial marks are in the scan."""
 
@@ -209,6 +219,8 @@ class FilmCamera(Entry):
     """Whether the film was scanned through its back, so that left and right are exchanged."""
     size: tuple[Pixels, Pixels] | None = None
     """Width and height of the scans in pixels, where all are equal."""
+    marks: Marks | None = None
+    """What the fiducial marks look like: one description for all, or one for each by name."""
     lens: Lens = NoLens()
 
     @field_validator("fiducials_mm")
@@ -223,6 +235,8 @@ class FilmCamera(Entry):
     def _enough(self) -> Self:
         if self.lens.type == "brown" and self.lens.unit == "px":
             raise ValueError("unit px has no meaning for the lens of a film camera; allowed are tangent and mm")
+        if isinstance(self.marks, EachMark):
+            _all_described(self.fiducials_mm, self.marks)
         needed = MODELS[self.interior]
         if len(self.fiducials_mm) < needed:
             raise ValueError(f"{len(self.fiducials_mm)} fiducial marks; {self.interior} needs at least {needed}")

@@ -201,6 +201,11 @@ def _film(name: str, camera: FilmCamera) -> list[str]:
         ("mirrored", camera.mirrored, "true if the film was scanned through its back"),
         ("size", camera.size, "width and height of the scans, pixels"),
         ("fiducials_mm", camera.fiducials_mm, "calibrated marks: name = [x, y]"),
+        (
+            "marks",
+            camera.marks and camera.marks.model_dump(exclude_none=True, exclude_defaults=True),
+            "what the marks look like, mm",
+        ),
     ]
     head = f"[cameras.{toml_key(name)}]"
     return [head, *_entries(r for r in rows if r[1] is not None), *_lens(camera.lens), ""]

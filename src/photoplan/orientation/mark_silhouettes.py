@@ -32,6 +32,8 @@ class Style:
 
     band: float = 0.25
     """Width of the strip of image along the outline that is compared, millimetres."""
+    inside: float | None = None
+    """Width of the strip of frame along the outline that is compared; None: all of the frame."""
     corner: float = 0.2
     """Radius about each corner that is not compared, millimetres."""
     mirrored: bool = False
@@ -40,6 +42,8 @@ class Style:
     """Anticlockwise, degrees: 0 upper, 90 left, 180 lower, 270 right side."""
     bright: bool = False
     """Whether the frame is brighter than the image, as in a negative."""
+    window: tuple[float, float, float, float] | None = None
+    """xmin, ymin, xmax, ymax of what is compared, as it looks at the upper side, millimetres; default: each mark's."""
 
     def __post_init__(self) -> None:
         if not (self.band > 0 and self.corner >= 0 and math.isfinite(self.band + self.corner + self.rotation)):
@@ -96,7 +100,11 @@ def block(
     extra = []
     if slit > 0:
         length = height if slit_length is None else slit_length
-        extra = [MarkPart(_rectangle((0.0, 0.0), (0.0, length), slit / 2, slit / 2), 1.0)]
+        ground = slit / 2 + (made.inside or 0.0)
+        extra = [
+            MarkPart(_rectangle((0.0, made.corner), (0.0, length), wide, wide), tone)
+            for wide, tone in ((ground, 0.0), (slit / 2, 1.0))
+        ]
     top = max(height, height if slit_length is None else slit_length) if slit > 0 else height
     sides = (height + depth) * 0.2
     window = (-tip - depth / left - sides, -depth - made.band, ledge + height / right, top)
@@ -161,7 +169,6 @@ def triangle(
     far: float,
     *,
     inside_bright: bool = False,
-    window: tuple[float, float, float, float] | None = None,
     style: Style | None = None,
 ) -> MarkPattern:
     """A wedge between two straight flanks: its vertex is the reference point.
@@ -175,8 +182,6 @@ def triangle(
         The part of each flank that is compared, millimetres from the vertex.
     inside_bright : bool
         A bright wedge in the dark frame, else a dark one on bright ground.
-    window : (xmin, ymin, xmax, ymax), optional
-        What is compared at most.
     style : Style, optional
         Band and side; `bright` exchanges the tones.
     """
@@ -185,17 +190,16 @@ def triangle(
     if not 0 <= near < far or not 0 < (flanks[1] - flanks[0]) % 360 < 180:
         raise InputError(f"triangle: flanks {flanks}, near {near}, far {far}; an angle under 180° and near < far")
     inner = 1.0 if inside_bright else 0.0
-    bands, wedge = [], [(0.0, 0.0)]
+    bands = []
     for degrees, sign in zip(flanks, (-1.0, 1.0), strict=True):
         a = math.radians(degrees)
         along, across = np.array([math.cos(a), math.sin(a)]), sign * np.array([-math.sin(a), math.cos(a)])
         p, q = near * along, far * along
         out, into = (np.array([p, q, q + side * made.band * across, p + side * made.band * across]) for side in (1, -1))
         bands += [MarkPart(out, 1.0 - inner), MarkPart(into, inner)]
-        wedge += [tuple(q)]
     points = np.concatenate([part.outline for part in bands])
-    box = window or (*points.min(axis=0).tolist(), *points.max(axis=0).tolist())
-    return _finish("triangle", bands, box, made)
+    (x0, y0), (x1, y1) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+    return _finish("triangle", bands, (x0, y0, x1, y1), made)
 
 
 def arc(
@@ -269,7 +273,12 @@ def _silhouette(
         a, b = outline[k], outline[k + 1]
         if abs(a[1] - b[1]) < 1e-9:
             gone.append(MarkPart(_rectangle(tuple(a), tuple(b), style.corner, style.band), math.nan))
-    return _finish(name, [*bands, MarkPart(frame, 0.0), *gone, *extra], window, style)
+    inner = [MarkPart(frame, 0.0)]
+    if style.inside is not None:
+        wide = style.inside
+        inner = [MarkPart(frame, math.nan)]
+        inner += [MarkPart(_rectangle(tuple(a), tuple(b), wide, 0.0), 0.0) for a, b in itertools.pairwise(outline)]
+    return _finish(name, [*bands, *inner, *gone, *extra], window, style)
 
 
 def _finish(name: str, parts: list[MarkPart], window: tuple[float, float, float, float], style: Style) -> MarkPattern:
@@ -279,7 +288,7 @@ def _finish(name: str, parts: list[MarkPart], window: tuple[float, float, float,
         MarkPart(turned(part.outline * flip, style.rotation), 1.0 - part.tone if style.bright else part.tone)
         for part in parts
     )
-    x0, y0, x1, y1 = window
+    x0, y0, x1, y1 = style.window or window
     corners = turned(np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]) * flip, style.rotation)
     low, high = corners.min(axis=0), corners.max(axis=0)
     return MarkPattern(name, made, math.nan, (float(low[0]), float(low[1]), float(high[0]), float(high[1])))

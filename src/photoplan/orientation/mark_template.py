@@ -171,12 +171,18 @@ def _draw(
     known = np.full(wide, 0.0 if np.isnan(pattern.background) else 1.0)
     tones = known * np.nan_to_num(pattern.background)
     for part in pattern.parts:
-        share = coverage(part.outline @ matrix.T + origin, wide)
-        known *= 1 - share
-        tones *= 1 - share
+        outline = part.outline @ matrix.T + origin
+        first = np.clip(np.floor(outline.min(axis=0)), 0, (wide[1], wide[0])).astype(np.int64)
+        last = np.clip(np.ceil(outline.max(axis=0)) + 1, first, (wide[1], wide[0])).astype(np.int64)
+        box = (slice(first[1], last[1]), slice(first[0], last[0]))
+        if known[box].size == 0:
+            continue
+        share = coverage(outline - first, known[box].shape)
+        known[box] *= 1 - share
+        tones[box] *= 1 - share
         if not np.isnan(part.tone):
-            known += share
-            tones += share * part.tone
+            known[box] += share
+            tones[box] += share * part.tone
     if blur_px > 0:
         known = ndimage.gaussian_filter(known, blur_px, mode="nearest")
         tones = ndimage.gaussian_filter(tones, blur_px, mode="nearest")
