@@ -1,4 +1,7 @@
-"""Cameras from photoplan's own TOML: the ``[cameras.NAME]`` tables of a project file, alone or in a whole project."""
+"""Cameras from photoplan's own TOML: the ``[cameras.NAME]`` tables of a project file, alone or in a whole project.
+
+A table ``[report]`` beside them is compared with them; see `photoplan.io.camera_usgs`.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from photoplan.errors import InputError
 from photoplan.io.camera_model import Camera, FilmCamera, FrameCamera
+from photoplan.io.camera_usgs import check_report
 from photoplan.io.project_errors import explain
 from photoplan.io.toml_file import read_toml
 
@@ -29,6 +33,8 @@ def read(path: Path) -> dict[str, FrameCamera | FilmCamera]:
     if not isinstance(cameras, dict) or not cameras:
         raise InputError(f"{path}: holds no [cameras.NAME] table")
     try:
-        return _CAMERAS.validate_python(cameras)
+        described = _CAMERAS.validate_python(cameras)
     except ValidationError as error:
         raise InputError(explain(error, cameras, str(path), text, ("cameras",))) from None
+    check_report(contents, described, str(path))
+    return described
