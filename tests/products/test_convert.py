@@ -107,11 +107,17 @@ def test_a_whole_project_is_converted_with_its_camera_and_image_files(tmp_path, 
         assert (tmp_path / "elsewhere" / "deep" / file).is_file()
 
 
-def test_axes_and_directions_that_a_table_does_not_state(tmp_path):
-    """A table of computer vision: camera y down, z forwards, ground to camera, radians; turned by a quarter."""
+@pytest.mark.parametrize(
+    ("axes", "turned"), [("up-back", 90), ("up-back", 270), ("down-forward", 90), ("down-forward", 0)]
+)
+def test_axes_and_directions_that_a_table_does_not_state(tmp_path, axes, turned):
+    """A table of radians from ground to camera, whose camera may be computer vision's, of images that are turned.
+
+    An image turned counter-clockwise shows what lies along the camera's x at that angle from its own x.
+    """
     made = block()
-    flip = np.diag([1.0, -1.0, -1.0])
-    turn = rotation_from_angles((0, 0, np.pi / 2))
+    flip = np.diag([1.0, -1.0, -1.0]) if axes == "down-forward" else np.eye(3)
+    turn = rotation_from_angles((0, 0, np.radians(turned)))
     rows = ["name,x,y,z,omega,phi,kappa"]
     for name, center, R in zip(NAMES, CENTERS, made.table.rotations):
         o, p, k = angles_from_rotation((R @ turn @ flip).T)
@@ -119,7 +125,7 @@ def test_axes_and_directions_that_a_table_does_not_state(tmp_path):
     source = tmp_path / "cv.csv"
     source.write_text("\n".join(rows) + "\n")
     form = TableFormat(angle_unit="rad", direction="ground-to-camera")
-    request = ConvertRequest(source, "csv", tmp_path / "o.csv", form=form, camera_axes="down-forward", turned=90)
+    request = ConvertRequest(source, "csv", tmp_path / "o.csv", form=form, camera_axes=axes, turned=turned)
     convert_orientation(request)
     again = read_orientation_block(tmp_path / "o.csv").table
     np.testing.assert_allclose(again.rotations, made.table.rotations, atol=1e-12)
