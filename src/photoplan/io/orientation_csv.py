@@ -174,7 +174,8 @@ def _why_no_header(row: _Row, renamed: dict[str, str] | None, path: Path) -> str
     header = [f.casefold() for f in row.fields]
     if sum(bool(_NUMBER.fullmatch(f)) for f in row.fields) >= 3:
         return (
-            f"{where}: no header; declare the columns, for example --columns name,x,y,z,omega,phi,kappa, or the format"
+            f"{where}: no header; declare the columns, for example --columns name,x,y,z,omega,phi,kappa, or the format "
+            "with --format"
         )
     if "latitude" in header or "longitude" in header:
         return f"{where}: positions are geographic; transform them into a projected CRS in metres beforehand"

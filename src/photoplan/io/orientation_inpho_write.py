@@ -27,7 +27,9 @@ def losses(block: OrientationBlock) -> list[Loss]:
     """What of a block an Inpho project does not hold."""
     lost = common_losses(block, cameras=True, film=False, crs=True)
     direction = DIRECTIONS[block.matrix or DEFAULT]
-    lost.append(Loss("other", f"no word on what the rotation matrix does; it is written {direction}, the angles as $INS"))
+    lost.append(
+        Loss("other", f"no word on what the rotation matrix does; it is written {direction}, the angles as $INS")
+    )
     for name, camera in block.cameras.items():
         if isinstance(camera, FrameCamera) and camera.camera_constant_mm is None:
             lost.append(

@@ -158,7 +158,7 @@ def sights_of(
 
 
 def judge_readings(poses: StatedPoses, sights: Sights) -> tuple[FittedReading, ...]:
-    """All readings with their errors, the best first; of equals the simpler first.
+    """All readings with their errors: those that fit, the best first and of equals the simpler; then the others.
 
     Raises
     ------
@@ -180,11 +180,14 @@ def judge_readings(poses: StatedPoses, sights: Sights) -> tuple[FittedReading, .
     order = sorted(off, key=lambda r: (round(_cost(off[r], off[ranked[0][1]]), 9), r.changes))
     best = off[order[0]]
     first = [FittedReading(r, float(np.median(off[r])), _worse(off[r], best, sights.image)) for r in order]
-    return (*first, *(FittedReading(r, median, np.inf) for median, r in ranked[BEST:]))
+    fits = fitting(first)
+    rest = [r for r in first if r not in fits]
+    rest += [FittedReading(r, median, np.inf) for median, r in ranked[BEST:]]
+    return (*fits, *sorted(rest, key=lambda r: r.median))
 
 
 def fitting(results: Sequence[FittedReading]) -> tuple[FittedReading, ...]:
-    """The readings that the points do not tell apart from the best."""
+    """The readings that the points do not tell apart from the best, which is the first."""
     return tuple(r for r in results if r.worse < CLEAR and r.median <= FACTOR * results[0].median + 1e-6)
 
 
