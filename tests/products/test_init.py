@@ -376,3 +376,91 @@ def test_the_command_prints_the_path_on_stdout_and_talks_on_stderr(files: dict[s
     assert isinstance(run(files).exception, UsageError)
     shutil.rmtree(files["folder"])
     assert isinstance(run(files).exception, HeightSystemError)
+
+
+def test_images_without_orientation(files: dict[str, Any], tmp_path: Path) -> None:
+    for name in ("points.csv", "control.csv", "gnss.csv"):
+        (tmp_path / name).write_text("x\n")
+    bare = {k: v for k, v in files.items() if k not in ("orientation", "terrain")}
+    said: list[str] = []
+    request = InitRequest(
+        **bare,
+        crs="EPSG:32632",
+        image_points=(tmp_path / "points.csv",),
+        control=(tmp_path / "control.csv",),
+        positions=tmp_path / "gnss.csv",
+        form=TableFormat(angle_unit="gon", rotation="pok"),
+        earth_curvature="strict",
+        refraction=True,
+    )
+    project = init_project(request, said.append).project
+    assert load_project(request.path) == project
+    assert "2 images without orientation" in said[0] and "as given" in said[0]
+    assert said[1] == "  height systems: control declared the same"
+    assert [(i.name, i.center, i.angles) for i in project.images] == [("a", None, None), ("b", None, None)]
+    assert project.terrain is None
+    assert project.observations.image_points == ("../points.csv",)
+    assert project.observations.control == ("../control.csv",)
+    assert project.observations.positions == "../gnss.csv"
+    assert (project.orientation.angle_unit, project.orientation.rotation) == ("gon", "pok")
+    with pytest.raises(InputError, match="has no orientation; `photoplan resect`"):
+        _ = project.images[0].pose_numbers
+    with pytest.raises(InputError, match=r"states no \[terrain\]"):
+        _ = project.ground
+
+
+def test_terrain_without_orientation_and_orientation_without_terrain(files: dict[str, Any]) -> None:
+    alone = make_project(InitRequest(**{**files, "orientation": None}, crs="EPSG:32632")).project
+    assert alone.images[0].center is None and alone.ground.height_system == "same"
+    oriented = make_project(InitRequest(**{**files, "terrain": None})).project
+    assert oriented.terrain is None and oriented.images[0].center is not None
+
+
+def test_fault_02_and_20_without_orientation_crs_and_heights_are_declared(files: dict[str, Any]) -> None:
+    bare = {**files, "orientation": None, "terrain": None}
+    with pytest.raises(InputError, match=r"nothing states the CRS .*--crs"):
+        make_project(InitRequest(**bare))
+    with pytest.raises(HeightSystemError, match=r"control points and orientation not stated .*--height-system"):
+        make_project(InitRequest(**{**bare, "height_system": None}, crs="EPSG:32632"))
+    with pytest.raises(InputError, match=r"nowhere\.csv: no such file"):
+        make_project(InitRequest(**bare, crs="EPSG:32632", control=(Path("nowhere.csv"),)))
+    with pytest.raises(InputError, match="virtual"):
+        make_project(InitRequest(**bare, crs="EPSG:32632", control=(Path("/vsizip/a.zip/c.csv"),)))
+
+
+def test_fault_12_unoriented_files_with_one_base_name(files: dict[str, Any], tmp_path: Path) -> None:
+    (tmp_path / "more").mkdir()
+    raster(tmp_path / "more" / "a.tif")
+    both = {**files, "orientation": None, "images": (*files["images"], str(tmp_path / "more" / "*.tif"))}
+    with pytest.raises(InputError, match=r"images/a\.tif and .*more/a\.tif have one base name"):
+        make_project(InitRequest(**both, crs="EPSG:32632"))
+
+
+def test_film_without_marks_and_cameras_by_size(files: dict[str, Any], tmp_path: Path) -> None:
+    marks = "{ 1 = [106.0, -106.0], 2 = [-106.0, -106.0], 3 = [-106.0, 106.0], 4 = [106.0, 106.0] }"
+    film = tmp_path / "film.toml"
+    film.write_text(f'[cameras.RC30]\ntype = "film"\ncamera_constant_mm = 153.0\nfiducials_mm = {marks}\n')
+    bare = {**files, "orientation": None, "terrain": None}
+    made = init_project(InitRequest(**{**bare, "camera": film}, crs="EPSG:32632"))
+    assert load_project(made.path) == made.project
+    assert [(i.size, i.fiducials) for i in made.project.images] == [((40, 30), None)] * 2
+    raster(tmp_path / "images" / "b.tif", (20, 30))
+    two = YAML + YAML.replace("cam:", "other:").replace("[40, 30]\n  focal", "[20, 30]\n  focal")
+    files["camera"].write_text(two)
+    assert [i.camera for i in make_project(InitRequest(**bare, crs="EPSG:32632")).project.images] == ["cam", "other"]
+    files["camera"].write_text(YAML + YAML.replace("cam:", "other:"))
+    with pytest.raises(InputError, match=r"describes 2 cameras \('cam', 'other'\), and 2 of them have the 40 × 30 px"):
+        make_project(InitRequest(**{**bare, "images": (str(tmp_path / "images" / "a.tif"),)}, crs="EPSG:32632"))
+
+
+def test_the_command_without_orientation(files: dict[str, Any], tmp_path: Path) -> None:
+    (tmp_path / "points.csv").write_text("point,image,x,y\n1,a,1,2\n")
+    arguments = [str(files["folder"]), "--images", files["images"][0], "--camera", str(files["camera"])]
+    more = ["--crs", "EPSG:32632", "--height-system", "EPSG:5773", "--image-points", str(tmp_path / "points.csv")]
+    result = CliRunner().invoke(command, [*arguments, *more, "--angle-unit", "gon", "--json", "-q"])
+    assert result.exit_code == 0, result.output
+    facts = json.loads(result.stdout)
+    assert facts["height_systems"] == {"terrain": None, "orientation": "EPSG:5773"}
+    project = load_project(files["folder"] / "project.toml")
+    assert project.orientation.angle_unit == "gon"
+    assert project.observations.image_points == ("../points.csv",)

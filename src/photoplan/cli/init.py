@@ -13,13 +13,20 @@ from photoplan.cli.orientation_options import reading_options, table_format
 
 __all__ = ["command"]
 
+_FILE = click.Path(path_type=Path)
+
 
 @click.command("init")
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
 @click.option("--images", "images", multiple=True, required=True, metavar="PATTERN", help="Files; may be repeated.")
 @click.option("--camera", required=True, type=click.Path(path_type=Path), help="Cameras: TOML, YAML or JSON.")
-@click.option("--orientation", required=True, type=click.Path(path_type=Path), help="Orientation: TOML, JSON, table …")
-@click.option("--terrain", required=True, metavar="FILE|HEIGHT", help="Raster of heights, or one height in metres.")
+@click.option("--orientation", type=_FILE, help="Orientation: TOML, JSON, table … [images are to be oriented].")
+@click.option(
+    "--terrain", metavar="FILE|HEIGHT", help="Raster of heights, or one height in metres; needed for products."
+)
+@click.option("--image-points", multiple=True, type=_FILE, metavar="FILE", help="Measured image points.")
+@click.option("--control", multiple=True, type=_FILE, metavar="FILE", help="Ground points, control and check.")
+@click.option("--positions", type=_FILE, metavar="FILE", help="Observed projection centres (GNSS).")
 @click.option("--crs", metavar="CRS", help="CRS of the project, EPSG:nnnn or WKT [the orientation's].")
 @click.option(
     "--height-system",
@@ -45,7 +52,8 @@ def command(
 ) -> None:
     """Write DIR/project.toml from images, camera, orientation and terrain.
 
-    Prints the path of the project file on stdout. Height systems must be stated by the files or declared.
+    Prints the path of the project file on stdout. Height systems must be stated by the files or declared. Without
+    --orientation the images are to be oriented (tie, resect, adjust), and --crs is needed.
     """
     from photoplan.products.init import InitRequest, init_project
 

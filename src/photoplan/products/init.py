@@ -2,37 +2,43 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.errors import HeightSystemError, InputError, UsageError
-from photoplan.geometry.crs import (
-    canonical_crs,
-    crs_label,
-    crs_step,
-    grid_rotation,
-    parse_crs,
-    require_projected_metres,
-    same_crs,
-    topocentric_poses,
-)
-from photoplan.geometry.heights import check_height_system, declared_pair, height_label, height_step
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.crs import crs_label
+from photoplan.geometry.heights import height_label
 from photoplan.io.camera_file import CameraFile, read_cameras
-from photoplan.io.camera_model import FilmCamera, FrameCamera
+from photoplan.io.camera_model import FilmCamera, FrameCamera, Triple
 from photoplan.io.camera_opensfm import resized
 from photoplan.io.names import check_input_name, match_key
 from photoplan.io.orientation_file import read_orientation
-from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat, degrees_of
+from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.project import parse_project, write_project
 from photoplan.io.project_model import Image, Project, Terrain
 from photoplan.io.raster_info import RasterInfo, read_info
-from photoplan.io.terrain_model_read import ModelReader, is_terrain_model
-from photoplan.products.init_match import camera_name, image_files, match_images, some
+from photoplan.products.init_match import (
+    Unoriented,
+    camera_by_size,
+    camera_name,
+    image_files,
+    match_images,
+    some,
+    unoriented,
+)
+from photoplan.products.init_systems import (
+    check_joined,
+    height_systems,
+    placed,
+    project_crs,
+    relative_path,
+    terrain_entry,
+)
 
 __all__ = ["InitRequest", "InitResult", "init_project", "make_project", "placed"]
 
@@ -55,12 +61,12 @@ class InitRequest:
     """Files, or patterns with ``*``, ``?`` and ``**``."""
     camera: Path
     """File with cameras: TOML, YAML or JSON."""
-    orientation: Path
-    """File with orientations, of any format of `photoplan.io.orientation_file`."""
-    terrain: str
-    """Raster of heights, or one height in metres."""
+    orientation: Path | None = None
+    """File with orientations, of any format of `photoplan.io.orientation_file`; None: the images are to be oriented."""
+    terrain: str | None = None
+    """Raster of heights, or one height in metres; None: it is added to the project before products are made."""
     crs: str | None = None
-    """Projected CRS of the project; None: that of the orientation."""
+    """Projected CRS of the project; None: that of the orientation. Needed without one."""
     height_system: str | None = None
     """Declares whatever the files do not state: ellipsoidal, EPSG:nnnn, same."""
     terrain_crs: str | None = None
@@ -77,6 +83,12 @@ class InitRequest:
     """none, correction or strict."""
     refraction: bool = False
     """Whether image points are corrected for refraction."""
+    image_points: tuple[Path, ...] = ()
+    """Files of measured image points, for [observations]."""
+    control: tuple[Path, ...] = ()
+    """Files of ground points, for [observations]."""
+    positions: Path | None = None
+    """Table of observed projection centres, for [observations]."""
     overwrite: bool = False
     """Whether an existing project file is replaced."""
 
@@ -132,31 +144,37 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
     """The project of the given files, without writing anything; see `init_project`."""
     files = image_files(request.images)
     cameras = read_cameras(request.camera)
-    table = read_orientation(request.orientation, request.form, request.format)
-    pairs, lonely_files, lonely_names = match_images(files, table)
+    table = None
+    if request.orientation is not None:
+        table = read_orientation(request.orientation, request.form, request.format)
+    pairs, lonely_files, lonely_names = match_images(files, table) if table else (unoriented(files), [], [])
     infos = {file: read_info(file) for file, _ in pairs}
-    terrain, terrain_info = _terrain(request)
-    crs, origin_of_crs = _crs(request, table, terrain_info)
-    used = _cameras(pairs, cameras, infos, table.file)
-    for line in _summary(used, pairs, crs, origin_of_crs, lonely_files, lonely_names, table):
+    terrain, terrain_info = terrain_entry(request)
+    crs, origin_of_crs = project_crs(request, table, terrain_info)
+    used = _cameras(pairs, cameras, infos, table.file if table else None)
+    for line in _summary(used, pairs, f"{crs_label(crs)} ({origin_of_crs})", (lonely_files, lonely_names), table):
         talk(line)
-    systems = _height_systems(request, table, terrain_info)
-    talk(f"  height systems: terrain {height_label(systems[0])}, orientation {height_label(systems[1])}")
-    centers, angles = placed(table, crs, systems[1])
-    _check_joined(systems, crs, centers)
-    rows = {image.name: k for k, image in enumerate(table.images)}
+    systems = height_systems(request, table, terrain_info)
+    of_terrain = f"terrain {height_label(systems[0])}, " if terrain is not None else ""
+    of_others = "orientation" if table else "control"
+    talk(f"  height systems: {of_terrain}{of_others} {height_label(systems[1])}")
+    poses: dict[str, tuple[Triple, Triple]] = {}
+    if table is not None:
+        centers, angles = placed(table, crs, systems[1])
+        check_joined(systems, crs, centers)
+        poses = {i.name: (_triple(c), _triple(a)) for i, c, a in zip(table.images, centers, angles)}
     images = []
     for file, oriented in pairs:
-        k, camera = rows[oriented.name], used[oriented.name][0]
-        described = used[oriented.name][1]
+        camera, described = used[oriented.name]
+        center, turned = poses.get(oriented.name, (None, None))
         size = infos[file].size if isinstance(described, FilmCamera) and described.size is None else None
         images.append(
             Image(
                 name=match_key(file.name),
-                file=_relative(file, request.folder),
+                file=relative_path(file, request.folder),
                 camera=camera,
-                center=(float(centers[k, 0]), float(centers[k, 1]), float(centers[k, 2])),
-                angles=(float(angles[k, 0]), float(angles[k, 1]), float(angles[k, 2])),
+                center=center,
+                angles=turned,
                 fiducials=oriented.fiducials,
                 size=size,
             )
@@ -165,15 +183,26 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
     return InitResult(request.path, project, tuple(f.name for f in lonely_files), tuple(lonely_names))
 
 
+def _triple(values: NDArray[np.float64]) -> Triple:
+    return float(values[0]), float(values[1]), float(values[2])
+
+
 def _cameras(
-    pairs: list[tuple[Path, OrientedImage]], cameras: CameraFile, infos: dict[Path, RasterInfo], table: Path
+    pairs: list[tuple[Path, OrientedImage | Unoriented]],
+    cameras: CameraFile,
+    infos: dict[Path, RasterInfo],
+    table: Path | None,
 ) -> dict[str, tuple[str, FrameCamera | FilmCamera]]:
     """Camera (name and description) of every image name; sizes agree with the files'."""
     used: dict[str, tuple[str, FrameCamera | FilmCamera]] = {}
     sizes: dict[str, tuple[tuple[int, int], Path]] = {}
     for file, image in pairs:
-        name = camera_name(image, cameras, table)
-        camera, size = cameras.cameras[name], infos[file].size
+        size = infos[file].size
+        if table is None or isinstance(image, Unoriented):
+            name = camera_by_size(file, size, cameras)
+        else:
+            name = camera_name(image, cameras, table)
+        camera = cameras.cameras[name]
         if isinstance(camera, FrameCamera):
             before = sizes.setdefault(name, (size, file))
             if cameras.normalised and size == before[0]:
@@ -187,166 +216,69 @@ def _cameras(
     return used
 
 
-@dataclass(frozen=True)
-class _TerrainFacts:
-    """What a terrain file states of its systems."""
-
-    path: Path
-    crs: str | None
-    vertical_crs: str | None
-
-
-def _terrain_facts(file: Path) -> _TerrainFacts:
-    if is_terrain_model(file):
-        header = ModelReader(file).header
-        return _TerrainFacts(file, header.crs, header.height_system)
-    info = read_info(file)
-    return _TerrainFacts(info.path, info.crs, info.vertical_crs)
-
-
-def _terrain(request: InitRequest) -> tuple[Terrain, _TerrainFacts | None]:
-    """The terrain entry (height system still open) and the facts of its file."""
-    text = request.terrain.strip()
-    try:
-        return Terrain(height=float(text)), None
-    except ValueError:
-        pass
-    check_input_name(text)
-    file = Path(text)
-    info = _terrain_facts(file)
-    if info.crs is None and request.terrain_crs is None:
-        raise InputError(f"terrain {file}: states no CRS; say the one it is in: --terrain-crs EPSG:nnnn")
-    stated = info.crs or request.terrain_crs
-    parse_crs(stated or "", f"terrain {file}")
-    if info.crs is not None and request.terrain_crs is not None and not same_crs(info.crs, request.terrain_crs):
-        raise InputError(
-            f"terrain {file}: states {crs_label(info.crs)}, not {request.terrain_crs}; leave --terrain-crs out"
-        )
-    crs = None if info.crs is not None else request.terrain_crs
-    return Terrain(file=_relative(file.absolute(), request.folder), crs=crs), replace(info, crs=stated)
-
-
-def _crs(request: InitRequest, table: OrientationTable, terrain: _TerrainFacts | None) -> tuple[str, str]:
-    """The project's CRS and where it comes from."""
-    if request.crs is not None:
-        crs, source = request.crs, "as given"
-    elif table.crs is not None:
-        crs, source = table.crs, f"from {(table.crs_file or table.file).name}"
-    elif table.origin is not None and terrain is not None and terrain.crs is not None:
-        crs, source = _horizontal(terrain.crs), f"from {terrain.path.name}"
-    else:
-        raise InputError(f"{table.file}: does not state the CRS of its coordinates; declare it with --crs EPSG:nnnn")
-    require_projected_metres(crs, f"CRS ({source})")
-    return canonical_crs(crs), source
-
-
-def _horizontal(text: str) -> str:
-    crs = parse_crs(text)
-    return str((crs.sub_crs_list[0] if crs.is_compound else crs).to_wkt())
-
-
-def _height_systems(request: InitRequest, table: OrientationTable, terrain: _TerrainFacts | None) -> tuple[str, str]:
-    """Height systems of terrain and orientation: as declared, else as the files state."""
-    stated_terrain = terrain.vertical_crs if terrain is not None else None
-    stated = [
-        request.terrain_height_system or stated_terrain or request.height_system,
-        request.orientation_height_system or table.height_system or request.height_system,
-    ]
-    if request.height_system is not None:
-        declared = check_height_system(request.height_system, "--height-system")
-        of_files = [s for s in (stated_terrain, table.height_system) if s is not None]
-        if len(of_files) == 2 and declared not in [check_height_system(s) for s in of_files]:
-            raise UsageError(
-                f"--height-system {request.height_system}: both files state theirs "
-                f"({height_label(stated[0])}; {height_label(stated[1])}); to overrule a file use "
-                "--terrain-height-system or --orientation-height-system"
-            )
-    terrain_system, orientation_system = stated
-    return declared_pair(terrain_system, orientation_system)
-
-
-def placed(table: OrientationTable, crs: str, system: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Projection centres (n, 3) and ω, φ, κ in degrees (n, 3) in the project's CRS."""
-    if table.origin is not None:
-        centers, axes = topocentric_poses(table.origin, crs, table.centers)
-        return centers, degrees_of(axes @ table.rotations)
-    if table.crs is None or same_crs(table.crs, crs):
-        return table.centers, table.opk_degrees()
-    source = parse_crs(table.crs)
-    if not source.is_projected:
-        raise InputError(
-            f"{table.file}: positions are in {crs_label(table.crs)}, which is not projected, so angles have no axes "
-            "to refer to; transform the orientation into a projected CRS beforehand"
-        )
-    if source.axis_info[0].unit_conversion_factor != 1.0 and system in ("same", "ellipsoidal"):
-        raise HeightSystemError(
-            f"{table.file}: {crs_label(table.crs)} is in {source.axis_info[0].unit_name}, and the unit of Z is not "
-            "stated; declare the vertical CRS with --orientation-height-system EPSG:nnnn"
-        )
-    XY = table.centers[:, :2]
-    bounds = (XY[:, 0].min(), XY[:, 1].min(), XY[:, 0].max(), XY[:, 1].max())
-    step = crs_step(table.crs, crs, bounds)
-    centers = np.column_stack([step(XY), table.centers[:, 2]])
-    return centers, degrees_of(grid_rotation(step, XY) @ table.rotations)
-
-
-def _check_joined(systems: tuple[str, str], crs: str, centers: NDArray[np.float64]) -> None:
-    """Fail now, not in every later command, if the height systems cannot be joined here."""
-    bounds = (centers[:, 0].min(), centers[:, 1].min(), centers[:, 0].max(), centers[:, 1].max())
-    height_step(systems[1], systems[0], crs, bounds)(centers)
-
-
 def _checked(
     request: InitRequest,
-    terrain: Terrain,
-    systems: tuple[str, str],
+    terrain: Terrain | None,
+    systems: tuple[str | None, str],
     crs: str,
     cameras: dict[str, FrameCamera | FilmCamera],
     images: list[Image],
 ) -> Project:
     """The project, checked as if it had been read."""
-    contents = {
+    orientation = {
+        "height_system": systems[1],
+        "earth_curvature": request.earth_curvature,
+        "refraction": request.refraction,
+    }
+    if request.orientation is None:
+        # Angles will be written so; those of a file are turned into ω, φ, κ in degrees.
+        orientation |= {"angle_unit": request.form.angle_unit, "rotation": request.form.rotation}
+    contents: dict[str, Any] = {
         "crs": crs,
-        "terrain": {**terrain.model_dump(exclude_none=True), "height_system": systems[0]},
-        "orientation": {
-            "height_system": systems[1],
-            "earth_curvature": request.earth_curvature,
-            "refraction": request.refraction,
-        },
+        "orientation": orientation,
+        "observations": _observations(request),
         "cameras": {name: c.model_dump(exclude_none=True) for name, c in cameras.items()},
         "images": [i.model_dump(exclude_none=True) for i in images],
     }
+    if terrain is not None:
+        contents["terrain"] = {**terrain.model_dump(exclude_none=True), "height_system": systems[0]}
     return parse_project(contents, request.folder.absolute().resolve(), "project")
 
 
-def _relative(file: Path, folder: Path) -> str:
-    """Path of a file as the project file states it: from the project's folder, where there is a way."""
-    # The folder of the file is resolved, not the file: a link keeps its own name, and so do the products.
-    target = file.parent.resolve() / file.name
-    try:
-        return Path(os.path.relpath(target, folder.absolute().resolve())).as_posix()
-    except ValueError:  # another drive
-        return target.as_posix()
+def _observations(request: InitRequest) -> dict[str, Any]:
+    """Entries of [observations]; the files have to be there."""
+    entries: dict[str, Any] = {}
+    for key, files in (("image_points", request.image_points), ("control", request.control)):
+        if files:
+            entries[key] = [_present(file, request.folder) for file in files]
+    if request.positions is not None:
+        entries["positions"] = _present(request.positions, request.folder)
+    return entries
+
+
+def _present(file: Path, folder: Path) -> str:
+    check_input_name(str(file))
+    if not file.is_file():
+        raise InputError(f"{file}: no such file; give the measurements that exist, or add them to the project later")
+    return relative_path(file.absolute(), folder)
 
 
 def _summary(
     used: dict[str, tuple[str, FrameCamera | FilmCamera]],
-    pairs: list[tuple[Path, OrientedImage]],
+    pairs: Sequence[tuple[Path, OrientedImage | Unoriented]],
     crs: str,
-    source: str,
-    lonely_files: list[Path],
-    lonely_names: list[str],
-    table: OrientationTable,
+    lonely: tuple[list[Path], list[str]],
+    table: OrientationTable | None,
 ) -> list[str]:
     """What was found, in a few lines."""
-    parts = [f"{len(pairs)} images"]
+    parts = [f"{len(pairs)} images" + ("" if table else " without orientation")]
     for name, camera in dict(used.values()).items():
         size = f", {camera.size[0]} × {camera.size[1]} px" if camera.size is not None else ""
         film = "film, " if isinstance(camera, FilmCamera) else ""
         parts.append(f'camera "{name}"{size}, {film}{LENS_NAMES[camera.lens.type]}')
-    lines = ["  " + " · ".join([*parts, f"{crs_label(crs)} ({source})"])]
-    if lonely_files:
-        lines.append(f"  left out, no orientation: {some([f.name for f in lonely_files])}")
-    if lonely_names:
-        lines.append(f"  left out, no image file: {some(lonely_names)}")
-    return lines + [f"  {note}" for note in table.notes]
+    lines = ["  " + " · ".join([*parts, crs])]
+    if lonely[0]:
+        lines.append(f"  left out, no orientation: {some([f.name for f in lonely[0]])}")
+    if lonely[1]:
+        lines.append(f"  left out, no image file: {some(lonely[1])}")
+    return lines + ([f"  {note}" for note in table.notes] if table else [])

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import glob
+from dataclasses import dataclass
 from pathlib import Path
 
 from photoplan.errors import InputError
 from photoplan.io.camera_file import CameraFile
+from photoplan.io.camera_model import FilmCamera
 from photoplan.io.names import check_input_name, match_key
 from photoplan.io.orientation_table import OrientationTable, OrientedImage
 
-__all__ = ["camera_name", "image_files", "match_images", "some"]
+__all__ = ["Unoriented", "camera_by_size", "camera_name", "image_files", "match_images", "some", "unoriented"]
 
 #: Names that are listed; the rest is counted.
 SHOWN = 5
+
+
+@dataclass(frozen=True)
+class Unoriented:
+    """An image of which nothing is known but its file."""
+
+    name: str
+    fiducials: None = None
 
 
 def image_files(patterns: tuple[str, ...]) -> list[Path]:
@@ -40,7 +50,7 @@ def image_files(patterns: tuple[str, ...]) -> list[Path]:
 
 def match_images(
     files: list[Path], table: OrientationTable
-) -> tuple[list[tuple[Path, OrientedImage]], list[Path], list[str]]:
+) -> tuple[list[tuple[Path, OrientedImage | Unoriented]], list[Path], list[str]]:
     """Image files with their orientation, files without, and names without a file.
 
     Names are compared without folder and raster suffix, and without regard to capitals where that leaves one choice.
@@ -61,7 +71,7 @@ def match_images(
     loose: dict[str, list[str]] = {}
     for key in by_key:
         loose.setdefault(key.casefold(), []).append(key)
-    pairs: list[tuple[Path, OrientedImage]] = []
+    pairs: list[tuple[Path, OrientedImage | Unoriented]] = []
     lonely: list[Path] = []
     taken: dict[str, Path] = {}
     for file in files:
@@ -72,10 +82,7 @@ def match_images(
             lonely.append(file)
             continue
         if key in taken:
-            raise InputError(
-                f"{taken[key]} and {file} have one base name, so their products would too; "
-                "rename one of them or narrow the pattern"
-            )
+            raise InputError(_one_name(taken[key], file))
         taken[key] = file
         pairs.append((file, by_key[key]))
     if not pairs:
@@ -84,6 +91,51 @@ def match_images(
             f"names there are {some([i.name for i in table.images])}"
         )
     return pairs, lonely, [image.name for key, image in by_key.items() if key not in taken]
+
+
+def unoriented(files: list[Path]) -> list[tuple[Path, OrientedImage | Unoriented]]:
+    """All image files, under their base names.
+
+    Raises
+    ------
+    InputError
+        Two files have one base name.
+    """
+    taken: dict[str, Path] = {}
+    for file in files:
+        key = match_key(file.name)
+        if key in taken:
+            raise InputError(_one_name(taken[key], file))
+        taken[key] = file
+    return [(file, Unoriented(key)) for key, file in taken.items()]
+
+
+def _one_name(first: Path, second: Path) -> str:
+    return (
+        f"{first} and {second} have one base name, so their products would too; "
+        "rename one of them or narrow the pattern"
+    )
+
+
+def camera_by_size(file: Path, size: tuple[int, int], cameras: CameraFile) -> str:
+    """Name of the camera of an image of which no table tells: the only one, or the only one of its size.
+
+    Raises
+    ------
+    InputError
+        Several cameras are described, and the size does not decide.
+    """
+    if len(cameras.cameras) == 1:
+        return next(iter(cameras.cameras))
+    of_size = [n for n, c in cameras.cameras.items() if c.size == size and not isinstance(c, FilmCamera)]
+    if len(of_size) == 1:
+        return of_size[0]
+    known = ", ".join(map(repr, cameras.cameras))
+    raise InputError(
+        f"{cameras.file} describes {len(cameras.cameras)} cameras ({known}), and {len(of_size)} of them have the "
+        f"{size[0]} × {size[1]} px of {file}; make a project with one camera's file, or give an orientation table with "
+        "a column `camera`"
+    )
 
 
 def camera_name(image: OrientedImage, cameras: CameraFile, table: Path) -> str:
