@@ -109,6 +109,19 @@ def test_images_without_orientation_are_left_out_of_toml(tmp_path):
         read_orientation(path)
 
 
+def test_what_a_project_knows_of_its_orientations_and_no_file_holds_is_noted(tmp_path):
+    path = tmp_path / "p.toml"
+    image = '[[images]]\nname = "b"\ncenter = [1.0, 2.0, 3.0]\nangles = [0.0, 0.0, 0.0]\n'
+    path.write_text('[orientation]\nearth_curvature = "strict"\nrefraction = true\n' + image)
+    (note,) = read_orientation(path).notes
+    assert "earth curvature (strict) and refraction" in note
+    path.write_text(image + "sigma_center = [0.1, 0.1, 0.2]\nsigma_angles = [0.0, 0.0, 0.0]\n")
+    (note,) = read_orientation(path).notes
+    assert "standard deviations" in note
+    path.write_text(image)
+    assert read_orientation(path).notes == ()
+
+
 def test_a_block_names_what_does_not_fit():
     image = OrientedImage("a", (0, 0, 0), (0, 0, 0), "x")
     table = OrientationTable(__import__("pathlib").Path("t"), (image,))
@@ -124,3 +137,38 @@ def test_formats_that_are_only_read_say_which_are_written(tmp_path, monkeypatch)
     assert written_formats() == []
     with pytest.raises(UsageError, match="csv is read only"):
         write_orientation(block(), tmp_path / "x", "csv")
+
+
+@pytest.mark.parametrize("name", ["csv", "toml", "patb", "bingo", "bluh", "inpho"])
+@pytest.mark.parametrize("end", ["\r\n", "\r"])
+def test_fault_18_marks_and_line_ends_change_nothing(tmp_path, name, end):
+    suffix = orientation_format(name).suffix
+    path = write_orientation(block(), tmp_path / f"out{suffix}", name)[0]
+    form = TableFormat(declared=frozenset({"direction"})) if name == "patb" else TableFormat()
+    stated = name if name == "bluh" else None
+    before = read_orientation(path, form, stated).images
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", end.encode()))
+    if name == "toml" and end == "\r":
+        # TOML knows no lone carriage return; the reader makes newlines of it.
+        assert b"\n" not in path.read_bytes()
+    assert read_orientation(path, form, stated).images == before
+
+
+@pytest.mark.parametrize("name", ["csv", "toml", "patb", "bingo", "bluh", "inpho"])
+def test_fault_7_huge_files_are_refused_by_their_size(tmp_path, name):
+    path = tmp_path / f"huge{orientation_format(name).suffix}"
+    with path.open("wb") as file:
+        file.truncate(300_000_000)
+    with pytest.raises(InputError, match="300000000 bytes; at most"):
+        read_orientation(path, format=name)
+
+
+@pytest.mark.parametrize("name", ["csv", "toml", "patb", "bingo", "bluh", "inpho"])
+def test_a_local_system_is_refused_where_its_origin_cannot_be_stated(tmp_path, name):
+    from dataclasses import replace
+
+    made = block()
+    local = replace(made, table=replace(made.table, origin=(47.0, 11.0, 600.0)))
+    with pytest.raises(InputError, match="carry them into a map with --crs"):
+        write_orientation(local, tmp_path / "x", name)
+    assert not list(tmp_path.iterdir())

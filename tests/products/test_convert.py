@@ -1,6 +1,7 @@
 """Conversion of orientation files: poses and pixels stay, what is lost is said or refused."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,10 @@ from tools.orientation_blocks import ANGLES, CAMERA, CENTERS, GROUND, NAMES, blo
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles
+from photoplan.io.camera_model import FilmCamera
 from photoplan.io.orientation_file import FORMATS, orientation_format, read_orientation_block, write_orientation
 from photoplan.io.orientation_table import TableFormat
+from photoplan.orientation.readings import Reading
 from photoplan.products.convert import ConvertRequest, convert_orientation
 from photoplan.products.convert_readings import list_readings
 
@@ -216,6 +219,47 @@ def test_fault_14_readings_of_matrices(tmp_path, toml, measured):
     found = list_readings(ConvertRequest(path, "csv", camera=toml), *measured)
     assert found.matrices
     assert [found.options(f.reading) for f in found.fitting] == ["--rotation-direction ground-to-camera"]
+
+
+def test_readings_of_film_scans_use_their_marks(tmp_path):
+    """Three scans of different position and turn; the one whose marks are not measured is left out and named."""
+    marks = {"a": (-106.0, -106.0), "b": (106.0, -106.0), "c": (106.0, 106.0), "d": (-106.0, 106.0)}
+    camera = FilmCamera(
+        type="film", camera_constant_mm=153.1, fiducials_mm=marks, principal_point_mm=(0.01, -0.02), size=(9600, 9600)
+    )
+    made = block(camera)
+    rng = np.random.default_rng(2)
+    ground = np.array(GROUND)[:1] + rng.uniform(-1, 1, (40, 3)) * [900, 900, 60]
+    images, lines = [], ["point,image,x,y"]
+    for k, (image, R) in enumerate(zip(made.table.images, made.table.rotations)):
+        # Pixels of 25 µm; scans lie turned by a tenth of a degree and are cut differently.
+        turn, shift = np.radians(0.1 * k), np.array([4790.0 + 30 * k, 4810.0 - 20 * k])
+
+        def to_pixel(xy, turn=turn, shift=shift):
+            c, s = np.cos(turn), np.sin(turn)
+            x, y = np.asarray(xy).T
+            return np.stack([c * x - s * y, -(s * x + c * y)], axis=-1) / 0.025 + shift
+
+        d = (ground - image.center) @ R
+        xy = -153.1 * d[:, :2] / d[:, 2:] + (0.01, -0.02)
+        lines += [f"p{p},{image.name},{x:.3f},{y:.3f}" for p, (x, y) in enumerate(to_pixel(xy))]
+        measured = None if k == 2 else {m: tuple(map(float, to_pixel(at))) for m, at in marks.items()}
+        images.append(replace(image, fiducials=measured))
+    film = replace(made, table=replace(made.table, images=tuple(images)))
+    source = write_orientation(film, tmp_path / "film.toml", "toml")[0]
+    (tmp_path / "points.csv").write_text("\n".join(lines) + "\n")
+    control = "".join(f"p{k},{X},{Y},{Z}\n" for k, (X, Y, Z) in enumerate(ground))
+    (tmp_path / "control.csv").write_text("name,x,y,z\n" + control)
+    found = list_readings(ConvertRequest(source, "csv"), tmp_path / "points.csv", tmp_path / "control.csv")
+    assert (found.points, found.images) == (80, 2)
+    assert found.fitting[0].reading == Reading()
+    assert found.fitting[0].median < 0.01
+    assert any(f"1 film images have no measured fiducial marks ({NAMES[2]!r}" in n for n in found.notes)
+    # Marks and sizes go into own TOML; an Inpho project says that it has none.
+    again = convert_orientation(ConvertRequest(source, "toml", tmp_path / "again.toml")).files[0]
+    assert [i.fiducials for i in read_orientation_block(again).table.images] == [i.fiducials for i in images]
+    lost = convert_orientation(ConvertRequest(source, "inpho", tmp_path / "film.prj")).lost
+    assert "film" in [loss.kind for loss in lost]
 
 
 def test_readings_need_a_camera_and_say_when_none_fits(tmp_path, toml, measured):

@@ -35,6 +35,8 @@ class _Line(BaseModel):
     file: Name | None = None
     size: tuple[Pixels, Pixels] | None = None
     fiducials: Fiducials | None = None
+    sigma_center: Triple | None = None
+    sigma_angles: Triple | None = None
 
 
 class _File(BaseModel):
@@ -69,7 +71,8 @@ def read_block(path: Path, form: TableFormat) -> OrientationBlock:
         crs, heights = split_compound(file.crs)
     if file.orientation.height_system is not None:
         heights = file.orientation.height_system
-    images, notes = [], []
+    images: list[OrientedImage] = []
+    notes: list[str] = []
     for i in file.images:
         if i.center is not None and i.angles is not None:
             images.append(OrientedImage(i.name, i.center, i.angles, i.camera, None, i.fiducials))
@@ -79,6 +82,7 @@ def read_block(path: Path, form: TableFormat) -> OrientationBlock:
         raise InputError(f"{path}: none of the {len(file.images)} images has center and angles")
     if len(images) < len(file.images):
         notes.append(f"{path.name}: {len(file.images) - len(images)} images are not oriented and left out")
+    notes += _not_taken(file, path)
     table = OrientationTable(
         path,
         tuple(images),
@@ -92,6 +96,19 @@ def read_block(path: Path, form: TableFormat) -> OrientationBlock:
     files = {i.name: i.file for i in file.images if i.file is not None and i.name in names}
     sizes = {i.name: i.size for i in file.images if i.size is not None and i.name in names}
     return OrientationBlock(table, file.cameras, files, sizes)
+
+
+def _not_taken(file: _File, path: Path) -> list[str]:
+    """Notes on what a project states of its orientations and no orientation file does."""
+    notes = []
+    corrections = [f"earth curvature ({file.orientation.earth_curvature})"]
+    corrections = corrections if file.orientation.earth_curvature != "none" else []
+    corrections += ["refraction"] if file.orientation.refraction else []
+    if corrections:
+        notes.append(f"{path.name}: orientations hold with {' and '.join(corrections)}; whoever reads them must know")
+    if any(i.sigma_center is not None or i.sigma_angles is not None for i in file.images):
+        notes.append(f"{path.name}: standard deviations of orientations are not taken over")
+    return notes
 
 
 def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
