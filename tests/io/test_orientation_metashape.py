@@ -150,6 +150,15 @@ def test_another_datum_keeps_its_own_ellipsoid(tmp_path: Path) -> None:
     np.testing.assert_allclose(seen, manual(1, earth), atol=1e-3)
 
 
+def test_longitudes_from_paris_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "cameras.xml").write_text(document(CRS("EPSG:27572").to_wkt("WKT1_GDAL")))
+    with pytest.raises(InputError, match="counts longitudes from Paris"):
+        read_orientation_block(tmp_path / "cameras.xml")
+    block = block_of({"a": frame()}, middle=(6e5, 2.4e6, 900.0), crs="EPSG:27572", height_system="ellipsoidal")
+    with pytest.raises(InputError, match="counts longitudes from Paris"):
+        write_orientation(block, tmp_path / "b.xml", "metashape")
+
+
 def test_a_local_block_stays_as_it_is(tmp_path: Path) -> None:
     local = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1]]'
     (tmp_path / "cameras.xml").write_text(document(local))

@@ -108,27 +108,39 @@ def map_poses(crs: str, xyz: ArrayLike) -> tuple[_Floats, _Floats]:
 
 def geocentric_poses(crs: str, XYZ: ArrayLike) -> tuple[_Floats, _Floats]:
     """Map points with ellipsoidal heights (n, 3) as geocentric points, with the map's axes there; see `map_poses`."""
+    _ellipsoid_of(crs)
     XYZ = np.asarray(XYZ, float).reshape(-1, 3)
     frame = LocalFrame(crs, (float(XYZ[:, 0].mean()), float(XYZ[:, 1].mean())))
     return frame.to_geocentric(XYZ), frame.R_local_earth.T @ frame.axes(XYZ)
 
 
-def _frame_at(crs: str, xyz: _Floats) -> LocalFrame:
-    """A local system of the CRS near geocentric points."""
+def _ellipsoid_of(crs: str) -> tuple[float, float]:
+    """Semi-axes of a projected CRS's ellipsoid, metres."""
     projected = require_projected_metres(crs)
     if projected.geodetic_crs is None or projected.ellipsoid is None:
         raise InputError(f"CRS {crs_label(crs)!r} has no ellipsoid; a projected CRS of the earth is needed")
-    b = projected.ellipsoid.semi_minor_metre or projected.ellipsoid.semi_major_metre
+    meridian = projected.prime_meridian
+    if meridian is not None and meridian.longitude != 0:
+        raise InputError(
+            f"CRS {crs_label(crs)!r} counts longitudes from {meridian.name}; geocentric coordinates count from "
+            "Greenwich: choose a CRS that does too"
+        )
+    a = projected.ellipsoid.semi_major_metre
+    return a, projected.ellipsoid.semi_minor_metre or a
+
+
+def _frame_at(crs: str, xyz: _Floats) -> LocalFrame:
+    """A local system of the CRS near geocentric points."""
+    a, b = _ellipsoid_of(crs)
     to_degrees = Transformer.from_pipeline(
-        f"+proj=pipeline +step +inv +proj=cart +a={projected.ellipsoid.semi_major_metre!r} +b={b!r} "
-        "+step +proj=unitconvert +xy_in=rad +xy_out=deg"
+        f"+proj=pipeline +step +inv +proj=cart +a={a!r} +b={b!r} +step +proj=unitconvert +xy_in=rad +xy_out=deg"
     )
     lon, lat, _ = to_degrees.transform(*xyz.mean(axis=0))
-    # The datum's own meridian: longitudes of the ellipsoid count from Greenwich in every geocentric system.
-    meridian = projected.prime_meridian.longitude if projected.prime_meridian is not None else 0.0
+    projected = parse_crs(crs)
+    assert projected.geodetic_crs is not None
     unit = projected.geodetic_crs.axis_info[0].unit_conversion_factor / np.radians(1.0)
     forward = Transformer.from_crs(projected.geodetic_crs, projected, always_xy=True)
-    X, Y = forward.transform((lon - meridian) / unit, lat / unit)
+    X, Y = forward.transform(lon / unit, lat / unit)
     if not np.isfinite([X, Y]).all():
         raise InputError(f"geocentric points near {lat:.4f}°, {lon:.4f}° have no place in {crs_label(crs)}")
     return LocalFrame(crs, (float(X), float(Y)))

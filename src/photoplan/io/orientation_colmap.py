@@ -234,7 +234,7 @@ def _losses(block: OrientationBlock) -> Iterable[Loss]:
     if block.table.height_system is not None:
         yield Loss("height_system", f"no height system ({block.table.height_system})")
     if block.cameras:
-        yield Loss("other", "cameras are called by numbers, in the order of the block")
+        yield Loss("other", "no names of cameras: they are numbered")
 
 
 def _sniff(path: Path, head: str) -> bool:

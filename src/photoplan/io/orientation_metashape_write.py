@@ -43,7 +43,7 @@ def losses(block: OrientationBlock) -> Iterable[Loss]:
     table = block.table
     if table.crs is not None and table.height_system != "ellipsoidal":
         stated = table.height_system or "not stated"
-        yield Loss("height_system", f"heights are taken as ellipsoidal there (they are: {stated})")
+        yield Loss("height_system", f"heights as ellipsoidal ones only (these are: {stated})")
 
 
 def render(block: OrientationBlock, path: Path) -> dict[Path, str]:

@@ -140,7 +140,7 @@ def _losses(block: OrientationBlock) -> Iterable[Loss]:
             yield loss
     crs = block.table.crs
     if crs is not None and not re.fullmatch(r"EPSG:32[67]\d\d", canonical_crs(crs)):
-        yield Loss("crs", "positions are not in a UTM zone of WGS 84, as readers of the format expect")
+        yield Loss("crs", "no CRS but UTM zones of WGS 84; readers will take these positions for others")
 
 
 def _sniff(path: Path, head: str) -> bool:

@@ -40,7 +40,7 @@ def height_losses(table: OrientationTable) -> Iterable[Loss]:
     """The loss of a format whose heights are understood as ellipsoidal."""
     if table.crs is not None and table.height_system != "ellipsoidal":
         stated = table.height_system or "not stated"
-        yield Loss("height_system", f"heights are taken as ellipsoidal there (they are: {stated})")
+        yield Loss("height_system", f"heights as ellipsoidal ones only (these are: {stated})")
 
 
 def render(block: OrientationBlock, path: Path) -> dict[Path, str]:

@@ -235,9 +235,9 @@ def _losses(block: OrientationBlock) -> Iterable[Loss]:
     yield from opencv_losses(block, rational=False, fisheye=False)
     for name, camera in block.cameras.items():
         if not _square(camera):
-            yield Loss("other", f"Pix4D's pixels are square, those of camera {name!r} are not")
+            yield Loss("other", f"square pixels only, and those of camera {name!r} are not: no .cam file")
     if len(block.cameras) > 1:
-        yield Loss("other", "cameras are called by numbers, in the order of their first image")
+        yield Loss("other", "no names of cameras: they are numbered by their first image")
     if block.table.height_system is not None:
         yield Loss("height_system", f"no height system ({block.table.height_system})")
 
