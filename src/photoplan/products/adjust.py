@@ -143,6 +143,8 @@ def _free(project: Project, options: Sequence[str]) -> dict[str, tuple[str, ...]
 
 def _prepare_outputs(request: AdjustRequest, project: Project) -> AdjustPlots:
     """What draws the report; outputs that exist are refused before any work."""
+    if request.folder.exists() and not request.folder.is_dir():
+        raise UsageError(f"{request.folder}: is no folder; reports go into a folder")
     _refuse_inputs(request, [request.project, *input_files(project)])
     return AdjustPlots()
 
