@@ -105,8 +105,10 @@ def start_points(block: Block, selection: Selection) -> tuple[_Floats, frozenset
     image = np.array([image_index.get(n, -1) for n in seen.images], np.int64)[seen.image[selection.measured]]
     point = np.array([point_index.get(n, -1) for n in seen.points], np.int64)[seen.point[selection.measured]]
     directions = np.empty((len(image), 3))
+    order = np.argsort(image, kind="stable")
+    ends = np.searchsorted(image[order], np.arange(len(chosen) + 1))
     for k, b in enumerate(chosen):
-        mine = image == k
+        mine = order[ends[k] : ends[k + 1]]
         camera = block.cameras[b.camera]
         plane = b.plane_to_pixel.inverse(seen.xy[selection.measured][mine])
         t = camera.lens.undistort((plane - camera.principal_point) / camera.c)
