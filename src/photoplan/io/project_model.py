@@ -304,10 +304,10 @@ def _check_film(image: Image, camera: FrameCamera | FilmCamera, where: str) -> N
         if image.fiducials is not None:
             raise ValueError(f'{where}: fiducials are given, but camera {image.camera!r} is digital (type = "frame")')
         return
-    if image.size is None and camera.size is None:
-        raise ValueError(f"{where}: size = [width, height] of the scan is stated neither here nor for its camera")
     if image.fiducials is None:
         return
+    if image.size is None and camera.size is None:
+        raise ValueError(f"{where}: size = [width, height] of the scan is stated neither here nor for its camera")
     unknown = [n for n in image.fiducials if n not in camera.fiducials_mm]
     if unknown:
         raise ValueError(

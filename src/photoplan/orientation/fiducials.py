@@ -301,8 +301,8 @@ def _result(
         said.append("three marks: the affine transformation has no redundancy, nothing checks them")
     elif np.abs(residuals).max() > 1000 * DEFORMED_MM:
         said.append(
-            f"residuals of {np.abs(residuals).max():.0f} µm are more than film deforms: look at the pictures of the "
-            "marks, one of them may be something else, or the calibration another camera's"
+            f"residuals of {np.abs(residuals).max():.0f} µm are more than film deforms: the scanner is not true, or "
+            "one of the marks is something else (look at --pictures), or the calibration another camera's"
         )
     for name, x, y, r in measured.placement.rivals:
         said.append(
@@ -335,7 +335,7 @@ def _nothing(layout: MarkLayout, scan: Scan, known: FiducialSearch) -> str:
     return (
         f"none of the {len(layout.names)} fiducial marks found in the scan of {width} × {height} px; not found: "
         f"{', '.join(layout.names)}. Check that the camera's marks look as described and that the scan shows them; "
-        "state the size of its pixels with --pixel-um"
+        "state its resolution with --scan-resolution"
     )
 
 

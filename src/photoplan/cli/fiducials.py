@@ -1,0 +1,76 @@
+"""`photoplan fiducials`: find the fiducial marks of film scans."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photoplan.cli.options import json_option
+
+__all__ = ["command"]
+
+_ANSWER = {"auto": None, "yes": True, "no": False}
+
+
+@click.command("fiducials")
+@click.argument("scans", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="IMAGE…")
+@click.option("--camera", type=click.Path(path_type=Path), metavar="FILE", help="Describes the camera and its marks.")
+@click.option("--camera-name", metavar="NAME", help="Which camera of the file, where it describes several.")
+@click.option("--images", "select", multiple=True, metavar="PATTERN", help="Of a project: images to measure [all].")
+@click.option("--scan-resolution", metavar="DPI|UM", help="Such as 1200dpi or 21um [what the files state, else found].")
+@click.option("--rotation", type=click.Choice(["auto", "0", "90", "180", "270"]), default="auto", show_default=True,
+              help="By which the picture was turned before scanning, counter-clockwise.")  # fmt: skip
+@click.option("--mirrored", type=click.Choice(list(_ANSWER)), default="auto", show_default=True,
+              help="Whether left and right are exchanged in the scan.")  # fmt: skip
+@click.option("--negative", type=click.Choice(list(_ANSWER)), default="auto", show_default=True,
+              help="Whether dark and bright are exchanged against the description.")  # fmt: skip
+@click.option("--band", type=click.IntRange(1), metavar="N", help="Band to use [luminance of the first three].")
+@click.option("--least-correlation", type=click.FloatRange(0.3, 0.99), metavar="R", help="Less is no mark [0.6].")
+@click.option("--pictures", type=click.Path(path_type=Path), metavar="FOLDER", help="Receives a picture of the marks.")
+@click.option("--overwrite", is_flag=True, help="Replace pictures that exist.")
+@click.option("--dry-run", is_flag=True, help="Of a project: do not write the marks into it.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any) -> None:
+    """Find the fiducial marks of scanned film photos, without approximate values.
+
+    IMAGE… are scans, with --camera FILE; or one project file, whose film images are measured and which receives the
+    marks. An image that fails does not stop the others; they are listed at the end (exit code 4).
+    """
+    from photoplan.cli.progress import progress
+    from photoplan.errors import InputError, TilesFailed
+    from photoplan.products.fiducials import FiducialsRequest, locate_fiducials
+
+    request = FiducialsRequest(scans, **_values(options))
+    with progress(0 if scans[0].suffix.lower() == ".toml" else len(scans), quiet, "images") as advance:
+        report = locate_fiducials(request, lambda _: advance(1, 0))
+    if as_json:
+        click.echo(json.dumps(report.to_dict(), indent=2, ensure_ascii=False))
+    for image in report.images:
+        if not as_json:
+            click.echo(str(image))
+            if image.picture is not None:
+                click.echo(str(image.picture))
+        if not quiet:
+            for note in image.found.notes:
+                click.echo(f"{image.name}: {note}", err=True)
+    if report.written is not None and not quiet:
+        click.echo(f"{report.written}: fiducial marks of {len(report.images)} images written", err=True)
+    if report.failed and not report.images:
+        raise InputError("\n".join(report.failed.values()))
+    if report.failed:
+        listed = "\n".join(f"  {reason}" for reason in report.failed.values())
+        raise TilesFailed(f"{len(report.failed)} of {len(report.failed) + len(report.images)} images failed:\n{listed}")
+
+
+def _values(options: dict[str, Any]) -> dict[str, Any]:
+    """Options as the request names them."""
+    options["rotation"] = None if options["rotation"] == "auto" else int(options["rotation"])
+    options["mirrored"] = _ANSWER[options["mirrored"]]
+    options["negative"] = _ANSWER[options["negative"]]
+    if options["least_correlation"] is None:
+        del options["least_correlation"]
+    return options
