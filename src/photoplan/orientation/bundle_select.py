@@ -154,7 +154,7 @@ def intersect(
         Number of points.
     """
     weight = np.ones(len(point))
-    good_rays = np.isfinite(directions).all(axis=1)
+    good_rays = np.asarray(np.isfinite(directions).all(axis=1))
     directions = np.where(good_rays[:, None], directions, 0.0)
     projector = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     XYZ = np.full((count, 3), np.nan)
