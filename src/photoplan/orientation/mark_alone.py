@@ -143,15 +143,18 @@ def _by_edges(
     negative: bool,
     blur_px: float,
 ) -> _Found:
-    """Correlation with fine pixels near a coarse place, where it is highest, the place by edges, and the matrix."""
+    """Correlation with finer pixels near a coarse place, where it is highest, the place by edges, and the matrix."""
     x, y, _, _, factor = coarse
     template = render(pattern, matrix, negative=negative, blur_px=blur_px)
     part, origin = _around(grey, template, (x, y), 2 * factor + 2)
-    surface, (ox, oy) = correlation_surface(part, template, _SHARE)
+    finer = max(1, factor // 3)
+    small, (ox, oy) = _shrunk_template(template, finer)
+    surface, _ = correlation_surface(_shrunk(part, finer), small, _SHARE)
     if not np.isfinite(surface).any():
         return -1.0, (x, y), None, matrix
     row, column = np.unravel_index(int(np.nanargmax(surface)), surface.shape)
-    at = (column + ox + origin[0], row + oy + origin[1])
+    half = (finer - 1) / 2
+    at = ((column + ox) * finer + half + origin[0], (row + oy) * finer + half + origin[1])
     edges = None
     if isinstance(pattern, MarkPattern):
         edges = fit_edges(grey, pattern, matrix, at, negative=negative, search_px=8.0)

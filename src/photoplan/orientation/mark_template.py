@@ -66,7 +66,7 @@ def coverage(outline: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np
             lines = np.arange(max(np.ceil(low), 0.0), min(np.floor(high), most) + 1)
             if low < high:
                 cuts.append((lines - a[axis]) / (b[axis] - a[axis]))
-        t = np.unique(np.clip(np.concatenate(cuts), 0.0, 1.0))
+        t = np.sort(np.clip(np.concatenate(cuts), 0.0, 1.0))
         middle = a + (t[:-1] + t[1:])[:, None] / 2 * (b - a)
         height = np.diff(t) * (b[1] - a[1])
         row = np.floor(middle[:, 1]).astype(np.int64)
