@@ -41,7 +41,7 @@ class AdjustPlots:
                 importlib.import_module(f"matplotlib.{part}")
         except ImportError:
             raise UsageError(
-                "a report needs matplotlib; install it with: pip install 'photoplan[report]', or say --no-report"
+                "a report needs matplotlib; install it with: pip install 'photoplan[report]', or say --dry-run"
             ) from None
 
     def network(self, facts: AdjustFacts) -> bytes:
@@ -78,6 +78,8 @@ class AdjustPlots:
             centers = np.array([image.center[:2] for image in facts.images])
             axes.scatter(*centers.T, s=2, marker="s", color="#d3dbe0", linewidths=0)
             left, right = axes.get_xlim()
+            bottom, top = axes.get_ylim()
+            axes.set_ylim(bottom - 0.08 * (top - bottom), top)
             reach = max((float(np.nanmax(np.abs(g.residual))) for g in some), default=0.0)
             spread = max((float(np.sqrt(np.nanmax(np.diag(g.covariance)))) for g in some), default=0.0)
             largest = max(reach, _ELLIPSE_95 * spread, 1e-6)
@@ -217,7 +219,7 @@ class AdjustPlots:
                         zorder=4.5,
                     )
         for g in [g for g in ground if np.isfinite(g.XYZ[:2]).all()][:_NAMED]:
-            box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.8}
+            box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7 if size > 20 else 0.0, "pad": 0.8}
             axes.annotate(
                 _short(g.name),
                 g.XYZ[:2],
@@ -288,7 +290,7 @@ def _scale_bar(axes: Any, scale: float, largest: float) -> None:
     left, right = axes.get_xlim()
     bottom, top = axes.get_ylim()
     length = _round_down(largest)
-    x, y = left + 0.03 * (right - left), bottom + 0.05 * (top - bottom)
+    x, y = left + 0.03 * (right - left), bottom + 0.03 * (top - bottom)
     axes.plot([x, x + length * scale], [y, y], color=INK, linewidth=2.2, solid_capstyle="butt")
     axes.annotate(_metres(length), (x, y), (0, 4), textcoords="offset points", fontsize=8, color=INK)
 
@@ -312,7 +314,7 @@ def _limits(values: NDArray[np.float64]) -> tuple[float, float]:
     if not len(known):
         return 0.0, 1.0
     low, high = float(np.percentile(known, 1)), float(np.percentile(known, 99))
-    return low, max(high, low * 1.001 + 1e-6)
+    return low, max(high, low * 1.1 + 1e-6)
 
 
 def _short(name: str) -> str:
