@@ -15,9 +15,12 @@ from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
 from photoplan.cameras.lenses.brown import Brown
 from photoplan.cameras.lenses.none import NoLens
+from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.errors import GeometryError, UsageError
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_opk
+from photoplan.orientation.block import AdjustSettings, Block, BlockCamera, BlockImage
+from photoplan.orientation.bundle import adjust_block
 from photoplan.orientation.direct import resect_direct
 from photoplan.orientation.resection import ResectSettings, resect, tangents_of
 
@@ -106,6 +109,33 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
         assert not found.rejected.any() or found.rejected.sum() == 1
     # The mean of F(6, 24) is 24 / 22.
     assert abs(np.mean(ratios) / (24 / 22) - 1.0) < 0.1
+
+
+@pytest.mark.parametrize("free", [(), ("c", "x0", "y0")])
+def test_it_is_the_bundle_adjustment_of_one_image(free: tuple[str, ...]) -> None:
+    """Control eliminated point by point, or as unknowns of a block: one adjustment."""
+    rng = np.random.default_rng(21)
+    pose = aerial_pose(rng, tilt=0.2)
+    points = measured(frame(pose), ground_below(rng, pose, 14, 400.0), rng, 0.5, 0.05)
+    found = resect(points, AERIAL, NoLens(), ResectSettings(free=free))
+    block = Block(
+        {"k": BlockCamera(AERIAL.c, AERIAL.principal_point, NoLens(), free)},
+        (BlockImage("a", "k", AERIAL.plane_to_pixel, Pose(pose.center + 5.0, pose.R_ground_camera)),),
+        ImagePoints(("a",), points.names, np.zeros(14, int), np.arange(14), points.xy, points.sigma),
+        GroundPoints(points.names, points.XYZ, np.full((14, 3), 0.05), np.zeros(14, bool)),
+    )
+    other = adjust_block(block, AdjustSettings(robust=False, variance_components=False))
+    deviation = np.sqrt(np.diag(found.covariance))
+    assert (np.abs(found.pose.center - other.poses[0].center) < 1e-3 * deviation[:3]).all()
+    assert turned_by(found.pose, other.poses[0]) < 1e-3 * deviation[3:6].min()
+    assert abs(found.sigma0 - other.sigma0) < 1e-4
+    assert found.redundancy == other.redundancy
+    scale = np.outer(deviation[:6], deviation[:6])
+    np.testing.assert_allclose(found.covariance[:6, :6] / scale, other.pose_covariance[0] / scale, atol=2e-3)
+    if free:
+        camera = other.cameras[0]
+        assert abs(camera.c - found.interior.c) < 1e-3 * deviation[6]
+        np.testing.assert_allclose(np.sqrt(np.diag(camera.covariance)), deviation[6:], rtol=1e-3)
 
 
 def test_redundancy_numbers_sum_to_the_redundancy() -> None:

@@ -22,7 +22,9 @@ _SAMPLES = 2000
 #: Points that take part in the choice between candidates, at most.
 _JUDGES = 600
 #: Candidates that are looked at with the depths of their points.
-_FINALISTS = 12
+_FINALISTS = 30
+#: Poses that are adjusted before they are compared.
+_REFINED = 8
 #: Least number of points that must agree.
 _LEAST = 8
 #: Smaller median angles between rays leave the base undetermined, radians.
@@ -137,21 +139,20 @@ def _in_front(pose: Pose, a: Array, b: Array) -> NDArray[np.bool_]:
 
 def _finalist(candidates: Array, a: Array, b: Array, limit: float) -> Pose:
     """The pose with the least cost where points behind an image count as wrong; of equal ones the least tilted."""
+
+    def cost(pose: Pose) -> tuple[float, NDArray[np.bool_]]:
+        front = _in_front(pose, a, b)
+        r = _misses(_essential(pose)[None], a, b)[0]
+        return float(np.where(front, np.minimum((r / limit) ** 2, 1.0), 1.0).sum()), front & (r < limit)
+
+    rough = sorted(((*cost(pose), pose) for E in candidates for pose in _poses(E)), key=lambda item: item[0])
     judged = []
-    for E in candidates:
-        for pose in _poses(E):
-            front = _in_front(pose, a, b)
-            r = _misses(_essential(pose)[None], a, b)[0]
-            inside = front & (r < limit)
-            if inside.sum() >= _LEAST:
-                pose = _refined(pose, a[inside], b[inside], limit)
-                r = _misses(_essential(pose)[None], a, b)[0]
-                front = _in_front(pose, a, b)
-            cost = np.where(front, np.minimum((r / limit) ** 2, 1.0), 1.0).sum()
-            judged.append((float(cost), -float(pose.R_ground_camera[2, 2]), pose))
+    for _, inside, pose in rough[:_REFINED]:
+        better = _refined(pose, a[inside], b[inside], limit) if inside.sum() >= _LEAST else pose
+        judged.append((cost(better)[0], -float(better.R_ground_camera[2, 2]), better))
     if not judged:
         raise GeometryError("no relative orientation fits any five of the common points")
-    least = min(cost for cost, _, _ in judged)
+    least = min(item[0] for item in judged)
     return min((item for item in judged if item[0] <= 1.02 * least + 0.5), key=lambda item: item[1])[2]
 
 
