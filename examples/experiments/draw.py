@@ -11,6 +11,7 @@ import matplotlib as mpl
 import numpy as np
 import resampling_kernels as kernels
 from draw_idea import draw_idea
+from draw_marks import draw_marks
 from draw_prediction import draw_prediction
 from draw_road import draw_road
 from matplotlib.axes import Axes
@@ -153,6 +154,7 @@ FIGURES = {
     "resampling-kernels": draw_kernels,
     "anchor-residual": draw_residual,
     "road-edge": draw_road,
+    "marks": draw_marks,
 }
 
 

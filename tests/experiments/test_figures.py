@@ -15,6 +15,7 @@ mpl = pytest.importorskip("matplotlib")
         ("resampling-kernels", {"steps": 21}),
         ("anchor-residual", {"samples": 3, "steps": 3}),
         ("road-edge", {}),
+        ("marks", {}),
     ],
 )
 def test_figure(name, sizes, tmp_path):
