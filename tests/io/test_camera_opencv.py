@@ -14,6 +14,7 @@ from photoplan.errors import InputError
 from photoplan.io.camera_file import read_cameras
 from photoplan.io.camera_opencv import render
 from photoplan.io.orientation_block import OrientationBlock
+from photoplan.io.orientation_file import read_orientation, write_orientation
 from photoplan.io.project_cameras import interior_of, lens_of
 from photoplan.io.project_model import Image
 
@@ -161,3 +162,13 @@ def test_json_by_hand_with_rows(tmp_path: Path) -> None:
     assert camera.principal_point == (319.25, 241.5)
     assert (camera.lens.k1, camera.lens.k3, camera.lens.p2) == (-0.41, -1.1, -2.0e-3)
     assert not read_cameras(tmp_path / "c.json").normalised
+
+
+def test_as_a_target_of_convert_and_as_a_mistaken_orientation(tmp_path: Path) -> None:
+    block = block_of({"cam 1": frame("opencv"), "cam 2": frame("brown")})
+    files = write_orientation(block, tmp_path / "out.yml", "opencv")
+    assert [f.name for f in files] == ["out_cam_1.yml", "out_cam_2.yml"]
+    again = {name: c for f in files for name, c in read_cameras(f).cameras.items()}
+    assert_same_cameras(block, OrientationBlock(block.table, again))
+    with pytest.raises(InputError, match="describes a camera and no orientation; give it with --camera"):
+        read_orientation(files[0])

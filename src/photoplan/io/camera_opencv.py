@@ -11,15 +11,19 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from photoplan.errors import InputError
 from photoplan.io.camera_model import FilmCamera, FrameCamera
-from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form
+from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
+from photoplan.io.names import unique_stems
+from photoplan.io.orientation_block import Loss, OrientationBlock, OrientationFormat
+from photoplan.io.orientation_table import TableFormat
 from photoplan.io.plain_files import finite, parse_yaml, read_json, read_text
 
-__all__ = ["is_opencv", "read", "render"]
+__all__ = ["FORMAT", "is_opencv", "read", "render"]
 
 MAX_BYTES = 1_000_000
 _COUNTS = (0, 4, 5, 8, 12, 14)
@@ -156,3 +160,31 @@ def _yaml_number(value: float) -> str:
     # 1e-05 is text in YAML 1.1, 1.0e-05 is a number.
     text = repr(value)
     return text if "." in text or "e" not in text else text.replace("e", ".0e")
+
+
+def _refuse(path: Path, form: TableFormat) -> OrientationBlock:
+    raise InputError(f"{path}: a calibration of OpenCV describes a camera and no orientation; give it with --camera")
+
+
+def _render_block(block: OrientationBlock, path: Path) -> dict[Path, str]:
+    if not block.cameras:
+        raise InputError(f"{path}: no camera is given; name the file that describes it")
+    stems = unique_stems(block.cameras)
+    texts: dict[Path, str] = {}
+    for name, camera in block.cameras.items():
+        file = path if len(stems) == 1 else path.with_name(f"{path.stem}_{stems[name]}{path.suffix}")
+        texts |= render(camera, file, name)
+    return texts
+
+
+def _losses(block: OrientationBlock) -> Iterable[Loss]:
+    yield from opencv_losses(block)
+    yield Loss("other", "no orientations: only the cameras")
+
+
+def _sniff(path: Path, head: str) -> bool:
+    known = path.suffix.lower() in (".yml", ".yaml", ".json")
+    return known and re.search(r"camera_?matrix", head, re.I) is not None
+
+
+FORMAT = OrientationFormat("opencv", "OpenCV calibration", _sniff, _refuse, _render_block, _losses, suffix=".yml")

@@ -34,6 +34,7 @@ FORMATS: dict[str, str] = {
     "exif": "photoplan.io.orientation_exif",
     "odm": "photoplan.io.orientation_odm",
     "colmap": "photoplan.io.orientation_colmap",
+    "opencv": "photoplan.io.camera_opencv",
 }
 
 #: Formats whose reader says what is wrong with a file that no format claims, by suffix; else it is a table of text.
