@@ -1,0 +1,80 @@
+"""`photoplan control`: control points from an orthophoto and heights."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photoplan.cli.options import json_option
+
+__all__ = ["command"]
+
+
+@click.command("control")
+@click.argument("project", type=click.Path(path_type=Path))
+@click.option(
+    "--ortho",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    required=True,
+    metavar="FILE",
+    help="Orthophoto; may be repeated.",
+)
+@click.option("--height-sigma", type=float, required=True, metavar="M", help="Standard deviation of the heights.")
+@click.option("--ortho-sigma", type=float, metavar="M", help="Standard deviation of X and of Y in it [one pixel].")
+@click.option("--heights", type=click.Path(path_type=Path), metavar="FILE", help="[the project's terrain]")
+@click.option("--height-system", metavar="NAME", help="Of --heights, where the file states none.")
+@click.option("--images", "images", multiple=True, metavar="NAME", help="Image or pattern; may be repeated [all].")
+@click.option("--grid", type=int, default=8, show_default=True, help="Patches along each side of an image.")
+@click.option("--search", type=float, default=30.0, show_default=True, metavar="M", help="How far points may be off.")
+@click.option("--radius", type=int, default=15, show_default=True, help="Of a patch, pixels of the coarser picture.")
+@click.option("--correlation", type=float, default=0.7, show_default=True, help="Least correlation of a patch.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), metavar="CSV", help="[control.csv by the project]")
+@click.option("--workers", type=click.IntRange(1), default=None, help="Images worked on at once [all cores].")
+@click.option("--dry-run", is_flag=True, help="Choose the patches and stop.")
+@click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(as_json: bool, quiet: bool, **options: Any) -> None:
+    """Propose control for the approximately oriented images of PROJECT.
+
+    Patches of an orthophoto are found in the photos. Their places with heights become ground points, written with the
+    image points beside them (NAME_points.csv); both become entries of [observations] in PROJECT. Points that do not
+    agree on one correction of an image's orientation are left out.
+    """
+    import psutil
+
+    from photoplan.cli.progress import progress
+    from photoplan.products.control import ControlRequest, propose_control
+
+    options["workers"] = options["workers"] or psutil.cpu_count() or 1
+    request = ControlRequest(**options)
+    found = propose_control(request, lambda words, count: progress(count, quiet or as_json, words))
+    if as_json:
+        click.echo(json.dumps(found.to_dict(), indent=2))
+        return
+    if found.output is None:
+        click.echo(f"{found.patches} patches at {found.resolution:g} m")
+        return
+    click.echo(str(found.output))
+    click.echo(str(found.image_points))
+    plane, height, image = found.sigma
+    click.echo(
+        f"{found.points} control points of {found.patches} patches at {found.resolution:g} m; standard deviations "
+        f"{plane:.2f} m, height {height:.2f} m, image {image:.2f} px (medians)"
+    )
+    width = max(5, *(len(i.name) for i in found.images))
+    click.echo(f"{'image':{width}}  tried found  kept  shift px          residual px")
+    for i in found.images:
+        click.echo(
+            f"{i.name:{width}} {i.tried:6} {i.matched:5} {len(i.points):5}  {i.shift[0]:7.1f} {i.shift[1]:7.1f}"
+            f"  {i.rms:10.2f}"
+        )
+    if not quiet:
+        for i in found.images:
+            if not len(i.points):
+                reasons = ", ".join(f"{count} {reason}" for reason, count in i.reasons.items())
+                click.echo(f"{i.name}: no control ({reasons})", err=True)
