@@ -19,14 +19,14 @@ from photoplan.io import (
 )
 from photoplan.io.camera_model import FilmCamera, FrameCamera
 from photoplan.io.orientation_table import TableFormat
-from photoplan.io.plain_files import read_text
+from photoplan.io.plain_files import read_head
 
 __all__ = ["CAMERA_FORMATS", "CameraFile", "read_cameras"]
 
 
 def _text(path: Path) -> dict[str, FrameCamera | FilmCamera]:
     """Cameras of one of the formats whose files end in ``.txt``."""
-    head = read_text(path, 1 << 30)[:65_536]
+    head = read_head(path)
     if head.lstrip().lower().startswith("filename imagewidth"):
         return dict(orientation_pix4d.read(path, TableFormat()).cameras)
     if "CAMERA_ID, MODEL" in head or path.name == "cameras.txt":

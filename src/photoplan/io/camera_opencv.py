@@ -21,7 +21,7 @@ from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, openc
 from photoplan.io.names import unique_stems
 from photoplan.io.orientation_block import Loss, OrientationBlock, OrientationFormat
 from photoplan.io.orientation_table import TableFormat
-from photoplan.io.plain_files import finite, parse_yaml, read_json, read_text
+from photoplan.io.plain_files import finite, parse_yaml, read_head, read_json, read_text
 
 __all__ = ["FORMAT", "is_opencv", "read", "render"]
 
@@ -34,7 +34,7 @@ _WIDTH, _HEIGHT = ("image_width", "width", "imagewidth"), ("image_height", "heig
 
 def is_opencv(path: Path) -> bool:
     """Whether a YAML or JSON file is a calibration of this kind."""
-    return re.search(r"camera_?matrix", read_text(path, 1_000_000_000)[:65_536], re.I) is not None
+    return re.search(r"camera_?matrix", read_head(path), re.I) is not None
 
 
 def read(path: Path) -> dict[str, FrameCamera | FilmCamera]:

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ValidationError
 from photoplan.errors import InputError
 from photoplan.io.project_errors import explain
 
-__all__ = ["build", "finite", "parse_yaml", "read_json", "read_text", "read_yaml"]
+__all__ = ["build", "finite", "parse_yaml", "read_head", "read_json", "read_text", "read_yaml"]
 
 #: Levels of nesting that any of our formats could need.
 MAX_DEPTH = 32
@@ -46,6 +46,22 @@ def read_text(path: Path, max_bytes: int) -> str:
         line = text[: text.index("\0")].count("\n") + 1
         raise InputError(f"{path}:{line}: holds a zero byte; this is not a text file")
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_head(path: Path, max_bytes: int = 65_536) -> str:
+    """The beginning of a text file, to tell formats apart; bytes that are not UTF-8 are replaced.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            raw = file.read(max_bytes)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    return raw.decode("utf-8-sig", errors="replace").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def read_yaml(path: Path, max_bytes: int = 200_000) -> Any:
