@@ -343,6 +343,10 @@ def test_fault_13_outputs_are_refused_before_any_work(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"report\.html: exists already; choose another output or say --overwrite"):
         exactly(made)
     assert made.project_text() == text
+    (tmp_path / "control.csv").rename(tmp_path / "away.csv")
+    with pytest.raises(UsageError, match="exists already"):
+        exactly(made)
+    (tmp_path / "away.csv").rename(tmp_path / "control.csv")
     exactly(made, overwrite=True)
     shared = tmp_path / "adjustment" / "image_points.csv"
     edit(made.path, '"points.csv"', '"adjustment/image_points.csv"')
