@@ -2,7 +2,8 @@
 
 Point 1 has lost its sign in print: with DX = +3250 it would lie on point 3. The printed matrices came from unrounded
 pixel coordinates, which are printed with two decimals; so what is computed from these may differ by as much as these
-decimals allow, and what is computed from the printed matrix by its last digit.
+decimals allow, and what is computed from the printed matrix by its last digit. The appendix's text speaks of mean
+residuals of 0.9 to 1.3 and at most 2.0 pixels, ten times what the figure prints (0.10, 0.13, 0.21).
 """
 
 from __future__ import annotations

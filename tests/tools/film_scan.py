@@ -44,10 +44,11 @@ class Film:
     """Rotations about X, then Y, then Z."""
     c: float = 152.87
     """Camera constant, millimetres."""
-    principal_point: tuple[float, float] = (0.012, -0.008)
+    principal_point: tuple[float, float] = (0.112, -0.083)
     """In the system of the marks, millimetres."""
-    distortion: tuple[float, float] = (0.12, -1.1e-5)
-    """a and b of the radial distortion a r + b r³ in micrometres at r in millimetres, outwards: 5 to −20 µm."""
+    distortion: tuple[float, float] = (0.6, -5.5e-5)
+    """a and b of the radial distortion a r + b r³ in micrometres at r in millimetres, outwards: 24 µm to −95 µm in the
+    corners, as lenses of the fifties had it."""
     shrinkage: tuple[float, float] = (2.8e-4, 1.7e-4)
     """Of the film since its calibration, along x and y."""
     turn_deg: float = 0.7
