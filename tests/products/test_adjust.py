@@ -372,6 +372,32 @@ def test_positions_alone_hold_the_block(tmp_path: Path) -> None:
     np.testing.assert_allclose(found(made)[0], made.centers, atol=2e-3)
 
 
+@pytest.mark.parametrize("curvature", ["strict", "none"])
+def test_shift_of_strips_and_boresight(tmp_path: Path, curvature: str) -> None:
+    """Found in map axes, though the block lies in a system that is turned by the convergence of meridians."""
+    shift = {"a": (0.8, -0.5, 0.3), "b": (-0.4, 0.9, -0.2)}
+    boresight = (0.2, -0.1, 0.3)
+    make = Make(curvature=curvature, positions=True, shift=shift, boresight_deg=boresight, unit="gon", rotation="kpo")
+    made = write_project(tmp_path, make)
+    report = exactly(made)
+    for strip in report.facts.strips:
+        np.testing.assert_allclose(strip.shift, shift[strip.name], atol=2e-3)
+        np.testing.assert_allclose(strip.rms, 0.0, atol=2e-3)
+    assert report.facts.boresight is not None
+    # A small rotation's vector and its angles agree to second order.
+    np.testing.assert_allclose(report.facts.boresight[0], np.array(boresight) / 0.9, atol=1e-3)
+    np.testing.assert_allclose(found(made)[0], made.centers, atol=5e-4)
+
+
+def test_the_lever_arm_is_found_in_camera_axes(tmp_path: Path) -> None:
+    lever = (0.5, -0.3, 1.2)
+    made = write_project(tmp_path, Make(positions=True, lever=lever))
+    report = exactly(made)
+    assert report.facts.lever_arm is not None
+    # The prior pulls a little, and the map's scale is that of lengths on the ground, not of the arm.
+    np.testing.assert_allclose(report.facts.lever_arm[0], lever, atol=5e-3)
+
+
 def test_the_stated_calibration_is_used(tmp_path: Path) -> None:
     made = write_project(tmp_path, Make(stated={"focal_px": 3597.0}))
     made.path.write_text(

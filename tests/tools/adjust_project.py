@@ -56,6 +56,12 @@ class Make:
     check: int = 0
     """How many of the nine ground points are check points."""
     positions: bool = False
+    shift: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    """By how much the observed positions of strips a and b are off, metres."""
+    lever: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Antenna minus projection centre in camera axes, metres."""
+    boresight_deg: tuple[float, float, float] | None = None
+    """ω, φ, κ from observed attitudes' camera axes to the true ones; None: no attitudes are observed."""
     control: bool = True
     seed: int = 7
 
@@ -108,8 +114,7 @@ def write_project(folder: Path, make: Make = Make()) -> Made:
         lines.append(",".join([name, *(f"{v:.6f}" for v in points[name]), role]))
     (folder / "control.csv").write_text("\n".join(lines) + "\n")
     if make.positions:
-        table = [f"{n},{c[0]:.5f},{c[1]:.5f},{c[2]:.5f},{n[0]}" for n, c in zip(names, centers)]
-        (folder / "positions.csv").write_text("\n".join(["name,x,y,z,strip", *table]) + "\n")
+        (folder / "positions.csv").write_text(_positions(make, names, centers, rotations))
     path = folder / "project.toml"
     path.write_text(_text(make, true, names, centers, rotations, random))
     return Made(path, names, centers, rotations, points)
@@ -139,6 +144,20 @@ def _points(random: np.random.Generator) -> dict[str, NDArray[np.float64]]:
         XY = MIDDLE + random.uniform(-1, 1, 2) * [1000.0, 650.0]
         out[f"T{k + 1}"] = np.array([*XY, GROUND + random.uniform(-30, 30)])
     return out
+
+
+def _positions(make: Make, names: tuple[str, ...], centers: NDArray[np.float64], rotations: NDArray[np.float64]) -> str:
+    lines = ["name,x,y,z,strip" + (",omega,phi,kappa" if make.boresight_deg else "")]
+    for name, center, R in zip(names, centers, rotations):
+        at = center + R @ make.lever + make.shift.get(name[0], (0.0, 0.0, 0.0))
+        fields = [name, *(f"{v:.5f}" for v in at), name[0]]
+        if make.boresight_deg:
+            seen = R @ rotation_from_angles(np.radians(make.boresight_deg))
+            angles = angles_from_rotation(seen, make.rotation) * ANGLE_UNITS[make.unit] / (2 * np.pi)
+            order = dict(zip(make.rotation, angles))
+            fields += [f"{order[letter]:.9f}" for letter in "opk"]
+        lines.append(",".join(fields))
+    return "\n".join(lines) + "\n"
 
 
 def _project(make: Make, names: tuple[str, ...], centers: NDArray[np.float64], camera: dict[str, Any]) -> Project:
@@ -179,6 +198,11 @@ def _text(
         lines += ['control = ["control.csv"]', "sigma_control = [0.01, 0.01]"]
     if make.positions:
         lines += ['positions = "positions.csv"', "sigma_position = [0.05, 0.05]"]
+    if make.boresight_deg:
+        lines.append("sigma_attitude = 0.01")
+    drift = "shift" if make.shift else "none"
+    lines += ["[adjustment]", f'drift = "{drift}"', f"boresight = {toml_value(make.boresight_deg is not None)}"]
+    lines.append(f"lever_arm_sigma = {2.0 if any(make.lever) else 0.0}")
     lines += ["[cameras.cam]", *(f"{key} = {toml_value(value)}" for key, value in camera.items())]
     metres, degrees = make.start
     for name, center, R in zip(names, centers, rotations):
