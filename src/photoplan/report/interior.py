@@ -123,7 +123,7 @@ class InteriorPlots:
         left, base = middle[0] - 0.15 * half, middle[1]
         ax.quiver(left, base, length * scale / 1000, 0, color=BLUE, width=width, **_VECTORS)
         ax.annotate(f"{length:g} µm", (left, base), (0, 5), textcoords="offset points", color=BLUE, fontsize=8)
-        reach = 1.32 * half
+        reach = 1.55 * half
         ax.set(
             title=_short(title, 30),
             aspect="equal",
