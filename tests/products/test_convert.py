@@ -285,6 +285,8 @@ def test_other_formats_there_and_back(tmp_path, toml, target):
     """By way of another program's axes, and of a local system where it has one, every pixel comes back."""
     if orientation_format(target).render is None:
         pytest.skip("this format is read only")
+    if target == "opencv":
+        pytest.skip("this format holds cameras only")
     there = tmp_path / target / f"there{orientation_format(target).suffix}"
     convert_orientation(ConvertRequest(toml, target, there))
     back = tmp_path / "back.csv"
