@@ -400,9 +400,7 @@ def test_the_lever_arm_is_found_in_camera_axes(tmp_path: Path) -> None:
 
 def test_the_stated_calibration_is_used(tmp_path: Path) -> None:
     made = write_project(tmp_path, Make(stated={"focal_px": 3597.0}))
-    made.path.write_text(
-        made.project_text().replace("[cameras.cam]", '[adjustment]\ncalibrate = { cam = ["c"] }\n[cameras.cam]')
-    )
+    edit(made.path, "[adjustment]", '[adjustment]\ncalibrate = { cam = ["c"] }')
     report = exactly(made)
     assert report.facts.cameras[0].parameters == ("c",)
     np.testing.assert_allclose(report.facts.cameras[0].after, 3600.0, atol=1e-3)
