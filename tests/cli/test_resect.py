@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rasterio
 from click.testing import CliRunner, Result
 
 from photoplan.cameras.base import project as project_points
@@ -19,6 +20,7 @@ from photoplan.errors import GeometryError, InputError, TilesFailed, UsageError
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_from_angles
 from photoplan.io.project import load_project
+from photoplan.products.scene import open_scene
 
 SIZE, C = (4000, 3000), 3200.0
 LENS = Brown(k1=-0.05)
@@ -131,6 +133,23 @@ def test_the_written_orientation_reproduces_the_points(folder: Path) -> None:
         np.testing.assert_allclose(again - point["xy"], point["residual"], atol=2e-3)
     assert found["written"] is True and found["left_out"] == ["c"] and found["failed"] == {}
     assert 0.5 < found["images"][0]["sigma0"] < 1.6
+
+
+@pytest.mark.parametrize("curvature", ["none", "correction", "strict"])
+def test_products_use_the_camera_that_was_adjusted(folder: Path, curvature: str) -> None:
+    """The camera that `ortho` opens misses the measured points by the residuals that were reported."""
+    path = folder / "project.toml"
+    terrain = '[terrain]\nheight = 260.0\nheight_system = "same"\n\n[orientation]'
+    text = path.read_text().replace("[orientation]", terrain, 1)
+    path.write_text(text.replace('earth_curvature = "strict"', f'earth_curvature = "{curvature}"'))
+    with rasterio.open(folder / "a.tif", "w", driver="GTiff", width=SIZE[0], height=SIZE[1], count=1, dtype="uint8"):
+        pass
+    found = json.loads(run(folder, "--images", "a", "--json").stdout)["images"][0]
+    camera = open_scene(load_project(path), "a").camera
+    control = np.genfromtxt(folder / "control.csv", delimiter=",", skip_header=1)[:, 1:]
+    for point in found["points"]:
+        again = project_points(camera, control[int(point["name"][1:]) - 1])
+        np.testing.assert_allclose(again - point["xy"], point["residual"], atol=2e-3)
 
 
 def test_a_dry_run_changes_nothing(folder: Path) -> None:

@@ -79,6 +79,20 @@ def test_fault_17_one_wrong_ray_is_found_or_the_point_is_refused(count: int) -> 
     assert np.isnan(found.XYZ[~good]).all()
 
 
+def test_fault_17_an_error_that_any_ray_could_have_is_not_guessed() -> None:
+    """Three cameras on a line and an error along it: every two rays meet, and nothing tells which pair is right."""
+    rng = np.random.default_rng(8)
+    poses = [Pose(at(x, 0, 1500), np.eye(3)) for x in (0.0, 500.0, 1000.0)]
+    X = at(500, 0, 0) + rng.uniform(-1, 1, (200, 3)) * (200, 400, 80)
+    rays = rays_of(poses, X, rng)
+    t = rays.tangents.copy()
+    wrong = rng.integers(0, 3, 200) * 200 + np.arange(200)
+    t[wrong, 0] += 0.01
+    found = intersect(poses, Rays(rays.image, rays.point, t, rays.sigma))
+    assert (found.reason == 4).mean() > 0.97
+    assert found.counts()["rays do not meet"] > 190
+
+
 def test_many_rays_lose_several() -> None:
     rng = np.random.default_rng(4)
     poses = [Pose(at(150 * (k % 5), 150 * (k // 5), 1000), rotation_opk(0, 0, k)) for k in range(25)]

@@ -169,6 +169,18 @@ def test_fault_17_gross_errors_are_named_and_leave_the_pose_alone(control: bool)
         assert np.abs(found.normalised[found.rejected]).max(axis=1).min() > 4.0
 
 
+def test_fault_17_points_leave_until_none_is_beyond_the_limit() -> None:
+    rng = np.random.default_rng(22)
+    pose = aerial_pose(rng)
+    points = measured(frame(pose), ground_below(rng, pose, 60, 150.0), rng, 0.5)
+    strict = resect(points, AERIAL, NoLens(), ResectSettings(critical=2.0))
+    assert 1 <= strict.rejected.sum() < 20
+    limit = 2.0 * max(1.0, strict.sigma0)
+    assert np.abs(strict.normalised[~strict.rejected]).max() < 1.05 * limit
+    assert np.abs(strict.normalised[strict.rejected]).max(axis=1).min() > 0.95 * 2.0
+    assert not resect(points, AERIAL, NoLens(), ResectSettings(critical=5.0)).rejected.any()
+
+
 def test_a_gross_error_among_four_points_is_reported_not_guessed() -> None:
     rng = np.random.default_rng(10)
     pose = aerial_pose(rng)

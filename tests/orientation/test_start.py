@@ -154,8 +154,10 @@ def test_similarity_in_closed_form() -> None:
     np.testing.assert_allclose(found(a), b, atol=1e-6)
     # Points on a plane leave the sign of the third axis to the determinant.
     a[:, 2] = 0.0
-    flat = fit_similarity(a, 37.0 * a @ R.T)
-    np.testing.assert_allclose(flat.R, R, atol=1e-10)
+    for k in range(20):
+        turned = rotation_opk(*rng.uniform(-3, 3, 3))
+        flat = fit_similarity(a[k:], 37.0 * a[k:] @ turned.T) if k < 17 else fit_similarity(a, a @ turned.T)
+        np.testing.assert_allclose(flat.R, turned, atol=1e-8)
     b = 37.0 * a @ R.T
     b[[2, 5, 8, 11, 14]] += rng.normal(size=(5, 3)) * 100
     found, agree = robust_similarity(a, b, 1e-3)

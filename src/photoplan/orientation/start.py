@@ -49,7 +49,7 @@ class Started:
     points: Mapping[str, tuple[float, float, float]]
     """Ground coordinates of the points whose rays meet."""
     left_out: tuple[tuple[str, str], ...]
-    """Images that could not be oriented: name and reason."""
+    """Images that could not be oriented: name and reason; those of models that have no place first."""
 
 
 def start_block(
@@ -179,6 +179,9 @@ def _result(
                 "no point is measured in it" if count == 0 else f"its {count} points do not connect it to other images"
             )
         left.append((image.name, why))
+    # What is said of models tells more than what is said of single images.
+    told = {images[k].name for k in reasons}
+    left.sort(key=lambda item: item[0] not in told)
     known = np.isfinite(block.XYZ[:, 0])
     points = {net.points[k]: tuple(float(v) for v in block.XYZ[k]) for k in np.flatnonzero(known)}
     return Started(
