@@ -1,0 +1,106 @@
+"""The real UltraCam block through `photoplan adjust`: 805 exposures from noisy orientations.
+
+Sixty-eight of the exposures have measured points; the others are held by their positions and attitudes alone.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tools.command import peak_of
+from tools.ign_block import Published, ign_project, published
+
+from photoplan.geometry.rotation import rotation_opk
+from photoplan.io.image_points import read_image_points
+from photoplan.io.project import load_project
+
+GIB = 2**30
+
+
+@pytest.fixture(scope="module")
+def block(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, Path, int, Published]:
+    data = shared / "data" / "ign_borea"
+    folder = tmp_path_factory.mktemp("ign")
+    project = ign_project(folder, data, position_noise=0.1, attitude_noise_deg=0.01)
+    said, peak = peak_of("adjust", project, "--variance-components", "-q")
+    assert said.code == 0, said.err
+    report = json.loads((folder / "adjustment" / "report.json").read_text())
+    return report, project, peak, published(data)
+
+
+def deviations(project: Path, truth: Published) -> tuple[np.ndarray, np.ndarray]:
+    """Adjusted minus published centres and small rotations in units of their standard deviations, (805, 6).
+
+    The datum, a similarity of all projection centres, is taken out first. Second: which images have measured points.
+    """
+    images = {image.name: image for image in load_project(project).images}
+    chosen = [images[name] for name in truth.names]
+    centers = np.array([i.center for i in chosen])
+    R = np.array([rotation_opk(*np.radians(i.angles)) for i in chosen])
+    true = np.array([rotation_opk(*np.radians(a)) for a in truth.angles])
+    a, b = centers - centers.mean(axis=0), truth.centers - truth.centers.mean(axis=0)
+    U, s, Vt = np.linalg.svd(b.T @ a)
+    D = np.diag([1.0, 1.0, np.linalg.det(U @ Vt)])
+    turn, scale = U @ D @ Vt, (s * np.diag(D)).sum() / (a**2).sum()
+    off = scale * a @ turn.T - b
+    rotated = np.swapaxes(true, 1, 2) @ (turn @ R)
+    small = np.stack([rotated[:, 2, 1], rotated[:, 0, 2], rotated[:, 1, 0]], axis=1)
+    # The angles' deviations in the angles themselves: the block is nearly vertical, ω and φ are turned by κ.
+    kappa = np.radians(truth.angles[:, 2])
+    c, k = np.cos(kappa), np.sin(kappa)
+    small = np.stack([c * small[:, 0] - k * small[:, 1], k * small[:, 0] + c * small[:, 1], small[:, 2]], axis=1)
+    sigma = np.array([[*i.sigma_center, *np.radians(i.sigma_angles)] for i in chosen])
+    measured = set(read_image_points(project.parent / "image_points.csv").images)
+    return np.concatenate([off, small], axis=1) / sigma, np.array([n in measured for n in truth.names])
+
+
+def test_sigma0_memory_and_control(block: tuple[dict, Path, int, Published]) -> None:
+    report, project, peak, _ = block
+    (group,) = [g for g in report["groups"] if g["name"].startswith("image points")]
+    sigma0 = 0.25 * group["found_to_stated"]
+    points = read_image_points(project.parent / "image_points.csv")
+    control = {"1003", "1005"}
+    rows = [line.split(",") for line in (project.parent / "adjustment" / "image_points.csv").read_text().split("\n")]
+    head = rows[0]
+    at = [head.index(n) for n in ("point", "residual_x", "residual_y")]
+    residuals = np.array([[float(r[at[1]]), float(r[at[2]])] for r in rows[1:] if len(r) > 1 and r[at[0]] in control])
+    rms = np.sqrt((residuals**2).mean(axis=0))
+    print(
+        f"\nign_borea: {len(report['images'])} exposures, {len(points)} measurements, sigma0 {sigma0:.3f} px, "
+        f"peak memory {peak / GIB:.2f} GiB, control residuals rms {rms.round(3)} px, largest "
+        f"{np.abs(residuals).max():.2f} px, {len(report['gross_errors'])} gross errors"
+    )
+    assert len(report["images"]) == 805
+    assert sigma0 <= 0.25
+    assert peak <= 1.5 * GIB
+    assert len(residuals) >= 15
+    assert (rms <= 0.75).all()
+
+
+def test_orientations_lie_near_the_published_ones(block: tuple[dict, Path, int, Published]) -> None:
+    _, project, _, truth = block
+    normalised, measured = deviations(project, truth)
+    share = (np.abs(normalised) <= 3.0).mean()
+    print(
+        f"\nign_borea: {share:.2%} of all orientation parameters within 3 sigma of the published ones, spread "
+        f"{np.sqrt((normalised**2).mean(axis=0)).round(2)}; of the {measured.sum()} exposures with points "
+        f"{(np.abs(normalised[measured]) <= 3.0).mean():.1%}, spread "
+        f"{np.sqrt((normalised[measured] ** 2).mean(axis=0)).round(2)}"
+    )
+    assert share >= 0.985
+    others = np.sqrt((normalised[~measured] ** 2).mean(axis=0))
+    assert (others > 0.5).all() and (others < 1.2).all()
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="the published orientations raise the sum of squares of the image points by ten times what their number "
+    "allows: no adjustment of these measurements lies within three of its standard deviations of them",
+)
+def test_every_measured_exposure_lies_within_three_sigma(block: tuple[dict, Path, int, Published]) -> None:
+    _, project, _, truth = block
+    normalised, measured = deviations(project, truth)
+    assert (np.abs(normalised[measured]) <= 3.0).all()
