@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -252,6 +253,9 @@ def test_check_points_positions_and_files(tmp_path: Path) -> None:
     assert data["check_accuracy"]["RMSE_H"] == pytest.approx(facts.check.rmse_h)
     assert len(data["images"]) == 8
     assert data["sigma0"] == facts.sigma0
+    assert data["heights"] == {"system": "ellipsoidal", "computed_in": "ellipsoidal", "operation": "none"}
+    assert {Path(path).name for path in data["inputs"]} == {"points.csv", "control.csv", "positions.csv"}
+    assert "photoplan" in data["versions"]
     text = made.project_text()
     assert text.startswith("# a remark that stays")
     assert "sigma_center" in text
@@ -283,6 +287,15 @@ def test_fault_17_gross_errors_are_named(tmp_path: Path) -> None:
     kept = adjusted(made, robust=False, overwrite=True)
     assert kept.facts.gross == ()
     assert kept.facts.sigma0 > 2
+
+
+def test_stated_accuracies_that_the_observations_contradict(tmp_path: Path) -> None:
+    made = write_project(tmp_path, Make(pixel_noise=0.3, sigma_image=1.2))
+    notes = adjusted(made, dry_run=True).facts.notes
+    said = next(note for note in notes if "image points, camera cam: the stated standard deviation is" in note)
+    found = re.search(r"is (.*) times too large; sigma_image = (.*) would fit", said)
+    assert found
+    np.testing.assert_allclose([float(found[1]), float(found[2])], [4.0, 0.3], rtol=0.15)
 
 
 def test_fault_17_a_wrong_control_point_is_named(tmp_path: Path) -> None:

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from photoplan.io.fingerprint import fingerprint
+from photoplan.io.run_record import versions
 from photoplan.products.adjust_block import MapResult
 from photoplan.report.adjust_facts import AdjustFacts, GroundFacts, MeasurementFacts
 
@@ -15,6 +17,7 @@ __all__ = ["facts_json"]
 
 def facts_json(facts: AdjustFacts, result: MapResult) -> dict[str, Any]:
     """All figures of the report; NaN becomes null."""
+    inputs = result.prepared.inputs
     data = {
         "sigma0": facts.sigma0,
         "redundancy": facts.redundancy,
@@ -47,7 +50,14 @@ def facts_json(facts: AdjustFacts, result: MapResult) -> dict[str, Any]:
         "left_out": [{"name": name, "reason": reason} for name, reason in facts.left_out],
         "tie_point_sigma": facts.point_sigma,
         "notes": facts.notes,
-        "inputs": [path for _, path in facts.inputs],
+        "crs": inputs.project.crs,
+        "heights": {
+            "system": inputs.project.orientation.height_system,
+            "computed_in": result.prepared.frame.inward.target,
+            "operation": result.prepared.frame.inward.operation,
+        },
+        "inputs": {str(path): fingerprint(path).digest for path in inputs.files},
+        "versions": versions(),
         "settings": dict(facts.settings),
     }
     clean: dict[str, Any] = _plain(data)

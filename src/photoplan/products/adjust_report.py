@@ -15,6 +15,7 @@ from photoplan.io.project_model import ANGLE_UNITS
 from photoplan.orientation.block import AdjustSettings
 from photoplan.products.adjust_block import MapResult
 from photoplan.products.adjust_field import residual_fields
+from photoplan.products.init_match import some
 from photoplan.report.adjust_facts import (
     AdjustFacts,
     CalibrationFacts,
@@ -32,6 +33,8 @@ _Floats = NDArray[np.float64]
 Triple = tuple[float, float, float]
 #: Kept measurements that are named.
 _WORST = 15
+#: Redundancy from which a group's variance factor says something, and from which ratio on it is told.
+_SOUND, _CONTRADICTED = 30.0, 1.4
 
 
 def build_facts(title: str, result: MapResult, settings: AdjustSettings, seconds: float) -> AdjustFacts:
@@ -85,10 +88,34 @@ def build_facts(title: str, result: MapResult, settings: AdjustSettings, seconds
         tie_XY=result.XYZ[tie, :2],
         point_sigma=_triple(np.sqrt(np.mean(sigma[tie] ** 2, axis=0)) if tie.any() else np.full(3, np.nan)),
         fields=residual_fields(result, used),
-        notes=inputs.notes,
+        notes=(*inputs.notes, *_advice(result, used)),
         inputs=_inputs(inputs.files),
         settings=_settings(result, settings, seconds),
     )
+
+
+def _advice(result: MapResult, used: NDArray[np.bool_]) -> list[str]:
+    """What to look at: stated accuracies that the observations contradict, images that hang on nothing but GNSS."""
+    points, adjusted = result.prepared.inputs.points, result.adjusted
+    out = []
+    for group in adjusted.groups:
+        if (
+            group.redundancy < _SOUND
+            or not np.isfinite(group.factor)
+            or 1 / _CONTRADICTED < group.factor < _CONTRADICTED
+        ):
+            continue
+        how = "small" if group.factor > 1 else "large"
+        ratio = max(group.factor, 1 / group.factor) if group.factor > 0 else np.inf
+        advice = ""
+        if group.unit == "px" and group.factor > 0:
+            advice = f"; sigma_image = {float(np.median(points.sigma)) * group.factor:.2g} would fit"
+        out.append(f"{group.name}: the stated standard deviation is {ratio:.1f} times too {how}{advice}")
+    seen = {points.images[k] for k in np.unique(points.image[used])}
+    alone = [name for name in adjusted.images if name not in seen]
+    if alone:
+        out.append(f"{len(alone)} images have no measured point; their orientation is the observed one: {some(alone)}")
+    return out
 
 
 def _triple(values: _Floats) -> Triple:
@@ -204,7 +231,8 @@ def _gross(result: MapResult) -> tuple[MeasurementFacts, ...]:
     for k, axis in zip(*np.nonzero(adjusted.ground_rejected)):
         d = result.ground_residuals[k, axis]
         what = f"control point {inputs.ground.names[k]!r}, {'XYZ'[axis]}"
-        out.append(MeasurementFacts(what, f"{d:+.3f} m", float(adjusted.ground_normalised[k, axis]), True))
+        text = f"{d:+.3f} m" if np.isfinite(d) else "too few of its image points are left"
+        out.append(MeasurementFacts(what, text, float(adjusted.ground_normalised[k, axis]), True))
     if inputs.positions is not None:
         for k in np.flatnonzero(adjusted.position_rejected):
             d = result.position_residuals[k]
@@ -226,9 +254,8 @@ def _measurement(result: MapResult, k: int, rejected: bool) -> MeasurementFacts:
     dx, dy = adjusted.residuals[k]
     normalised = adjusted.normalised[k]
     axis = int(np.argmax(np.abs(np.nan_to_num(normalised))))
-    return MeasurementFacts(
-        result.prepared.inputs.points.label(k), f"{dx:+.2f} {dy:+.2f} px", float(normalised[axis]), rejected
-    )
+    text = f"{dx:+.2f} {dy:+.2f} px" if np.isfinite([dx, dy]).all() else "without it, one image sees the point"
+    return MeasurementFacts(result.prepared.inputs.points.label(k), text, float(normalised[axis]), rejected)
 
 
 def _inputs(files: Sequence[Path]) -> tuple[tuple[str, str], ...]:
