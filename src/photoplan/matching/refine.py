@@ -32,6 +32,9 @@ _CHUNK = 500
 #: A reference may be so much coarser than the finest image of its track.
 _NEARLY_FINEST = 0.8
 
+#: The mapping of a patch may change by this while it is matched, against the one it starts from: else it is another's.
+_BENT = 0.5
+
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
 
 
@@ -129,6 +132,7 @@ def match_between(
         w = np.broadcast_to(round_patch, templates.shape) if weights is None else weights[chunk]
         match_patches(np.nan_to_num(templates), np.ascontiguousarray(w), windows, limits, found)
         good = (found[:, -1] == CONVERGED) & whole & _on_known(known, found, settings.radius)
+        good &= _near(found[:, 2:6].reshape(-1, 2, 2), start[1][chunk])
         found[:, :2] += middle - half
         results[chunk[good]] = found[good]
     return Matched(
@@ -137,6 +141,12 @@ def match_between(
         results[:, CORRELATION],
         results[:, [9, 10, 10, 11]].reshape(-1, 2, 2),
     )
+
+
+def _near(affine: NDArray[np.float64], start: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether mappings are still like those that they started from."""
+    change = np.linalg.inv(start) @ np.nan_to_num(affine, nan=9.0) - np.eye(2)
+    return np.asarray(np.linalg.norm(change, axis=(1, 2), ord=2) < _BENT, np.bool_)
 
 
 def _on_known(known: NDArray[np.bool_], found: NDArray[np.float64], radius: int) -> NDArray[np.bool_]:

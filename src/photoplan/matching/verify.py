@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,10 +108,45 @@ def _essential(t: tuple[NDArray[np.float64], NDArray[np.float64]], threshold: fl
     )
     if E is None or inliers is None or E.shape != (3, 3):
         return fits
-    index = np.flatnonzero(known)
-    # A finer solution may be found from all inliers of the first one; its own threshold decides, not a soft one.
-    fits[index] = _sampson(E, p, q) <= threshold
+    fits[known] = _sampson(_adjusted(cv2, E, p, q, threshold), p, q) <= threshold
     return fits
+
+
+def _adjusted(
+    cv2: Any, E: NDArray[np.float64], p: NDArray[np.float64], q: NDArray[np.float64], threshold: float
+) -> NDArray[np.float64]:
+    """Essential matrix of all matches that fit: five unknowns, weights that fall with the distance (Cauchy).
+
+    A sample of five matches gives a solution through their noise, which loses part of the right ones.
+    """
+    R, _, base = cv2.decomposeEssentialMat(E)
+    base = base.ravel()
+
+    def distances(E: NDArray[np.float64]) -> NDArray[np.float64]:
+        return _signed(E, p, q)
+
+    step = 1e-6
+    for _ in range(10):
+        across = np.linalg.svd(base[None])[2][1:]
+        now = distances(_cross(base) @ R)
+        turned = [_cross(base) @ cv2.Rodrigues(step * axis)[0] @ R for axis in np.eye(3)]
+        moved = [_cross(base + step * side) @ R for side in across]
+        J = np.stack([(distances(m) - now) / step for m in (*turned, *moved)], axis=1)
+        weight = 1.0 / (1.0 + (2.0 * now / threshold) ** 2)
+        N = (J * weight[:, None]).T @ J
+        change = -np.linalg.lstsq(N, (J * weight[:, None]).T @ now, rcond=1e-10)[0]
+        R = cv2.Rodrigues(change[:3])[0] @ R
+        base = base + change[3:] @ across
+        base /= np.linalg.norm(base)
+        if np.abs(change).max() < 1e-7:
+            break
+    better = _cross(base) @ R
+    fit = [int((np.abs(distances(m)) <= threshold).sum()) for m in (E, better)]
+    return better if fit[1] >= fit[0] else E
+
+
+def _cross(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def _fundamental(xy: tuple[NDArray[np.float64], NDArray[np.float64]], threshold: float) -> NDArray[np.bool_]:
@@ -132,10 +168,15 @@ def _fundamental(xy: tuple[NDArray[np.float64], NDArray[np.float64]], threshold:
 
 def _sampson(F: NDArray[np.float64], p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
     """Distance of matches from their epipolar lines, to first order (Hartley and Zisserman 2004, eq. 11.9)."""
+    return np.abs(_signed(F, p, q))
+
+
+def _signed(F: NDArray[np.float64], p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same with a sign."""
     one = np.ones((len(p), 1))
     a, b = np.concatenate([p, one], axis=1), np.concatenate([q, one], axis=1)
     line_b, line_a = a @ F.T, b @ F
-    gap = np.abs((b * line_b).sum(axis=1))
+    gap = (b * line_b).sum(axis=1)
     scale = np.sqrt((line_a[:, :2] ** 2).sum(axis=1) + (line_b[:, :2] ** 2).sum(axis=1))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(scale > 0, np.sqrt(2) * gap / scale, np.inf)

@@ -24,8 +24,7 @@ from photoplan.io.raster import RasterReader
 from photoplan.products.control_match import ImageControl, OrthoPatch, Settings, control_of_image
 from photoplan.products.control_patches import Ortho, choose_patches
 from photoplan.products.scene import open_scene
-from photoplan.products.tie import Stage
-from photoplan.products.tie_work import threads
+from photoplan.products.tie_work import Stage, threads, unwatched
 
 __all__ = ["ControlReport", "ControlRequest", "propose_control"]
 
@@ -104,7 +103,7 @@ def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def propose_control(request: ControlRequest, stage: Stage) -> ControlReport:
+def propose_control(request: ControlRequest, stage: Stage = unwatched) -> ControlReport:
     """Match patches of an orthophoto in the photos of a project.
 
     Raises

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,11 +27,18 @@ from photoplan.matching.verify import PairMatches, VerifySettings
 from photoplan.products.init_match import some
 from photoplan.products.tie_inputs import TieImage, chosen_pairs, open_images
 from photoplan.products.tie_picture import draw_ties
-from photoplan.products.tie_work import FeatureStore, Map, find_features, find_pairs, like_pairs, threads
+from photoplan.products.tie_work import (
+    FeatureStore,
+    Map,
+    Stage,
+    find_features,
+    find_pairs,
+    like_pairs,
+    threads,
+    unwatched,
+)
 
-__all__ = ["Stage", "TieReport", "TieRequest", "find_ties"]
-
-Stage = Callable[[str, int], AbstractContextManager[Callable[[int, int], None]]]
+__all__ = ["TieReport", "TieRequest", "find_ties"]
 
 #: Longer sides are reduced before features are looked for, unless the scale is stated, pixels.
 _LONGEST = 6000
@@ -134,7 +140,7 @@ class TieReport:
         }
 
 
-def find_ties(request: TieRequest, stage: Stage = lambda words, count: nullcontext(_silent)) -> TieReport:
+def find_ties(request: TieRequest, stage: Stage = unwatched) -> TieReport:
     """Find tie points between the images of a project.
 
     Features and matches are kept in a folder ``NAME.cache`` beside the output: a run that was interrupted continues.
@@ -184,10 +190,6 @@ def find_ties(request: TieRequest, stage: Stage = lambda words, count: nullconte
     drawn = draw_ties(output.with_suffix(".png"), images, tracks) if request.picture else None
     report = _report(names, chosen, factor, (len(pairs), verified), found, tracks, notes)
     return replace(report, output=output, picture=drawn, refined=refined, loops=loops)
-
-
-def _silent(parts: int, pixels: int, /) -> None:
-    """Nobody watches."""
 
 
 def _check(request: TieRequest, project: Project, names: Sequence[str]) -> Path:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -21,14 +21,21 @@ from photoplan.matching.pairs import match_features, pairs_by_likeness
 from photoplan.matching.verify import PairMatches, VerifySettings, verify_pair
 from photoplan.products.tie_inputs import TieImage, guide_of
 
-__all__ = ["FeatureStore", "Map", "find_features", "find_pairs", "like_pairs", "threads"]
+__all__ = ["FeatureStore", "Map", "Stage", "find_features", "find_pairs", "like_pairs", "threads", "unwatched"]
 
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
+#: Called with what is done next and the number of its parts; gives a context with a function that counts them.
+Stage = Callable[[str, int], AbstractContextManager[Callable[[int, int], None]]]
 #: Changes when kept features or matches mean something else.
 _FORM = 1
 #: Images whose features are in memory with their descriptors.
 _IN_MEMORY = 64
 _FIELDS = ("xy", "scale", "angle", "strength", "descriptors")
+
+
+def unwatched(words: str, count: int) -> AbstractContextManager[Callable[[int, int], None]]:
+    """A stage that tells nobody how far it is."""
+    return nullcontext(lambda parts, pixels: None)
 
 
 @contextmanager

@@ -1,0 +1,38 @@
+"""Control proposed for aerial images of 6 m pixels in mountains from orthophotos of 5 m, with spoilt orientations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from tools.proposed import residuals, spoilt
+
+from photoplan.io.ground_points import read_ground_points
+from photoplan.products.control import ControlRequest, propose_control
+from photoplan.products.init import InitRequest, init_project
+
+
+def test_control_fits_the_true_orientation_to_a_pixel(shared: Path, tmp_path: Path) -> None:
+    data = shared / "data" / "ngi_dmc"
+    init_project(
+        InitRequest(
+            folder=tmp_path,
+            images=(str(data / "images" / "*.tif"),),
+            camera=data / "eo" / "ngi_int_param.yaml",
+            orientation=data / "eo" / "ngi_xyz_opk.csv",
+            terrain=str(data / "dem.tif"),
+            height_system="same",
+        )
+    )
+    near = tmp_path / "near.toml"
+    near.write_text((tmp_path / "project.toml").read_text())
+    spoilt(near, 10.0, 0.2)
+    orthos = tuple(data / "ref" / f"ngi_rgb_byte_{k}.tif" for k in (1, 2, 3, 4))
+    found = propose_control(ControlRequest(near, orthos, height_sigma=3.0, search=60.0))
+    error = residuals(tmp_path / "project.toml", tmp_path / "control.csv")
+    print(f"{len(error)} points, rms {np.sqrt((error**2).mean()):.2f} px")
+    assert len(error) >= 100 and min(len(i.points) for i in found.images) >= 20
+    assert np.sqrt((error**2).mean()) <= 1.0  # measured: 0.4
+    ground = read_ground_points(tmp_path / "control.csv")
+    # Slopes carry the error of the place into the height.
+    assert (ground.sigma[:, 2] > 3.0).all() and ground.sigma[:, 2].max() > 4.0
