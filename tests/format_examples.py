@@ -25,8 +25,9 @@ LENSES: dict[str, Any] = {
     "none": described.NoLens(),
     "brown": BrownLens(type="brown", k1=-0.05, k2=0.01, k3=-0.002, p1=3e-4, p2=-2e-4),
     "brown with shear": BrownLens(type="brown", k1=-0.05, k2=0.01, p1=3e-4, p2=-2e-4, b1=4e-4, b2=-3e-4, k4=1e-3),
+    "brown with affinity": BrownLens(type="brown", k1=-0.05, k2=0.01, p1=3e-4, p2=-2e-4, b1=4e-4),
     "opencv": OpenCVLens(type="opencv", k1=-0.05, k2=0.01, p1=3e-4, p2=-2e-4, k3=1e-3),
-    "rational": OpenCVLens(type="opencv", k1=0.1, k2=0.01, p1=3e-4, k3=1e-3, k4=0.15, k5=2e-3, k6=1e-4),
+    "rational": OpenCVLens(type="opencv", k1=0.1, k2=0.01, p1=3e-4, k3=1e-3, k4=0.15, k5=2e-3, k6=1e-5),
     "fisheye": OpenCVFisheyeLens(type="opencv_fisheye", k1=-0.03, k2=0.004, k3=-1e-3, k4=1e-4),
 }
 

@@ -133,7 +133,7 @@ def test_models_see_the_documented_pixels(tmp_path: Path, name: str) -> None:
         np.testing.assert_allclose(pixels(block, X), [fx * xd + p["cx"] - 0.5, fy * yd + p["cy"] - 0.5], atol=1e-8)
 
 
-@pytest.mark.parametrize("lens", ["none", "brown", "opencv", "rational", "fisheye"])
+@pytest.mark.parametrize("lens", ["none", "brown", "brown with affinity", "opencv", "rational", "fisheye"])
 def test_round_trip(tmp_path: Path, lens: str) -> None:
     block = block_of({"x": frame(lens), "y": frame("opencv")}, middle=(100.0, 200.0, 90.0))
     again = round_trip(block, tmp_path / "sparse", "colmap")

@@ -212,7 +212,7 @@ def test_no_position_at_all_is_said(tmp_path: Path) -> None:
     np.testing.assert_allclose(block.table.centers[1], camera_transform(1)[:3, 3], atol=1e-12)
 
 
-@pytest.mark.parametrize("lens", ["none", "brown", "brown with shear", "opencv", "fisheye"])
+@pytest.mark.parametrize("lens", ["none", "brown", "brown with affinity", "brown with shear", "opencv", "fisheye"])
 def test_round_trip_of_lenses(tmp_path: Path, lens: str) -> None:
     block = block_of({"cam <1> & 2": frame(lens)})
     again = round_trip(block, tmp_path / "cameras.xml", "metashape")

@@ -111,7 +111,7 @@ def test_shots_round_trip(tmp_path: Path) -> None:
         write_orientation(block_of({"a": frame()}), tmp_path / "b.geojson", "odm")
 
 
-@pytest.mark.parametrize("lens", ["none", "brown", "opencv", "fisheye"])
+@pytest.mark.parametrize("lens", ["none", "brown", "brown with affinity", "opencv", "fisheye"])
 def test_reconstruction_written_sees_the_same_pixels(tmp_path: Path, lens: str) -> None:
     """Projected with OpenSfM's definition from the written numbers, and with photoplan's camera from the block."""
     block = with_table(block_of({"a": frame(lens)}, middle=(30.0, -20.0, 90.0)), origin=(46.84, -91.99, 150.0))
