@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -87,9 +88,13 @@ def _figures(report: AdjustReport) -> list[str]:
     return lines
 
 
+def _sigmas(normalised: float) -> str:
+    return f", {abs(normalised):.1f} sigma" if math.isfinite(normalised) else ""
+
+
 def _talk(report: AdjustReport) -> list[str]:
     f = report.facts
-    lines = [f"gross error: {m.what}: {m.residual}, {abs(m.normalised):.1f} sigma" for m in f.gross[:_SHOWN]]
+    lines = [f"gross error: {m.what}: {m.residual}{_sigmas(m.normalised)}" for m in f.gross[:_SHOWN]]
     if len(f.gross) > _SHOWN:
         lines.append(f"and {len(f.gross) - _SHOWN} more gross errors; all are in report.json")
     if f.left_out:

@@ -42,7 +42,7 @@ _SETTLED = 1e-9
 #: Rounds of data snooping, and of variance components.
 _ROUNDS, _COMPONENTS = 8, 6
 #: Damping (part of the diagonal) after a step that made things worse, and when to give up.
-_FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e6
+_FIRST_DAMPING, _MOST_DAMPING = 1e-8, 1e6
 
 
 def adjust_block(block: Block, settings: AdjustSettings | None = None, progress: Progress | None = None) -> Adjusted:

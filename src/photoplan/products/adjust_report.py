@@ -25,7 +25,7 @@ from photoplan.report.adjust_facts import (
     MeasurementFacts,
     StripFacts,
 )
-from photoplan.report.check_points import check_accuracy
+from photoplan.report.check_points import CheckAccuracy, check_accuracy
 
 __all__ = ["build_facts", "point_layers"]
 
@@ -43,7 +43,6 @@ def build_facts(title: str, result: MapResult, settings: AdjustSettings, seconds
     inputs, project = prepared.inputs, prepared.inputs.project
     used = np.isfinite(adjusted.residuals).all(axis=1) & ~adjusted.rejected
     ground = ground_facts(result)
-    check = [g for g in ground if g.check and np.isfinite(g.residual).any()]
     names = {g.name for g in ground}
     tie = np.array([name not in names for name in adjusted.points], bool)
     sigma = np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2))
@@ -67,13 +66,8 @@ def build_facts(title: str, result: MapResult, settings: AdjustSettings, seconds
         groups=tuple(GroupFacts(g.name, g.count, g.redundancy, g.rms, g.unit, g.factor) for g in adjusted.groups),
         images=_images(result, used),
         ground=ground,
-        check=check_accuracy(np.array([g.residual for g in check]), np.array([g.stated for g in check]))
-        if check
-        else None,
-        cameras=tuple(
-            CalibrationFacts(c.name, c.parameters, c.units, c.before, c.after, c.sigma, c.correlation)
-            for c in result.cameras
-        ),
+        check=_check(ground),
+        cameras=_cameras(result),
         strips=_strips(result),
         lever_arm=None
         if inputs.positions is None
@@ -116,6 +110,20 @@ def _advice(result: MapResult, used: NDArray[np.bool_]) -> list[str]:
     if alone:
         out.append(f"{len(alone)} images have no measured point; their orientation is the observed one: {some(alone)}")
     return out
+
+
+def _check(ground: Sequence[GroundFacts]) -> CheckAccuracy | None:
+    check = [g for g in ground if g.check and np.isfinite(g.residual).any()]
+    if not check:
+        return None
+    return check_accuracy(np.array([g.residual for g in check]), np.array([g.stated for g in check]))
+
+
+def _cameras(result: MapResult) -> tuple[CalibrationFacts, ...]:
+    return tuple(
+        CalibrationFacts(c.name, c.parameters, c.units, c.before, c.after, c.sigma, c.correlation)
+        for c in result.cameras
+    )
 
 
 def _triple(values: _Floats) -> Triple:

@@ -252,13 +252,14 @@ def _observations(request: InitRequest) -> dict[str, Any]:
         if files:
             entries[key] = [_present(file, request.folder) for file in files]
     if request.positions is not None:
-        entries["positions"] = _present(request.positions, request.folder)
+        entries["positions"] = _present(request.positions, request.folder, or_folder=True)
     return entries
 
 
-def _present(file: Path, folder: Path) -> str:
+def _present(file: Path, folder: Path, *, or_folder: bool = False) -> str:
+    """Path from the project; positions may be a folder, of images that state them."""
     check_input_name(str(file))
-    if not file.is_file():
+    if not (file.is_file() or (or_folder and file.is_dir())):
         raise InputError(f"{file}: no such file; give the measurements that exist, or add them to the project later")
     return relative_path(file.absolute(), folder)
 
