@@ -22,6 +22,8 @@ __all__ = ["Style", "arc", "block", "curve", "notch", "triangle"]
 
 _STEPS = 40
 """Pieces of an arc."""
+_BELOW = 0.5
+"""Part of the band of image that has frame below it."""
 _FAR = 1000.0
 """Beyond every window, millimetres."""
 
@@ -189,14 +191,15 @@ def triangle(
     _check("triangle", far=far)
     if not 0 <= near < far or not 0 < (flanks[1] - flanks[0]) % 360 < 180:
         raise InputError(f"triangle: flanks {flanks}, near {near}, far {far}; an angle under 180° and near < far")
-    inner = 1.0 if inside_bright else 0.0
+    inner, below = (1.0 if inside_bright else 0.0), _BELOW * made.band
     bands = []
-    for degrees, sign in zip(flanks, (-1.0, 1.0), strict=True):
+    for degrees, left_is_outside in zip(flanks, (False, True), strict=True):
         a = math.radians(degrees)
-        along, across = np.array([math.cos(a), math.sin(a)]), sign * np.array([-math.sin(a), math.cos(a)])
-        p, q = near * along, far * along
-        out, into = (np.array([p, q, q + side * made.band * across, p + side * made.band * across]) for side in (1, -1))
-        bands += [MarkPart(out, 1.0 - inner), MarkPart(into, inner)]
+        p, q = ((r * math.cos(a), r * math.sin(a)) for r in (near, far))
+        sides = [(made.band, below), (0.0, made.band)]
+        for (wide, over), tone in zip(sides, (inner, 1.0 - inner), strict=True):
+            left, right = (over, wide) if left_is_outside else (wide, over)
+            bands.append(MarkPart(_rectangle(p, q, left, right), tone))
     points = np.concatenate([part.outline for part in bands])
     (x0, y0), (x1, y1) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
     return _finish("triangle", bands, (x0, y0, x1, y1), made)
@@ -266,19 +269,20 @@ def _silhouette(
     `unsure`: numbers of the vertices after and before which the outline is not known to be straight.
     """
     frame = np.concatenate([outline, [(_FAR * 2, _FAR * 2), (-_FAR * 2, _FAR * 2)]])
-    bands = [MarkPart(_rectangle(tuple(a), tuple(b), 0.0, style.band), 1.0) for a, b in itertools.pairwise(outline)]
+    pieces = [(tuple(a), tuple(b)) for a, b in itertools.pairwise(outline)]
+    # The dark reaches below the bright: where parts only touched, ground would shine through between them.
+    below = _BELOW * style.band
+    dark = [MarkPart(_rectangle(a, b, style.inside or below, below), 0.0) for a, b in pieces]
+    if style.inside is None:
+        dark.insert(0, MarkPart(frame, 0.0))
+    bands = [MarkPart(_rectangle(a, b, 0.0, style.band), 1.0) for a, b in pieces]
     at = [tuple(p) for p in outline[1:-1]] if corners is None else corners
     gone = [MarkPart(disc(2 * style.corner, (float(x), float(y))), math.nan) for x, y in at if style.corner > 0]
     for k in unsure or ():
         a, b = outline[k], outline[k + 1]
         if abs(a[1] - b[1]) < 1e-9:
             gone.append(MarkPart(_rectangle(tuple(a), tuple(b), style.corner, style.band), math.nan))
-    inner = [MarkPart(frame, 0.0)]
-    if style.inside is not None:
-        wide = style.inside
-        inner = [MarkPart(frame, math.nan)]
-        inner += [MarkPart(_rectangle(tuple(a), tuple(b), wide, 0.0), 0.0) for a, b in itertools.pairwise(outline)]
-    return _finish(name, [*bands, *inner, *gone, *extra], window, style)
+    return _finish(name, [*dark, *bands, *gone, *extra], window, style)
 
 
 def _finish(name: str, parts: list[MarkPart], window: tuple[float, float, float, float], style: Style) -> MarkPattern:

@@ -18,6 +18,9 @@ _LARGEST = 4096
 """Side of a template in pixels beyond which the scale must be wrong."""
 _SHARP = 0.5
 """Standard deviation in pixels of the area of a pixel, about what a scanner's pixel blurs."""
+_GRAIN = 0.8
+"""Standard deviation in pixels by which an example is smoothed: interpolation lowers its grain between pixels, and
+matching would be drawn there by a quarter of a pixel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +200,7 @@ def _draw(
 def _resample(
     example: MarkExample, matrix: NDArray[np.float64], shape: tuple[int, int], at: tuple[float, float]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Values and weights of an example, cubic; smoothed first where the scan's pixels are larger than the example's."""
+    """Values and weights of an example, cubic; smoothed first, more where the scan's pixels are larger than its own."""
     given = np.asarray(example.values, np.float64)
     valid = np.isfinite(given)
     if not valid.any() or np.ptp(given[valid]) == 0:
@@ -206,10 +209,9 @@ def _resample(
     known = valid.astype(np.float64)
     tones = np.where(valid, (given - low) / (high - low), 0.0)
     larger = 1 / (example.pixel_mm * np.sqrt(abs(np.linalg.det(matrix))))
-    if larger > 1:
-        sigma = _SHARP * np.sqrt(larger**2 - 1)
-        known = ndimage.gaussian_filter(known, sigma, mode="nearest")
-        tones = ndimage.gaussian_filter(tones, sigma, mode="nearest")
+    sigma = max(_GRAIN, _SHARP * np.sqrt(max(larger**2 - 1, 0.0)))
+    known = ndimage.gaussian_filter(known, sigma, mode="nearest")
+    tones = ndimage.gaussian_filter(tones, sigma, mode="nearest")
     rows, columns = np.indices(shape, dtype=np.float64)
     millimetres = np.stack([columns - at[0], rows - at[1]], axis=-1) @ np.linalg.inv(matrix).T
     column = example.reference[0] + millimetres[..., 0] / example.pixel_mm
