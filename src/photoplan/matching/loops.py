@@ -20,8 +20,8 @@ from photoplan.matching.tracks import Tracks
 
 __all__ = ["Loops", "close_loops", "latin_weights"]
 
-#: Side of the squares that are dealt out, pixels. Noise of neighbouring pixels is alike: with squares of 4 pixels a third
-#: of the effect of grain two pixels wide was missed, with 6 a seventh; larger ones leave too few for a patch.
+#: Side of the squares that are dealt out, pixels. Noise of neighbouring pixels is alike: with squares of 4 pixels, a
+#: third of the effect of grain two pixels wide was missed, with 6 a seventh; larger ones leave too few for a patch.
 SQUARE = 6
 #: The patch of the loops is larger than that of refinement by this: a third of it is used at a time.
 WIDER = 1.5
