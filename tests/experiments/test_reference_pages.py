@@ -103,7 +103,8 @@ def test_figures_of_linear_prediction_on_the_pages_are_those_of_the_code():
 
 def test_every_entry_of_the_project_file_is_explained():
     schema = json.loads(project_schema())
-    page = (DOCS / "reference" / "project-file.md").read_text("utf-8")
+    # What marks look like has a page of its own.
+    page = "".join((DOCS / "reference" / f"{name}.md").read_text("utf-8") for name in ("project-file", "marks"))
     tables = [schema, *schema["$defs"].values()]
     entries = {name for table in tables for name in table.get("properties", {})}
     headings = {"terrain", "orientation", "observations", "adjustment", "ortho", "cameras", "images"}

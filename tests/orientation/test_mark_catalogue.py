@@ -134,6 +134,19 @@ def test_a_silhouette_is_found_by_its_edges(kind: str, side: float, texture: flo
     assert rms(errors) <= limit, errors
 
 
+@pytest.mark.parametrize("inside", [None, 0.3])
+def test_frame_and_image_meet_without_a_seam(inside: float | None) -> None:
+    x, y = 0.37, -0.21
+    pattern = frame.block(2.6, 1.5, 1.6, 2.4, style=frame.Style(inside=inside))
+    drawn = render(pattern, matrix(7.0), blur_px=0.0, offset=(x, y))
+    whole = frame.block(2.6, 1.5, 1.6, 2.4).parts[0].outline
+    exact = 1 - coverage(whole @ matrix(7.0).T + np.array(drawn.reference), drawn.values.shape)
+    seen = drawn.weights > 0.99
+    edge = seen & (exact > 0.1) & (exact < 0.9)
+    assert edge.sum() > 100
+    assert np.abs(drawn.values - exact)[edge].max() < 1e-5
+
+
 def test_standard_deviations_of_edges_are_those_of_their_errors() -> None:
     rng = np.random.default_rng(3)
     pattern = silhouettes()["block"]

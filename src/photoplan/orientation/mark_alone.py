@@ -7,7 +7,7 @@ Here a single mark is sought whose scale and rotation are known to a few per cen
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,10 @@ _BLUNT = 0.1
 """Coarse correlations so near to the best do not decide between rotations."""
 _RMS = 1.5
 """Largest root mean square distance of the edge points from the description, pixels."""
+_QUARTERS = 0.06
+"""How much better a quarter of an example may correlate elsewhere; those of marks of another shape do by more."""
+_NEAR = 8
+"""Pixels about a place in which the quarters are sought."""
 _SURE = 1.0
 """Largest standard deviation of an accepted place, pixels."""
 
@@ -124,7 +128,13 @@ def find_mark(
     part, origin = _around(grey, render(pattern, turn, blur_px=0.0), at, _AROUND)
     fine = locate_mark(part, pattern, turn, negative=negative, blur_px=blur_px)
     second = max(t[3] / t[2] for _, t in likely if t[2] == top)
-    return _judged(pattern, fine, (fine.x + origin[0], fine.y + origin[1]), edges, second, least_correlation)
+    place = (fine.x + origin[0], fine.y + origin[1])
+    judged = _judged(pattern, fine, place, edges, second, least_correlation)
+    if isinstance(pattern, MarkExample) and judged.accepted:
+        apart = min(_disagreement(grey, render(pattern, each, negative=negative), place) for each in turned)
+        if apart > _QUARTERS:
+            return replace(judged, refused=f"its quarters lie elsewhere: they correlate better there by {apart:.2f}")
+    return judged
 
 
 def _nothing(why: str) -> AloneMark:
@@ -196,6 +206,22 @@ def _judged(
     elif not max(sx, sy) <= _SURE:
         refused = f"standard deviation of {max(sx, sy):.1f} px; {_SURE} px are allowed"
     return AloneMark(x, y, sx, sy, fine.correlation, second, method, refused, edges)
+
+
+def _disagreement(grey: NDArray[np.float32], template: Template, at: tuple[float, float]) -> float:
+    """How much better the worst quarter of a template correlates somewhere near than at a place; 1: not seen there."""
+    part, origin = _around(grey, template, at, _NEAR)
+    column, row = (round(at[k] - origin[k] - template.reference[k]) for k in (0, 1))
+    i, j = np.indices(template.values.shape)
+    lower, right = i >= template.values.shape[0] // 2, j >= template.values.shape[1] // 2
+    worst = 0.0
+    for quarter in (lower & right, lower & ~right, ~lower & right, ~lower & ~right):
+        piece = Template(template.values, template.weights * quarter, template.reference)
+        surface, _ = correlation_surface(part, piece, _SHARE)
+        here = surface[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+        if np.isfinite(surface).any():  # a quarter without contrast, or outside, says nothing
+            worst = max(worst, float(np.nanmax(surface) - np.nanmax(here)) if np.isfinite(here).any() else 1.0)
+    return worst
 
 
 def _turn(degrees: float) -> NDArray[np.float64]:
