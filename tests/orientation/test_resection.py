@@ -226,8 +226,44 @@ def test_three_points_need_an_approximate_pose_or_leave_several() -> None:
             alone = resect(points, AERIAL, NoLens())
             assert np.abs(alone.pose.center - pose.center).max() < 1e-4
         except GeometryError as error:
-            refused += "positions of the camera possible" in str(error)
+            refused += "3 points leave" in str(error)
     assert refused > 5
+
+
+@pytest.mark.parametrize("count", [4, 5])
+def test_few_noisy_points_never_give_another_pose(count: int) -> None:
+    rng = np.random.default_rng(1)
+    refused = 0
+    for k in range(100):
+        pose = aerial_pose(rng, tilt=0.03 if k % 2 else 0.2)
+        X = ground_below(rng, pose, count, 300.0)
+        points = measured(frame(pose), X, rng, 0.5)
+        t = tangents_of(AERIAL, NoLens(), points.xy)
+        try:
+            found = resect_direct(t, X, 0.5 / 7650.0).pose
+        except GeometryError as error:
+            refused += "positions of the camera possible" in str(error)
+            continue
+        assert np.abs(found.center - pose.center).max() < 60.0
+    assert refused <= 5
+
+
+def test_fault_16_a_fourth_point_beside_the_first_decides_nothing() -> None:
+    rng = np.random.default_rng(23)
+    refused = 0
+    for _ in range(10):
+        pose = aerial_pose(rng)
+        X = ground_below(rng, pose, 3, 100.0)
+        X = np.concatenate([X, X[:1] + np.array([0.05, 0.02, 0.0])])
+        try:
+            found = resect(measured(frame(pose), X, rng, 0.0), AERIAL, NoLens())
+            assert np.abs(found.pose.center - pose.center).max() < 1e-3
+        except GeometryError as error:
+            refused += "4 points leave" in str(error)
+    assert refused >= 4
+    same = measured(frame(pose), np.repeat(X[:1], 5, axis=0), rng, 0.0)
+    with pytest.raises(GeometryError, match="lie on one line"):
+        resect(same, AERIAL, NoLens())
 
 
 def test_fault_16_control_on_a_line() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations, islice
+from itertools import combinations, islice, product
 from math import comb
 
 import numpy as np
@@ -27,6 +27,10 @@ _JUDGES = 400
 _COLLINEAR = 1e-4
 #: With so few points another pose may fit as well; it is looked for.
 _FEW = 6
+#: Centres closer than this, in units of the points' extent, are one pose.
+_SAME = 2e-3
+#: A pose fits whose residuals are below this, in units of three standard deviations.
+_FITS = 4.0 / 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +89,7 @@ def resect_direct(
     cost = np.minimum((r / (3.0 * scale)) ** 2, 1.0).sum(axis=1)
     order = np.argsort(cost, kind="stable")
     around = None if near is None else Pose(near.center - origin, near.R_ground_camera)
-    pose = _best(R[order], centers[order], (t, X), scale, around)
+    pose = _best(R[order], centers[order], (t, X), scale, around, scale <= sigma)
     return _finished(pose, t, X, sigma, origin)
 
 
@@ -155,31 +159,41 @@ def _median_scale(r: Array) -> float:
     return least / float(np.sqrt(-2.0 * np.log1p(-share))) if np.isfinite(least) else 0.0
 
 
-def _best(R: Array, centers: Array, points: tuple[Array, Array], scale: float, near: Pose | None) -> Pose:
-    """The pose that fits best, of candidates in the order of their cost; several that fit are refused or told apart."""
+def _best(R: Array, centers: Array, points: tuple[Array, Array], scale: float, near: Pose | None, sure: bool) -> Pose:
+    """The pose that fits best, of candidates in the order of their cost.
+
+    Where the noise is known (`sure`) and the points are few, several poses may see all of them as they were measured:
+    then the one nearest to `near` is it, and without that none.
+    """
     t, X = points
     few = len(t) <= _FEW
     size = float(np.linalg.norm(X, axis=1).mean())
-    kept: list[tuple[float, Pose]] = []
-    for k in range(min(len(R), 60 if few else 5)):
+    kept: list[tuple[float, bool, Pose]] = []
+    # Noise of three points may grow at the others, so that few points are also adjusted all together.
+    limits = (4.0, np.inf) if few else (4.0,)
+    for k, limit in product(range(min(len(R), 60 if few else 5)), limits):
         pose = Pose(centers[k], R[k])
-        r = _distances(R[k : k + 1], centers[k : k + 1], t, X)[0]
-        inside = r < 4.0 * scale
+        inside = _distances(R[k : k + 1], centers[k : k + 1], t, X)[0] < limit * scale
         pose = polished_pose(pose, t, X, inside) if inside.sum() >= 3 else pose
-        r = _distances(pose.R_ground_camera[None], pose.center[None], t, X)[0]
-        cost = float(np.minimum((r / (3.0 * scale)) ** 2, 1.0).sum())
-        if all(np.linalg.norm(pose.center - other.center) > 1e-3 * size for _, other in kept):
-            kept.append((cost, pose))
-    if near is not None and few:
-        fitting = [(c, p) for c, p in kept if c <= min(x for x, _ in kept) + 1.0]
-        return min(fitting, key=lambda item: _apart(item[1], near, size))[1]
-    kept.sort(key=lambda item: item[0])
-    if len(t) == 3 and len(kept) > 1:
+        r = _distances(pose.R_ground_camera[None], pose.center[None], t, X)[0] / (3.0 * scale)
+        if (r < _FITS).all():
+            # One minimum is one pose, whichever points led there.
+            pose = polished_pose(pose, t, X, np.ones(len(t), bool), 20)
+        found = (float(np.minimum(r * r, 1.0).sum()), bool((r < _FITS).all()), pose)
+        same = [i for i, (_, _, other) in enumerate(kept) if np.linalg.norm(pose.center - other.center) < _SAME * size]
+        if not same:
+            kept.append(found)
+        elif found[0] < kept[same[0]][0]:
+            kept[same[0]] = found
+    fitting = [pose for _, fits, pose in kept if fits] if few and sure else []
+    if len(fitting) < 2:
+        return min(kept, key=lambda item: item[0])[2]
+    if near is None:
         raise GeometryError(
-            f"three points leave {len(kept)} positions of the camera possible; a fourth point or an approximate "
-            "orientation is needed"
+            f"{len(t)} points leave {len(fitting)} positions of the camera possible; a further point apart from these, "
+            "or an approximate orientation, is needed"
         )
-    return kept[0][1]
+    return min(fitting, key=lambda pose: _apart(pose, near, size))
 
 
 def _apart(a: Pose, b: Pose, size: float) -> float:

@@ -165,10 +165,8 @@ def _direct(task: _Task, interior: Interior, near: Pose | None) -> DirectPose:
     f = interior.c * _pixels_per_unit(interior)
     X = task.points.XYZ
     # What control adds to the noise, at a distance that is not known yet but of the order of the points' extent.
-    control = (
-        np.sqrt(np.trace(task.points.covariance, axis1=1, axis2=2) / 3.0)
-        / np.linalg.norm(X - X.mean(axis=0), axis=1).max()
-    )
+    extent = max(float(np.linalg.norm(X - X.mean(axis=0), axis=1).max()), 1e-9)
+    control = np.sqrt(np.trace(task.points.covariance, axis1=1, axis2=2) / 3.0) / extent
     sigma = float(np.median(np.hypot(task.points.sigma.mean(axis=1) / f, control)))
     return resect_direct(t, X, sigma, near)
 
