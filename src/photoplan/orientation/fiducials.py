@@ -26,6 +26,8 @@ FILM_MM = 0.005
 """What film deforms beside an affine transformation, at least; millimetres."""
 DEFORMED_MM = 0.1
 """Residuals in millimetres from which a mark may be a false one: office scanners leave 0.07."""
+RIVALS = 4
+"""Look-alikes that are named."""
 STATED_TOLERANCE = 0.03
 """Part by which the resolution that a file states may be wrong."""
 
@@ -70,7 +72,7 @@ class LocatedMark:
     correlation: float
     """With the template, at the nearest whole pixel."""
     method: str
-    """`matching` (least squares) or `paraboloid`."""
+    """`matching` (least squares), `paraboloid`, or `edges` where image content lies beside the mark."""
     paraboloid: tuple[float, float] | None
     """Column and row by the paraboloid (Behr 1989, eq. 4.4)."""
     matching: tuple[float, float] | None
@@ -163,12 +165,13 @@ def _search(
         found = search_placements(Search(scan, layout, turns, negatives, STATED_TOLERANCE), [known.pixel_mm])
         if found and _convincing(found[0], layout):
             return found, notes
-        notes.append(
-            f"pixels of {1000 * known.pixel_mm:.4g} µm, as stated, do not fit the marks; other sizes were tried"
-        )
     wide = search_placements(Search(scan, layout, turns, negatives), pixel_sizes(layout, scan.size))
     if known.pixel_mm is not None and not (wide and _convincing(wide[0], layout)):
         return found or wide, []
+    if known.pixel_mm is not None and abs(math.log(wide[0].pixel_mm / known.pixel_mm)) > STATED_TOLERANCE:
+        notes.append(
+            f"pixels of {1000 * known.pixel_mm:.4g} µm, as stated, do not fit the marks; other sizes were tried"
+        )
     return wide, notes
 
 
@@ -304,7 +307,10 @@ def _result(
             f"residuals of {np.abs(residuals).max():.0f} µm are more than film deforms: the scanner is not true, or "
             "one of the marks is something else (look at --pictures), or the calibration another camera's"
         )
-    for name, x, y, r in measured.placement.rivals:
+    rivals = sorted(measured.placement.rivals, key=lambda rival: -rival[3])
+    if len(rivals) > RIVALS:
+        said.append(f"{len(rivals)} places look like marks and are none; the first are named")
+    for name, x, y, r in rivals[:RIVALS]:
         said.append(
             f"another place looks like mark {names.get(name, name)!r}: ({x:.0f}, {y:.0f}), correlation {r:.2f}; "
             "it does not lie where the other marks say"

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.orientation.mark_drawn import draw
+from photoplan.orientation.mark_edges import fit_edges
 from photoplan.orientation.mark_layout import FILM, MarkLayout, Placement, fit_placement
 from photoplan.orientation.mark_locate import BLURS, Location, best_blur, locate_mark
 from photoplan.orientation.mark_search import Scan
@@ -24,6 +26,10 @@ _NEAR_PX = 3.0
 """Pixels from where the first measurement has a mark in which the second one seeks it."""
 _NEAR_MM = 0.35
 """Millimetres from a coarse candidate in which its mark is sought."""
+_KNOWN = (0.002, 0.002)
+"""Standard deviations of rotation (radians) and scale at a mark, once an affine transformation joins all marks."""
+_EDGES_USED, _EDGES_RMS, _EDGES_AGREE = 0.4, 1.5, 1.5
+"""Least share of a mark's edges that is seen, their largest distance and difference from the correlation, pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +63,8 @@ class _Look:
     least: float
     expected: NDArray[np.float64]
     radius: Mapping[str, float]
+    sigmas: tuple[float, float] = (0.035, 0.02)
+    """Standard deviations of rotation (radians) and scale of the matrix."""
 
 
 def measure_marks(scan: Scan, layout: MarkLayout, placement: Placement, least: float) -> Measured:
@@ -76,7 +84,7 @@ def measure_marks(scan: Scan, layout: MarkLayout, placement: Placement, least: f
         radius = dict.fromkeys(found, _NEAR_PX)
         for name, at in found.items():
             expected[layout.names.index(name)] = at.x, at.y
-        look = _Look(matrix, blur, placement.negative, least, expected, radius)
+        look = _Look(matrix, blur, placement.negative, least, expected, radius, _KNOWN)
         found, missed = _round(scan, layout, look, wide)
     _, expected = _refit(layout, placement, found)
     where = {name: (float(x), float(y)) for name, (x, y) in zip(layout.names, expected)}
@@ -134,7 +142,19 @@ def _locate(scan: Scan, layout: MarkLayout, k: int, look: _Look, radius: float) 
         )
     except InputError:
         return None
-    return at.moved(col, row)
+    return _by_edges(at, grey, pattern, look).moved(col, row)
+
+
+def _by_edges(at: Location, grey: NDArray[np.float32], pattern: MarkPattern | MarkExample, look: _Look) -> Location:
+    """The place by the mark's edges where image content lies beside it; as it was, if they do not confirm it."""
+    if not isinstance(pattern, MarkPattern) or not math.isnan(pattern.background) or not math.isfinite(at.x):
+        return at
+    fit = fit_edges(grey, pattern, look.matrix, (at.x, at.y), negative=look.negative, sigmas=look.sigmas)
+    if fit is None or fit.used < _EDGES_USED or fit.rms > _EDGES_RMS:
+        return at
+    if math.hypot(fit.x - at.x, fit.y - at.y) > _EDGES_AGREE + 3 * math.hypot(fit.sigma_x, fit.sigma_y):
+        return at
+    return replace(at, x=fit.x, y=fit.y, sigma_x=fit.sigma_x, sigma_y=fit.sigma_y, method="edges")
 
 
 def _blur(scan: Scan, layout: MarkLayout, look: _Look, found: Mapping[str, Location]) -> float:
