@@ -33,7 +33,7 @@ def test_a_block_is_adjusted(tmp_path: Path) -> None:
 def test_json_quiet_and_dry_run(photoplan: Here, tmp_path: Path) -> None:
     made = write_project(tmp_path / "block", Make(pixel_noise=0.3))
     before = made.project_text()
-    said = photoplan("adjust", made.path, "--dry-run", "--json", "-q", "--variance-components", "--critical", 5)
+    said = photoplan("adjust", made.path, "--dry-run", "--json", "-q", "--no-variance-components", "--critical", 5)
     assert said.code == 0, said.err
     assert said.err == ""
     found = json.loads(said.out)

@@ -284,7 +284,7 @@ def test_fault_17_gross_errors_are_named(tmp_path: Path) -> None:
     assert gross[0].what == f"point {point!r} in image {image.removesuffix('.tif')!r}"
     # Computed minus measured: rows were made too large.
     np.testing.assert_allclose(float(gross[0].residual.split()[1]), -40.0, atol=4.0)
-    kept = adjusted(made, robust=False, overwrite=True)
+    kept = adjusted(made, robust=False, variance_components=False, overwrite=True)
     assert kept.facts.gross == ()
     assert kept.facts.sigma0 > 2
 
@@ -417,6 +417,33 @@ def test_the_stated_calibration_is_used(tmp_path: Path) -> None:
     report = exactly(made)
     assert report.facts.cameras[0].parameters == ("c",)
     np.testing.assert_allclose(report.facts.cameras[0].after, 3600.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("where", ["project", "option"])
+def test_what_is_known_of_a_camera_beforehand_counts(tmp_path: Path, where: str) -> None:
+    """Known to a millionth of a pixel a wrong camera constant stays; hardly known it becomes what it is without."""
+    plain = write_project(tmp_path, Make(stated={"focal_px": 3597.0}))
+    free = adjusted(plain, robust=False, variance_components=False, calibrate=("c",)).facts.cameras[0].after[0]
+    assert abs(free - 3597.0) > 0.5
+    for sigma, expected in ((1e-6, 3597.0), (1e5, free)):
+        folder = tmp_path / str(sigma)
+        folder.mkdir()
+        made = write_project(folder, Make(stated={"focal_px": 3597.0}))
+        options = {}
+        if where == "project":
+            known = f'calibrate = {{ cam = ["c"] }}\nprior_sigma = {{ cam = {{ c = {sigma} }} }}'
+            edit(made.path, "[adjustment]", f"[adjustment]\n{known}")
+        else:
+            options["calibrate"] = (f"cam=c:{sigma}",)
+        report = adjusted(made, robust=False, variance_components=False, **options)
+        np.testing.assert_allclose(report.facts.cameras[0].after, expected, atol=1e-3)
+
+
+def test_a_standard_deviation_that_is_none_is_refused(tmp_path: Path) -> None:
+    made = write_project(tmp_path)
+    for text in ("c:x", "c:-1", "c:0", "c:nan"):
+        with pytest.raises(UsageError, match="no standard deviation; write c:5"):
+            adjusted(made, calibrate=(f"cam={text}",))
 
 
 def test_control_of_another_program(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ def image_of(entries: dict[str, Any]) -> Image:
 
 def started(entries: dict[str, Any], *free: str) -> tuple[BlockCamera, Interior]:
     interior = interior_of(described(entries), image_of(entries))
-    return block_camera("cam", described(entries), interior, free), interior
+    return block_camera("cam", described(entries), interior, dict.fromkeys(free)), interior
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ def block(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict,
     data = shared / "data" / "ign_borea"
     folder = tmp_path_factory.mktemp("ign")
     project = ign_project(folder, data, position_noise=0.1, attitude_noise_deg=0.01)
-    said, peak = peak_of("adjust", project, "--variance-components", "-q")
+    said, peak = peak_of("adjust", project, "-q")
     assert said.code == 0, said.err
     report = json.loads((folder / "adjustment" / "report.json").read_text())
     return report, project, peak, published(data)

@@ -161,6 +161,8 @@ class Adjustment(Entry):
 
     calibrate: dict[Name, tuple[Parameter, ...]] = Field(default_factory=dict)
     """Parameters of each camera that are unknowns."""
+    prior_sigma: dict[Name, dict[Parameter, Positive]] = Field(default_factory=dict)
+    """Standard deviations with which parameters are known beforehand, by camera."""
     lever_arm: Triple = (0.0, 0.0, 0.0)
     """Antenna minus projection centre in camera axes (x right, y up, z towards the viewer), metres."""
     lever_arm_sigma: NotNegative = 0.0

@@ -139,6 +139,7 @@ def _adjustment(adjustment: Adjustment) -> list[str]:
         return []
     comments = {
         "calibrate": "parameters of each camera that are unknowns: c, x0, y0, k1 …",
+        "prior_sigma": "standard deviations with which they are known beforehand",
         "lever_arm": "antenna minus projection centre in camera axes, metres",
         "lever_arm_sigma": "its standard deviation; 0: held fixed",
         "drift": '"none", "shift" or "linear" for each strip',

@@ -35,6 +35,7 @@ _Floats = NDArray[np.float64]
 
 #: Largest step at the end, in units of each unknown's own standard deviation (the others fixed).
 _CONVERGED = 1e-3
+_ROUNDING = 1e-6
 #: The same for the robust start, and its least number of iterations.
 _ROUGHLY, _LEAST = 0.5, 8
 #: Largest relative change of the sum of squares at the end.
@@ -178,7 +179,8 @@ class _Loop:
             self._progress(self.count, float(np.sqrt(after / max(1.0, float((weight > 0).sum())))))
             largest = float(np.abs(step / reduced.scale).max()) if len(step) else 0.0
             settled = abs(cost - after) <= _SETTLED * after or after < 1e-18 * len(e)
-            if damping == 0.0 and (largest < _CONVERGED or settled) and not robust:
+            # A damped step is short for that reason alone, unless rounding is all that is left.
+            if not robust and ((damping == 0.0 and (largest < _CONVERGED or settled)) or largest < _ROUNDING):
                 return state
             if robust and turn >= _LEAST and largest < _ROUGHLY:
                 return state

@@ -35,6 +35,8 @@ _SOFT = 3.0
 _HUBER = 5
 #: Where the weights begin to fall, in standard deviations.
 _HUBER_LIMIT, _FALL = 2.0, 3.0
+#: Image points are not judged by less than this part of their stated standard deviation, however small residuals are.
+_BEST = 0.05
 #: An observation that was taken out comes back when its residual is below this part of the critical value.
 _BACK = 0.75
 
@@ -115,7 +117,7 @@ def robust_scale(e: _Floats, kind: tuple[str, str]) -> float:
     e = e[np.isfinite(e)]
     if len(e) < 20:
         return 1.0
-    return max(1.4826 * float(np.median(np.abs(e))), 1e-9 if kind[1] == "px" else 1.0)
+    return max(1.4826 * float(np.median(np.abs(e))), _BEST if kind[1] == "px" else 1.0)
 
 
 def robust_weights(model: Model, e: _Floats, turn: int) -> _Floats:

@@ -17,6 +17,8 @@ __all__ = ["Solution", "solution_of"]
 
 _Floats = NDArray[np.float64]
 
+#: Smallest variance factor: data without noise would otherwise get weights that no arithmetic bears.
+_LEAST = 0.02
 #: Redundancy from which the variance factor of a group is worth estimating.
 _ENOUGH = 10.0
 
@@ -83,7 +85,7 @@ class Solution:
         for k in range(len(kinds)):
             mine = (of == k) & (w > 0)
             if mine.any() and (total := float(r[mine].sum())) > _ENOUGH:
-                out[k] = max(float(np.sqrt((e[mine] ** 2).sum() / total)), 1e-6)
+                out[k] = max(float(np.sqrt((e[mine] ** 2).sum() / total)), _LEAST)
         return out
 
 

@@ -29,7 +29,7 @@ from photoplan.products.adjust_block import (
     map_result,
     prepare,
 )
-from photoplan.products.adjust_cameras import camera_entries, parse_calibrate
+from photoplan.products.adjust_cameras import Free, camera_entries, parse_calibrate
 from photoplan.products.adjust_inputs import AdjustInputs, read_inputs
 from photoplan.products.adjust_json import facts_json
 from photoplan.products.adjust_report import build_facts, point_layers
@@ -58,7 +58,8 @@ class AdjustRequest:
     """Names or patterns; empty: all."""
     robust: bool = True
     critical: float = 4.0
-    variance_components: bool = False
+    variance_components: bool = True
+    """Whether each group of observations gets the accuracy that its residuals show."""
     output: Path | None = None
     """Folder; None: ``adjustment`` beside the project file."""
     dry_run: bool = False
@@ -135,10 +136,12 @@ def adjust_project(
     return _write(request, result, facts, data, plots)
 
 
-def _free(project: Project, options: Sequence[str]) -> dict[str, tuple[str, ...]]:
+def _free(project: Project, options: Sequence[str]) -> Free:
     if options:
         return parse_calibrate(options, list(project.cameras))
-    return {name: tuple(parameters) for name, parameters in project.adjustment.calibrate.items() if parameters}
+    known = project.adjustment.prior_sigma
+    stated = project.adjustment.calibrate.items()
+    return {name: {p: known.get(name, {}).get(p) for p in parameters} for name, parameters in stated if parameters}
 
 
 def _prepare_outputs(request: AdjustRequest, project: Project) -> AdjustPlots:

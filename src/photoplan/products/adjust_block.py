@@ -16,7 +16,7 @@ from photoplan.io.project_cameras import interior_of
 from photoplan.io.project_model import ANGLE_UNITS, Project
 from photoplan.orientation.block import Adjusted, AdjustSettings, Block, BlockCamera, BlockImage
 from photoplan.orientation.bundle import adjust_block
-from photoplan.products.adjust_cameras import Calibrated, block_camera, calibrated
+from photoplan.products.adjust_cameras import Calibrated, Free, block_camera, calibrated
 from photoplan.products.adjust_frame import BlockFrame, angle_derivatives, block_frame, make_bend, nadir_heights
 from photoplan.products.adjust_inputs import AdjustInputs
 
@@ -68,7 +68,7 @@ class MapResult:
     """Those that had unknowns."""
 
 
-def prepare(inputs: AdjustInputs, starts: Mapping[str, Pose], free: Mapping[str, Sequence[str]]) -> Prepared:
+def prepare(inputs: AdjustInputs, starts: Mapping[str, Pose], free: Free) -> Prepared:
     """The block of a project in its Cartesian system.
 
     Parameters
@@ -76,8 +76,8 @@ def prepare(inputs: AdjustInputs, starts: Mapping[str, Pose], free: Mapping[str,
     inputs : AdjustInputs
     starts : mapping
         Map pose of every image.
-    free : mapping
-        Parameters of cameras that are unknowns.
+    free : Free
+        Parameters of cameras that are unknowns, with what is known of them beforehand.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def prepare(inputs: AdjustInputs, starts: Mapping[str, Pose], free: Mapping[str,
         camera = project.cameras[image.camera]
         interior = interior_of(camera, image)
         if image.camera not in cameras:
-            cameras[image.camera] = block_camera(image.camera, camera, interior, free.get(image.camera, ()))
+            cameras[image.camera] = block_camera(image.camera, camera, interior, free.get(image.camera))
         pose = frame.pose(starts[image.name])
         images.append(BlockImage(image.name, image.camera, interior.plane_to_pixel, pose))
     unused = [name for name in free if name not in cameras]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +21,7 @@ from photoplan.io import camera_model as described
 from photoplan.io.project_cameras import lens_of
 from photoplan.orientation.block import PARAMETERS, AdjustedCamera, BlockCamera
 
-__all__ = ["Calibrated", "block_camera", "calibrated", "camera_entries", "parse_calibrate"]
+__all__ = ["Calibrated", "Free", "block_camera", "calibrated", "camera_entries", "parse_calibrate"]
 
 Description = described.FrameCamera | described.FilmCamera
 
@@ -56,15 +57,21 @@ class Calibrated:
             return self.covariance / np.outer(s, s)
 
 
-def parse_calibrate(options: Sequence[str], cameras: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Parameters of cameras from options ``CAMERA=c,x0,y0,k1``; the name may be left out where there is one camera.
+#: Parameters of each camera that are unknowns, with the standard deviation with which each is known beforehand.
+Free = dict[str, dict[str, float | None]]
+
+
+def parse_calibrate(options: Sequence[str], cameras: Sequence[str]) -> Free:
+    """Free parameters from options ``CAMERA=c:5,x0,y0,k1``; the name may be left out where there is one camera.
+
+    A number after a colon is the standard deviation with which the parameter is known beforehand.
 
     Raises
     ------
     UsageError
-        A camera is not in the project, or a parameter is unknown.
+        A camera is not in the project, a parameter is unknown, or a standard deviation is not positive.
     """
-    found: dict[str, tuple[str, ...]] = {}
+    found: Free = {}
     for option in options:
         name, equals, listed = option.rpartition("=")
         if not equals and len(cameras) == 1:
@@ -74,7 +81,8 @@ def parse_calibrate(options: Sequence[str], cameras: Sequence[str]) -> dict[str,
                 f"--calibrate {option!r}: cameras of the project are {', '.join(map(repr, cameras))}; write "
                 "CAMERA=c,x0,y0,k1"
             )
-        parameters = tuple(dict.fromkeys(p.strip() for p in listed.split(",") if p.strip()))
+        parts = [p.partition(":") for p in listed.split(",") if p.strip()]
+        parameters = {p.strip(): _prior(option, colon, sigma) for p, colon, sigma in parts}
         unknown = [p for p in parameters if p not in PARAMETERS]
         if unknown or not parameters:
             raise UsageError(f"--calibrate {option!r}: {unknown[:1] or 'nothing'}; allowed are {', '.join(PARAMETERS)}")
@@ -82,7 +90,21 @@ def parse_calibrate(options: Sequence[str], cameras: Sequence[str]) -> dict[str,
     return found
 
 
-def block_camera(name: str, camera: Description, interior: Interior, free: Sequence[str]) -> BlockCamera:
+def _prior(option: str, colon: str, text: str) -> float | None:
+    if not colon:
+        return None
+    try:
+        sigma = float(text)
+    except ValueError:
+        sigma = math.nan
+    if not (math.isfinite(sigma) and sigma > 0):
+        raise UsageError(f"--calibrate {option!r}: {text!r} is no standard deviation; write c:5 for ± 5")
+    return sigma
+
+
+def block_camera(
+    name: str, camera: Description, interior: Interior, free: Mapping[str, float | None] | None = None
+) -> BlockCamera:
     """A camera of the block.
 
     Parameters
@@ -93,14 +115,17 @@ def block_camera(name: str, camera: Description, interior: Interior, free: Seque
         Its description in the project.
     interior : Interior
         Interior orientation of one of its images.
-    free : sequence of str
-        Parameters that are unknowns, by the names that the project's lens gives them.
+    free : mapping, optional
+        Parameters that are unknowns, by the names that the project's lens gives them, each with the standard deviation
+        with which it is known beforehand (None: not at all): c, x0, y0 in the project's unit, coefficients of the lens
+        for image coordinates divided by c.
 
     Raises
     ------
     UsageError
         The lens is not described by the coefficients that should be free.
     """
+    free = free or {}
     lens = lens_of(camera)
     own = [p for p in free if p not in INTERIOR]
     if own and isinstance(lens, Reversed):
@@ -116,9 +141,12 @@ def block_camera(name: str, camera: Description, interior: Interior, free: Seque
     missing = [p for p in own if p in ("b1", "b2")]
     if missing and isinstance(lens, OpenCV):
         raise UsageError(f'camera {name!r}: an OpenCV lens has no {", ".join(missing)}; a lens of type "brown" has')
-    names = [_OPENCV.get(p, (p, 1.0))[0] if isinstance(lens, OpenCV) else p for p in free]
+    names = {_OPENCV.get(p, (p, 1.0))[0] if isinstance(lens, OpenCV) else p: sigma for p, sigma in free.items()}
     ordered = tuple(p for p in PARAMETERS if p in names)
-    return BlockCamera(interior.c, interior.principal_point, lens, ordered)
+    prior = {p: sigma for p, sigma in names.items() if sigma is not None}
+    if "c" in prior and _constant_in_pixels_of_mm(camera) and camera.camera_constant_mm is not None:
+        prior["c"] *= interior.c / camera.camera_constant_mm
+    return BlockCamera(interior.c, interior.principal_point, lens, ordered, prior)
 
 
 def calibrated(camera: Description, start: BlockCamera, found: AdjustedCamera) -> Calibrated:

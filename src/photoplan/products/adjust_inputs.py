@@ -16,6 +16,7 @@ from photoplan.io.ground_points import read_ground_points
 from photoplan.io.image_points import named_as, read_image_points
 from photoplan.io.names import match_key
 from photoplan.io.observed_positions import PositionTable, read_observed_positions
+from photoplan.io.orientation_exif import image_files
 from photoplan.io.orientation_table import TableFormat, angle_in_radians
 from photoplan.io.project_model import Image, Project
 from photoplan.products.init_match import some
@@ -77,7 +78,7 @@ def read_inputs(project: Project, names: Sequence[str]) -> AdjustInputs:
         notes.append(f"{len(unmeasured)} ground points are measured in no image: {some(unmeasured)}")
     table = _positions(project, names, notes)
     if table is not None:
-        files.append(table.path)
+        files += image_files(table.path)
     positions = None if table is None else table.positions(observations.sigma_position)
     unit = project.orientation.angle_unit
     sigma = None if observations.sigma_attitude is None else observations.sigma_attitude

@@ -88,7 +88,7 @@ def _found(inputs: AdjustInputs, known: Mapping[str, Pose]) -> tuple[dict[str, P
     for image in inputs.images:
         camera = project.cameras[image.camera]
         interior = interior_of(camera, image)
-        cameras.setdefault(image.camera, block_camera(image.camera, camera, interior, ()))
+        cameras.setdefault(image.camera, block_camera(image.camera, camera, interior))
         pose = frame.pose(known[image.name]) if image.name in known else None
         images.append(StartImage(image.name, image.camera, interior.plane_to_pixel, pose))
     full = ground.where(np.isfinite(ground.XYZ).all(axis=1))

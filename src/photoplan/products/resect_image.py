@@ -168,7 +168,7 @@ def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -
     camera = None
     entries: dict[str, Any] = {}
     if found.free:
-        start = block_camera(image.camera, described, interior, found.free)
+        start = block_camera(image.camera, described, interior, dict.fromkeys(found.free))
         adjusted = AdjustedCamera(
             image.camera, found.interior.c, found.interior.principal_point, lens, found.free, found.covariance[6:, 6:]
         )
