@@ -63,6 +63,9 @@ def test_matches_are_mutual_and_clear() -> None:
     a, b = features(base), features(base[::-1] + 0.03 * rng.random((30, 128)))
     found = match_features(a, b)
     assert found.tolist() == [[i, 29 - i] for i in range(30)]
+    # Two features of a that are most like the same one of b: the more similar one has it.
+    rival = features(np.vstack([base, base[:1] + 0.15 * rng.random((1, 128))]))
+    assert match_features(rival, b).tolist() == [[i, 29 - i] for i in range(30)]
     # The same thing twice in b is no match any more, unless it is one place with two directions.
     twice = np.vstack([b.descriptors, b.descriptors[:1]]).astype(float)
     apart = features(twice, np.vstack([b.xy, b.xy[:1] + 50]))
@@ -119,6 +122,16 @@ def test_without_cameras_too(relief: float) -> None:
     a, b, right = view(relief, 7, 50, noise=0.2)
     fits = verify_pair((a, b), (None, None), VerifySettings(threshold=4.0))
     assert fits[right].mean() > 0.9 and fits[~right].sum() <= 5
+
+
+def test_on_flat_ground_matches_shifted_along_their_epipolar_line_go_too() -> None:
+    """No epipolar line shows them; the homography of flat ground does, where cameras are not known."""
+    rng = np.random.default_rng(6)
+    a = rng.uniform(0, [2000, 1500], (120, 2))
+    b = a - (400.0, 0.0) + rng.normal(0, 0.2, a.shape)
+    b[:20, 0] += rng.uniform(30, 200, 20)
+    fits = verify_pair((a, b), (None, None), VerifySettings())
+    assert fits[20:].mean() > 0.95 and fits[:20].sum() == 0
 
 
 def test_unrelated_images_are_not_verified() -> None:

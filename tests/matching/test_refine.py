@@ -97,6 +97,17 @@ def test_wrong_matches_are_left_out() -> None:
     assert gross.sum() <= 1  # of 20: a place that happens to look alike
 
 
+def test_patches_that_are_not_alike_enough_are_left_out() -> None:
+    start, _ = tracks(40, 0.3)
+    images = pictures(8.0)
+    all_ = refine_tracks(start, images, RefineSettings())
+    assert all_.unlike == 0 and 0.85 < all_.correlation < 0.97
+    some = refine_tracks(start, images, RefineSettings(correlation=all_.correlation))
+    assert 30 <= some.unlike <= 50 and some.tracks.count < 40
+    none = refine_tracks(start, images, RefineSettings(sigma=0.01))
+    assert none.tracks.count == 0 and none.uncertain >= 60 and none.uncertain + none.unsettled == 80
+
+
 def test_patches_at_the_edge_and_on_invalid_pixels_are_left_out() -> None:
     images = pictures(1.0)
     values = images[1].pixels.values

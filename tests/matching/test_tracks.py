@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -82,10 +84,18 @@ def cloud(count: int, seed: int, images: tuple[int, ...], first: int = 0, **box:
 
 
 def test_long_tracks_are_kept_first() -> None:
-    t = tracks_of(cloud(2000, 1, (0, 1)) + cloud(60, 2, (0, 1, 2, 3), first=2000))
+    short = cloud(2000, 1, (0, 1)) + cloud(2000, 7, (2, 3), first=2000)
+    t = tracks_of(short + cloud(60, 2, (0, 1, 2, 3), first=4000))
     keep = thin_tracks(t, [SIZE] * 4, 250)
-    assert keep[2000:].all()
-    assert 250 <= keep.sum() < 500
+    assert keep[4000:].all()
+    assert 400 <= keep.sum() < 1000
+
+
+def test_of_equally_long_tracks_the_more_accurate_ones_are_kept() -> None:
+    t = tracks_of(cloud(2000, 8, (0, 1)))
+    sigma = np.random.default_rng(9).uniform(0.05, 0.2, t.count)
+    keep = thin_tracks(replace(t, sigma=np.repeat(sigma[t.track], 2).reshape(-1, 2)), [SIZE] * 2, 250)
+    assert sigma[keep].mean() < 0.09 < 0.12 < sigma[~keep].mean()
 
 
 def test_points_are_spread_and_about_as_many_as_wanted() -> None:
@@ -99,11 +109,12 @@ def test_points_are_spread_and_about_as_many_as_wanted() -> None:
 
 
 def test_every_sixth_of_an_overlap_keeps_points_where_there_are_some() -> None:
-    """Two strips: many long tracks fill the cells, the pair (0, 2) has few short ones near one edge."""
-    long = cloud(4000, 5, (0, 1, 3))
+    """Two strips: long tracks fill the cells of both images, the pair (0, 2) has few short ones near one edge."""
+    long = cloud(2000, 5, (0, 1, 3)) + cloud(2000, 10, (2, 4, 5), first=2000)
     edge = cloud(40, 6, (0, 2), first=4000, low=np.array([0.0, 700.0]), high=np.array([1000.0, 800.0]))
     t = tracks_of(long + edge)
-    keep = thin_tracks(t, [SIZE] * 4, 100)
+    keep = thin_tracks(t, [SIZE] * 6, 100)
     xy = t.xy[(t.image == 0) & (t.track >= 4000)]
     kept = xy[keep[4000:]]
+    assert len(kept) < 25
     assert np.histogram(kept[:, 0], bins=3, range=(0, 1000))[0].min() >= GRUBER

@@ -21,6 +21,8 @@ __all__ = ["FeatureSettings", "Features", "extract_features", "opencv"]
 
 #: A descriptor's numbers are kept as bytes, this many to one: their squares sum up to its square.
 DESCRIPTOR_UNIT = 512.0
+#: Parts that are worked on are not smaller than this, reduced pixels.
+_LEAST_TILE = 128
 #: Pixels (reduced) around a tile that its features may use.
 _MARGIN = 96
 #: The image is divided into this many cells along each side, which get an equal share of the features.
@@ -38,7 +40,7 @@ class FeatureSettings:
     contrast: float = 0.015
     """Least contrast of a feature, part of the range of grey values."""
     tile: int = 2048
-    """Side of the parts that are worked on at once, reduced pixels."""
+    """Side of the parts that are worked on at once, pixels of the full image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +96,7 @@ def extract_features(image: GreyImage, settings: FeatureSettings) -> Features:
     )
     width, height = (s // settings.factor for s in image.size)
     parts = []
-    for core in Window(0, 0, width, height).tiles(settings.tile):
+    for core in Window(0, 0, width, height).tiles(max(_LEAST_TILE, settings.tile // settings.factor)):
         part = _tile_features(cv2, sift, image, core, limits, settings)
         parts.append(_spread(part, settings, image.size, share=2.0))
     return _spread(_joined(parts), settings, image.size)
