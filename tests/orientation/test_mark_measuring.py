@@ -40,12 +40,13 @@ def test_paraboloid_is_exact_on_a_paraboloid() -> None:
     assert max(top.sigma_x, top.sigma_y) < 1e-9
 
 
-def test_paraboloid_standard_deviations_tell_its_spread() -> None:
+@pytest.mark.parametrize(("dx", "dy"), [(0.2, -0.1), (1.5, -1.3)])
+def test_paraboloid_standard_deviations_tell_its_spread(dx: float, dy: float) -> None:
     rng = np.random.default_rng(2)
     Y, X = np.mgrid[:7, :7].astype(float)
-    surface = 0.9 - 0.02 * (X - 3.2) ** 2 - 0.03 * (Y - 2.9) ** 2
+    surface = 0.9 - 0.02 * (X - 3 - dx) ** 2 - 0.03 * (Y - 3 - dy) ** 2
     tops = [paraboloid_peak(surface + rng.normal(0, 0.002, surface.shape), 3, 3) for _ in range(400)]
-    normalised = [((t.x - 3.2) / t.sigma_x, (t.y - 2.9) / t.sigma_y) for t in tops if t is not None]
+    normalised = [((t.x - 3 - dx) / t.sigma_x, (t.y - 3 - dy) / t.sigma_y) for t in tops if t is not None]
     assert len(normalised) == 400
     assert 0.9 < np.std(normalised) < 1.1
 
