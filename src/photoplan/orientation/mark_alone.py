@@ -205,7 +205,7 @@ def _judged(
         refused = f"edges and correlation differ by {math.hypot(x - at[0], y - at[1]):.1f} px"
     elif not max(sx, sy) <= _SURE:
         refused = f"standard deviation of {max(sx, sy):.1f} px; {_SURE} px are allowed"
-    return AloneMark(x, y, sx, sy, fine.correlation, second, method, refused, edges)
+    return AloneMark(float(x), float(y), float(sx), float(sy), fine.correlation, second, method, refused, edges)
 
 
 def _disagreement(grey: NDArray[np.float32], template: Template, at: tuple[float, float]) -> float:
