@@ -189,7 +189,8 @@ class _Loop:
             return state
         raise GeometryError(
             f"the adjustment has not converged after {self._most} iterations (largest step {largest:.2g} standard "
-            "deviations); are all free parameters determined?"
+            "deviations). Are the start orientations about right, and all free parameters determined? Images that have "
+            "no start orientation are oriented from control and tie points"
         )
 
 

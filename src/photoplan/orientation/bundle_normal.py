@@ -78,6 +78,9 @@ def reduce_normals(rows: Rows, points: int, damping: float = 0.0) -> Reduced:
     e = rows.e[: len(at)]
     n_p = np.stack([np.bincount(at, P[:, k] * e, points) for k in range(3)], axis=-1).astype(float)
     V[:, range(3), range(3)] *= 1.0 + damping
+    # A point whose measurements have all lost their weight stays where it is.
+    with np.errstate(invalid="ignore"):
+        V[~(np.linalg.det(V) > 0.0)] = np.eye(3)
     V_inverse = np.asarray(np.linalg.inv(V), np.float64)
     N_gg = (rows.A_global.T @ rows.A_global).tocsc()
     N_pg = (rows.A_points.T @ rows.A_global).tocsr()
@@ -106,7 +109,10 @@ class Inverse:
     def __init__(self, reduced: Reduced) -> None:
         factor = reduced.factor
         if not np.array_equal(factor.perm_r, factor.perm_c):
-            raise GeometryError("the normal equations are not positive definite: the unknowns are not determined")
+            raise GeometryError(
+                "the normal equations are not positive definite: the unknowns are not determined. Are start "
+                "orientations, positions, image points and control of the same block?"
+            )
         self._order = factor.perm_c.astype(np.int64)
         self._scale = reduced.scale
         pattern = _pattern(reduced, self._order)

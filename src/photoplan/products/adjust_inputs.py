@@ -18,6 +18,7 @@ from photoplan.io.names import match_key
 from photoplan.io.observed_positions import PositionTable, read_observed_positions
 from photoplan.io.orientation_exif import image_files
 from photoplan.io.orientation_table import TableFormat, angle_in_radians
+from photoplan.io.project_cameras import image_size
 from photoplan.io.project_model import Image, Project
 from photoplan.products.init_match import some
 
@@ -130,9 +131,26 @@ def _image_points(
             f"{', '.join(str(path) for path, _ in parts)}: none of the images is in the project: measured are "
             f"{some(unknown)}; the project has {some(every)}"
         )
+    _refuse_outside(project, merged)
     if unknown:
         notes.append(f"{len(unknown)} images of the measurements are not in the project: {some(unknown)}")
     return _with_sigma(merged, project.observations.sigma_image)
+
+
+def _refuse_outside(project: Project, points: ImagePoints) -> None:
+    """Measurements outside their image, by more than half a pixel beyond its border: of another size, or exchanged."""
+    sizes = np.array([image_size(project.cameras[i.camera], i) for i in map(project.image, points.images)])
+    width_height = sizes[points.image]
+    outside = np.flatnonzero(((points.xy < -1.0) | (points.xy > width_height)).any(axis=1))
+    if len(outside):
+        k = int(outside[0])
+        width, height = width_height[k]
+        x, y = points.xy[k]
+        raise InputError(
+            f"{points.label(k)}: column {x:g}, row {y:g} lies outside the image of {width} × {height} pixels "
+            f"({len(outside)} of {len(points)} measurements do); were they measured in images of another size, or are "
+            "x and y exchanged?"
+        )
 
 
 def _with_sigma(points: ImagePoints, sigma: float) -> ImagePoints:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from photoplan.errors import GeometryError
+from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_from_angles
 from photoplan.io.orientation_table import angle_in_radians
@@ -20,6 +20,9 @@ from photoplan.products.adjust_inputs import AdjustInputs
 from photoplan.products.init_match import some
 
 __all__ = ["known_poses", "started"]
+
+#: Farther from its image, no control point is believed, metres.
+_SIGHT = 50e3
 
 
 def known_poses(inputs: AdjustInputs) -> dict[str, Pose]:
@@ -49,6 +52,7 @@ def started(inputs: AdjustInputs) -> tuple[AdjustInputs, dict[str, Pose]]:
         An interior orientation cannot be made (fiducial marks missing), or height systems cannot be joined.
     """
     known = known_poses(inputs)
+    _refuse_far(inputs, known)
     if len(known) == len(inputs.images):
         return inputs, known
     found, reasons = _found(inputs, known)
@@ -70,6 +74,22 @@ def started(inputs: AdjustInputs) -> tuple[AdjustInputs, dict[str, Pose]]:
         notes.append(f"{len(lost)} images could not be oriented and are left out: {some(lost)} ({why})")
     names = [image.name for image in images]
     return replace(inputs, images=images, points=inputs.points.of_images(names), notes=tuple(notes)), found
+
+
+def _refuse_far(inputs: AdjustInputs, known: Mapping[str, Pose]) -> None:
+    """Control beyond the sight of an image that measures it: of another place, CRS or unit."""
+    ground, points = inputs.ground, inputs.points
+    row = {name: k for k, name in enumerate(ground.names)}
+    for image, point in zip(points.image, points.point):
+        k, name = row.get(points.points[point], -1), points.images[image]
+        if k < 0 or ground.check[k] or name not in known:
+            continue
+        away = float(np.hypot(*(ground.XYZ[k, :2] - known[name].center[:2])))
+        if away > _SIGHT:
+            raise InputError(
+                f"control point {ground.names[k]!r} lies {away / 1000:.0f} km from image {name!r}, in which it is "
+                f"measured; are X and Y exchanged, or is it in another CRS or unit than {inputs.project.crs}?"
+            )
 
 
 def _found(inputs: AdjustInputs, known: Mapping[str, Pose]) -> tuple[dict[str, Pose], dict[str, str]]:
