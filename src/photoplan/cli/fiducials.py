@@ -45,8 +45,7 @@ def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any)
     from photoplan.products.fiducials import FiducialsRequest, locate_fiducials
 
     request = FiducialsRequest(scans, **_values(options))
-    with progress(0 if scans[0].suffix.lower() == ".toml" else len(scans), quiet, "images") as advance:
-        report = locate_fiducials(request, lambda _: advance(1, 0))
+    report = locate_fiducials(request, lambda total: progress(total, quiet, "images"))
     if as_json:
         click.echo(json.dumps(report.to_dict(), indent=2, ensure_ascii=False))
     for image in report.images:

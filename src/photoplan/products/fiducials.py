@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,8 +62,13 @@ class _Job:
     layout: MarkLayout
 
 
+def _unwatched(total: int) -> AbstractContextManager[Callable[[int, int], None]]:
+    return nullcontext(lambda images, pixels: None)
+
+
 def locate_fiducials(
-    request: FiducialsRequest, finished: Callable[[ImageFiducials | None], None] = lambda _: None
+    request: FiducialsRequest,
+    begin: Callable[[int], AbstractContextManager[Callable[[int, int], None]]] = _unwatched,
 ) -> FiducialsReport:
     """Find the fiducial marks of all images; one that fails does not stop the others.
 
@@ -70,8 +76,8 @@ def locate_fiducials(
     ----------
     request : FiducialsRequest
         What is asked.
-    finished : callable
-        Called after each image, with its result or None.
+    begin : callable
+        Gets the number of images; what it returns is entered, and called with (1, 0) after each image.
 
     Raises
     ------
@@ -86,16 +92,15 @@ def locate_fiducials(
     pixel_mm = sum(parse_pitch(request.scan_resolution)) / 2 if request.scan_resolution else None
     results: list[ImageFiducials] = []
     failed: dict[str, str] = {}
-    for job in jobs:
-        result = None
-        try:
-            result = _locate(request, job, pixel_mm, pictures, project is not None)
-            results.append(result)
-        except ResourceError:
-            raise
-        except PhotoplanError as error:
-            failed[job.name] = str(error)
-        finished(result)
+    with begin(len(jobs)) as advance:
+        for job in jobs:
+            try:
+                results.append(_locate(request, job, pixel_mm, pictures, project is not None))
+            except ResourceError:
+                raise
+            except PhotoplanError as error:
+                failed[job.name] = str(error)
+            advance(1, 0)
     written = None
     if project is not None and results and not request.dry_run:
         written = request.images[0]
