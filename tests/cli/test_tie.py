@@ -148,6 +148,7 @@ def test_pairs_of_a_file(photoplan: Here, project: Path, tmp_path: Path) -> None
         (["--scale", "0"], "a number from 0.01 to 1"),
         (["--features", "3"], "50 and 1 are the least"),
         (["--images", "nothing*"], "is not in the project"),
+        (["-o", "points.png"], "a table is written"),
     ],
 )
 def test_wrong_use(photoplan: Here, project: Path, options: list[str], message: str) -> None:

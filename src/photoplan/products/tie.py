@@ -25,6 +25,7 @@ from photoplan.matching.thin import thin_tracks
 from photoplan.matching.tracks import Tracks, TracksFound, build_tracks, connected_parts
 from photoplan.matching.verify import PairMatches, VerifySettings
 from photoplan.products.init_match import some
+from photoplan.products.scene import input_files
 from photoplan.products.tie_inputs import TieImage, chosen_pairs, open_images
 from photoplan.products.tie_picture import draw_ties
 from photoplan.products.tie_work import (
@@ -202,7 +203,10 @@ def _check(request: TieRequest, project: Project, names: Sequence[str]) -> Path:
         )
     opencv()
     output = request.output or request.project.resolve().parent / "tie_points.csv"
-    inputs = [request.project, *(project.resolve(project.image(n).file) for n in names)]
+    points = [project.resolve(file) for file in project.observations.image_points]  # an older run's among them
+    inputs = [request.project, *(file for file in input_files(project) if file not in points)]
+    if output.suffix.lower() in (".png", ".cache"):
+        raise UsageError(f"{output}: a table is written; give it a name such as tie_points.csv")
     if not request.dry_run:
         for path in (output, output.with_suffix(".png")):
             check_output(path, inputs, overwrite=request.overwrite)
