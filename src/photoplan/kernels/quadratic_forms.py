@@ -2,44 +2,49 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from photoplan.kernels.jit import kernel
 from photoplan.kernels.selected_inverse import lookup
 
-__all__ = ["gathered", "point_variances", "row_variances"]
+__all__ = ["SparseRows", "gathered", "point_variances", "row_variances"]
+
+
+class SparseRows(NamedTuple):
+    """Rows of a sparse matrix (CSR)."""
+
+    pointer: Any
+    columns: Any
+    values: Any
 
 
 @kernel
-def gathered(pointer, rows, diagonal, lower, index):
-    """Dense part of the selected inverse at `index` (m,) (numbers in the order of elimination), shape (m, m)."""
-    m = len(index)
+def gathered(Q, unknowns):
+    """Dense part of a `SelectedInverse` at `unknowns` (m,), shape (m, m)."""
+    m = len(unknowns)
     out = np.empty((m, m))
     for a in range(m):
         for b in range(a + 1):
-            out[a, b] = out[b, a] = lookup(pointer, rows, diagonal, lower, index[a], index[b])
+            out[a, b] = out[b, a] = lookup(Q, unknowns[a], unknowns[b])
     return out
 
 
 @kernel
-def row_variances(pointer, rows, diagonal, lower, order, A_pointer, A_columns, A_values, chosen):
-    """a Q aᵀ of rows `chosen` of a sparse matrix (CSR), shape (len(chosen),); `order` numbers its columns."""
+def row_variances(Q, A, chosen):
+    """a Q aᵀ of the rows `chosen` of `SparseRows` A, shape (len(chosen),)."""
     out = np.zeros(len(chosen))
     for r in range(len(chosen)):
-        begin, end = A_pointer[chosen[r]], A_pointer[chosen[r] + 1]
+        begin, end = A.pointer[chosen[r]], A.pointer[chosen[r] + 1]
         for a in range(begin, end):
-            i = order[A_columns[a]]
-            out[r] += A_values[a] ** 2 * diagonal[i]
-            for b in range(begin, a):
-                z = lookup(pointer, rows, diagonal, lower, i, order[A_columns[b]])
-                out[r] += 2.0 * A_values[a] * A_values[b] * z
+            for b in range(begin, end):
+                out[r] += A.values[a] * A.values[b] * lookup(Q, A.columns[a], A.columns[b])
     return out
 
 
 @kernel
-def point_variances(
-    pointer, rows, diagonal, lower, order, row_pointer, row_index, A_pointer, A_columns, A_values, P, V_inverse
-):
+def point_variances(Q, A, P, row_pointer, row_index, V_inverse):
     """Covariance of every point and the variance that the unknowns give to each of its rows.
 
     With the unknowns of a point eliminated, its change is −V⁻¹ (N_pg dx_g − …), so that
@@ -48,14 +53,14 @@ def point_variances(
 
     Parameters
     ----------
-    pointer, rows, diagonal, lower, order
-        Selected inverse Q of the reduced normal equations, and the place of each unknown in it.
-    row_pointer, row_index : int64 arrays
-        Rows of each point.
-    A_pointer, A_columns, A_values
-        The rows' part on unknowns that are not points (CSR).
+    Q : SelectedInverse
+        Of the reduced normal equations.
+    A : SparseRows
+        The rows' part on unknowns that are not points.
     P : float64 array, shape (rows, 3)
         The rows' part on their point.
+    row_pointer, row_index : int64 arrays
+        Rows of each point.
     V_inverse : float64 array, shape (points, 3, 3)
 
     Returns
@@ -66,41 +71,38 @@ def point_variances(
     m = len(row_pointer) - 1
     covariance = np.empty((m, 3, 3))
     variance = np.zeros(len(P))
-    mark = np.full(len(order), -1, np.int64)
-    union = np.empty(len(order), np.int64)
+    mark = np.full(len(Q.order), -1, np.int64)
+    union = np.empty(len(Q.order), np.int64)
     for p in range(m):
         count = 0
         for q in range(row_pointer[p], row_pointer[p + 1]):
-            for a in range(A_pointer[row_index[q]], A_pointer[row_index[q] + 1]):
-                if mark[A_columns[a]] < 0:
-                    mark[A_columns[a]] = count
-                    union[count] = A_columns[a]
+            for a in range(A.pointer[row_index[q]], A.pointer[row_index[q] + 1]):
+                if mark[A.columns[a]] < 0:
+                    mark[A.columns[a]] = count
+                    union[count] = A.columns[a]
                     count += 1
-        index = np.empty(count, np.int64)
-        for a in range(count):
-            index[a] = order[union[a]]
-        Q = gathered(pointer, rows, diagonal, lower, index)
+        dense = gathered(Q, union[:count])
         N = np.zeros((3, count))
         for q in range(row_pointer[p], row_pointer[p + 1]):
             r = row_index[q]
-            for a in range(A_pointer[r], A_pointer[r + 1]):
-                column = mark[A_columns[a]]
+            for a in range(A.pointer[r], A.pointer[r + 1]):
+                column = mark[A.columns[a]]
                 for k in range(3):
-                    N[k, column] += P[r, k] * A_values[a]
+                    N[k, column] += P[r, k] * A.values[a]
         C = V_inverse[p] @ N
-        QC = Q @ np.ascontiguousarray(C.T)
+        QC = dense @ np.ascontiguousarray(C.T)
         covariance[p] = V_inverse[p] + C @ QC
         for q in range(row_pointer[p], row_pointer[p + 1]):
             r = row_index[q]
             # (a_g − a_p C) Q (a_g − a_p C)ᵀ in parts: the first is sparse, the others are small.
             value = 0.0
-            begin, end = A_pointer[r], A_pointer[r + 1]
+            begin, end = A.pointer[r], A.pointer[r + 1]
             for a in range(begin, end):
-                i = mark[A_columns[a]]
+                i = mark[A.columns[a]]
                 for b in range(begin, end):
-                    value += A_values[a] * A_values[b] * Q[i, mark[A_columns[b]]]
+                    value += A.values[a] * A.values[b] * dense[i, mark[A.columns[b]]]
                 for k in range(3):
-                    value -= 2.0 * A_values[a] * QC[i, k] * P[r, k]
+                    value -= 2.0 * A.values[a] * QC[i, k] * P[r, k]
             for k in range(3):
                 for n in range(3):
                     value += P[r, k] * P[r, n] * covariance[p, k, n]

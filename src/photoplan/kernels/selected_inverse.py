@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from photoplan.kernels.jit import inner, kernel
 
-__all__ = ["aligned", "fill_pattern", "lookup", "selected_inverse"]
+__all__ = ["SelectedInverse", "aligned", "fill_pattern", "lookup", "selected_inverse"]
 
 
 @kernel
@@ -120,20 +122,33 @@ def selected_inverse(pointer, rows, L, D):
     return diagonal, lower
 
 
+class SelectedInverse(NamedTuple):
+    """Entries of the inverse at the pattern of the factor, with the numbers under which unknowns are eliminated."""
+
+    pointer: Any
+    """Columns of the strictly lower triangle (CSC)."""
+    rows: Any
+    diagonal: Any
+    lower: Any
+    order: Any
+    """Number of each unknown in the order of elimination."""
+
+
 @inner
-def lookup(pointer, rows, diagonal, lower, i, j):
-    """Entry (i, j) of the selected inverse; 0 where it was not computed."""
+def lookup(Q, a, b):
+    """Entry of unknowns a and b; 0 where it was not computed."""
+    i, j = Q.order[a], Q.order[b]
     if i == j:
-        return diagonal[i]
+        return Q.diagonal[i]
     if i < j:
         i, j = j, i
-    low, high = pointer[j], pointer[j + 1]
+    low, high = Q.pointer[j], Q.pointer[j + 1]
     while low < high:
         middle = (low + high) // 2
-        if rows[middle] < i:
+        if Q.rows[middle] < i:
             low = middle + 1
         else:
             high = middle
-    if low < pointer[j + 1] and rows[low] == i:
-        return lower[low]
+    if low < Q.pointer[j + 1] and Q.rows[low] == i:
+        return Q.lower[low]
     return 0.0

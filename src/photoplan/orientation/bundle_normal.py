@@ -11,8 +11,8 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
 from photoplan.errors import GeometryError
-from photoplan.kernels.quadratic_forms import gathered, point_variances, row_variances
-from photoplan.kernels.selected_inverse import aligned, fill_pattern, selected_inverse
+from photoplan.kernels.quadratic_forms import SparseRows, gathered, point_variances, row_variances
+from photoplan.kernels.selected_inverse import SelectedInverse, aligned, fill_pattern, selected_inverse
 from photoplan.orientation.bundle_rows import Rows
 
 __all__ = ["Inverse", "Reduced", "reduce_normals"]
@@ -113,35 +113,32 @@ class Inverse:
                 "the normal equations are not positive definite: the unknowns are not determined. Are start "
                 "orientations, positions, image points and control of the same block?"
             )
-        self._order = factor.perm_c.astype(np.int64)
-        self._scale = reduced.scale
-        pattern = _pattern(reduced, self._order)
-        self._pointer, self._rows = fill_pattern(pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64))
+        order = factor.perm_c.astype(np.int64)
+        pattern = _pattern(reduced, order)
+        pointer, rows = fill_pattern(pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64))
         L = factor.L.tocsc()
-        values = aligned(self._pointer, self._rows, L.indptr.astype(np.int64), L.indices.astype(np.int64), L.data)
-        self._diagonal, self._lower = selected_inverse(self._pointer, self._rows, values, factor.U.diagonal())
+        values = aligned(pointer, rows, L.indptr.astype(np.int64), L.indices.astype(np.int64), L.data)
+        diagonal, lower = selected_inverse(pointer, rows, values, factor.U.diagonal())
+        self._Q = SelectedInverse(pointer, rows, diagonal, lower, order)
         self._reduced = reduced
 
     def block(self, columns: NDArray[np.int64]) -> _Floats:
         """Cofactors of unknowns that occur together in an equation (or belong to one image), shape (m, m)."""
-        scale = self._scale[columns]
-        dense = gathered(self._pointer, self._rows, self._diagonal, self._lower, self._order[columns])
+        scale = self._reduced.scale[columns]
+        dense = gathered(self._Q, columns)
         return np.asarray(dense * scale[:, None] * scale[None, :])
 
     def variances(self) -> tuple[_Floats, _Floats]:
         """Cofactors of all points (m, 3, 3), and a Q aᵀ of all rows: 1 minus it is the redundancy number."""
         rows, reduced = self._reduced.rows, self._reduced
         at, P = _on_points(rows)
-        A = (rows.A_global @ sparse.diags(self._scale)).tocsr()
+        scaled = (rows.A_global @ sparse.diags(reduced.scale)).tocsr()
+        A = SparseRows(scaled.indptr.astype(np.int64), scaled.indices.astype(np.int64), scaled.data)
         order = np.argsort(at, kind="stable").astype(np.int64)
         pointer = np.searchsorted(at[order], np.arange(len(reduced.V_inverse) + 1)).astype(np.int64)
-        A_pointer, A_columns = A.indptr.astype(np.int64), A.indices.astype(np.int64)
-        inverse = (self._pointer, self._rows, self._diagonal, self._lower, self._order)
-        covariance, with_point = point_variances(
-            *inverse, pointer, order, A_pointer, A_columns, A.data, P, reduced.V_inverse
-        )
+        covariance, with_point = point_variances(self._Q, A, P, pointer, order, reduced.V_inverse)
         others = np.arange(len(at), len(rows.e))
-        return covariance, np.concatenate([with_point, row_variances(*inverse, A_pointer, A_columns, A.data, others)])
+        return covariance, np.concatenate([with_point, row_variances(self._Q, A, others)])
 
 
 def _pattern(reduced: Reduced, order: NDArray[np.int64]) -> sparse.csc_matrix:

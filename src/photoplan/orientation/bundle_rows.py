@@ -114,74 +114,84 @@ def linearise(model: Model, state: State, weight: _Floats) -> tuple[Rows, Residu
     """Equations at a state; `weight` (rows,) is the square root of each row's robust weight."""
     rays = _project(model, state, derivatives=True)
     found = _residuals(model, state, rays)
-    block, columns = model.block, model.columns
-    of_rows: list[tuple[_Floats, NDArray[np.int64], NDArray[np.int64]]] = []
-    k, c = len(model.image), len(model.ground)
+    entries = _Entries()
+    on_points = _image_rows(model, state, rays, entries)
+    at = _direct_rows(model, state, found, entries)
+    prior, at_columns, prior_white = _priors(model, state)
+    entries.parts.append((prior_white, at + np.arange(len(prior)), at_columns))
+    k, c = 2 * len(model.image), len(model.ground)
+    point = np.full(at + len(prior), -1, np.int64)
+    point[:k] = np.repeat(model.point, 2)
+    point[k : k + c] = model.ground_point
+    e = whitened(model, found)
+    e = np.where(weight > 0, e, 0.0) * weight
+    A_global = _matrix(entries.parts, weight, (len(point), model.columns.count))
+    row = np.repeat(np.arange(k + c), 3)
+    column = (3 * point[: k + c, None] + np.arange(3)).ravel()
+    values = np.concatenate([on_points, model.ground_white]).ravel()
+    A_points = _matrix([(values, row, column)], weight, (len(point), 3 * len(model.point_names)))
+    return Rows(e, A_global, A_points, point), found
 
-    def put(first_row: int, at: NDArray[np.int64], values: _Floats) -> None:
-        """Values (n, r, u) of n blocks of r rows, whose u columns begin at `at` (n,)."""
-        n, r, u = values.shape
-        row = first_row + np.arange(n * r).reshape(n, r, 1) + np.zeros((1, 1, u), np.int64)
-        column = at[:, None, None] + np.arange(u)[None, None, :] + np.zeros((1, r, 1), np.int64)
-        of_rows.append((values.ravel(), row.ravel(), column.ravel()))
 
+class _Entries:
+    """Entries of a sparse matrix while it is filled: values, rows, columns."""
+
+    def __init__(self) -> None:
+        self.parts: list[tuple[_Floats, NDArray[np.int64], NDArray[np.int64]]] = []
+
+    def put(self, rows: NDArray[np.int64], first: NDArray[np.int64], values: _Floats) -> None:
+        """Blocks `values` (n, r, u) on rows (n, r); the u columns of each block begin at `first` (n,)."""
+        column = first[:, None, None] + np.arange(values.shape[2])
+        row, column = np.broadcast_arrays(rows[:, :, None], column)
+        self.parts.append((values.ravel(), row.ravel(), column.ravel()))
+
+
+def _image_rows(model: Model, state: State, rays: _Rays, entries: _Entries) -> _Floats:
+    """Rows of image points: entries of orientations and cameras; returned: the coefficients of the points, (2k, 3)."""
+    k = len(model.image)
     white = 1.0 / model.sigma[:, :, None]
-    by_t = rays.outer @ rays.inner
     z = rays.p[:, 2]
     by_p = np.zeros((k, 2, 3))
     by_p[:, 0, 0] = by_p[:, 1, 1] = -1.0 / z
     by_p[:, :, 2] = -rays.t / z[:, None]
-    by_p = by_t @ by_p
-    R = state.rotations[model.image]
-    by_X = by_p @ np.swapaxes(R, 1, 2)
-    put(0, 6 * model.image, np.concatenate([-by_X, by_p @ skew(rays.p)], axis=2) * white)
+    by_p = rays.outer @ rays.inner @ by_p
+    by_X = by_p @ np.swapaxes(state.rotations[model.image], 1, 2)
+    rows = np.arange(2 * k).reshape(k, 2)
+    entries.put(rows, 6 * model.image, np.concatenate([-by_X, by_p @ skew(rays.p)], axis=2) * white)
     for index, (name, free) in enumerate(zip(model.camera_names, model.free)):
         mine = np.flatnonzero(model.camera_of[model.image] == index)
         if free and len(mine):
             J = _by_parameters(state.cameras[index], free, rays, mine) * white[mine]
-            rows = 2 * mine[:, None] + np.arange(2)
-            n, _, u = J.shape
-            row = np.repeat(rows[:, :, None], u, axis=2)
-            column = np.broadcast_to(columns.cameras[name] + np.arange(u), J.shape)
-            of_rows.append((J.ravel(), row.ravel(), np.ascontiguousarray(column).ravel()))
-    at = 2 * k + c
-    if block.positions is not None and len(model.position):
-        J_sigma = 1.0 / block.positions.sigma[model.position_row][:, :, None]
+            entries.put(rows[mine], np.full(len(mine), model.columns.cameras[name]), J)
+    return (by_X * white).reshape(-1, 3)
+
+
+def _direct_rows(model: Model, state: State, found: Residuals, entries: _Entries) -> int:
+    """Rows of observed positions and attitudes; returned: the number of the row after them."""
+    block, columns = model.block, model.columns
+    at, n = 2 * len(model.image) + len(model.ground), len(model.position)
+    if block.positions is not None and n:
+        rows = at + np.arange(3 * n).reshape(n, 3)
+        white = 1.0 / block.positions.sigma[model.position_row][:, :, None]
         R = state.rotations[model.position]
         eye = np.broadcast_to(np.eye(3), R.shape)
-        put(at, 6 * model.position, np.concatenate([eye, -R @ skew(state.lever)], axis=2) * J_sigma)
+        entries.put(rows, 6 * model.position, np.concatenate([eye, -R @ skew(state.lever)], axis=2) * white)
         if columns.lever >= 0:
-            put(at, np.full(len(R), columns.lever), R * J_sigma)
+            entries.put(rows, np.full(n, columns.lever), R * white)
         if columns.strips:
-            first = np.array([columns.strips[n] for n in model.strip_names], np.int64)[model.strip_of]
+            first = np.array([columns.strips[name] for name in model.strip_names], np.int64)[model.strip_of]
             drift = eye if block.drift == "shift" else np.concatenate([eye, eye * model.tau[:, None, None]], axis=2)
-            put(at, first, drift * J_sigma)
-    at += 3 * len(model.position)
-    if block.attitudes is not None and len(model.attitude):
-        J_sigma = 1.0 / block.attitudes.sigma[model.attitude_row][:, :, None]
-        n = len(model.attitude)
+            entries.put(rows, first, drift * white)
+    at, n = at + 3 * n, len(model.attitude)
+    if block.attitudes is not None and n:
+        rows = at + np.arange(3 * n).reshape(n, 3)
+        white = 1.0 / block.attitudes.sigma[model.attitude_row][:, :, None]
         # log(exp(e) exp(δ)) = e + (1 + [e]× / 2) δ + …, and a rotation before the boresight is turned by it.
         by_turn = np.eye(3) + 0.5 * skew(found.attitude)
-        put(at, 6 * model.attitude + 3, by_turn @ state.boresight.T * J_sigma)
+        entries.put(rows, 6 * model.attitude + 3, by_turn @ state.boresight.T * white)
         if columns.boresight >= 0:
-            put(at, np.full(n, columns.boresight), by_turn * J_sigma)
-    at += 3 * len(model.attitude)
-    prior, at_columns, prior_white = _priors(model, state)
-    of_rows.append((prior_white, at + np.arange(len(prior)), at_columns))
-    count = at + len(prior)
-    point = np.full(count, -1, np.int64)
-    point[: 2 * k] = np.repeat(model.point, 2)
-    point[2 * k : 2 * k + c] = model.ground_point
-    on_points = np.zeros((2 * k + c, 3))
-    on_points[: 2 * k] = (by_X * white).reshape(-1, 3)
-    on_points[2 * k :] = model.ground_white
-    e = whitened(model, found)
-    e = np.where(weight > 0, e, 0.0) * weight
-    A_global = _matrix(of_rows, weight, (count, columns.count))
-    row = np.repeat(np.arange(2 * k + c), 3)
-    column = (3 * point[: 2 * k + c, None] + np.arange(3)).ravel()
-    A_points = _matrix([(on_points.ravel(), row, column)], weight, (count, 3 * len(model.point_names)))
-    return Rows(e, A_global, A_points, point), found
+            entries.put(rows, np.full(n, columns.boresight), by_turn * white)
+    return at + 3 * n
 
 
 def whitened(model: Model, found: Residuals) -> _Floats:
