@@ -23,7 +23,7 @@ from photoplan.io.project_model import Project, Terrain
 from photoplan.io.raster import RasterReader
 from photoplan.products.control_match import ImageControl, OrthoPatch, Settings, control_of_image
 from photoplan.products.control_patches import Ortho, choose_patches
-from photoplan.products.scene import open_scene
+from photoplan.products.scene import input_files, open_scene
 from photoplan.products.tie_work import Stage, threads, unwatched
 
 __all__ = ["ControlReport", "ControlRequest", "propose_control"]
@@ -183,9 +183,12 @@ def _check(request: ControlRequest, project: Project) -> tuple[Path, Path]:
     output = request.output or request.project.resolve().parent / "control.csv"
     image_output = output.with_name(f"{output.stem}_points{output.suffix or '.csv'}")
     if not request.dry_run:
-        inputs = [request.project, *request.ortho, *(project.resolve(i.file) for i in project.images)]
-        for path in (output, image_output):
-            check_output(path, inputs, overwrite=request.overwrite)
+        inputs = [request.project, *request.ortho]
+        # Tables of an older run of this command may be replaced, those of other measurements may not.
+        for path, own in ((output, project.observations.control), (image_output, project.observations.image_points)):
+            older = [project.resolve(file) for file in own]
+            others = [file for file in input_files(project) if file not in older]
+            check_output(path, [*inputs, *others], overwrite=request.overwrite)
     return output, image_output
 
 

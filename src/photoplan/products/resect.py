@@ -17,6 +17,7 @@ from photoplan.io.project_model import Project
 from photoplan.orientation.resection_model import ResectSettings
 from photoplan.products.adjust_inputs import AdjustInputs, read_inputs
 from photoplan.products.resect_image import ResectedImage, control_rows, resect_image
+from photoplan.products.scene import input_files
 from photoplan.report.resect_report import ResectFacts, ResectPlots, resect_report
 
 __all__ = ["ResectRequest", "ResectResult", "resect_project"]
@@ -99,8 +100,7 @@ def resect_project(request: ResectRequest, step: Callable[[str], None] = lambda 
     project = _overridden(load_project(request.project), request)
     plots = None
     if request.report is not None:
-        given = [request.project, *(project.resolve(f) for f in project.observations.control)]
-        check_output(request.report, given, overwrite=request.overwrite)
+        check_output(request.report, [request.project, *input_files(project)], overwrite=request.overwrite)
         plots = ResectPlots()
     names = project.select(request.images or None)
     inputs = read_inputs(project, names)

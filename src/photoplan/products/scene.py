@@ -100,6 +100,8 @@ def input_files(project: Project) -> list[Path]:
     """All files that a project names; nothing that is written may replace one of them."""
     files = [image.file for image in project.images]
     files += [] if project.terrain is None or project.terrain.file is None else [project.terrain.file]
+    observed = project.observations
+    files += [*observed.image_points, *observed.control, *([observed.positions] if observed.positions else [])]
     return [project.resolve(file) for file in files]
 
 
