@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ import numpy as np
 
 from photoplan.errors import UsageError
 from photoplan.io.adjusted_points import write_point_layers, write_residuals
-from photoplan.io.disk import write_atomically
+from photoplan.io.disk import disk_error, write_atomically
 from photoplan.io.product import check_output
 from photoplan.io.project import load_project
 from photoplan.io.project_edit import ProjectChanges, edit_project
@@ -148,6 +149,11 @@ def _prepare_outputs(request: AdjustRequest, project: Project) -> AdjustPlots:
     """What draws the report; outputs that exist are refused before any work."""
     if request.folder.exists() and not request.folder.is_dir():
         raise UsageError(f"{request.folder}: is no folder; reports go into a folder")
+    there = next(
+        folder for folder in (request.folder.absolute(), *request.folder.absolute().parents) if folder.exists()
+    )
+    if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
+        raise UsageError(f"{request.folder}: cannot be made, as {there} cannot be written into; give another --output")
     _refuse_inputs(request, [request.project, *input_files(project)])
     return AdjustPlots()
 
@@ -176,7 +182,10 @@ def _write(
     folder, adjusted = request.folder, result.adjusted
     html = adjust_report(facts, plots).encode("utf-8", errors="replace")
     changes = _changes(result)
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise disk_error(folder, error) from error
     write_point_layers(folder / "points.gpkg", point_layers(result, facts), result.prepared.frame.crs)
     write_residuals(
         folder / "image_points.csv",

@@ -97,10 +97,12 @@ def resect_project(request: ResectRequest, step: Callable[[str], None] = lambda 
         Project or measurements cannot be used, or no image has three control points.
     """
     settings = ResectSettings(request.free, not request.unknown_camera_constant, request.critical)
-    project = _overridden(load_project(request.project), request)
+    stated = load_project(request.project)
+    project = _overridden(stated, request)
     plots = None
     if request.report is not None:
-        check_output(request.report, [request.project, *input_files(project)], overwrite=request.overwrite)
+        given = [request.project, *input_files(stated), *input_files(project)]
+        check_output(request.report, given, overwrite=request.overwrite)
         plots = ResectPlots()
     names = project.select(request.images or None)
     inputs = read_inputs(project, names)
