@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.errors import UsageError
 from photoplan.io.disk import write_atomically
+from photoplan.report.drawing import load_matplotlib, png
 from photoplan.terrain.contours import ContourLine
 
 __all__ = ["ContourPicture"]
@@ -35,11 +34,7 @@ class ContourPicture:
     _count: int = 0
 
     def __post_init__(self) -> None:
-        try:
-            import matplotlib.figure  # noqa: PLC0415  # optional, and slow to import
-        except ImportError:
-            raise UsageError("a preview needs matplotlib; install it with: pip install 'photoplan[report]'") from None
-        self._figure = matplotlib.figure.Figure
+        self._mpl = load_matplotlib("a preview")
         xmin, ymin, xmax, ymax = self.bounds
         self._pixel = max(xmax - xmin, ymax - ymin) / SIDE
 
@@ -68,20 +63,17 @@ class ContourPicture:
         size
             Height of the texts, metres.
         """
-        from matplotlib.collections import LineCollection  # noqa: PLC0415
-
         xmin, ymin, xmax, ymax = self.bounds
         inches = (xmax - xmin) / self._pixel / 100, (ymax - ymin) / self._pixel / 100
-        figure = self._figure(figsize=(max(inches[0], 1), max(inches[1], 1)), dpi=100)
+        figure = self._mpl.figure.Figure(figsize=(max(inches[0], 1), max(inches[1], 1)), dpi=100)
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set_axis_off()
         for kind, colour, width in (("plain", "#a8763e", 0.5), ("low", "#4a78a8", 0.5), ("index", "#7a4a14", 1.1)):
-            axes.add_collection(LineCollection(self._lines[kind], colors=colour, linewidths=width))
+            lines = self._mpl.collections.LineCollection(self._lines[kind], colors=colour, linewidths=width)
+            axes.add_collection(lines)
         axes.set(xlim=(xmin, xmax), ylim=(ymin, ymax), aspect="equal")
         points = max(5.0, 72 / 100 * size / self._pixel)
         for x, y, angle, text in labels:
             box = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
             axes.text(x, y, text, rotation=angle, ha="center", va="center", size=points, color="#5a3208", bbox=box)
-        content = io.BytesIO()
-        figure.savefig(content, format="png", facecolor="white", metadata={"Software": None})
-        write_atomically(path, content.getvalue())
+        write_atomically(path, png(figure, dpi=100, facecolor="white"))

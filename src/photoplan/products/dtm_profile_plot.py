@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import UsageError
+from photoplan.report.drawing import load_matplotlib, png
 
 __all__ = ["ProfilePlot"]
 
@@ -41,11 +42,7 @@ class ProfilePlot:
     """
 
     def __init__(self) -> None:
-        try:
-            import matplotlib.figure  # noqa: PLC0415  # optional, and slow to import
-        except ImportError:
-            raise UsageError("a picture needs matplotlib; install it with: pip install 'photoplan[report]'") from None
-        self._figure = matplotlib.figure.Figure
+        self._mpl = load_matplotlib("a picture")
 
     def draw(self, path: Path, profiles: Sequence[Drawn]) -> None:
         """Write a PNG: a panel for each profile, all in one scale.
@@ -59,7 +56,7 @@ class ProfilePlot:
             raise UsageError(
                 f"{len(profiles)} lines; a picture shows at most {MOST}: give fewer, or write a .csv alone"
             )
-        figure = self._figure(figsize=(10, 1.0 + 2.4 * len(profiles)), layout="constrained", dpi=110)
+        figure = self._mpl.figure.Figure(figsize=(10, 1.0 + 2.4 * len(profiles)), layout="constrained", dpi=110)
         axes = figure.subplots(len(profiles), 1, squeeze=False)[:, 0]
         span = max(high - low for low, high in map(_range, profiles))
         length = max(float(p.distance[-1]) for p in profiles)
@@ -72,7 +69,7 @@ class ProfilePlot:
             box = panel.get_window_extent()
             factor = (box.height / (1.1 * span)) / (box.width / length)
             panel.set_title(f"{item.name}  (heights × {factor:.2g})", loc="left", fontsize=10)
-        figure.savefig(path, format="png")
+        path.write_bytes(png(figure, dpi=110))
 
 
 def _panel(panel: Any, item: Drawn, span: float, length: float) -> None:

@@ -82,20 +82,21 @@ def locate_fiducials(
     Raises
     ------
     UsageError
-        Options contradict each other, or a picture exists.
+        Options contradict each other, or a picture exists or cannot be drawn because matplotlib is missing.
     InputError
         Camera or project cannot be used.
     """
     project = _project(request)
     jobs = _jobs(request, project)
     pictures = _pictures(request, jobs)
+    drawer = MarksPicture() if pictures else None
     pixel_mm = sum(parse_pitch(request.scan_resolution)) / 2 if request.scan_resolution else None
     results: list[ImageFiducials] = []
     failed: dict[str, str] = {}
     with begin(len(jobs)) as advance:
         for job in jobs:
             try:
-                results.append(_locate(request, job, pixel_mm, pictures, project is not None))
+                results.append(_locate(request, job, pixel_mm, drawer, pictures, project is not None))
             except ResourceError:
                 raise
             except PhotoplanError as error:
@@ -183,7 +184,12 @@ def _pictures(request: FiducialsRequest, jobs: Sequence[_Job]) -> dict[str, Path
 
 
 def _locate(
-    request: FiducialsRequest, job: _Job, pixel_mm: float | None, pictures: Mapping[str, Path], in_project: bool
+    request: FiducialsRequest,
+    job: _Job,
+    pixel_mm: float | None,
+    drawer: MarksPicture | None,
+    pictures: Mapping[str, Path],
+    in_project: bool,
 ) -> ImageFiducials:
     scan = ScanImage(job.file, request.band)
     known = FiducialSearch(
@@ -205,8 +211,8 @@ def _locate(
             "scans of the other kind a camera of their own"
         )
     picture = pictures.get(job.name)
-    if picture is not None:
-        MarksPicture().draw(picture, scan, job.layout, found, job.name)
+    if drawer is not None and picture is not None:
+        drawer.draw(picture, scan, job.layout, found, job.name)
     return ImageFiducials(job.name, job.file, job.camera_name, scan.size, scan.rule, found, picture)
 
 

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from photoplan.errors import UsageError
-from photoplan.io.disk import disk_error
+from photoplan.io.disk import disk_error, write_atomically
 from photoplan.orientation.fiducials import FiducialResult, LocatedMark, MissingMark
 from photoplan.orientation.mark_drawn import draw
 from photoplan.orientation.mark_layout import MarkLayout
 from photoplan.orientation.mark_measure import mark_window
 from photoplan.orientation.mark_search import Scan
+from photoplan.report.drawing import load_matplotlib, png
 
 __all__ = ["MarksPicture"]
 
@@ -35,11 +35,7 @@ class MarksPicture:
     """
 
     def __init__(self) -> None:
-        try:
-            import matplotlib.figure  # noqa: PLC0415  # optional, and slow to import
-        except ImportError:
-            raise UsageError("a picture needs matplotlib; install it with: pip install 'photoplan[report]'") from None
-        self._figure = matplotlib.figure.Figure
+        self._mpl = load_matplotlib("a picture")
 
     def draw(self, path: Path, scan: Scan, layout: MarkLayout, found: FiducialResult, title: str) -> None:
         """Write a PNG.
@@ -52,7 +48,7 @@ class MarksPicture:
         marks: list[LocatedMark | MissingMark] = [*found.marks, *found.missing]
         across = min(_ACROSS, len(marks))
         down = math.ceil(len(marks) / across)
-        figure = self._figure(figsize=(4.6 * across, 0.6 + 3.0 * down), layout="constrained", dpi=110)
+        figure = self._mpl.figure.Figure(figsize=(4.6 * across, 0.6 + 3.0 * down), layout="constrained")
         figure.suptitle(title, fontsize=11)
         panels = figure.subplots(down, 2 * across, squeeze=False).ravel()
         for panel in panels:
@@ -61,9 +57,9 @@ class MarksPicture:
             _panels(panels[2 * k : 2 * k + 2], scan, layout, found, mark)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            figure.savefig(path, format="png")
         except OSError as error:
             raise disk_error(path, error) from error
+        write_atomically(path, png(figure, dpi=110))
 
 
 def _panels(

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.errors import UsageError
 from photoplan.report.adjust_facts import AdjustFacts, GroundFacts, ResidualField
-from photoplan.report.plots import BLUE, GREEN, INK, ORANGE, PURPLE, RED, SKY, SOFT, STYLE, png
+from photoplan.report.drawing import (
+    BLUE,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    RED,
+    SKY,
+    SOFT,
+    STYLE,
+    load_matplotlib,
+    png,
+    round_down,
+)
 
 __all__ = ["AdjustPlots"]
 
@@ -35,14 +46,7 @@ class AdjustPlots:
     """
 
     def __init__(self) -> None:
-        try:
-            self._mpl: Any = importlib.import_module("matplotlib")
-            for part in ("cm", "colors", "figure", "ticker", "patches", "collections"):
-                importlib.import_module(f"matplotlib.{part}")
-        except ImportError:
-            raise UsageError(
-                "a report needs matplotlib; install it with: pip install 'photoplan[report]', or say --dry-run"
-            ) from None
+        self._mpl = load_matplotlib("a report", "say --dry-run")
 
     def network(self, facts: AdjustFacts) -> bytes:
         """Image centres by strip, tie points, control and check points."""
@@ -83,7 +87,7 @@ class AdjustPlots:
             reach = max((float(np.nanmax(np.abs(g.residual))) for g in some), default=0.0)
             spread = max((float(np.sqrt(np.nanmax(np.diag(g.covariance)))) for g in some), default=0.0)
             largest = max(reach, _ELLIPSE_95 * spread, 1e-6)
-            scale = _round_scale(0.07 * (right - left) / largest)
+            scale = round_down(max(0.07 * (right - left) / largest, 1e-6))
             for g in some:
                 x, y = g.XYZ[:2] if np.isfinite(g.XYZ[:2]).all() else (np.nan, np.nan)
                 if not np.isfinite([x, y]).all():
@@ -173,7 +177,7 @@ class AdjustPlots:
             # One arrow is compared with the noise of its mean: those that stand out are dark.
             unsure = field.noise / np.sqrt(np.maximum(field.count, 1))
             clear = np.hypot(*field.mean.T) > 2.5 * unsure
-            key = _round_down(max(largest, 1e-6))
+            key = round_down(max(largest, 1e-6))
             side = np.sqrt((xmax - xmin) * (ymax - ymin) / max(1, len(field.at)))
             scale = 0.85 * side / max(largest, 1e-9)
             for some, colour, name in ((~clear, "#8fa3b0", "within its noise"), (clear, RED, "stands out (2.5 sigma)")):
@@ -275,8 +279,7 @@ def _arrow(axes: Any, x: float, y: float, dx: float, dy: float, colour: str) -> 
 
 
 def _key(mpl: Any, colour: str, label: str) -> Any:
-    lines = importlib.import_module("matplotlib.lines")
-    return lines.Line2D([], [], color=colour, linewidth=1.8, label=label)
+    return mpl.lines.Line2D([], [], color=colour, linewidth=1.8, label=label)
 
 
 def _legend(fig: Any) -> None:
@@ -289,7 +292,7 @@ def _legend(fig: Any) -> None:
 def _scale_bar(axes: Any, scale: float, largest: float) -> None:
     left, right = axes.get_xlim()
     bottom, top = axes.get_ylim()
-    length = _round_down(largest)
+    length = round_down(largest)
     x, y = left + 0.03 * (right - left), bottom + 0.03 * (top - bottom)
     axes.plot([x, x + length * scale], [y, y], color=INK, linewidth=2.2, solid_capstyle="butt")
     axes.annotate(_metres(length), (x, y), (0, 4), textcoords="offset points", fontsize=8, color=INK)
@@ -297,16 +300,6 @@ def _scale_bar(axes: Any, scale: float, largest: float) -> None:
 
 def _metres(value: float) -> str:
     return f"{value * 1000:g} mm" if value < 0.01 else f"{value * 100:g} cm" if value < 1 else f"{value:g} m"
-
-
-def _round_down(value: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not larger."""
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(round(max(f for f in (1.0, 2.0, 5.0) if f <= value / power * (1 + 1e-9)) * power, 12))
-
-
-def _round_scale(value: float) -> float:
-    return _round_down(max(value, 1e-6))
 
 
 def _limits(values: NDArray[np.float64]) -> tuple[float, float]:

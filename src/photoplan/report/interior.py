@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,13 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.errors import UsageError
+from photoplan.report.drawing import BLUE, INK, RED, SOFT, STYLE, load_matplotlib, png
 from photoplan.report.page import Cell, figure, headline, page, section, table
-from photoplan.report.plots import BLUE, INK, RED, SOFT, STYLE
 
 __all__ = ["InteriorPlots", "ResidualPanel", "interior_report", "vector_scale"]
 
-_DPI = 150
 #: In the units of the axes; heads in widths of their shafts.
 _VECTORS = {
     "angles": "xy",
@@ -64,13 +60,7 @@ class InteriorPlots:
     """
 
     def __init__(self) -> None:
-        try:
-            self._mpl: Any = importlib.import_module("matplotlib")
-            importlib.import_module("matplotlib.figure")
-        except ImportError:
-            raise UsageError(
-                "plots need matplotlib; install it with: pip install 'photoplan[report]', or leave report and plot out"
-            ) from None
+        self._mpl = load_matplotlib("a plot of residuals", "leave report and plot out")
 
     def residuals(self, panels: Sequence[ResidualPanel]) -> bytes:
         """Residual vectors of all scans, one panel each at the same scale, and all in one; PNG.
@@ -98,9 +88,7 @@ class InteriorPlots:
                 ax.set_axis_off()
             left_out = f", {len(shown)} of {len(panels)} scans shown" if len(shown) < len(panels) else ""
             fig.suptitle(f"residuals at the fiducial marks, vectors × {scale:.0f}{left_out}", fontsize=10)
-            buffer = io.BytesIO()
-            fig.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
-            return buffer.getvalue()
+            return png(fig)
 
     def _panel(self, ax: Any, title: str, panels: Sequence[ResidualPanel], scale: float, single: bool) -> None:
         named = len(panels) == 1

@@ -1,47 +1,25 @@
-"""Plots of reports, as PNG in memory: colours that are told apart by colour-blind readers, units on all axes."""
+"""Plots of the report of a terrain model, as PNG in memory."""
 
 from __future__ import annotations
 
-import importlib
-import io
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.errors import UsageError
+from photoplan.report.drawing import BLUE, INK, PURPLE, RED, SKY, SOFT, STYLE, load_matplotlib, png
 
 if TYPE_CHECKING:
     from photoplan.report.build_report import CovarianceFacts, FilterEffect, GrossError, ReportMap
 
-__all__ = ["LINE_WORDS", "Plots", "png"]
+__all__ = ["LINE_WORDS", "Plots"]
 
 #: What lines of each kind are called.
 LINE_WORDS = {"breakline": "breaklines", "formline": "form lines", "border": "border lines", "hole": "holes"}
 
-#: Colours of Okabe and Ito.
-BLUE, RED, ORANGE, GREEN, PURPLE, SKY = "#0072B2", "#D55E00", "#E69F00", "#009E73", "#CC79A7", "#56B4E9"
-INK, SOFT = "#1c2730", "#5c6b77"
 LINE_COLOURS = {"breakline": "#7a1f00", "formline": PURPLE, "border": INK, "hole": INK}
-STYLE = {
-    "font.family": "DejaVu Sans",
-    "font.size": 9,
-    "axes.edgecolor": SOFT,
-    "axes.labelcolor": INK,
-    "xtick.color": SOFT,
-    "ytick.color": SOFT,
-    "axes.titlesize": 9.5,
-    "axes.titlelocation": "left",
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#e3e8eb",
-    "grid.linewidth": 0.7,
-    "legend.frameon": False,
-    "axes.unicode_minus": True,
-    "text.parse_math": False,
-}
-_DPI, _WIDTH = 150, 7.2
+_WIDTH = 7.2
 #: Numbers in the map of gross errors.
 _NUMBERED = 30
 #: Points in a map at most.
@@ -58,14 +36,7 @@ class Plots:
     """
 
     def __init__(self) -> None:
-        try:
-            self._mpl: Any = importlib.import_module("matplotlib")
-            for part in ("cm", "colors", "figure", "ticker"):
-                importlib.import_module(f"matplotlib.{part}")
-        except ImportError:
-            raise UsageError(
-                "a report needs matplotlib; install it with: pip install 'photoplan[report]', or leave the report out"
-            ) from None
+        self._mpl = load_matplotlib("a report", "leave the report out")
 
     def heights(self, area: ReportMap) -> bytes:
         """Heights as shaded tints, with lines."""
@@ -225,12 +196,11 @@ class Plots:
         bar.outline.set_visible(False)
 
     def _lines(self, axes: Any, area: ReportMap) -> None:
-        module = importlib.import_module("matplotlib.collections")
         for kind in sorted({kind for kind, _ in area.lines}):
             some = [xy for k, xy in area.lines if k == kind]
             dashes = {"formline": "--", "hole": ":"}.get(kind, "-")
             axes.add_collection(
-                module.LineCollection(
+                self._mpl.collections.LineCollection(
                     some,
                     colors=LINE_COLOURS.get(kind, INK),
                     linewidths=0.5,
@@ -240,13 +210,6 @@ class Plots:
             )
         if area.lines:
             axes.figure.legend(loc="outside lower center", ncols=4)
-
-
-def png(fig: Any) -> bytes:
-    """A figure as PNG, without the name of the program that drew it."""
-    buffer = io.BytesIO()
-    fig.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
-    return buffer.getvalue()
 
 
 def _limits(values: NDArray[np.float32], percent: float) -> tuple[float, float]:

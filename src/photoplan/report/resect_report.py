@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.errors import UsageError
+from photoplan.report.drawing import BLUE, INK, RED, SOFT, STYLE, load_matplotlib, png, round_down
 from photoplan.report.page import Cell, figure, headline, page, section, table, text
-from photoplan.report.plots import BLUE, INK, RED, SOFT, STYLE, png
 
 __all__ = ["ResectFacts", "ResectPlots", "resect_report"]
 
@@ -57,20 +55,14 @@ class ResectPlots:
     """
 
     def __init__(self) -> None:
-        try:
-            self._mpl: Any = importlib.import_module("matplotlib")
-            importlib.import_module("matplotlib.figure")
-        except ImportError:
-            raise UsageError(
-                "a report needs matplotlib; install it with: pip install 'photoplan[report]', or leave --report out"
-            ) from None
+        self._mpl = load_matplotlib("a report", "leave --report out")
 
     def residuals(self, facts: ResectFacts) -> tuple[bytes, float]:
         """Residual vectors at the measured points, and the factor by which they are enlarged."""
         width, height = facts.size
         used = ~facts.rejected & np.isfinite(facts.residuals).all(axis=1)
         typical = float(np.linalg.norm(facts.residuals[used], axis=1).max(initial=0.0)) or 1e-3
-        scale = _round_down(0.09 * max(width, height) / typical)
+        scale = round_down(0.09 * max(width, height) / typical)
         with self._mpl.rc_context(STYLE):
             tall = float(np.clip(_WIDTH * height / width, 2.5, 8.0))
             fig = self._mpl.figure.Figure(figsize=(_WIDTH, tall + 0.5), layout="constrained")
@@ -98,18 +90,12 @@ class ResectPlots:
 
     def _key(self, axes: Any, size: tuple[int, int], scale: float, typical: float) -> None:
         """A bar with the length of a residual."""
-        length = _round_down(typical)
+        length = round_down(typical)
         x, y = 0.03 * size[0], 0.96 * size[1]
         axes.plot([x, x + scale * length], [y, y], color=INK, linewidth=2.2, solid_capstyle="butt", zorder=4)
         label = f"residual of {length:g} px"
         box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
         axes.annotate(label, (x, y), (0, 4), textcoords="offset points", fontsize=8, color=SOFT, bbox=box)
-
-
-def _round_down(value: float) -> float:
-    """The next lower of 1, 2, 5 times a power of ten."""
-    power = 10.0 ** np.floor(np.log10(max(value, 1e-12)))
-    return float(max(f for f in (1.0, 2.0, 5.0) if f * power <= value * (1 + 1e-9)) * power)
 
 
 def resect_report(project: str, images: Sequence[ResectFacts], plots: ResectPlots) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.report.plots import BLUE, GREEN, INK, ORANGE, RED, SKY, SOFT, STYLE, Plots, png
+from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SKY, SOFT, STYLE, load_matplotlib, png
 
 __all__ = ["TieFacts", "TiePlots", "TieView", "spread_views"]
 
@@ -49,8 +49,17 @@ class TieFacts:
     views: tuple[TieView, ...]
 
 
-class TiePlots(Plots):
-    """Draws the picture."""
+class TiePlots:
+    """Draws; made before any work, so that a missing library is known at once.
+
+    Raises
+    ------
+    UsageError
+        When made: matplotlib is not installed.
+    """
+
+    def __init__(self) -> None:
+        self._mpl = load_matplotlib("a picture of tie points")
 
     def ties(self, facts: TieFacts) -> bytes:
         """Network and views, as PNG."""

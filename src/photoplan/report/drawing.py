@@ -1,0 +1,94 @@
+"""What all plots share: matplotlib when it is there, colours that are told apart by colour-blind readers, PNG bytes."""
+
+from __future__ import annotations
+
+import importlib
+import io
+from typing import Any
+
+import numpy as np
+
+from photoplan.errors import UsageError
+
+__all__ = [
+    "BLUE",
+    "GREEN",
+    "INK",
+    "ORANGE",
+    "PURPLE",
+    "RED",
+    "SKY",
+    "SOFT",
+    "STYLE",
+    "load_matplotlib",
+    "png",
+    "round_down",
+]
+
+#: Colours of Okabe and Ito.
+BLUE, RED, ORANGE, GREEN, PURPLE, SKY = "#0072B2", "#D55E00", "#E69F00", "#009E73", "#CC79A7", "#56B4E9"
+INK, SOFT = "#1c2730", "#5c6b77"
+STYLE = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9,
+    "axes.edgecolor": SOFT,
+    "axes.labelcolor": INK,
+    "xtick.color": SOFT,
+    "ytick.color": SOFT,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e3e8eb",
+    "grid.linewidth": 0.7,
+    "legend.frameon": False,
+    "axes.unicode_minus": True,
+    "text.parse_math": False,
+}
+_DPI = 150
+_PARTS = ("cm", "collections", "colors", "figure", "lines", "patches", "ticker")
+
+
+def load_matplotlib(what: str, otherwise: str = "") -> Any:
+    """Import matplotlib with the parts that plots use; it is optional, and takes a second to import.
+
+    Parameters
+    ----------
+    what : str
+        What needs it, for the message: "a report".
+    otherwise : str
+        How to do without it, for the message: "leave --report out".
+
+    Returns
+    -------
+    module
+        ``matplotlib``.
+
+    Raises
+    ------
+    UsageError
+        It is not installed; the message names the extra.
+    """
+    try:
+        for part in _PARTS:
+            importlib.import_module(f"matplotlib.{part}")
+        return importlib.import_module("matplotlib")
+    except ImportError:
+        way_out = f", or {otherwise}" if otherwise else ""
+        raise UsageError(
+            f"{what} needs matplotlib; install it with: pip install 'photoplan[report]'{way_out}"
+        ) from None
+
+
+def png(fig: Any, dpi: int = _DPI, **options: Any) -> bytes:
+    """A figure as PNG, without the name of the program that drew it; options are those of matplotlib's ``savefig``."""
+    buffer = io.BytesIO()
+    fig.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None}, **options)
+    return buffer.getvalue()
+
+
+def round_down(value: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not larger; 1e-12 at least."""
+    value = max(value, 1e-12)
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(round(max(f for f in (1.0, 2.0, 5.0) if f <= value / power * (1 + 1e-9)) * power, 12))
