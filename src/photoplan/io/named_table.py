@@ -6,7 +6,6 @@ with ``#`` that names the columns is the header. Every error names file and line
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -18,15 +17,20 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.io.plain_files import read_text
+from photoplan.io.text_columns import (
+    DELIMITERS,
+    NUMBER,
+    decimal,
+    find_delimiter,
+    has_decimal_comma,
+    number_of_columns,
+    split_line,
+)
 
 __all__ = ["NamedTable", "TableColumns", "read_named_table"]
 
 MAX_BYTES = 1_000_000_000
-_DELIMITERS = (";", "\t", ",", " ")
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _NOTHING = ("nan", "inf", "infinity", "null", "none", "na", "n/a")
-#: Lines that decide the delimiter.
-_SNIFFED = 20
 
 
 @dataclass(frozen=True)
@@ -92,13 +96,11 @@ class NamedTable:
     def _number(self, k: int, text: str, role: str, empty: bool) -> float:
         if empty and not text:
             return math.nan
-        plain = text.replace(",", ".") if self.decimal_comma and "." not in text else text
-        if _NUMBER.fullmatch(plain):
-            value = float(plain)
-            if abs(value) < 1e300:
-                return value
+        value = decimal(text, self.decimal_comma)
+        if value is not None:
+            return value
         hint = ""
-        if not self.decimal_comma and re.fullmatch(r"[-+]?\d+,\d+", text):
+        if not self.decimal_comma and has_decimal_comma(text):
             hint = "; write decimals with a point"
         elif not text or text.casefold().lstrip("+-") in _NOTHING:
             hint = "; leave the field empty where it is not known" if empty else "; give it or delete the line"
@@ -118,65 +120,24 @@ def read_named_table(path: Path, columns: TableColumns) -> NamedTable:
     data = [(n, text) for n, text in lines if not text.lstrip().startswith("#")]
     if columns.declared is None and lines and lines[0][1].lstrip().startswith("#"):
         head = (lines[0][0], lines[0][1].lstrip()[1:].strip())
-        splits = [d for d in _DELIMITERS if _count(path, head, d) >= len(columns.needed)]
-        if any(_header(_split(path, head, d), columns) is not None for d in splits):
+        splits = [d for d in DELIMITERS if number_of_columns(path, head, d) >= len(columns.needed)]
+        if any(_header(split_line(path, head, d), columns) is not None for d in splits):
             data.insert(0, head)
     if not data:
         raise InputError(f"{path}: holds no line with data")
-    delimiter = _delimiter(path, data, columns)
-    first = _split(path, data[0], delimiter)
+    allowed = [d for d in DELIMITERS if d != "," or not columns.decimal_comma]
+    delimiter = find_delimiter(path, data, columns.needed, allowed)
+    first = split_line(path, data[0], delimiter)
     roles, skip = _roles(f"{path}:{data[0][0]}", first, columns)
     body = data[skip:]
     if not body:
         raise InputError(f"{path}: holds a header and no line with data")
-    rows = tuple(_split(path, item, delimiter) for item in body)
+    rows = tuple(split_line(path, item, delimiter) for item in body)
     for (line, _), row in zip(body, rows):
         if len(row) != len(first):
             hint = "; is the decimal sign a comma? write decimals with a point" if delimiter == "," else ""
             raise InputError(f"{path}:{line}: {len(row)} columns, the first line has {len(first)}{hint}")
     return NamedTable(path, rows, tuple(line for line, _ in body), roles, columns.decimal_comma)
-
-
-def _split(path: Path, item: tuple[int, str], delimiter: str) -> tuple[str, ...]:
-    line, text = item
-    if '"' not in text:
-        fields = text.split() if delimiter == " " else text.split(delimiter)
-        return tuple(field.strip() for field in fields)
-    text = text.expandtabs(1).strip() if delimiter == " " else text
-    try:
-        fields = next(csv.reader([text], delimiter=delimiter, skipinitialspace=True, strict=True))
-    except (csv.Error, StopIteration) as error:
-        raise InputError(f"{path}:{line}: cannot be split into columns ({error})") from None
-    return tuple(field.strip() for field in fields)
-
-
-def _delimiter(path: Path, data: Sequence[tuple[int, str]], columns: TableColumns) -> str:
-    """The one that splits the first lines into equally many and enough columns, or at least the first line."""
-    least = len(columns.needed)
-    enough = []
-    for delimiter in _DELIMITERS:
-        if delimiter == "," and columns.decimal_comma:
-            continue
-        counts = [_count(path, item, delimiter) for item in data[:_SNIFFED]]
-        if counts[0] >= least:
-            if len(set(counts)) == 1:
-                return delimiter
-            enough.append(delimiter)
-    if enough:
-        return enough[0]
-    line, text = data[0]
-    raise InputError(
-        f"{path}:{line}: {text.strip()[:80]!r} has fewer than {least} columns by comma, semicolon, tab or space; "
-        f"needed are {', '.join(columns.needed)}"
-    )
-
-
-def _count(path: Path, item: tuple[int, str], delimiter: str) -> int:
-    """Columns of a line; 0 where quotes do not allow this delimiter."""
-    try:
-        return len(_split(path, item, delimiter))
-    except InputError:
-        return 0
 
 
 def _roles(where: str, first: tuple[str, ...], columns: TableColumns) -> tuple[dict[str, int], int]:
@@ -187,7 +148,7 @@ def _roles(where: str, first: tuple[str, ...], columns: TableColumns) -> tuple[d
     if found is not None:
         return found, 1
     order = next((o for o in columns.orders if len(o) == len(first)), None)
-    numeric = sum(bool(_NUMBER.fullmatch(f.replace(",", "."))) for f in first)
+    numeric = sum(bool(NUMBER.fullmatch(f.replace(",", "."))) for f in first)
     if order is not None and numeric >= 2:
         return {role: k for k, role in enumerate(order)}, 0
     if numeric >= 2:

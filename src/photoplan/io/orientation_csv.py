@@ -6,7 +6,6 @@ the suffix ``.prj`` beside the table states its CRS (EPSG code, WKT or PROJ stri
 
 from __future__ import annotations
 
-import csv
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from photoplan.io.orientation_block import OrientationBlock, OrientationFormat, 
 from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.plain_files import read_text
 from photoplan.io.project_model import ANGLE_UNITS
+from photoplan.io.text_columns import NUMBER, decimal, find_delimiter, has_decimal_comma, split_line
 
 __all__ = ["FORMAT", "HEADERS", "read"]
 
@@ -32,12 +32,8 @@ HEADERS = {
     "camera": ("camera", "camera_id", "cam"),
 }
 NEEDED = ("name", "x", "y", "z", "omega", "phi", "kappa")
-DELIMITERS = (";", "\t", ",", " ")
 MAX_BYTES = 100_000_000
-#: Lines that decide the delimiter.
-SNIFFED = 20
 
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _ANGLE_OF = {"o": "omega", "p": "phi", "k": "kappa"}
 
 
@@ -78,42 +74,11 @@ def read(path: Path, form: TableFormat) -> OrientationTable:
 
 
 def _split(item: tuple[int, str], delimiter: str, path: Path) -> _Row:
-    line, text = item
-    # A table in columns by spaces may hold tabs too.
-    text = text.expandtabs().strip() if delimiter == " " else text
-    try:
-        fields = next(csv.reader([text], delimiter=delimiter, skipinitialspace=True, strict=True))
-    except (csv.Error, StopIteration) as error:
-        raise InputError(f"{path}:{line}: cannot be split into columns ({error})") from None
-    return _Row(line, tuple(f.strip() for f in fields))
+    return _Row(item[0], split_line(path, item, delimiter))
 
 
 def _delimiter(data: list[tuple[int, str]], form: TableFormat, path: Path) -> str:
-    """The declared delimiter, or the first that splits the first lines into equally many columns, or the first line."""
-    if form.delimiter is not None:
-        return form.delimiter
-    first = []
-    for delimiter in DELIMITERS:
-        counts = [_count(item, delimiter, path) for item in data[:SNIFFED]]
-        if counts[0] >= len(NEEDED):
-            if len(set(counts)) == 1:
-                return delimiter
-            first.append(delimiter)
-    if first:
-        return first[0]
-    line, text = data[0]
-    raise InputError(
-        f"{path}:{line}: {text[:80]!r} has fewer than {len(NEEDED)} columns by comma, semicolon, tab or space; "
-        f"needed are {', '.join(NEEDED)}"
-    )
-
-
-def _count(item: tuple[int, str], delimiter: str, path: Path) -> int:
-    """Columns of a line; 0 where quotes do not allow this delimiter."""
-    try:
-        return len(_split(item, delimiter, path).fields)
-    except InputError:
-        return 0
+    return find_delimiter(path, data, NEEDED) if form.delimiter is None else form.delimiter
 
 
 def _columns(rows: list[_Row], form: TableFormat, path: Path) -> tuple[dict[str, int], list[_Row], list[str]]:
@@ -172,7 +137,7 @@ def _roles_of_header(row: _Row, renamed: dict[str, str] | None) -> dict[str, int
 def _why_no_header(row: _Row, renamed: dict[str, str] | None, path: Path) -> str:
     where = f"{path}:{row.line}"
     header = [f.casefold() for f in row.fields]
-    if sum(bool(_NUMBER.fullmatch(f)) for f in row.fields) >= 3:
+    if sum(bool(NUMBER.fullmatch(f)) for f in row.fields) >= 3:
         return (
             f"{where}: no header; declare the columns, for example --columns name,x,y,z,omega,phi,kappa, or the format "
             "with --format"
@@ -213,13 +178,11 @@ def _image(row: _Row, roles: dict[str, int], width: int, form: TableFormat, path
 
 def _number(row: _Row, role: str, roles: dict[str, int], form: TableFormat, path: Path) -> float:
     text = row.fields[roles[role]]
-    plain = text.replace(",", ".") if form.decimal_comma and "." not in text else text
-    if _NUMBER.fullmatch(plain):
-        number = float(plain)
-        if abs(number) < 1e300:
-            return number
+    number = decimal(text, form.decimal_comma)
+    if number is not None:
+        return number
     hint = ""
-    if not form.decimal_comma and re.fullmatch(r"[-+]?\d+,\d+", text):
+    if not form.decimal_comma and has_decimal_comma(text):
         hint = "; if the table uses decimal commas, declare it (--decimal-comma)"
     elif not text or text.casefold().lstrip("+-") in ("nan", "inf", "null", "none", "na", "n/a"):
         hint = "; give the orientation or delete the line"
