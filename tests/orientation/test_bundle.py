@@ -10,8 +10,9 @@ from tools.sim_block import FOCAL, Simulated, simulate
 
 from photoplan.cameras.lenses.brown import Brown
 from photoplan.cameras.lenses.opencv import OpenCV
+from photoplan.cameras.plane import Bilinear2D
 from photoplan.orientation.active import Active
-from photoplan.orientation.block import PARAMETERS, Adjusted, AdjustSettings
+from photoplan.orientation.block import PARAMETERS, Adjusted, AdjustSettings, BlockCamera
 from photoplan.orientation.bundle import adjust_block
 from photoplan.orientation.bundle_model import build_model
 from photoplan.orientation.bundle_robust import weights_of
@@ -19,6 +20,7 @@ from photoplan.orientation.bundle_rows import linearise, residuals_of, whitened
 from photoplan.orientation.bundle_select import select, start_points
 from photoplan.orientation.bundle_state import rotation_vector, start_state
 
+FILM = ("c", "x0", "y0")
 PLAIN = AdjustSettings(robust=False, variance_components=False)
 
 
@@ -177,6 +179,52 @@ def test_check_points_do_not_take_part() -> None:
     assert not result.rejected.any() or result.rejected.mean() < 0.01
     np.testing.assert_allclose(result.ground_residuals[4], -10.0, atol=0.7)
     assert np.isnan(result.ground_normalised[4]).all()
+
+
+def test_film_and_digital_images_are_adjusted_together() -> None:
+    """Every second image as a film scan: its own camera in millimetres, turned and sheared, bilinear in the scan."""
+    simulated = simulate(8, strips=3, images=6, per_image=60, cross=True)
+    block = simulated.block
+    seen = block.observations
+    pitch = 0.02
+    scans = {
+        b.name: Bilinear2D(50.0 + k, 0.4, 1e-5, 2100.0 + 7 * k, 0.3, -49.8, -2e-5, 1600.0)
+        for k, b in enumerate(block.images)
+        if k % 2
+    }
+    xy = seen.xy.copy()
+    for name, scan in scans.items():
+        mine = seen.image == seen.images.index(name)
+        digital = block.images[int(name[1:])].plane_to_pixel
+        xy[mine] = scan(digital.inverse(seen.xy[mine]) * pitch)
+    images = tuple(
+        replace(b, camera="film", plane_to_pixel=scans[b.name]) if b.name in scans else b for b in block.images
+    )
+    cameras = {"cam": block.cameras["cam"], "film": BlockCamera(FOCAL * pitch * 1.001, (0.05, -0.03), Brown(), FILM)}
+    mixed = replace(block, images=images, cameras=cameras, observations=replace(seen, xy=xy))
+    result = adjust_block(mixed, AdjustSettings(variance_components=False))
+    sigma = np.sqrt(np.diagonal(result.pose_covariance, axis1=1, axis2=2))
+    assert np.sqrt(((errors_of(simulated, result) / sigma) ** 2).mean()) < 1.5
+    (film,) = [c for c in result.cameras if c.name == "film"]
+    off = np.array([film.c - FOCAL * pitch, *film.principal_point])
+    assert (np.abs(off) < 4 * np.sqrt(np.diag(film.covariance))).all()
+    assert np.sqrt(film.covariance[0, 0]) < 0.02
+    assert len([g for g in result.groups if g.name.startswith("image points")]) == 2
+
+
+def test_points_behind_the_cameras_do_not_stop_the_adjustment() -> None:
+    """Wild measurements whose rays meet above the block, or nowhere, are taken out and named."""
+    simulated = simulate(3, strips=2, images=5, per_image=60)
+    seen = simulated.block.observations
+    rng = np.random.default_rng(0)
+    wild = np.flatnonzero(np.isin(seen.point, rng.choice(len(seen.points), 12, replace=False)))
+    xy = seen.xy.copy()
+    xy[wild] = rng.uniform(0, 2900, (len(wild), 2))
+    result = adjust_block(replace(simulated.block, observations=replace(seen, xy=xy)))
+    taken = result.rejected | np.isnan(result.residuals[:, 0])
+    assert taken[wild].mean() > 0.9
+    assert 0.9 < result.sigma0 < 1.1
+    assert np.isfinite(result.XYZ).all() and np.isfinite(result.point_covariance).all()
 
 
 def test_lever_arm_drift_and_boresight_are_recovered() -> None:

@@ -9,6 +9,7 @@ are found in two ways: first by weights that fall with the residual, from whatev
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,7 +77,7 @@ def adjust_block(block: Block, settings: AdjustSettings | None = None, progress:
         state = loop.run(model, state, active, robust=True)
         active = first_taken_out(model, state, active, settings.critical)
     for turn in range(_ROUNDS):
-        model, state, selection = _rebuilt(block, model, state, active, lost)
+        model, state, selection, lost = _rebuilt(block, model, state, active, lost)
         state = loop.run(model, state, active)
         solution = solution_of(model, state, weights_of(model, active), settings.covariance)
         if not settings.robust or turn == _ROUNDS - 1:
@@ -102,7 +103,10 @@ def _selected(block: Block, active: Active, lost: frozenset[str]) -> tuple[Selec
         selection = select(block, active, lost)
         if not selection.images or not selection.points:
             reasons = "; ".join(f"{name}: {reason}" for name, reason in selection.left_out[:5])
-            raise GeometryError(f"no image has enough measured points to be adjusted ({reasons or 'no measurements'})")
+            raise GeometryError(
+                f"no image has enough measured points to be adjusted ({reasons or 'no measurements'}); are image "
+                "points and images of the same block?"
+            )
         XYZ, parallel = start_points(block, selection)
         if not parallel:
             return selection, XYZ, lost
@@ -116,27 +120,19 @@ def _check(model: Model, state: State, active: Active) -> None:
 
 def _rebuilt(
     block: Block, model: Model, state: State, active: Active, lost: frozenset[str]
-) -> tuple[Model, State, Selection]:
-    """The model without what was taken out; unknowns keep their values, points that come back are intersected."""
-    selection = select(block, active, lost)
-    if not selection.images or not selection.points:
-        raise GeometryError(
-            "gross errors leave no image with enough points; are image points and images the same block?"
-        )
+) -> tuple[Model, State, Selection, frozenset[str]]:
+    """The model without what was taken out; unknowns keep their values, points that come back are intersected.
+
+    Rays that are left may be parallel, so that points can be lost here too.
+    """
+    poses = dict(zip(model.image_names, state.poses()))
+    images = tuple(replace(b, pose=poses.get(b.name, b.pose)) for b in block.images)
+    selection, XYZ, lost = _selected(replace(block, images=images), active, lost)
     made = build_model(block, selection.images, selection.measured, selection.points)
-    place = {name: k for k, name in enumerate(model.image_names)}
-    poses = state.poses()
-    start = [
-        poses[place[n]] if n in place else block.images[k].pose for n, k in zip(made.image_names, selection.images)
-    ]
-    points = {name: k for k, name in enumerate(model.point_names)}
-    XYZ = np.full((len(made.point_names), 3), np.nan)
-    old = np.array([points.get(n, -1) for n in made.point_names], np.int64)
+    before = {name: k for k, name in enumerate(model.point_names)}
+    old = np.array([before.get(n, -1) for n in made.point_names], np.int64)
     XYZ[old >= 0] = state.XYZ[old[old >= 0]]
-    if (old < 0).any():
-        fresh, _ = start_points(block, selection)
-        XYZ[old < 0] = fresh[old < 0]
-    return made, state.carried(model, made, start, XYZ), selection
+    return made, state.carried(model, made, [images[k].pose for k in selection.images], XYZ), selection, lost
 
 
 class _Loop:

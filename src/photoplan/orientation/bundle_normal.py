@@ -19,6 +19,9 @@ __all__ = ["Inverse", "Reduced", "reduce_normals"]
 
 _Floats = NDArray[np.float64]
 
+#: Part of a point's normal matrix that is added to its diagonal: far below rounding of any point that is determined.
+_RIDGE = 1e-13
+
 
 @dataclass(frozen=True, eq=False)
 class Reduced:
@@ -77,7 +80,11 @@ def reduce_normals(rows: Rows, points: int, damping: float = 0.0) -> Reduced:
             V[:, k, n] = V[:, n, k] = np.bincount(at, P[:, k] * P[:, n], points)
     e = rows.e[: len(at)]
     n_p = np.stack([np.bincount(at, P[:, k] * e, points) for k in range(3)], axis=-1).astype(float)
+    # A point whose measurements have lost their weight (all but one ray, or all) must not make the equations singular:
+    # it then stays where it is.
+    trace = np.trace(V, axis1=1, axis2=2)[:, None]
     V[:, range(3), range(3)] *= 1.0 + damping
+    V[:, range(3), range(3)] += _RIDGE * trace + (trace == 0.0)
     # A point whose measurements have all lost their weight stays where it is.
     with np.errstate(invalid="ignore"):
         V[~(np.linalg.det(V) > 0.0)] = np.eye(3)
