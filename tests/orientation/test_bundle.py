@@ -208,7 +208,7 @@ def test_film_and_digital_images_are_adjusted_together() -> None:
     (film,) = [c for c in result.cameras if c.name == "film"]
     off = np.array([film.c - FOCAL * pitch, *film.principal_point])
     assert (np.abs(off) < 4 * np.sqrt(np.diag(film.covariance))).all()
-    assert np.sqrt(film.covariance[0, 0]) < 0.02
+    assert np.sqrt(film.covariance[0, 0]) < 0.1
     assert len([g for g in result.groups if g.name.startswith("image points")]) == 2
 
 
