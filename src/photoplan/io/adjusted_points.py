@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyogrio.raw
 import shapely
 from numpy.typing import NDArray
-from pyogrio.errors import DataSourceError
 
 from photoplan.cameras.observed import ImagePoints
-from photoplan.errors import UsageError
-from photoplan.io.disk import disk_error, sync_file, sync_folder, write_atomically
+from photoplan.io.geopackage import VectorLayer, write_geopackage
+from photoplan.io.named_table import write_named_table
 
 __all__ = ["PointLayer", "write_point_layers", "write_residuals"]
 
@@ -46,33 +41,10 @@ def write_point_layers(path: Path, layers: Sequence[PointLayer], crs: str) -> No
     ResourceError
         The disk is full.
     """
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial.gpkg")
-    try:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            partial.unlink(missing_ok=True)
-            for layer in layers:
-                if len(layer.XYZ):
-                    pyogrio.raw.write(
-                        os.fspath(partial),
-                        geometry=shapely.to_wkb(np.array([*shapely.points(layer.XYZ)], object)),
-                        field_data=list(layer.columns.values()),
-                        fields=list(layer.columns),
-                        layer=layer.name,
-                        driver="GPKG",
-                        geometry_type="Point Z",
-                        crs=crs,
-                        append=partial.exists(),
-                    )
-            sync_file(partial)
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
-        sync_folder(path.parent)
-    except DataSourceError as error:
-        raise UsageError(f"{path}: cannot be written ({error}); choose a folder that can be written") from error
-    except OSError as error:
-        raise disk_error(path, error) from error
+    vectors = [
+        VectorLayer(item.name, "Point Z", shapely.points(item.XYZ), item.columns) for item in layers if len(item.XYZ)
+    ]
+    write_geopackage(path, vectors, crs)
 
 
 def write_residuals(
@@ -98,17 +70,14 @@ def write_residuals(
     ResourceError, UsageError
         The disk is full, or the folder cannot be written to.
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     pairs = ("residual", "normalised", "redundancy")
     names = [f"{name}_{axis}" for name in pairs for axis in "xy"]
-    writer.writerow(["point", "image", "x", "y", "sigma_x", "sigma_y", *names, "used"])
+    rows = []
     used: NDArray[np.bool_] = np.asarray(np.isfinite(residuals).all(axis=1))
     for k in range(len(points)):
         numbers = [*(f"{v:.10g}" for v in points.xy[k]), *(f"{v:.6g}" for v in points.sigma[k])]
         for values in (residuals[k], normalised[k], redundancies[k]):
             numbers += ["" if not np.isfinite(v) else f"{v:.4f}" for v in values]
         state = "rejected" if rejected[k] else "yes" if used[k] else "no"
-        writer.writerow([points.points[points.point[k]], points.images[points.image[k]], *numbers, state])
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, text.getvalue().encode())
+        rows.append([points.points[points.point[k]], points.images[points.image[k]], *numbers, state])
+    write_named_table(path, ["point", "image", "x", "y", "sigma_x", "sigma_y", *names, "used"], rows)

@@ -8,8 +8,6 @@ are read with declared columns: ``"name,-,x,y,z"``.
 
 from __future__ import annotations
 
-import csv
-import io
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -25,8 +23,7 @@ from photoplan.cameras.observed import GroundPoints
 from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_label, parse_crs, same_crs, split_compound
 from photoplan.io.checks import check_plain_file
-from photoplan.io.disk import write_atomically
-from photoplan.io.named_table import TableColumns, read_named_table
+from photoplan.io.named_table import TableColumns, read_named_table, write_named_table
 from photoplan.io.plain_files import read_text
 
 __all__ = ["read_ground_points", "write_ground_points"]
@@ -196,12 +193,9 @@ def write_ground_points(path: Path, points: GroundPoints) -> None:
     ResourceError, UsageError
         The disk is full, or the folder cannot be written to.
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*_NEEDED, "sigma_x", "sigma_y", "sigma_z", "role"])
+    rows = []
     for k, name in enumerate(points.names):
         numbers = ["" if np.isnan(v) else f"{v:.4f}" for v in points.XYZ[k]]
         numbers += ["" if np.isnan(v) else f"{v:.6g}" for v in points.sigma[k]]
-        writer.writerow([name, *numbers, "check" if points.check[k] else "control"])
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, text.getvalue().encode())
+        rows.append([name, *numbers, "check" if points.check[k] else "control"])
+    write_named_table(path, [*_NEEDED, "sigma_x", "sigma_y", "sigma_z", "role"], rows)

@@ -6,8 +6,6 @@ are in pixels, (0, 0) the centre of the upper-left pixel. One image may be writt
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,8 +13,7 @@ import numpy as np
 
 from photoplan.cameras.observed import ImagePoints
 from photoplan.errors import InputError
-from photoplan.io.disk import write_atomically
-from photoplan.io.named_table import NamedTable, TableColumns, read_named_table
+from photoplan.io.named_table import NamedTable, TableColumns, read_named_table, write_named_table
 from photoplan.io.names import match_key
 
 __all__ = ["named_as", "read_image_points", "write_image_points"]
@@ -122,13 +119,10 @@ def write_image_points(path: Path, points: ImagePoints) -> None:
         The disk is full, or the folder cannot be written to.
     """
     stated = bool(np.isfinite(points.sigma).any())
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*_NEEDED, *(("sigma_x", "sigma_y") if stated else ())])
+    rows = []
     for k in range(len(points)):
         row = [points.points[points.point[k]], points.images[points.image[k]], *(f"{v:.10g}" for v in points.xy[k])]
         if stated:
             row += ["" if np.isnan(v) else f"{v:.6g}" for v in points.sigma[k]]
-        writer.writerow(row)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, text.getvalue().encode())
+        rows.append(row)
+    write_named_table(path, [*_NEEDED, *(("sigma_x", "sigma_y") if stated else ())], rows)

@@ -6,9 +6,11 @@ with ``#`` that names the columns is the header. Every error names file and line
 
 from __future__ import annotations
 
+import csv
+import io
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
+from photoplan.io.disk import disk_error, write_atomically
 from photoplan.io.plain_files import read_text
 from photoplan.io.text_columns import (
     DELIMITERS,
@@ -27,7 +30,7 @@ from photoplan.io.text_columns import (
     split_line,
 )
 
-__all__ = ["NamedTable", "TableColumns", "read_named_table"]
+__all__ = ["NamedTable", "TableColumns", "read_named_table", "write_named_table"]
 
 MAX_BYTES = 1_000_000_000
 _NOTHING = ("nan", "inf", "infinity", "null", "none", "na", "n/a")
@@ -195,3 +198,22 @@ def _declared(where: str, first: tuple[str, ...], columns: TableColumns) -> tupl
     numbers = [first[roles[r]] for r in roles if r in ("x", "y", "z", "sigma")]
     header = bool(numbers) and not any(re.match(r"[-+.]?\d", text) for text in numbers)
     return roles, int(header)
+
+
+def write_named_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write a comma-separated table with a header; it appears complete or not at all, in a folder that is made.
+
+    Raises
+    ------
+    ResourceError, UsageError
+        The disk is full, or the folder cannot be written to.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise disk_error(path, error) from error
+    write_atomically(path, text.getvalue().encode())

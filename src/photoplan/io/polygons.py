@@ -19,7 +19,7 @@ from pyogrio.errors import DataSourceError, FieldError, GeometryError
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import MapGrid
 from photoplan.io.checks import check_plain_file
-from photoplan.io.disk import disk_error, sync_file, sync_folder
+from photoplan.io.geopackage import VectorLayer, write_geopackage
 
 __all__ = ["Feature", "Features", "label_polygons", "read_features", "write_features"]
 
@@ -152,26 +152,4 @@ def write_features(
     """
     if path.suffix.lower() != ".gpkg":
         raise UsageError(f"{path}: vectors are written as GeoPackage; give a name that ends with .gpkg")
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial.gpkg")
-    try:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            pyogrio.raw.write(
-                os.fspath(partial),
-                geometry=shapely.to_wkb(np.array([*shapes], object)),
-                field_data=list(columns.values()),
-                fields=list(columns),
-                layer=layer,
-                driver="GPKG",
-                geometry_type=kind,
-                crs=crs,
-            )
-            sync_file(partial)
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
-        sync_folder(path.parent)
-    except DataSourceError as error:
-        raise UsageError(f"{path}: cannot be written ({error}); choose a folder that can be written") from error
-    except OSError as error:
-        raise disk_error(path, error) from error
+    write_geopackage(path, [VectorLayer(layer, kind, shapes, columns)], crs)

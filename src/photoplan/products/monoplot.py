@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,7 +14,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.rotation import rotation_from_angles
-from photoplan.io.disk import write_atomically
+from photoplan.io.named_table import write_named_table
 from photoplan.io.orientation_table import angle_in_radians
 from photoplan.io.polygons import read_features, write_features
 from photoplan.io.product import check_output
@@ -199,15 +197,12 @@ def _read(request: MonoplotRequest) -> _Given:
 
 def _write_table(path: Path, given: _Given, found: GroundPoints) -> None:
     """The columns of the input, then `COLUMNS`; fields without a value are empty."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*given.header, *COLUMNS])
+    rows = []
     degrees = np.degrees(found.angle)
     for i, row in enumerate(given.rows):
         numbers = [_text(v, 4) for v in (*found.XYZ[i], *found.sigmas[i])]
-        writer.writerow([*row, *numbers, _text(degrees[i], 2), _remark(found, i)])
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, text.getvalue().encode())
+        rows.append([*row, *numbers, _text(degrees[i], 2), _remark(found, i)])
+    write_named_table(path, [*given.header, *COLUMNS], rows)
 
 
 def _text(value: float, digits: int) -> str:
