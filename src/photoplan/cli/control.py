@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -69,10 +70,8 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     width = max(5, *(len(i.name) for i in found.images))
     click.echo(f"{'image':{width}}  tried found  kept  shift px          residual px")
     for i in found.images:
-        click.echo(
-            f"{i.name:{width}} {i.tried:6} {i.matched:5} {len(i.points):5}  {i.shift[0]:7.1f} {i.shift[1]:7.1f}"
-            f"  {i.rms:10.2f}"
-        )
+        x, y, rms = (f"{v:.{digits}f}" if math.isfinite(v) else "–" for v, digits in zip((*i.shift, i.rms), (1, 1, 2)))
+        click.echo(f"{i.name:{width}} {i.tried:6} {i.matched:5} {len(i.points):5}  {x:>7} {y:>7}  {rms:>10}")
     if not quiet:
         for i in found.images:
             if not len(i.points):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 
 import click
@@ -55,6 +56,8 @@ def photoplan() -> None:
 def main() -> None:
     """Entry point of the command."""
     catch_interrupts()
+    # Photos have no georeference. Here and not only where files are opened, since a filter there holds for one thread.
+    warnings.filterwarnings("ignore", "Dataset has no geotransform")
     _leave(run())
 
 
