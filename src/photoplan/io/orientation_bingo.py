@@ -12,7 +12,7 @@ from pathlib import Path
 from photoplan.errors import InputError
 from photoplan.io.orientation_block import Loss, OrientationBlock, OrientationFormat, common_losses, require_map
 from photoplan.io.orientation_table import Direction, TableFormat
-from photoplan.io.orientation_text import angle_block, one_word, word_lines
+from photoplan.io.orientation_text import angle_block, angle_lines, word_lines
 
 __all__ = ["FORMAT", "read", "render"]
 
@@ -44,13 +44,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
 def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     """The text of a file."""
     require_map(block, path)
-    lines = []
-    for image, angles in zip(block.table.images, block.angles("pok", "gon")):
-        X, Y, Z = image.center
-        p, o, k = angles
-        name = one_word(image.name, path)
-        lines.append(f"{KEYWORD} {name:<{NAME}} {X:14.4f} {Y:14.4f} {Z:12.4f} {p:14.8f} {o:14.8f} {k:14.8f}")
-    return {path: "\n".join(lines) + "\n"}
+    return {path: "".join(f"{KEYWORD} {line}\n" for line in angle_lines(block, path, NAME))}
 
 
 def _losses(block: OrientationBlock) -> list[Loss]:

@@ -151,6 +151,18 @@ def require_map(block: OrientationBlock, path: Path) -> None:
         )
 
 
+def require_cameras(block: OrientationBlock, path: Path, what: str) -> None:
+    """Refuse a block without cameras, for formats that describe them; `what` names the file in the message.
+
+    Raises
+    ------
+    InputError
+        There are none.
+    """
+    if not block.cameras:
+        raise InputError(f"{path}: {what} describes the cameras, and none is given; name the file that does")
+
+
 def without_lenses(block: OrientationBlock) -> OrientationBlock:
     """The block with all lenses taken as free of distortion."""
     cameras = {name: camera.model_copy(update={"lens": NoLens()}) for name, camera in block.cameras.items()}
@@ -193,3 +205,10 @@ def common_losses(
     if block.table.height_system is not None and not height_system:
         lost.append(Loss("height_system", f"no height system ({block.table.height_system})"))
     return lost
+
+
+def height_losses(table: OrientationTable) -> Iterable[Loss]:
+    """The loss of a format whose heights are understood as ellipsoidal."""
+    if table.crs is not None and table.height_system != "ellipsoidal":
+        stated = table.height_system or "not stated"
+        yield Loss("height_system", f"heights as ellipsoidal ones only (these are: {stated})")

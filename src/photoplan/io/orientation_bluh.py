@@ -11,13 +11,15 @@ from pathlib import Path
 from photoplan.errors import InputError
 from photoplan.io.orientation_block import OrientationBlock, OrientationFormat, common_losses, require_map
 from photoplan.io.orientation_table import Direction, TableFormat
-from photoplan.io.orientation_text import angle_block, one_word, word_lines
+from photoplan.io.orientation_text import angle_block, angle_lines, word_lines
 
 __all__ = ["FORMAT", "read", "render"]
 
 #: Angle unit, rotation, direction.
 OWN: tuple[str, str, Direction] = ("gon", "pok", "camera-to-ground")
 COLUMNS = 7
+#: Characters of a name.
+NAME = 20
 
 
 def read(path: Path, form: TableFormat) -> OrientationBlock:
@@ -42,12 +44,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
 def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     """The text of a file."""
     require_map(block, path)
-    lines = []
-    for image, angles in zip(block.table.images, block.angles("pok", "gon")):
-        X, Y, Z = image.center
-        p, o, k = angles
-        lines.append(f"{one_word(image.name, path):<20} {X:14.4f} {Y:14.4f} {Z:12.4f} {p:14.8f} {o:14.8f} {k:14.8f}")
-    return {path: "\n".join(lines) + "\n"}
+    return {path: "".join(f"{line}\n" for line in angle_lines(block, path, NAME))}
 
 
 FORMAT = OrientationFormat(

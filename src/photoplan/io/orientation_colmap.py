@@ -20,14 +20,13 @@ from photoplan.cameras.observed import ImagePoints
 from photoplan.errors import InputError
 from photoplan.io.camera_model import FilmCamera, FrameCamera
 from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
-from photoplan.io.orientation_block import Loss, OrientationBlock, OrientationFormat
-from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat, degrees_of
+from photoplan.io.orientation_block import Loss, OrientationBlock, OrientationFormat, require_cameras
+from photoplan.io.orientation_table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.plain_files import finite, read_text
 
 __all__ = ["FORMAT", "ColmapPoints", "read", "read_cameras", "read_points"]
 
 MAX_BYTES = 2 << 30
-FLIP = np.diag([1.0, -1.0, -1.0])
 #: Parameters of every model: one or two focal lengths f, principal point c, coefficients of the lens.
 _MODELS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -191,8 +190,7 @@ def read_points(path: Path) -> ColmapPoints:
 
 
 def _render(block: OrientationBlock, path: Path) -> dict[Path, str]:
-    if not block.cameras:
-        raise InputError(f"{path}: a COLMAP model describes the cameras, and none is given; name the file that does")
+    require_cameras(block, path, "a COLMAP model")
     cameras = ["# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     numbers = {name: str(k + 1) for k, name in enumerate(block.cameras)}
     for name, camera in block.cameras.items():

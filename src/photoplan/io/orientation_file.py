@@ -9,6 +9,7 @@ from photoplan.errors import InputError, UsageError
 from photoplan.io.disk import disk_error, write_atomically
 from photoplan.io.orientation_block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation_table import OrientationTable, TableFormat
+from photoplan.io.plain_files import read_head
 
 __all__ = [
     "FORMATS",
@@ -40,9 +41,6 @@ FORMATS: dict[str, str] = {
 #: Formats whose reader says what is wrong with a file that no format claims, by suffix; else it is a table of text.
 _BY_SUFFIX = {".toml": "toml", ".json": "opensfm"}
 
-#: Bytes of a file that formats are recognised by.
-HEAD = 65_536
-
 
 def orientation_format(name: str) -> OrientationFormat:
     """The format of a name.
@@ -69,23 +67,12 @@ def choose_format(path: Path, form: TableFormat) -> OrientationFormat:
     if form.columns is not None:
         # Only a table has columns to be declared.
         return orientation_format("csv")
-    head = _head(path)
+    head = "" if path.is_dir() else read_head(path)
     claiming = [f for f in map(orientation_format, FORMATS) if f.sniff(path, head)]
     if len(claiming) > 1:
         kinds = ", ".join(f"{f.name} ({f.title})" for f in claiming)
         raise InputError(f"{path}: its content does not tell which format it is: {kinds}; say it with --format")
     return claiming[0] if claiming else orientation_format(_BY_SUFFIX.get(path.suffix.lower(), "csv"))
-
-
-def _head(path: Path) -> str:
-    if path.is_dir():
-        return ""
-    try:
-        with path.open("rb") as file:
-            raw = file.read(HEAD)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-    return raw.decode("utf-8-sig", errors="replace").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def read_orientation_block(

@@ -32,14 +32,13 @@ from photoplan.io.camera_model import FilmCamera, FrameCamera
 from photoplan.io.lens_forms import AgisoftForm, frame_camera
 from photoplan.io.orientation_block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation_metashape_write import losses, render
-from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat, degrees_of
+from photoplan.io.orientation_table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.plain_files import finite
 from photoplan.io.xml_file import numbers, read_xml
 
 __all__ = ["FORMAT", "read", "read_cameras"]
 
 MAX_BYTES = 256 << 20
-FLIP = np.diag([1.0, -1.0, -1.0])
 _COEFFICIENTS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 
 _Floats = NDArray[np.float64]

@@ -23,11 +23,11 @@ from photoplan.geometry.earth_poses import (
 )
 from photoplan.io.camera_model import FilmCamera, FrameCamera
 from photoplan.io.lens_forms import agisoft_form
-from photoplan.io.orientation_block import Loss, OrientationBlock
+from photoplan.io.orientation_block import Loss, OrientationBlock, height_losses, require_cameras
+from photoplan.io.orientation_table import FLIP
 
 __all__ = ["losses", "render"]
 
-FLIP = np.diag([1.0, -1.0, -1.0])
 _LOCAL = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
 
 _Floats = NDArray[np.float64]
@@ -40,10 +40,7 @@ def losses(block: OrientationBlock) -> Iterable[Loss]:
             yield Loss("camera", f"no camera {name!r}: film has no pixels of its own")
         elif agisoft_form(camera) is None:
             yield Loss("lens", f"no lens of type {camera.lens.type} as camera {name!r} has it")
-    table = block.table
-    if table.crs is not None and table.height_system != "ellipsoidal":
-        stated = table.height_system or "not stated"
-        yield Loss("height_system", f"heights as ellipsoidal ones only (these are: {stated})")
+    yield from height_losses(block.table)
 
 
 def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
@@ -54,8 +51,7 @@ def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     InputError
         The block has no cameras, a lens has no form there, or the CRS cannot be used.
     """
-    if not block.cameras:
-        raise InputError(f"{path}: cameras.xml describes the cameras, and none is given; name the file that does")
+    require_cameras(block, path, "cameras.xml")
     R_world_chunk, t, wkt, centers, rotations = _placed(block)
     sensors = {name: str(k) for k, name in enumerate(block.cameras)}
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', '<document version="2.0.0">']

@@ -25,9 +25,9 @@ from photoplan.io import camera_opensfm
 from photoplan.io.camera_model import FilmCamera, FrameCamera
 from photoplan.io.lens_forms import opencv_form
 from photoplan.io.orientation_block import Loss, OrientationBlock, OrientationFormat, common_losses
-from photoplan.io.orientation_opensfm import FLIP, rotation_from_axis_angle
+from photoplan.io.orientation_opensfm import rotation_from_axis_angle
 from photoplan.io.orientation_opensfm_write import axis_angle
-from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat, degrees_of
+from photoplan.io.orientation_table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.plain_files import finite, read_json
 
 __all__ = ["FORMAT", "read"]

@@ -19,13 +19,10 @@ from photoplan.errors import InputError
 from photoplan.io.camera_opensfm import cameras_of
 from photoplan.io.orientation_block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation_opensfm_write import losses, render
-from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat, degrees_of
+from photoplan.io.orientation_table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.plain_files import finite, read_json
 
 __all__ = ["FORMAT", "read", "read_block", "rotation_from_axis_angle"]
-
-#: From camera axes x right, y down, z forwards to x right, y up, z backwards, and back.
-FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def rotation_from_axis_angle(vector: ArrayLike) -> NDArray[np.float64]:

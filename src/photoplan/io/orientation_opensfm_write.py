@@ -16,12 +16,10 @@ from photoplan.geometry.crs import crs_step
 from photoplan.geometry.earth_poses import topocentric_of_map
 from photoplan.io.camera_model import FilmCamera, FrameCamera
 from photoplan.io.lens_forms import opencv_form, opencv_losses
-from photoplan.io.orientation_block import Loss, OrientationBlock
-from photoplan.io.orientation_table import OrientationTable
+from photoplan.io.orientation_block import Loss, OrientationBlock, height_losses, require_cameras
+from photoplan.io.orientation_table import FLIP, OrientationTable
 
 __all__ = ["axis_angle", "losses", "normalised_camera", "render"]
-
-FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def axis_angle(R_camera_world: NDArray[np.float64]) -> list[float]:
@@ -36,13 +34,6 @@ def losses(block: OrientationBlock) -> Iterable[Loss]:
     yield from height_losses(block.table)
 
 
-def height_losses(table: OrientationTable) -> Iterable[Loss]:
-    """The loss of a format whose heights are understood as ellipsoidal."""
-    if table.crs is not None and table.height_system != "ellipsoidal":
-        stated = table.height_system or "not stated"
-        yield Loss("height_system", f"heights as ellipsoidal ones only (these are: {stated})")
-
-
 def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     """Text of a ``reconstruction.json``.
 
@@ -51,10 +42,7 @@ def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     InputError
         The block has no cameras or no place on the earth, or a camera has no form there.
     """
-    if not block.cameras:
-        raise InputError(
-            f"{path}: reconstruction.json describes the cameras, and none is given; name the file that does"
-        )
+    require_cameras(block, path, "reconstruction.json")
     origin, centers, rotations = _tangential(block.table, path)
     shots = {}
     for image, center, R in zip(block.table.images, centers, rotations):

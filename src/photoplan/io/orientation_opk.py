@@ -22,7 +22,7 @@ from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.geometry.earth_poses import enu_poses, is_local_crs, is_wgs84_geographic, legacy_wkt
 from photoplan.geometry.rotation import rotation_opk
 from photoplan.io.orientation_block import Loss, OrientationBlock, OrientationFormat, common_losses
-from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat, degrees_of
+from photoplan.io.orientation_table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.plain_files import finite, read_text
 
 __all__ = ["FORMAT", "read"]
@@ -30,7 +30,6 @@ __all__ = ["FORMAT", "read"]
 MAX_BYTES = 256 << 20
 _HEADER = re.compile(r"#\s*PhotoID\W+X\W+Y\W+Z\W+Omega\W+Phi\W+Kappa", re.I)
 _SYSTEM = re.compile(r"#\s*CoordinateSystem\s*:?\s*(\S.*)", re.I)
-FLIP = np.diag([1.0, -1.0, -1.0])
 #: Largest difference of an angle's matrix and the printed one: angles are printed with six digits and more.
 _TOLERANCE = 1e-5
 

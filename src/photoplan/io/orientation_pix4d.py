@@ -24,13 +24,12 @@ from photoplan.io import camera_pix4d
 from photoplan.io.camera_model import FilmCamera, FrameCamera
 from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
 from photoplan.io.orientation_block import Loss, OrientationBlock, OrientationFormat
-from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat, degrees_of
+from photoplan.io.orientation_table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.plain_files import finite, read_text
 
 __all__ = ["FORMAT", "read"]
 
 MAX_BYTES = 1 << 30
-FLIP = np.diag([1.0, -1.0, -1.0])
 _EXTERNAL = re.compile(r"\s*#?\s*imageName\s+X\s+Y\s+Z\s+Omega\s+Phi\s+Kappa\b", re.I)
 _FULL = re.compile(r"\s*fileName\s+imageWidth\s+imageHeight", re.I)
 _NAMES = ("_calibrated_external_camera_parameters.txt", "_calibrated_camera_parameters.txt")

@@ -14,9 +14,11 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.rotation import ROTATION_ORDERS, opk_from_rotation, rotation_from_angles
 from photoplan.io.project_model import ANGLE_UNITS
 
-__all__ = ["Direction", "OrientationTable", "OrientedImage", "TableFormat", "angle_in_radians"]
+__all__ = ["FLIP", "Direction", "OrientationTable", "OrientedImage", "TableFormat", "angle_in_radians", "degrees_of"]
 
 Direction = Literal["camera-to-ground", "ground-to-camera"]
+#: From camera axes x right, y down, z forwards to x right, y up, z backwards, and back.
+FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def angle_in_radians(value: NDArray[np.float64], unit: str) -> NDArray[np.float64]:

@@ -21,6 +21,7 @@ __all__ = [
     "DIRECTIONS",
     "Words",
     "angle_block",
+    "angle_lines",
     "checked_rotation",
     "number",
     "numbers",
@@ -149,3 +150,27 @@ def angle_block(
         images.append(OrientedImage(name, (X, Y, Z), (a, b, c), None, line.line))
     note = f"{path.name}: angles read as {unit}, rotation {rotation}, {DIRECTIONS[direction]}"
     return OrientationBlock(OrientationTable(path, tuple(images), unit, rotation, direction, notes=(note,)))
+
+
+def angle_lines(block: OrientationBlock, path: Path, width: int) -> list[str]:
+    """A line for each image: name, X, Y, Z in metres, and φ, ω, κ in gon, φ the primary rotation.
+
+    Parameters
+    ----------
+    block : OrientationBlock
+    path : Path
+        For the message.
+    width : int
+        Characters that names are filled up to.
+
+    Raises
+    ------
+    InputError
+        A name holds white space.
+    """
+    lines = []
+    for image, (phi, omega, kappa) in zip(block.table.images, block.angles("pok", "gon")):
+        X, Y, Z = image.center
+        name = one_word(image.name, path)
+        lines.append(f"{name:<{width}} {X:14.4f} {Y:14.4f} {Z:12.4f} {phi:14.8f} {omega:14.8f} {kappa:14.8f}")
+    return lines

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from pydantic import BaseModel
@@ -113,6 +113,12 @@ def _orientation(orientation: Orientation) -> list[str]:
     ]
 
 
+def _given(section: BaseModel, comments: Mapping[str, str]) -> list[str]:
+    """Entries of a section that are stated, with their comments."""
+    values = section.model_dump(exclude_none=True)
+    return _entries((key, value, comments[key]) for key, value in values.items() if value != ())
+
+
 def _observations(observations: Observations) -> list[str]:
     if observations == Observations():
         return []
@@ -125,11 +131,10 @@ def _observations(observations: Observations) -> list[str]:
         "sigma_position": "[horizontal, height], metres",
         "sigma_attitude": "in the unit of [orientation]; attitudes are observations only with it",
     }
-    given = observations.model_dump(exclude_none=True)
     return [
         "# Measurements from which `photoplan resect` and `photoplan adjust` determine orientations.",
         "[observations]",
-        *_entries((key, value, comments[key]) for key, value in given.items() if value != ()),
+        *_given(observations, comments),
         "",
     ]
 
@@ -145,11 +150,10 @@ def _adjustment(adjustment: Adjustment) -> list[str]:
         "drift": '"none", "shift" or "linear" for each strip',
         "boresight": "whether rotations between observed attitudes and camera are unknowns",
     }
-    given = adjustment.model_dump(exclude_none=True)
     return [
         "# What `photoplan adjust` estimates besides orientations and points.",
         "[adjustment]",
-        *_entries((key, value, comments[key]) for key, value in given.items()),
+        *_given(adjustment, comments),
         "",
     ]
 
