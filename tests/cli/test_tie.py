@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 from tools.command import Here, edit
+from tools.real_projects import drone_project
 
 from photoplan.io.image_points import read_image_points
 from photoplan.io.project import load_project
 from photoplan.products import tie_work
-from photoplan.products.init import InitRequest, init_project
 
 NEAR = ("DJI_0025", "DJI_0026", "DJI_0033")
 FAST = ("--features", 1200, "--per-image", 150, "--workers", 1)
@@ -20,17 +20,7 @@ FAST = ("--features", 1200, "--per-image", 150, "--workers", 1)
 @pytest.fixture(scope="module")
 def pristine_ties(block: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("tie")
-    names = (*NEAR, "DJI_0018")
-    init_project(
-        InitRequest(
-            folder=folder,
-            images=tuple(str(block / "images" / f"{n}.jpg") for n in names),
-            camera=block / "int.yaml",
-            orientation=block / "ext.csv",
-            terrain=str(block / "dsm.tif"),
-            height_system="same",
-        )
-    )
+    drone_project(block, folder, *NEAR, "DJI_0018")
     return folder
 
 

@@ -10,30 +10,19 @@ import pytest
 import rasterio
 from tools.command import Here
 from tools.proposed import residuals, spoilt
+from tools.real_projects import drone_project
 
 from photoplan.io.ground_points import read_ground_points
 from photoplan.io.image_points import read_image_points
 from photoplan.io.project import load_project
 from photoplan.io.project_edit import ProjectChanges, edit_project
-from photoplan.products.init import InitRequest, init_project
 
 IMAGES = ("DJI_0025", "DJI_0026", "DJI_0027")
 
 
 @pytest.fixture(scope="module")
 def true(block: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("control")
-    init_project(
-        InitRequest(
-            folder=folder,
-            images=tuple(str(block / "images" / f"{n}.jpg") for n in IMAGES),
-            camera=block / "int.yaml",
-            orientation=block / "ext.csv",
-            terrain=str(block / "dsm.tif"),
-            height_system="same",
-        )
-    )
-    return folder / "project.toml"
+    return drone_project(block, tmp_path_factory.mktemp("control"), *IMAGES)
 
 
 @pytest.fixture
