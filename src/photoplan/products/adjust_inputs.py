@@ -125,7 +125,10 @@ def _image_points(
                 "order, or it has none and the order is image, point"
             )
         renamed.append(own)
-    merged = ImagePoints.merged(renamed).of_images(names)
+    try:
+        merged = ImagePoints.merged(renamed).of_images(names)
+    except InputError as error:
+        raise InputError(f"{', '.join(path.name for path, _ in parts)}: {error}") from None
     if not len(merged):
         raise InputError(
             f"{', '.join(str(path) for path, _ in parts)}: none of the images is in the project: measured are "
