@@ -181,6 +181,39 @@ def test_check_points_do_not_take_part() -> None:
     assert np.isnan(result.ground_normalised[4]).all()
 
 
+def with_smooth_errors(simulated: Simulated, seed: int, size: float, reach: float) -> Simulated:
+    """The block with further image errors that are smooth over `reach` pixels, each image's its own."""
+    rng = np.random.default_rng(seed)
+    seen = simulated.block.observations
+    xy = seen.xy.copy()
+    for k in range(len(seen.images)):
+        mine = seen.image == k
+        for axis in range(2):
+            waves, phases = rng.normal(0, 1 / reach, (200, 2)), rng.uniform(0, 2 * np.pi, 200)
+            xy[mine, axis] += size * np.sqrt(2 / 200) * np.cos(seen.xy[mine] @ waves.T + phases).sum(axis=1)
+    return replace(simulated, block=replace(simulated.block, observations=replace(seen, xy=xy)))
+
+
+def test_correlated_image_errors_are_noticed_and_covariances_stay_calibrated() -> None:
+    """Errors that are alike over 500 of 4000 pixels: taken as independent, accuracies are twice too good."""
+    spreads = {}
+    for regarded in (True, False):
+        normal, effects = [], []
+        for seed in range(8):
+            simulated = simulate(
+                seed, strips=3, images=5, per_image=150, gnss=0.1, attitude=3e-4, sigma=0.2, base=0.25, control=9
+            )
+            simulated = with_smooth_errors(simulated, seed, 0.4, 500.0)
+            result = adjust_block(simulated.block, AdjustSettings(correlation=regarded))
+            sigma = np.sqrt(np.diagonal(result.pose_covariance, axis1=1, axis2=2))
+            normal.append(errors_of(simulated, result) / sigma)
+            effects += [c.effect for c in result.correlations]
+        spreads[regarded] = float(np.sqrt((np.concatenate(normal) ** 2).mean()))
+        print(f"\nregarded {regarded}: spread {spreads[regarded]:.2f}, effects {np.round(effects, 1)}")
+    assert 0.8 <= spreads[True] <= 1.2
+    assert spreads[False] > 1.6
+
+
 def test_film_and_digital_images_are_adjusted_together() -> None:
     """Every second image as a film scan: its own camera in millimetres, turned and sheared, bilinear in the scan."""
     simulated = simulate(8, strips=3, images=6, per_image=60, cross=True)

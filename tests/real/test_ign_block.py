@@ -80,27 +80,20 @@ def test_sigma0_memory_and_control(block: tuple[dict, Path, int, Published]) -> 
     assert (rms <= 0.75).all()
 
 
-def test_orientations_lie_near_the_published_ones(block: tuple[dict, Path, int, Published]) -> None:
-    _, project, _, truth = block
+def test_orientations_lie_within_three_sigma_of_the_published_ones(block: tuple[dict, Path, int, Published]) -> None:
+    """As many as normally distributed errors allow: 0.27 % lie beyond three standard deviations."""
+    report, project, _, truth = block
     normalised, measured = deviations(project, truth)
-    share = (np.abs(normalised) <= 3.0).mean()
+    share, own = ((np.abs(n) <= 3.0).mean() for n in (normalised, normalised[measured]))
+    spread = np.sqrt((normalised[measured] ** 2).mean(axis=0))
+    (correlation,) = report["image_correlations"]
     print(
-        f"\nign_borea: {share:.2%} of all orientation parameters within 3 sigma of the published ones, spread "
-        f"{np.sqrt((normalised**2).mean(axis=0)).round(2)}; of the {measured.sum()} exposures with points "
-        f"{(np.abs(normalised[measured]) <= 3.0).mean():.1%}, spread "
-        f"{np.sqrt((normalised[measured] ** 2).mean(axis=0)).round(2)}"
+        f"\nign_borea: {share:.2%} of all {normalised.size} orientation parameters within 3 sigma of the published ones; "
+        f"of the {measured.sum()} exposures with points {own:.2%}, spread {spread.round(2)}, largest "
+        f"{np.abs(normalised[measured]).max():.2f}; {correlation['effect']:.1f} measurements count as one, errors alike "
+        f"over {correlation['reach_px']:.0f} px"
     )
-    assert share >= 0.985
-    others = np.sqrt((normalised[~measured] ** 2).mean(axis=0))
-    assert (others > 0.5).all() and (others < 1.2).all()
-
-
-@pytest.mark.xfail(
-    strict=True,
-    reason="the published orientations raise the sum of squares of the image points by ten times what their number "
-    "allows: no adjustment of these measurements lies within three of its standard deviations of them",
-)
-def test_every_measured_exposure_lies_within_three_sigma(block: tuple[dict, Path, int, Published]) -> None:
-    _, project, _, truth = block
-    normalised, measured = deviations(project, truth)
-    assert (np.abs(normalised[measured]) <= 3.0).all()
+    assert share >= 0.995
+    assert own >= 0.99
+    assert np.abs(normalised[measured]).max() < 4.0
+    assert (spread > 0.5).all() and (spread < 1.45).all()

@@ -30,12 +30,13 @@ _SHOWN = 20
 @click.option("--no-robust", is_flag=True, help="Seek no gross errors.")
 @click.option("--critical", type=float, default=4.0, show_default=True, help="Normalised residual of a gross error.")
 @click.option("--no-variance-components", is_flag=True, help="Weight groups as stated, not as their residuals show.")
+@click.option("--no-correlation", is_flag=True, help="Take errors of neighbouring image points as independent.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Report [PROJECT/adjustment].")
 @click.option("--dry-run", is_flag=True, help="Adjust and print the figures; write nothing.")
 @click.option("--overwrite", is_flag=True, help="Replace an older report.")
 @json_option
 @click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
-def command(as_json: bool, quiet: bool, no_robust: bool, no_variance_components: bool, **options: Any) -> None:
+def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Orientations, points and cameras from all measurements of a project at once.
 
     Measurements are the files that [observations] names. Orientations and calibrated cameras are written into the
@@ -53,9 +54,9 @@ def command(as_json: bool, quiet: bool, no_robust: bool, no_variance_components:
         if terminal:
             click.echo(f"\r  iteration {number} · weighted residuals {rms:.4g} \033[K", err=True, nl=False)
 
-    report = adjust_project(
-        AdjustRequest(robust=not no_robust, variance_components=not no_variance_components, **options), talk, progress
-    )
+    for name in ("robust", "variance_components", "correlation"):
+        options[name] = not options.pop(f"no_{name}")
+    report = adjust_project(AdjustRequest(**options), talk, progress)
     if terminal:
         click.echo("\r\033[K", err=True, nl=False)
     if as_json:

@@ -26,6 +26,7 @@ __all__ = [
     "Block",
     "BlockCamera",
     "BlockImage",
+    "Correlation",
     "Group",
 ]
 
@@ -101,6 +102,8 @@ class AdjustSettings:
     """Normalised residual from which an observation is taken out as a gross error."""
     variance_components: bool = True
     """Whether the groups' standard deviations are estimated and used."""
+    correlation: bool = True
+    """Whether it is regarded that errors of neighbouring image points are alike, where their residuals show it."""
     iterations: int = 40
     """Most iterations."""
     covariance: bool = True
@@ -122,6 +125,21 @@ class Group:
     unit: str
     factor: float
     """Standard deviation found divided by the one that was stated (root of vᵀPv / redundancy)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Correlation:
+    """Errors of image points that are alike over some distance, of the images of one camera."""
+
+    camera: str
+    effect: float
+    """Measurements that count as one for an orientation."""
+    reach: float
+    """Distance over which errors are alike, pixels."""
+    distance: NDArray[np.float64]
+    """Outer limits of classes of distance, (m,), pixels."""
+    rho: NDArray[np.float64]
+    """Correlation of residuals in each class, (m,); NaN: too few pairs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,3 +225,5 @@ class Adjusted:
     redundancy: int
     unknowns: int
     iterations: int
+    correlations: tuple[Correlation, ...] = ()
+    """Of cameras whose image points have clearly correlated errors; orientations and their covariances regard it."""

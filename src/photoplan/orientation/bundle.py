@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from photoplan.errors import GeometryError
 from photoplan.orientation.active import Active
-from photoplan.orientation.block import Adjusted, AdjustSettings, Block
+from photoplan.orientation.block import Adjusted, AdjustSettings, Block, Correlation
+from photoplan.orientation.bundle_correlation import correlation_of, effects_of_rows
 from photoplan.orientation.bundle_model import Model, build_model
 from photoplan.orientation.bundle_normal import reduce_normals
 from photoplan.orientation.bundle_rank import check_rank
@@ -24,7 +25,7 @@ from photoplan.orientation.bundle_result import result_of
 from photoplan.orientation.bundle_robust import first_taken_out, robust_weights, snooped, softened, weights_of
 from photoplan.orientation.bundle_rows import linearise, residuals_of, whitened
 from photoplan.orientation.bundle_select import Selection, select, start_points
-from photoplan.orientation.bundle_solution import solution_of
+from photoplan.orientation.bundle_solution import Solution, solution_of
 from photoplan.orientation.bundle_state import State, start_state
 
 __all__ = ["Progress", "adjust_block"]
@@ -44,7 +45,7 @@ _SETTLED = 1e-9
 #: Rounds of data snooping, and of variance components.
 _ROUNDS, _COMPONENTS = 8, 6
 #: Damping (part of the diagonal) after a step that made things worse, and when to give up.
-_FIRST_DAMPING, _MOST_DAMPING = 1e-8, 1e6
+_FIRST_DAMPING, _MOST_DAMPING = 1e-12, 1e6
 
 
 def adjust_block(block: Block, settings: AdjustSettings | None = None, progress: Progress | None = None) -> Adjusted:
@@ -74,11 +75,11 @@ def adjust_block(block: Block, settings: AdjustSettings | None = None, progress:
     state = start_state(model, [block.images[k].pose for k in selection.images], XYZ)
     _check(model, state, active)
     if settings.robust:
-        state = loop.run(model, state, active, robust=True)
+        state = loop.run(model, state, weights_of(model, active), robust=True)
         active = first_taken_out(model, state, active, settings.critical)
     for turn in range(_ROUNDS):
         model, state, selection, lost = _rebuilt(block, model, state, active, lost)
-        state = loop.run(model, state, active)
+        state = loop.run(model, state, weights_of(model, active))
         solution = solution_of(model, state, weights_of(model, active), settings.covariance)
         if not settings.robust or turn == _ROUNDS - 1:
             break
@@ -86,15 +87,34 @@ def adjust_block(block: Block, settings: AdjustSettings | None = None, progress:
         if next_active.equals(active):
             break
         active = next_active
+    solution, correlations = _weighted(loop, solution, active, settings)
+    check_rank(model, solution.state, solution.reduced)
+    return result_of(block, selection, solution, active, loop.count, correlations)
+
+
+def _weighted(
+    loop: _Loop, solution: Solution, active: Active, settings: AdjustSettings
+) -> tuple[Solution, tuple[Correlation, ...]]:
+    """The solution with the accuracies that residuals show: variance components, and correlated image points."""
+    model, state = solution.model, solution.state
+    correlations: tuple[Correlation, ...] = ()
+    if settings.correlation and settings.covariance:
+        k = len(model.image)
+        used = solution.weight[: 2 * k : 2] > 0
+        correlations = correlation_of(model, solution.normalised()[: 2 * k].reshape(-1, 2), used)
+    effects = effects_of_rows(model, correlations, len(solution.e)) if correlations else None
     factors: _Floats | None = None
-    for _ in range(_COMPONENTS if settings.variance_components else 0):
-        factors = solution.factors()
-        state = loop.run(model, state, active, factors=factors)
-        solution = solution_of(model, state, weights_of(model, active, factors), settings.covariance)
-        if np.allclose(solution.factors(), factors, rtol=0.02):
+    for _ in range(_COMPONENTS):
+        if settings.variance_components and settings.covariance:
+            factors = solution.factors()
+        elif effects is None:
             break
-    check_rank(model, state, solution.reduced)
-    return result_of(block, selection, solution, active, loop.count)
+        weight = weights_of(model, active, factors)
+        state = loop.run(model, state, weight if effects is None else weight / effects)
+        solution = solution_of(model, state, weight, settings.covariance, effects)
+        if factors is None or np.allclose(solution.factors(), factors, rtol=0.02):
+            break
+    return solution, correlations
 
 
 def _selected(block: Block, active: Active, lost: frozenset[str]) -> tuple[Selection, _Floats, frozenset[str]]:
@@ -142,11 +162,8 @@ class _Loop:
         self.count = 0
         self._most, self._progress = most, progress
 
-    def run(
-        self, model: Model, state: State, active: Active, robust: bool = False, factors: _Floats | None = None
-    ) -> State:
-        """The state where the weighted sum of squares is least (Levenberg–Marquardt)."""
-        base = weights_of(model, active, factors)
+    def run(self, model: Model, state: State, base: _Floats, robust: bool = False) -> State:
+        """The state where the sum of squares with weights `base` (rows,) is least (Levenberg–Marquardt)."""
         if robust:
             base = base * softened(model, state)
         damping, cost = 0.0, np.inf

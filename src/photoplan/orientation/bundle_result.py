@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.orientation.active import Active
-from photoplan.orientation.block import Adjusted, AdjustedCamera, AdjustedStrip, Block, Group
+from photoplan.orientation.block import Adjusted, AdjustedCamera, AdjustedStrip, Block, Correlation, Group
 from photoplan.orientation.bundle_robust import kinds_of
 from photoplan.orientation.bundle_rows import residuals_of_all
 from photoplan.orientation.bundle_select import Selection
@@ -18,7 +18,14 @@ __all__ = ["result_of"]
 _Floats = NDArray[np.float64]
 
 
-def result_of(block: Block, selection: Selection, solution: Solution, active: Active, iterations: int) -> Adjusted:
+def result_of(
+    block: Block,
+    selection: Selection,
+    solution: Solution,
+    active: Active,
+    iterations: int,
+    correlations: tuple[Correlation, ...],
+) -> Adjusted:
     """The result as users see it."""
     model, state = solution.model, solution.state
     residuals = residuals_of_all(model, state)
@@ -59,6 +66,7 @@ def result_of(block: Block, selection: Selection, solution: Solution, active: Ac
         redundancy=solution.redundancy,
         unknowns=columns.count + 3 * len(model.point_names),
         iterations=iterations,
+        correlations=correlations,
     )
 
 

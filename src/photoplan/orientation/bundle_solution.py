@@ -34,7 +34,7 @@ class Solution:
     e: _Floats
     """Residuals of all rows divided by the standard deviations that were stated."""
     weight: _Floats
-    """Weights of all rows: 0 for those that are taken out."""
+    """Weights of all rows, each by itself: 0 for those that are taken out."""
     inverse: Inverse | None
     """None: covariances were not asked for."""
     redundancies: _Floats
@@ -52,7 +52,8 @@ class Solution:
         """Standard deviation of unit weight; NaN without redundancy."""
         counted = self.weight > 0
         total = float((self.weight[counted] * self.e[counted] ** 2).sum())
-        return float(np.sqrt(total / self.redundancy)) if self.redundancy > 0 else float("nan")
+        redundancy = float(self.redundancies[counted].sum()) if self.inverse is not None else float(self.redundancy)
+        return float(np.sqrt(total / redundancy)) if self.redundancy > 0 else float("nan")
 
     def scales(self) -> _Floats:
         """Standard deviation of each group's residuals in units of the stated ones, in a robust way."""
@@ -89,15 +90,39 @@ class Solution:
         return out
 
 
-def solution_of(model: Model, state: State, weight: _Floats, covariance: bool) -> Solution:
-    """Equations, redundancy numbers and cofactors at a converged state."""
+def solution_of(
+    model: Model, state: State, weight: _Floats, covariance: bool, effects: _Floats | None = None
+) -> Solution:
+    """Equations, redundancy numbers and cofactors at a converged state.
+
+    Parameters
+    ----------
+    weight : ndarray, shape (rows,)
+        Weights of the rows, each by itself.
+    covariance : bool
+        Whether cofactors and redundancy numbers are wanted.
+    effects : ndarray, shape (rows,), optional
+        How many rows of image points count as one for what they have in common: orientations and cameras. Points, and
+        residuals of image points, go by the rows' own weights.
+    """
     rows, found = linearise(model, state, np.sqrt(weight))
     reduced = reduce_normals(rows, len(model.point_names))
-    inverse = None
-    redundancies = np.full(len(rows.e), np.nan)
-    points = np.full((len(model.point_names), 3, 3), np.nan)
-    if covariance:
+    e = whitened(model, found)
+    if not covariance:
+        none = np.full(len(e), np.nan)
+        return Solution(
+            model, state, reduced, found, e, weight, None, none, np.full((len(model.point_names), 3, 3), np.nan)
+        )
+    inverse = Inverse(reduced)
+    points, variance = inverse.variances()
+    redundancies = np.clip(1.0 - variance, 0.0, 1.0)
+    if effects is not None:
+        common, _ = linearise(model, state, np.sqrt(weight / effects))
+        own = reduced.V_inverse
+        reduced = reduce_normals(common, len(model.point_names))
         inverse = Inverse(reduced)
         points, variance = inverse.variances()
-        redundancies = np.clip(1.0 - variance, 0.0, 1.0)
-    return Solution(model, state, reduced, found, whitened(model, found), weight, inverse, redundancies, points)
+        points = points - reduced.V_inverse + own
+        others = slice(2 * len(model.image), None)
+        redundancies[others] = np.clip(1.0 - variance[others], 0.0, 1.0)
+    return Solution(model, state, reduced, found, e, weight, inverse, redundancies, points)

@@ -61,6 +61,8 @@ class AdjustRequest:
     critical: float = 4.0
     variance_components: bool = True
     """Whether each group of observations gets the accuracy that its residuals show."""
+    correlation: bool = True
+    """Whether errors of neighbouring image points may be alike."""
     output: Path | None = None
     """Folder; None: ``adjustment`` beside the project file."""
     dry_run: bool = False
@@ -126,7 +128,9 @@ def adjust_project(
     inputs, starts = started(inputs)
     prepared = prepare(inputs, starts, free)
     talk(_used(prepared))
-    settings = AdjustSettings(request.robust, request.critical, request.variance_components)
+    settings = AdjustSettings(
+        request.robust, request.critical, request.variance_components, correlation=request.correlation
+    )
     prepared, adjusted = adjust_prepared(prepared, settings, partial(adjust_block, progress=progress))
     result = map_result(prepared, adjusted)
     title = f"Bundle adjustment of {request.project.resolve().parent.name}"

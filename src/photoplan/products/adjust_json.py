@@ -39,6 +39,10 @@ def facts_json(facts: AdjustFacts, result: MapResult) -> dict[str, Any]:
             }
             for g in facts.groups
         ],
+        "image_correlations": [
+            {"camera": c.camera, "effect": c.effect, "reach_px": c.reach, "distance_px": c.distance, "rho": c.rho}
+            for c in result.adjusted.correlations
+        ],
         "cameras": _cameras(facts),
         "control": [_ground(g) for g in facts.ground if not g.check],
         "check_points": [_ground(g) for g in facts.ground if g.check],

@@ -105,6 +105,11 @@ def _advice(result: MapResult, used: NDArray[np.bool_]) -> list[str]:
         if group.unit == "px" and group.factor > 0:
             advice = f"; sigma_image = {float(np.median(points.sigma)) * group.factor:.2g} would fit"
         out.append(f"{group.name}: the stated standard deviation is {ratio:.1f} times too {how}{advice}")
+    out += [
+        f"image errors of camera {c.camera} are alike over up to {c.reach:.0f} px: for its orientations "
+        f"{c.effect:.1f} measurements count as one"
+        for c in adjusted.correlations
+    ]
     seen = {points.images[k] for k in np.unique(points.image[used])}
     alone = [name for name in adjusted.images if name not in seen]
     if alone:
@@ -286,6 +291,7 @@ def _settings(result: MapResult, settings: AdjustSettings, seconds: float) -> tu
         ("lever arm", f"{adjustment.lever_arm} m ± {adjustment.lever_arm_sigma:g} m"),
         ("drift", adjustment.drift),
         ("variance components", "estimated and used" if settings.variance_components else "not used"),
+        ("correlation of image errors", "regarded" if settings.correlation else "not regarded"),
         ("time", f"{seconds:.1f} s"),
     )
 
