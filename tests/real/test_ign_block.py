@@ -88,10 +88,10 @@ def test_orientations_lie_within_three_sigma_of_the_published_ones(block: tuple[
     spread = np.sqrt((normalised[measured] ** 2).mean(axis=0))
     (correlation,) = report["image_correlations"]
     print(
-        f"\nign_borea: {share:.2%} of all {normalised.size} orientation parameters within 3 sigma of the published ones; "
+        f"\nign_borea: {share:.2%} of all {normalised.size} orientation parameters within 3 sigma of the published, "
         f"of the {measured.sum()} exposures with points {own:.2%}, spread {spread.round(2)}, largest "
-        f"{np.abs(normalised[measured]).max():.2f}; {correlation['effect']:.1f} measurements count as one, errors alike "
-        f"over {correlation['reach_px']:.0f} px"
+        f"{np.abs(normalised[measured]).max():.2f}; {correlation['effect']:.1f} measurements count as one, errors "
+        f"alike over {correlation['reach_px']:.0f} px"
     )
     assert share >= 0.995
     assert own >= 0.99
