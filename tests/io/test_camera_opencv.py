@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from format_examples import assert_same_cameras, block_of, frame
+from tools.format_examples import assert_same_cameras, block_of, frame
 
 from photoplan.errors import InputError
 from photoplan.io.camera_file import read_cameras

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from format_examples import assert_same, block_of, frame, pixels, round_trip
 from scipy.spatial.transform import Rotation
+from tools.format_examples import assert_same, block_of, frame, pixels, round_trip
 
 from photoplan.errors import InputError
 from photoplan.io.orientation_colmap import read_points

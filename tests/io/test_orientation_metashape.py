@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from format_examples import assert_same, block_of, frame, pixels, round_trip, with_table
 from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
+from tools.format_examples import assert_same, block_of, frame, pixels, round_trip, with_table
 
 from photoplan.errors import InputError, UsageError
 from photoplan.io.orientation_exif import rotation_from_gimbal

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from format_examples import assert_same, below, block_of, frame, pixels, round_trip, with_table
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
+from tools.format_examples import assert_same, below, block_of, frame, pixels, round_trip, with_table
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import topocentric_poses

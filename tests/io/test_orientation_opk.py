@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from format_examples import assert_same, block_of, round_trip
 from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
+from tools.format_examples import assert_same, block_of, round_trip
 
 from photoplan.errors import InputError
 from photoplan.io.orientation_file import orientation_format, read_orientation_block

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from format_examples import assert_same, block_of, frame
+from tools.format_examples import assert_same, block_of, frame
 
 from photoplan.io.orientation_file import (
     FORMATS,

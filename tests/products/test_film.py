@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+from tools.real_projects import drone_project
 
 from photoplan.errors import InputError
 from photoplan.io.project import load_project, parse_project
 from photoplan.io.project_model import Project
-from photoplan.products.init import InitRequest, init_project
 from photoplan.products.orthophoto import plan_orthophotos, render
 
 CAMERA = "DJI FC300S half-res"
@@ -21,15 +21,7 @@ MARKS = {"1": (100.0, 80.0), "2": (1890.0, 90.0), "3": (1900.0, 1040.0), "4": (1
 
 @pytest.fixture(scope="module")
 def digital(block: Path, tmp_path_factory: pytest.TempPathFactory) -> Project:
-    request = InitRequest(
-        tmp_path_factory.mktemp("film"),
-        (str(block / "images" / "DJI_0032.jpg"),),
-        block / "int.yaml",
-        block / "ext.csv",
-        str(block / "dsm.tif"),
-        height_system="same",
-    )
-    return load_project(init_project(request).path)
+    return load_project(drone_project(block, tmp_path_factory.mktemp("film"), "DJI_0032"))
 
 
 def as_film(project: Project, marks: dict[str, tuple[float, float]], interior: str = "affine") -> Project:

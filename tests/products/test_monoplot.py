@@ -14,6 +14,7 @@ import shapely
 from cameras.camera_examples import BROWN
 from scipy.ndimage import gaussian_filter
 from tools.function_surface import FunctionSurface, raster_surface
+from tools.real_projects import drone_project
 from tools.small_block import hills
 
 from photoplan.cameras.base import project
@@ -24,7 +25,6 @@ from photoplan.cli.main import run
 from photoplan.errors import UsageError
 from photoplan.geometry.pose import Pose
 from photoplan.io.project import load_project
-from photoplan.products.init import InitRequest, init_project
 from photoplan.products.monoplot import MonoplotRequest, monoplot_file
 from photoplan.products.scene import open_scene
 from photoplan.surfaces.level import LevelSurface
@@ -174,12 +174,7 @@ def test_wrong_standard_deviations_are_refused():
 @pytest.fixture(scope="module")
 def brighton_project(block, tmp_path_factory):
     """The drone block of the package."""
-    folder = tmp_path_factory.mktemp("brighton")
-    request = InitRequest(
-        folder, (str(block / "images" / "*.jpg"),), block / "int.yaml", block / "ext.csv", str(block / "dsm.tif"),
-        height_system="same",
-    )  # fmt: skip
-    return init_project(request).path
+    return drone_project(block, tmp_path_factory.mktemp("brighton"))
 
 
 def test_the_drone_block_gives_one_point_from_two_images(brighton_project, tmp_path):

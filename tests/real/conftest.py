@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+from tools.real_projects import dmc_project, drone_project
 
 from photoplan.io.project import load_project
 from photoplan.products.execution import Run, execute
-from photoplan.products.init import InitRequest, init_project
 from photoplan.products.orthophoto import plan_orthophotos
 
 
@@ -26,32 +26,13 @@ def make_orthos(project_folder: Path, images: Sequence[str] | None, resolution: 
 def brighton(block: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """The drone block at 0.1 m, all 18 images."""
     folder = tmp_path_factory.mktemp("brighton")
-    init_project(
-        InitRequest(
-            folder=folder,
-            images=(str(block / "images" / "*.jpg"),),
-            camera=block / "int.yaml",
-            orientation=block / "ext.csv",
-            terrain=str(block / "dsm.tif"),
-            height_system="same",
-        )
-    )
+    drone_project(block, folder)
     return make_orthos(folder, None, 0.1)
 
 
 @pytest.fixture(scope="session")
 def ngi(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """The four DMC frames at 5 m."""
-    data = shared / "data" / "ngi_dmc"
     folder = tmp_path_factory.mktemp("ngi")
-    init_project(
-        InitRequest(
-            folder=folder,
-            images=(str(data / "images" / "*.tif"),),
-            camera=data / "eo" / "ngi_int_param.yaml",
-            orientation=data / "eo" / "ngi_xyz_opk.csv",
-            terrain=str(data / "dem.tif"),
-            height_system="same",
-        )
-    )
+    dmc_project(shared, folder)
     return make_orthos(folder, None, 5.0)

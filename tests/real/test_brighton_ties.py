@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tools.real_projects import drone_project
 from tools.ties import reprojection
 
 from photoplan.cameras.observed import ImagePoints
 from photoplan.io.image_points import read_image_points
 from photoplan.io.project import load_project
-from photoplan.products.init import InitRequest, init_project
 from photoplan.products.scene import open_scene
 from photoplan.products.tie import TieReport, TieRequest, find_ties
 
@@ -25,18 +25,7 @@ IMAGES = tuple(f"DJI_00{k}" for k in (25, 26, 27, 32, 33))
 
 @pytest.fixture(scope="module")
 def project(block: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("ties")
-    init_project(
-        InitRequest(
-            folder=folder,
-            images=(str(block / "images" / "*.jpg"),),
-            camera=block / "int.yaml",
-            orientation=block / "ext.csv",
-            terrain=str(block / "dsm.tif"),
-            height_system="same",
-        )
-    )
-    return folder / "project.toml"
+    return drone_project(block, tmp_path_factory.mktemp("ties"))
 
 
 def ties(project: Path, **how: object) -> tuple[TieReport, ImagePoints, NDArray]:

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tools.proposed import residuals, spoilt
+from tools.real_projects import dmc_project
 
 from photoplan.io.ground_points import read_ground_points
 from photoplan.products.control import ControlRequest, propose_control
-from photoplan.products.init import InitRequest, init_project
 
 
 @pytest.mark.parametrize(
@@ -22,22 +22,13 @@ def test_control_fits_the_true_orientation_to_a_pixel(
     shared: Path, tmp_path: Path, orthos: list[str], limit: float
 ) -> None:
     data = shared / "data" / "ngi_dmc"
-    init_project(
-        InitRequest(
-            folder=tmp_path,
-            images=(str(data / "images" / "*.tif"),),
-            camera=data / "eo" / "ngi_int_param.yaml",
-            orientation=data / "eo" / "ngi_xyz_opk.csv",
-            terrain=str(data / "dem.tif"),
-            height_system="same",
-        )
-    )
+    true = dmc_project(shared, tmp_path)
     near = tmp_path / "near.toml"
-    near.write_text((tmp_path / "project.toml").read_text())
+    near.write_text(true.read_text())
     spoilt(near, 10.0, 0.2)
     files = tuple(data / "ref" / name for name in orthos)
     found = propose_control(ControlRequest(near, files, height_sigma=3.0, search=60.0))
-    error = residuals(tmp_path / "project.toml", tmp_path / "control.csv")
+    error = residuals(true, tmp_path / "control.csv")
     print(f"{len(error)} points, rms {np.sqrt((error**2).mean()):.2f} px")
     assert len(error) >= 100 and min(len(i.points) for i in found.images) >= 20
     assert np.sqrt((error**2).mean()) <= limit  # measured: 0.40 and 0.73

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 from tools.command import peak_of
+from tools.real_projects import drone_project
 
 from photoplan.engine.execute import render
 from photoplan.engine.twin import strict_positions, strict_scales, twin_resample
@@ -23,15 +24,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def project(block: Path, tmp_path_factory: pytest.TempPathFactory):
-    request = InitRequest(
-        tmp_path_factory.mktemp("brighton"),
-        (str(block / "images" / "*.jpg"),),
-        block / "int.yaml",
-        block / "ext.csv",
-        str(block / "dsm.tif"),
-        height_system="same",
-    )
-    return load_project(init_project(request).path)
+    return load_project(drone_project(block, tmp_path_factory.mktemp("brighton")))
 
 
 @pytest.mark.parametrize("kernel", ["nearest", "bilinear", "bicubic", "bicubic-1", "lanczos3"])

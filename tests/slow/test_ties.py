@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tools.real_projects import drone_project
 from tools.ties import reprojection
 
 from photoplan.io.image_points import read_image_points
 from photoplan.io.project import load_project
-from photoplan.products.init import InitRequest, init_project
 from photoplan.products.scene import open_scene
 from photoplan.products.tie import TieRequest, find_ties
 
@@ -20,17 +20,7 @@ from photoplan.products.tie import TieRequest, find_ties
 def test_every_image_is_connected_and_95_percent_of_the_points_fit_to_3_px(
     block: Path, tmp_path: Path, oriented: bool
 ) -> None:
-    init_project(
-        InitRequest(
-            folder=tmp_path,
-            images=(str(block / "images" / "*.jpg"),),
-            camera=block / "int.yaml",
-            orientation=block / "ext.csv",
-            terrain=str(block / "dsm.tif"),
-            height_system="same",
-        )
-    )
-    path = tmp_path / "project.toml"
+    path = drone_project(block, tmp_path)
     report = find_ties(TieRequest(path, use_orientation=oriented, workers=2))
     assert len(report.parts) == 1 and len(report.parts[0]) == 18
     assert min(report.per_image.values()) >= 80
