@@ -131,7 +131,7 @@ def test_the_written_orientation_reproduces_the_points(folder: Path) -> None:
     for point in found["images"][0]["points"]:
         again = project_points(camera, control[int(point["name"][1:]) - 1])
         np.testing.assert_allclose(again - point["xy"], point["residual"], atol=2e-3)
-    assert found["written"] is True and found["left_out"] == ["c"] and found["failed"] == {}
+    assert found["written"] is True and found["left_out"] == ["c"] and found["failed"] == []
     assert 0.5 < found["images"][0]["sigma0"] < 1.6
 
 

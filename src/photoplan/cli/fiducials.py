@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from photoplan.cli.failures import end_with_failures
 from photoplan.cli.options import json_option
 
 __all__ = ["command"]
@@ -41,7 +42,6 @@ def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any)
     marks. An image that fails does not stop the others; they are listed at the end (exit code 4).
     """
     from photoplan.cli.progress import progress
-    from photoplan.errors import InputError, TilesFailed
     from photoplan.products.fiducials import FiducialsRequest, locate_fiducials
 
     request = FiducialsRequest(scans, **_values(options))
@@ -58,11 +58,7 @@ def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any)
                 click.echo(f"{image.name}: {note}", err=True)
     if report.written is not None and not quiet:
         click.echo(f"{report.written}: fiducial marks of {len(report.images)} images written", err=True)
-    if report.failed and not report.images:
-        raise InputError("\n".join(report.failed.values()))
-    if report.failed:
-        listed = "\n".join(f"  {reason}" for reason in report.failed.values())
-        raise TilesFailed(f"{len(report.failed)} of {len(report.failed) + len(report.images)} images failed:\n{listed}")
+    end_with_failures(report.failed, len(report.images))
 
 
 def _values(options: dict[str, Any]) -> dict[str, Any]:

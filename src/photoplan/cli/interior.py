@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from photoplan.cli.failures import end_with_failures
 from photoplan.cli.options import json_option
 
 __all__ = ["command"]
@@ -34,7 +35,6 @@ def command(images: tuple[str, ...], as_json: bool, quiet: bool, **options: Any)
     An image whose marks are missing, exchanged, mirrored or wrong does not stop the others; they are listed at the end
     (exit code 4).
     """
-    from photoplan.errors import InputError, TilesFailed
     from photoplan.products.interior import InteriorRequest, interior_orientations
 
     found = interior_orientations(InteriorRequest(images=images or None, **options))
@@ -51,9 +51,4 @@ def command(images: tuple[str, ...], as_json: bool, quiet: bool, **options: Any)
             click.echo(f"marks not measured in {', '.join(found.unmeasured)}: photoplan fiducials finds them", err=True)
         for camera in found.written:
             click.echo(f"camera {camera!r}: interior = {options['model']!r} written to the project", err=True)
-    if found.refused and not found.images:
-        raise InputError("\n".join(found.refused.values()))
-    if found.refused:
-        listed = "\n".join(f"  {reason}" for reason in found.refused.values())
-        total = len(found.refused) + len(found.images)
-        raise TilesFailed(f"{len(found.refused)} of {total} images failed:\n{listed}")
+    end_with_failures(found.failed, len(found.images))

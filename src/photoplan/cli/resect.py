@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from photoplan.cli.failures import end_with_failures
 from photoplan.cli.options import json_option
 
 if TYPE_CHECKING:
@@ -44,7 +45,6 @@ def command(as_json: bool, quiet: bool, free: str | None, **options: Any) -> Non
     they are listed at the end (exit code 4).
     """
     from photoplan.cli.progress import progress
-    from photoplan.errors import InputError, TilesFailed
     from photoplan.products.resect import ResectRequest, resect_project
 
     parameters = tuple(dict.fromkeys(p.strip() for p in (free or "").split(",") if p.strip()))
@@ -57,12 +57,7 @@ def command(as_json: bool, quiet: bool, free: str | None, **options: Any) -> Non
         _show(result)
     if not quiet:
         _talk(result)
-    if result.failed:
-        total = len(result.failed) + len(result.images)
-        listed = "\n".join(f"  {reason}" for reason in result.failed.values())
-        if not result.images:
-            raise InputError("\n".join(result.failed.values()))
-        raise TilesFailed(f"{len(result.failed)} of {total} images could not be oriented:\n{listed}")
+    end_with_failures(result.failed, len(result.images), "images could not be oriented")
 
 
 def _show(result: ResectResult) -> None:

@@ -128,7 +128,7 @@ def write_orientation(block: OrientationBlock, path: str | Path, format: str, *,
     texts = render(block, Path(path))
     present = [str(file) for file in texts if file.exists()]
     if present and not overwrite:
-        raise UsageError(f"{', '.join(present)}: exists; give --overwrite to replace it, or another name")
+        raise UsageError(f"{', '.join(present)}: exists already; choose another output or say --overwrite")
     for file, text in texts.items():
         try:
             file.parent.mkdir(parents=True, exist_ok=True)

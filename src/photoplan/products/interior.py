@@ -140,7 +140,7 @@ class InteriorResult:
     images: tuple[ImageInterior, ...]
     unmeasured: tuple[str, ...]
     """Film scans whose marks are not measured yet."""
-    refused: dict[str, str]
+    failed: dict[str, str]
     """Film scans whose marks cannot be right, and why."""
     written: tuple[str, ...]
     """Cameras whose model was set in the project file."""
@@ -152,7 +152,7 @@ class InteriorResult:
         return {
             "images": [image.to_dict() for image in self.images],
             "unmeasured": list(self.unmeasured),
-            "refused": self.refused,
+            "failed": [{"image": name, "reason": reason} for name, reason in self.failed.items()],
             "written": list(self.written),
             "report": self.report and str(self.report),
             "plot": self.plot and str(self.plot),
@@ -163,7 +163,7 @@ def interior_orientations(request: InteriorRequest) -> InteriorResult:
     """Interior orientation of every film scan of a project whose marks are measured.
 
     Scans with marks that cannot be right are listed in the result, the others are computed all the same; the project
-    file is changed only if none is refused.
+    file is changed only if none fails.
 
     Raises
     ------
@@ -187,21 +187,21 @@ def interior_orientations(request: InteriorRequest) -> InteriorResult:
             f"{request.project}: no fiducial marks are measured in {', '.join(unmeasured[:5])}; "
             "`photoplan fiducials` finds them"
         )
-    found, refused = [], {}
+    found, failed = [], {}
     for image in scans:
         if image.fiducials:
             try:
                 found.append(_interior(project, image, request.model, pitch))
             except InputError as error:
-                refused[image.name] = str(error)
+                failed[image.name] = str(error)
     if plots is not None and found:
-        _draw(request, found, refused, plots)
-    written = _write(request, found) if request.write and not refused else ()
+        _draw(request, found, failed, plots)
+    written = _write(request, found) if request.write and not failed else ()
     drawn = bool(found)
     return InteriorResult(
         tuple(found),
         unmeasured,
-        refused,
+        failed,
         written,
         request.report if drawn else None,
         request.plot if drawn else None,
@@ -252,7 +252,7 @@ def _interior(project: Project, image: Image, model: str | None, pitch: tuple[fl
 
 
 def _draw(
-    request: InteriorRequest, found: Sequence[ImageInterior], refused: dict[str, str], plots: InteriorPlots
+    request: InteriorRequest, found: Sequence[ImageInterior], failed: dict[str, str], plots: InteriorPlots
 ) -> None:
     panels = [ResidualPanel(i.image, i.fit.names, i.plane_mm, i.residuals_um) for i in found]
     if request.plot is not None:
@@ -260,7 +260,7 @@ def _draw(
     if request.report is not None:
         pairs = list(zip(panels, (i.to_dict() for i in found)))
         title = f"Interior orientation · {request.project.resolve().parent.name}"
-        write_atomically(request.report, interior_report(title, pairs, refused, plots).encode("utf-8", "replace"))
+        write_atomically(request.report, interior_report(title, pairs, failed, plots).encode("utf-8", "replace"))
 
 
 def _write(request: InteriorRequest, found: Sequence[ImageInterior]) -> tuple[str, ...]:

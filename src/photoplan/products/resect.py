@@ -73,7 +73,7 @@ class ResectResult:
             "project": str(self.project),
             "written": self.written,
             "images": [image.to_dict() for image in self.images],
-            "failed": self.failed,
+            "failed": [{"image": name, "reason": reason} for name, reason in self.failed.items()],
             "left_out": list(self.left_out),
             "report": self.report and str(self.report),
             "notes": list(self.notes),
