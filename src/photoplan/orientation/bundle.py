@@ -44,6 +44,9 @@ _ROUGHLY, _LEAST = 0.5, 8
 _SETTLED = 1e-9
 #: Rounds of data snooping, and of variance components.
 _ROUNDS, _COMPONENTS = 8, 6
+#: Whole steps that may make things worse for once: a block that turns as a whole cannot avoid it, since the step is
+#: straight and its way is not. What they led to counts only if it is better in the end.
+_PATIENCE = 4
 #: Damping (part of the diagonal) after a step that made things worse, and when to give up.
 _FIRST_DAMPING, _MOST_DAMPING = 1e-12, 1e6
 
@@ -167,11 +170,17 @@ class _Loop:
         if robust:
             base = base * softened(model, state)
         damping, cost = 0.0, np.inf
+        patience, best, least = _PATIENCE, state, np.inf
         for turn in range(self._most):
             e = whitened(model, residuals_of(model, state))
             weight = base * robust_weights(model, e * np.sqrt(base), turn) if robust else base
             weight = np.where(np.isfinite(e), weight, 0.0)
             before = _cost(e, weight)
+            if before <= least:
+                best, least = state, before
+            elif patience == 0 and not robust:
+                state, patience, damping = best, -1, _FIRST_DAMPING
+                continue
             rows, _ = linearise(model, state, np.sqrt(weight))
             while True:
                 reduced = reduce_normals(rows, len(model.point_names), damping)
@@ -179,6 +188,9 @@ class _Loop:
                 moved = state.moved(model, step, points)
                 after = _cost(whitened(model, residuals_of(model, moved)), weight)
                 if after <= before * (1.0 + 1e-9) + 1e-12:
+                    break
+                if patience > 0 and damping == 0.0 and after < np.inf:
+                    patience -= 1
                     break
                 damping = max(10.0 * damping, _FIRST_DAMPING)
                 if damping > _MOST_DAMPING:
