@@ -6,7 +6,7 @@ beside the adjustment's.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -241,8 +241,3 @@ def misses(made: Made, changed: Project, make: Make) -> NDArray[np.float64]:
             if file == f"{name}.tif":
                 out.append(project(camera, made.points[point]) - [float(x), float(y)])
     return np.array(out)
-
-
-def with_camera(make: Make, **entries: Any) -> Make:
-    """The same with other entries of the camera."""
-    return replace(make, camera={**make.camera, **entries})

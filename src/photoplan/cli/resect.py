@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 __all__ = ["command"]
 
-_SIGN = {"deg": "°", "gon": " gon", "rad": " rad"}
 _DIGITS = {"deg": 4, "gon": 4, "rad": 6}
 _FILE = click.Path(path_type=Path)
 
@@ -70,9 +69,9 @@ def _show(result: ResectResult) -> None:
 
 def _lines(image: ResectedImage) -> list[str]:
     """An image with its parameters and their standard deviations."""
-    found, unit = image.found, image.angle_unit
+    found = image.found
     used = int((~found.rejected).sum())
-    sign, digits = _SIGN[unit], _DIGITS[unit]
+    sign, digits = image.angle_sign, _DIGITS[image.angle_unit]
     center = zip(("X0", "Y0", "Z0"), image.center, image.sigma_center)
     angles = zip(image.angle_names, image.angles, image.sigma_angles)
     lines = [

@@ -17,6 +17,7 @@ __all__ = [
     "Curve",
     "Dot",
     "DotCross",
+    "EachMark",
     "Example",
     "Mark",
     "Marks",
@@ -25,6 +26,7 @@ __all__ = [
     "Polygon",
     "Ring",
     "RingCross",
+    "Silhouette",
     "Triangle",
 ]
 
@@ -121,7 +123,7 @@ class Polygon(_Entry):
     rotation: Number = 0.0
 
 
-class _Silhouette(_Entry):
+class Silhouette(_Entry):
     """A mark that is the outline of the camera's frame, described as at the upper side of a picture."""
 
     band: Length = 0.25
@@ -133,7 +135,7 @@ class _Silhouette(_Entry):
     window: Box | None = None
 
 
-class Block(_Silhouette):
+class Block(Silhouette):
     """A stepped trapezoid."""
 
     type: Literal["block"]
@@ -146,7 +148,7 @@ class Block(_Silhouette):
     slit_length: Length | None = None
 
 
-class Curve(_Silhouette):
+class Curve(Silhouette):
     """A step on one side and an arc on the other."""
 
     type: Literal["curve"]
@@ -156,7 +158,7 @@ class Curve(_Silhouette):
     run: Length
 
 
-class Notch(_Silhouette):
+class Notch(Silhouette):
     """Two teeth beside one edge."""
 
     type: Literal["notch"]
@@ -166,7 +168,7 @@ class Notch(_Silhouette):
     angle: Angle = 45.0
 
 
-class Triangle(_Silhouette):
+class Triangle(Silhouette):
     """A wedge between two flanks."""
 
     type: Literal["triangle"]
@@ -176,7 +178,7 @@ class Triangle(_Silhouette):
     inside_bright: Flag = False
 
 
-class Arc(_Silhouette):
+class Arc(Silhouette):
     """A cusp of two arcs with a cross in it."""
 
     type: Literal["arc"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.run_record import versions
 from photoplan.products.adjust_block import MapResult
+from photoplan.products.plain_values import plain
 from photoplan.report.adjust_facts import AdjustFacts, GroundFacts, MeasurementFacts
 
 __all__ = ["facts_json"]
@@ -64,21 +64,8 @@ def facts_json(facts: AdjustFacts, result: MapResult) -> dict[str, Any]:
         "versions": versions(),
         "settings": dict(facts.settings),
     }
-    clean: dict[str, Any] = _plain(data)
+    clean: dict[str, Any] = plain(data)
     return clean
-
-
-def _plain(value: Any) -> Any:
-    """Without NaN, arrays and NumPy's own numbers."""
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(v) for v in value]
-    if isinstance(value, float | np.floating):
-        return float(value) if math.isfinite(value) else None
-    if isinstance(value, np.integer | np.bool_):
-        return value.item()
-    return value
 
 
 def _cameras(facts: AdjustFacts) -> dict[str, Any]:

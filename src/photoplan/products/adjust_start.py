@@ -9,8 +9,6 @@ import numpy as np
 
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import rotation_from_angles
-from photoplan.io.orientation_table import angle_in_radians
 from photoplan.io.project_cameras import interior_of
 from photoplan.orientation.block import BlockCamera
 from photoplan.orientation.start import StartImage, start_block
@@ -18,6 +16,7 @@ from photoplan.products.adjust_cameras import block_camera
 from photoplan.products.adjust_frame import block_frame
 from photoplan.products.adjust_inputs import AdjustInputs
 from photoplan.products.init_match import some
+from photoplan.products.scene import stated_pose
 
 __all__ = ["known_poses", "started"]
 
@@ -27,14 +26,12 @@ _SIGHT = 50e3
 
 def known_poses(inputs: AdjustInputs) -> dict[str, Pose]:
     """Orientations (map poses) that the project states, or observed positions together with attitudes."""
-    orientation = inputs.project.orientation
     found: dict[str, Pose] = {}
     table = inputs.table
     row = {} if table is None or table.R_ground_camera is None else {n: k for k, n in enumerate(table.images)}
     for image in inputs.images:
         if image.center is not None and image.angles is not None:
-            angles = angle_in_radians(np.array(image.angles), orientation.angle_unit)
-            found[image.name] = Pose(np.array(image.center, float), rotation_from_angles(angles, orientation.rotation))
+            found[image.name] = stated_pose(inputs.project, image)
         elif image.name in row and table is not None and table.R_ground_camera is not None:
             k = row[image.name]
             found[image.name] = Pose(table.XYZ[k], table.R_ground_camera[k])

@@ -79,8 +79,8 @@ def mark_pattern(mark: described.Mark, folder: Path) -> MarkPattern | MarkExampl
         return _polygon(mark)
     given = mark.model_dump(exclude_none=True)
     kind = given.pop("type")
-    if isinstance(mark, described._Silhouette):
-        style = frame.Style(**{key: given.pop(key) for key in described._Silhouette.model_fields if key in given})
+    if isinstance(mark, described.Silhouette):
+        style = frame.Style(**{key: given.pop(key) for key in described.Silhouette.model_fields if key in given})
         makers = {
             "block": frame.block,
             "curve": frame.curve,

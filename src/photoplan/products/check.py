@@ -12,6 +12,7 @@ from photoplan.geometry.crs import crs_label
 from photoplan.io.project_model import Project
 from photoplan.plan.coverage import Coverage, cover
 from photoplan.products.orthophoto import mean_gsd, two_figures
+from photoplan.products.plain_values import plain
 from photoplan.products.plausibility import assess, view_of
 from photoplan.products.scene import Scene, ground_of, open_scene, pose_of
 
@@ -70,8 +71,8 @@ class ProjectCheck:
     def to_dict(self) -> dict[str, Any]:
         """Plain values for `--json`; NaN becomes null."""
         return {
-            "images": [{k: _plain(v) for k, v in asdict(i).items()} for i in self.images],
-            "sensible_resolution": _plain(self.sensible_resolution),
+            "images": [plain(asdict(i)) for i in self.images],
+            "sensible_resolution": plain(self.sensible_resolution),
             "height_systems": dict(zip(("terrain", "orientation", "working"), self.heights)),
             "crs": self.crs,
             "alternative": self.alternative,
@@ -97,12 +98,6 @@ class ProjectCheck:
             closing.append("all plausible")
         alternative = [] if self.alternative is None else [self.alternative]
         return "\n".join([*lines, " · ".join(closing), *alternative, *self.advice])
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return [_plain(v) for v in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def check_project(project: Project, images: Sequence[str] | None = None) -> ProjectCheck:

@@ -22,6 +22,7 @@ from photoplan.io.project_cameras import fiducial_fit
 from photoplan.io.project_edit import ProjectChanges, edit_project
 from photoplan.io.project_model import Image, Project
 from photoplan.io.scan_pitch import parse_pitch, read_pitch
+from photoplan.products.plain_values import plain
 from photoplan.products.scene import input_files
 from photoplan.report.interior import InteriorPlots, ResidualPanel, interior_report
 
@@ -89,8 +90,8 @@ class ImageInterior:
             "marks": marks,
             "missing": list(fit.missing),
             "redundancy": fit.redundancy,
-            "sigma0_px": _plain(fit.sigma0),
-            "sigma0_um": _plain(self.sigma0_um),
+            "sigma0_px": plain(fit.sigma0),
+            "sigma0_um": plain(self.sigma0_um),
             "mm_to_px": coefficients,
             "scale_px_per_mm": list(facts.scale),
             "pixel_um": [1000 * s for s in facts.pixel_size],
@@ -99,7 +100,7 @@ class ImageInterior:
             "mirrored": facts.mirrored,
             "scan_pitch_um": self.pitch and [1000 * p for p in self.pitch],
             "shrinkage_permille": shrinkage and [1000 * shrinkage.x, 1000 * shrinkage.y],
-            "sigma_shrinkage_permille": shrinkage and [_plain(1000 * s) for s in shrinkage.sigma],
+            "sigma_shrinkage_permille": shrinkage and plain([1000 * s for s in shrinkage.sigma]),
             "note": self.note,
         }
 
@@ -267,7 +268,3 @@ def _write(request: InteriorRequest, found: Sequence[ImageInterior]) -> tuple[st
     cameras = tuple(dict.fromkeys(i.camera for i in found))
     edit_project(request.project, ProjectChanges(cameras={name: {"interior": request.model} for name in cameras}))
     return cameras
-
-
-def _plain(value: float) -> float | None:
-    return value if math.isfinite(value) else None

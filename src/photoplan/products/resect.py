@@ -172,13 +172,12 @@ def _changes(done: Sequence[ResectedImage]) -> ProjectChanges:
 
 
 def _facts(result: ResectedImage) -> ResectFacts:
-    unit = {"deg": "°", "gon": " gon", "rad": " rad"}[result.angle_unit]
     orientation = [
         (name, f"{value:.3f} m", f"{sigma:.3f} m")
         for name, value, sigma in zip(("X0", "Y0", "Z0"), result.center, result.sigma_center)
     ]
     orientation += [
-        (name, f"{value:.5f}{unit}", f"{sigma:.5f}{unit}")
+        (name, f"{value:.5f}{result.angle_sign}", f"{sigma:.5f}{result.angle_sign}")
         for name, value, sigma in zip(result.angle_names, result.angles, result.sigma_angles)
     ]
     if result.calibrated is not None:

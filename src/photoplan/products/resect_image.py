@@ -14,8 +14,7 @@ from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
 from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles
-from photoplan.io.orientation_table import angle_in_radians
+from photoplan.geometry.rotation import angles_from_rotation
 from photoplan.io.project_cameras import interior_of, lens_of
 from photoplan.io.project_model import ANGLE_UNITS, Image, Project
 from photoplan.orientation.block import AdjustedCamera
@@ -24,6 +23,8 @@ from photoplan.orientation.resection_model import MeasuredPoints, Resected, Rese
 from photoplan.products.adjust_cameras import Calibrated, block_camera, calibrated, camera_entries
 from photoplan.products.adjust_frame import angle_derivatives, block_frame, nadir_heights
 from photoplan.products.adjust_inputs import AdjustInputs
+from photoplan.products.plain_values import plain
+from photoplan.products.scene import stated_pose
 
 __all__ = ["ResectedImage", "control_rows", "resect_image"]
 
@@ -56,6 +57,11 @@ class ResectedImage:
     camera_entries: dict[str, Any]
     """Entries of the camera in the project that change."""
     notes: tuple[str, ...]
+
+    @property
+    def angle_sign(self) -> str:
+        """What is written behind angles."""
+        return {"deg": "°", "gon": " gon", "rad": " rad"}[self.angle_unit]
 
     @property
     def image_entries(self) -> dict[str, Any]:
@@ -95,9 +101,9 @@ class ResectedImage:
                 {
                     "name": name,
                     "xy": self.points.xy[k].tolist(),
-                    "residual": _finite(found.residuals[k]),
-                    "normalised": _finite(found.normalised[k]),
-                    "redundancy": _finite(found.redundancies[k]),
+                    "residual": plain(found.residuals[k]),
+                    "normalised": plain(found.normalised[k]),
+                    "redundancy": plain(found.redundancies[k]),
                     "rejected": bool(found.rejected[k]),
                 }
                 for k, name in enumerate(self.points.names)
@@ -113,10 +119,6 @@ def _camera_dict(found: Calibrated) -> dict[str, Any]:
             found.parameters, found.after, found.sigma, found.units, found.before
         )
     }
-
-
-def _finite(values: Array) -> list[float | None]:
-    return [float(v) if np.isfinite(v) else None for v in values]
 
 
 def _rounded(values: Array, decimals: int) -> list[float]:
@@ -225,17 +227,10 @@ def _resected(
         )
 
     plain = orientation.earth_curvature == "none" and not orientation.refraction
-    near = _stated(project, image)
+    near = None if image.center is None or image.angles is None else stated_pose(project, image)
     found = resect(points, *camera, settings, camera_of=None if plain else camera_of, near=near, name=image.name)
     if orientation.earth_curvature == "correction":
         # It refers to the ground below the station, which is known only now.
         below = float(nadir_heights(project, found.pose.center[None, :2], below)[0])
         found = resect(points, *camera, settings, camera_of=camera_of, near=found.pose, name=image.name)
     return found
-
-
-def _stated(project: Project, image: Image) -> Pose | None:
-    if image.center is None or image.angles is None:
-        return None
-    angles = angle_in_radians(np.array(image.angles), project.orientation.angle_unit)
-    return Pose(np.array(image.center, float), rotation_from_angles(angles, project.orientation.rotation))

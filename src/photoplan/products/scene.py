@@ -31,7 +31,7 @@ from photoplan.surfaces.base import Surface
 from photoplan.surfaces.level import LevelSurface
 from photoplan.surfaces.shifted import ShiftedSurface
 
-__all__ = ["Ground", "Scene", "SceneAddress", "ground_of", "input_files", "open_scene", "pose_of"]
+__all__ = ["Ground", "Scene", "SceneAddress", "ground_of", "input_files", "open_scene", "pose_of", "stated_pose"]
 
 
 @dataclass(frozen=True)
@@ -218,14 +218,26 @@ class _Undulation:
         return self.step(np.concatenate([XY, np.zeros((*XY.shape[:-1], 1))], axis=-1))
 
 
+def stated_pose(project: Project, image: Image) -> Pose:
+    """Exterior orientation of an image as the project states it, in the orientation's height system.
+
+    Raises
+    ------
+    InputError
+        It states none.
+    """
+    orientation = project.orientation
+    center, angles = image.pose_numbers
+    radians = angle_in_radians(np.array(angles), orientation.angle_unit)
+    return Pose(np.array(center, float), rotation_from_angles(radians, orientation.rotation))
+
+
 def pose_of(project: Project, image: Image, ground: Ground) -> Pose:
     """Exterior orientation of an image, in the height system that the ground has."""
-    orientation = project.orientation
-    stated, turned = image.pose_numbers
-    angles = angle_in_radians(np.array(turned), orientation.angle_unit)
-    center = np.array(stated, float)
+    stated = stated_pose(project, image)
+    center = stated.center.copy()
     center[2] = height_step(ground.height_systems[1], ground.working_system, project.crs)(center)
-    return Pose(center, rotation_from_angles(angles, orientation.rotation))
+    return Pose(center, stated.R_ground_camera)
 
 
 def _camera(project: Project, image: Image, ground: Ground, size: tuple[int, int]) -> Camera:
