@@ -23,12 +23,12 @@ from photoplan.geometry.crs import canonical_crs, crs_label, crs_step, parse_crs
 from photoplan.io.disk import write_atomically
 from photoplan.io.names import match_key
 from photoplan.io.plain_files import read_text
+from photoplan.io.text_columns import NUMBER
 
 __all__ = ["GcpList", "is_gcp_list", "read_gcp_list", "write_gcp_list"]
 
 MAX_BYTES = 100_000_000
 _UTM = re.compile(r"WGS\s*84\s+UTM\s+(\d{1,2})\s*([NS])", re.I)
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +138,7 @@ def _crs(where: str, text: str) -> str:
         if not 1 <= zone <= 60:
             raise InputError(f"{where}: UTM zone {zone}; zones are 1 to 60")
         return f"EPSG:{32600 + zone + 100 * (utm[2].upper() == 'S')}"
-    if len(text.split()) >= 6 and sum(bool(_NUMBER.fullmatch(word)) for word in text.split()[:5]) == 5:
+    if len(text.split()) >= 6 and sum(bool(NUMBER.fullmatch(word)) for word in text.split()[:5]) == 5:
         raise InputError(f"{where}: the first line is a measurement; it must state the CRS, such as EPSG:32632")
     parse_crs(text, where)
     return split_compound(text)[0]
@@ -153,7 +153,7 @@ def _line(path: Path, number: int, text: str) -> _Line:
         if what == "Z" and word.casefold() == "nan":
             values.append(np.nan)
             continue
-        if not _NUMBER.fullmatch(word):
+        if not NUMBER.fullmatch(word):
             hint = "; write decimals with a point" if "," in word else ""
             raise InputError(f"{path}:{number}: {what} = {word[:40]!r} is not a number{hint}")
         values.append(float(word))

@@ -21,10 +21,10 @@ from pyogrio.errors import DataSourceError, FieldError, GeometryError
 
 from photoplan.cameras.observed import GroundPoints
 from photoplan.errors import InputError
-from photoplan.geometry.crs import crs_label, parse_crs, same_crs, split_compound
+from photoplan.geometry.crs import crs_label, same_crs, split_compound
 from photoplan.io.checks import check_plain_file
 from photoplan.io.named_table import TableColumns, read_named_table, write_named_table
-from photoplan.io.plain_files import read_text
+from photoplan.io.prj_file import crs_beside
 
 __all__ = ["read_ground_points", "write_ground_points"]
 
@@ -73,7 +73,8 @@ def read_ground_points(
     path = Path(path)
     if path.suffix.lower() == ".gpkg":
         return _from_layer(path, crs)
-    _check_crs(path, _sidecar(path), crs)
+    beside = crs_beside(path)
+    _check_crs(path, None if beside is None else beside.crs, crs)
     table = read_named_table(path, TableColumns(_ROLES, _NEEDED, (), columns, decimal_comma))
     names = table.names("name")
     XYZ = np.stack([table.numbers(axis, empty=True) for axis in ("x", "y", "z")], axis=1)
@@ -120,16 +121,6 @@ def _first(*columns: NDArray[np.float64]) -> NDArray[np.float64]:
     for column in columns[1:]:
         out = np.where(np.isnan(out), column, out)
     return out
-
-
-def _sidecar(path: Path) -> str | None:
-    """CRS of a ``.prj`` beside a table."""
-    side = next((p for p in (path.with_suffix(".prj"), path.with_suffix(".PRJ")) if p.is_file()), None)
-    if side is None:
-        return None
-    text = read_text(side, 100_000).strip()
-    parse_crs(text, str(side))
-    return split_compound(text)[0]
 
 
 def _check_crs(path: Path, own: str | None, wanted: str | None) -> None:

@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.observed import ObservedAttitudes, ObservedPositions
 from photoplan.errors import InputError
-from photoplan.geometry.crs import crs_label, parse_crs, same_crs, split_compound
+from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.rotation import rotation_from_angles
 from photoplan.io.named_table import NamedTable, TableColumns, read_named_table
 from photoplan.io.names import match_key
 from photoplan.io.orientation_exif import map_positions, read_folder
 from photoplan.io.orientation_file import read_orientation
 from photoplan.io.orientation_table import TableFormat, angle_in_radians
-from photoplan.io.plain_files import read_text
+from photoplan.io.prj_file import crs_beside
 from photoplan.io.project_model import ANGLE_UNITS
 
 __all__ = ["PositionTable", "read_observed_positions"]
@@ -126,7 +126,9 @@ def read_observed_positions(
         return _from_images(path, crs)
     if path.suffix.lower() not in _TEXTS:
         return _from_orientation(path, form, crs)
-    _check_crs(path, crs)
+    beside = None if crs is None else crs_beside(path)
+    if beside is not None and crs is not None:
+        _same(path, beside.crs, crs)
     table = read_named_table(path, TableColumns(_ROLES, _NEEDED, (), columns, form.decimal_comma))
     names = table.names("name")
     first: dict[str, int] = {}
@@ -197,15 +199,6 @@ def _times(table: NamedTable) -> NDArray[np.float64]:
             raise InputError(f"{table.where(k)}: time {text[:40]!r}; seconds or ISO 8601 are needed") from None
         out.append(moment.replace(tzinfo=moment.tzinfo or datetime.UTC).timestamp())
     return np.array(out)
-
-
-def _check_crs(path: Path, crs: str | None) -> None:
-    side = next((p for p in (path.with_suffix(".prj"), path.with_suffix(".PRJ")) if p.is_file()), None)
-    if side is None or crs is None:
-        return
-    text = read_text(side, 100_000).strip()
-    parse_crs(text, str(side))
-    _same(path, split_compound(text)[0], crs)
 
 
 def _same(path: Path, own: str, crs: str) -> None:

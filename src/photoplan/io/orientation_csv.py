@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from photoplan.errors import InputError
-from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.io.orientation_block import OrientationBlock, OrientationFormat, common_losses, require_map
 from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.plain_files import read_text
+from photoplan.io.prj_file import crs_beside
 from photoplan.io.project_model import ANGLE_UNITS
 from photoplan.io.text_columns import NUMBER, decimal, find_delimiter, has_decimal_comma, split_line
 
@@ -67,7 +67,8 @@ def read(path: Path, form: TableFormat) -> OrientationTable:
         raise InputError(f"{path}: holds a header and no image")
     width = len(rows[0].fields) if form.columns is not None else len(_split(data[0], delimiter, path).fields)
     images = tuple(_image(row, roles, width, form, path) for row in rows)
-    side, crs, heights = _sidecar(path)
+    beside = crs_beside(path)
+    crs, side, heights = (None,) * 3 if beside is None else (beside.crs, beside.file, beside.height_system)
     return OrientationTable(
         path, images, form.angle_unit, form.rotation, form.direction, crs, side, heights, notes=tuple(notes)
     )
@@ -187,16 +188,6 @@ def _number(row: _Row, role: str, roles: dict[str, int], form: TableFormat, path
     elif not text or text.casefold().lstrip("+-") in ("nan", "inf", "null", "none", "na", "n/a"):
         hint = "; give the orientation or delete the line"
     raise InputError(f"{path}:{row.line}: {role} = {text!r} is not a number{hint}")
-
-
-def _sidecar(path: Path) -> tuple[Path | None, str | None, str | None]:
-    """The ``.prj`` file beside the table, its CRS and height system."""
-    side = next((p for p in (path.with_suffix(".prj"), path.with_suffix(".PRJ")) if p.is_file()), None)
-    if side is None:
-        return None, None, None
-    text = read_text(side, 100_000).strip()
-    parse_crs(text, str(side))
-    return side, *split_compound(text)
 
 
 def _delimiter_safe(name: str) -> str:

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.geometry.crs import parse_crs, split_compound
-from photoplan.io.plain_files import read_text
+from photoplan.io.prj_file import crs_beside
 from photoplan.io.terrain_columns import Block, Layout, find_layout, parse_block
 from photoplan.io.terrain_groups import CodeIndex, PointColumns, class_of, is_line, make_groups
 from photoplan.io.terrain_options import CodeClass, ReadOptions
@@ -183,7 +182,8 @@ def _terrain(
     left_out = len(columns.xyz) - sum(len(g.xyz) for g in groups)
     if left_out:
         notes.append(f"{path.name}: {left_out} points left out, their codes say `ignore`")
-    crs, heights = _sidecar(path)
+    stated = crs_beside(path)
+    crs, heights = (None, None) if stated is None else (stated.crs, stated.height_system)
     return MeasuredTerrain(tuple(groups), tuple(lines), crs, heights, files=(path,), notes=tuple(notes))
 
 
@@ -242,13 +242,3 @@ def _line_sigma(sigma: NDArray[np.float64] | None, part: NDArray[np.int64], defa
     if sigma is None or np.isnan(sigma[part]).all():
         return default
     return float(np.sqrt(np.nanmean(sigma[part] ** 2)))
-
-
-def _sidecar(path: Path) -> tuple[str | None, str | None]:
-    """CRS and height system that the file's ``.prj`` states."""
-    side = next((p for p in (path.with_suffix(".prj"), path.with_suffix(".PRJ")) if p.is_file()), None)
-    if side is None:
-        return None, None
-    text = read_text(side, 100_000).strip()
-    parse_crs(text, str(side))
-    return split_compound(text)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,12 +13,11 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.plain_files import read_text
+from photoplan.io.text_columns import DELIMITERS, NUMBER
 
 __all__ = ["XYTable", "read_xy_table"]
 
 MAX_BYTES = 1_000_000_000
-_DELIMITERS = (";", "\t", ",", " ")
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +70,7 @@ def read_xy_table(path: Path, roles: Mapping[str, Sequence[str]]) -> XYTable:
     ]
     if not lines:
         raise InputError(f"{path}: holds no line with data")
-    delimiter = next((d for d in _DELIMITERS if d in lines[0][1].strip()), ",")
+    delimiter = next((d for d in DELIMITERS if d in lines[0][1].strip()), ",")
     split = [_split(path, number, text, delimiter) for number, text in lines]
     header = split[0]
     known = [name.lower() for name in header]
@@ -108,7 +106,7 @@ def _number(table: XYTable, row: int, column: int, empty: bool = False) -> float
     text = table.rows[row][column]
     if empty and not text:
         return math.nan
-    if not _NUMBER.fullmatch(text):
+    if not NUMBER.fullmatch(text):
         hint = "; write decimals with a point" if "," in text else ""
         raise InputError(
             f"{table.path}:{table.lines[row]}: column {table.header[column]!r} holds {text[:40]!r}; a number is needed"
