@@ -167,6 +167,9 @@ def test_from_scan_to_orthophoto_by_commands(case: Case) -> None:
     (interior,) = json.loads(said.out)["images"]
     assert interior["shrinkage_permille"] == pytest.approx(1000 * np.array(FILM.shrinkage), abs=0.02)
     assert interior["rotation_deg"] == pytest.approx(FILM.turn_deg, abs=0.005)
+    residuals = {m["name"]: m["residual_um"] for m in interior["marks"]}
+    for mark in found["marks"]:  # both verbs state them in one sense
+        assert mark["residual_um"] == pytest.approx(residuals[mark["name"]], abs=0.02)
 
     said = process("resect", project, "--sigma-image", SIGMA_IMAGE, "--sigma-control", SIGMA_CONTROL, SIGMA_CONTROL)
     assert said.code == 0, said.err

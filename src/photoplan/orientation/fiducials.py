@@ -101,7 +101,7 @@ class FiducialResult:
     fit: FiducialFit
     """Affine transformation from millimetres to pixels."""
     residuals_um: NDArray[np.float64]
-    """Measured minus transformed position of each mark in `fit`, in the image plane (x right, y up), micrometres."""
+    """Transformed minus measured position of each mark in `fit`, in the image plane (x right, y up), micrometres."""
     turn: Turn
     """How the upright picture was turned before it was scanned."""
     negative: bool
@@ -291,7 +291,7 @@ def _result(
     turn, fit, names = decided
     marks = {names[old]: _located(names[old], at) for old, at in measured.found.items()}
     to_mm = np.linalg.inv(fit.transformation.derivative(np.zeros(2)))
-    residuals = -fit.residuals @ to_mm.T * 1000.0
+    residuals = fit.residuals @ to_mm.T * 1000.0
     missing = []
     for name in fit.missing:
         k = layout.names.index(name)
