@@ -74,9 +74,13 @@ def read_inputs(project: Project, names: Sequence[str]) -> AdjustInputs:
             parts.append((path, read_image_points(path)))
     points = _image_points(project, parts, names, notes)
     ground = _ground(project, ground_parts)
-    unmeasured = [n for n in ground.names if n not in set(points.points)]
+    measured = set(points.points)
+    unmeasured = [n for n in ground.names if n not in measured]
     if unmeasured:
         notes.append(f"{len(unmeasured)} ground points are measured in no image: {some(unmeasured)}")
+        keep = np.array([n in measured for n in ground.names], bool)
+        names_kept = tuple(n for n in ground.names if n in measured)
+        ground = GroundPoints(names_kept, ground.XYZ[keep], ground.sigma[keep], ground.check[keep])
     table = _positions(project, names, notes)
     if table is not None:
         files += image_files(table.path)
