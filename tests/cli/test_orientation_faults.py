@@ -14,7 +14,10 @@ import pytest
 import rasterio
 from rasterio.transform import Affine
 from tools.adjust_project import Make, write_project
-from tools.command import Here, Said, edit, start, wait_for
+from tools.command import Here, Said, edit, process, start, wait_for
+
+import photoplan as photoplan_package
+from photoplan.products import adjust
 
 pytest.importorskip("matplotlib")
 
@@ -479,3 +482,57 @@ class TestInterruption:
         assert running.returncode == 130, (out, err)
         assert "Traceback" not in err
         assert state(block) == before
+
+    def test_fault_25_ctrl_c_in_tie(self, tmp_path: Path) -> None:
+        """While features are sought: no table, no entry in the project, no child left behind."""
+        pytest.importorskip("cv2")
+        data = Path(photoplan_package.__file__).parent / "demo_block"
+        words = (
+            "--images",
+            data / "images" / "*.jpg",
+            "--camera",
+            data / "int.yaml",
+            "--orientation",
+            data / "ext.csv",
+        )
+        said = process("init", tmp_path, *words, "--height-system", "same")
+        assert said.code == 0, said.err
+        before = (tmp_path / "project.toml").read_bytes()
+        running = start("tie", tmp_path / "project.toml", "--workers", 1)
+        wait_for(lambda: any(tmp_path.glob("*.cache/*")), running)
+        os.killpg(running.pid, signal.SIGINT)
+        out, err = running.communicate(timeout=20)
+        assert running.returncode == 130, (out, err)
+        assert "Traceback" not in err
+        assert (tmp_path / "project.toml").read_bytes() == before
+        assert not (tmp_path / "tie_points.csv").exists()
+
+    def test_what_is_edited_meanwhile_stays(
+        self, photoplan: Here, block: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Results are entered into the file as it is when they are there, not as it was."""
+        path, facts = block / "project.toml", adjust.build_facts
+
+        def meanwhile(*given: object) -> object:
+            edit(path, "# a remark that stays", "# a remark that was changed\n# and another one")
+            return facts(*given)
+
+        monkeypatch.setattr(adjust, "build_facts", meanwhile)
+        assert photoplan("adjust", path).code == 0
+        text = path.read_text()
+        assert "# a remark that was changed\n# and another one" in text and "sigma_center" in text
+
+    def test_a_project_that_vanishes_meanwhile(
+        self, photoplan: Here, block: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        path, facts = block / "project.toml", adjust.build_facts
+
+        def meanwhile(*given: object) -> object:
+            path.rename(block / "elsewhere.toml")
+            return facts(*given)
+
+        monkeypatch.setattr(adjust, "build_facts", meanwhile)
+        said = photoplan("adjust", path)
+        assert said.code in (2, 3), said
+        assert "project.toml" in said.err
+        assert not path.exists()
