@@ -96,6 +96,11 @@ def film_shrinkage(
         Distance of two columns and of two rows on the film, in the unit of the image plane.
     covariance : ndarray, shape (6, 6) or (8, 8), optional
         Of the coefficients, as `FiducialFit` has it.
+
+    Raises
+    ------
+    InputError
+        A sampling distance is not positive.
     """
     if not all(math.isfinite(p) and p > 0 for p in pitch):
         raise InputError(f"sampling distance {pitch} of the scan; two positive numbers are needed")

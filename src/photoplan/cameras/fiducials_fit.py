@@ -61,6 +61,13 @@ class FiducialFit:
 def fit_marks(model: str, plane_mm: Marks, scan_px: Marks, *, mirrored: bool = False) -> FiducialFit:
     """`fit_similarity`, `fit_affine` or `fit_bilinear`, by the name of the model.
 
+    Parameters
+    ----------
+    model : str
+        similarity, affine or bilinear.
+    plane_mm, scan_px, mirrored
+        As for `fit_affine`.
+
     Raises
     ------
     InputError

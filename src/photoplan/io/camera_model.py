@@ -176,7 +176,7 @@ class FrameCamera(Entry):
 
     @property
     def pixel_mm(self) -> tuple[float, float]:
-        """Side lengths of a pixel in millimetres; only where the camera is described in millimetres."""
+        """Side lengths of a pixel in millimetres; InputError where the camera is described in pixels alone."""
         if self.sensor_size_mm is not None:
             return self.sensor_size_mm[0] / self.size[0], self.sensor_size_mm[1] / self.size[1]
         if self.pixel_size_um is None:

@@ -76,7 +76,13 @@ class NamedTable:
         return [row[at] for row in self.rows]
 
     def names(self, role: str) -> list[str]:
-        """Fields of a role, none of them empty."""
+        """Fields of a role, none of them empty.
+
+        Raises
+        ------
+        InputError
+            A field is empty, has control characters or more than 1000 characters.
+        """
         found = self.texts(role)
         for k, text in enumerate(found):
             if not text or any(ord(c) < 32 for c in text) or len(text) > 1000:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import unicodedata
 from collections.abc import Iterable
@@ -10,7 +11,7 @@ from pathlib import Path
 
 from photoplan.errors import InputError, UsageError
 
-__all__ = ["check_input_name", "inside", "match_key", "resolve_input", "safe_stem", "unique_stems"]
+__all__ = ["check_input_name", "inside", "match_key", "relative_path", "resolve_input", "safe_stem", "unique_stems"]
 
 #: Bytes of a stem at most; file systems allow 255 for a name, and products add a few suffixes.
 MAX_BYTES = 120
@@ -125,3 +126,13 @@ def inside(folder: Path, name: str) -> Path:
     if root not in path.parents:
         raise UsageError(f"output {name!r} lies outside {folder}; nothing is written outside the output folder")
     return path
+
+
+def relative_path(file: Path, folder: Path) -> str:
+    """Path of a file as the project file states it: from the project's folder, where there is a way."""
+    # The folder of the file is resolved, not the file: a link keeps its own name, and so do the products.
+    target = file.parent.resolve() / file.name
+    try:
+        return Path(os.path.relpath(target, folder.absolute().resolve())).as_posix()
+    except ValueError:  # another drive
+        return target.as_posix()

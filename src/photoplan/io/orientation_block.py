@@ -26,6 +26,8 @@ __all__ = [
     "OrientationBlock",
     "OrientationFormat",
     "common_losses",
+    "height_losses",
+    "require_cameras",
     "require_map",
     "without_lenses",
 ]

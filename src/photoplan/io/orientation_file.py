@@ -18,6 +18,7 @@ __all__ = [
     "read_orientation",
     "read_orientation_block",
     "write_orientation",
+    "written_formats",
 ]
 
 #: Module of every format, by name; each defines `FORMAT` (see `photoplan.io.orientation_block`).
@@ -107,6 +108,16 @@ def read_orientation(path: str | Path, form: TableFormat | None = None, format: 
 
 def write_orientation(block: OrientationBlock, path: str | Path, format: str, *, overwrite: bool = False) -> list[Path]:
     """Write a block in a format; each file appears complete or not at all.
+
+    Parameters
+    ----------
+    block : OrientationBlock
+    path : path
+        File, or folder of a format with several files.
+    format : str
+        One of `FORMATS`.
+    overwrite : bool
+        Replace files that exist.
 
     Returns
     -------

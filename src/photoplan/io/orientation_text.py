@@ -70,7 +70,20 @@ def number(word: str, where: str, what: str) -> float:
 
 
 def numbers(words: Sequence[str], where: str, what: str, count: int) -> tuple[float, ...]:
-    """`count` numbers; raises InputError as `number`."""
+    """`count` numbers.
+
+    Parameters
+    ----------
+    words : sequence of str
+    where, what : str
+        File and line, and what the numbers are, for messages.
+    count : int
+
+    Raises
+    ------
+    InputError
+        There are more or fewer, or one is none.
+    """
     if len(words) != count:
         raise InputError(f"{where}: {what}: {len(words)} values; {count} numbers are needed")
     return tuple(number(word, where, what) for word in words)
@@ -109,7 +122,19 @@ def checked_rotation(values: Sequence[float], where: str) -> NDArray[np.float64]
 def pose_image(
     name: str, center: Sequence[float], R_ground_camera: NDArray[np.float64], line: int, camera: str | None = None
 ) -> OrientedImage:
-    """An image whose rotation is given by a matrix, with ω, φ, κ in degrees."""
+    """An image whose rotation is given by a matrix, with ω, φ, κ in degrees.
+
+    Parameters
+    ----------
+    name : str
+    center : sequence of float
+        X, Y, Z, metres.
+    R_ground_camera : ndarray, shape (3, 3)
+    line : int
+        Of the file, for messages.
+    camera : str, optional
+        Name of its camera, where the file states it.
+    """
     X, Y, Z = center
     omega, phi, kappa = degrees_of(R_ground_camera[None])[0].tolist()
     return OrientedImage(name, (X, Y, Z), (omega, phi, kappa), camera, line)

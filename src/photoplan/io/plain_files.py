@@ -79,7 +79,7 @@ def read_yaml(path: Path, max_bytes: int = 200_000) -> Any:
 
 
 def parse_yaml(text: str, path: Path) -> Any:
-    """Plain contents of YAML text that was read from `path`; see `read_yaml`."""
+    """Plain contents of YAML text that was read from `path`; raises InputError as `read_yaml`."""
     try:
         depth = 0
         for event in yaml.parse(text, yaml.SafeLoader):

@@ -26,7 +26,7 @@ def read_xml(path: Path, max_bytes: int) -> Element:
 
 
 def parse_xml(text: str, where: str) -> Element:
-    """Root of XML text; `where` begins messages, see `read_xml`."""
+    """Root of XML text; `where` begins messages. Raises InputError as `read_xml`."""
     try:
         # A declaration of another encoding was right for the bytes; the text has none any more.
         root: Element = fromstring(text.lstrip().encode(), forbid_dtd=True)

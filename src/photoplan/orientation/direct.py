@@ -238,7 +238,20 @@ def tangent_derivatives(pose: Pose, X: Array) -> tuple[Array, Array, Array, Arra
 
 
 def polished_pose(pose: Pose, t: Array, X: Array, use: NDArray[np.bool_], iterations: int = 8) -> Pose:
-    """Least squares over the points `use`, all of one weight; the pose itself where that gets worse."""
+    """Least squares over some points, all of one weight; the pose itself where that gets worse.
+
+    Parameters
+    ----------
+    pose : Pose
+        Start value.
+    t : ndarray, shape (n, 2)
+        Tangent coordinates.
+    X : ndarray, shape (n, 3)
+        Their points, in the system of the pose.
+    use : ndarray of bool, shape (n,)
+    iterations : int
+        Most steps.
+    """
     t, X = t[use], X[use]
     size = float(np.linalg.norm(X - pose.center, axis=1).mean())
     unit = np.array([size] * 3 + [1.0] * 3)

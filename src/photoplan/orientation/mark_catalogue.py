@@ -92,7 +92,7 @@ def dot(diameter: float, *, bright: bool = True, margin: float | None = None) ->
 
 
 def ring(diameter: float, width: float, *, bright: bool = True, margin: float | None = None) -> MarkPattern:
-    """A ring of an outer diameter and the width of its line, millimetres."""
+    """A ring of an outer diameter and the width of its line, millimetres; `bright` and `margin` as for `cross`."""
     return _mark("ring", _ring("ring", diameter, width), bright, margin, least=max(2 * width, diameter / 8))
 
 
@@ -118,7 +118,12 @@ def ring_cross(
     cross_width : float, optional
         Width of the arms, default that of the ring.
     free, rotation, bright, margin
-        As for `cross`.
+        As for `cross`; default of the margin: an eighth of the diameter, at least twice the width.
+
+    Raises
+    ------
+    InputError
+        The sizes are not those of a ring and a cross.
     """
     parts = _ring("ring_cross", diameter, width)
     wide = width if cross_width is None else cross_width
@@ -139,7 +144,22 @@ def dot_cross(
     bright: bool = True,
     margin: float | None = None,
 ) -> MarkPattern:
-    """A disc in the middle of a cross; `free`: where the arms begin, so that ground shows between them and the disc."""
+    """A disc in the middle of a cross.
+
+    Parameters
+    ----------
+    diameter : float
+        Of the disc, millimetres.
+    arm, width, rotation, bright, margin
+        As for `cross`.
+    free : float
+        Where the arms begin, so that ground shows between them and the disc; millimetres from the centre.
+
+    Raises
+    ------
+    InputError
+        The arms do not show outside the disc, or a size is not positive.
+    """
     _positive("dot_cross", diameter=diameter, arm=arm, width=width)
     if not 0 <= free < arm or diameter >= 2 * arm:
         raise InputError(f"dot_cross: diameter {diameter}, arm {arm}, free {free} mm; the arms must show outside")

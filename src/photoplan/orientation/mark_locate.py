@@ -149,7 +149,15 @@ def best_blur(
     at: tuple[float, float],
     negative: bool,
 ) -> NDArray[np.float64]:
-    """Highest correlation within a pixel of a place, for each of `BLURS`."""
+    """Highest correlation within a pixel of a place, for each of `BLURS`; NaN where the image is too small.
+
+    Parameters
+    ----------
+    image, pattern, mm_to_pixel, negative
+        As for `locate_mark`.
+    at : (float, float)
+        Column and row of the reference point in the image.
+    """
     found = []
     for blur in BLURS:
         template = draw(pattern, mm_to_pixel, negative=negative, blur_px=blur)

@@ -68,7 +68,18 @@ class _Look:
 
 
 def measure_marks(scan: Scan, layout: MarkLayout, placement: Placement, least: float) -> Measured:
-    """Measure all marks: as the placement draws them, then as the affine transformation and blur so found do."""
+    """Measure all marks: as the placement draws them, then as the affine transformation and blur so found do.
+
+    Parameters
+    ----------
+    scan : Scan
+    layout : MarkLayout
+        The marks that are sought.
+    placement : Placement
+        Where they about lie.
+    least : float
+        A place that correlates less is no mark.
+    """
     scale = 1.0 / placement.pixel_mm
     wide = FILM * layout.extent * scale + _NEAR_PX
     start = dict.fromkeys(placement.found, _NEAR_MM * scale + _NEAR_PX)

@@ -151,6 +151,11 @@ def notch(reach: float, tip: float, shoulder: float, *, angle: float = 45.0, sty
         Between edge and flanks, degrees.
     style : Style, optional
         Band, corners, side.
+
+    Raises
+    ------
+    InputError
+        The sizes are not those of a notch.
     """
     made = style or Style()
     _check("notch", reach=reach, tip=tip, shoulder=shoulder)
@@ -186,6 +191,11 @@ def triangle(
         A bright wedge in the dark frame, else a dark one on bright ground.
     style : Style, optional
         Band and side; `bright` exchanges the tones.
+
+    Raises
+    ------
+    InputError
+        The flanks enclose no angle below 180°, or nothing of them is compared.
     """
     made = style or Style()
     _check("triangle", far=far)

@@ -57,7 +57,19 @@ def net_of(
     ground: GroundPoints,
     sigma: float,
 ) -> Net:
-    """Measurements of the block's images; those for which a lens has no ray are dropped."""
+    """Measurements of the block's images; those for which a lens has no ray are dropped.
+
+    Parameters
+    ----------
+    cameras : mapping of str to BlockCamera
+    images : sequence
+        With name, camera and transformation from image plane to pixels.
+    observations : ImagePoints
+    ground : GroundPoints
+        Check points and points without all three coordinates are no control here.
+    sigma : float
+        Standard deviation of a measurement that states none, pixels.
+    """
     number = {image.name: k for k, image in enumerate(images)}
     of_block = np.array([number.get(name, -1) for name in observations.images], np.int64)
     image = of_block[observations.image] if len(observations) else np.empty(0, np.int64)

@@ -38,7 +38,17 @@ _SOUND, _CONTRADICTED = 30.0, 1.4
 
 
 def build_facts(title: str, result: MapResult, settings: AdjustSettings, seconds: float) -> AdjustFacts:
-    """What the report shows."""
+    """What the report shows.
+
+    Parameters
+    ----------
+    title : str
+    result : MapResult
+    settings : AdjustSettings
+        How it was adjusted.
+    seconds : float
+        How long that took.
+    """
     prepared, adjusted = result.prepared, result.adjusted
     inputs, project = prepared.inputs, prepared.inputs.project
     used = np.isfinite(adjusted.residuals).all(axis=1) & ~adjusted.rejected

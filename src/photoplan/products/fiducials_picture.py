@@ -38,7 +38,17 @@ class MarksPicture:
         self._mpl = load_matplotlib("a picture")
 
     def draw(self, path: Path, scan: Scan, layout: MarkLayout, found: FiducialResult, title: str) -> None:
-        """Write a PNG.
+        """Write a PNG; its folder is made.
+
+        Parameters
+        ----------
+        path : Path
+        scan : Scan
+        layout : MarkLayout
+            What was sought.
+        found : FiducialResult
+            What was found.
+        title : str
 
         Raises
         ------

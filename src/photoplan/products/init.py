@@ -16,7 +16,7 @@ from photoplan.geometry.heights import height_label
 from photoplan.io.camera_file import CameraFile, read_cameras
 from photoplan.io.camera_model import FilmCamera, FrameCamera, Triple
 from photoplan.io.camera_opensfm import resized
-from photoplan.io.names import check_input_name, match_key
+from photoplan.io.names import check_input_name, match_key, relative_path
 from photoplan.io.orientation_file import read_orientation
 from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.project import parse_project, write_project
@@ -36,7 +36,6 @@ from photoplan.products.init_systems import (
     height_systems,
     placed,
     project_crs,
-    relative_path,
     terrain_entry,
 )
 

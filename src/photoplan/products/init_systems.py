@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
@@ -22,7 +21,7 @@ from photoplan.geometry.crs import (
     topocentric_poses,
 )
 from photoplan.geometry.heights import check_height_system, declared_pair, height_label, height_step
-from photoplan.io.names import check_input_name
+from photoplan.io.names import check_input_name, relative_path
 from photoplan.io.orientation_table import OrientationTable, degrees_of
 from photoplan.io.project_model import Terrain
 from photoplan.io.raster_info import read_info
@@ -35,7 +34,6 @@ __all__ = [
     "height_systems",
     "placed",
     "project_crs",
-    "relative_path",
     "terrain_entry",
 ]
 
@@ -195,7 +193,15 @@ def height_systems(
 
 
 def placed(table: OrientationTable, crs: str, system: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Projection centres (n, 3) and ω, φ, κ in degrees (n, 3) in the project's CRS."""
+    """Projection centres (n, 3) and ω, φ, κ in degrees (n, 3) in the project's CRS.
+
+    Raises
+    ------
+    InputError
+        The positions are in a CRS to whose axes angles cannot refer.
+    HeightSystemError
+        The unit of the heights is not stated.
+    """
     if table.origin is not None:
         centers, axes = topocentric_poses(table.origin, crs, table.centers)
         return centers, degrees_of(axes @ table.rotations)
@@ -225,13 +231,3 @@ def check_joined(systems: tuple[str | None, str], crs: str, centers: NDArray[np.
         return
     bounds = (centers[:, 0].min(), centers[:, 1].min(), centers[:, 0].max(), centers[:, 1].max())
     height_step(systems[1], systems[0], crs, bounds)(centers)
-
-
-def relative_path(file: Path, folder: Path) -> str:
-    """Path of a file as the project file states it: from the project's folder, where there is a way."""
-    # The folder of the file is resolved, not the file: a link keeps its own name, and so do the products.
-    target = file.parent.resolve() / file.name
-    try:
-        return Path(os.path.relpath(target, folder.absolute().resolve())).as_posix()
-    except ValueError:  # another drive
-        return target.as_posix()

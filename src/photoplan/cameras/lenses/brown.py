@@ -67,6 +67,11 @@ class Brown:
             p1, p2 [unit⁻¹].
         b : (float, float)
             b1, b2, without unit. Coefficients that are added to c as pixels (Agisoft) are divided by c first.
+
+        Raises
+        ------
+        InputError
+            The camera constant is not positive, or there are more than four radial coefficients.
         """
         if not (math.isfinite(c) and c > 0):
             raise InputError(f"camera constant {c}; a positive number in the unit of the coefficients is needed")
