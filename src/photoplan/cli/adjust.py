@@ -26,7 +26,7 @@ _SHOWN = 20
 @click.option(
     "--calibrate", multiple=True, metavar="CAMERA=c:SIGMA,x0,…", help="Unknowns, with what is known [as stated]."
 )
-@click.option("--images", multiple=True, metavar="NAME", help="Only these; * and ? allowed, may be repeated [all].")
+@click.option("--images", multiple=True, metavar="NAME", help="Image or pattern; may be repeated [all].")
 @click.option("--no-robust", is_flag=True, help="Seek no gross errors.")
 @click.option("--critical", type=float, default=4.0, show_default=True, help="Normalised residual of a gross error.")
 @click.option("--no-variance-components", is_flag=True, help="Weight groups as stated, not as their residuals show.")

@@ -20,7 +20,8 @@ _ANSWER = {"auto": None, "yes": True, "no": False}
 @click.argument("scans", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="IMAGE…")
 @click.option("--camera", type=click.Path(path_type=Path), metavar="FILE", help="Describes the camera and its marks.")
 @click.option("--camera-name", metavar="NAME", help="Which camera of the file, where it describes several.")
-@click.option("--images", "select", multiple=True, metavar="PATTERN", help="Of a project: images to measure [all].")
+@click.option("--images", "select", multiple=True, metavar="NAME",
+              help="Of a project: image or pattern; may be repeated [all film].")  # fmt: skip
 @click.option("--scan-resolution", metavar="DPI|UM", help="Such as 1200dpi or 21um [what the files state, else found].")
 @click.option("--rotation", type=click.Choice(["auto", "0", "90", "180", "270"]), default="auto", show_default=True,
               help="By which the picture was turned before scanning, counter-clockwise.")  # fmt: skip

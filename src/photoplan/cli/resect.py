@@ -23,7 +23,8 @@ _FILE = click.Path(path_type=Path)
 
 @click.command("resect")
 @click.argument("project", type=_FILE)
-@click.option("--images", multiple=True, metavar="NAME", help="Names or patterns [all with 3 control points or more].")
+@click.option("--images", multiple=True, metavar="NAME",
+              help="Image or pattern; may be repeated [all with 3 control points].")  # fmt: skip
 @click.option("--image-points", multiple=True, type=_FILE, metavar="FILE", help="Instead of the project's.")
 @click.option("--control", multiple=True, type=_FILE, metavar="FILE", help="Instead of the project's.")
 @click.option("--sigma-image", type=click.FloatRange(0, min_open=True), help="Of image points, pixels [the project's].")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import canonical_crs, require_projected_metres
@@ -148,7 +149,7 @@ def _with_axes(block: OrientationBlock, request: ConvertRequest) -> OrientationB
     return replace(block, table=_with_poses(block.table, block.table.centers, degrees_of(block.table.rotations @ F.T)))
 
 
-def _with_poses(table: OrientationTable, centers: np.ndarray, opk: np.ndarray) -> OrientationTable:
+def _with_poses(table: OrientationTable, centers: NDArray[np.float64], opk: NDArray[np.float64]) -> OrientationTable:
     images = tuple(
         OrientedImage(i.name, _triple(c), _triple(a), i.camera, i.line, i.fiducials)
         for i, c, a in zip(table.images, centers, opk)
@@ -156,7 +157,7 @@ def _with_poses(table: OrientationTable, centers: np.ndarray, opk: np.ndarray) -
     return replace(table, images=images, angle_unit="deg", rotation="opk", direction="camera-to-ground")
 
 
-def _triple(values: np.ndarray) -> tuple[float, float, float]:
+def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
     a, b, c = (float(v) for v in values)
     return a, b, c
 
