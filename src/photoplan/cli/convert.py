@@ -50,7 +50,6 @@ def command(
     list_readings: bool,
     image_points: Path | None,
     control: Path | None,
-    turned: str,
     as_json: bool,
     quiet: bool,
     **options: Any,
@@ -62,7 +61,8 @@ def command(
     from photoplan.products.convert import ConvertRequest
 
     form = table_format(options)
-    request = ConvertRequest(orientation, target or "csv", form=form, turned=int(turned), **options)
+    options["turned"] = int(options["turned"])
+    request = ConvertRequest(orientation, target or "csv", form=form, **options)
     if list_readings:
         if image_points is None or control is None:
             raise click.UsageError("--list-readings needs --image-points FILE and --control FILE")
