@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -132,6 +133,7 @@ def test_an_image_that_fails_does_not_stop_the_others(scans, photoplan: Here) ->
 
 
 def test_pictures_are_drawn_and_not_replaced(scans, tmp_path: Path, photoplan: Here) -> None:  # type: ignore[no-untyped-def]
+    pytest.importorskip("matplotlib")
     folder, _ = scans
     words = ("fiducials", folder / "b.tif", "--camera", folder / "camera.toml", "--pictures", tmp_path / "new")
     said = photoplan(*words)
@@ -141,6 +143,16 @@ def test_pictures_are_drawn_and_not_replaced(scans, tmp_path: Path, photoplan: H
     assert picture.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert photoplan(*words).code == 2
     assert photoplan(*words, "--overwrite").code == 0
+
+
+def test_a_missing_library_is_told_before_any_work(scans, tmp_path: Path, photoplan: Here) -> None:  # type: ignore[no-untyped-def]
+    folder, _ = scans
+    words = ("fiducials", folder / "none.tif", "--camera", folder / "camera.toml", "--pictures", tmp_path / "new")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "matplotlib.figure", None)
+        said = photoplan(*words)
+    assert said.code == 2 and "a picture needs matplotlib; install it with: pip install 'photoplan[report]'" in said.err
+    assert not (tmp_path / "new").exists()
 
 
 def a_project(folder: Path, tmp_path: Path) -> Path:
