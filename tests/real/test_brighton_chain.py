@@ -12,7 +12,6 @@ cores; with the command's own settings the figures are 4.2, 4.7, 2.4 cm and 0.08
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -130,21 +129,3 @@ def test_without_any_orientation_to_orthophotos(chain: Chain, tied: Path, block:
     print(f"orthophotos: {d.shape[1]} patches, rms {rms} m, mean {d.mean(axis=1)} m")
     assert d.shape[1] >= 180
     assert (rms <= 0.08).all()  # measured: 0.051 and 0.045; with the reference orientation 0.043 and 0.044
-
-
-def test_control_from_the_old_orthophoto(chain: Chain, tied: Path, block: Path) -> None:
-    """Positions of GNSS lie 10 m too low; matched control puts the block where it belongs."""
-    folder = Path(shutil.copytree(tied.parent, chain.folder / "old"))
-    project = folder / "project.toml"
-    terrain = f'[terrain]\nfile = "{chain.heights.as_posix()}"\nheight_system = "same"\n\n'
-    edit(project, "[orientation]\n", terrain + "[orientation]\n")
-    command("adjust", project, "-o", folder / "first")
-    old = block / "ref_ortho_from_cloud.tif"
-    options = ("--height-sigma", 0.3, "--search", 15, "--grid", 5, "--workers", 2)
-    said = command("control", project, "--ortho", old, *options)
-    edit(project, "[orientation]\n", '[adjustment]\ndrift = "shift"\n\n[orientation]\n')
-    command("adjust", project, "-o", folder / "second")
-    off = distance(project, chain.reference)
-    print(f"\n{said}\ncontrol of the old orthophoto: {off}")
-    assert np.abs(off.shift).max() <= 0.2
-    assert np.sqrt((off.positions**2).mean()) <= 0.08 and np.sqrt((off.angles**2).mean()) <= 0.10
