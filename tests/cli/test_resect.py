@@ -130,7 +130,7 @@ def test_the_written_orientation_reproduces_the_points(folder: Path) -> None:
     control = np.genfromtxt(folder / "control.csv", delimiter=",", skip_header=1)[:, 1:]
     for point in found["images"][0]["points"]:
         again = project_points(camera, control[int(point["name"][1:]) - 1])
-        np.testing.assert_allclose(again - point["xy"], point["residual"], atol=2e-3)
+        np.testing.assert_allclose(again - point["xy"], point["residual_px"], atol=2e-3)
     assert found["written"] is True and found["left_out"] == ["c"] and found["failed"] == []
     assert 0.5 < found["images"][0]["sigma0"] < 1.6
 
@@ -149,7 +149,7 @@ def test_products_use_the_camera_that_was_adjusted(folder: Path, curvature: str)
     control = np.genfromtxt(folder / "control.csv", delimiter=",", skip_header=1)[:, 1:]
     for point in found["points"]:
         again = project_points(camera, control[int(point["name"][1:]) - 1])
-        np.testing.assert_allclose(again - point["xy"], point["residual"], atol=2e-3)
+        np.testing.assert_allclose(again - point["xy"], point["residual_px"], atol=2e-3)
 
 
 def test_a_dry_run_changes_nothing(folder: Path) -> None:

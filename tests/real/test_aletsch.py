@@ -58,7 +58,7 @@ def test_eleven_points_without_start_values(facts: dict, tmp_path: Path) -> None
     result = CliRunner().invoke(command, [str(path), "--unknown-camera-constant", "--json"])
     assert result.exit_code == 0, result.output
     image = json.loads(result.stdout)["images"][0]
-    residuals = np.array([p["residual"] for p in image["points"]])
+    residuals = np.array([p["residual_px"] for p in image["points"]])
     assert len(residuals) == 11 and not any(p["rejected"] for p in image["points"])
     rms = float(np.sqrt((residuals**2).mean()))
     assert rms <= 6.0

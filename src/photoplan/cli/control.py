@@ -53,9 +53,9 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     options["workers"] = options["workers"] or psutil.cpu_count() or 1
     request = ControlRequest(**options)
-    found = propose_control(request, lambda words, count: progress(count, quiet or as_json, words))
+    found = propose_control(request, lambda words, count: progress(count, quiet, words))
     if as_json:
-        click.echo(json.dumps(found.to_dict(), indent=2))
+        click.echo(json.dumps(found.to_dict(), indent=2, ensure_ascii=False))
         return
     if found.output is None:
         click.echo(f"{found.patches} patches at {found.resolution:g} m")

@@ -48,9 +48,9 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     options["picture"] = not options.pop("no_picture")
     options["workers"] = options["workers"] or psutil.cpu_count() or 1
     request = TieRequest(**options)
-    found = find_ties(request, lambda words, count: progress(count, quiet or as_json, words))
+    found = find_ties(request, lambda words, count: progress(count, quiet, words))
     if as_json:
-        click.echo(json.dumps(found.to_dict(), indent=2))
+        click.echo(json.dumps(found.to_dict(), indent=2, ensure_ascii=False))
     elif found.output is None:
         click.echo(f"{len(found.images)} images, {found.pairs or 'not yet known number of'} pairs: {found.chosen}")
     else:

@@ -101,7 +101,7 @@ class ResectedImage:
                 {
                     "name": name,
                     "xy": self.points.xy[k].tolist(),
-                    "residual": plain(found.residuals[k]),
+                    "residual_px": plain(found.residuals[k]),
                     "normalised": plain(found.normalised[k]),
                     "redundancy": plain(found.redundancies[k]),
                     "rejected": bool(found.rejected[k]),
