@@ -56,12 +56,19 @@ def correlation_of(model: Model, normalised: _Floats, used: NDArray[np.bool_]) -
 
 
 def effects_of_rows(model: Model, correlations: tuple[Correlation, ...], rows: int) -> _Floats:
-    """How many measurements count as one, of each row; 1 for everything but correlated image points, (rows,)."""
+    """How many measurements count as one, of each row; 1 for everything but correlated tie points, (rows,).
+
+    Control and check points are few and far from each other, so what they say is hardly alike. And if the image points
+    of control lost weight, it would lie where its ground coordinates are, and nothing would check these.
+    """
     of_camera = np.ones(len(model.camera_names))
     for correlation in correlations:
         of_camera[model.camera_names.index(correlation.camera)] = correlation.effect
     out = np.ones(rows)
-    out[: 2 * len(model.image)] = np.repeat(of_camera[model.camera_of[model.image]], 2)
+    ground = set(model.block.ground.names)
+    surveyed = np.array([name in ground for name in model.point_names], bool)
+    effects = np.where(surveyed[model.point], 1.0, of_camera[model.camera_of[model.image]])
+    out[: 2 * len(model.image)] = np.repeat(effects, 2)
     return out
 
 

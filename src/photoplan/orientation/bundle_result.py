@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from photoplan.orientation.active import Active
 from photoplan.orientation.block import Adjusted, AdjustedCamera, AdjustedStrip, Block, Correlation, Group
-from photoplan.orientation.bundle_robust import kinds_of
+from photoplan.orientation.bundle_robust import kinds_of, kinds_of_measurements
 from photoplan.orientation.bundle_rows import residuals_of_all
 from photoplan.orientation.bundle_select import Selection
 from photoplan.orientation.bundle_solution import Solution
@@ -82,12 +82,8 @@ def _of_measurements(solution: Solution, residuals: _Floats) -> tuple[_Floats, _
     out = np.isfinite(residuals[:, 0])
     out[model.observation] = False
     if out.any():
-        block, scales = model.block, solution.scales()
-        cameras = {name: n for n, name in enumerate(model.camera_names)}
-        kind_of = {b.name: cameras.get(b.camera, 0) for b in block.images}
-        seen = block.observations
-        kind = np.array([kind_of.get(n, 0) for n in seen.images], np.int64)[seen.image[out]]
-        normalised[out] = residuals[out] / seen.sigma[out] / scales[kind][:, None]
+        scale = solution.scales()[kinds_of_measurements(model)[out]]
+        normalised[out] = residuals[out] / model.block.observations.sigma[out] / scale[:, None]
     return redundancies, normalised
 
 

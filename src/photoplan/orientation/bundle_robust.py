@@ -17,6 +17,7 @@ __all__ = [
     "Kinds",
     "first_taken_out",
     "kinds_of",
+    "kinds_of_measurements",
     "robust_scale",
     "robust_weights",
     "snooped",
@@ -55,9 +56,13 @@ class Judged:
 
 
 def kinds_of(model: Model) -> tuple[Kinds, NDArray[np.int64]]:
-    """Groups of observations, and the group of each row; rows of what is known beforehand are not listed."""
+    """Groups of observations, and the group of each row; rows of what is known beforehand are not listed.
+
+    Control and check points are measured otherwise than tie points (by hand, say), so they are groups of their own.
+    """
     kinds: list[tuple[str, str]] = [(f"image points, camera {name}", "px") for name in model.camera_names]
-    of = [np.repeat(model.camera_of[model.image], 2)]
+    kinds += [(f"control and check points in images, camera {name}", "px") for name in model.camera_names]
+    of = [np.repeat(kinds_of_measurements(model)[model.observation], 2)]
     at = len(kinds)
     kinds += [("control, horizontal", "m"), ("control, height", "m")]
     of.append(at + (model.ground_axis == 2))
@@ -70,6 +75,17 @@ def kinds_of(model: Model) -> tuple[Kinds, NDArray[np.int64]]:
         kinds.append(("observed attitudes", "rad"))
         of.append(np.full(3 * len(model.attitude), len(kinds) - 1))
     return tuple(kinds), np.concatenate(of).astype(np.int64)
+
+
+def kinds_of_measurements(model: Model) -> NDArray[np.int64]:
+    """Group of every measurement of the block, also of those that take no part; −1: its image takes none."""
+    seen = model.block.observations
+    cameras = {name: k for k, name in enumerate(model.camera_names)}
+    of_image = {b.name: cameras.get(b.camera, -1) for b in model.block.images}
+    camera = np.array([of_image.get(n, -1) for n in seen.images], np.int64)[seen.image]
+    names = set(model.block.ground.names)
+    surveyed = np.array([n in names for n in seen.points], bool)[seen.point]
+    return np.where(camera < 0, -1, camera + len(cameras) * surveyed)
 
 
 def weights_of(model: Model, active: Active, factors: _Floats | None = None) -> _Floats:
@@ -208,9 +224,7 @@ def _brought_back(model: Model, state: State, judged: Judged, before: Active, af
     _, of = kinds_of(model)
     residuals = residuals_of_all(model, state)
     image = after.image.copy()
-    camera = {name: k for k, name in enumerate(model.camera_names)}
-    of_image = {b.name: camera.get(b.camera, -1) for b in block.images}
-    kind = np.array([of_image.get(n, -1) for n in block.observations.images], np.int64)[block.observations.image]
+    kind = kinds_of_measurements(model)
     with np.errstate(invalid="ignore"):
         size = np.abs(residuals / block.observations.sigma).max(axis=1) / scales[kind]
     image |= ~before.image & (kind >= 0) & (np.nan_to_num(size, nan=np.inf) < limit)
