@@ -293,7 +293,7 @@ def test_stated_accuracies_that_the_observations_contradict(tmp_path: Path) -> N
     made = write_project(tmp_path, Make(pixel_noise=0.3, sigma_image=1.2))
     notes = adjusted(made, dry_run=True).facts.notes
     said = next(note for note in notes if "image points, camera cam: the stated standard deviation is" in note)
-    found = re.search(r"is (.*) times too large; sigma_image = (.*) would fit", said)
+    found = re.search(r"is (.*) times too large; (.*) px would fit", said)
     assert found
     np.testing.assert_allclose([float(found[1]), float(found[2])], [4.0, 0.3], rtol=0.15)
 

@@ -21,7 +21,7 @@ from photoplan.orientation.bundle_correlation import correlation_of, effects_of_
 from photoplan.orientation.bundle_model import Model, build_model
 from photoplan.orientation.bundle_normal import reduce_normals
 from photoplan.orientation.bundle_rank import check_rank
-from photoplan.orientation.bundle_result import result_of
+from photoplan.orientation.bundle_result import Weighted, result_of
 from photoplan.orientation.bundle_robust import first_taken_out, robust_weights, snooped, softened, weights_of
 from photoplan.orientation.bundle_rows import linearise, residuals_of, whitened
 from photoplan.orientation.bundle_select import Selection, select, start_points
@@ -90,14 +90,12 @@ def adjust_block(block: Block, settings: AdjustSettings | None = None, progress:
         if next_active.equals(active):
             break
         active = next_active
-    solution, correlations = _weighted(loop, solution, active, settings)
-    check_rank(model, solution.state, solution.reduced)
-    return result_of(block, selection, solution, active, loop.count, correlations)
+    weighted = _weighted(loop, solution, active, settings)
+    check_rank(model, weighted.solution.state, weighted.solution.reduced)
+    return result_of(block, selection, weighted, active, loop.count)
 
 
-def _weighted(
-    loop: _Loop, solution: Solution, active: Active, settings: AdjustSettings
-) -> tuple[Solution, tuple[Correlation, ...]]:
+def _weighted(loop: _Loop, solution: Solution, active: Active, settings: AdjustSettings) -> Weighted:
     """The solution with the accuracies that residuals show: variance components, and correlated image points."""
     model, state = solution.model, solution.state
     correlations: tuple[Correlation, ...] = ()
@@ -109,15 +107,15 @@ def _weighted(
     factors: _Floats | None = None
     for _ in range(_COMPONENTS):
         if settings.variance_components and settings.covariance:
-            factors = solution.factors()
+            factors = solution.factors(factors)
         elif effects is None:
             break
         weight = weights_of(model, active, factors)
         state = loop.run(model, state, weight if effects is None else weight / effects)
         solution = solution_of(model, state, weight, settings.covariance, effects)
-        if factors is None or np.allclose(solution.factors(), factors, rtol=0.02):
+        if factors is None or np.allclose(solution.factors(factors), factors, rtol=0.02):
             break
-    return solution, correlations
+    return Weighted(solution, solution.factors(factors), correlations)
 
 
 def _selected(block: Block, active: Active, lost: frozenset[str]) -> tuple[Selection, _Floats, frozenset[str]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,20 +15,24 @@ from photoplan.orientation.bundle_select import Selection
 from photoplan.orientation.bundle_solution import Solution
 from photoplan.orientation.bundle_state import rotation_vector
 
-__all__ = ["result_of"]
+__all__ = ["Weighted", "result_of"]
 
 _Floats = NDArray[np.float64]
 
 
-def result_of(
-    block: Block,
-    selection: Selection,
-    solution: Solution,
-    active: Active,
-    iterations: int,
-    correlations: tuple[Correlation, ...],
-) -> Adjusted:
+@dataclass(frozen=True, eq=False)
+class Weighted:
+    """The last solution and how its observations were weighted."""
+
+    solution: Solution
+    factors: _Floats
+    """Standard deviation found over the one stated, of each group (`kinds_of`)."""
+    correlations: tuple[Correlation, ...]
+
+
+def result_of(block: Block, selection: Selection, weighted: Weighted, active: Active, iterations: int) -> Adjusted:
     """The result as users see it."""
+    solution = weighted.solution
     model, state = solution.model, solution.state
     residuals = residuals_of_all(model, state)
     redundancies, normalised = _of_measurements(solution, residuals)
@@ -61,12 +67,12 @@ def result_of(
         boresight=rotation_vector(state.boresight),
         boresight_sigma=_sigma(solution, columns.boresight, 3, variance),
         strips=_strips(solution, variance),
-        groups=_groups(solution),
+        groups=_groups(solution, weighted.factors),
         sigma0=sigma0,
         redundancy=solution.redundancy,
         unknowns=columns.count + 3 * len(model.point_names),
         iterations=iterations,
-        correlations=correlations,
+        correlations=weighted.correlations,
     )
 
 
@@ -153,11 +159,12 @@ def _strips(solution: Solution, variance: float) -> tuple[AdjustedStrip, ...]:
     return tuple(out)
 
 
-def _groups(solution: Solution) -> tuple[Group, ...]:
+def _groups(solution: Solution, factors: _Floats) -> tuple[Group, ...]:
     """Figures of each kind of observation."""
     model = solution.model
     kinds, of = kinds_of(model)
-    factors = np.full(len(kinds), np.nan) if solution.inverse is None else solution.factors()
+    if solution.inverse is None:
+        factors = np.full(len(kinds), np.nan)
     raw = np.concatenate(
         [
             solution.found.image.ravel(),

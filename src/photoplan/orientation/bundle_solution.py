@@ -78,10 +78,14 @@ class Solution:
         """What data snooping looks at."""
         return Judged(self.e, self.normalised(), self.weight, self.scales())
 
-    def factors(self) -> _Floats:
-        """Variance components: standard deviation found over the one stated, of each group (Förstner 1979)."""
+    def factors(self, before: _Floats | None = None) -> _Floats:
+        """Variance components: standard deviation found over the one stated, of each group (Förstner 1979).
+
+        Groups with little redundancy keep the factor that they had `before` (1 if it is None): the more a group's
+        weight grows, the less checks it, so its factor may not fall for ever, nor jump back.
+        """
         kinds, of = kinds_of(self.model)
-        out = np.ones(len(kinds))
+        out = np.ones(len(kinds)) if before is None else before.copy()
         r, e, w = (v[: len(of)] for v in (self.redundancies, self.e, self.weight))
         for k in range(len(kinds)):
             mine = (of == k) & (w > 0)

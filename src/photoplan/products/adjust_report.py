@@ -113,7 +113,7 @@ def _advice(result: MapResult, used: NDArray[np.bool_]) -> list[str]:
         ratio = max(group.factor, 1 / group.factor) if group.factor > 0 else np.inf
         advice = ""
         if group.unit == "px" and group.factor > 0:
-            advice = f"; sigma_image = {float(np.median(points.sigma)) * group.factor:.2g} would fit"
+            advice = f"; {float(np.median(points.sigma)) * group.factor:.2g} px would fit"
         out.append(f"{group.name}: the stated standard deviation is {ratio:.1f} times too {how}{advice}")
     out += [
         f"image errors of camera {c.camera} are alike over up to {c.reach:.0f} px: for its orientations "
