@@ -107,13 +107,13 @@ def _weighted(loop: _Loop, solution: Solution, active: Active, settings: AdjustS
     factors: _Floats | None = None
     for _ in range(_COMPONENTS):
         if settings.variance_components and settings.covariance:
-            factors = solution.factors(factors)
+            factors = solution.trusted(solution.factors(factors))
         elif effects is None:
             break
         weight = weights_of(model, active, factors)
         state = loop.run(model, state, weight if effects is None else weight / effects)
         solution = solution_of(model, state, weight, settings.covariance, effects)
-        if factors is None or np.allclose(solution.factors(factors), factors, rtol=0.02):
+        if factors is None or np.allclose(solution.trusted(solution.factors(factors)), factors, rtol=0.02):
             break
     return Weighted(solution, solution.factors(factors), correlations)
 

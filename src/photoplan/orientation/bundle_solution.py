@@ -78,6 +78,16 @@ class Solution:
         """What data snooping looks at."""
         return Judged(self.e, self.normalised(), self.weight, self.scales())
 
+    def trusted(self, factors: _Floats) -> _Floats:
+        """Factors that weights are made with: control is not taken for better than stated.
+
+        Errors of control are often alike (one survey, one orthophoto); orientations then follow them, and residuals
+        are small for that reason alone.
+        """
+        kinds, _ = kinds_of(self.model)
+        control = np.array([name.startswith("control, ") for name, _ in kinds], bool)
+        return np.asarray(np.where(control, np.maximum(factors, 1.0), factors))
+
     def factors(self, before: _Floats | None = None) -> _Floats:
         """Variance components: standard deviation found over the one stated, of each group (Förstner 1979).
 
