@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 __all__ = ["Domain"]
+
+#: A prepared polygon builds its index when it is first asked, and GEOS does not guard that against other threads.
+_ONE_AT_A_TIME = threading.Lock()
 
 #: Cells of the raster that says what is near data, at most; more area means larger cells.
 _MOST_CELLS = 30_000_000
@@ -57,5 +61,6 @@ class Domain:
         inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
         inside[inside] = self.near[row[inside], column[inside]]
         if self.polygon is not None and inside.any():
-            inside[inside] = shapely.contains_xy(self.polygon, xy[inside])
+            with _ONE_AT_A_TIME:
+                inside[inside] = shapely.contains_xy(self.polygon, xy[inside])
         return inside
