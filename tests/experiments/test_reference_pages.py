@@ -21,6 +21,7 @@ OTHERS = {"--help"}
 #: Verbs as they are typed, and the page that explains them; `dtm` itself is a group of verbs without options.
 PLACES = {verb: "command-line" for verb in VERBS if verb != "dtm"} | {f"dtm {verb}": "dtm" for verb in DTM_VERBS}
 PLACES |= dict.fromkeys(("convert", "fiducials", "interior", "tie", "control", "resect", "adjust"), "orientation")
+PLACES |= {verb: verb for verb in ("mtf", "restore", "characterise", "sensor", "simulate")}
 
 
 def long_options(text):

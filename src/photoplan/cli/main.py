@@ -31,6 +31,11 @@ VERBS = {
     "run": "Execute a plan written by `ortho --plan`.",
     "dtm": "Terrain models: build, sample, contours, volumes …",
     "monoplot": "Image points to ground points on a terrain model.",
+    "mtf": "Measure spread function and MTF from edges and patterns.",
+    "restore": "Restore images with a filter, given or measured.",
+    "characterise": "Know a camera from image series.",
+    "sensor": "Resolution, bandwidth and noise of a sensor.",
+    "simulate": "Form an image of a scene with blur, noise, jitter …",
     "info": "Show what a raster, project, plan or run record holds.",
     "demo": "Make the orthophotos of the included real block.",
 }
