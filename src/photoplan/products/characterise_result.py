@@ -1,0 +1,106 @@
+"""What an analysis of a camera gives: figures with their sigmas, tables, plots, and what could not be known and why."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from photoplan.products.plain_values import plain
+from photoplan.report.characterise_charts import Chart, Picture
+
+__all__ = ["Figure", "Outcome", "Table", "joined"]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One number that was found."""
+
+    name: str
+    """As in JSON: small letters with the unit, such as ``read_noise_e``."""
+    value: float
+    sigma: float
+    """Its standard deviation; NaN where none can be stated."""
+    label: str
+    """What it is, for people."""
+    unit: str = ""
+    plane: str = ""
+    """Of which colour; empty where there is one plane, or it holds for all."""
+    at: str = ""
+    """Under which condition, where there are several: ``500 nm``."""
+    remark: str = ""
+
+    def __str__(self) -> str:
+        sigma = f" ± {_short(self.sigma)}" if math.isfinite(self.sigma) else ""
+        where = " ".join(filter(None, [self.plane, self.at]))
+        unit = f" {self.unit}" if self.unit else ""
+        more = f" · {self.remark}" if self.remark else ""
+        return f"{self.label}{f' ({where})' if where else ''}: {_short(self.value, self.sigma)}{sigma}{unit}{more}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values; keys that say nothing are left out."""
+        found = {"name": self.name, "value": self.value, "sigma": self.sigma, "unit": self.unit}
+        more = {"plane": self.plane, "at": self.at, "remark": self.remark, "label": self.label}
+        return dict(plain(found | {key: value for key, value in more.items() if value}))
+
+
+def _short(value: float, sigma: float = math.nan) -> str:
+    """A number with as many digits as its standard deviation allows (two of it)."""
+    if not math.isfinite(value):
+        return "–"
+    if not math.isfinite(sigma) or sigma <= 0 or value == 0:
+        return f"{value:.4g}"
+    digits = min(max(math.floor(math.log10(abs(value))) - math.floor(math.log10(sigma)) + 2, 2), 9)
+    return f"{value:.{digits}g}"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of figures; written as CSV and shown in the report."""
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[str | float | int, ...], ...]
+    caption: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What one analysis found."""
+
+    figures: tuple[Figure, ...] = ()
+    refused: Mapping[str, str] = field(default_factory=dict)
+    """Figures that the data do not allow, and why, one sentence each."""
+    tables: Mapping[str, Table] = field(default_factory=dict)
+    """By the stem of their CSV file."""
+    plots: tuple[Chart | Picture, ...] = ()
+    notes: tuple[str, ...] = ()
+    details: Mapping[str, Any] = field(default_factory=dict)
+    """More plain values for JSON."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        return {
+            "figures": [figure.to_dict() for figure in self.figures],
+            "refused": dict(self.refused),
+            "notes": list(self.notes),
+            "details": plain(dict(self.details)),
+        }
+
+
+def joined(outcomes: Sequence[Outcome]) -> Outcome:
+    """Several outcomes (of planes, of wavelengths) as one; later tables of one name are put below earlier ones."""
+    tables: dict[str, Table] = {}
+    for outcome in outcomes:
+        for name, table in outcome.tables.items():
+            known = tables.get(name)
+            rows = table.rows if known is None else known.rows + table.rows
+            tables[name] = Table(table.head, rows, table.caption)
+    return Outcome(
+        tuple(f for o in outcomes for f in o.figures),
+        {key: why for o in outcomes for key, why in o.refused.items()},
+        tables,
+        tuple(p for o in outcomes for p in o.plots),
+        tuple(dict.fromkeys(n for o in outcomes for n in o.notes)),
+        {key: value for o in outcomes for key, value in o.details.items()},
+    )

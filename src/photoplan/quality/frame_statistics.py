@@ -1,0 +1,162 @@
+"""Statistics of frames that were taken under one condition, gathered frame by frame.
+
+The mean image, the temporal variance of every pixel, and their summary. A lamp that flickers makes whole frames
+brighter or darker; the summary takes the differences of the frames' means out of the temporal variance (as
+EMVA 1288 release 4 linear does for two frames; here for any number).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+
+__all__ = ["FrameStack", "Level", "StackSums"]
+
+
+@dataclass(frozen=True)
+class Level:
+    """Summary of the frames of one condition; variances are squared grey values."""
+
+    frames: int
+    pixels: int
+    mean: float
+    """Grey value, mean over pixels and frames."""
+    temporal_variance: float
+    """Of a pixel from frame to frame, without the variation of the frames' means; NaN for a single frame."""
+    spatial_variance: float
+    """Of the mean image, with the rest of the temporal noise in it."""
+    frame_mean_sigma: float
+    """Standard deviation of the frames' means; NaN for a single frame."""
+    saturated_share: float
+    """Share of samples at or above saturation."""
+    zero_share: float
+    """Share of samples at zero."""
+    largest: float
+    smallest: float
+
+    @property
+    def mean_sigma(self) -> float:
+        """Standard deviation of `mean` by temporal noise: that of pixels, and of whole frames where that is larger."""
+        if self.frames < 2:
+            return float("nan")
+        pixel = self.temporal_variance / (self.frames * self.pixels)
+        return float(np.sqrt(max(pixel, self.frame_mean_sigma**2 / self.frames)))
+
+    @property
+    def degrees(self) -> int:
+        """Degrees of freedom of the temporal variance."""
+        return (self.frames - 1) * (self.pixels - 1)
+
+    @property
+    def variance_sigma(self) -> float:
+        """Standard deviation of the temporal variance, for noise that is nearly Gaussian."""
+        return float(self.temporal_variance * np.sqrt(2.0 / self.degrees)) if self.degrees else float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class FrameStack:
+    """Images of the frames of one condition."""
+
+    level: Level
+    mean: NDArray[np.float64]
+    """Mean image, shape (h, w)."""
+    variance: NDArray[np.float64] | None
+    """Temporal variance of every pixel; None for a single frame."""
+    counted: NDArray[np.bool_] | None
+    """Pixels that the summary counts; None: all."""
+    frame_means: tuple[float, ...]
+
+
+class StackSums:
+    """Gathers frames one after the other: memory holds two images, however many frames there are.
+
+    Parameters
+    ----------
+    saturation : float
+        Grey value from which on a sample is saturated.
+    counted : array of bool, optional
+        Pixels that the summary counts.
+    """
+
+    def __init__(self, saturation: float, counted: NDArray[np.bool_] | None = None) -> None:
+        self._saturation, self._counted = saturation, counted
+        self._means: list[float] = []
+        self._saturated = self._zero = 0
+        self._largest, self._smallest = -np.inf, np.inf
+        self._mean: NDArray[np.float64] | None = None
+        self._squares: NDArray[np.float64] | None = None
+
+    def add(self, frame: NDArray[Any]) -> None:
+        """One more frame, shape (h, w).
+
+        Raises
+        ------
+        InputError
+            Its size differs from the others', or no pixel counts.
+        """
+        seen = frame if self._counted is None else frame[self._counted]
+        if not seen.size:
+            raise InputError("no pixel of the frame counts")
+        values = frame.astype(np.float64)
+        self._saturated += int(np.count_nonzero(seen >= self._saturation))
+        self._zero += int(np.count_nonzero(seen <= 0))
+        self._largest = max(self._largest, float(seen.max()))
+        self._smallest = min(self._smallest, float(seen.min()))
+        self._means.append(float(np.mean(seen, dtype=np.float64)))
+        if self._mean is None or self._squares is None:
+            self._mean, self._squares = values, np.zeros_like(values)
+            return
+        if values.shape != self._mean.shape:
+            raise InputError(f"frame of shape {values.shape}; the others have {self._mean.shape}")
+        # Welford 1962: stable, and needs no second pass.
+        difference = values - self._mean
+        self._mean += difference / len(self._means)
+        self._squares += difference * (values - self._mean)
+
+    def add_all(self, frames: Iterable[NDArray[Any]]) -> StackSums:
+        """Several frames."""
+        for frame in frames:
+            self.add(frame)
+        return self
+
+    def stack(self) -> FrameStack:
+        """What the frames say.
+
+        Raises
+        ------
+        InputError
+            There was no frame.
+        """
+        count = len(self._means)
+        if self._mean is None or self._squares is None:
+            raise InputError("no frame given")
+        mean, squares = self._mean, self._squares
+        seen = mean.ravel() if self._counted is None else mean[self._counted]
+        pixels = seen.size
+        temporal = sigma = float("nan")
+        if count > 1:
+            inner = float(squares.sum() if self._counted is None else squares[self._counted].sum())
+            between = float(np.sum((np.array(self._means) - np.mean(self._means)) ** 2))
+            if pixels > 1:
+                temporal = max(inner - pixels * between, 0.0) / ((count - 1) * (pixels - 1))
+            sigma = float(np.sqrt(between / (count - 1)))
+        level = Level(
+            frames=count,
+            pixels=pixels,
+            mean=float(seen.mean()),
+            temporal_variance=temporal,
+            spatial_variance=float(seen.var(ddof=1)) if pixels > 1 else float("nan"),
+            frame_mean_sigma=sigma,
+            saturated_share=self._saturated / (count * pixels),
+            zero_share=self._zero / (count * pixels),
+            largest=self._largest,
+            smallest=self._smallest,
+        )
+        variance = squares / (count - 1) if count > 1 else None
+        return FrameStack(level, mean, variance, self._counted, tuple(self._means))
