@@ -1,10 +1,18 @@
 """BLUH and BINGO: φ, ω, κ in gon with φ primary; hand-written files after the programs' descriptions."""
 
-from math import pi
+from math import cos, pi, sin
 
 import numpy as np
 import pytest
-from tools.orientation_blocks import GROUND, block, our_pixels, phi_omega_kappa, pixels_of_matrix
+from tools.orientation_blocks import (
+    CAMERA,
+    GROUND,
+    block,
+    our_pixels,
+    phi_omega_kappa,
+    pixels_of_matrix,
+    pixels_of_millimetres,
+)
 
 from photoplan.errors import InputError
 from photoplan.io.orientation_file import read_orientation, read_orientation_block, write_orientation
@@ -35,6 +43,35 @@ def test_ground_points_fall_on_the_pixels_of_the_collinearity_equations(tmp_path
     np.testing.assert_allclose(our_pixels(table), expected, atol=1e-6)
     assert [i.center for i in table.images] == [v[:3] for v in LINES.values()]
     assert table.notes == ("block.dat: angles read as gon, rotation pok, camera to ground",)
+
+
+@pytest.mark.parametrize(("name", "keyword"), FORMATS.items())
+def test_lines_mean_what_a_published_program_takes_them_for(tmp_path, name, keyword):
+    """Š. Turek, Implementation of bundle block adjustment method for determination of exterior orientation into GRASS
+    GIS, master's thesis, Czech Technical University in Prague, 2014
+    (geo.fsv.cvut.cz/proj/dp/2014/stepan-turek-dp-2014.pdf), and its program, which reads the results of Bingo-F and
+    compares its own with them: lines beginning with an asterisk are comments; `ORIA` number X0 Y0 Z0 φ ω κ, gon, and
+    one more column; `CORD` number X Y Z are points. The matrix, from the ground's axes to the camera's, is called
+    BLUH's; it and the collinearity equations are written out here. For BLUH's file only the rotation is documented so.
+    """
+    path = tmp_path / "itera.dat"
+    rows = [f"{keyword}{n}  {'  '.join(map(str, v))}  1" for n, v in LINES.items()]
+    others = ["* orientations", "", "CORD 101 512300.0 5274150.0 500.0 0"] if keyword else []
+    path.write_text("\n".join([*others, *rows]) + "\n")
+    table = read_orientation(path, format=name)
+    expected = []
+    for X, Y, Z, *gon in LINES.values():
+        p, o, k = (v / 200 * pi for v in gon)
+        r = [
+            [cos(k) * cos(p) + sin(k) * sin(o) * sin(p), sin(k) * cos(o), -cos(k) * sin(p) + sin(k) * sin(o) * cos(p)],
+            [-sin(k) * cos(p) + cos(k) * sin(o) * sin(p), cos(k) * cos(o), sin(k) * sin(p) + cos(k) * sin(o) * cos(p)],
+            [cos(o) * sin(p), -sin(o), cos(o) * cos(p)],
+        ]
+        x, y, z = np.array(r) @ (np.array(GROUND) - (X, Y, Z)).T
+        c = CAMERA.camera_constant_mm
+        expected.append(pixels_of_millimetres(-c * x / z, -c * y / z))
+    np.testing.assert_allclose(our_pixels(table), expected, atol=1e-6)
+    assert [i.name for i in table.images] == list(LINES)
 
 
 @pytest.mark.parametrize("name", FORMATS)

@@ -1,4 +1,4 @@
-"""Inpho projects: the fixture is written by hand after files that programs of others write and read."""
+"""Inpho projects: written by hand after files that programs of others write and read, and published orientations."""
 
 from dataclasses import replace
 
@@ -91,14 +91,15 @@ def test_camera_image_and_orientation(tmp_path):
 
 
 def test_fault_14_what_the_matrix_does_is_told_by_angles_in_the_file_or_declared(tmp_path):
-    with pytest.raises(InputError, match=r"does not say what its rotation matrices do.*--list-readings"):
-        read_orientation_block(write(tmp_path))
+    usual = read_orientation_block(write(tmp_path)).table
+    np.testing.assert_allclose(usual.rotations[0], np.transpose(MATRIX), atol=1e-12)
+    assert any("ground to camera, as MATCH-AT writes them (another program's" in n for n in usual.notes)
     phi = np.degrees(np.arcsin(0.6))
     # A boresight of some tenths of a degree is usual.
     own = f"$NAVIGATION\n  $PHOTO_NUM : 01\\ 4711\n  $GPS : 1 2 3\n  $INS : 0.3 {phi} 89.8\n$ENDNAV\n"
     found = read_orientation_block(write(tmp_path, TEXT + own)).table
     np.testing.assert_allclose(found.rotations[0], MATRIX, atol=1e-12)
-    assert "block.prj: rotation matrices read as camera to ground" in found.notes
+    assert "block.prj: rotation matrices read as camera to ground, as the angles of $INS tell" in found.notes
     R = np.transpose(MATRIX)
     angles = np.degrees([np.arctan2(-R[1, 2], R[2, 2]), np.arcsin(R[0, 2]), np.arctan2(-R[0, 1], R[0, 0])])
     other = f"$NAVIGATION\n  $PHOTO_NUM : 01\\ 4711\n  $INS : {' '.join(map(str, angles))}\n$ENDNAV\n"
@@ -106,7 +107,7 @@ def test_fault_14_what_the_matrix_does_is_told_by_angles_in_the_file_or_declared
     np.testing.assert_allclose(found.rotations[0], R, atol=1e-12)
     # In gon the same numbers mean something else, which fits neither.
     text = TEXT.replace("$ANGULAR_UNITS : deg", "$ANGULAR_UNITS : gon") + own
-    with pytest.raises(InputError, match="does not say"):
+    with pytest.raises(InputError, match=r"differ from the angles of \$INS by \d+° or more, .*--list-readings"):
         read_orientation_block(write(tmp_path, text))
     # A declaration stands above the angles.
     assert np.allclose(read_orientation_block(write(tmp_path, TEXT + own), TO_CAMERA).table.rotations[0], R)
@@ -140,7 +141,7 @@ def test_written_and_read_again_in_whole(tmp_path, matrix):
     assert again.files == made.files
     np.testing.assert_allclose(our_pixels(again.table, again.cameras["DMC"]), our_pixels(made.table, CAMERA), atol=1e-4)
     direction = (matrix or "ground-to-camera").replace("-", " ")
-    assert f"out.prj: rotation matrices read as {direction}" in again.table.notes
+    assert f"out.prj: rotation matrices read as {direction}, as the angles of $INS tell" in again.table.notes
     assert "ground to camera" in " ".join(loss.text for loss in orientation_format("inpho").losses(block()))
 
 
@@ -219,3 +220,118 @@ def test_newer_camera_definitions_and_an_unknown_system(tmp_path):
     assert list(found.cameras) == ["DMC"]
     assert found.table.crs is None
     assert any("'LOCAL1' is not known" in n for n in found.table.notes)
+
+
+#: Four images of flight line 35 of the oblique survey of Wuppertal, 2024: X, Y, Z and the rows of the matrix.
+WUPPERTAL = {
+    "035_168_170003763": """375693.31106 5681491.0868 925.6723
+      -0.617998724625 -0.414397810619 0.668095824651
+      0.558538775542 -0.829475598634 0.002160436945
+      0.553273903757 0.374492571122 0.744072107793""",
+    "035_160_171003771": """375165.66116 5681128.66801 931.25653
+      -0.829021420218 -0.559216456904 -0.000662681846
+      0.415820913125 -0.615648652093 -0.66938009037
+      0.373920383274 -0.555205990155 0.742919817658""",
+    "035_160_174003771": """375165.56471 5681128.81252 931.23247
+      -0.616058311491 -0.414936143995 -0.669552203529
+      0.56064689824 -0.828050604508 -0.002692929089
+      -0.55330571327 -0.377041367466 0.742760119341""",
+    "035_160_176003771": """375165.68938 5681128.9972 931.2691
+      -0.829241275362 -0.558884260054 -0.002700203592
+      0.414347042776 -0.618012957422 0.668114146386
+      -0.375067241142 0.552909005464 0.74405389341""",
+}
+
+
+def wuppertal(folder):
+    """A project of these images; the camera constant is not published with them and made up."""
+    photos = [f"$PHOTO\n  $PHOTO_NUM : {n}\n  $EXT_ORI :\n      100.0 {e}\n$END\n" for n, e in WUPPERTAL.items()]
+    return write(folder, "$PROJECT 15.0.0\n$END\n" + "".join(photos))
+
+
+def azimuths_from_the_flight_line(table):
+    """Azimuths of the viewing directions, less a multiple of 90° the flight line's, degrees; and the four quarters."""
+    east, north = table.centers[0, :2] - table.centers[1, :2]
+    view = -table.rotations[:, :, 2]
+    assert np.all(view[:, 2] < -0.7)
+    angle = np.degrees(np.arctan2(view[:, 0], view[:, 1]) - np.arctan2(east, north))
+    return (angle + 45) % 90 - 45, sorted(np.round(angle / 90) % 4)
+
+
+def test_published_cameras_look_along_and_across_their_flight_line(tmp_path):
+    """cismet CARMA (github.com/cismet/carma, MIT), libraries/mapping/oblique-viewer/src/lib/core/utils/
+    exteriorOrientation.spec.ts, commit 3423e08: names, positions and matrix rows of four images, as its viewer serves
+    them, taken from the survey's Inpho project. Each comes from another head of one mount; two stations give the flight
+    line. The heads of a mount look ahead, back, left and right. Read the other way they would look north, east, south
+    and west, 34° from it.
+    """
+    table = read_orientation_block(wuppertal(tmp_path)).table
+    off, quarters = azimuths_from_the_flight_line(table)
+    assert np.abs(off).max() < 0.6
+    assert quarters == [0, 1, 2, 3]
+    turned = read_orientation_block(wuppertal(tmp_path), FROM_CAMERA).table
+    assert np.abs(azimuths_from_the_flight_line(turned)[0]).min() > 33
+    assert [i.name for i in table.images] == list(WUPPERTAL)
+
+
+def test_a_project_sees_the_pixels_of_a_published_data_contract(tmp_path):
+    """cismet CARMA, scripts/oblique-viewer/README.md and libraries/mapping/oblique-viewer/README.md: rows of the matrix
+    are the camera's axes in the ground's (east, north, up), optical axis -z; an affine transformation from millimetres
+    of the image to pixels whose (0, 0) is the centre of the first one; the mount's rotation is not applied. Order of
+    the sections and camera of scripts/oblique-viewer/test_import_prj.py; the pose is a published one.
+    """
+    name, pose = list(WUPPERTAL.items())[1]
+    text = f"""\
+$PROJECT 15.0.0
+  $ANGULAR_UNITS : deg
+$END
+$COORDINATE_SYSTEM_SET
+  $ID : ETRS89 UTM32 GCG2016
+  $COORDINATE_SYSTEM : EPSG:25832
+$END_COORDINATE_SYSTEM
+$CAMERA_DEFINITION
+  $ID : O42_LE
+  $CCD_COLUMNS : 100
+  $CCD_ROWS : 80
+  $PIXEL_REFERENCE : CenterTopLeft
+  $CAMERA_MOUNT_ROTATION : 270
+  $ACTIVE_CALIBRATION : 1
+  $CALIBRATION_SET :
+    $ID : 1
+    $CCD_INTERIOR_ORIENTATION :
+      10 0 49.5
+      0 -10 39.5
+    $FOCAL_LENGTH : 124
+    $PRINCIPAL_POINT_PPA : 0 0
+    $END
+  $END
+$END
+$PHOTO
+  $PHOTO_NUM : {name}
+  $CAMERA_ID : O42_LE
+  $EXT_ORI : 12:00:00 01/01/2026
+    124 {pose}
+$END
+$STATION
+  $STATION_ID : _01_7420
+  $IMAGES : {{ {name} }}
+$END
+$MULTIHEADSYSTEM
+  $HEAD_DATASET :
+    $ID : 1
+    $HEADS :
+      O42_LE 1 left LE
+    $END_HEADS
+  $END
+$END
+"""
+    found = read_orientation_block(write(tmp_path, text))
+    (camera,) = found.cameras.values()
+    rows = np.array([row.split() for row in pose.split("\n")], float)
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform([-5, -4], [5, 4], (20, 2)).T
+    # A ray: its millimetres times the first two axes, the camera constant against the third.
+    rays = np.stack([x, y, np.full(20, -124.0)], axis=1) @ rows[1:]
+    ground = rows[0] + rays * rng.uniform(6, 10, (20, 1))
+    expected = np.stack([10 * x + 49.5, -10 * y + 39.5], axis=1)
+    np.testing.assert_allclose(our_pixels(found.table, camera, ground)[0], expected, atol=1e-6)

@@ -1,11 +1,19 @@
 """PATB: three records for each image (PCI Geomatics, Using Pat-B in OrthoEngine); the fixture is written by hand."""
 
+from dataclasses import replace
+from math import cos, radians, sin
+
 import numpy as np
 import pytest
 from tools.orientation_blocks import CAMERA, block, our_pixels, pixels_of_matrix
 
 from photoplan.errors import InputError
-from photoplan.io.orientation_file import read_orientation, read_orientation_block, write_orientation
+from photoplan.io.orientation_file import (
+    orientation_format,
+    read_orientation,
+    read_orientation_block,
+    write_orientation,
+)
 from photoplan.io.orientation_table import TableFormat
 
 FROM_CAMERA = TableFormat(declared=frozenset({"direction"}))
@@ -42,8 +50,6 @@ def test_fault_14_what_the_matrix_does_is_not_guessed(tmp_path):
 
 @pytest.mark.parametrize("matrix", ["camera-to-ground", "ground-to-camera"])
 def test_written_and_read_again(tmp_path, matrix):
-    from dataclasses import replace
-
     made = replace(block(), matrix=matrix)
     (path,) = write_orientation(made, tmp_path / "out.ori", "patb")
     form = FROM_CAMERA if matrix == "camera-to-ground" else TO_CAMERA
@@ -69,6 +75,38 @@ def test_layout_is_that_of_the_description(tmp_path):
     np.testing.assert_allclose(np.reshape(a, (3, 3)), block().table.rotations[0], atol=6e-13)
     without = write_orientation(block(camera=None), tmp_path / "none.ori", "patb")[0].read_text().split("\n")[0]
     assert without[16:32].strip() == ""
+
+
+def test_a_file_after_the_published_layout_with_angles_of_the_published_convention(tmp_path):
+    """Layout: PCI Geomatics, Using Pat-B in OrthoEngine (support.pcigeomatics.com, article 204186705): photo number and
+    centre `I16,16X,3F16.5`, a11 a12 a13 a21 a22 `5F16.12`, a23 a31 a32 a33 `4F16.12`. Matrix: Pix4D, How are the
+    internal and external camera parameters defined? (support.pix4d.com, article 202559089), which calls its ω, φ, κ
+    PATB's convention: R = R_ω R_φ R_κ takes the camera's axes to the world's (X east, Y north, Z up). Neither says
+    that the matrix of the file is this R and not its transpose, so the direction is declared.
+    """
+    omega, phi, kappa = -2.25, 3.5, 117.0
+    o, p, k = map(radians, (omega, phi, kappa))
+    a = [
+        [cos(p) * cos(k), -cos(p) * sin(k), sin(p)],
+        [cos(o) * sin(k) + sin(o) * sin(p) * cos(k), cos(o) * cos(k) - sin(o) * sin(p) * sin(k), -sin(o) * cos(p)],
+        [sin(o) * sin(k) - cos(o) * sin(p) * cos(k), sin(o) * cos(k) + cos(o) * sin(p) * sin(k), cos(o) * cos(p)],
+    ]
+    flat = [f"{v:16.12f}" for row in a for v in row]
+    records = [f"{13300001:16d}{'':16}{475222.5:16.5f}{5943050.25:16.5f}{6064.49:16.5f}", "".join(flat[:5])]
+    path = write(tmp_path, "\n".join([*records, "".join(flat[5:])]) + "\n")
+    (image,) = read_orientation(path, FROM_CAMERA).images
+    assert (image.name, image.center) == ("13300001", (475222.5, 5943050.25, 6064.49))
+    np.testing.assert_allclose(image.angles, (omega, phi, kappa), atol=1e-9)
+
+
+def test_names_that_patb_may_not_take_are_told():
+    """Catalyst, Exporting a project to PATB (catalyst.earth, oe_ImpExpATproj_ExpPATB): at most 15 characters."""
+    made = block()
+    images = [replace(made.table.images[0], name=name) for name in ("a" * 15, "b" * 16)]
+    losses = orientation_format("patb").losses
+    for image, told in zip(images, (False, True)):
+        lost = losses(replace(made, table=replace(made.table, images=(image,)), files={}))
+        assert any("more than 15 characters" in loss.text for loss in lost) == told
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
-"""Pix4D's parameter files, by hand after its knowledge base and the specification of its open format (OPF).
+"""Pix4D's parameter files: of a real project, and by hand after its knowledge base and open format (OPF).
 
-That the two files state one pose in this way was checked once on an image that Pix4D itself wrote into both: positions
-agreed to 1e-6 m, rotations to 2e-8. The numbers here are made up.
+That the external file and the full one state one pose in this way was checked once on an image that Pix4D itself wrote
+into both: positions agreed to 1e-6 m, rotations to 2e-8. The numbers of the external file here are made up.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from tools.format_examples import assert_same, block_of, frame, pixels, round_tr
 
 from photoplan.errors import InputError
 from photoplan.io.camera_file import read_cameras
+from photoplan.io.orientation_block import without_lenses
 from photoplan.io.orientation_file import orientation_format, read_orientation_block
 
 T, OPK, OFFSET = (332081.125, 3488911.75, 4093.5), (-2.9375, 3.0625, 119.8125), (331967.0, 3488533.0, 4096.0)
@@ -53,6 +54,8 @@ DSC 0157.JPG {SIZE[0]} {SIZE[1]}
 {rows(K, TANGENTIAL, np.subtract(T, OFFSET), *R_FULL)}
 """
 STEM = "p_calibrated"
+#: Written by Pix4D; where from is in the README.md of the folder.
+PUBLISHED = Path(__file__).parents[1] / "data" / "pix4d_easyidp"
 
 
 def project(folder: Path, *, full: bool = True, offset: bool = True) -> Path:
@@ -76,6 +79,38 @@ def test_both_files_of_pix4d_state_one_orientation(tmp_path: Path) -> None:
     np.testing.assert_allclose(external.table.rotations, full.table.rotations, rtol=0, atol=1e-13)
     assert external.cameras == full.cameras
     assert any("cameras from p_calibrated_camera_parameters.txt" in n for n in external.table.notes)
+
+
+def test_published_files_see_the_pixels_of_their_own_projection_matrices() -> None:
+    """Files of one project that Pix4D wrote (EasyIDP, MIT): the full file against the project's `pmatrix.txt`, which
+    takes coordinates less the offset to pixels without distortion, counted from the corner of the image."""
+    block = read_orientation_block(PUBLISHED / "test_calibrated_camera_parameters.txt")
+    offset = np.array([368109.0, 3956043.0, 96.0])
+    lines = (PUBLISHED / "test_pmatrix.txt").read_text().splitlines()
+    assert [i.name for i in block.table.images] == [line.split()[0] for line in lines]
+    np.testing.assert_allclose(block.table.centers[0] - offset, (15.940748, -29.026922, 15.154226), atol=1e-6)
+    for k, line in enumerate(lines):
+        P = np.array(line.split()[1:], float).reshape(3, 4)
+        ground = np.random.default_rng(k).uniform([-9, -6, -16], [9, 6, -14], (40, 3)) + block.table.centers[k] - offset
+        h = ground @ P[:, :3].T + P[:, 3]
+        # Six decimals of the matrix are some thousandths of a pixel here.
+        np.testing.assert_allclose(
+            pixels(without_lenses(block), ground + offset, k), h[:, :2] / h[:, 2:] - 0.5, atol=0.02
+        )
+    (camera,) = block.cameras.values()
+    assert (camera.lens.k1, camera.lens.p1) == (0.02006588392682263564, -0.00288771142181162843)
+
+
+def test_the_published_inpho_camera_counts_from_the_middle_of_the_image() -> None:
+    """The `.cam` in Inpho's form of the same project states the offset of the principal point from the image's middle,
+    in pixels with y up, and the camera constant in millimetres: with the corner of the image at (0, 0) they are those
+    of the full file."""
+    words = (PUBLISHED / "test_calibrated_internal_camera_parameters.cam").read_text().split()
+    x, y = (float(words[len(words) - words[::-1].index(key)]) for key in ("XPOFF", "YPOFF"))
+    focal = float(words[words.index("FOCAL") + 1])
+    (camera,) = read_orientation_block(PUBLISHED / "test_calibrated_camera_parameters.txt").cameras.values()
+    np.testing.assert_allclose(camera.principal_point, (5472 / 2 - x - 0.5, 3648 / 2 - y - 0.5), atol=1e-9)
+    np.testing.assert_allclose(camera.focal, focal / 12.825 * 5472, rtol=1e-12)
 
 
 def lens(x: Any, y: Any, k: Any, t: Any) -> Any:

@@ -1,7 +1,9 @@
 """Orientations of BINGO (``itera.dat``).
 
 Lines that begin with ``ORIA``: name, X0, Y0, Z0 in metres, φ, ω, κ in gon; φ about Y is the primary rotation, then ω,
-then κ. Other lines belong to other parts of an adjustment and are passed over.
+then κ. So a program reads them whose author compared his adjustment with BINGO's (Š. Turek, master's thesis, Czech
+Technical University in Prague, 2014). Other lines belong to other parts of an adjustment and are passed over, as is
+what follows the angles.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Orientation files of BLUH, the bundle adjustment of the University of Hannover.
 
 A line for each image: name, X0, Y0, Z0 in metres, φ, ω, κ in gon; φ about Y is the primary rotation, then ω, then κ
-(K. Jacobsen, program system BLUH, user manual). Files of other make look the same, so the format has to be stated.
+(rotation: Š. Turek, master's thesis, Czech Technical University in Prague, 2014, who names it BLUH's). For the columns
+no public description was found. Files of other make look the same, so the format has to be stated.
 """
 
 from __future__ import annotations

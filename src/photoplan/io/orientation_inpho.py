@@ -13,10 +13,13 @@ Sections ``$CAMERA`` (or ``$CAMERA_DEFINITION``) and ``$PHOTO`` hold entries ``$
 ``$INS`` in ``$NAVIGATION``
     ω, φ, κ of an image, in ``$ANGULAR_UNITS``.
 
-What the matrix does is not described in public, and programs differ. A file with ``$INS`` settles it by itself: the
-matrix or its transpose is the rotation of these angles. Otherwise the user declares it. An affine transformation that
-turns the image is carried over to the rotation. ``$RADIAL_COEFFS`` and ``$DECENTRE_COEFFS`` are not read, since it is
-not public whether they correct or distort: a camera that has them is left to a camera file.
+The matrix takes the ground's axes (X east, Y north, Z up) to the camera's (x right, y up, z towards the viewer), its
+rows are the camera's axes: so projects of MATCH-AT are read and published by others (cismet CARMA, importer and data
+contract of its oblique viewer), and only so do the cameras of a published project look along and across their
+flight line. There are programs that take it the other way. So ``$INS`` is heard first: the matrix or its transpose is
+the rotation of these angles, and if neither is, the user declares it. An affine transformation that turns
+the image is carried over to the rotation. ``$RADIAL_COEFFS`` and ``$DECENTRE_COEFFS`` are not read, since it is not
+public whether they correct or distort: a camera that has them is left to a camera file.
 """
 
 from __future__ import annotations
@@ -43,6 +46,8 @@ MAX_BYTES = 200_000_000
 #: Largest median difference of matrices and angles that settles what the matrices do: boresight angles and errors of
 #: observed attitudes stay below, degrees.
 AGREE = 3.0
+#: What matrices of MATCH-AT do.
+OWN: Direction = "ground-to-camera"
 #: Row products of an affine transformation without shear, and of a rotation that is none.
 SQUARE = 1e-6
 
@@ -136,8 +141,8 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     Raises
     ------
     InputError
-        There is no oriented image, an entry cannot be read (the message names its line), or nothing tells what the
-        rotation matrices do.
+        There is no oriented image, an entry cannot be read (the message names its line), or the rotation matrices are
+        neither way those of the angles in `$INS`.
     """
     file = _parse(path)
     photos = [p for p in file.photos if "$EXT_ORI" in p]
@@ -147,8 +152,8 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     if len(photos) < len(file.photos):
         notes.append(f"{path.name}: {len(file.photos) - len(photos)} images have no $EXT_ORI and are left out")
     poses = [_Pose(photo, path) for photo in photos]
-    direction = _direction(poses, file, form, path)
-    notes.append(f"{path.name}: rotation matrices read as {DIRECTIONS[direction]}")
+    direction, reason = _direction(poses, file, form, path)
+    notes.append(f"{path.name}: rotation matrices read as {DIRECTIONS[direction]}{reason}")
     cameras: dict[str, FrameCamera | FilmCamera] = {}
     turns: dict[str, NDArray[np.float64]] = {}
     for section in file.cameras:
@@ -196,10 +201,10 @@ class _Pose:
         self.M = checked_rotation(rows, f"{where}: image {name!r}")
 
 
-def _direction(poses: list[_Pose], file: _File, form: TableFormat, path: Path) -> Direction:
-    """What the matrices do: as declared, or as the angles of `$INS` tell."""
+def _direction(poses: list[_Pose], file: _File, form: TableFormat, path: Path) -> tuple[Direction, str]:
+    """What the matrices do: as declared, as the angles of `$INS` tell, or as MATCH-AT writes them; and the reason."""
     if form.declares_direction:
-        return form.direction
+        return form.direction, ""
     unit = _ANGLE_UNITS.get((file.other.text("$ANGULAR_UNITS") or "deg").lower(), np.nan)
     angles = {}
     for section in file.navigation if np.isfinite(unit) else ():
@@ -208,20 +213,25 @@ def _direction(poses: list[_Pose], file: _File, form: TableFormat, path: Path) -
             words = ins.value.split()[:3]
             angles[name] = [number(w, f"{path}:{ins.line}", f"$INS of image {name!r}") * unit for w in words]
     known = [(pose.M, rotation_opk(*angles[pose.name])) for pose in poses if len(angles.get(pose.name, [])) == 3]
-    if known:
-        off = {
-            "camera-to-ground": np.median([_between(M, R) for M, R in known]),
-            "ground-to-camera": np.median([_between(M.T, R) for M, R in known]),
-        }
-        fitting: list[Direction] = [d for d in ("camera-to-ground", "ground-to-camera") if off[d] < AGREE]
-        if len(fitting) == 1:
-            return fitting[0]
-        if len(fitting) == 2 and max(off.values()) > 3 * min(off.values()) and max(off.values()) > 1e-6:
-            return min(fitting, key=lambda d: off[d])
-    raise InputError(
-        f"{path}: an Inpho project does not say what its rotation matrices do, and no $INS angles tell; declare "
-        "--rotation-direction camera-to-ground or ground-to-camera (with measured points, --list-readings tells which)"
-    )
+    usual = ", as MATCH-AT writes them (another program's project: --rotation-direction camera-to-ground)"
+    if not known:
+        return OWN, usual
+    off: dict[Direction, float] = {
+        "camera-to-ground": float(np.median([_between(M, R) for M, R in known])),
+        "ground-to-camera": float(np.median([_between(M.T, R) for M, R in known])),
+    }
+    fitting = [d for d in off if off[d] < AGREE]
+    if not fitting:
+        raise InputError(
+            f"{path}: the rotation matrices differ from the angles of $INS by {min(off.values()):.0f}° or more, "
+            "whatever they do; declare --rotation-direction ground-to-camera (as MATCH-AT writes them) or "
+            "camera-to-ground (with measured points, --list-readings tells which)"
+        )
+    if len(fitting) == 1:
+        return fitting[0], ", as the angles of $INS tell"
+    if max(off.values()) > 3 * min(off.values()) and max(off.values()) > 1e-6:
+        return min(fitting, key=lambda d: off[d]), ", as the angles of $INS tell"
+    return OWN, usual
 
 
 def _between(A: NDArray[np.float64], B: NDArray[np.float64]) -> float:

@@ -30,6 +30,9 @@ from photoplan.io.orientation_text import (
 
 __all__ = ["FORMAT", "read", "render"]
 
+#: Characters of an image name that PATB takes at most (Catalyst's guide on export to PATB).
+NAME = 15
+
 
 def read(path: Path, form: TableFormat) -> OrientationBlock:
     """Block of a file.
@@ -101,6 +104,9 @@ def _losses(block: OrientationBlock) -> list[Loss]:
     lost = common_losses(block, cameras=False)
     direction = DIRECTIONS[block.matrix or "camera-to-ground"]
     lost.append(Loss("other", f"no word on what the rotation matrix does; it is written {direction}"))
+    long = [image.name for image in block.table.images if len(image.name) > NAME]
+    if long:
+        lost.append(Loss("other", f"names of more than {NAME} characters may not be taken ({long[0]!r}): shorten them"))
     return lost
 
 
