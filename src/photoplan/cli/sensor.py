@@ -1,0 +1,38 @@
+"""`photoplan sensor`: figures of a sensor from its description."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photoplan.cli.options import json_option
+
+__all__ = ["command"]
+
+
+@click.command("sensor")
+@click.argument("file", type=click.Path(path_type=Path), metavar="FILE")
+@click.option("--report", type=click.Path(path_type=Path), metavar="HTML", help="Figures and plots as a page.")
+@click.option("--csv", type=click.Path(path_type=Path), metavar="CSV", help="Figures as a table.")
+@click.option("--overwrite", is_flag=True, help="Replace report and table if they exist.")
+@click.option("--dry-run", is_flag=True, help="Print the figures, write nothing.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(as_json: bool, quiet: bool, **options: Any) -> None:
+    """Resolution, bandwidth, charge transfer and noise of the sensor that FILE (TOML) describes."""
+    from photoplan.products.sensor import SensorRequest, describe_sensor
+
+    found = describe_sensor(SensorRequest(**options))
+    if as_json:
+        click.echo(json.dumps(found.to_dict(), indent=2, ensure_ascii=False))
+    else:
+        click.echo(str(found))
+        for path in found.written:
+            click.echo(str(path))
+    differing = [f for f in found.figures if f.stated is not None and abs(f.value - f.stated) > 0.01 * abs(f.stated)]
+    if not quiet:
+        for figure in differing:
+            click.echo(f"{figure.name}: {figure.value:.4g} by {figure.source}; {figure.stated:g} is stated", err=True)
