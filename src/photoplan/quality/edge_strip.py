@@ -1,0 +1,274 @@
+"""The strip of pixels along a line, summed in cells: are both sides even, valid, and free of other edges?"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from math import ceil, floor, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.quality.edge_candidates import StraightEdge
+
+__all__ = ["Sides", "Strip", "strip_along"]
+
+Array = NDArray[np.float64]
+
+#: Length of a block along the line, pixels.
+_BLOCK = 6.0
+#: Factor by which means of cells may scatter more than single pixels let expect: noise of compressed or interpolated
+#: images hangs together over two or three pixels.
+_TOGETHER = 3.0
+#: Shares of a block's pixels that may be saturated or invalid.
+_SPOILT = 0.01
+#: Pixels that one strip may take at most.
+_MOST = 16_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Strip:
+    """Sums of the pixels beside a line: blocks along it, bins of one pixel across it."""
+
+    line: StraightEdge
+    block: float
+    """Length of a block, pixels."""
+    half: int
+    """Bins to each side."""
+    count: Array
+    """Pixels used, shape (blocks, 2 half); the bins go from the dark to the bright side."""
+    total: Array
+    """Their sum."""
+    square: Array
+    """Their sum of squares."""
+    saturated: Array
+    """Saturated pixels."""
+    invalid: Array
+    """Invalid pixels, those outside the image included."""
+
+    def profile(self) -> Array:
+        """Medians over the blocks of the means of the bins, shape (2 half,); NaN where there is nothing."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            means = np.where(self.count >= 2, self.total / self.count, np.nan)
+        known = np.isfinite(means).any(axis=0)
+        profile = np.full(means.shape[1], np.nan)
+        if known.any():
+            profile[known] = np.nanmedian(means[:, known], axis=0)
+        return profile
+
+    def blur(self) -> tuple[float, float] | None:
+        """Distances from the line, on the dark and the bright side, from which the grey values are even; None: unknown.
+
+        The step ends where its slope has fallen to a twentieth; the same width is added for what edge enhancement
+        does beside it.
+        """
+        profile = self.profile()
+        middle = self.half
+        slope = np.diff(profile)
+        near = slope[middle - 3 : middle + 2]
+        if not np.isfinite(near).all() or near.max() <= 0.0:
+            return None
+        peak = middle - 3 + int(np.argmax(near))
+        ends = []
+        for step in (-1, 1):
+            k = peak
+            while 0 <= k + step < len(slope) and slope[k + step] > 0.05 * slope[peak]:
+                k += step
+            # Slope k lies between bins k and k + 1, at distance k + 1 - half from the line.
+            ends.append(abs(k + 1 - middle) + 0.5)
+        low, high = (profile[middle + s] for s in (-max(1, round(ends[0])), max(0, round(ends[1]) - 1)))
+        width = 1.02 * (high - low) / slope[peak] if np.isfinite(high - low) else 3.0
+        ring = float(np.clip(width, 2.0, 6.0))
+        return ends[0] + ring, ends[1] + ring
+
+    def sides(self, blur: tuple[float, float], half: int) -> Sides:
+        """Both sides beyond the blur, in a window of half a width."""
+        outer = self.half - half
+        dark = slice(outer, floor(self.half - blur[0]))
+        bright = slice(ceil(self.half + blur[1]), self.half + half)
+        return Sides(self, dark, bright, slice(outer, 2 * self.half - outer))
+
+    def worst_reason(self) -> str:
+        """Why no profile could be made."""
+        return "saturated" if self.saturated.sum() > self.invalid.sum() else "invalid"
+
+
+@dataclass(frozen=True, eq=False)
+class Sides:
+    """The cells beyond the blur on both sides."""
+
+    strip: Strip
+    dark: slice
+    bright: slice
+    window: slice
+
+    def part(self, start: int, end: int) -> Sides:
+        """Blocks from start to end."""
+        s = self.strip
+        cut = slice(start, end)
+        part = Strip(
+            s.line, s.block, s.half, s.count[cut], s.total[cut], s.square[cut], s.saturated[cut], s.invalid[cut]
+        )
+        return Sides(part, self.dark, self.bright, self.window)
+
+    @property
+    def contrast(self) -> float:
+        """Bright minus dark side, medians of the blocks."""
+        dark, bright = (float(np.nanmedian(self._means(side))) for side in (self.dark, self.bright))
+        return bright - dark
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the pixels of both sides about the means of their blocks and bins."""
+        return sqrt(sum(self._noise(side) ** 2 for side in (self.dark, self.bright)) / 2)
+
+    @property
+    def snr(self) -> float:
+        """Contrast over noise; capped at 10000 where there is none."""
+        return min(self.contrast / max(self.noise, 1e-12), 1e4)
+
+    def good_blocks(self, evenness: float) -> tuple[NDArray[np.bool_], Counter[str]]:
+        """Which blocks are clean, and what the others are."""
+        s = self.strip
+        everything = (s.count + s.saturated + s.invalid)[:, self.window].sum(axis=1)
+        saturated = s.saturated[:, self.window].sum(axis=1) > _SPOILT * everything
+        invalid = s.invalid[:, self.window].sum(axis=1) > _SPOILT * everything
+        uneven = np.zeros(len(everything), bool)
+        textured = np.zeros(len(everything), bool)
+        contrast = self.contrast
+        for side in (self.dark, self.bright):
+            count = s.count[:, side].sum(axis=1)
+            mean = self._means(side)
+            noise = self._noise(side)
+            allowed = np.maximum(evenness * contrast, 4 * _TOGETHER**0.5 * noise / np.sqrt(np.maximum(count, 1)))
+            middle = np.nanmedian(mean) if np.isfinite(mean).any() else np.nan
+            # Light changes slowly along an edge: each block is compared with those around it.
+            local = _running_median(mean, 9)
+            textured |= ~(np.abs(mean - local) <= allowed)
+            uneven |= ~(np.abs(mean - middle) <= 6 * allowed)
+            deviation = np.sqrt(np.maximum(s.square[:, side].sum(axis=1) / np.maximum(count, 1) - mean**2, 0.0))
+            uneven |= ~(deviation <= np.maximum(2.5 * noise, evenness * contrast))
+        why: Counter[str] = Counter()
+        for mask, name in (
+            (saturated, "saturated"),
+            (invalid, "invalid"),
+            (uneven, "two_sided"),
+            (textured, "textured"),
+        ):
+            why[name] = int(mask.sum())
+        good = ~(saturated | invalid | uneven | textured)
+        # Saturated pixels are left out of the sums, what remains then looks uneven: the cause is named, not the effect.
+        if saturated.any() and saturated.sum() >= 0.3 * len(saturated):
+            return good, Counter(saturated=1)
+        return good, +why
+
+    def reason(self, evenness: float, least_snr: float) -> str:
+        """Why the blocks together are no edge to measure; empty if they are one."""
+        contrast = self.contrast
+        if not contrast > 0.0 or self.snr < least_snr:
+            return "weak"
+        for side in (self.dark, self.bright):
+            mean, noise, s = self._means(side), self._noise(side), self.strip
+            count = s.count[:, side].sum(axis=1)
+            # Blocks of a side that scatter more than noise does are texture.
+            turned = mean - np.polyval(np.polyfit(np.arange(len(mean)), mean, 1), np.arange(len(mean)))
+            scatter = float(np.std(turned, ddof=min(2, len(mean) - 1))) if len(mean) > 2 else 0.0
+            expected = _TOGETHER * noise / sqrt(float(np.median(count)))
+            if scatter > max(evenness / 2 * contrast, 2 * expected):
+                return "textured"
+            bins = s.total[:, side].sum(axis=0) / np.maximum(s.count[:, side].sum(axis=0), 1)
+            error = _TOGETHER**0.5 * noise / np.sqrt(np.maximum(s.count[:, side].sum(axis=0), 1))
+            if (np.abs(bins - np.median(bins)) > np.maximum(evenness * contrast, 4 * error)).any():
+                return "two_sided"
+        return ""
+
+    def _means(self, side: slice) -> Array:
+        count = self.strip.count[:, side].sum(axis=1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.where(count > 0, self.strip.total[:, side].sum(axis=1) / count, np.nan)
+
+    def _noise(self, side: slice) -> float:
+        """Median over the blocks of the deviation of pixels about the means of their bins."""
+        s = self.strip
+        count, total, square = s.count[:, side], s.total[:, side], s.square[:, side]
+        inner = (square - np.divide(total**2, count, out=np.zeros_like(total), where=count > 0)).sum(axis=1)
+        free = (count - (count > 0)).sum(axis=1)
+        some = free > 0
+        if not some.any():
+            return 0.0
+        return sqrt(max(float(np.median(inner[some] / free[some])), 0.0))
+
+
+def _running_median(values: Array, width: int) -> Array:
+    """Medians of so many neighbours, fewer at the ends."""
+    half = width // 2
+    padded = np.concatenate([np.full(half, np.nan), values, np.full(half, np.nan)])
+    windows = np.lib.stride_tricks.sliding_window_view(padded, width)
+    known = np.isfinite(windows).any(axis=1)
+    result = np.full(len(values), np.nan)
+    if known.any():
+        result[known] = np.nanmedian(windows[known], axis=1)
+    return result
+
+
+def strip_along(
+    grey: NDArray[np.float32],
+    valid: NDArray[np.bool_] | None,
+    saturated: NDArray[np.bool_] | None,
+    line: StraightEdge,
+    half: int,
+) -> Strip | None:
+    """Sum the pixels beside a line.
+
+    Parameters
+    ----------
+    grey : array
+        Shape (h, w).
+    valid, saturated : array, optional
+        Masks of the same shape; None: all valid, none saturated.
+    line : StraightEdge
+    half : int
+        Bins to each side.
+
+    Returns
+    -------
+    Strip or None
+        None if the line's surroundings are far outside the picture or too large.
+    """
+    xs, ys = zip(*line.ends)
+    reach = half + 1
+    col, row = floor(min(xs)) - reach, floor(min(ys)) - reach
+    width, height = ceil(max(xs)) + reach + 1 - col, ceil(max(ys)) + reach + 1 - row
+    if width * height > _MOST:
+        return None
+    dx = np.arange(col, col + width) - line.x
+    dy = (np.arange(row, row + height) - line.y)[:, None]
+    along = dx * line.tx + dy * line.ty + line.length / 2
+    across = dy * line.tx - dx * line.ty
+    i, j = np.nonzero((np.abs(across) < half) & (along >= 0) & (along < line.length))
+    blocks = max(1, int(line.length // _BLOCK))
+    block = line.length / blocks
+    bins = np.floor(across[i, j] + half).astype(np.int64)
+    cell = np.minimum((along[i, j] / block).astype(np.int64), blocks - 1) * 2 * half + bins
+    y, x = i + row, j + col
+    inside = (x >= 0) & (x < grey.shape[1]) & (y >= 0) & (y < grey.shape[0])
+    usable, clipped = inside.copy(), np.zeros(len(x), bool)
+    if valid is not None:
+        usable[inside] &= valid[y[inside], x[inside]]
+    if saturated is not None:
+        clipped[usable] = saturated[y[usable], x[usable]]
+    if not usable.any():
+        return None
+    shape = (blocks, 2 * half)
+    good = usable & ~clipped
+    values = grey[y[good], x[good]].astype(float)
+    # A value near all of them keeps the sums of squares exact.
+    base = float(np.median(values)) if values.size else 0.0
+    values -= base
+
+    def summed(of: NDArray[np.bool_], weights: Array | None = None) -> Array:
+        return np.bincount(cell[of], weights, minlength=shape[0] * shape[1]).astype(float).reshape(shape)
+
+    return Strip(
+        line, block, half, summed(good), summed(good, values), summed(good, values**2), summed(clipped), summed(~usable)
+    )
