@@ -1,0 +1,223 @@
+"""How a value approaches its end: an exponential with its standard deviations, or the reason why there is none."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize, stats
+
+from photoplan.errors import InputError
+
+__all__ = ["LEAST_VALUES", "Approach", "check_times", "fit_approach"]
+
+Array = NDArray[np.float64]
+
+#: Values below which no exponential is fitted: its three unknowns need something that checks them.
+LEAST_VALUES = 8
+#: Chance of error below which a change is taken as real.
+LEVEL = 0.01
+_CANDIDATES = 80
+#: A time constant is known when its standard deviation is below this part of it.
+_KNOWN = 0.5
+
+
+@dataclass(frozen=True)
+class Approach:
+    """y(t) = end + (start − end) · exp(−t / τ), with t counted from the first value."""
+
+    mean: float
+    """Weighted mean of all values."""
+    start: float | None
+    """Value at the first time; None: no significant change."""
+    end: float | None
+    """Value that is approached; None: no significant change, or the series ends too early to know it."""
+    change: float | None
+    """End minus start."""
+    sigma_change: float | None
+    time_constant: float | None
+    """τ in the unit of the times; None: not determined, see `verdict`."""
+    sigma_time_constant: float | None
+    sigma_end: float | None
+    rms: float
+    """Standard deviation of one value of unit weight about the curve (about the mean, if there is no change)."""
+    probability: float
+    """Chance that noise alone would look as much like a change."""
+    redundancy: int
+    verdict: str
+    """What is known and what is not, in words."""
+
+    @property
+    def significant(self) -> bool:
+        """Whether a change is real, with a chance of error of 1 %."""
+        return self.probability < LEVEL
+
+    def at(self, time: Array | float) -> Array:
+        """Values of the curve at times since the first value; the mean where there is no curve."""
+        t = np.asarray(time, float)
+        if self.start is None or self.end is None or self.time_constant is None:
+            return np.full(t.shape, self.mean)
+        return self.end + (self.start - self.end) * np.exp(-t / self.time_constant)
+
+    def time_within(self, bound: float) -> float | None:
+        """Time since the first value after which the curve stays within a bound of its end; None: not known."""
+        if not bound > 0.0:
+            raise InputError(f"bound {bound}; a positive number is needed")
+        if self.change is None or self.time_constant is None:
+            return None
+        return max(0.0, self.time_constant * math.log(max(abs(self.change), 1e-300) / bound))
+
+
+def check_times(times: Array, what: str) -> Array:
+    """Times as finite, increasing numbers.
+
+    Raises
+    ------
+    InputError
+        A time is missing, or does not come after the one before; the message numbers it.
+    """
+    t = np.asarray(times, float)
+    if t.ndim != 1:
+        raise InputError(f"{what}: times of shape {t.shape}; one per measurement is needed")
+    missing = np.flatnonzero(~np.isfinite(t))
+    if missing.size:
+        raise InputError(f"{what}: measurement {missing[0] + 1} has no time; give every frame its time in seconds")
+    back = np.flatnonzero(np.diff(t) <= 0.0)
+    if back.size:
+        k = int(back[0])
+        raise InputError(
+            f"{what}: time {t[k + 1]:g} s of measurement {k + 2} does not come after {t[k]:g} s of measurement "
+            f"{k + 1}; sort the frames by time, and give each time once"
+        )
+    return t
+
+
+def fit_approach(times: Array, values: Array, sigma: Array | None = None, what: str = "series") -> Approach:
+    """Exponential by least squares, tested against a constant.
+
+    Parameters
+    ----------
+    times : ndarray, shape (n,)
+        Increasing.
+    values : ndarray, shape (n,)
+    sigma : ndarray, shape (n,), optional
+        Their standard deviations, which give weights only: their level is estimated from the residuals.
+    what : str
+        What is measured, for messages.
+
+    Raises
+    ------
+    InputError
+        Less than `LEAST_VALUES` values, a value that is not finite, times that do not increase.
+    """
+    t, y, w = _checked(times, values, sigma, what)
+    t = t - t[0]
+    mean, rss0 = _constant(y, w)
+    n = len(y)
+    taus = np.geomspace(0.3 * float(np.diff(t).min()), 10.0 * t[-1], _CANDIDATES)
+    rss = np.array([_for_tau(t, y, w, tau)[1] for tau in taus])
+    best = int(rss.argmin())
+    start, end, tau, rss1 = _refined(t, y, w, taus, best)
+    probability = _probability(rss0, rss1, n, taus)
+    if probability >= LEVEL:
+        verdict = "no significant change"
+        rms = math.sqrt(rss0 / (n - 1))
+        return Approach(mean, None, None, None, None, None, None, None, rms, probability, n - 1, verdict)
+    rms = math.sqrt(rss1 / (n - 3))
+    sigmas = _sigmas(t, w, (start, end, tau), rms)
+    verdict = _verdict(t, tau, sigmas[2], (abs(end - start), sigmas[3]))
+    if verdict.startswith("the series"):  # its end is not seen
+        return Approach(mean, start, None, None, None, None, None, None, rms, probability, n - 3, verdict)
+    known = not verdict.startswith("the change")
+    return Approach(
+        mean,
+        start if known else None,
+        end,
+        end - start if known else None,
+        sigmas[3] if known else None,
+        tau if known else None,
+        sigmas[2] if known else None,
+        sigmas[1],
+        rms,
+        probability,
+        n - 3,
+        verdict,
+    )
+
+
+def _checked(times: Array, values: Array, sigma: Array | None, what: str) -> tuple[Array, Array, Array]:
+    t, y = check_times(times, what), np.asarray(values, float)
+    if y.shape != t.shape:
+        raise InputError(f"{what}: {y.size} values at {t.size} times; as many of both are needed")
+    if len(y) < LEAST_VALUES:
+        raise InputError(f"{what}: {len(y)} measurements; at least {LEAST_VALUES} are needed to follow a change")
+    if not np.isfinite(y).all():
+        raise InputError(f"{what}: measurement {int(np.flatnonzero(~np.isfinite(y))[0]) + 1} has no value")
+    s = np.ones_like(y) if sigma is None else np.asarray(sigma, float)
+    if s.shape != y.shape or not (np.isfinite(s).all() and (s > 0.0).all()):
+        raise InputError(f"{what}: standard deviations must be positive numbers, one per value")
+    return t, y, 1.0 / s
+
+
+def _constant(y: Array, w: Array) -> tuple[float, float]:
+    mean = float((w**2 @ y) / (w @ w))
+    return mean, float(((w * (y - mean)) ** 2).sum())
+
+
+def _for_tau(t: Array, y: Array, w: Array, tau: float) -> tuple[Array, float]:
+    """Start and end for a given time constant, and the sum of squares that remains."""
+    decay = np.exp(-t / tau)
+    A = w[:, None] * np.column_stack([decay, 1.0 - decay])
+    found, *_ = np.linalg.lstsq(A, w * y, rcond=None)
+    return found, float(((A @ found - w * y) ** 2).sum())
+
+
+def _refined(t: Array, y: Array, w: Array, taus: Array, best: int) -> tuple[float, float, float, float]:
+    low, high = taus[max(best - 1, 0)], taus[min(best + 1, len(taus) - 1)]
+    found = optimize.minimize_scalar(
+        lambda log_tau: _for_tau(t, y, w, math.exp(log_tau))[1],
+        bounds=(math.log(low), math.log(high)),
+        method="bounded",
+        options={"xatol": 1e-7},
+    )
+    tau = math.exp(float(found.x))
+    (start, end), rss = _for_tau(t, y, w, tau)
+    return float(start), float(end), tau, rss
+
+
+def _probability(rss0: float, rss1: float, n: int, taus: Array) -> float:
+    """Of the F-test; as the best of many time constants was taken, the chances of independent ones add up."""
+    if rss1 <= 1e-24 * max(rss0, 1e-300):
+        return 0.0 if rss0 > 0.0 else 1.0
+    ratio = ((rss0 - rss1) / 2.0) / (rss1 / (n - 3))
+    trials = 1.0 + math.log(taus[-1] / taus[0]) / 4.0
+    return min(1.0, trials * float(stats.f.sf(ratio, 2, n - 3)))
+
+
+def _sigmas(t: Array, w: Array, found: tuple[float, float, float], rms: float) -> tuple[float, float, float, float]:
+    """Of start, end, time constant and change."""
+    start, end, tau = found
+    decay = np.exp(-t / tau)
+    J = w[:, None] * np.column_stack([decay, 1.0 - decay, (start - end) * decay * t / tau**2])
+    length = np.linalg.norm(J, axis=0)
+    if not (length > 0.0).all() or np.linalg.cond(J / length) > 1e8:
+        return math.inf, math.inf, math.inf, math.inf
+    Q = np.linalg.inv((J / length).T @ (J / length)) / np.outer(length, length) * rms**2
+    of_change = Q[0, 0] + Q[1, 1] - 2.0 * Q[0, 1]
+    return math.sqrt(Q[0, 0]), math.sqrt(Q[1, 1]), math.sqrt(Q[2, 2]), math.sqrt(max(of_change, 0.0))
+
+
+def _verdict(t: Array, tau: float, sigma_tau: float, change: tuple[float, float]) -> str:
+    step = float(np.median(np.diff(t)))
+    if tau > 2.0 * t[-1] or (tau > t[-1] / 2.0 and not sigma_tau < _KNOWN * tau):
+        return (
+            f"the series of {t[-1]:.4g} s is too short to see the end of the change: its time constant is longer than "
+            f"about {t[-1] / 2:.3g} s"
+        )
+    if tau < step / 2.0 or not sigma_tau < _KNOWN * tau:
+        if change[0] < 3.0 * change[1] or tau < step:
+            return f"the change is over within about {step:.3g} s, the distance of two measurements: too fast to follow"
+        return "the change is seen, its time constant only roughly"
+    return "exponential approach"

@@ -1,0 +1,199 @@
+"""Periodic parts of a series with gaps: least-squares spectrum beside a trend, and their adjustment."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Harmonic", "Spectrum", "adjust_periods", "spectrum"]
+
+Array = NDArray[np.float64]
+
+_OVERSAMPLING = 4
+_LONGEST = 1.5
+"""Least number of periods in the series: fewer cannot be told from a curve."""
+_AT_ONCE = 256
+
+
+@dataclass(frozen=True)
+class Harmonic:
+    """A oscillation: amplitude · sin(2π t / period + phase), with t the line counted from the window's first."""
+
+    period: float
+    """Lines."""
+    sigma_period: float
+    amplitude: float
+    """Pixels."""
+    sigma_amplitude: float
+    phase: float
+    """Radians, −π to π, at the window's first line."""
+    sigma_phase: float
+    probability: float
+    """Chance that noise alone makes as strong an oscillation at any of the frequencies that were tried."""
+
+    def at(self, t: Array) -> Array:
+        """Its part at lines."""
+        return self.amplitude * np.sin(2.0 * math.pi * np.asarray(t, float) / self.period + self.phase)
+
+    def hertz(self, line_time: float, interlaced: bool) -> float:
+        """Frequency in Hz; of an interlaced image, two successive lines count as one line of a field."""
+        return (2.0 if interlaced else 1.0) / (self.period * line_time)
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Share of the sum of squares that an oscillation of each frequency explains beside the base functions."""
+
+    frequency: Array
+    """Cycles per line, shape (k,)."""
+    power: Array
+    """0 to 1, shape (k,)."""
+    level: float
+    """Power that noise alone exceeds anywhere with a chance of 1 ‰."""
+
+    @property
+    def best(self) -> int:
+        """Index of the strongest frequency."""
+        return int(self.power.argmax())
+
+
+def spectrum(t: Array, y: Array, base: Array, chance: float = 0.001) -> Spectrum:
+    """Least-squares spectrum: at every frequency the base functions are adjusted anew (Lomb, Scargle).
+
+    Parameters
+    ----------
+    t : ndarray, shape (n,)
+        Lines; some may be missing.
+    y : ndarray, shape (n,)
+        Values.
+    base : ndarray, shape (n, k)
+        Functions that are adjusted with every oscillation: the trend, the offset of the fields, other oscillations.
+    chance : float
+        Of a false alarm, for `Spectrum.level`.
+    """
+    n = len(t)
+    extent = float(t[-1] - t[0]) + 1.0
+    low, high = _LONGEST / extent, 0.5 - 1.0 / extent
+    frequency = np.linspace(low, high, max(2, math.ceil((high - low) * extent * _OVERSAMPLING)))
+    Q, _ = np.linalg.qr(base)
+    rest = y - Q @ (Q.T @ y)
+    rss0 = max(float(rest @ rest), 1e-300)
+    power = np.empty(len(frequency))
+    for first in range(0, len(frequency), _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        angle = 2.0 * math.pi * np.multiply.outer(t - t[0], frequency[part])
+        power[part] = _explained(np.cos(angle), np.sin(angle), Q, rest) / rss0
+    freedom = n - base.shape[1] - 3
+    trials = max(1.0, (high - low) * extent)
+    single = -math.expm1(math.log1p(-chance) / trials)
+    return Spectrum(frequency, np.clip(power, 0.0, 1.0), 1.0 - single ** (2.0 / freedom))
+
+
+def false_alarm(found: Spectrum, freedom: int, extent: float) -> float:
+    """Chance that noise alone has its strongest power this high."""
+    single = (1.0 - float(found.power[found.best])) ** (freedom / 2.0)
+    trials = max(1.0, float(found.frequency[-1] - found.frequency[0]) * extent)
+    return -math.expm1(trials * math.log1p(-min(single, 1.0 - 1e-12)))
+
+
+def _explained(c: Array, s: Array, Q: Array, rest: Array) -> Array:
+    """Sum of squares that cosine and sine explain, after both are freed of what the base can do."""
+    c, s = c - Q @ (Q.T @ c), s - Q @ (Q.T @ s)
+    cc, ss, cs = (c * c).sum(axis=0), (s * s).sum(axis=0), (c * s).sum(axis=0)
+    yc, ys = rest @ c, rest @ s
+    det = cc * ss - cs**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        out = (yc**2 * ss - 2.0 * yc * ys * cs + ys**2 * cc) / det
+    return np.where(det > 1e-8 * cc * ss, out, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """Base functions and oscillations adjusted together."""
+
+    unknowns: Array
+    """Of the base functions, shape (k,)."""
+    sigmas: Array
+    harmonics: tuple[Harmonic, ...]
+    residuals: Array
+    """Computed minus measured, shape (n,)."""
+    sigma0: float
+    """Standard deviation of one value."""
+
+
+def adjust_periods(t: Array, y: Array, base: Array, frequencies: list[float], chances: list[float]) -> Adjusted:
+    """Adjust the base functions and the frequency, amplitude and phase of every oscillation by least squares.
+
+    Parameters
+    ----------
+    t, y, base
+        As for `spectrum`.
+    frequencies : list of float
+        Approximate frequencies, cycles per line.
+    chances : list of float
+        False-alarm chance of each, which is only passed on.
+    """
+    # About its middle, frequency and phase of an oscillation are nearly uncorrelated.
+    middle = float(t.mean())
+    f = np.array(frequencies)
+    limit = 0.5 / (float(t[-1] - t[0]) + 1.0)
+    k = base.shape[1]
+    for _ in range(12):
+        A = _design(t - middle, base, f)
+        found, *_ = np.linalg.lstsq(A, y, rcond=None)
+        if not len(f):
+            break
+        J = np.column_stack([A, _by_frequency(t - middle, f, found[k:])])
+        step, *_ = np.linalg.lstsq(J, y - A @ found, rcond=None)
+        change = np.clip(step[A.shape[1] :], -limit, limit)
+        f = np.clip(f + change, 1e-6, 0.5 - 1e-6)
+        if np.abs(change).max() < 1e-12:
+            break
+    A = _design(t - middle, base, f)
+    found, *_ = np.linalg.lstsq(A, y, rcond=None)
+    J = np.column_stack([A, _by_frequency(t - middle, f, found[k:])])
+    residuals = A @ found - y
+    sigma0 = math.sqrt(float(residuals @ residuals) / max(len(t) - J.shape[1], 1))
+    length = np.linalg.norm(J, axis=0)
+    length[length == 0.0] = 1.0
+    covariance = np.linalg.pinv((J / length).T @ (J / length)) / np.outer(length, length) * sigma0**2
+    harmonics = tuple(_harmonic(i, k, f, found, covariance, middle, chances) for i in range(len(f)))
+    return Adjusted(found[:k], np.sqrt(np.diag(covariance)[:k]), harmonics, residuals, sigma0)
+
+
+def _design(t: Array, base: Array, f: Array) -> Array:
+    angle = 2.0 * math.pi * np.multiply.outer(t, f)
+    return np.column_stack([base, *(part for i in range(len(f)) for part in (np.cos(angle[:, i]), np.sin(angle[:, i])))])
+
+
+def _by_frequency(t: Array, f: Array, found: Array) -> Array:
+    """Derivatives of every oscillation with respect to its frequency."""
+    angle = 2.0 * math.pi * np.multiply.outer(t, f)
+    a, b = found[0::2], found[1::2]
+    return 2.0 * math.pi * t[:, None] * (b * np.cos(angle) - a * np.sin(angle))
+
+
+def _harmonic(
+    i: int, k: int, f: Array, found: Array, covariance: Array, middle: float, chances: list[float]
+) -> Harmonic:
+    """Amplitude, phase and period with their standard deviations; the phase is moved to line 0."""
+    a, b = found[k + 2 * i], found[k + 2 * i + 1]
+    amplitude = math.hypot(a, b)
+    index = [k + 2 * i, k + 2 * i + 1, k + 2 * len(f) + i]
+    C = covariance[np.ix_(index, index)]
+    of_amplitude = np.array([a, b, 0.0]) / max(amplitude, 1e-300)
+    # phase = atan2(a, b) − 2π f · middle
+    of_phase = np.array([b, -a, 0.0]) / max(amplitude, 1e-300) ** 2 - [0.0, 0.0, 2.0 * math.pi * middle]
+    phase = math.remainder(math.atan2(a, b) - 2.0 * math.pi * f[i] * middle, math.tau)
+    return Harmonic(
+        1.0 / float(f[i]),
+        math.sqrt(C[2, 2]) / float(f[i]) ** 2,
+        amplitude,
+        math.sqrt(of_amplitude @ C @ of_amplitude),
+        phase,
+        math.sqrt(of_phase @ C @ of_phase),
+        chances[i],
+    )
