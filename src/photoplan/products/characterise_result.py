@@ -32,11 +32,16 @@ class Figure:
     remark: str = ""
 
     def __str__(self) -> str:
-        sigma = f" ± {_short(self.sigma)}" if math.isfinite(self.sigma) else ""
+        sigma = f" ± {self.sigma:.2g}" if math.isfinite(self.sigma) else ""
         where = " ".join(filter(None, [self.plane, self.at]))
         unit = f" {self.unit}" if self.unit else ""
         more = f" · {self.remark}" if self.remark else ""
         return f"{self.label}{f' ({where})' if where else ''}: {_short(self.value, self.sigma)}{sigma}{unit}{more}"
+
+    @property
+    def texts(self) -> tuple[str, str, str]:
+        """Value, standard deviation (empty: none) and unit as they are printed."""
+        return _short(self.value, self.sigma), f"{self.sigma:.2g}" if math.isfinite(self.sigma) else "", self.unit
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values; keys that say nothing are left out."""

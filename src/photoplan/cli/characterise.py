@@ -1,0 +1,81 @@
+"""`photoplan characterise`: know a camera from image series."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from photoplan.cli.failures import end_with_failures
+from photoplan.cli.options import json_option
+
+if TYPE_CHECKING:
+    from photoplan.products.characterise import AnalysisRun, CharacteriseReport
+
+__all__ = ["command"]
+
+
+@click.command("characterise")
+@click.argument("series", type=click.Path(path_type=Path), metavar="SERIES")
+@click.option("--only", multiple=True, metavar="NAME", help="Run this analysis; may be repeated [all possible].")
+@click.option("--report", type=click.Path(path_type=Path), metavar="FILE", help="Write an HTML report with plots.")
+@click.option("--csv", type=click.Path(path_type=Path), metavar="FOLDER", help="Write the figures as tables.")
+@click.option("--overwrite", is_flag=True, help="Replace a report and tables that exist.")
+@click.option("--dry-run", is_flag=True, help="Say which analyses would run and what is missing for the others.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(series: Path, as_json: bool, quiet: bool, **options: Any) -> None:
+    """Know a camera from image series: noise, gain, linearity, dark signal, defects, light fall-off …
+
+    SERIES is a TOML file that says which images are what (dark frames, flat frames, scenes …) and how they were
+    exposed. Every analysis that they allow is made; the others are listed with what is missing.
+    """
+    from photoplan.cli.progress import progress
+    from photoplan.products.characterise import CharacteriseRequest, characterise
+
+    request = CharacteriseRequest(series, **options)
+    report = characterise(request, lambda total: progress(total, quiet, "analyses"))
+    if as_json:
+        click.echo(json.dumps(report.to_dict(), indent=2, ensure_ascii=False))
+    else:
+        _print(report)
+    if not quiet:
+        _talk(report, options["dry_run"])
+    end_with_failures(report.failed, sum(run.outcome is not None for run in report.runs), "analyses failed")
+
+
+def _print(report: CharacteriseReport) -> None:
+    """Figures, refusals and paths on stdout."""
+    for run in report.runs:
+        if run.state == "possible":
+            click.echo(f"{run.analysis.name}: possible")
+        if run.outcome is not None:
+            click.echo(run.analysis.title)
+            for figure in run.outcome.figures:
+                click.echo(f"  {figure}")
+            for what, why in run.outcome.refused.items():
+                click.echo(f"  not known: {what}: {why}")
+    for path in report.written:
+        click.echo(str(path))
+
+
+def _talk(report: CharacteriseReport, dry_run: bool) -> None:
+    """What was not done, and remarks, on stderr."""
+    for run in report.runs:
+        for note in _notes(run):
+            click.echo(note, err=True)
+    states = [run.state for run in report.runs]
+    done = states.count("possible" if dry_run else "done")
+    click.echo(
+        f"{len(report.series.frames)} frames, {len(report.series.reduced)} reduced figures: {done} analyses "
+        f"{'possible' if dry_run else 'done'}, {states.count('missing')} lack data",
+        err=True,
+    )
+
+
+def _notes(run: AnalysisRun) -> list[str]:
+    if run.missing is not None:
+        return [f"{run.analysis.name}: missing: {run.missing}"]
+    return [] if run.outcome is None else [f"{run.analysis.name}: {note}" for note in run.outcome.notes]
