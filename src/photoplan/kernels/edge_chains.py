@@ -1,4 +1,4 @@
-"""Edge pixels: where the gradient has its ridge, to parts of a pixel, and which of them hang together in one direction."""
+"""Edge pixels: where the gradient has its ridge, to parts of a pixel, and which of them form one line."""
 
 from __future__ import annotations
 

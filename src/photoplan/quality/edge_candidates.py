@@ -143,7 +143,7 @@ def find_lines(
         return [], Counter()
     row, col = np.nonzero(np.isfinite(offset))
     u = np.stack([gx[row, col], gy[row, col]], 1).astype(float)
-    size = np.hypot(*u.T)
+    size: Array = np.hypot(*u.T)
     order = np.argsort(-size, kind="stable")
     row, col, u, size = row[order], col[order], (u / size[:, None])[order], size[order]
     index = np.full(grey.shape, -1, np.int32)
@@ -152,7 +152,7 @@ def find_lines(
     chains = int(grow(index, np.stack([row, col], 1).astype(np.int32), u, cos(_TURN), label))
     steep = np.abs(u[:, 0]) >= np.abs(u[:, 1])
     part = offset[row, col].astype(float)
-    points = np.stack([col + np.where(steep, part, 0.0), row + np.where(steep, 0.0, part)], 1)
+    points: Array = np.stack([col + np.where(steep, part, 0.0), row + np.where(steep, 0.0, part)], 1)
     return _lines(points, u, size, (label, chains), least_length)
 
 

@@ -180,6 +180,8 @@ def examine(picture: EdgePicture, line: StraightEdge, rules: EdgeRules) -> tuple
         score = region.line.length * min(half, 16) ** 0.5
         if best is None or score > 1.25 * best[0]:
             best = score, region
+        if region.line.length > 0.8 * line.length:
+            break
     if best is not None:
         return best[1], ""
     return None, reasons.most_common(1)[0][0] if reasons else "blurred"

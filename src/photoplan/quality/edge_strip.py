@@ -50,11 +50,7 @@ class Strip:
         """Medians over the blocks of the means of the bins, shape (2 half,); NaN where there is nothing."""
         with np.errstate(invalid="ignore", divide="ignore"):
             means = np.where(self.count >= 2, self.total / self.count, np.nan)
-        known = np.isfinite(means).any(axis=0)
-        profile = np.full(means.shape[1], np.nan)
-        if known.any():
-            profile[known] = np.nanmedian(means[:, known], axis=0)
-        return profile
+        return _median(means.T)
 
     def blur(self) -> tuple[float, float] | None:
         """Distances from the line, on the dark and the bright side, from which the grey values are even; None: unknown.
@@ -114,7 +110,7 @@ class Sides:
     @property
     def contrast(self) -> float:
         """Bright minus dark side, medians of the blocks."""
-        dark, bright = (float(np.nanmedian(self._means(side))) for side in (self.dark, self.bright))
+        dark, bright = (float(_median(self._means(side))) for side in (self.dark, self.bright))
         return bright - dark
 
     @property
@@ -141,21 +137,15 @@ class Sides:
             mean = self._means(side)
             noise = self._noise(side)
             allowed = np.maximum(evenness * contrast, 4 * _TOGETHER**0.5 * noise / np.sqrt(np.maximum(count, 1)))
-            middle = np.nanmedian(mean) if np.isfinite(mean).any() else np.nan
+            middle = _median(mean)
             # Light changes slowly along an edge: each block is compared with those around it.
             local = _running_median(mean, 9)
             textured |= ~(np.abs(mean - local) <= allowed)
             uneven |= ~(np.abs(mean - middle) <= 6 * allowed)
             deviation = np.sqrt(np.maximum(s.square[:, side].sum(axis=1) / np.maximum(count, 1) - mean**2, 0.0))
             uneven |= ~(deviation <= np.maximum(2.5 * noise, evenness * contrast))
-        why: Counter[str] = Counter()
-        for mask, name in (
-            (saturated, "saturated"),
-            (invalid, "invalid"),
-            (uneven, "two_sided"),
-            (textured, "textured"),
-        ):
-            why[name] = int(mask.sum())
+        bad = {"saturated": saturated, "invalid": invalid, "two_sided": uneven, "textured": textured}
+        why = Counter({name: int(mask.sum()) for name, mask in bad.items()})
         good = ~(saturated | invalid | uneven | textured)
         # Saturated pixels are left out of the sums, what remains then looks uneven: the cause is named, not the effect.
         if saturated.any() and saturated.sum() >= 0.3 * len(saturated):
@@ -199,16 +189,20 @@ class Sides:
         return sqrt(max(float(np.median(inner[some] / free[some])), 0.0))
 
 
+def _median(values: Array) -> Array:
+    """Medians of the last axis without NaN; NaN where there is nothing else."""
+    ordered = np.sort(values, axis=-1)
+    known = np.isfinite(values).sum(axis=-1, keepdims=True)
+    low = np.take_along_axis(ordered, np.maximum(known - 1, 0) // 2, -1)
+    high = np.take_along_axis(ordered, np.minimum(known // 2, values.shape[-1] - 1), -1)
+    return np.asarray(np.where(known > 0, (low + high) / 2, np.nan)[..., 0])
+
+
 def _running_median(values: Array, width: int) -> Array:
     """Medians of so many neighbours, fewer at the ends."""
     half = width // 2
     padded = np.concatenate([np.full(half, np.nan), values, np.full(half, np.nan)])
-    windows = np.lib.stride_tricks.sliding_window_view(padded, width)
-    known = np.isfinite(windows).any(axis=1)
-    result = np.full(len(values), np.nan)
-    if known.any():
-        result[known] = np.nanmedian(windows[known], axis=1)
-    return result
+    return _median(np.lib.stride_tricks.sliding_window_view(padded, width))
 
 
 def strip_along(
