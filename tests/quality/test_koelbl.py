@@ -1,0 +1,93 @@
+"""Spread function from an edge profile: Kölbl 2006, table 1, and recovery of what made the profile."""
+
+import numpy as np
+import pytest
+
+from photoplan.errors import InputError
+from photoplan.quality.koelbl import normalised_edge, spread_from_edge, spread_from_response
+from photoplan.quality.spread import SpreadFunction
+
+TABLE_1 = np.array([150.0, 148, 133, 67, 52, 50])
+
+
+def test_koelbl_table_1():
+    found = spread_from_edge(TABLE_1)
+    print(dict(zip("ZAB", np.round(found.spread.side(), 4), strict=True)))
+    assert np.round(normalised_edge(TABLE_1), 2) == pytest.approx([-1.0, -0.96, -0.66, 0.66, 0.96, 1.0])
+    assert found.spread.side() == pytest.approx([0.66, 0.15, 0.02], abs=0.0005)
+    assert (found.shift, found.border) == (0.0, 2)
+    assert found.beyond == pytest.approx(0.0, abs=1e-12)
+
+
+def test_rising_and_falling_edges_agree():
+    assert spread_from_edge(TABLE_1[::-1]).spread.values == pytest.approx(spread_from_edge(TABLE_1).spread.values)
+
+
+def edge(spread, shift, count=21, levels=(40.0, 200.0)):
+    """Image of an object edge that lies `shift` pixels behind the border of pixels 9 and 10."""
+    object_ = np.where(np.arange(count + 40) < 30, levels[0], levels[1]).astype(float)
+    mixed = 30 if shift >= 0.0 else 29
+    object_[mixed] += (levels[0] - levels[1]) * shift if shift >= 0.0 else (levels[1] - levels[0]) * -shift
+    return np.convolve(object_, spread.values, mode="same")[20:-20]
+
+
+@pytest.mark.parametrize("shift", [-0.5, -0.31, -0.05, 0.0, 0.2, 0.49])
+def test_shift_and_spread_are_recovered_together(shift):
+    spread = SpreadFunction.symmetric([0.61, 0.17, 0.02, 0.005])
+    found = spread_from_edge(edge(spread, shift), half=4)
+    # An edge half a pixel before a border is the one half a pixel behind the border before it.
+    assert (found.border + found.shift - 9.0) == pytest.approx(shift, abs=1e-6)
+    assert found.spread.side()[:4] == pytest.approx(spread.side(), abs=1e-6)
+    assert found.residual < 1e-7
+
+
+def test_asymmetric_spread_function():
+    values = np.array([0.01, 0.12, 0.62, 0.2, 0.05])
+    values = SpreadFunction.normalised(values)
+    centroid = float(values.values @ np.arange(-2, 3))
+    found = spread_from_edge(edge(values, 0.0), half=4, symmetric=False)
+    assert found.shift == pytest.approx(centroid)
+    assert found.spread.values @ np.arange(-4, 5) == pytest.approx(0.0, abs=0.01)
+    assert found.spread.asymmetry > 0.02
+    assert spread_from_edge(edge(values, 0.0), half=4).residual > 50 * found.residual
+
+
+def test_stray_light_beyond_the_reach_is_named():
+    tails = SpreadFunction.symmetric([0.6, 0.15, 0.02, 0.01, 0.01, 0.01])
+    found = spread_from_edge(edge(tails, 0.0), (40.0, 200.0), half=2)
+    # Twice 0.03 of 1.0 lie farther than two pixels; a part of it is taken for nearer light.
+    assert 0.75 * 0.06 < found.beyond < 0.06
+
+
+@pytest.mark.parametrize(
+    ("profile", "word"),
+    [
+        ([5.0, 5, 5, 5, 5], "no edge"),
+        ([5.0, 6, 7], "at least four"),
+        ([5.0, 5, np.nan, 9, 9], "finite"),
+        ([5.0, 5, 9, 9], None),
+    ],
+)
+def test_what_is_no_edge(profile, word):
+    if word is None:
+        assert spread_from_edge(np.array(profile)).spread.half == 1
+        return
+    with pytest.raises(InputError, match=word):
+        spread_from_edge(np.array(profile))
+
+
+def test_reach_beyond_the_profile_is_refused():
+    with pytest.raises(InputError, match="3 pixels before the edge"):
+        spread_from_edge(TABLE_1, half=5)
+
+
+def test_response_to_discrete_spread():
+    position = np.linspace(-8.0, 8.0, 1601)
+    # A triangle two pixels wide is a pixel's aperture over a box: its steps are 1/8, 6/8, 1/8.
+    response = np.interp(position, np.linspace(-1, 1, 201), np.cumsum(1 - np.abs(np.linspace(-1, 1, 201))) / 100.0)
+    spread, beyond = spread_from_response(position, response, 3, np.full(position.size, 0.01))
+    assert spread.side() == pytest.approx([0.75, 0.125, 0.0, 0.0], abs=0.01)
+    assert beyond == pytest.approx(0.0, abs=1e-9)
+    assert spread.sigma == pytest.approx(0.01 * np.sqrt(2.0))
+    with pytest.raises(InputError, match="known from -8.0 to 8.0"):
+        spread_from_response(position, response, 8)
