@@ -89,5 +89,5 @@ def test_response_to_discrete_spread():
     assert spread.side() == pytest.approx([0.75, 0.125, 0.0, 0.0], abs=0.01)
     assert beyond == pytest.approx(0.0, abs=1e-9)
     assert spread.sigma == pytest.approx(0.01 * np.sqrt(2.0))
-    with pytest.raises(InputError, match="known from -8.0 to 8.0"):
+    with pytest.raises(InputError, match=r"known from -8\.0 to 8\.0"):
         spread_from_response(position, response, 8)

@@ -1,4 +1,4 @@
-"""Simulated scenes restored: what the exact inverse holds for objects of whole pixels, and least squares for any edge."""
+"""Simulated scenes restored: the exact inverse for objects of whole pixels, least squares for any edge."""
 
 import numpy as np
 import pytest

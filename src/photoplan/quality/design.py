@@ -93,7 +93,7 @@ def design_filter(
     Raises
     ------
     InputError
-        The exact inverse is asked for and its condition does not hold, or the scene's statistics are needed and missing.
+        The exact inverse is asked for and its condition does not hold, or the scene is needed and missing.
     """
     asked = options or DesignOptions()
     conditions = (condition_of(x.spread), condition_of(y.spread))
