@@ -1,0 +1,118 @@
+"""A tile with a margin: what lies beyond the image, or is invalid, continues the valid pixels beside it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.geometry.grid import Window
+from photoplan.kernels.extend import extend_oddly
+from photoplan.quality.convolution import LEFT, RIGHT
+
+__all__ = ["Margin"]
+
+
+@dataclass(frozen=True)
+class Margin:
+    """How far filters reach beyond a pixel, and what they find there.
+
+    Pixels beyond the image and invalid ones are one case: q gets ``2 v(p) - v(2 p - q)`` from the nearest valid pixel p
+    (`photoplan.kernels.extend`). Constants and linear ramps go on, so there is nothing for a filter to sharpen: across
+    a straight edge an even filter leaves the outermost pixel as it is (times its sum), noise included. Only pixels that
+    a filter of this reach can need are looked at, hence the result is that of any other tile.
+    """
+
+    columns: int
+    rows: int
+
+    def around(self, window: Window, size: tuple[int, int], gaps: bool = True) -> Window:
+        """Pixels of an image of `size` that the filtered pixels of a window depend on.
+
+        Parameters
+        ----------
+        window : Window
+            Inside the image.
+        size : (int, int)
+            Width and height of the image.
+        gaps : bool
+            Whether pixels may be missing beside the window, so that those further away have to stand in.
+        """
+        times = 3 if gaps else 1
+        columns, rows = times * self.columns, times * self.rows
+        wide = (window.col - columns, window.row - rows, window.stop[0] + columns, window.stop[1] + rows)
+        left, top = max(wide[0], 0), max(wide[1], 0)
+        return Window(left, top, min(wide[2], size[0]) - left, min(wide[3], size[1]) - top)
+
+    def fits(self, window: Window, size: tuple[int, int]) -> bool:
+        """Whether a window lies so far inside the image that nothing has to be continued at its edge."""
+        return self.around(window, size, gaps=False).size == (window.width + 2 * self.columns) * (
+            window.height + 2 * self.rows
+        )
+
+    def source(
+        self, window: Window, pixels: NDArray[np.float32], at: Window, valid: NDArray[np.bool_] | None
+    ) -> NDArray[np.float32]:
+        """Pixels of a window with its margin, all of them finite, as `Convolution` wants them.
+
+        Parameters
+        ----------
+        window : Window
+            Whose pixels will be filtered.
+        pixels : ndarray, shape (bands, at.height, at.width)
+            Values at invalid pixels are of no account.
+        at : Window
+            Where they are: what `around` said, of the whole image's pixels.
+        valid : ndarray of bool, shape (at.height, at.width)
+            None: all are.
+
+        Returns
+        -------
+        ndarray, shape (bands, window.height + 2 rows, LEFT + window.width + 2 columns + RIGHT)
+        """
+        width, height = window.width + 2 * self.columns, window.height + 2 * self.rows
+        out = np.zeros((pixels.shape[0], height, LEFT + width + RIGHT), np.float32)
+        wide = Window(window.col - self.columns, window.row - self.rows, width, height)
+        common = wide & at
+        of = _part(common, at)
+        to = _part(common, wide)
+        known = np.zeros((height, width), bool)
+        known[to] = True if valid is None else valid[of]
+        out[:, to[0], LEFT + to[1].start : LEFT + to[1].stop] = np.where(known[to], pixels[:, *of], np.float32(0.0))
+        if not known.all():
+            usable = np.ones((at.height, at.width), bool) if valid is None else valid
+            wanted = self._near(usable, at, wide) & ~known
+            place = (wide.row - at.row, wide.col - at.col, LEFT)
+            extend_oddly(np.ascontiguousarray(pixels), usable, wanted, _offsets(self.columns, self.rows), place, out)
+        return out
+
+    def _near(self, valid: NDArray[np.bool_], at: Window, wide: Window) -> NDArray[np.bool_]:
+        """Pixels of `wide` that have a valid one within reach."""
+        sums = np.zeros((at.height + 1, at.width + 1), np.int64)
+        sums[1:, 1:] = valid.cumsum(0, np.int64).cumsum(1)
+        rows, cols = np.arange(wide.row, wide.stop[1]) - at.row, np.arange(wide.col, wide.stop[0]) - at.col
+        top, bottom = np.clip(rows - self.rows, 0, at.height), np.clip(rows + self.rows + 1, 0, at.height)
+        left, right = np.clip(cols - self.columns, 0, at.width), np.clip(cols + self.columns + 1, 0, at.width)
+        found = sums[np.ix_(bottom, right)] - sums[np.ix_(top, right)]
+        return np.asarray(found - sums[np.ix_(bottom, left)] + sums[np.ix_(top, left)] > 0)
+
+
+def _part(common: Window, of: Window) -> tuple[slice, slice]:
+    """Rows and columns of a common part in the arrays of a window."""
+    return (
+        slice(common.row - of.row, common.stop[1] - of.row),
+        slice(common.col - of.col, common.stop[0] - of.col),
+    )
+
+
+@lru_cache(maxsize=16)
+def _offsets(columns: int, rows: int) -> NDArray[np.int32]:
+    """Squared distance, rows and columns of all neighbours within reach, the nearest first."""
+    dy, dx = np.mgrid[-rows : rows + 1, -columns : columns + 1]
+    squared = dy**2 + dx**2
+    order = np.lexsort((dx.ravel(), dy.ravel(), squared.ravel()))[1:]
+    table = np.stack([squared.ravel(), dy.ravel(), dx.ravel()], axis=1)[order].astype(np.int32)
+    table.setflags(write=False)
+    return table
