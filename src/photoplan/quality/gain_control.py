@@ -78,7 +78,12 @@ class Asymmetry:
 
 
 def gain_control(
-    times: Array, values: Array, *, step_time: float | None = None, name: str = "series", saturation: float | None = None
+    times: Array,
+    values: Array,
+    *,
+    step_time: float | None = None,
+    name: str = "series",
+    saturation: float | None = None,
 ) -> GainControl:
     """Follow the grey values after a step of brightness.
 
@@ -112,8 +117,8 @@ def gain_control(
         )
     if saturation is not None and (y[first:] >= saturation).any():
         raise InputError(
-            f"{name}: grey values after the step reach {y[first:].max():.1f}, the saturation ({saturation:g}); what the "
-            "control does is hidden there. Take the series with less light"
+            f"{name}: grey values after the step reach {y[first:].max():.1f}, the saturation ({saturation:g}); what "
+            "the control does is hidden there. Take the series with less light"
         )
     approach = fit_approach(t[first:], y[first:], what=f"{name} after the step")
     ahead = y[:first]

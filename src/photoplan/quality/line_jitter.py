@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy import ndimage, stats
 
 from photoplan.errors import InputError
-from photoplan.quality.plumb_edge import LEAST_LINES
 from photoplan.quality.line_period import Adjusted, Harmonic, Spectrum, adjust_periods, false_alarm, spectrum
+from photoplan.quality.plumb_edge import LEAST_LINES
 
 __all__ = ["LineJitter", "Spike", "grey_error", "line_jitter", "position_error"]
 
@@ -132,8 +132,8 @@ def line_jitter(position: Array, name: str = "edge", degree: int | None = None) 
     used = ~_spikes(t, y)
     if (~used).sum() > _MOST_SPIKES * len(used):
         raise InputError(
-            f"{name}: {(~used).sum()} of {len(used)} lines stand out from their neighbours; the edge is no line, choose "
-            "another window"
+            f"{name}: {(~used).sum()} of {len(used)} lines stand out from their neighbours; the edge is no line, "
+            "choose another window"
         )
     chosen, fit, whole = _chosen(t[used], y[used], degree, len(p))
     trend, parity = _base(t, chosen, len(p))
@@ -170,7 +170,7 @@ def line_jitter(position: Array, name: str = "edge", degree: int | None = None) 
 def _base(t: Array, degree: int, lines: int) -> tuple[Array, Array]:
     """Legendre polynomials over the window, and the parity of the lines (−½ even, +½ odd)."""
     u = 2.0 * t / max(lines - 1, 1) - 1.0
-    return np.polynomial.legendre.legvander(u, degree), np.where(t % 2 == 0, -0.5, 0.5)
+    return np.asarray(np.polynomial.legendre.legvander(u, degree), float), np.where(t % 2 == 0, -0.5, 0.5)
 
 
 def _chosen(t: Array, y: Array, degree: int | None, lines: int) -> tuple[int, Adjusted, Spectrum]:

@@ -143,17 +143,17 @@ def adjust_periods(t: Array, y: Array, base: Array, frequencies: list[float], ch
     k = base.shape[1]
     for _ in range(12):
         A = _design(t - middle, base, f)
-        found, *_ = np.linalg.lstsq(A, y, rcond=None)
+        found = _solve(A, y)
         if not len(f):
             break
         J = np.column_stack([A, _by_frequency(t - middle, f, found[k:])])
-        step, *_ = np.linalg.lstsq(J, y - A @ found, rcond=None)
+        step = _solve(J, y - A @ found)
         change = np.clip(step[A.shape[1] :], -limit, limit)
         f = np.clip(f + change, 1e-6, 0.5 - 1e-6)
         if np.abs(change).max() < 1e-12:
             break
     A = _design(t - middle, base, f)
-    found, *_ = np.linalg.lstsq(A, y, rcond=None)
+    found = _solve(A, y)
     J = np.column_stack([A, _by_frequency(t - middle, f, found[k:])])
     residuals = A @ found - y
     sigma0 = math.sqrt(float(residuals @ residuals) / max(len(t) - J.shape[1], 1))
@@ -164,9 +164,15 @@ def adjust_periods(t: Array, y: Array, base: Array, frequencies: list[float], ch
     return Adjusted(found[:k], np.sqrt(np.diag(covariance)[:k]), harmonics, residuals, sigma0)
 
 
+def _solve(A: Array, y: Array) -> Array:
+    return np.asarray(np.linalg.lstsq(A, y, rcond=None)[0], float)
+
+
 def _design(t: Array, base: Array, f: Array) -> Array:
     angle = 2.0 * math.pi * np.multiply.outer(t, f)
-    return np.column_stack([base, *(part for i in range(len(f)) for part in (np.cos(angle[:, i]), np.sin(angle[:, i])))])
+    return np.column_stack(
+        [base, *(part for i in range(len(f)) for part in (np.cos(angle[:, i]), np.sin(angle[:, i])))]
+    )
 
 
 def _by_frequency(t: Array, f: Array, found: Array) -> Array:

@@ -151,8 +151,8 @@ def correlate_edge(grey: NDArray[np.floating], fitted: EdgeLines, *, name: str =
 def _window(grey: NDArray[np.floating], name: str) -> Array:
     if grey.ndim != 2 or grey.shape[0] < LEAST_LINES or grey.shape[1] < 2 * _REACH + 4:
         raise InputError(
-            f"{name}: a window of {grey.shape[-1]} columns and {len(grey)} lines; at least {2 * _REACH + 4} columns and "
-            f"{LEAST_LINES} lines are needed"
+            f"{name}: a window of {grey.shape[-1]} columns and {len(grey)} lines; at least {2 * _REACH + 4} columns "
+            f"and {LEAST_LINES} lines are needed"
         )
     if grey.size > _LARGEST:
         raise InputError(f"{name}: a window of {grey.size} pixels; at most {_LARGEST} are taken, choose a narrower one")
@@ -204,7 +204,8 @@ def _refuse_cut(g: Array, coarse: NDArray[np.int64], contrast: float, name: str,
     if not noisy_dark and noisy_bright:
         raise InputError(
             f"{name}: cut off in the dark: {100 * share_low:.0f} % of the pixels on its dark side are at "
-            f"{np.nanmin(dark):g}; the edge's place would be wrong. Take the image with more light or a higher black level"
+            f"{np.nanmin(dark):g}; the edge's place would be wrong. Take the image with more light or a "
+            "higher black level"
         )
 
 
