@@ -29,6 +29,8 @@ REASONS = {
 }
 #: Widths of half a window that are tried, pixels.
 _HALVES = (20, 16, 13, 11, 9, 7)
+#: Good blocks that must lie before and behind a gap.
+_RUN = 5
 #: Pixels of a side that must lie beyond the blur.
 _SIDE = 3
 
@@ -92,6 +94,8 @@ class EdgeRegion:
     """Contrast over the standard deviation of the sides."""
     aligned: bool
     """Too nearly parallel to rows or columns for all positions within a pixel to occur along it."""
+    gaps: tuple[tuple[float, float], ...] = ()
+    """Stretches that are left out, from and to distances along the line from its middle, pixels."""
 
     @property
     def merit(self) -> float:
@@ -114,7 +118,10 @@ class EdgeRegion:
         dy = (np.arange(height) + (row - line.y))[:, None]
         along = dx * line.tx + dy * line.ty
         across = dy * line.tx - dx * line.ty
-        return np.asarray((np.abs(along) <= line.length / 2) & (np.abs(across) <= self.half))
+        mask = (np.abs(along) <= line.length / 2) & (np.abs(across) <= self.half)
+        for start, end in self.gaps:
+            mask &= (along < start) | (along > end)
+        return np.asarray(mask)
 
 
 def find_edges(picture: EdgePicture, rules: EdgeRules | None = None) -> tuple[list[EdgeRegion], Counter[str]]:
@@ -193,17 +200,32 @@ def _clean_part(
     rules, least_contrast = demands
     sides = strip.sides(blur, half)
     good, why = sides.good_blocks(rules.evenness)
-    start, end = _longest(good)
+    start, end = _longest(_bridged(good))
     step = strip.block
-    length = min((end - start) * step, strip.line.length - start * step)
+    length = (end - start) * step
     if length < rules.least_length:
         return None, why.most_common(1)[0][0] if why else "short"
-    part = sides.part(start, end)
+    chosen = good.copy()
+    chosen[:start] = chosen[end:] = False
+    part = sides.blocks(chosen)
     reason = part.reason(rules.evenness, rules.least_snr)
     if reason or part.contrast < least_contrast:
         return None, reason or "weak"
     line = strip.line.part(start * step, start * step + length)
-    return EdgeRegion(line, half, part.contrast, part.snr, _is_aligned(line)), ""
+    bad = np.flatnonzero(~good[start:end])
+    gaps = tuple((float(k * step - length / 2), float((k + 1) * step - length / 2)) for k in bad)
+    return EdgeRegion(line, half, part.contrast, part.snr, _is_aligned(line), gaps), ""
+
+
+def _bridged(good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Good blocks, and one or two others between long runs of good ones: the edge goes on behind a spot."""
+    bridged = good.copy()
+    for k in range(_RUN, len(good) - _RUN):
+        for width in (1, 2):
+            after = good[k + width : k + width + _RUN]
+            if not good[k] and len(after) == _RUN and after.all() and good[k - _RUN : k].all():
+                bridged[k : k + width] = True
+    return bridged
 
 
 def _longest(good: NDArray[np.bool_]) -> tuple[int, int]:

@@ -98,14 +98,11 @@ class Sides:
     bright: slice
     window: slice
 
-    def part(self, start: int, end: int) -> Sides:
-        """Blocks from start to end."""
+    def blocks(self, chosen: NDArray[np.bool_]) -> Sides:
+        """Only the blocks that are chosen."""
         s = self.strip
-        cut = slice(start, end)
-        part = Strip(
-            s.line, s.block, s.half, s.count[cut], s.total[cut], s.square[cut], s.saturated[cut], s.invalid[cut]
-        )
-        return Sides(part, self.dark, self.bright, self.window)
+        sums = (each[chosen] for each in (s.count, s.total, s.square, s.saturated, s.invalid))
+        return Sides(Strip(s.line, s.block, s.half, *sums), self.dark, self.bright, self.window)
 
     @property
     def contrast(self) -> float:

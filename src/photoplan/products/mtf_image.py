@@ -1,0 +1,179 @@
+"""An image as light: grey values made linear, one band or the luminance of three, with what is saturated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.grid import Window
+from photoplan.io.linearisation_file import read_linearisation_table
+from photoplan.io.raster import RasterReader
+from photoplan.quality.edge_candidates import range_of
+from photoplan.quality.edge_find import EdgePicture
+from photoplan.quality.linearise import Linearisation
+
+__all__ = ["LUMINANCE", "LightImage", "linearisation_of"]
+
+#: Channel 0.
+LUMINANCE = 0
+_WEIGHTS = np.array([0.2126, 0.7152, 0.0722])
+"""Of red, green and blue light (ITU-R BT.709)."""
+_CLIPS = tuple(float(2**bits - 1) for bits in (8, 10, 11, 12, 13, 14, 15, 16))
+"""Values with which sensors of so many bits end."""
+_OFTEN = 20
+"""Pixels that must have such a value."""
+_SAMPLES = 24
+"""Windows in which the range of values is looked for."""
+
+
+def linearisation_of(words: str) -> Linearisation:
+    """What ``linear``, ``srgb`` or the name of a table stand for.
+
+    Raises
+    ------
+    InputError
+        The table cannot be read or used.
+    UsageError
+        It is neither a word nor a file.
+    """
+    if words in ("linear", "srgb"):
+        return Linearisation(words)  # type: ignore[arg-type]
+    path = Path(words)
+    if not path.is_file():
+        raise UsageError(f"--linearisation {words}: is no file; give linear, srgb, or a table that exists")
+    table = read_linearisation_table(path)
+    try:
+        return Linearisation.from_table(table)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+@dataclass(frozen=True, eq=False)
+class LightImage:
+    """An image behind windows of light.
+
+    Channel 0 is the luminance of the first three bands, or the only band; channel n is band n.
+    """
+
+    reader: RasterReader
+    linearisation: Linearisation
+    span: dict[int, float]
+    """Range of the values of each channel that was asked for."""
+
+    @classmethod
+    def open(cls, path: Path, linearisation: Linearisation) -> LightImage:
+        """Open a file; its pixels are not read yet.
+
+        Raises
+        ------
+        InputError
+            The file cannot be used.
+        """
+        return cls(RasterReader(path), linearisation, {})
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, pixels."""
+        return self.reader.size
+
+    def channel_name(self, channel: int) -> str:
+        """How messages call a channel."""
+        if channel == LUMINANCE:
+            return "luminance" if self.reader.bands >= 3 else "band 1"
+        return f"band {channel}"
+
+    def channels(self, band: str | None) -> tuple[int, ...]:
+        """Channels that an option asks for: None: luminance or the first band, a number, or all.
+
+        Raises
+        ------
+        UsageError
+            There is no such band.
+        """
+        bands = self.reader.bands
+        if band is None:
+            return (LUMINANCE,) if bands >= 3 or bands == 1 else (1,)
+        if band == "all":
+            return (LUMINANCE, *range(1, bands + 1)) if bands >= 3 else tuple(range(1, bands + 1))
+        if not band.isdecimal() or not 1 <= int(band) <= bands:
+            raise UsageError(f"{self.reader.path}: --band {band}; the file has bands 1 to {bands}, or say all")
+        return (int(band),)
+
+    def picture(self, window: Window, channel: int) -> EdgePicture:
+        """Light of a channel in a window, with the range of values of the whole image.
+
+        Raises
+        ------
+        InputError
+            The pixels are damaged, or the table of the linearisation does not hold their values.
+        """
+        grey, valid, saturated = self._light(window, channel)
+        return EdgePicture(grey, valid, saturated, self._span(channel))
+
+    def _light(
+        self, window: Window, channel: int
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None, NDArray[np.bool_] | None]:
+        pixels, valid = self.reader.read(window)
+        single = channel != LUMINANCE or self.reader.bands < 3
+        bands = [max(channel, 1)] if single else [1, 2, 3]
+        light = np.zeros(pixels.shape[1:], np.float32)
+        saturated = np.zeros(pixels.shape[1:], bool)
+        for weight, band in zip([1.0] if single else _WEIGHTS, bands):
+            stored = pixels[band - 1]
+            light += np.float32(weight) * self._linear(stored, valid, band)
+            low, high = self._ends(stored)
+            saturated |= (stored >= high) | (stored <= low)
+        return light, valid, saturated if saturated.any() else None
+
+    def _linear(self, stored: NDArray[np.generic], valid: NDArray[np.bool_] | None, band: int) -> NDArray[np.float32]:
+        """Light of a band, full scale 1 but for tables; integers by a table of the values that occur."""
+        known = stored if valid is None else stored[valid]
+        result = np.zeros(stored.shape, np.float32)
+        if known.size == 0:
+            return result
+        scale = 1.0 if self.linearisation.kind == "table" else self.linearisation.full_scale(stored.dtype)
+        low = known.min()
+        if stored.dtype.kind == "f":
+            light = self.linearisation.to_linear(known, band)
+        else:
+            grey = np.arange(int(low), int(known.max()) + 1).astype(stored.dtype)
+            light = self.linearisation.to_linear(grey, band)[known.astype(np.int64) - int(low)]
+        if valid is None:
+            return np.asarray(light / scale, np.float32)
+        result[valid] = light / scale
+        return result
+
+    def _ends(self, stored: NDArray[np.generic]) -> tuple[float, float]:
+        """Stored values at which a sensor or a file clips.
+
+        Those of the type, of the bits that the file states, or the largest value of the window if it is what a sensor
+        of fewer bits ends with.
+        """
+        kind = self.reader.dtype
+        largest = float(np.nanmax(stored)) if stored.size else 0.0
+        often = largest in _CLIPS and int((stored == largest).sum()) >= _OFTEN
+        if kind.kind == "f":
+            return -np.inf, largest if often or (largest == 1.0 and int((stored == 1.0).sum()) >= _OFTEN) else np.inf
+        limits = np.iinfo(kind)
+        bits = self.reader.info.bits
+        high = float(2**bits - 1) if kind.kind == "u" and 0 < bits < 8 * kind.itemsize else float(limits.max)
+        return float(limits.min), largest if often else high
+
+    def _span(self, channel: int) -> float:
+        """Range of the values of the whole image, from windows spread over it; asked once."""
+        if channel not in self.span:
+            width, height = self.size
+            side = min(256, width), min(256, height)
+            n = max(1, round(_SAMPLES**0.5))
+            parts = []
+            for i in range(n):
+                for j in range(n):
+                    at = (round(j * (width - side[0]) / max(n - 1, 1)), round(i * (height - side[1]) / max(n - 1, 1)))
+                    grey, valid, _ = self._light(Window(*at, *side), channel)
+                    parts.append((grey if valid is None else grey[valid]).ravel()[::7])
+            self.span[channel] = range_of(np.concatenate(parts)[None])
+        return self.span[channel]
