@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from photoplan.errors import GeometryError, InputError
-from photoplan.quality.fall_off_adjust import FallOffSettings, Fit, adjust, separability, significant
+from photoplan.quality.fall_off_adjust import FallOffSettings, Fit, adjust, columns, separability, significant
 from photoplan.quality.fall_off_blocks import Blocks, to_blocks
 from photoplan.quality.fall_off_model import FallOffModel, half_diagonal
 
