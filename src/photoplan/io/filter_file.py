@@ -16,7 +16,7 @@ from photoplan.io.plain_files import finite, read_text
 from photoplan.io.project_write import toml_key, toml_value
 from photoplan.io.toml_file import read_toml
 
-__all__ = ["FilterEntries", "KernelEntry", "filter_text", "is_filter", "read_filter_file"]
+__all__ = ["FilterEntries", "KernelEntry", "filter_text", "is_filter", "plain_fact", "read_filter_file"]
 
 #: Entry `kind` of a filter file, by which it is told from a project.
 FILTER_KIND = "restoration filter"
@@ -103,7 +103,7 @@ def filter_text(filter_: FilterEntries) -> str:
     if filter_.image_size is not None:
         lines += ["# Width and height of the images that the places `at` refer to, pixels."]
         lines.append(f"image_size = {toml_value([int(side) for side in filter_.image_size])}")
-    facts = {key: _plain(value) for key, value in filter_.facts.items() if value is not None}
+    facts = {key: plain_fact(value) for key, value in filter_.facts.items() if value is not None}
     if facts:
         lines += ["", "# How it was made; no entry here changes the result.", "[facts]"]
         lines += [f"{toml_key(str(key))} = {toml_value(value)}" for key, value in facts.items()]
@@ -118,14 +118,14 @@ def filter_text(filter_: FilterEntries) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _plain(value: object) -> Any:
+def plain_fact(value: object) -> Any:
     """A fact as TOML can say it."""
     if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
+        return plain_fact(value.tolist())
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items() if item is not None}
+        return {str(key): plain_fact(item) for key, item in value.items() if item is not None}
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain(item) for item in value]
+        return [plain_fact(item) for item in value]
     return value if isinstance(value, str | bool | int | float) else str(value)
 
 

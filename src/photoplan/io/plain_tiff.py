@@ -10,7 +10,7 @@ from __future__ import annotations
 import errno
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 import rasterio
 
 from photoplan.errors import PhotoplanError
-from photoplan.io.gdal import gdal_settings
+from photoplan.io.gdal import gdal_settings, not_georeferenced
 from photoplan.io.tiff_layout import TiffArray, read_tiff_layout
 
 __all__ = ["write_plain_tiff"]
@@ -33,6 +33,7 @@ def write_plain_tiff(
     tags: dict[str, str],
     blocks: Iterable[tuple[int, int, int]],
     source: int,
+    dress: Callable[[Any], None] | None = None,
 ) -> None:
     """Write a tiled TIFF.
 
@@ -50,6 +51,8 @@ def write_plain_tiff(
         that are not named stay unwritten (sparse).
     source
         Descriptor of the open file that holds the blocks' bytes, in this machine's byte order.
+    dress
+        Called with the data set while its header is made: for names and colours of bands, and metadata.
 
     Raises
     ------
@@ -60,9 +63,11 @@ def write_plain_tiff(
     fixed = {"driver": "GTiff", "tiled": True, "interleave": "pixel", "sparse_ok": True, "compress": "none"}
     colours = profile.get("colormap")
     fixed = {name: value for name, value in (profile | fixed).items() if name != "colormap"}
-    with gdal_settings(GDAL_PAM_ENABLED=False), rasterio.open(path, "w", **fixed) as dataset:
+    with gdal_settings(GDAL_PAM_ENABLED=False), not_georeferenced(), rasterio.open(path, "w", **fixed) as dataset:
         if colours is not None:
             dataset.write_colormap(1, colours)
+        if dress is not None:
+            dress(dataset)
         dataset.update_tags(**tags)
     layout = read_tiff_layout(path)
     offsets, counts = np.zeros_like(layout.offsets), np.zeros_like(layout.counts)

@@ -19,6 +19,7 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.cog import CogOptions, write_cog
 from photoplan.io.disk import disk_error, free_megabytes, sync_file, sync_folder
 from photoplan.io.gdal import GDAL_ERRORS, first_cause
+from photoplan.io.image_form import ImageForm, dress
 from photoplan.io.lock import FileLock
 from photoplan.io.plain_tiff import write_plain_tiff
 from photoplan.io.product_check import check_product
@@ -122,6 +123,9 @@ class ProductFile:
     """How the overviews are made: `average`, `mode` or `nearest`."""
     colours: Mapping[int, tuple[int, int, int]] | None = None
     """Colour table of one band of uint8."""
+    form: ImageForm | None = None
+    """Of an image whose copy the product is: its place on the map counts instead of the grid's, and its names and
+    colours of bands and its metadata are taken over."""
     _log: TileLog | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -281,23 +285,28 @@ class ProductFile:
         """What GDAL is told about the product."""
         grid = self.grid
         blocks = len(self._windows) * (self._coder.pixel_bytes + self._coder.mask_bytes)
+        stated = grid.crs if self.form is None else self.form.crs
         try:
-            crs = rasterio.crs.CRS.from_user_input(grid.crs) if grid.crs else None
+            crs = rasterio.crs.CRS.from_user_input(stated) if stated else None
         except GDAL_ERRORS as error:
-            raise UsageError(f"{self.path}: the reference system {grid.crs!r} is not understood ({error})") from error
+            raise UsageError(f"{self.path}: the reference system {stated!r} is not understood ({error})") from error
+        # GDAL's transform refers to the outer edge of the upper-left pixel, as the grid's edges do.
+        place = (grid.resolution, 0.0, grid.left, 0.0, -grid.resolution, grid.top)
+        photometric = "RGB" if self.bands in (3, 4) and self.dtype != np.float32 else "MINISBLACK"
+        if self.form is not None:
+            place, photometric = self.form.transform, self.form.photometric or photometric
         return {
             "width": grid.width,
             "height": grid.height,
             "count": self.bands,
             "dtype": self.dtype.name,
             "crs": crs,
-            # GDAL's transform refers to the outer edge of the upper-left pixel, as the grid's edges do.
-            "transform": rasterio.transform.Affine(grid.resolution, 0, grid.left, 0, -grid.resolution, grid.top),
+            "transform": rasterio.transform.Affine(*place),
             "nodata": self._coder.nodata,
             "blockxsize": self.tile,
             "blockysize": self.tile,
             "bigtiff": "YES" if blocks > _BIG else "NO",
-            "photometric": "RGB" if self.bands in (3, 4) and self.dtype != np.float32 else "MINISBLACK",
+            "photometric": photometric,
         } | ({"alpha": "NO"} if self.bands != 3 else {})
 
     def _assemble(self, log: TileLog, tags: dict[str, str]) -> Path:
@@ -311,7 +320,9 @@ class ProductFile:
         colours: dict[str, Any] = {}
         if self.colours:
             colours = {"colormap": dict(self.colours), "photometric": "PALETTE"}
-        write_plain_tiff(part if direct else plain, profile | colours, tags, blocks, log.descriptor)
+        form = self.form
+        dresser = None if form is None else lambda dataset: dress(dataset, form)
+        write_plain_tiff(part if direct else plain, profile | colours, tags, blocks, log.descriptor, dresser)
         if direct:
             return part
         if self._coder.mask_bytes:

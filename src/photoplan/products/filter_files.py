@@ -6,11 +6,11 @@ from pathlib import Path
 
 from photoplan.errors import InputError, UsageError
 from photoplan.io.disk import write_atomically
-from photoplan.io.filter_file import FilterEntries, KernelEntry, filter_text, read_filter_file
+from photoplan.io.filter_file import FilterEntries, KernelEntry, filter_text, plain_fact, read_filter_file
 from photoplan.io.product import check_output
 from photoplan.quality.filters import FilterKernel, RestorationFilter
 
-__all__ = ["load_filter", "save_filter"]
+__all__ = ["entries_of", "load_filter", "save_filter"]
 
 
 def load_filter(path: Path) -> RestorationFilter:
@@ -43,7 +43,12 @@ def save_filter(path: Path, filter_: RestorationFilter, *, overwrite: bool = Fal
     if path.suffix.lower() != ".toml":
         raise UsageError(f"{path}: a filter is written as TOML; give a name that ends in .toml")
     check_output(path, overwrite=overwrite)
-    kernels = tuple(KernelEntry(k.values, k.at, k.band) for k in filter_.kernels)
-    text = filter_text(FilterEntries(kernels, filter_.image_size, filter_.description, filter_.facts))
-    write_atomically(path, text.encode())
+    write_atomically(path, filter_text(entries_of(filter_)).encode())
     return path
+
+
+def entries_of(filter_: RestorationFilter) -> FilterEntries:
+    """A filter as its file says it."""
+    kernels = tuple(KernelEntry(k.values, k.at, k.band) for k in filter_.kernels)
+    facts = {str(name): plain_fact(value) for name, value in filter_.facts.items() if value is not None}
+    return FilterEntries(kernels, filter_.image_size, filter_.description, facts)

@@ -1,0 +1,134 @@
+"""`photoplan restore`: images restored with a filter."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from photoplan.cli.failures import end_with_failures
+from photoplan.cli.options import BYTES, json_option
+
+if TYPE_CHECKING:
+    from photoplan.products.restore import RestoredImage, RestorePlan
+
+__all__ = ["command"]
+
+
+@click.command("restore")
+@click.argument("images", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="IMAGE…")
+@click.option("--filter", "filter_file", required=True, type=click.Path(path_type=Path), metavar="FILE",
+              help="Restoration filter: TOML, or one kernel as rows of numbers.")  # fmt: skip
+@click.option("--output", type=click.Path(path_type=Path), metavar="FOLDER",
+              help="Folder of the results [restored, beside the first image].")  # fmt: skip
+@click.option("--band", "bands", multiple=True, type=click.IntRange(1), metavar="N",
+              help="Restore this band; may be repeated [all]. Others stay as they are.")  # fmt: skip
+@click.option("--linearisation", default="linear", show_default=True, metavar="linear|srgb|TABLE",
+              help="How grey values become light, which is what is filtered.")  # fmt: skip
+@click.option("--dtype", default="same", show_default=True, metavar="same|float32|uint16", help="Type of the results.")
+@click.option("--compress", default="deflate", show_default=True, help="deflate, zstd, lzw, jpeg or none.")
+@click.option("--workers", type=click.IntRange(1), default=None, help="Tiles computed at once [all cores].")
+@click.option("--memory", type=BYTES, default=None, metavar="SIZE", help="Stay under this, e.g. 2GB.")
+@click.option("--overwrite", is_flag=True, help="Replace results that exist.")
+@click.option("--no-quicklook", is_flag=True, help="Write no pictures.")
+@click.option("--dry-run", is_flag=True, help="Say what would be done, and stop.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(
+    images: tuple[Path, ...], filter_file: Path, as_json: bool, quiet: bool, dry_run: bool, **options: Any
+) -> None:
+    """Restore images of any size with a filter: NAME_restored.tif (a cloud-optimised GeoTIFF) and its run record.
+
+    Noise grows by the figure that is printed first. An image that fails does not stop the others (exit code 4). The
+    same command continues a run that was interrupted.
+    """
+    import psutil
+
+    from photoplan.cli.progress import progress
+    from photoplan.products.restore import RestoreRequest, plan_restoration, restore_images
+
+    def talk(text: str) -> None:
+        if not quiet:
+            click.echo(text, err=True)
+
+    options["quicklook"] = not options.pop("no_quicklook")
+    options["workers"] = options["workers"] or psutil.cpu_count() or 1
+    request = RestoreRequest(images, filter_file, **options)
+    plan = plan_restoration(request)
+    for line in _before(plan):
+        talk(line)
+    if dry_run:
+        _show(plan, as_json)
+        end_with_failures(plan.failed, len(plan.jobs))
+        return
+
+    def finished(image: RestoredImage) -> None:
+        if not as_json:
+            click.echo(str(image.path))
+        for line in _after(image):
+            talk(line)
+
+    report = restore_images(request, lambda total: progress(total, quiet), talk, finished)
+    if as_json:
+        click.echo(json.dumps(report.to_dict(), indent=2, ensure_ascii=False))
+    end_with_failures(report.failed, len(report.images))
+
+
+def _before(plan: RestorePlan) -> list[str]:
+    """What a user should know before the filter is used."""
+    from photoplan.products.restore import filter_figures
+
+    figures = filter_figures(plan.filter)
+    sums = ", ".join(f"{total:.4g}" for total in figures["sums"][:6])
+    kernels = "1 kernel" if figures["kernels"] == 1 else f"{figures['kernels']} kernels"
+    lines = [
+        f"filter {figures['size'][0]} × {figures['size'][1]}, {kernels}, sum {sums}: noise grows "
+        f"{figures['noise_gain']:.3g} times"
+    ]
+    for name in ("condition", "rule"):
+        if name in figures["facts"]:
+            lines.append(f"{name}: {figures['facts'][name]}")
+    return lines
+
+
+def _show(plan: RestorePlan, as_json: bool) -> None:
+    from photoplan.products.restore import filter_figures
+
+    rows: list[dict[str, Any]] = [
+        {
+            "image": str(job.reader.info.path),
+            "path": str(job.target),
+            "size": list(job.reader.size),
+            "bands": job.reader.bands,
+            "dtype": str(job.reader.dtype),
+            "tiles": job.tiles,
+        }
+        for job in plan.jobs
+    ]
+    if as_json:
+        click.echo(json.dumps({"filter": filter_figures(plan.filter), "images": rows, "failed": plan.failed}, indent=2))
+        return
+    for row in rows:
+        click.echo(
+            f"{row['image']}: {row['size'][0]} × {row['size'][1]}, {row['bands']} bands of {row['dtype']}, "
+            f"{row['tiles']} tiles → {row['path']}"
+        )
+
+
+def _after(image: RestoredImage) -> list[str]:
+    """What became of an image; clipping with advice."""
+    lines = [f"{image.image}: {image.pixels / 1e6:.1f} Mpx in {image.seconds:.1f} s"]
+    below, above = sum(image.below), sum(image.above)
+    if below or above:
+        way_out = "--dtype float32 keeps all values"
+        if image.dtype == "uint8" and above:
+            way_out += ", --dtype uint16 those above 255"
+        lines.append(
+            f"warning: {image.image}: {below} pixels fell below and {above} above what the type holds "
+            f"({image.clipped_share:.2%}) and were clipped; {way_out}"
+        )
+    if image.picture is not None:
+        lines.append(f"quick look: {image.picture}")
+    return lines
