@@ -1,0 +1,183 @@
+"""Reasons why a region gives no figure of an edge: each with what was found, what is allowed and what to do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc
+
+from photoplan.errors import InputError
+
+__all__ = ["EdgeSettings", "Residuals", "check_clipping", "check_line", "check_region", "check_sides", "check_step"]
+
+#: Side of the squares beside the edge whose means are tested for structure, pixels.
+CELL = 5
+#: Chance of error of the tests: a clean edge is refused once in so many.
+CHANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class EdgeSettings:
+    """What an edge must be like, and how its profile is described."""
+
+    curve: int = 1
+    """1: a straight line; 2: a parabola, for edges that a lens bends."""
+    shading: bool = True
+    """Whether both levels may change linearly along the edge (illumination, fall-off)."""
+    blocks: int = 20
+    """Into how many independent profiles an edge is split at most; a block has two rows at least."""
+    confidence: float = 0.95
+    """Probability that an interval holds the true figure."""
+    least_length: float = 12.0
+    """Shortest edge, pixels."""
+    least_snr: float = 5.0
+    """Smallest ratio of step to noise of a pixel."""
+    most_clipped: float = 0.01
+    """Largest share of clipped pixels on a side."""
+    most_structure: float = 0.03
+    """Largest structure beside the edge that is not noise, root mean square relative to the step."""
+    most_bend: float = 0.1
+    """Largest deviation from the line, root mean square in pixels, that is more than noise."""
+
+    def __post_init__(self) -> None:
+        if self.curve not in (1, 2):
+            raise InputError(f"the line of an edge has degree 1 (straight) or 2 (parabola); given: {self.curve}")
+        if self.blocks < 5:
+            raise InputError(f"an interval needs 5 blocks of an edge at least; given: {self.blocks}")
+        if not 0.5 <= self.confidence < 1.0:
+            raise InputError(f"a confidence is 0.5 or more and below 1; given: {self.confidence}")
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """What a profile leaves of the pixels, relative to the step, with where they are; shape (n,) each."""
+
+    across: NDArray[np.float64]
+    along: NDArray[np.float64]
+    distance: NDArray[np.float64]
+    value: NDArray[np.float64]
+    spread: NDArray[np.float64]
+    """Line spread function at the pixels, per pixel."""
+    width: float
+    """Standard deviation of the line spread function, pixels."""
+
+
+def check_region(image: NDArray[np.float64], valid: NDArray[np.bool_]) -> None:
+    """Refuse what is no region of pixels: wrong shape, too small, too large, no valid or no finite pixels."""
+    if image.ndim != 2 or valid.shape != image.shape:
+        raise InputError(
+            f"a region is an array of rows and columns with a mask like it; given: {image.shape}, {valid.shape}"
+        )
+    if min(image.shape) < 8:
+        raise InputError(f"a region for an edge has 8 × 8 pixels at least; given: {image.shape[1]} × {image.shape[0]}")
+    if image.size > 16_000_000:
+        raise InputError(
+            f"a region for an edge has 16 million pixels at most; given: {image.shape[1]} × {image.shape[0]}"
+        )
+    if np.count_nonzero(valid) < 0.5 * image.size:
+        raise InputError("less than half of the region's pixels are valid; choose a region inside the image")
+
+
+def check_clipping(
+    light: NDArray[np.float64], distance: NDArray[np.float64], limits: tuple[float, float] | None, most: float
+) -> None:
+    """Refuse an edge with a clipped side: its profile is cut off, and no figure of it is right."""
+    if limits is None:
+        return
+    low, high = limits
+    slack = 1e-9 * max(abs(low), abs(high), 1e-300)
+    for side, name in ((distance < 0.0, "dark"), (distance > 0.0, "bright")):
+        values = light[side]
+        if values.size == 0:
+            continue
+        share = float(np.mean((values <= low + slack) | (values >= high - slack)))
+        if share > most:
+            raise InputError(
+                f"saturated edge: {100 * share:.1f} % of the pixels on its {name} side are clipped ({low:g} or {high:g}), "
+                f"allowed are {100 * most:g} %; take an image with another exposure"
+            )
+
+
+def check_step(step: float, noise: float, count: int, least: float) -> None:
+    """Refuse a region without a significant step, and a step that is drowned in noise."""
+    if not step > 6.0 * noise / np.sqrt(max(count, 1) / 4.0):
+        raise InputError(
+            f"no edge: both sides differ by {step:.3g} with a noise of {noise:.3g} per pixel, which may be chance"
+        )
+    if step < least * noise:
+        raise InputError(
+            f"edge too noisy: the step is {step / noise:.1f} times the noise of a pixel, at least {least:g} are needed; "
+            "use a stronger edge, or the mean of several images"
+        )
+
+
+def check_line(residuals: Residuals, most: float, curve: int) -> float:
+    """Root mean square deviation of the edge from its line beyond noise, pixels; refuse a bent edge.
+
+    Each row's shift is that of least squares, Σ r · LSF / Σ LSF²; shifts of the rows are compared with what the pixels'
+    noise explains, as means over stretches of the edge.
+    """
+    row = residuals.along.astype(np.intp)
+    row -= row.min()
+    near = residuals.spread > 0.05 * residuals.spread.max()
+    weight = np.bincount(row[near], residuals.spread[near] ** 2, row.max() + 1)
+    moment = np.bincount(row[near], (residuals.value * residuals.spread)[near], row.max() + 1)
+    good = weight > 0.5 * np.median(weight[weight > 0.0])
+    if np.count_nonzero(good) < 12:
+        return 0.0
+    stretch = max(4, np.count_nonzero(good) // 12)
+    groups = np.arange(np.count_nonzero(good)) // stretch
+    total, sums = np.bincount(groups, weight[good]), np.bincount(groups, moment[good])
+    shift = sums / total
+    noise = float(residuals.value[near].var())
+    excess = float((shift**2).mean() - noise * (1.0 / total).mean())
+    chance = float(chdtrc(shift.size, (shift**2 * total).sum() / max(noise, 1e-30)))
+    deviation = float(np.sqrt(max(excess, 0.0)))
+    if chance < CHANCE and deviation > most:
+        advice = (
+            "measure it as a curve of degree 2, or choose a shorter region" if curve == 1 else "choose a shorter region"
+        )
+        raise InputError(
+            f"bent edge: it deviates from its line by {deviation:.2f} pixels (root mean square), allowed are {most:g}; {advice}"
+        )
+    return deviation
+
+
+def check_sides(residuals: Residuals, most: float) -> float:
+    """Structure beside the edge that noise does not explain, root mean square relative to the step; refuse too much.
+
+    Means over squares of 5 × 5 pixels on either side are compared with the noise of single pixels, which follows from
+    differences of neighbours along the edge (χ² test); a second edge, a corner or a texture all show so.
+    """
+    far = np.abs(residuals.distance) > 2.0 * residuals.width
+    value = residuals.value[far]
+    across, along = residuals.across[far].astype(np.intp), residuals.along[far].astype(np.intp)
+    if value.size < 4 * CELL * CELL:
+        return 0.0
+    across, along = across - across.min(), along - along.min()
+    frame = np.full((along.max() + 1, across.max() + 1), np.nan)
+    frame[along, across] = value
+    steps = np.diff(frame, axis=0)
+    steps = steps[np.isfinite(steps)]
+    noise = float(np.median(np.abs(steps)) / 0.6745) ** 2 / 2.0 if steps.size else 0.0
+    noise = max(noise, float((steps**2).mean()) / 2.0 if steps.size else 0.0)
+    side = (residuals.distance[far] > 0.0).astype(np.intp)
+    cell = (along // CELL * (across.max() // CELL + 1) + across // CELL) * 2 + side
+    count = np.bincount(cell)
+    sums = np.bincount(cell, value)[count >= 5]
+    count = count[count >= 5]
+    if count.size < 4:
+        return 0.0
+    square = sums**2 / count
+    chance = float(chdtrc(count.size, square.sum() / max(noise, 1e-30)))
+    structure = float(np.sqrt(max((square.sum() - noise * count.size) / count.sum(), 0.0)))
+    if chance < CHANCE and structure > most:
+        largest = float(np.abs(sums / count).max())
+        what = "a second edge, a corner or another object" if largest > 0.25 else "texture"
+        raise InputError(
+            f"the sides of the edge are not even: {what} of {100 * structure:.1f} % of the step (root mean square; "
+            f"up to {100 * largest:.0f} %) where {100 * most:g} % are allowed; choose a cleaner or narrower region"
+        )
+    return structure
