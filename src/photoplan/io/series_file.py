@@ -20,6 +20,7 @@ from photoplan.io.project_errors import explain
 from photoplan.io.raster import RasterReader
 from photoplan.io.series_model import CameraFacts, FramesEntry, SeriesEntry
 from photoplan.io.series_names import Values, find_files, number_of_time
+from photoplan.io.series_positions import MeasuredPositions, read_positions
 from photoplan.io.series_statistics import ReducedPoint, read_statistics
 from photoplan.io.series_table import read_conditions
 from photoplan.io.toml_file import read_toml
@@ -79,6 +80,8 @@ class Series:
     dtype: str
     saturation_dn: float
     """Largest grey value that can occur; infinity for float images without a stated one."""
+    positions: tuple[MeasuredPositions, ...]
+    """Positions of targets that were measured before."""
     inputs: tuple[Path, ...]
     """All files that were read or will be."""
 
@@ -129,6 +132,11 @@ def read_series(path: Path) -> Series:
         source = resolve_input(folder, figures.file)
         reduced += read_statistics(source, figures)
         inputs.append(source)
+    positions: list[MeasuredPositions] = []
+    for table_of in entries.positions:
+        source = resolve_input(folder, table_of.file)
+        positions.append(read_positions(source, table_of))
+        inputs.append(source)
     _refuse_twice(path, frames)
     bits = entries.camera.bits
     saturation = entries.camera.saturation_dn or (2.0**bits - 1.0 if bits else facts.largest)
@@ -141,6 +149,7 @@ def read_series(path: Path) -> Series:
         facts.bands,
         facts.dtype,
         saturation,
+        tuple(positions),
         tuple(dict.fromkeys(inputs)),
     )
 

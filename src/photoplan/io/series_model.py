@@ -8,7 +8,18 @@ from pydantic import AfterValidator, Field, Strict, field_validator, model_valid
 
 from photoplan.io.camera_model import Entry, Name, Number, Positive
 
-__all__ = ["CONDITIONS", "KINDS", "CameraFacts", "FramesEntry", "SeriesEntry", "StatisticsEntry", "StepEntry"]
+__all__ = [
+    "CONDITIONS",
+    "KINDS",
+    "CameraFacts",
+    "EdgeEntry",
+    "FramesEntry",
+    "PositionsEntry",
+    "SeriesEntry",
+    "StatisticsEntry",
+    "StepEntry",
+    "TargetEntry",
+]
 
 #: Kinds of frames and what they show.
 KINDS = {
@@ -82,6 +93,26 @@ class StepEntry(Entry):
     """Column and row of its first pixel, width and height."""
 
 
+class EdgeEntry(Entry):
+    """One straight edge in plumb frames."""
+
+    name: Name
+    roi: Roi
+    """Window that the edge crosses from end to end: column and row of its first pixel, width and height."""
+    direction: Literal["vertical", "horizontal"] = "vertical"
+    """How it runs; a horizontal edge is free of jitter of the rows and shows the method's own noise."""
+
+
+class TargetEntry(Entry):
+    """One round target in target or stage frames."""
+
+    name: Name
+    roi: Roi | None = None
+    """Window in which it lies in all frames; None: the roi of the frames."""
+    bright: Annotated[bool, Strict()] = True
+    """Whether it is brighter than its surroundings."""
+
+
 class FramesEntry(Entry):
     """A group of image files of one kind."""
 
@@ -115,6 +146,10 @@ class FramesEntry(Entry):
     """Exposure of the reference frame; default the longest in which under 0.1 % of the pixels are saturated."""
     steps: tuple[StepEntry, ...] = ()
     """Patches of a grey wedge."""
+    edges: tuple[EdgeEntry, ...] = ()
+    """Straight edges in plumb frames."""
+    targets: tuple[TargetEntry, ...] = ()
+    """Round targets in target or stage frames; None named: one in the roi."""
     name: Name | None = None
     values: dict[Name, Number | str] = Field(default_factory=dict)
     """Anything else that an analysis asks for."""
@@ -142,6 +177,13 @@ class FramesEntry(Entry):
             raise ValueError("brightest_exposure_ms needs brightest")
         if self.steps and self.kind != "wedge":
             raise ValueError(f"steps belong to kind wedge; this entry is {self.kind}")
+        if self.edges and self.kind != "plumb":
+            raise ValueError(f"edges belong to kind plumb; this entry is {self.kind}")
+        if self.targets and self.kind not in ("target", "stage"):
+            raise ValueError(f"targets belong to kinds target and stage; this entry is {self.kind}")
+        for what, listed in (("edges", self.edges), ("targets", self.targets)):
+            if len({each.name for each in listed}) < len(listed):
+                raise ValueError(f"two {what} have the same name")
         if self.steps and self.density is not None:
             raise ValueError("give either density (one patch fills the frame) or steps")
         return self
@@ -162,15 +204,27 @@ class StatisticsEntry(Entry):
     temperature_c: Number | None = None
 
 
+class PositionsEntry(Entry):
+    """Positions of targets that were measured before, as a table."""
+
+    file: Annotated[str, Field(min_length=1, max_length=1000)]
+    """CSV with columns x and y (pixels); kind stage also stage_x, stage_y, name; kind target also time_s, target."""
+    kind: Literal["stage", "target"]
+    unit: Annotated[str, Field(min_length=1, max_length=20)] = "um"
+    """Of the stage's coordinates."""
+    name: Name | None = None
+
+
 class SeriesEntry(Entry):
     """The whole file."""
 
     camera: CameraFacts = CameraFacts()
     frames: tuple[FramesEntry, ...] = ()
     statistics: tuple[StatisticsEntry, ...] = ()
+    positions: tuple[PositionsEntry, ...] = ()
 
     @model_validator(mode="after")
     def _something(self) -> Self:
-        if not self.frames and not self.statistics:
-            raise ValueError("holds neither a [[frames]] nor a [[statistics]] table")
+        if not self.frames and not self.statistics and not self.positions:
+            raise ValueError("holds no [[frames]], [[statistics]] or [[positions]] table")
         return self

@@ -14,6 +14,7 @@ from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.io.disk import write_atomically
 from photoplan.io.product import check_output
 from photoplan.io.series_file import Series, read_series
+from photoplan.io.whole_image import write_whole_image
 from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_registry import ANALYSES, Analysis
 from photoplan.products.characterise_result import Figure, Outcome, Table
@@ -78,7 +79,7 @@ class CharacteriseReport:
     series: Series
     runs: tuple[AnalysisRun, ...]
     written: tuple[Path, ...]
-    """Report and tables."""
+    """Report, tables and what goes with them."""
 
     @property
     def failed(self) -> dict[str, str]:
@@ -207,6 +208,20 @@ def _write_tables(request: CharacteriseRequest, runs: Sequence[AnalysisRun]) -> 
         path = request.csv / f"{name}.csv"
         write_atomically(path, text.getvalue().encode("utf-8"))
         written.append(path)
+    return written + _write_files(request.csv, done)
+
+
+def _write_files(folder: Path, done: Sequence[AnalysisRun]) -> list[Path]:
+    written = []
+    for run in done:
+        assert run.outcome is not None
+        for name, content in run.outcome.files.items():
+            path = folder / name
+            if isinstance(content, bytes):
+                write_atomically(path, content)
+            else:
+                write_whole_image(path, content)
+            written.append(path)
     return written
 
 

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from numpy.typing import NDArray
+
 from photoplan.products.plain_values import plain
 from photoplan.report.characterise_charts import Chart, Picture
 
@@ -54,10 +56,11 @@ def _short(value: float, sigma: float = math.nan) -> str:
     """A number with as many digits as its standard deviation allows (two of it)."""
     if not math.isfinite(value):
         return "–"
-    if not math.isfinite(sigma) or sigma <= 0 or value == 0:
-        return f"{value:.4g}"
-    digits = min(max(math.floor(math.log10(abs(value))) - math.floor(math.log10(sigma)) + 2, 2), 9)
-    return f"{value:.{digits}g}"
+    digits = 4
+    if math.isfinite(sigma) and sigma > 0 and value != 0:
+        digits = min(max(math.floor(math.log10(abs(value))) - math.floor(math.log10(sigma)) + 2, 2), 9)
+    rounded = float(f"{value:.{digits}g}")
+    return f"{rounded:.10g}" if 1e-4 <= abs(rounded) < 1e7 or rounded == 0 else f"{value:.{digits}g}"
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,8 @@ class Outcome:
     notes: tuple[str, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
     """More plain values for JSON."""
+    files: Mapping[str, bytes | NDArray[Any]] = field(default_factory=dict)
+    """More files by name, written beside the tables: contents, or an image of type float32."""
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for `--json`."""
@@ -108,4 +113,5 @@ def joined(outcomes: Sequence[Outcome]) -> Outcome:
         tuple(p for o in outcomes for p in o.plots),
         tuple(dict.fromkeys(n for o in outcomes for n in o.notes)),
         {key: value for o in outcomes for key, value in o.details.items()},
+        {name: content for o in outcomes for name, content in o.files.items()},
     )

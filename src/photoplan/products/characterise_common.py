@@ -1,0 +1,135 @@
+"""What several analyses of a camera share: series of settings, black levels, words for reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import inf, isfinite, nan
+
+from photoplan.errors import InputError
+from photoplan.io.series_pixels import Plane
+from photoplan.products.characterise_data import SeriesData, Setting
+from photoplan.products.characterise_result import Outcome
+from photoplan.quality.frame_statistics import Level
+from photoplan.quality.photon_transfer import is_clipped_dark
+
+__all__ = ["Black", "Run", "black_of", "dark_levels", "exposure_runs", "prefix", "saturation_of", "tried"]
+
+#: Conditions that may be the abscissa of a run, with what axes say.
+_ABSCISSAS = (
+    ("exposure_ms", "exposure ms", "ms"),
+    ("photons_per_pixel", "photons per pixel", "photon"),
+    ("illumination", "illumination", "step"),
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    """Settings that differ in one condition only, by its growing value."""
+
+    settings: tuple[Setting, ...]
+    name: str
+    """Of the condition, such as ``exposure_ms``."""
+    axis: str
+    unit: str
+    label: str
+    """What they have in common, such as ``500 nm``."""
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """The condition, increasing."""
+        return tuple(float(getattr(setting.first, self.name)) for setting in self.settings)
+
+
+def exposure_runs(data: SeriesData, kinds: Sequence[str], least: int) -> list[Run]:
+    """Runs of at least so many settings of different exposure, photons or illumination (the first that differs)."""
+    found: dict[tuple[object, ...], list[Setting]] = {}
+    for setting in data.settings(*kinds):
+        first = setting.first
+        key = (first.group.index, first.kind, first.wavelength_nm, first.temperature_c, first.density)
+        found.setdefault(key, []).append(setting)
+    runs = []
+    for settings in found.values():
+        run = _run(settings)
+        if run is not None and len(run.settings) >= least:
+            runs.append(run)
+    return runs
+
+
+def _run(settings: Sequence[Setting]) -> Run | None:
+    for name, axis, unit in _ABSCISSAS:
+        values = [getattr(setting.first, name) for setting in settings]
+        if None in values or len(set(values)) < 2 or len(set(values)) < len(values):
+            continue
+        ordered = tuple(sorted(settings, key=lambda s: float(getattr(s.first, name))))
+        return Run(ordered, name, axis, unit, _common(ordered))
+    return None
+
+
+def _common(settings: Sequence[Setting]) -> str:
+    first = settings[0].first
+    words = [first.group.entry.name] if first.group.entry.name else []
+    for name, unit in (("wavelength_nm", "nm"), ("temperature_c", "°C"), ("density", "density")):
+        value = getattr(first, name)
+        if value is not None:
+            words.append(f"{value:g} {unit}")
+    return " ".join(words)
+
+
+@dataclass(frozen=True)
+class Black:
+    """Grey value without light."""
+
+    mean: float
+    sigma: float
+    level: Level | None
+    """Of the dark frames it comes from; None: it was stated."""
+    rule: str
+    """Where it comes from, for notes."""
+
+
+def black_of(data: SeriesData, setting: Setting, plane: Plane) -> Black:
+    """Black of a setting: dark frames of the same exposure (and temperature, if both state it), else what is stated."""
+    stated = data.series.camera.black_level_dn
+    clipped = False
+    for dark in data.settings("dark"):
+        if dark.first.exposure_ms != setting.first.exposure_ms or _differ(dark, setting):
+            continue
+        level = data.levels(dark)[plane.name]
+        if is_clipped_dark(level):
+            clipped = True
+            continue
+        sigma = level.mean_sigma
+        return Black(level.mean, sigma if isfinite(sigma) else 0.0, level, "dark frames of the same exposure")
+    why = "black is cut off in the dark frames" if clipped else "no dark frames of the same exposure"
+    return Black(stated, 0.0, None, f"{why}: black level {stated:g} DN as stated")
+
+
+def _differ(dark: Setting, setting: Setting) -> bool:
+    a, b = dark.first.temperature_c, setting.first.temperature_c
+    return a is not None and b is not None and abs(a - b) > 0.5
+
+
+def dark_levels(data: SeriesData, plane: Plane) -> list[Level]:
+    """Levels of all dark settings with two frames or more, the shortest exposure first."""
+    settings = sorted(data.settings("dark"), key=lambda s: s.first.exposure_ms or 0.0)
+    return [data.levels(s)[plane.name] for s in settings if len(s.frames) >= 2]
+
+
+def saturation_of(data: SeriesData, levels: Sequence[Level]) -> float:
+    """Grey value at which grey values stop: that of the series, or the largest that was seen of a clipped level."""
+    stated = data.series.saturation_dn
+    return stated if stated < inf else max((level.largest for level in levels), default=nan)
+
+
+def prefix(*parts: str) -> str:
+    """Parts that say something, as the key of a refusal."""
+    return " ".join(part for part in parts if part)
+
+
+def tried(what: str, make: Callable[[], Outcome]) -> Outcome:
+    """The outcome, or the refusal of `what` with its reason where the data do not allow it."""
+    try:
+        return make()
+    except InputError as error:
+        return Outcome(refused={what: str(error)})

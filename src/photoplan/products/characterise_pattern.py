@@ -1,0 +1,184 @@
+"""Fixed pattern of a series: DSNU, PRNU, their rows, columns and pixels, spectrograms."""
+
+from __future__ import annotations
+
+from math import isfinite, nan
+
+import numpy as np
+
+from photoplan.errors import InputError
+from photoplan.io.series_pixels import Plane
+from photoplan.products.characterise_common import prefix, tried
+from photoplan.products.characterise_data import SeriesData, Setting
+from photoplan.products.characterise_result import Figure, Outcome, Table, joined
+from photoplan.quality.fixed_pattern import (
+    PatternVariance,
+    Spectrogram,
+    pattern_variance,
+    prnu_percent,
+    signed_root,
+    spectrogram,
+)
+from photoplan.quality.frame_statistics import FrameStack
+from photoplan.quality.photon_transfer import is_clipped_dark
+from photoplan.report.characterise_charts import Chart, Curve
+
+__all__ = ["analyse", "missing"]
+
+#: Share of saturation that the standard asks of bright frames.
+_HALF = 0.5
+
+
+def missing(data: SeriesData) -> str | None:
+    """What the series lacks."""
+    if _best_dark(data) is not None or _flats(data):
+        return None
+    return "no setting of dark or flat frames has two frames or more"
+
+
+def _best_dark(data: SeriesData) -> Setting | None:
+    """The dark setting with the most frames."""
+    settings = [s for s in data.settings("dark") if len(s.frames) >= 2]
+    return max(settings, key=lambda s: len(s.frames), default=None)
+
+
+def _flats(data: SeriesData) -> list[Setting]:
+    return [s for s in data.settings("flat") if len(s.frames) >= 2]
+
+
+def analyse(data: SeriesData) -> Outcome:
+    """DSNU and PRNU of every plane."""
+    return joined([_plane(data, plane) for plane in data.planes])
+
+
+def _plane(data: SeriesData, plane: Plane) -> Outcome:
+    outcomes = []
+    dark: PatternVariance | None = None
+    flat = _half_bright(data, plane)
+    setting = _matching_dark(data, flat)
+    if setting is not None:
+        stack = data.stacks(setting)[plane.name]
+        outcomes.append(tried(prefix("DSNU", plane.name), lambda: _dsnu(stack, plane.name, setting.label)))
+        if not is_clipped_dark(stack.level) and outcomes[0].figures:
+            dark = _variance(stack, filtered=False)
+    if flat is None:
+        why = "no flat frames, two or more at a setting, between 5 % and 95 % of saturation"
+        outcomes.append(Outcome(refused={prefix("PRNU", plane.name): why}))
+    else:
+        outcomes.append(tried(prefix("PRNU", plane.name), lambda: _prnu(data, flat, plane, dark)))
+    return joined(outcomes)
+
+
+def _half_bright(data: SeriesData, plane: Plane) -> Setting | None:
+    """The flat setting whose mean is nearest to half of saturation."""
+    full = data.series.saturation_dn
+    best, distance = None, np.inf
+    for setting in _flats(data):
+        level = data.levels(setting)[plane.name]
+        share = level.mean / full if isfinite(full) else _HALF
+        if 0.05 <= share <= 0.95 and level.saturated_share < 1e-3 and abs(share - _HALF) < distance:
+            best, distance = setting, abs(share - _HALF)
+    return best
+
+
+def _matching_dark(data: SeriesData, flat: Setting | None) -> Setting | None:
+    """Dark frames of the same exposure as the flat ones, else those with the most frames."""
+    if flat is not None:
+        for setting in data.settings("dark"):
+            if setting.first.exposure_ms == flat.first.exposure_ms and len(setting.frames) >= 2:
+                return setting
+    return _best_dark(data)
+
+
+def _variance(stack: FrameStack, filtered: bool) -> PatternVariance:
+    if stack.counted is not None:
+        raise InputError("a mask or brightest is in use; rows and columns need a rectangle: give a roi instead")
+    return pattern_variance(stack.mean, stack.level.temporal_variance, stack.level.frames, filtered=filtered)
+
+
+def _dsnu(stack: FrameStack, name: str, label: str) -> Outcome:
+    if is_clipped_dark(stack.level):
+        raise InputError(
+            f"black is cut off: {100 * stack.level.zero_share:.3g} % of the samples are zero, which hides the pattern; "
+            "raise the camera's black level"
+        )
+    found = _variance(stack, filtered=False)
+    return joined(
+        [_parts(found, "dsnu", "DSNU", name, "DN", 1.0, label), _spectra(stack, name, f"dark {name}".strip())]
+    )
+
+
+def _prnu(data: SeriesData, flat: Setting, plane: Plane, dark: PatternVariance | None) -> Outcome:
+    stack = data.stacks(flat)[plane.name]
+    raw = _variance(stack, filtered=False)
+    even = _variance(stack, filtered=True)
+    black = dark.mean if dark is not None else data.series.camera.black_level_dn
+    signal = raw.mean - black
+    if signal <= 0:
+        raise InputError("flat frames are not brighter than black")
+    name = plane.name
+    figures = []
+    for kind, found, remark in (
+        ("prnu_percent", even, "slow variation of the light taken out"),
+        ("prnu_unfiltered_percent", raw, "with the light's unevenness"),
+    ):
+        value, sigma = prnu_percent(found, dark if dark is not None else _no_pattern(black))
+        figures.append(Figure(kind, value, sigma, "PRNU", "%", name, remark=remark))
+    notes = () if dark is not None else (f"{prefix(name, 'PRNU')}: no dark pattern taken out",)
+    whole = Outcome(tuple(figures), notes=notes)
+    parts = _parts(even, "bright", "bright pattern", name, "%", 100 / signal, flat.label)
+    return joined([whole, parts, _spectra(stack, name, f"flat {name}".strip())])
+
+
+def _no_pattern(black: float) -> PatternVariance:
+    return PatternVariance(0, 0, 0, 0, 0, 0, 0, 0, black, 0, False)
+
+
+def _parts(found: PatternVariance, key: str, words: str, plane: str, unit: str, factor: float, label: str) -> Outcome:
+    """Total, rows, columns and pixels of a pattern as figures, variances as a table."""
+    figures = []
+    for part, variance, sigma in (
+        ("", found.total, found.total_sigma),
+        ("row", found.row, found.row_sigma),
+        ("column", found.column, found.column_sigma),
+        ("pixel", found.pixel, found.pixel_sigma),
+    ):
+        value, of_value = signed_root(variance, sigma)
+        name = "_".join(filter(None, [key, part, "percent" if unit == "%" else "dn"]))
+        what = f"{words}, {part}s" if part else words
+        remark = "not above zero" if variance <= 0 else ""
+        figures.append(Figure(name, value * factor, of_value * factor, what, unit, plane, remark=remark))
+    return Outcome(tuple(figures), details={prefix(key, plane).replace(" ", "_"): found.to_dict() | {"setting": label}})
+
+
+def _spectra(stack: FrameStack, plane: str, title: str) -> Outcome:
+    """Spectrograms along rows and columns."""
+    along = {"rows": spectrogram(stack.mean, 1), "columns": spectrogram(stack.mean, 0)}
+    head = ("image", "along", "frequency_cycles_px", "amplitude_dn")
+    rows = tuple((title, way, float(f), float(a)) for way, s in along.items() for f, a in zip(s.frequency, s.amplitude))
+    figures = [
+        Figure(
+            f"excess_{title.split()[0]}_{way}",
+            s.excess,
+            nan,
+            f"power over white noise along {way}, {title.split()[0]}",
+            "",
+            plane,
+            remark=_peak(s),
+        )
+        for way, s in along.items()
+    ]
+    curves = tuple(Curve(s.frequency, s.amplitude, f"along {way}", "line") for way, s in along.items())
+    chart = Chart(
+        f"Spectrogram, {title}",
+        "Root of the power; white noise is level, peaks are periodic patterns.",
+        "frequency cycles/px",
+        "amplitude DN",
+        curves,
+        log_y=True,
+    )
+    return Outcome(tuple(figures), tables={"spectrograms": Table(head, rows, "Spectrograms")}, plots=(chart,))
+
+
+def _peak(s: Spectrogram) -> str:
+    return f"peak at {s.peak_frequency:.4g} cycles/px" if isfinite(s.peak_frequency) else ""

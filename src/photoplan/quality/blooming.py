@@ -1,0 +1,203 @@
+"""Blooming: charge of an overfull pixel that runs over into its neighbours (Behr 1989, §4.2.3).
+
+A bright object is exposed longer and longer. As long as nothing runs over, its neighbours grow with the exposure like
+everything else, stray light included. Where they begin to grow faster, blooming has begun; the grey value that the
+object has there is the onset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from math import nan, sqrt
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from photoplan.errors import InputError
+
+__all__ = ["Blooming", "find_blooming"]
+
+#: Pixels from the object that count as its neighbours; the nearest one holds part of the object itself.
+_NEAR, _FAR = 2, 4
+#: Standard deviations by which neighbours must exceed what was expected.
+_SIGNIFICANT = 4.0
+#: Part of the range up to saturation in which the object gives the responses.
+_SAFE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Blooming:
+    """What neighbours of a bright object show."""
+
+    onset_dn: float
+    """Grey value of the object above black, from its response, at which neighbours begin to grow faster; NaN: they do
+    not."""
+    onset_dn_sigma: float
+    last_without: float
+    """Object's grey value above black at the longest exposure without blooming."""
+    object_dn: NDArray[np.float64]
+    """Grey value of the object above black that its response promises at each exposure."""
+    excess_dn: NDArray[np.float64]
+    """Grey value of the neighbours above what was expected."""
+    excess_sigma: NDArray[np.float64]
+    extent_rows: int
+    """Pixels beyond the object along columns (up or down) that are lifted at the longest exposure."""
+    extent_columns: int
+    """The same along rows."""
+    threshold_dn: float
+    """Excess from which on a pixel counts as lifted."""
+    object_pixels: int
+    neighbour_pixels: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(self).items()}
+
+
+def find_blooming(
+    exposures: Sequence[float], images: Sequence[NDArray[Any]], black: float, saturation: float
+) -> Blooming:
+    """Onset and extent of blooming around the brightest object.
+
+    Parameters
+    ----------
+    exposures : sequence of float
+        Increasing.
+    images : sequence of array, each of shape (h, w)
+        Mean images at these exposures.
+    black : float
+        Grey value without light.
+    saturation : float
+        Largest grey value.
+
+    Raises
+    ------
+    InputError
+        There are fewer than four exposures, no two of them leave the object unsaturated, none saturates it, or there is
+        no dark surrounding.
+    """
+    if len(exposures) < 4 or (np.diff(exposures) <= 0).any():
+        raise InputError(f"{len(exposures)} exposures; blooming needs four that increase")
+    span = saturation - black
+    tops = [float(np.percentile(image, 99.5)) - black for image in images]
+    safe = [k for k, top in enumerate(tops) if top <= _SAFE * span]
+    if len(safe) < 2:
+        raise InputError(
+            f"{len(safe)} exposures in which the bright object is below half of saturation; blooming needs two or more"
+        )
+    if tops[-1] < 0.95 * span:
+        raise InputError("the bright object does not reach saturation at the longest exposure; expose it longer")
+    response = _response(exposures, images, safe, black)
+    bright = _object(response)
+    near = _neighbours(response, bright)
+    of_object = float(response[bright].mean())
+    times = np.array(exposures, float)
+    excess = np.array([float((image[near] - black - response[near] * t).mean()) for image, t in zip(images, times)])
+    sigma = _sigmas(images, times, response, near, safe, black)
+    usable = np.array([float(np.median(image[near])) - black < 0.95 * span for image in images])
+    object_dn = of_object * times
+    onset, onset_sigma, last = _onset(object_dn, excess, sigma, usable)
+    threshold = max(_SIGNIFICANT * float(sigma[-1]) * sqrt(near.sum()), 0.03 * span)
+    lifted = images[-1] - black - np.minimum(response * times[-1], span) > threshold
+    rows, columns = _extent(lifted, bright)
+    return Blooming(
+        onset, onset_sigma, last, object_dn, excess, sigma, rows, columns, threshold, int(bright.sum()), int(near.sum())
+    )
+
+
+def _response(
+    exposures: Sequence[float], images: Sequence[NDArray[Any]], safe: Sequence[int], black: float
+) -> NDArray[np.float64]:
+    """Grey values per exposure of every pixel, from the exposures without saturation."""
+    total = np.zeros(images[0].shape)
+    weight = 0.0
+    for k in safe:
+        total += exposures[k] * (np.asarray(images[k], np.float64) - black)
+        weight += exposures[k] ** 2
+    return total / weight
+
+
+def _object(response: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Pixels of the brightest object: over half of the largest response, the largest connected patch."""
+    top = float(np.percentile(response, 99.9))
+    patches, count = ndimage.label(response > 0.5 * top)
+    if not count:
+        raise InputError("no bright object found")
+    sizes = np.bincount(patches.ravel())[1:]
+    found = patches == 1 + int(np.argmax(sizes))
+    if found.sum() < 4 or found.mean() > 0.5:
+        raise InputError(
+            f"the bright object has {int(found.sum())} of {found.size} pixels; blooming needs a small bright object on "
+            "a dark ground: give a roi around one"
+        )
+    return np.asarray(found)
+
+
+def _neighbours(response: NDArray[np.float64], bright: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Dark pixels close to the object."""
+    square = np.ones((3, 3), bool)
+    far = ndimage.binary_dilation(bright, square, _FAR)
+    near = far & ~ndimage.binary_dilation(bright, square, _NEAR - 1)
+    near &= response < 0.25 * float(response[bright].mean())
+    if near.sum() < 8:
+        raise InputError("the bright object has no dark surrounding; give a roi around an object on a dark ground")
+    return np.asarray(near)
+
+
+def _sigmas(
+    images: Sequence[NDArray[Any]],
+    times: NDArray[np.float64],
+    response: NDArray[np.float64],
+    near: NDArray[np.bool_],
+    safe: Sequence[int],
+    black: float,
+) -> NDArray[np.float64]:
+    """Standard deviation of the mean excess: noise of the neighbours, and that of their responses."""
+    residual = np.concatenate([(images[k][near] - black - response[near] * times[k]) for k in safe])
+    freedom = max(residual.size - near.sum(), 1)
+    noise = sqrt(max(float(np.sum(residual**2)) / freedom, 1 / 12))
+    of_response = noise / sqrt(float(np.sum(times[list(safe)] ** 2)))
+    level = np.array([max(float(image[near].mean()) - black, 1.0) for image in images])
+    base = max(float(np.mean(level[list(safe)])), 1.0)
+    grown = noise * np.sqrt(np.maximum(level / base, 1.0))  # shot noise
+    return np.asarray(np.sqrt(grown**2 + (of_response * times) ** 2) / sqrt(near.sum()))
+
+
+def _onset(
+    level: NDArray[np.float64], excess: NDArray[np.float64], sigma: NDArray[np.float64], usable: NDArray[np.bool_]
+) -> tuple[float, float, float]:
+    """Where the excess leaves zero by the line through the first levels with blooming, its sigma, last without."""
+    above = excess > _SIGNIFICANT * sigma
+    without = np.flatnonzero(~above)
+    first = int(without[-1]) + 1 if without.size else 0
+    last = float(level[first - 1]) if first else 0.0
+    if first >= level.size:
+        return nan, nan, last
+    beyond = [k for k in range(first, level.size) if usable[k]][:2]
+    upper = float(level[first])
+    if len(beyond) == 2:
+        slope = (excess[beyond[1]] - excess[beyond[0]]) / (level[beyond[1]] - level[beyond[0]])
+        crossing = float(level[beyond[0]] - excess[beyond[0]] / slope) if slope > 0 else nan
+        if last <= crossing <= upper:
+            spread = float(np.hypot(sigma[beyond[0]] * 2, sigma[beyond[1]]) / slope)
+            return crossing, max(spread, 0.05 * (upper - last)), last
+    return (last + upper) / 2, (upper - last) / sqrt(12.0), last
+
+
+def _extent(lifted: NDArray[np.bool_], bright: NDArray[np.bool_]) -> tuple[int, int]:
+    """Longest unbroken run of lifted pixels from the object along columns and along rows."""
+    return _run(lifted, bright), _run(lifted.T, bright.T)
+
+
+def _run(lifted: NDArray[np.bool_], bright: NDArray[np.bool_]) -> int:
+    longest = 0
+    for col in np.flatnonzero(bright.any(axis=0)):
+        rows = np.flatnonzero(bright[:, col])
+        below, above = lifted[rows[-1] + 1 :, col], lifted[: rows[0], col][::-1]
+        for side in (below, above):
+            stop = np.flatnonzero(~side)
+            longest = max(longest, int(stop[0]) if stop.size else side.size)
+    return longest

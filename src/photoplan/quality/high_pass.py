@@ -1,0 +1,73 @@
+"""Background of a sensor's image taken away, so that only what differs from pixel to pixel is left.
+
+`high_pass` is the filter of EMVA 1288 (release 3.1, appendix C.5): the image minus itself smoothed by a 7 × 7 box, an
+11 × 11 box and a 3 × 3 binomial filter. `background` follows the image by medians of blocks: single
+pixels, however bright, leave no trace in it.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+__all__ = ["LINE_SHARE", "WHITE_SHARE", "background", "high_pass"]
+
+_BOXES = (7, 11)
+_BINOMIAL = (0.25, 0.5, 0.25)
+#: Side of a block of `background`, pixels.
+BLOCK = 16
+
+
+def _smooth(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    for side in _BOXES:
+        image = ndimage.uniform_filter(image, side, mode="reflect")
+    for axis in (0, 1):
+        image = ndimage.correlate1d(image, _BINOMIAL, axis=axis, mode="reflect")
+    return np.asarray(image)
+
+
+def _share(image: NDArray[np.float64]) -> float:
+    return float(np.sum((image - _smooth(image))[:, 20] ** 2))
+
+
+def _impulse() -> NDArray[np.float64]:
+    impulse = np.zeros((41, 41))
+    impulse[20, 20] = 1.0
+    return impulse
+
+
+WHITE_SHARE = float(np.sum((_impulse() - _smooth(_impulse())) ** 2))
+"""Part of the variance of white noise that `high_pass` leaves."""
+LINE_SHARE = _share(np.repeat(_impulse()[:, 20:21], 41, axis=1))
+"""Part of the variance of independent offsets of rows, or of columns, that it leaves."""
+
+
+def high_pass(image: NDArray[Any]) -> NDArray[np.float64]:
+    """An image without its slow variation, shape (h, w); white noise keeps `WHITE_SHARE` of its variance."""
+    values = np.asarray(image, np.float64)
+    return values - _smooth(values)
+
+
+def background(image: NDArray[Any]) -> NDArray[np.float64]:
+    """Slow variation of an image by medians of blocks of 16 × 16 pixels, linear between their middles."""
+    values = np.asarray(image, np.float64)
+    height, width = values.shape
+    rows, cols = max(1, height // BLOCK), max(1, width // BLOCK)
+    y = np.linspace(0, height, rows + 1).astype(int)
+    x = np.linspace(0, width, cols + 1).astype(int)
+    medians = np.array([[np.median(values[a:b, c:d]) for c, d in pairwise(x)] for a, b in pairwise(y)])
+    if rows > 2 and cols > 2:
+        medians = ndimage.median_filter(medians, 3, mode="nearest")
+    middle_y, middle_x = (y[:-1] + y[1:] - 1) / 2, (x[:-1] + x[1:] - 1) / 2
+    at_y = np.interp(np.arange(height), middle_y, np.arange(rows))
+    at_x = np.interp(np.arange(width), middle_x, np.arange(cols))
+    low_y, low_x = np.minimum(at_y.astype(int), max(rows - 2, 0)), np.minimum(at_x.astype(int), max(cols - 2, 0))
+    high_y, high_x = np.minimum(low_y + 1, rows - 1), np.minimum(low_x + 1, cols - 1)
+    fy, fx = (at_y - low_y)[:, None], (at_x - low_x)[None, :]
+    upper = medians[np.ix_(low_y, low_x)] * (1 - fx) + medians[np.ix_(low_y, high_x)] * fx
+    lower = medians[np.ix_(high_y, low_x)] * (1 - fx) + medians[np.ix_(high_y, high_x)] * fx
+    return np.asarray(upper * (1 - fy) + lower * fy)

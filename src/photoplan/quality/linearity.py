@@ -1,0 +1,126 @@
+"""Linearity: how exactly grey values are proportional to the light.
+
+The linearity error is that of EMVA 1288 release 4 linear: a line fitted to the levels between 5 % and 95 % of
+saturation by least squares of the relative deviations, and the mean of their absolute values in percent. The response
+between neighbouring levels shows where a curve bends (Behr 1989, §4.2.2 and fig. 4.12).
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.errors import InputError
+
+__all__ = ["Linearity", "linearity"]
+
+LOW, HIGH = 0.05, 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Linearity:
+    """Result for one series of levels."""
+
+    exposure: NDArray[np.float64]
+    """Of the levels, increasing, in the unit that was given (ms, photons …)."""
+    signal: NDArray[np.float64]
+    """Grey values above black."""
+    response: NDArray[np.float64]
+    """Signal over exposure."""
+    response_sigma: NDArray[np.float64]
+    segment: NDArray[np.float64]
+    """Slope between each level and the one before; NaN for the first."""
+    used: NDArray[np.bool_]
+    """Levels between 5 % and 95 % of saturation."""
+    offset: float
+    slope: float
+    """Line of least relative deviations."""
+    slope_sigma: float
+    deviation_percent: NDArray[np.float64]
+    """Relative deviation from the line, %."""
+    error_percent: float
+    """Linearity error: mean absolute deviation of the used levels."""
+    error_percent_sigma: float
+    error_min_percent: float
+    """Largest negative deviation of the used levels."""
+    error_max_percent: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(self).items()}
+
+
+def linearity(exposure: ArrayLike, signal: ArrayLike, sigma: ArrayLike, saturation: float) -> Linearity:
+    """Linearity error and response of levels.
+
+    Parameters
+    ----------
+    exposure : array, shape (n,)
+        Exposure, or photons; positive, any order, no value twice.
+    signal : array, shape (n,)
+        Mean grey value above black.
+    sigma : array, shape (n,)
+        Its standard deviation.
+    saturation : float
+        Grey value above black at which the sensor saturates.
+
+    Raises
+    ------
+    InputError
+        An exposure is not positive or stands twice, fewer than three levels lie between 5 % and 95 % of saturation, or
+        the signal falls where the exposure grows.
+    """
+    order = np.argsort(np.asarray(exposure, float), kind="stable")
+    x, y, s = (np.asarray(v, float)[order] for v in (exposure, signal, sigma))
+    if x.size and (x[0] <= 0 or (np.diff(x) <= 0).any()):
+        raise InputError("exposures must be positive and differ from level to level")
+    used = (y >= LOW * saturation) & (y <= HIGH * saturation)
+    _refuse_falling(x, y, s, HIGH * saturation)
+    if np.count_nonzero(used) < 3:
+        raise InputError(
+            f"{np.count_nonzero(used)} of {x.size} levels lie between 5 % and 95 % of saturation ({saturation:.4g} "
+            "DN); linearity needs 3"
+        )
+    u, v = x[used], y[used]
+    design = np.column_stack([1 / v, u / v])  # minimises the sum of ((y − a − b x) / y)²
+    solve = np.linalg.pinv(design)
+    offset, slope = solve @ np.ones_like(u)
+    fitted = offset + slope * x
+    deviation = 100 * (y - fitted) / fitted
+    error = float(np.abs(deviation[used]).mean())
+    relative = s[used] / v
+    residual = np.eye(u.size) - design @ solve
+    spread = 100 * np.sqrt((residual**2) @ relative**2)
+    with np.errstate(invalid="ignore"):
+        segment = np.concatenate([[np.nan], np.diff(y) / np.diff(x)])
+    return Linearity(
+        x,
+        y,
+        y / x,
+        s / x,
+        segment,
+        used,
+        float(offset),
+        float(slope),
+        float(np.sqrt((solve[1] ** 2) @ relative**2)),
+        deviation,
+        error,
+        float(np.sqrt(np.sum(spread**2)) / u.size),
+        float(deviation[used].min()),
+        float(deviation[used].max()),
+    )
+
+
+def _refuse_falling(x: NDArray[np.float64], y: NDArray[np.float64], s: NDArray[np.float64], top: float) -> None:
+    """A signal that falls while the exposure grows is no series of exposures."""
+    noise = 5 * np.hypot(s[1:], s[:-1]) + 0.01 * np.maximum(np.abs(y[:-1]), 1.0)
+    falls = (np.diff(y) < -np.nan_to_num(noise)) & (y[:-1] < top)
+    if falls.any():
+        k = int(np.argmax(falls))
+        raise InputError(
+            f"the signal falls from {y[k]:.4g} to {y[k + 1]:.4g} DN while the exposure grows from {x[k]:g} to "
+            f"{x[k + 1]:g}; check the exposures of the frames, the lamp, and that automatic gain is off"
+        )

@@ -1,0 +1,118 @@
+"""Saturation: where a sensor stops to answer more light with larger grey values.
+
+Three signs, the first that is found counts: grey values stop at the largest that the camera writes; the response falls
+below the line of the darker levels; the temporal variance falls although the mean grows (EMVA 1288 release 4 linear,
+saturation).
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from math import inf, nan, sqrt
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.errors import InputError
+
+__all__ = ["Saturation", "find_saturation"]
+
+#: Share of samples at the largest grey value from which on a level is clipped.
+_CLIPPED = 0.01
+#: Part of the response that is lost where a level departs from the line.
+_DEPARTED = 0.05
+
+
+@dataclass(frozen=True)
+class Saturation:
+    """Where and why it saturates."""
+
+    level_dn: float
+    """Mean grey value of the most exposed level: what saturation looks like."""
+    rule: str
+    """``clipping``, ``response`` or ``variance``."""
+    last_unsaturated: float
+    """Largest exposure without the sign."""
+    first_saturated: float
+    exposure: float
+    """Exposure at which the line of the darker levels reaches `level_dn`; NaN if it lies not between the two."""
+    exposure_sigma: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+
+def find_saturation(
+    exposure: ArrayLike, mean: ArrayLike, black: float, saturated_share: ArrayLike, variance: ArrayLike | None = None
+) -> Saturation | None:
+    """Saturation of levels with growing exposure; None where none of them shows a sign of it.
+
+    Parameters
+    ----------
+    exposure, mean : array, shape (n,)
+        Exposure (increasing) and mean grey value.
+    black : float
+        Grey value without light.
+    saturated_share : array, shape (n,)
+        Share of samples at the largest grey value.
+    variance : array, shape (n,), optional
+        Temporal variance.
+
+    Raises
+    ------
+    InputError
+        There are fewer than four levels, or the exposures do not increase.
+    """
+    x, y, share = (np.asarray(v, float) for v in (exposure, mean, saturated_share))
+    if x.size < 4 or (np.diff(x) <= 0).any():
+        raise InputError(f"{x.size} levels; saturation needs four of increasing exposure")
+    signal = y - black
+    found = {
+        "clipping": _first(share > _CLIPPED),
+        "response": _first_departure(x, signal),
+        "variance": None if variance is None else _first_collapse(np.asarray(variance, float)),
+    }
+    known = {rule: k for rule, k in found.items() if k is not None and k > 0}
+    if not known:
+        if found["clipping"] == 0:
+            raise InputError("every level has saturated samples; take shorter exposures")
+        return None
+    rule = min(known, key=lambda name: (known[name], list(known).index(name)))
+    first = known[rule]
+    level = float(y[-1])
+    response = float(np.median(signal[:first] / x[:first]))
+    spread = float(np.std(signal[:first] / x[:first])) / sqrt(first)
+    at = (level - black) / response if response > 0 else inf
+    # Clipped shares begin before the mean arrives: the crossing may lie a little outside of the two levels.
+    inside = 0.8 * x[first - 1] <= at <= 1.2 * x[first]
+    sigma = at * spread / response if inside and first > 1 else nan
+    return Saturation(level, rule, float(x[first - 1]), float(x[first]), at if inside else nan, sigma)
+
+
+def _first(signs: NDArray[np.bool_]) -> int | None:
+    """The first level from which on all show the sign."""
+    without = np.flatnonzero(~signs)
+    first = int(without[-1]) + 1 if without.size else 0
+    return first if first < signs.size else None
+
+
+def _first_departure(x: NDArray[np.float64], signal: NDArray[np.float64]) -> int | None:
+    """Level from which on the response stays below that of the darker ones, with a flat end."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        response = signal / x
+    reference = float(np.median(response[: max(2, x.size // 2)]))
+    first = _first(response < (1 - _DEPARTED) * reference)
+    if first is None or first == x.size:
+        return None
+    last_slope = (signal[-1] - signal[-2]) / (x[-1] - x[-2])
+    return first if last_slope < 0.1 * reference else None
+
+
+def _first_collapse(variance: NDArray[np.float64]) -> int | None:
+    """Level behind the largest variance, where the last is less than half of it."""
+    if not np.isfinite(variance).all():
+        return None
+    top = int(np.argmax(variance))
+    return top + 1 if top + 1 < variance.size and variance[-1] < 0.5 * variance[top] else None

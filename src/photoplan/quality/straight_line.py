@@ -1,0 +1,96 @@
+"""Straight lines through measured points with known standard deviations, by weighted least squares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import sqrt
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import gammaincc
+
+from photoplan.errors import InputError
+
+__all__ = ["StraightLine", "fit_line"]
+
+#: Level of significance at which the scatter about the line is taken as larger than stated.
+_SIGNIFICANT = 0.01
+
+
+@dataclass(frozen=True)
+class StraightLine:
+    """y = offset + slope · x."""
+
+    offset: float
+    slope: float
+    covariance: tuple[float, float, float]
+    """Variance of the offset, covariance, variance of the slope."""
+    chi_square: float
+    """Weighted sum of squared residuals with the stated standard deviations."""
+    degrees: int
+
+    @property
+    def offset_sigma(self) -> float:
+        """Standard deviation of the offset."""
+        return sqrt(self.covariance[0])
+
+    @property
+    def slope_sigma(self) -> float:
+        """Standard deviation of the slope."""
+        return sqrt(self.covariance[2])
+
+    def at(self, x: ArrayLike) -> NDArray[np.float64]:
+        """y at x, same shape."""
+        return np.asarray(self.offset + self.slope * np.asarray(x, float))
+
+    def sigma_at(self, x: float) -> float:
+        """Standard deviation of y at x."""
+        c00, c01, c11 = self.covariance
+        return sqrt(max(c00 + 2 * x * c01 + x * x * c11, 0.0))
+
+
+def fit_line(x: ArrayLike, y: ArrayLike, sigma: ArrayLike, *, through_origin: bool = False) -> StraightLine:
+    """Line by weighted least squares.
+
+    Where the residuals are significantly (1 %) larger than the standard deviations allow, those of the result are
+    enlarged to the scatter that was found.
+
+    Parameters
+    ----------
+    x, y, sigma : array, shape (n,)
+        Points and the standard deviations of y, all positive.
+    through_origin : bool
+        Whether the offset is 0.
+
+    Raises
+    ------
+    InputError
+        There are too few different x, or a standard deviation is not positive.
+    """
+    x, y, sigma = (np.asarray(v, np.float64) for v in (x, y, sigma))
+    if not (np.isfinite(x).all() and np.isfinite(y).all() and np.isfinite(sigma).all() and (sigma > 0).all()):
+        raise InputError("a straight line needs finite points with positive standard deviations")
+    unknowns = 1 if through_origin else 2
+    if len(x) < unknowns or (through_origin and not x.any()) or (not through_origin and np.ptp(x) == 0):
+        raise InputError(f"{len(x)} points with {len(set(x.tolist()))} different abscissas; a line needs {unknowns}")
+    # Shifted and scaled, so that the normal equations are well conditioned whatever the unit of x.
+    shift = 0.0 if through_origin else float(np.average(x, weights=sigma**-2.0))
+    scale = float(np.abs(x - shift).max()) or 1.0
+    u = (x - shift) / scale
+    design = u[:, None] if through_origin else np.column_stack([np.ones_like(u), u])
+    weighted = design / sigma[:, None]
+    cofactor = np.linalg.inv(weighted.T @ weighted)
+    solution = cofactor @ (weighted.T @ (y / sigma))
+    chi_square = float(np.sum(((y - design @ solution) / sigma) ** 2))
+    degrees = len(x) - unknowns
+    if degrees and gammaincc(degrees / 2, chi_square / 2) < _SIGNIFICANT:
+        cofactor = cofactor * chi_square / degrees
+    if through_origin:
+        slope = float(solution[0]) / scale
+        return StraightLine(0.0, slope, (0.0, 0.0, float(cofactor[0, 0]) / scale**2), chi_square, degrees)
+    back = np.array([[1.0, -shift / scale], [0.0, 1.0 / scale]])
+    offset, slope = back @ solution
+    c = back @ cofactor @ back.T
+    return StraightLine(
+        float(offset), float(slope), (float(c[0, 0]), float(c[0, 1]), float(c[1, 1])), chi_square, degrees
+    )
