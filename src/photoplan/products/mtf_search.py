@@ -5,19 +5,21 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from math import cos, floor, hypot, radians
+from math import ceil, cos, floor, hypot, radians
 
 from photoplan.geometry.grid import Window
 from photoplan.products.mtf_image import LightImage
 from photoplan.quality.edge_candidates import StraightEdge, find_lines
 from photoplan.quality.edge_find import EdgeRegion, EdgeRules, examine
 
-__all__ = ["Found", "join_lines", "search_edges", "select_spread", "tiles_of"]
+__all__ = ["Found", "join_lines", "parted", "search_edges", "select_spread", "tiles_of"]
 
 #: Side of a tile, pixels: its arrays take some 200 MB.
 TILE = 2048
-#: Longest edge that is measured as one, pixels; longer ones are cut.
+#: Longest line that is examined as one, pixels: bounds the window that is read for it.
 LONGEST = 1600.0
+#: Longest part that is measured as one: no lens, print or roof is straight to a tenth of a pixel for longer.
+PART = 256.0
 #: Cells of the field, in each direction, among which edges are chosen in turn.
 _CELLS = 6
 #: Edges of a cell that are kept while the search goes on.
@@ -103,7 +105,8 @@ def search_edges(
     for line in join_lines(open_lines):
         for part in _pieces(line):
             _examine_alone(image, channel, (area, part), rules, found)
-    found.regions.sort(key=lambda region: -region.merit)
+    parts = [part for region in found.regions for part in parted(region, ceil(region.line.length / PART))]
+    found.regions = sorted(parts, key=lambda region: -region.merit)
     return found
 
 
@@ -130,6 +133,19 @@ def _examine_alone(
         found.rejected[reason] += 1
     else:
         found.regions.append(_placed(region, window.col, window.row))
+
+
+def parted(region: EdgeRegion, count: int) -> list[EdgeRegion]:
+    """An edge in parts of equal length, each an edge of its own."""
+    if count < 2:
+        return [region]
+    step = region.line.length / count
+    parts = []
+    for k in range(count):
+        shift = (k + 0.5) * step - region.line.length / 2
+        gaps = tuple((a - shift, b - shift) for a, b in region.gaps if b - shift > -step / 2 and a - shift < step / 2)
+        parts.append(replace(region, line=region.line.part(k * step, (k + 1) * step), gaps=gaps))
+    return parts
 
 
 def _placed(region: EdgeRegion, dx: float, dy: float) -> EdgeRegion:

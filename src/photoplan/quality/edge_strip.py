@@ -22,6 +22,8 @@ _BLOCK = 6.0
 _TOGETHER = 3.0
 #: Shares of a block's pixels that may be saturated or invalid.
 _SPOILT = 0.01
+#: Share of the contrast by which grey values may go beyond both sides next to an edge: more is a line, not enhancement.
+_SEAM = 0.35
 #: Pixels that one strip may take at most.
 _MOST = 16_000_000
 
@@ -154,6 +156,10 @@ class Sides:
         contrast = self.contrast
         if not contrast > 0.0 or self.snr < least_snr:
             return "weak"
+        inner = self.strip.profile()[self.dark.stop : self.bright.start]
+        low, high = (float(_median(self._means(side))) for side in (self.dark, self.bright))
+        if np.nanmin(inner) < low - _SEAM * contrast or np.nanmax(inner) > high + _SEAM * contrast:
+            return "two_sided"
         for side in (self.dark, self.bright):
             mean, noise, s = self._means(side), self._noise(side), self.strip
             count = s.count[:, side].sum(axis=1)

@@ -1,0 +1,65 @@
+"""`photoplan mtf`: spread function and MTF of images from edges."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photoplan.cli.failures import end_with_failures
+from photoplan.cli.options import json_option
+
+__all__ = ["command"]
+
+
+# Test patterns (bars, star, USAF groups) are another way to measure: their options stand after --roi, and
+# `photoplan.products.mtf_patterns` is asked instead of `measure_mtf` where --pattern is given.
+@click.command("mtf")
+@click.argument("images", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="IMAGE…")
+@click.option("--roi", "rois", type=int, nargs=4, multiple=True, metavar="COL ROW WIDTH HEIGHT",
+              help="Window with one edge; may be repeated [edges are sought in the whole image].")  # fmt: skip
+@click.option("--linearisation", metavar="linear|srgb|TABLE", help="How grey values become light [linear].")
+@click.option("--band", metavar="N|all", help="Band, or luminance and every band [luminance, or the only band].")
+@click.option("--pixel-size", "pixel_um", type=float, metavar="UM", help="On the sensor, for cycles/mm.")
+@click.option("--lab", type=click.Path(path_type=Path), metavar="FILE", help="MTF values of a laboratory to compare.")
+@click.option("--flight", type=click.Choice(["x", "y"]), help="Flight direction along rows (x) or columns (y).")
+@click.option("--grid", type=int, default=3, show_default=True, metavar="N", help="Cells of the field, each way.")
+@click.option("--most-edges", type=int, default=60, show_default=True, metavar="N", help="Measured in an image.")
+@click.option("--least-length", type=click.FloatRange(8.0, 10_000.0), metavar="PX",
+              help="Of an edge [20, with --roi 12].")  # fmt: skip
+@click.option("--least-snr", type=click.FloatRange(3.0, 1e6), default=8.0, show_default=True, metavar="R",
+              help="Contrast of an edge over its noise.")  # fmt: skip
+@click.option("--report", type=click.Path(path_type=Path), metavar="FILE.html", help="Report with plots.")
+@click.option("--csv", type=click.Path(path_type=Path), metavar="FILE", help="A row for each edge.")
+@click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(images: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any) -> None:
+    """Measure sharpness: edges are found, or given by --roi, and their spread function and MTF measured.
+
+    An image that fails does not stop the others; they are listed at the end (exit code 4). No figure is given for an
+    edge that is saturated, noisy, or has texture beside it.
+    """
+    from photoplan.cli.progress import progress
+    from photoplan.products.mtf import MtfRequest, measure_mtf
+
+    def talk(text: str) -> None:
+        if not quiet:
+            click.echo(text, err=True)
+
+    request = MtfRequest(images, **options)
+    report = measure_mtf(request, lambda total: progress(total, quiet, "tiles"), talk)
+    if as_json:
+        click.echo(json.dumps(report.to_dict(), indent=2, ensure_ascii=False))
+    for image in report.images:
+        if not as_json:
+            click.echo(str(image))
+        for note in image.notes:
+            talk(f"{image.name}: {note}")
+    if not as_json:
+        for path in (report.csv, report.report):
+            if path is not None:
+                click.echo(str(path))
+    end_with_failures(report.failed, len(report.images))

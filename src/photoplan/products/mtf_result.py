@@ -1,0 +1,341 @@
+"""What became of MTF measurements: edges, their means by direction, channel and place, as values, lines and JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.products.plain_values import plain
+from photoplan.quality.edge_find import REASONS
+from photoplan.quality.edge_groups import CombinedValue, GaussianFit
+from photoplan.quality.edge_response import EdgeMeasurement
+from photoplan.quality.enhancement import Enhancement
+from photoplan.quality.mtf_curve import MtfCurve
+
+__all__ = ["EdgeGroup", "ImageMtf", "LabComparison", "MeasuredEdge", "MtfReport", "rejected_words"]
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredEdge:
+    """One edge in one channel."""
+
+    number: int
+    """From 1; the same edge in another channel has the same number."""
+    ends: tuple[tuple[float, float], tuple[float, float]]
+    """Column and row of both ends."""
+    half: int
+    """Pixels reach so far to both sides."""
+    aligned: bool
+    """It crosses less than a row or column along its length."""
+    channel: int
+    """0: luminance, else the band."""
+    band: str
+    """The channel's name."""
+    flight: str | None
+    """``along`` or ``across`` the flight direction; None if that was not told."""
+    measured: EdgeMeasurement
+    """Profile, MTF and figures, in pixels of the image."""
+
+    @property
+    def col(self) -> float:
+        """Column of its middle."""
+        return self.measured.col
+
+    @property
+    def row(self) -> float:
+        """Row of its middle."""
+        return self.measured.row
+
+    @property
+    def direction(self) -> str:
+        """``x``: brightness changes along the rows, the spread function in x is measured; ``y``: along the columns."""
+        return self.measured.direction
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        m = self.measured
+        return {
+            "number": self.number,
+            "col": round(self.col, 2),
+            "row": round(self.row, 2),
+            "ends": [[round(v, 1) for v in end] for end in self.ends],
+            "band": self.band,
+            "direction": self.direction,
+            "flight_direction": self.flight,
+            "angle_deg": m.angle_deg,
+            "length": m.length,
+            "half_width": self.half,
+            "aligned": self.aligned,
+            "sampling": m.sampling,
+            "dark": m.dark,
+            "bright": m.bright,
+            "snr": m.snr,
+            "mtf50": m.mtf50,
+            "mtf50_interval": m.mtf50_interval,
+            "mtf10": m.mtf10,
+            "mtf10_interval": m.mtf10_interval,
+            "fwhm": m.fwhm,
+            "fwhm_interval": m.fwhm_interval,
+            "gaussian_fwhm": m.gaussian_fwhm,
+            "modulation_at_half": m.nyquist,
+            "overshoot": m.overshoot,
+            "overshoot_sigma": m.overshoot_sigma,
+            "undershoot": m.undershoot,
+            "undershoot_sigma": m.undershoot_sigma,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class LabComparison:
+    """Values of a laboratory beside those of a mean curve."""
+
+    frequency: NDArray[np.float64]
+    """Cycles per pixel, shape (n,)."""
+    laboratory: NDArray[np.float64]
+    measured: NDArray[np.float64]
+    """NaN beyond the curve."""
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the differences; NaN if there is no common frequency."""
+        known = np.isfinite(self.measured)
+        return float(np.sqrt(np.mean((self.measured - self.laboratory)[known] ** 2))) if known.any() else float("nan")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "cycles_per_px": self.frequency,
+            "laboratory": self.laboratory,
+            "measured": self.measured,
+            "rms_difference": self.rms,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeGroup:
+    """The mean of the edges of a channel, in a direction or in all, in a cell of the field or in all."""
+
+    channel: int
+    band: str
+    direction: str | None
+    """``x``, ``y``; None: both together."""
+    flight: str | None
+    """``along``, ``across``; None: both together or not known."""
+    cell: tuple[int, int] | None
+    """Row and column of the cell of the field; None: the whole field."""
+    bounds: tuple[float, float, float, float] | None
+    """First column, first row, last column and row of the cell."""
+    mtf50: CombinedValue
+    mtf10: CombinedValue
+    fwhm: CombinedValue
+    overshoot: CombinedValue
+    undershoot: CombinedValue
+    mtf50_range: tuple[float, float, float]
+    """Quantiles 0.1, 0.5 and 0.9 of the edges' MTF50."""
+    curve: MtfCurve
+    gaussian: GaussianFit
+    lab: LabComparison | None
+
+    def to_dict(self, pixel_um: float | None) -> dict[str, Any]:
+        """Plain values for JSON."""
+        per_mm = None if pixel_um is None else 1000.0 / pixel_um
+        values = {
+            "band": self.band,
+            "direction": self.direction,
+            "flight_direction": self.flight,
+            "cell": self.cell and {"row": self.cell[0], "col": self.cell[1], "bounds": self.bounds},
+            "edges": self.mtf50.edges,
+            **_combined("mtf50", self.mtf50),
+            "mtf50_quantiles": self.mtf50_range,
+            **_combined("mtf10", self.mtf10),
+            **_combined("fwhm", self.fwhm),
+            "overshoot": self.overshoot.value,
+            "undershoot": self.undershoot.value,
+            "gaussian": {"fwhm": self.gaussian.fwhm, "rms_difference": self.gaussian.rms},
+            "laboratory": self.lab and self.lab.to_dict(),
+            "curve": {
+                "cycles_per_px": self.curve.frequency,
+                "modulation": self.curve.modulation,
+                "sigma": self.curve.sigma,
+            },
+        }
+        if per_mm is not None:
+            values["mtf50_cycles_per_mm"] = self.mtf50.value * per_mm
+            values["mtf10_cycles_per_mm"] = self.mtf10.value * per_mm
+        return values
+
+
+def _combined(name: str, value: CombinedValue) -> dict[str, Any]:
+    return {
+        name: value.value,
+        f"{name}_interval": value.interval,
+        f"{name}_sigma": value.sigma,
+        f"{name}_scatter": value.scatter,
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class ImageMtf:
+    """Measurements in one image."""
+
+    name: str
+    file: Path
+    size: tuple[int, int]
+    linearisation: str
+    """In words."""
+    edges: tuple[MeasuredEdge, ...]
+    groups: tuple[EdgeGroup, ...]
+    """The first is that of all edges of the first channel."""
+    enhancement: Enhancement
+    found: int
+    """Edges that could have been measured; at most as many as asked for were."""
+    grid: int
+    """Cells of the field in each direction."""
+    rejected: dict[str, int]
+    """How many edges were rejected, by reason."""
+    notes: tuple[str, ...]
+
+    @property
+    def total(self) -> EdgeGroup:
+        """All edges of the first channel."""
+        return self.groups[0]
+
+    def groups_of(self, channel: int, cells: bool = False) -> list[EdgeGroup]:
+        """Groups of a channel: of the whole field, or of its cells."""
+        return [g for g in self.groups if g.channel == channel and (g.cell is not None) == cells]
+
+    def to_dict(self, pixel_um: float | None = None) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "image": self.name,
+            "file": str(self.file),
+            "size": list(self.size),
+            "linearisation": self.linearisation,
+            "edges": [edge.to_dict() for edge in self.edges],
+            "summary": [group.to_dict(pixel_um) for group in self.groups],
+            "enhancement": self.enhancement.to_dict(),
+            "edges_found": self.found,
+            "rejected": dict(self.rejected),
+            "notes": list(self.notes),
+        }
+
+    def __str__(self) -> str:
+        """A line for each direction and channel of the whole field."""
+        lines = [f"{self.name}: {self.total.mtf50.edges} edges of {self.found} · {self.linearisation}"]
+        for group in self.groups:
+            if group.cell is None:
+                lines.append(f"  {_label(group):<22} {_figures(group)}")
+        return "\n".join(lines)
+
+
+def _label(group: EdgeGroup) -> str:
+    where = group.direction or "all"
+    if group.flight is not None:
+        where += f" ({group.flight} flight)"
+    return f"{group.band} {where}"
+
+
+def _figures(group: EdgeGroup) -> str:
+    low, high = group.mtf50.interval
+    return (
+        f"MTF50 {group.mtf50.value:.4f} [{low:.4f}, {high:.4f}] cy/px  MTF10 {_number(group.mtf10.value)}  "
+        f"FWHM {_number(group.fwhm.value)} px  Gaussian {group.gaussian.fwhm:.2f} px (rms {group.gaussian.rms:.3f})  "
+        f"{group.mtf50.edges} edges"
+    )
+
+
+def _number(value: float) -> str:
+    return f"{value:.3f}" if isfinite(value) else "–"
+
+
+def rejected_words(rejected: dict[str, int]) -> str:
+    """How many edges were rejected for what, most frequent first; empty if none."""
+    ordered = sorted(rejected.items(), key=lambda item: -item[1])
+    return ", ".join(f"{count} {REASONS.get(reason, reason)}" for reason, count in ordered if count)
+
+
+@dataclass(frozen=True, eq=False)
+class MtfReport:
+    """What became of all images."""
+
+    images: tuple[ImageMtf, ...]
+    failed: dict[str, str]
+    """Why, by name of the image."""
+    linearisation: str
+    pixel_um: float | None
+    flight: str | None
+    report: Path | None
+    csv: Path | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON: NaN is null."""
+        values: dict[str, Any] = plain(
+            {
+                "linearisation": self.linearisation,
+                "pixel_size_um": self.pixel_um,
+                "flight": self.flight,
+                "images": [image.to_dict(self.pixel_um) for image in self.images],
+                "failed": [{"image": name, "reason": reason} for name, reason in self.failed.items()],
+                "report": self.report and str(self.report),
+                "csv": self.csv and str(self.csv),
+            }
+        )
+        return values
+
+    @property
+    def csv_rows(self) -> tuple[Sequence[str], list[list[object]]]:
+        """Header and a row for each edge."""
+        header = [*_COLUMNS]
+        rows = [
+            [image.name, *(_field(values[name]) for name in header[1:])]
+            for image in self.images
+            for values in (_flat(edge) for edge in image.edges)
+        ]
+        return header, rows
+
+
+_COLUMNS = (
+    "image",
+    "number",
+    "col",
+    "row",
+    "band",
+    "direction",
+    "flight_direction",
+    "angle_deg",
+    "length",
+    "half_width",
+    "aligned",
+    "dark",
+    "bright",
+    "snr",
+    "mtf50",
+    "mtf50_low",
+    "mtf50_high",
+    "mtf10",
+    "fwhm",
+    "fwhm_low",
+    "fwhm_high",
+    "overshoot",
+    "undershoot",
+)
+
+
+def _flat(edge: MeasuredEdge) -> dict[str, Any]:
+    values = edge.to_dict()
+    for name in ("mtf50", "fwhm"):
+        values[f"{name}_low"], values[f"{name}_high"] = values[f"{name}_interval"]
+    return values
+
+
+def _field(value: object) -> object:
+    """A field of the table: empty for what is not known."""
+    if isinstance(value, float | np.floating):
+        return f"{float(value):.6g}" if isfinite(value) else ""
+    return "" if value is None else value
