@@ -8,11 +8,22 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Strict, Tag, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Strict,
+    Tag,
+    field_validator,
+    model_validator,
+)
 
 from photoplan.cameras.fiducials_fit import MODELS
 from photoplan.errors import InputError
 from photoplan.io.mark_model import EachMark, Marks
+from photoplan.io.names import check_input_name
 
 __all__ = [
     "BrownLens",
@@ -31,6 +42,8 @@ __all__ = [
     "Pixels",
     "Positive",
     "RadialTableLens",
+    "Restoration",
+    "Restore",
     "Triple",
 ]
 
@@ -131,6 +144,37 @@ def _in_mm(lens: Lens) -> bool:
     return lens.type == "radial_table" or (lens.type == "brown" and lens.unit == "mm")
 
 
+class Restoration(Entry):
+    """How images are restored before anything is made of them."""
+
+    filter: Annotated[str, Field(min_length=1, max_length=4000)]
+    """A restoration filter: TOML, or one kernel as rows of numbers."""
+    linearisation: Annotated[str, Field(min_length=1, max_length=4000)] = "linear"
+    """``linear``, ``srgb``, or a file with a table."""
+
+    @field_validator("filter", "linearisation")
+    @classmethod
+    def _plain(cls, text: str) -> str:
+        try:
+            return check_input_name(text)
+        except InputError as error:
+            raise ValueError(str(error)) from None
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Files that it names."""
+        table = () if self.linearisation in ("linear", "srgb") else (self.linearisation,)
+        return (self.filter, *table)
+
+
+def _restoration(value: Any) -> Any:
+    """A name alone is that of the filter."""
+    return {"filter": value} if isinstance(value, str) else value
+
+
+Restore = Annotated[Restoration, BeforeValidator(_restoration)]
+
+
 class FrameCamera(Entry):
     """A digital frame camera: by its focal length in pixels, or by camera constant and pixel or sensor size."""
 
@@ -147,6 +191,8 @@ class FrameCamera(Entry):
     principal_point_mm: Pair | None = None
     """The same as x0 to the right and y0 upwards from the image's middle, millimetres."""
     lens: Lens = NoLens()
+    restore: Restore | None = None
+    """Filter that its images are restored with, where they state no other."""
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
@@ -222,6 +268,8 @@ class FilmCamera(Entry):
     marks: Marks | None = None
     """What the fiducial marks look like: one description for all, or one for each by name."""
     lens: Lens = NoLens()
+    restore: Restore | None = None
+    """Filter that its scans are restored with, where they state no other."""
 
     @field_validator("fiducials_mm")
     @classmethod

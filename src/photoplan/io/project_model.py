@@ -22,6 +22,8 @@ from photoplan.io.camera_model import (
     Number,
     Pixels,
     Positive,
+    Restoration,
+    Restore,
     Triple,
 )
 from photoplan.io.names import check_input_name, resolve_input, unique_stems
@@ -65,6 +67,8 @@ class Image(Entry):
     """Measured fiducial marks of a film scan: name = [column, row], pixels."""
     size: tuple[Pixels, Pixels] | None = None
     """Width and height of this scan, where the camera does not state them."""
+    restore: Restore | None = None
+    """Filter that it is restored with before anything is made of it; None: that of its camera, if there is one."""
 
     @field_validator("file")
     @classmethod
@@ -268,6 +272,10 @@ class Project(Entry):
                 )
             chosen.update(found)
         return [n for n in names if n in chosen]
+
+    def restoration(self, image: Image) -> Restoration | None:
+        """How an image of the project is restored: as it states itself, else as its camera does; None: not at all."""
+        return image.restore or self.cameras[image.camera].restore
 
     def ortho_settings(self) -> dict[str, Any]:
         """What the `[ortho]` table states, by the names of `photoplan.products.settings.OrthoSettings`."""

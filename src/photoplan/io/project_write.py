@@ -192,6 +192,7 @@ def _frame(name: str, camera: FrameCamera) -> list[str]:
         ("sensor_size_mm", camera.sensor_size_mm, ""),
         ("principal_point_px", camera.principal_point_px, "column, row"),
         ("principal_point_mm", camera.principal_point_mm, "x right, y up, from the middle of the image"),
+        *_restore(camera),
     ]
     head = f"[cameras.{toml_key(name)}]"
     return [head, *_entries(r for r in rows if r[1] is not None), *_lens(camera.lens), ""]
@@ -211,9 +212,14 @@ def _film(name: str, camera: FilmCamera) -> list[str]:
             camera.marks and camera.marks.model_dump(exclude_none=True, exclude_defaults=True),
             "what the marks look like, mm",
         ),
+        *_restore(camera),
     ]
     head = f"[cameras.{toml_key(name)}]"
     return [head, *_entries(r for r in rows if r[1] is not None), *_lens(camera.lens), ""]
+
+
+def _restore(camera: FrameCamera | FilmCamera) -> list[tuple[str, Any, str]]:
+    return [("restore", camera.restore and camera.restore.model_dump(), "filter that its images are restored with")]
 
 
 def _lens(lens: BaseModel) -> list[str]:

@@ -159,7 +159,7 @@ def _check_image(scene: Scene, name: str, tilt: float, fault: str | None) -> Ima
 
 
 def _notes(scene: Scene) -> tuple[str, ...]:
-    return scene.reader.info.warnings
+    return scene.notes
 
 
 def _sensitivity(scene: Scene, coverage: Coverage) -> tuple[float, float]:

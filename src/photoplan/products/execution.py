@@ -21,6 +21,7 @@ from photoplan.kernels.rectify import is_compiled
 from photoplan.plan.anchors import Anchors
 from photoplan.plan.product import ProductPlan, Tile, compile_tile
 from photoplan.products.orthophoto import OrthoPlan, OrthoProduct, render_tile
+from photoplan.products.restored_reader import RestoredReader
 from photoplan.products.results import ProductResult, finished_products, product_path
 from photoplan.products.scene import Scene, SceneAddress, input_files, open_scene
 
@@ -181,7 +182,7 @@ def _make(
 ) -> ProductResult:
     started = time.perf_counter()
     settings, scene = plan.settings, open_scene(plan.project, product.plan.image)
-    for note in scene.reader.info.warnings:
+    for note in scene.notes:
         run.talk(f"note: {note}")
     if not is_compiled(scene.reader.dtype, scene.reader.bands, settings.kernel):
         run.talk("compiling the resampling kernels for this kind of image, once (up to a minute)")
@@ -314,6 +315,7 @@ def _record(plan: OrthoPlan, product: OrthoProduct, scene: Scene, run: Run, resu
         "crs_operations": [
             {"operation": step.operation, "accuracy_m": step.accuracy} for step in scene.ground.operations
         ],
+        "restored": scene.reader.describe() if isinstance(scene.reader, RestoredReader) else None,
         "projection_centre": [float(c) for c in center],
         "gsd_m": product.gsd,
         "first_cell_px": product.plan.rule.cell,

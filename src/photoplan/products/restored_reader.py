@@ -58,6 +58,16 @@ class RestoredReader:
         """Type of the restored pixels."""
         return self.restorer.out
 
+    def describe(self) -> str:
+        """How the pixels are restored, in words."""
+        used = self.restorer.filter
+        columns, rows = used.margin
+        name = f' "{used.description}"' if used.description else ""
+        return (
+            f"restored with the filter{name}, {2 * columns + 1} × {2 * rows + 1}; noise grows {used.noise_gain:.3g} "
+            f"times; {self.restorer.linearisation.describe()}"
+        )
+
     def read(self, window: Window) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
         """Restored pixels of a window inside the image, shape (bands, height, width), and their validity."""
         parts = list(window.tiles(PART))
@@ -139,14 +149,8 @@ def restored_reader(
     return RestoredReader(source, restorer)
 
 
-def linearisation_of(text: str, folder: Path | None = None) -> Linearisation:
+def linearisation_of(text: str) -> Linearisation:
     """The linearisation that a user names: `linear`, `srgb`, or a file with a table.
-
-    Parameters
-    ----------
-    text : str
-    folder : Path, optional
-        Where relative names of files start.
 
     Raises
     ------
@@ -155,7 +159,7 @@ def linearisation_of(text: str, folder: Path | None = None) -> Linearisation:
     """
     if text in ("linear", "srgb"):
         return Linearisation("linear" if text == "linear" else "srgb")
-    path = Path(text) if folder is None else folder / text
+    path = Path(text)
     try:
         return Linearisation.from_table(read_linearisation_table(path))
     except InputError as error:

@@ -25,8 +25,10 @@ from photoplan.io.project import parse_project
 from photoplan.io.project_cameras import interior_of, lens_of
 from photoplan.io.project_model import Image, Project, Terrain
 from photoplan.io.raster import RasterReader
+from photoplan.products.filter_files import load_filter
 from photoplan.products.open_terrain import open_terrain
 from photoplan.products.reach import reach
+from photoplan.products.restored_reader import RestoredReader, linearisation_of, restored_reader
 from photoplan.surfaces.base import Surface
 from photoplan.surfaces.level import LevelSurface
 from photoplan.surfaces.shifted import ShiftedSurface
@@ -81,9 +83,17 @@ class Scene:
     surface: Surface
     terrain_bounds: tuple[float, float, float, float]
     """Where the surface can be seen from this camera at all."""
-    reader: RasterReader
+    reader: RasterReader | RestoredReader
     ground: Ground
     address: SceneAddress
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know of the pixels, one sentence each."""
+        found = self.reader.info.warnings
+        if isinstance(self.reader, RestoredReader):
+            found += (f"{self.reader.info.path.name}: {self.reader.describe()}",)
+        return found
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -99,6 +109,8 @@ class Scene:
 def input_files(project: Project) -> list[Path]:
     """All files that a project names; nothing that is written may replace one of them."""
     files = [image.file for image in project.images]
+    restored = [project.restoration(image) for image in project.images]
+    files += [file for each in restored if each is not None for file in each.files]
     files += [] if project.terrain is None or project.terrain.file is None else [project.terrain.file]
     observed = project.observations
     files += [*observed.image_points, *observed.control, *([observed.positions] if observed.positions else [])]
@@ -119,6 +131,9 @@ def open_scene(project: Project, name: str) -> Scene:
     files = [project.resolve(image.file)]
     if project.ground.file is not None:
         files.append(project.resolve(project.ground.file))
+    restoration = project.restoration(image)
+    if restoration is not None:
+        files += [project.resolve(file) for file in restoration.files]
     digests = tuple((str(path), _digest(str(path), _stamp(path))) for path in files)
     return _open(
         SceneAddress(alone.model_dump_json(exclude={"ortho"}, exclude_none=True), str(project.folder), digests)
@@ -147,9 +162,20 @@ def _open(address: SceneAddress) -> Scene:
     project = parse_project(json.loads(address.text), Path(address.folder), "project")
     image = project.images[0]
     ground = ground_of(project)
-    reader = RasterReader(project.resolve(image.file))
+    reader = _reader(project, image)
     camera = _camera(project, image, ground, reader.size)
     return Scene(camera, ground.surface, reach(camera, ground.surface, ground.bounds), reader, ground, address)
+
+
+def _reader(project: Project, image: Image) -> RasterReader | RestoredReader:
+    """The image's pixels, restored if the project says so."""
+    source = RasterReader(project.resolve(image.file))
+    restoration = project.restoration(image)
+    if restoration is None:
+        return source
+    table = restoration.linearisation
+    light = linearisation_of(table if table in ("linear", "srgb") else str(project.resolve(table)))
+    return restored_reader(source, load_filter(project.resolve(restoration.filter)), light)
 
 
 @dataclass(frozen=True)
