@@ -14,12 +14,20 @@ __all__ = ["command"]
 
 @click.command("info")
 @click.argument("file", type=click.Path(path_type=Path))
+@click.option("--plot", type=click.Path(path_type=Path), metavar="PICTURE", help="Draw a restoration filter as PNG.")
+@click.option("--overwrite", is_flag=True, help="Replace a picture that exists.")
 @json_option
-def command(file: Path, as_json: bool) -> None:
-    """Show what FILE holds: a raster, a terrain model, a project, a plan or a run record."""
+def command(file: Path, plot: Path | None, overwrite: bool, as_json: bool) -> None:
+    """Show what FILE holds: a raster, a terrain model, a project, a plan, a run record or a restoration filter."""
     from photoplan.products.describe import describe
 
+    if plot is not None:
+        from photoplan.products.describe_filter import draw_filter
+
+        draw_filter(file, plot, overwrite=overwrite)
     facts = describe(file)
+    if plot is not None:
+        facts["picture"] = str(plot)
     if as_json:
         click.echo(json.dumps(facts, indent=2))
         return

@@ -1,4 +1,4 @@
-"""What a file holds, in words: rasters, terrain models, projects, plans."""
+"""What a file holds, in words: rasters, terrain models, projects, plans, filters."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from typing import Any
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_label
+from photoplan.io.filter_file import is_filter
 from photoplan.io.plan_file import read_plan_tables
 from photoplan.io.project import load_project
 from photoplan.io.project_model import Terrain
 from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.terrain_model_read import ModelReader, is_terrain_model
+from photoplan.products.describe_filter import describe_filter
 from photoplan.products.describe_model import describe_model
 
 __all__ = ["describe"]
@@ -29,6 +31,8 @@ def describe(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     kind = path.suffix.lower()
+    if kind == ".csv" or (kind == ".toml" and is_filter(path)):
+        return describe_filter(path)
     if kind == ".toml":
         return _project(path)
     if is_terrain_model(path):

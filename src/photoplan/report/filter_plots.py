@@ -1,0 +1,123 @@
+"""A filter as a picture: its weights, sections through its middle, and what it does to every frequency."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, SOFT, STYLE, load_matplotlib, png
+
+__all__ = ["MOST_DRAWN", "FilterPlots", "KernelPicture", "frequency_response"]
+
+#: Kernels that are drawn; of more, the first ones are.
+MOST_DRAWN = 12
+_DIRECTIONS = (("row", BLUE, "-"), ("column", ORANGE, "--"), ("diagonal", GREEN, ":"))
+
+
+@dataclass(frozen=True, eq=False)
+class KernelPicture:
+    """What is drawn of a kernel."""
+
+    title: str
+    values: NDArray[np.float64]
+    """(2 m + 1, 2 n + 1)."""
+
+
+def frequency_response(
+    values: NDArray[np.float64], frequency: NDArray[np.float64], direction: tuple[float, float]
+) -> NDArray[np.float64]:
+    """Factor by which a kernel changes the amplitude of waves.
+
+    Parameters
+    ----------
+    values : ndarray, shape (2 m + 1, 2 n + 1)
+    frequency : ndarray
+        Cycles per pixel.
+    direction : (column, row)
+        Unit vector across the waves.
+    """
+    m, n = (side // 2 for side in values.shape)
+    rows, columns = np.mgrid[-m : m + 1, -n : n + 1]
+    along = (direction[0] * columns + direction[1] * rows).ravel()
+    return np.asarray(np.abs(np.exp(-2j * np.pi * np.multiply.outer(frequency, along)) @ values.ravel()))
+
+
+class FilterPlots:
+    """Draws; made before any work, so that a missing library is known at once.
+
+    Raises
+    ------
+    UsageError
+        When made: matplotlib is not installed.
+    """
+
+    def __init__(self) -> None:
+        self._mpl = load_matplotlib("a picture of a filter")
+
+    def draw(self, title: str, kernels: Sequence[KernelPicture]) -> bytes:
+        """PNG with a row of three panels for each kernel."""
+        drawn = list(kernels[:MOST_DRAWN])
+        height = 3.0 * len(drawn) + 0.7
+        with self._mpl.rc_context(STYLE):
+            fig = self._mpl.figure.Figure(figsize=(11.0, height), layout="constrained")
+            more = f" (the first {MOST_DRAWN} of {len(kernels)} kernels)" if len(kernels) > MOST_DRAWN else ""
+            fig.suptitle(title + more, x=0.01, ha="left", fontsize=11, color=INK)
+            rows = fig.subplots(len(drawn), 3, squeeze=False, gridspec_kw={"width_ratios": [1.0, 1.3, 1.3]})
+            for panels, kernel in zip(rows, drawn):
+                self._weights(panels[0], kernel)
+                self._sections(panels[1], kernel)
+                self._response(panels[2], kernel)
+            return png(fig)
+
+    def _weights(self, axes: Any, kernel: KernelPicture) -> None:
+        """Heat map; the colour is that of the root, since the middle is far larger than all others."""
+        values = kernel.values
+        m, n = (side // 2 for side in values.shape)
+        rooted = np.sign(values) * np.sqrt(np.abs(values))
+        most = float(np.abs(rooted).max()) or 1.0
+        box = (-n - 0.5, n + 0.5, m + 0.5, -m - 0.5)
+        axes.imshow(rooted, cmap="RdBu_r", vmin=-most, vmax=most, extent=box, interpolation="nearest")
+        axes.grid(visible=False)
+        axes.set_title(kernel.title)
+        axes.set_xlabel("columns")
+        axes.set_ylabel("rows")
+        if values.size <= 49:
+            for (i, k), value in np.ndenumerate(values):
+                strong = abs(rooted[i, k]) > 0.6 * most
+                axes.text(
+                    k - n, i - m, f"{value:.2g}", ha="center", va="center", fontsize=6, color="white" if strong else INK
+                )
+
+    @staticmethod
+    def _sections(axes: Any, kernel: KernelPicture) -> None:
+        values = kernel.values
+        m, n = (side // 2 for side in values.shape)
+        axes.axhline(0.0, color=SOFT, linewidth=0.8)
+        axes.plot(np.arange(-n, n + 1), values[m], "o-", color=BLUE, markersize=3.5, linewidth=1.2, label="middle row")
+        axes.plot(
+            np.arange(-m, m + 1), values[:, n], "s--", color=ORANGE, markersize=3, linewidth=1.2, label="middle column"
+        )
+        axes.plot(
+            np.arange(-n, n + 1), values.sum(0), "^:", color=GREEN, markersize=3, linewidth=1.2, label="column sums"
+        )
+        axes.set_title(f"sections; sum {values.sum():.4g}")
+        axes.set_xlabel("pixels from the middle")
+        axes.legend(fontsize=7.5)
+
+    @staticmethod
+    def _response(axes: Any, kernel: KernelPicture) -> None:
+        """Up to the Nyquist frequency along rows and columns."""
+        frequency = np.linspace(0.0, 0.5, 101)
+        for (name, colour, line), direction in zip(_DIRECTIONS, ((1.0, 0.0), (0.0, 1.0), (0.5**0.5, 0.5**0.5))):
+            response = frequency_response(kernel.values, frequency, direction)
+            axes.plot(frequency, response, line, color=colour, linewidth=1.6, label=f"along a {name}")
+        axes.set_xlim(0.0, 0.5)
+        axes.set_ylim(bottom=0.0)
+        gain = float(np.sqrt((kernel.values**2).sum()))
+        axes.set_title(f"frequency response |R|; noise grows {gain:.3g} times")
+        axes.set_xlabel("cycles per pixel")
+        axes.legend(fontsize=7.5)
