@@ -1,0 +1,351 @@
+"""What became of measurements of test patterns, as values, lines, table rows and JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.geometry.grid import Window
+from photoplan.products.plain_values import plain
+from photoplan.quality.bar_curve import BarCurve, coltman_mtf
+from photoplan.quality.mtf_curve import MtfCurve
+from photoplan.quality.siemens import StarMtf
+from photoplan.quality.usaf import UsafBars, UsafResult
+from photoplan.report.pattern_plots import Curve, PatternFacts, PolarCurve
+
+__all__ = ["ImagePattern", "PatternReport", "PatternResult"]
+
+
+@dataclass(frozen=True, eq=False)
+class PatternResult:
+    """One pattern in one channel."""
+
+    file: Path
+    band: str
+    window: Window
+    found: BarCurve | StarMtf | UsafResult
+    coltman: bool = False
+    """Convert the contrast transfer of bars into an MTF."""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Names it within the report."""
+        w = self.window
+        return f"{self.file.name}, {self.band}, column {w.col}, row {w.row}, {w.width} × {w.height}"
+
+    def curves(self) -> dict[str, tuple[str, MtfCurve]]:
+        """Curves by name: ``mtf`` or ``contrast``, and the curve."""
+        if isinstance(self.found, BarCurve):
+            curves = {"contrast transfer": ("contrast", self.found.contrast), "mtf": ("mtf", self.found.mtf)}
+            if self.coltman:
+                curves["mtf by Coltman's series"] = ("mtf", coltman_mtf(self.found.contrast))
+            return curves
+        if isinstance(self.found, StarMtf):
+            single = {f"mtf at {angle:g}°": ("mtf", curve) for angle, curve in self.found.directional.items()}
+            return {"mtf": ("mtf", self.found.mtf), **single}
+        return {}
+
+    def to_dict(self, pixel_um: float | None) -> dict[str, Any]:
+        """Plain values for JSON."""
+        window = [self.window.col, self.window.row, self.window.width, self.window.height]
+        values: dict[str, Any] = {"band": self.band, "roi": window, "notes": list(self.notes)}
+        if isinstance(self.found, BarCurve):
+            values |= _bars(self.found)
+        elif isinstance(self.found, StarMtf):
+            values |= _star(self.found, self.window)
+        else:
+            values |= _usaf(self.found, self.window)
+        for name, (_, curve) in self.curves().items():
+            entry = _curve(curve, pixel_um)
+            key = name.replace(" by Coltman's series", "_coltman").replace(" ", "_")
+            if " at " in name:
+                values.setdefault("directions", []).append({"direction_deg": float(name.split()[-1][:-1]), **entry})
+            else:
+                values[key] = entry
+        return values
+
+    def rows(self) -> Iterator[list[object]]:
+        """Rows of the table: curve, direction, group, element, frequency, value, standard deviation, resolved."""
+        head = [self.file.name, self.band, self.window.col, self.window.row]
+        if isinstance(self.found, UsafResult):
+            for bars in self.found.bars:
+                kind = [_kind(bars), bars.group, bars.element, bars.frequency, bars.lp_mm, bars.contrast, bars.sigma]
+                yield [*head, "contrast transfer", *kind, bars.resolved]
+            return
+        for name, (_, curve) in self.curves().items():
+            label, _, direction = name.partition(" at ")
+            for f, m, s in _points(curve):
+                yield [*head, label, direction.rstrip("°"), "", "", f, "", m, s, ""]
+
+    def lines(self) -> list[str]:
+        """What is printed."""
+        if isinstance(self.found, UsafResult):
+            return _usaf_lines(self.found)
+        if isinstance(self.found, StarMtf):
+            star = self.found
+            lines = [
+                f"star of {star.sectors} {star.wave} sectors, centre column {star.centre[0] + self.window.col:.2f}, "
+                f"row {star.centre[1] + self.window.row:.2f}: {_figures(star.mtf)}"
+            ]
+            return lines + [f"  {angle:5.1f}°  {_figures(curve)}" for angle, curve in star.directional.items()]
+        found = self.found
+        lines = [f"bars, full contrast from {found.levels_from}"]
+        for k, group in enumerate(found.groups):
+            lines.append(
+                f"  {group.frequency:.4f} cy/px at {group.angle_deg:.1f}°  contrast transfer "
+                f"{_value(found.contrast, k + 1)}  MTF {_value(found.mtf, k + 1)}"
+            )
+        return lines
+
+
+def _kind(bars: UsafBars) -> str:
+    return "horizontal" if bars.horizontal else "vertical"
+
+
+def _points(curve: MtfCurve) -> Iterator[tuple[float, float, float]]:
+    sigma = np.full(curve.frequency.size, np.nan) if curve.sigma is None else curve.sigma
+    yield from zip(curve.frequency.tolist(), curve.modulation.tolist(), sigma.tolist())
+
+
+def _value(curve: MtfCurve, k: int) -> str:
+    sigma = "" if curve.sigma is None else f" ± {curve.sigma[k]:.4f}"
+    return f"{curve.modulation[k]:.4f}{sigma}"
+
+
+def _figures(curve: MtfCurve) -> str:
+    words = [
+        f"{name} {value:.4f}" for name, value in (("MTF50", curve.mtf50), ("MTF10", curve.mtf10)) if isfinite(value)
+    ]
+    first, last = curve.frequency[1], curve.frequency[-1]
+    return f"{'  '.join(words) or 'stays above 0.5'}  ({first:.3f} to {last:.3f} cy/px)"
+
+
+def _curve(curve: MtfCurve, pixel_um: float | None) -> dict[str, Any]:
+    values: dict[str, Any] = {
+        "cycles_per_px": curve.frequency,
+        "modulation": curve.modulation,
+        "sigma": curve.sigma,
+        "mtf50": curve.mtf50,
+        "mtf10": curve.mtf10,
+    }
+    if pixel_um is not None:
+        values["lp_per_mm"] = curve.frequency * 1000.0 / pixel_um
+    return values
+
+
+def _bars(found: BarCurve) -> dict[str, Any]:
+    groups = [
+        {
+            "cycles_per_px": g.frequency,
+            "angle_deg": g.angle_deg,
+            "phase": g.phase,
+            "duty": g.duty,
+            "periods": g.periods,
+            "low": g.low,
+            "high": g.high,
+            "modulation": g.modulation,
+            "modulation_sigma": g.modulation_sigma,
+            "fundamental": g.fundamental,
+            "fundamental_sigma": g.fundamental_sigma,
+            "aligned": g.aligned,
+        }
+        for g in found.groups
+    ]
+    return {"groups": groups, "low": found.low, "high": found.high, "levels_from": found.levels_from}
+
+
+def _star(found: StarMtf, window: Window) -> dict[str, Any]:
+    return {
+        "center": [found.centre[0] + window.col, found.centre[1] + window.row],
+        "center_sigma": found.centre_sigma,
+        "sectors": found.sectors,
+        "wave": found.wave,
+        "low": found.low,
+        "high": found.high,
+        "levels_from": found.levels_from,
+        "radii": found.radii,
+    }
+
+
+def _limit(bars: UsafBars | None) -> dict[str, Any] | None:
+    if bars is None:
+        return None
+    return {
+        "group": bars.group,
+        "element": bars.element,
+        "lp_per_mm": bars.lp_mm,
+        "cycles_per_px": bars.frequency,
+        "contrast": bars.contrast,
+        "sigma": bars.sigma,
+    }
+
+
+def _usaf(found: UsafResult, window: Window) -> dict[str, Any]:
+    elements = [
+        {
+            "group": b.group,
+            "element": b.element,
+            "bars": _kind(b),
+            "lp_per_mm": b.lp_mm,
+            "cycles_per_px": b.frequency,
+            "col": b.centre[0] + window.col,
+            "row": b.centre[1] + window.row,
+            "contrast": b.contrast,
+            "sigma": b.sigma,
+            "resolved": b.resolved,
+            "seen": b.seen,
+        }
+        for b in found.bars
+    ]
+    return {
+        "groups": list(found.groups),
+        "resolved_groups": list(found.resolved_groups),
+        "pixel_on_target_um": found.pixel_um,
+        "matched": found.place.matched,
+        "rms": found.place.rms,
+        "limit_horizontal": _limit(found.limit(horizontal=True)),
+        "limit_vertical": _limit(found.limit(horizontal=False)),
+        "elements": elements,
+    }
+
+
+def _usaf_lines(found: UsafResult) -> list[str]:
+    groups = ", ".join(map(str, found.groups))
+    lines = [
+        f"USAF-1951 target: groups {groups} seen; {found.place.matched} threes of bars placed within "
+        f"{found.place.rms:.2f} px; {found.pixel_um:.4g} µm a pixel on the target"
+    ]
+    for horizontal in (True, False):
+        kind = "horizontal" if horizontal else "vertical"
+        last = found.limit(horizontal=horizontal)
+        if last is None:
+            lines.append(f"  {kind} bars: none is resolved")
+            continue
+        lines.append(
+            f"  {kind} bars resolved up to group {last.group}, element {last.element}: {last.lp_mm:.2f} LP/mm, "
+            f"{last.frequency:.3f} cy/px, contrast transfer {last.contrast:.3f} ± {last.sigma:.3f}"
+        )
+    return lines
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePattern:
+    """Measurements in one image."""
+
+    name: str
+    file: Path
+    size: tuple[int, int]
+    linearisation: str
+    results: tuple[PatternResult, ...]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know."""
+        return tuple(dict.fromkeys(note for result in self.results for note in result.notes))
+
+    def to_dict(self, pixel_um: float | None = None) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "image": self.name,
+            "file": str(self.file),
+            "size": list(self.size),
+            "linearisation": self.linearisation,
+            "patterns": [result.to_dict(pixel_um) for result in self.results],
+        }
+
+    def __str__(self) -> str:
+        lines = [f"{self.name}: {self.linearisation}"]
+        for result in self.results:
+            first, *rest = result.lines()
+            lines += [f"  {result.band}: {first}", *(f"  {line}" for line in rest)]
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True, eq=False)
+class PatternReport:
+    """What became of all images."""
+
+    pattern: str
+    images: tuple[ImagePattern, ...]
+    failed: Mapping[str, str]
+    """Why, by name of the image."""
+    linearisation: str
+    pixel_um: float | None
+    report: Path | None
+    csv: Path | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON: NaN is null."""
+        values: dict[str, Any] = plain(
+            {
+                "pattern": self.pattern,
+                "linearisation": self.linearisation,
+                "pixel_size_um": self.pixel_um,
+                "images": [image.to_dict(self.pixel_um) for image in self.images],
+                "failed": [{"image": name, "reason": reason} for name, reason in self.failed.items()],
+                "report": self.report and str(self.report),
+                "csv": self.csv and str(self.csv),
+            }
+        )
+        return values
+
+    @property
+    def csv_rows(self) -> tuple[Sequence[str], list[list[object]]]:
+        """Header, and a row for each point of each curve, or each three bars of a USAF target."""
+        header = ["image", "band", "col", "row", "curve", "direction", "group", "element", "cycles_per_px", "lp_per_mm",
+                  "value", "sigma", "resolved"]  # fmt: skip
+        rows = [[_field(v) for v in row] for image in self.images for r in image.results for row in r.rows()]
+        return header, rows
+
+    def facts(self, pictures: Mapping[str, NDArray[np.float32]]) -> list[PatternFacts]:
+        """What the report shows of each pattern."""
+        return [_facts(result, self, pictures.get(result.name)) for image in self.images for result in image.results]
+
+
+def _field(value: object) -> object:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float | np.floating):
+        return f"{float(value):.6g}" if isfinite(value) else ""
+    return value
+
+
+def _facts(result: PatternResult, report: PatternReport, picture: NDArray[np.float32] | None) -> PatternFacts:
+    curves, polar, marks = [], [], []
+    window, found = result.window, result.found
+    step = max(1, -(-max(window.width, window.height) // 900))
+    for name, (kind, curve) in result.curves().items():
+        points = np.array(list(_points(curve)))
+        if " at " in name:
+            polar.append(PolarCurve(float(name.split()[-1][:-1]), points[:, 0], points[:, 1]))
+        else:
+            curves.append(Curve(name, kind, points[:, 0], points[:, 1], points[:, 2], len(points) < 40))
+    if isinstance(found, UsafResult):
+        for horizontal in (True, False):
+            rows = [b for b in found.bars if b.horizontal == horizontal and isfinite(b.contrast)]
+            f, c, s = np.array([[b.frequency, b.contrast, b.sigma] for b in rows]).reshape(-1, 3).T
+            kind = "horizontal" if horizontal else "vertical"
+            curves.append(Curve(f"{kind} bars", "contrast", f, c, s, True))
+        for b in found.bars:
+            label = f"{b.group}.{b.element}" if not b.horizontal else ""
+            marks.append((b.centre[0] / step, b.centre[1] / step, label, b.resolved))
+    elif isinstance(found, StarMtf):
+        marks.append((found.centre[0] / step, found.centre[1] / step, "centre", True))
+    return PatternFacts(
+        title=result.name,
+        lines=tuple(result.lines()),
+        notes=result.notes,
+        linearisation=report.linearisation,
+        curves=tuple(curves),
+        polar=tuple(polar),
+        picture=picture if not isinstance(found, BarCurve) else None,
+        marks=tuple(marks),
+        pixel_um=report.pixel_um,
+    )
