@@ -97,4 +97,32 @@ ANALYSES: tuple[Analysis, ...] = (
         "flat frames or reduced figures with photons per pixel, and dark ones at the same exposures",
         "characterise_emva",
     ),
+    Analysis(
+        "fall_off", "Light fall-off", "flat frames (dark frames at their exposure improve it)", "characterise_fall_off"
+    ),
+    Analysis("drift", "Brightness drift", "drift frames with times, ten or more", "characterise_drift"),
+    Analysis(
+        "gain_control",
+        "Automatic gain control",
+        "step frames with times: one entry per transition, eight or more frames after it",
+        "characterise_gain",
+    ),
+    Analysis(
+        "line_jitter",
+        "Line jitter",
+        "plumb frames: a straight vertical edge (two parallel ones, a horizontal one as control)",
+        "characterise_jitter",
+    ),
+    Analysis(
+        "warm_up",
+        "Warm-up drift",
+        "target frames with times, or a table of positions; two targets for scale",
+        "characterise_warm_up",
+    ),
+    Analysis(
+        "stage",
+        "Stage calibration",
+        "stage frames with stage coordinates, or a table of positions; four points or more",
+        "characterise_stage",
+    ),
 )

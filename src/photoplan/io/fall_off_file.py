@@ -1,0 +1,101 @@
+"""Correction files of light fall-off: the model of one camera as TOML, which can be read and edited."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, Strict, ValidationError
+
+from photoplan.errors import InputError
+from photoplan.io.camera_model import Entry, Number, Positive
+from photoplan.io.project_errors import explain
+from photoplan.io.toml_file import read_toml
+
+__all__ = ["FallOffEntry", "fall_off_text", "read_fall_off_entry"]
+
+_MAX_BYTES = 1_000_000
+_Side = Annotated[int, Strict(), Field(gt=0, le=10_000_000)]
+_Degree = Annotated[int, Strict(), Field(ge=-20, le=20)]
+
+
+class TermEntry(Entry):
+    """A term of the artificial part."""
+
+    n: _Degree
+    """Power of the radius, in half diagonals of the image."""
+    m: _Degree
+    """Multiple of the angle: cosine, where negative the sine of its amount; 0: the same all around."""
+    coefficient: Number
+    sigma: Annotated[float, Strict(), Field(ge=0)] | None = None
+    """Standard deviation; only information."""
+
+
+class FallOffEntry(Entry):
+    """The whole file."""
+
+    format: Literal["photoplan light fall-off 1"]
+    size: tuple[_Side, _Side]
+    """Width and height of the images that it corrects, pixels (of a Bayer pattern: of one colour)."""
+    plane: Annotated[str, Field(max_length=100)] = ""
+    """Which colour it corrects; empty: images of one band."""
+    principal_point_px: tuple[Number, Number]
+    camera_constant_px: Positive | None = None
+    """Of the natural part cos⁴ω; left out: the terms hold everything."""
+    dark_dn: Number = 0.0
+    """Grey value of no light."""
+    gain_image: Annotated[str, Field(max_length=1000)] | None = None
+    """Image of the gains beside this file; only information, the gains follow from the terms."""
+    gain_reduction: Annotated[int, Strict(), Field(ge=1)] | None = None
+    """Pixels of the camera per pixel of the gain image, along each side."""
+    terms: Annotated[tuple[TermEntry, ...], Field(max_length=200)] = ()
+
+
+def read_fall_off_entry(path: Path) -> FallOffEntry:
+    """Contents of a correction file.
+
+    Raises
+    ------
+    InputError
+        The file is not of this form; the message names the entry.
+    """
+    contents, text = read_toml(path, _MAX_BYTES)
+    try:
+        return FallOffEntry.model_validate(contents)
+    except ValidationError as error:
+        raise InputError(explain(error, contents, str(path), text)) from None
+
+
+def fall_off_text(entry: FallOffEntry) -> str:
+    """A correction file's text."""
+    lines = [
+        "# Light fall-off: grey values are multiplied by 1 / (cos⁴ω · (1 + sum of terms)) after dark_dn is taken off.",
+        "# A term is coefficient · r^n · cos(m θ), for negative m r^n · sin(|m| θ); r in half diagonals from the",
+        "# principal point, θ from columns to rows.",
+        f'format = "{entry.format}"',
+        f"size = [{entry.size[0]}, {entry.size[1]}]",
+    ]
+    if entry.plane:
+        lines.append(f"plane = {_quoted(entry.plane)}")
+    lines.append(f"principal_point_px = {_numbers(entry.principal_point_px)}")
+    if entry.camera_constant_px is not None:
+        lines.append(f"camera_constant_px = {entry.camera_constant_px!r}")
+    lines.append(f"dark_dn = {entry.dark_dn!r}")
+    if entry.gain_image is not None:
+        lines.append(f"gain_image = {_quoted(entry.gain_image)}")
+    if entry.gain_reduction is not None:
+        lines.append(f"gain_reduction = {entry.gain_reduction}")
+    for term in entry.terms:
+        lines += ["", "[[terms]]", f"n = {term.n}", f"m = {term.m}", f"coefficient = {term.coefficient!r}"]
+        if term.sigma is not None:
+            lines.append(f"sigma = {term.sigma!r}")
+    return "\n".join(lines) + "\n"
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return "[" + ", ".join(repr(float(v)) for v in values) + "]"
+
+
+def _quoted(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -1,0 +1,125 @@
+"""Frames of a series by entry and time, for analyses that follow something from frame to frame."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.geometry.grid import Window
+from photoplan.io.series_file import Frame, Group
+from photoplan.io.series_pixels import frame_pixels, split
+from photoplan.products.characterise_data import SeriesData
+
+__all__ = ["FrameGroup", "central_window", "frame_groups"]
+
+
+@dataclass(frozen=True)
+class FrameGroup:
+    """The frames of one ``[[frames]]`` entry, in the order of their names (numbers in them by value)."""
+
+    group: Group
+    frames: tuple[Frame, ...]
+
+    @property
+    def label(self) -> str:
+        """Its name, else its number among the entries."""
+        return self.group.entry.name or f"entry {self.group.index + 1}"
+
+    def times(self) -> NDArray[np.float64]:
+        """Time of each frame, seconds since the first.
+
+        Raises
+        ------
+        InputError
+            A frame has no time, or one that does not come after the frame before.
+        """
+        for frame in self.frames:
+            if frame.time_s is None:
+                raise InputError(
+                    f"{self.group.label}: {frame.file.name} has no time; give a field {{time_s}} in the name, a table "
+                    'with a column time_s, or time_from = "exif"'
+                )
+        t = np.array([frame.time_s for frame in self.frames], float)
+        back = np.flatnonzero(np.diff(t) <= 0.0)
+        if back.size:
+            k = int(back[0])
+            raise InputError(
+                f"{self.group.label}: {self.frames[k + 1].file.name} has the time {t[k + 1]:.10g} s, which does not "
+                f"come after {t[k]:.10g} s of {self.frames[k].file.name} before it; correct the times"
+            )
+        return np.asarray(t - t[0])
+
+    def pixels(self, data: SeriesData, window: Window | None = None) -> Iterator[dict[str, NDArray[Any]]]:
+        """Pixels of a window (the roi) of every frame, by plane."""
+        window = self.group.window if window is None else window
+        for frame in self.frames:
+            image = frame_pixels(frame, window)
+            data.watch(1)
+            yield {plane.name: split(image, plane, window) for plane in data.planes}
+
+    def number(self, key: str, default: float, low: float, high: float) -> float:
+        """A number among the entry's values.
+
+        Raises
+        ------
+        InputError
+            It is no number, or outside of what is allowed.
+        """
+        value = self.group.entry.values.get(key, default)
+        if isinstance(value, str) or not low <= value <= high:
+            raise InputError(
+                f"{self.group.label}: values.{key} is {value!r}; a number from {low:g} to {high:g} is needed"
+            )
+        return float(value)
+
+    def word(self, key: str, allowed: tuple[str, ...]) -> str:
+        """A word among the entry's values; the first allowed one where it has none.
+
+        Raises
+        ------
+        InputError
+            It is another word.
+        """
+        value = self.group.entry.values.get(key, allowed[0])
+        if value not in allowed:
+            raise InputError(f"{self.group.label}: values.{key} is {value!r}; allowed are {', '.join(allowed)}")
+        return str(value)
+
+    def has(self, key: str) -> bool:
+        """Whether the entry states a value."""
+        return key in self.group.entry.values
+
+
+def frame_groups(data: SeriesData, kind: str) -> tuple[FrameGroup, ...]:
+    """Entries with frames of a kind, in the order of the file."""
+    found: dict[int, list[Frame]] = {}
+    for frame in data.series.of(kind):
+        found.setdefault(frame.group.index, []).append(frame)
+    return tuple(FrameGroup(frames[0].group, tuple(sorted(frames, key=_natural))) for frames in found.values())
+
+
+def _natural(frame: Frame) -> tuple[tuple[int, str | int], ...]:
+    parts = re.split(r"(\d+)", frame.file.name)
+    return tuple((1, int(p[:15])) if p.isdigit() and p.isascii() else (0, p) for p in parts)
+
+
+def central_window(window: Window, side: int, where: str) -> Window:
+    """A square in the middle of a window.
+
+    Raises
+    ------
+    InputError
+        The window is smaller.
+    """
+    if side > min(window.width, window.height):
+        raise InputError(
+            f"{where}: a window of {side} × {side} pixels in an area of {window.width} × {window.height}; state "
+            "a smaller values.window"
+        )
+    return Window(window.col + (window.width - side) // 2, window.row + (window.height - side) // 2, side, side)
