@@ -38,7 +38,7 @@ __all__ = ["MOST_PIXELS", "FormedImage", "ImageModel", "form_image", "form_serie
 
 _Array = NDArray[np.float64]
 #: Pixels × bands of an image that is formed: it is held in memory several times as float64.
-MOST_PIXELS = 100_000_000
+MOST_PIXELS = 40_000_000
 
 
 @dataclass(frozen=True)

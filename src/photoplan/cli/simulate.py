@@ -1,0 +1,64 @@
+"""`photoplan simulate`: form images of a scene by a described camera."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photoplan.cli.options import json_option
+
+__all__ = ["command"]
+
+
+@click.command("simulate")
+@click.argument("scene", metavar="SCENE")
+@click.option(
+    "--model", type=click.Path(path_type=Path), metavar="FILE", help="Describes the camera [changes nothing]."
+)
+@click.option("--output", type=click.Path(path_type=Path), metavar="FILE", help="TIFF to write [SCENE_simulated.tif].")
+@click.option("--frames", type=int, default=1, show_default=True, metavar="N", help="Images to form; numbered files.")
+@click.option("--seed", type=int, metavar="N", help="Of all that is random [the model's, else 0].")
+@click.option("--exposure", type=float, multiple=True, metavar="FACTOR",
+              help="Of light and time; once, or once for each frame [1].")  # fmt: skip
+@click.option("--size", type=click.IntRange(1, 100_000), nargs=2, metavar="WIDTH HEIGHT",
+              help="Of a pattern [512 512].")  # fmt: skip
+@click.option("--levels", type=float, nargs=2, metavar="DARK BRIGHT", help="Values of a pattern [0 1].")
+@click.option("--phase", type=float, nargs=2, metavar="X Y",
+              help="Pixels by which a pattern is moved from the middle [0 0].")  # fmt: skip
+@click.option("--oversampling", type=click.IntRange(1, 64), metavar="K",
+              help="Cells of the scene along a side of a pixel [1 for files, 8 for patterns].")  # fmt: skip
+@click.option("--dtype", type=click.Choice(["uint8", "uint16", "float32"]), help="Of the files [as the model says].")
+@click.option("--overwrite", is_flag=True, help="Replace images that exist.")
+@click.option("--dry-run", is_flag=True, help="Check everything, say what would be written, write nothing.")
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+def command(scene: str, as_json: bool, quiet: bool, **options: Any) -> None:
+    """Form images of a scene with blur, noise, jitter, blooming and all else that a camera does.
+
+    SCENE is an image file, or a pattern: flat, edge:ANGLE, bars:PERIOD,ANGLE, star:SECTORS, wedge:STEPS or
+    discs:PITCH,DIAMETER.
+    """
+    from photoplan.cli.progress import progress
+    from photoplan.products.simulate import SimulateRequest, simulate
+
+    report = simulate(SimulateRequest(scene, **options), lambda total: progress(total, quiet, "images"))
+    if as_json:
+        click.echo(json.dumps(report.to_dict(), indent=2, ensure_ascii=False))
+    else:
+        for image in report.images:
+            click.echo(str(image.path))
+    if quiet:
+        return
+    if options["dry_run"]:
+        click.echo("dry run: nothing was written", err=True)
+    along = " ".join(f"{axis} {value:.4f}" for axis, value in zip("xy", report.mtf50))
+    click.echo(
+        f"{len(report.images)} images of {report.bands} × {report.size[0]} × {report.size[1]} pixels, {report.dtype} · "
+        f"MTF50 of the model: {along} cycles per pixel",
+        err=True,
+    )
+    for note in report.notes:
+        click.echo(note, err=True)

@@ -1,0 +1,81 @@
+"""Images that are in memory as a whole, written as TIFF; the name holds the old or the whole new file."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+
+from photoplan.errors import PhotoplanError, UsageError
+from photoplan.io.disk import disk_error, sync_file, sync_folder
+from photoplan.io.gdal import GDAL_ERRORS, gdal_settings
+
+__all__ = ["write_whole_image"]
+
+_TYPES = ("uint8", "uint16", "int16", "float32")
+
+
+def write_whole_image(path: Path, values: NDArray[Any], tags: Mapping[str, str] | None = None) -> None:
+    """Write an image without place on the map and without nodata: every value is a value.
+
+    Parameters
+    ----------
+    path
+        The file; replaced if it is there.
+    values
+        Shape (height, width) or (bands, height, width); uint8, uint16, int16 or float32.
+    tags
+        Tags of the file.
+
+    Raises
+    ------
+    UsageError
+        The type of the values is another, or the folder cannot be written.
+    ResourceError
+        The disk is full.
+    """
+    bands = values[None] if values.ndim == 2 else values
+    if bands.ndim != 3 or bands.dtype.name not in _TYPES:
+        raise UsageError(f"{path}: pixels of type {bands.dtype}, shape {values.shape}; allowed are {', '.join(_TYPES)}")
+    part = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tif")
+    profile: dict[str, Any] = {
+        "driver": "GTiff",
+        "width": bands.shape[2],
+        "height": bands.shape[1],
+        "count": bands.shape[0],
+        "dtype": bands.dtype.name,
+        "compress": "deflate",
+        "predictor": 3 if bands.dtype.kind == "f" else 2,
+        "bigtiff": "IF_SAFER",
+    }
+    if min(bands.shape[1:]) >= 256:
+        profile |= {"tiled": True, "blockxsize": 256, "blockysize": 256}
+    try:
+        try:
+            with gdal_settings(GDAL_PAM_ENABLED=False), rasterio.open(part, "w", **profile) as dataset:
+                dataset.write(bands)
+                dataset.update_tags(**dict(tags or {}))
+            sync_file(part)
+            _check(part, bands, path)
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+        sync_folder(path.parent)
+    except OSError as error:
+        raise disk_error(path, error) from error
+    except GDAL_ERRORS as error:
+        raise disk_error(path, OSError(0, f"{error}")) from error
+
+
+def _check(part: Path, bands: NDArray[Any], path: Path) -> None:
+    """Read the file again: a late error of the disk would show in its last block."""
+    with gdal_settings(), rasterio.open(part) as dataset:
+        last = dataset.read(window=rasterio.windows.Window(0, bands.shape[1] - 1, bands.shape[2], 1))
+    if not np.array_equal(last[:, 0], bands[:, -1], equal_nan=bands.dtype.kind == "f"):
+        raise PhotoplanError(f"{path}: the last line was not kept on the disk; run the command again")
