@@ -45,8 +45,8 @@ def _run(data: SeriesData, run: Run) -> Outcome:
         )
     images: dict[str, list[np.ndarray]] = {plane.name: [] for plane in data.planes}
     for setting in run.settings:
-        for name, stack in data.stacks(setting).items():
-            images[name].append(stack.mean.astype(np.float32))
+        for name, image in data.mean_images(setting).items():
+            images[name].append(image)
     return joined(
         [
             tried(

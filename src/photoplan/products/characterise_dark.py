@@ -48,7 +48,8 @@ def _plane(data: SeriesData, plane: Plane) -> Outcome:
         outcomes.append(
             tried(key, lambda s=settings, v=levels, t=temperature, a=at: _current(s, v, plane.name, (t, a), currents))  # type: ignore[misc]
         )
-    outcomes.append(_doubling(currents, plane.name))
+    stated = [temperature for temperature in by_temperature if temperature is not None]
+    outcomes.append(_doubling(currents, plane.name, len(stated)))
     return joined(outcomes)
 
 
@@ -97,12 +98,16 @@ def _current(
     )
 
 
-def _doubling(currents: Currents, name: str) -> Outcome:
+def _doubling(currents: Currents, name: str, stated: int) -> Outcome:
     known = {t: c for t, c in currents.items() if t is not None}
     key = prefix("doubling temperature", name)
+    if stated < 2:
+        why = f"the dark frames state {stated} temperatures; two or more are needed (temperature_c)"
+        return Outcome(refused={"doubling temperature": why})
     if len(known) < 2:
-        have = f"{len(known)} temperature" + ("" if len(known) == 1 else "s")
-        return Outcome(refused={key: f"dark currents at {have}; two are needed: give temperature_c for dark frames"})
+        return Outcome(
+            refused={key: f"a dark current is known at {len(known)} of {stated} temperatures; two are needed"}
+        )
     temperatures = sorted(known)
     values = [known[t].current_dn_s for t in temperatures]
     sigmas = [known[t].current_dn_s_sigma for t in temperatures]

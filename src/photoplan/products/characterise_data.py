@@ -95,6 +95,14 @@ class SeriesData:
             self._levels[key] = {name: stack.level for name, stack in self._last[key].items()}
         return self._last[key]
 
+    def mean_images(self, setting: Setting) -> dict[str, NDArray[np.float32]]:
+        """Mean images of a condition by plane, whatever pixels count."""
+        sums: dict[str, NDArray[np.float64]] = {}
+        for frame in setting.frames:
+            for name, pixels in self.pixels(frame).items():
+                sums[name] = sums[name] + pixels if name in sums else pixels.astype(np.float64)
+        return {name: (total / len(setting.frames)).astype(np.float32) for name, total in sums.items()}
+
     def levels(self, setting: Setting) -> dict[str, Level]:
         """Summaries of a condition by plane; kept, so that frames are read once for all analyses that need no more."""
         key = _key(setting)

@@ -55,9 +55,16 @@ def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
     found = linearity(run.values, signal, sigma, full)
     where = {"plane": plane.name, "at": run.label}
     unit = f"DN/{run.unit}"
+    count = f"{np.count_nonzero(found.used)} levels"
     figures = [
         Figure(
-            "linearity_error_percent", found.error_percent, found.error_percent_sigma, "linearity error", "%", **where
+            "linearity_error_percent",
+            found.error_percent,
+            found.error_percent_sigma,
+            "linearity error",
+            "%",
+            remark=count,
+            **where,
         ),
         Figure("response", found.slope, found.slope_sigma, "response", unit, **where),
     ]

@@ -108,14 +108,16 @@ def _plots(found: PhotonTransfer, name: str) -> tuple[Chart, ...]:
     bias = found.bias_dn if np.isfinite(found.bias_dn) else 0.0
     signal = found.mean - bias
     rest = ~found.used
-    grid = np.geomspace(max(signal[signal > 0].min(), 1e-3), signal.max(), 100)
+    least = max(0.1, 1e-5 * float(signal.max()))
+    seen = (signal > least) & (found.variance > 0)
+    grid = np.geomspace(max(float(signal[seen].min()), least), float(signal.max()), 100)
     curves = [Curve(signal[found.used], found.variance[found.used], "used", colour=0)]
     if rest.any():
         curves.append(Curve(signal[rest], found.variance[rest], "not used", colour=3))
     line = Curve(grid, found.line.at(grid + bias), "line", "dashed", colour=1)
     log = [
         Curve(signal[k], np.sqrt(found.variance[k]), label, colour=c)
-        for k, label, c in ((found.used & (signal > 0), "used", 0), (rest & (signal > 0), "not used", 3))
+        for k, label, c in ((found.used & seen, "used", 0), (rest & seen, "not used", 3))
         if k.any()
     ]
     model = Curve(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from math import nan, sqrt
 from typing import Any
 
@@ -76,36 +77,44 @@ def find_blooming(
     Raises
     ------
     InputError
-        There are fewer than four exposures, no two of them leave the object unsaturated, none saturates it, or there is
-        no dark surrounding.
+        There are fewer than four exposures, no two of them leave the object unsaturated, there is no dark surrounding,
+        or nothing blooms and no exposure would saturate the object.
     """
     if len(exposures) < 4 or (np.diff(exposures) <= 0).any():
         raise InputError(f"{len(exposures)} exposures; blooming needs four that increase")
     span = saturation - black
-    tops = [float(np.percentile(image, 99.5)) - black for image in images]
+    tops = [_brightest(image) - black for image in images]
     safe = [k for k, top in enumerate(tops) if top <= _SAFE * span]
     if len(safe) < 2:
         raise InputError(
             f"{len(safe)} exposures in which the bright object is below half of saturation; blooming needs two or more"
         )
-    if tops[-1] < 0.95 * span:
-        raise InputError("the bright object does not reach saturation at the longest exposure; expose it longer")
     response = _response(exposures, images, safe, black)
     bright = _object(response)
     near = _neighbours(response, bright)
-    of_object = float(response[bright].mean())
+    inside = response[bright]
+    of_object = float(inside[inside >= 0.9 * np.percentile(inside, 90)].mean())
     times = np.array(exposures, float)
     excess = np.array([float((image[near] - black - response[near] * t).mean()) for image, t in zip(images, times)])
     sigma = _sigmas(images, times, response, near, safe, black)
     usable = np.array([float(np.median(image[near])) - black < 0.95 * span for image in images])
     object_dn = of_object * times
     onset, onset_sigma, last = _onset(object_dn, excess, sigma, usable)
+    if not np.isfinite(onset) and object_dn[-1] < 0.95 * span:
+        raise InputError(
+            f"no blooming, but the bright object reaches only {object_dn[-1]:.4g} DN of {span:.4g}; expose it longer"
+        )
     threshold = max(_SIGNIFICANT * float(sigma[-1]) * sqrt(near.sum()), 0.03 * span)
     lifted = images[-1] - black - np.minimum(response * times[-1], span) > threshold
     rows, columns = _extent(lifted, bright)
     return Blooming(
         onset, onset_sigma, last, object_dn, excess, sigma, rows, columns, threshold, int(bright.sum()), int(near.sum())
     )
+
+
+def _brightest(image: NDArray[Any]) -> float:
+    """Largest value that more than a pixel has."""
+    return float(ndimage.median_filter(np.asarray(image, np.float32), 3, mode="nearest").max())
 
 
 def _response(
@@ -122,7 +131,7 @@ def _response(
 
 def _object(response: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Pixels of the brightest object: over half of the largest response, the largest connected patch."""
-    top = float(np.percentile(response, 99.9))
+    top = _brightest(response)
     patches, count = ndimage.label(response > 0.5 * top)
     if not count:
         raise InputError("no bright object found")
@@ -176,15 +185,22 @@ def _onset(
     last = float(level[first - 1]) if first else 0.0
     if first >= level.size:
         return nan, nan, last
-    beyond = [k for k in range(first, level.size) if usable[k]][:2]
-    upper = float(level[first])
-    if len(beyond) == 2:
-        slope = (excess[beyond[1]] - excess[beyond[0]]) / (level[beyond[1]] - level[beyond[0]])
-        crossing = float(level[beyond[0]] - excess[beyond[0]] / slope) if slope > 0 else nan
-        if last <= crossing <= upper:
-            spread = float(np.hypot(sigma[beyond[0]] * 2, sigma[beyond[1]]) / slope)
-            return crossing, max(spread, 0.05 * (upper - last)), last
+    beyond = [k for k in range(first, level.size) if usable[k]][:3]
+    upper, before = float(level[first]), float(level[first - 2]) if first > 1 else 0.0
+    crossings = [_crossing(level[[i, j]], excess[[i, j]]) for i, j in pairwise(beyond)]
+    if crossings and before <= crossings[0] <= upper:
+        i, j = beyond[:2]
+        spread = float(np.hypot(2 * sigma[i], sigma[j]) * (level[j] - level[i]) / (excess[j] - excess[i]))
+        # The growth is no straight line: how far the next pair leads elsewhere says by how much.
+        bend = abs(crossings[1] - crossings[0]) if len(crossings) > 1 else (upper - last) / sqrt(12.0)
+        return crossings[0], float(np.hypot(max(spread, 0.1 * (upper - last)), min(bend, upper - last))), last
     return (last + upper) / 2, (upper - last) / sqrt(12.0), last
+
+
+def _crossing(level: NDArray[np.float64], excess: NDArray[np.float64]) -> float:
+    """Where the line through two levels has no excess; NaN where it does not grow."""
+    slope = (excess[1] - excess[0]) / (level[1] - level[0])
+    return float(level[0] - excess[0] / slope) if slope > 0 else nan
 
 
 def _extent(lifted: NDArray[np.bool_], bright: NDArray[np.bool_]) -> tuple[int, int]:

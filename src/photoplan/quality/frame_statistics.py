@@ -42,11 +42,14 @@ class Level:
 
     @property
     def mean_sigma(self) -> float:
-        """Standard deviation of `mean` by temporal noise: that of pixels, and of whole frames where that is larger."""
+        """Standard deviation of `mean`: by the noise of pixels, or of whole frames where that is clearly larger."""
         if self.frames < 2:
             return float("nan")
-        pixel = self.temporal_variance / (self.frames * self.pixels)
-        return float(np.sqrt(max(pixel, self.frame_mean_sigma**2 / self.frames)))
+        of_pixels = self.temporal_variance / self.pixels
+        of_frames = self.frame_mean_sigma**2
+        # About the 1 % point of the scatter that pixels alone would give to the means of so few frames.
+        usual = of_pixels * (1 + 4 * np.sqrt(2 / (self.frames - 1)))
+        return float(np.sqrt((of_frames if of_frames > usual else of_pixels) / self.frames))
 
     @property
     def degrees(self) -> int:

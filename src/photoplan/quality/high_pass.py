@@ -60,8 +60,6 @@ def background(image: NDArray[Any]) -> NDArray[np.float64]:
     y = np.linspace(0, height, rows + 1).astype(int)
     x = np.linspace(0, width, cols + 1).astype(int)
     medians = np.array([[np.median(values[a:b, c:d]) for c, d in pairwise(x)] for a, b in pairwise(y)])
-    if rows > 2 and cols > 2:
-        medians = ndimage.median_filter(medians, 3, mode="nearest")
     middle_y, middle_x = (y[:-1] + y[1:] - 1) / 2, (x[:-1] + x[1:] - 1) / 2
     at_y = np.interp(np.arange(height), middle_y, np.arange(rows))
     at_x = np.interp(np.arange(width), middle_x, np.arange(cols))

@@ -74,10 +74,10 @@ def find_saturation(
         "response": _first_departure(x, signal),
         "variance": None if variance is None else _first_collapse(np.asarray(variance, float)),
     }
+    if found["clipping"] == 0:
+        raise InputError("every level has saturated samples; take shorter exposures")
     known = {rule: k for rule, k in found.items() if k is not None and k > 0}
     if not known:
-        if found["clipping"] == 0:
-            raise InputError("every level has saturated samples; take shorter exposures")
         return None
     rule = min(known, key=lambda name: (known[name], list(known).index(name)))
     first = known[rule]

@@ -90,10 +90,9 @@ class ChartDrawer:
         axes = fig.subplots()
         for k, curve in enumerate(chart.curves):
             _draw_curve(axes, curve, COLOURS[(k if curve.colour is None else curve.colour) % len(COLOURS)])
-        if chart.log_x:
-            axes.set_xscale("log")
-        if chart.log_y:
-            axes.set_yscale("log")
+        for name, wanted in (("x", chart.log_x), ("y", chart.log_y)):
+            if wanted:
+                self._logarithmic(axes, name)
         for where, what in chart.marks:
             axes.axvline(where, color=SOFT, linewidth=0.9, linestyle=":")
             axes.annotate(what, (where, 0.98), (3, 0), xycoords=("data", "axes fraction"), textcoords="offset points",
@@ -104,11 +103,22 @@ class ChartDrawer:
             fig.legend(loc="outside upper left", ncols=min(4, labelled), fontsize=8)
         return png(fig)
 
+    def _logarithmic(self, axes: Any, name: str) -> None:
+        """A logarithmic axis with plain numbers; 2 and 5 are named too where it covers few decades."""
+        getattr(axes, f"set_{name}scale")("log")
+        low, high = getattr(axes, f"get_{name}lim")()
+        axis = getattr(axes, f"{name}axis")
+        steps = (1.0, 2.0, 5.0) if high < 400 * low else (1.0,)
+        ticker = self._mpl.ticker
+        axis.set_major_locator(ticker.LogLocator(base=10.0, subs=steps))
+        axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(ticker.NullFormatter())
+
     def _picture(self, picture: Picture) -> bytes:
         values = np.asarray(picture.values, np.float64)
         factor = max(1, -(-max(values.shape) // _SIDE))
         known = values[np.isfinite(values)]
-        low, high = picture.limits or (tuple(np.percentile(known, [0.5, 99.5])) if known.size else (0.0, 1.0))
+        low, high = picture.limits or _limits(known)
         small = _reduced(values, factor)
         height, width = values.shape
         left, right, bottom, top = picture.extent or (-0.5, width - 0.5, height - 0.5, -0.5)
@@ -116,7 +126,7 @@ class ChartDrawer:
         fig = self._mpl.figure.Figure(figsize=(_SIZE[0], tall + 0.6), layout="constrained")
         axes = fig.subplots()
         aspect = "equal" if picture.extent is None else "auto"
-        options = {"cmap": "gray", "vmin": low, "vmax": max(high, low + 1e-12), "interpolation": "nearest"}
+        options = {"cmap": "gray", "vmin": low, "vmax": high, "interpolation": "nearest"}
         shown = axes.imshow(small, extent=(left, right, bottom, top), aspect=aspect, **options)
         axes.grid(False)
         if picture.points:
@@ -140,6 +150,16 @@ def _draw_curve(axes: Any, curve: Curve, colour: str) -> None:
         axes.plot(x, y, linewidth=line, marker="o", markersize=3.6, **options)
     if curve.sigma is not None:
         axes.errorbar(x, y, yerr=curve.sigma, fmt="none", ecolor=colour, elinewidth=0.9, capsize=2)
+
+
+def _limits(known: NDArray[np.float64]) -> tuple[float, float]:
+    """What a scale shows: nearly all values; where nearly all are equal, all."""
+    if not known.size:
+        return 0.0, 1.0
+    low, high = (float(v) for v in np.percentile(known, [0.5, 99.5]))
+    if high - low < 1e-9 * max(abs(high), 1.0):
+        low, high = float(known.min()), float(known.max())
+    return low, high if high > low else low + 1.0
 
 
 def _reduced(values: NDArray[np.float64], factor: int) -> NDArray[np.float64]:
