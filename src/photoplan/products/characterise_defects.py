@@ -140,7 +140,7 @@ def _growth(data: SeriesData, setting: Setting, plane: Plane, found: DefectList)
             "rate of the hottest pixel",
             "DN/s",
             plane.name,
-            f"column {places[0][0]}, row {places[0][1]}",
+            remark=f"column {places[0][0]}, row {places[0][1]}",
         ),
     )
     curves = tuple(
