@@ -8,6 +8,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
+from photoplan.quality.usaf_layout import usaf_layout
+
 
 def gauss_box(sigma):
     """MTF of a Gaussian of a standard deviation in pixels and a square pixel: a function of fx and fy."""
@@ -77,3 +79,40 @@ def rectangle(shape, x0, y0, x1, y1, sigma):
     across = box_edge(x - x0, sigma) - box_edge(x - x1, sigma)
     down = box_edge(y - y0, sigma) - box_edge(y - y1, sigma)
     return np.outer(down, across)
+
+
+def usaf_chart(shape, scale, origin, sigma=0.7, turn=0.0, mirrored=False, low=30.0, high=200.0, groups=6, over=6):
+    """A USAF-1951 target: `scale` pixels a period of its first element, its centre at `origin`."""
+    c, s = np.cos(turn), np.sin(turn)
+    matrix = scale * np.array([[c, -s], [s, c]]) @ np.diag([-1.0 if mirrored else 1.0, 1.0])
+    inverse = np.linalg.inv(matrix)
+
+    def draw(x, y):
+        bright = np.zeros((y.size, x.size), bool)
+        for item in usaf_layout(groups):
+            middle, reach = matrix @ [item.x, item.y] + origin, 1.8 * scale * item.period
+            rows = slice(*np.searchsorted(y[:, 0], [middle[1] - reach, middle[1] + reach]))
+            columns = slice(*np.searchsorted(x[0], [middle[0] - reach, middle[0] + reach]))
+            dx, dy = x[:, columns] - middle[0], y[rows] - middle[1]
+            across, along = (inverse[k, 0] * dx + inverse[k, 1] * dy for k in (0, 1))
+            across, along = across / item.period, along / item.period
+            if item.horizontal:
+                across, along = along, across
+            inside = (np.abs(across) <= 1.25) & (np.abs(along) <= 1.25)
+            bright[rows, columns] |= inside & (np.abs(across - np.round(across)) <= 0.25)
+        return low + (high - low) * bright
+
+    return formed(draw, shape, sigma, over)
+
+
+def three_bars(period, sigma):
+    """Contrast of three long bars along the pixels: mean of their middles less mean of the gaps' middles, exact."""
+
+    def profile(t):
+        return sum(
+            box_edge(t - (k - 0.25) * period, sigma) - box_edge(t - (k + 0.25) * period, sigma) for k in (-1, 0, 1)
+        )
+
+    return float(
+        np.mean([profile(k * period) for k in (-1, 0, 1)]) - np.mean([profile(k * period) for k in (-0.5, 0.5)])
+    )

@@ -14,7 +14,7 @@ from photoplan.cli.failures import end_with_failures
 __all__ = ["edge_options", "pattern_options", "run_patterns"]
 
 #: Options that speak of edges only, and those that speak of patterns only.
-_OF_EDGES = {"lab", "flight", "grid", "most_edges", "least_length", "least_snr"}
+_OF_EDGES = {"lab", "flight", "grid", "most_edges", "least_length", "least_snr", "half_width"}
 _OF_PATTERNS = {"sectors", "group", "levels", "coltman"}
 
 

@@ -126,7 +126,7 @@ def measure_star(
     full = (high - low) / 2.0 * (4.0 / pi if wave == "square" else 1.0) / ((high + low) / 2.0)
     directional = {}
     for k in range(rules.directions):
-        parts = [_direction(pixels, r, w, k, rules.directions, sectors) for r, w in _radii(inner, outer)]
+        parts = [_direction(pixels, r, w, k, rules.directions, sectors) for r, w in _radii(inner, outer, 1.25)]
         kept = [ring for ring in parts if ring is not None]
         if len(kept) >= 2:
             directional[degrees(pi * k / rules.directions)] = _curve(kept, sectors, full)
@@ -169,12 +169,12 @@ def _extent(values: Array, pixels: StarPixels, sectors: int, outer: float) -> fl
     return outer if reach >= outer - 3.0 else reach - 3.0
 
 
-def _radii(inner: float, outer: float) -> list[tuple[float, float]]:
-    """Radii of rings and half their width: frequencies in even steps of 0.02, rings of a pixel at least."""
+def _radii(inner: float, outer: float, least: float = 0.75) -> list[tuple[float, float]]:
+    """Radii of rings and half their widths: 3 % of the radius, and `least` pixels at least."""
     radii: list[tuple[float, float]] = []
     r = outer - 1.0
     while r > inner and len(radii) < 400:
-        half = float(np.clip(0.03 * r, 0.75, 6.0))
+        half = float(np.clip(0.03 * r, least, 6.0))
         radii.append((r - half, half))
         r -= 2.0 * half
     return radii[:-1] if len(radii) > 1 and radii[-1][0] < inner else radii
@@ -187,7 +187,7 @@ def _direction(pixels: StarPixels, radius: float, half: float, k: int, count: in
     away = (angle + pi / 2.0 - pi * k / count + pi / 2.0) % pi - pi / 2.0
     reach = max(pi / count / 2.0, 1.5 * pi / sectors)
     part = np.abs(away) <= reach
-    if reach > pi / 4.0 or part.sum() < 24:
+    if reach > pi / 4.0 or part.sum() < 20:
         return None
     try:
         ring = fit_ring(values[part], angle[part], radius, sectors, whole=False)

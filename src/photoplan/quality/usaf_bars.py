@@ -24,6 +24,8 @@ _MIDDLE = 0.75
 _REACH = 0.125
 #: Bars with fewer cycles per pixel have levels of their own; those with more are measured by their waves.
 _WIDE = 0.1
+#: Cycles per pixel of the highest harmonic wave that is fitted.
+_LAST_WAVE = 0.8
 
 
 @dataclass(frozen=True)
@@ -201,15 +203,36 @@ def _wide(u: Array, light: Array) -> tuple[float, float, bool]:
 
 
 def _fine(u: Array, light: Array, frequency: float) -> tuple[float, float, bool]:
-    """Difference of bars and gaps by waves with the bars' period, beside a level with slope and curvature."""
-    waves = [k for k in (1, 3) if k * frequency < 0.42]
+    """Difference of bars and gaps by waves with the bars' period, beside a level with slope and curvature.
+
+    Harmonic waves are taken in as far as blur leaves them and the places of the pixels tell them apart.
+    """
     turn = 2.0 * pi * u
     columns = [np.ones_like(u), u, u**2]
     # The level's curvature is the same for bars and gaps but for their mean squares, 2/3 and 1/4.
     weights = [0.0, 0.0, 2.0 / 3.0 - 0.25]
-    for k in waves or [1]:
+    best: tuple[float, float] | None = None
+    least = np.inf
+    for k in (1, 3, 5):
+        if best is not None and k * frequency > _LAST_WAVE:
+            break
         columns += [np.cos(k * turn), np.sin(k * turn)]
         weights += [2.0, 0.0]
-    solution, covariance, _ = least_squares(np.stack(columns, axis=1), light)
-    combine = np.array(weights)
-    return float(combine @ solution), sqrt(max(float(combine @ covariance @ combine), 0.0)), False
+        if u.size < 2 * len(columns):
+            break
+        try:
+            solution, covariance, residuals = least_squares(np.stack(columns, axis=1), light)
+        except InputError:
+            break
+        combine = np.array(weights)
+        variance = max(float(combine @ covariance @ combine), 0.0)
+        # What the places of the pixels alone make of noise.
+        power = float(residuals @ residuals) / max(u.size - len(columns), 1)
+        spread = variance / power if power > 0.0 else least
+        if best is not None and spread > 3.0 * least:
+            break
+        least = min(least, spread)
+        best = float(combine @ solution), sqrt(variance)
+    if best is None:
+        raise InputError("too few pixels for three bars")
+    return *best, False

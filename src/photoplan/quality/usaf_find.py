@@ -200,11 +200,10 @@ def _matches(
     units = np.array([[0.0, 1.0] if item.horizontal else [1.0, 0.0] for item in items]) @ matrix.T
     steps = np.hypot(units[:, 0], units[:, 1])
     periods = steps * np.array([item.period for item in items])
-    found = []
-    for t, three in enumerate(threes):
-        away = np.hypot(*(places - three.centre).T)
-        aligned = np.abs(units @ three.across) / steps
-        fits = (away < tolerance * periods) & (np.abs(three.period / periods - 1.0) < 0.1) & (aligned > 0.97)
-        if fits.any():
-            found.append((t, int(np.where(fits, away, np.inf).argmin())))
-    return found
+    centres = np.array([three.centre for three in threes])
+    away = np.hypot(*(places[None, :, :] - centres[:, None, :]).transpose(2, 0, 1))
+    aligned = np.abs(np.array([three.across for three in threes]) @ units.T) / steps
+    same = np.abs(np.array([three.period for three in threes])[:, None] / periods - 1.0) < 0.1
+    away[~((away < tolerance * periods) & same & (aligned > 0.97))] = np.inf
+    nearest = away.argmin(axis=1)
+    return [(t, int(k)) for t, k in enumerate(nearest) if np.isfinite(away[t, k])]
