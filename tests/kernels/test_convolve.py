@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.convolve import round_clipped
 from photoplan.quality.borders import Margin
@@ -31,6 +32,13 @@ def padded(image):
     return np.pad(image.astype(np.float32), ((0, 0), (LEFT, RIGHT)))
 
 
+def convolved(image, values, margin):
+    convolution = Convolution(FilterKernel(values))
+    out = np.empty((image.shape[0] - 2 * margin[1], image.shape[1] - 2 * margin[0]), np.float32)
+    assert convolution(padded(image), margin, out) == (0, 0)
+    return out
+
+
 def even(values):
     both = values + values[::-1]
     return both + both[:, ::-1]
@@ -44,9 +52,8 @@ def test_convolution_is_the_plain_sum(shape, symmetric):
     values = even(values) if symmetric else values
     m, n = (side // 2 for side in shape)
     image = rng.uniform(0, 65535, (7 + 2 * m, 70 + 2 * n))
-    convolution = Convolution(FilterKernel(values))
-    assert convolution.even == (symmetric or shape == (1, 1))
-    made = convolution(padded(image), (n, m))
+    assert Convolution(FilterKernel(values)).even == (symmetric or shape == (1, 1))
+    made = convolved(image, values, (n, m))
     bound = ROUNDING * sum(shape) * np.abs(values).sum() * 65535
     np.testing.assert_allclose(made, plain_convolution(image.astype(np.float32), values), atol=bound, rtol=0)
 
@@ -55,9 +62,9 @@ def test_a_margin_wider_than_the_kernel_changes_nothing():
     rng = np.random.default_rng(0)
     values = rng.normal(size=(3, 5))
     image = rng.uniform(0, 255, (20, 30))
-    wide = Convolution(FilterKernel(values))(padded(image), (4, 3))
-    narrow = Convolution(FilterKernel(values))(padded(image[2:-2, 2:-2]), (2, 1))
-    assert np.array_equal(wide, narrow)
+    assert np.array_equal(convolved(image, values, (4, 3)), convolved(image[2:-2, 2:-2], values, (2, 1)))
+    with pytest.raises(UsageError, match="a margin of"):
+        convolved(image, values, (1, 1))
 
 
 def test_values_that_differ_by_rounding_alone_count_as_symmetric():
@@ -72,7 +79,7 @@ def test_the_widest_kernel_of_all():
     rng = np.random.default_rng(1)
     values = rng.normal(size=(101, 101)) / 101
     image = rng.uniform(0, 255, (102, 103))
-    made = Convolution(FilterKernel(values))(padded(image), (50, 50))
+    made = convolved(image, values, (50, 50))
     np.testing.assert_allclose(
         made, plain_convolution(image, values), atol=ROUNDING * 202 * np.abs(values).sum() * 255, rtol=0
     )

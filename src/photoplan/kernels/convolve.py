@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.kernels.jit import kernel
+from photoplan.kernels.jit import inner, kernel
 
 __all__ = ["CHUNK", "EVEN_TAPS", "GENERAL_TAPS", "convolve_even", "convolve_general", "round_clipped"]
 
@@ -21,7 +21,32 @@ CHUNK = 64
 #: Columns of weights that are unrolled together; a tag of that length selects the compiled code.
 GENERAL_TAPS = (5, 11)
 #: The same for one half of an even kernel, without its middle.
-EVEN_TAPS = (4, 5)
+EVEN_TAPS = (5,)
+
+
+@inner
+def _finish(
+    total: NDArray[np.float32], valid: NDArray[np.bool_], limits: tuple[Any, ...], y: int, out: NDArray[Any]
+) -> tuple[int, int]:
+    """Round a line of sums, clip it, and write it to row y of `out`; see `round_clipped` for what is counted."""
+    low, high = np.float32(limits[0]), np.float32(limits[1])
+    below, above = 0, 0
+    if low > high:
+        for x in range(out.shape[1]):
+            out[y, x] = total[x]
+        return below, above
+    everywhere = valid.shape[0] == 0
+    for x in range(out.shape[1]):
+        size = abs(total[x])
+        whole = np.floor(size)
+        # The difference is exact, whereas size + 0.5 may be rounded up to the next whole number.
+        whole += np.float32(1.0) if size - whole >= np.float32(0.5) else np.float32(0.0)
+        value = -whole if total[x] < 0 else whole
+        counts = everywhere or valid[y, x]
+        below += value < low and counts
+        above += value > high and counts
+        out[y, x] = np.int32(min(max(value, low), high))
+    return below, above
 
 
 @kernel
@@ -30,8 +55,10 @@ def convolve_general(
     start: tuple[int, int],
     weights: NDArray[np.float32],
     taps_tag: tuple[Any, ...],
-    out: NDArray[np.float32],
-) -> None:
+    valid: NDArray[np.bool_],
+    limits: tuple[float, float],
+    out: NDArray[Any],
+) -> tuple[int, int]:
     """Sum of weights times pixels: out[y, x] = Σ weights[i, k] · source[row + y + i, column + x + k].
 
     Parameters
@@ -44,13 +71,21 @@ def convolve_general(
         The columns are a multiple of the tag's length, filled up with zeros.
     taps_tag : tuple
         Its length is how many columns of weights are summed in one pass.
-    out : (height, width) float32
+    valid, limits
+        As in `round_clipped`; limits with low > high: sums are written as they are, and `out` is float32.
+    out : (height, width)
+
+    Returns
+    -------
+    below, above : int
+        Clipped pixels, see `round_clipped`.
     """
     height, width = out.shape
     taps = len(taps_tag)
     rows, columns = weights.shape
     span = (width + CHUNK - 1) // CHUNK * CHUNK
     total = np.empty(span, np.float32)
+    below, above = 0, 0
     for y in range(height):
         for x in range(span):
             total[x] = np.float32(0.0)
@@ -64,8 +99,10 @@ def convolve_general(
                         # Unsigned: a negative index would count from the end, and that test would forbid vectors.
                         value += weights[i, first + k] * part[np.uintp(x) + np.uintp(k)]
                     total[x] = value
-        for x in range(width):
-            out[y, x] = total[x]
+        counted = _finish(total, valid, limits, y, out)
+        below += counted[0]
+        above += counted[1]
+    return below, above
 
 
 @kernel
@@ -74,48 +111,60 @@ def convolve_even(
     start: tuple[int, int],
     weights: NDArray[np.float32],
     taps_tag: tuple[Any, ...],
-    out: NDArray[np.float32],
-) -> None:
+    valid: NDArray[np.bool_],
+    limits: tuple[float, float],
+    out: NDArray[Any],
+) -> tuple[int, int]:
     """The same for kernels that are even in both directions: equal rows are added first, then equal columns.
 
     Parameters
     ----------
-    source, taps_tag, out
-        As in `convolve_general`.
+    source, taps_tag, valid, limits, out
+        As in `convolve_general`, which also says what is returned.
     start : (row, column)
         Pixel of `source` under the upper left corner of the whole kernel, zeros included, for the first result.
     weights : (m + 1, n + 1) float32
-        Middle row and column first; n is a multiple of the tag's length.
+        Middle row and column first; n is a multiple of the tag's length, and not 0.
     """
     height, width = out.shape
     taps = len(taps_tag)
     m, n = weights.shape[0] - 1, weights.shape[1] - 1
     span = (width + CHUNK - 1) // CHUNK * CHUNK
     total = np.empty(span, np.float32)
+    below, above = 0, 0
     folded = np.empty(span + 2 * n, np.float32)
+    middle = folded[n:]
     for y in range(height):
         for x in range(span):
             total[x] = np.float32(0.0)
         for i in range(m + 1):
-            above, below = source[start[0] + y + m - i, start[1] :], source[start[0] + y + m + i, start[1] :]
+            first_line, second_line = source[start[0] + y + m - i, start[1] :], source[start[0] + y + m + i, start[1] :]
             if i == 0:
                 for x in range(span + 2 * n):
-                    folded[x] = above[x]
+                    folded[x] = first_line[x]
             else:
                 for x in range(span + 2 * n):
-                    folded[x] = above[x] + below[x]
-            for x in range(span):
-                total[x] += weights[i, 0] * folded[np.uintp(x) + np.uintp(n)]
+                    folded[x] = first_line[x] + second_line[x]
             for first in range(1, n + 1, taps):
                 left, right = folded[n - first - taps + 1 :], folded[n + first :]
-                for x in range(span):
-                    value = total[x]
-                    for k in range(taps):
-                        both = left[np.uintp(x) + np.uintp(taps - 1 - k)] + right[np.uintp(x) + np.uintp(k)]
-                        value += weights[i, first + k] * both
-                    total[x] = value
-        for x in range(width):
-            out[y, x] = total[x]
+                if first == 1:
+                    for x in range(span):
+                        value = total[x] + weights[i, 0] * middle[x]
+                        for k in range(taps):
+                            both = left[np.uintp(x) + np.uintp(taps - 1 - k)] + right[np.uintp(x) + np.uintp(k)]
+                            value += weights[i, 1 + k] * both
+                        total[x] = value
+                else:
+                    for x in range(span):
+                        value = total[x]
+                        for k in range(taps):
+                            both = left[np.uintp(x) + np.uintp(taps - 1 - k)] + right[np.uintp(x) + np.uintp(k)]
+                            value += weights[i, first + k] * both
+                        total[x] = value
+        counted = _finish(total, valid, limits, y, out)
+        below += counted[0]
+        above += counted[1]
+    return below, above
 
 
 @kernel
@@ -138,18 +187,9 @@ def round_clipped(
     below, above : int
         Pixels whose rounded value was below `low` and above `high`.
     """
-    low, high = np.float32(limits[0]), np.float32(limits[1])
-    everywhere = valid.shape[0] == 0
     below, above = 0, 0
     for y in range(values.shape[0]):
-        for x in range(values.shape[1]):
-            size = abs(values[y, x])
-            whole = np.floor(size)
-            # The difference is exact, whereas size + 0.5 may be rounded up to the next whole number.
-            whole += np.float32(1.0) if size - whole >= np.float32(0.5) else np.float32(0.0)
-            value = -whole if values[y, x] < 0 else whole
-            counts = everywhere or valid[y, x]
-            below += value < low and counts
-            above += value > high and counts
-            out[y, x] = np.int32(min(max(value, low), high))
+        counted = _finish(values[y], valid, limits, y, out)
+        below += counted[0]
+        above += counted[1]
     return below, above

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from photoplan.geometry.grid import Window
 from photoplan.kernels.extend import extend_oddly
 from photoplan.quality.convolution import LEFT, RIGHT
+from photoplan.quality.scratch import Scratch
 
 __all__ = ["Margin"]
 
@@ -53,7 +55,12 @@ class Margin:
         )
 
     def source(
-        self, window: Window, pixels: NDArray[np.float32], at: Window, valid: NDArray[np.bool_] | None
+        self,
+        window: Window,
+        pixels: NDArray[Any],
+        at: Window,
+        valid: NDArray[np.bool_] | None,
+        scratch: Scratch | None = None,
     ) -> NDArray[np.float32]:
         """Pixels of a window with its margin, all of them finite, as `Convolution` wants them.
 
@@ -62,30 +69,44 @@ class Margin:
         window : Window
             Whose pixels will be filtered.
         pixels : ndarray, shape (bands, at.height, at.width)
-            Values at invalid pixels are of no account.
+            Of any type that float32 holds; values at invalid pixels are of no account.
         at : Window
             Where they are: what `around` said, of the whole image's pixels.
         valid : ndarray of bool, shape (at.height, at.width)
             None: all are.
+        scratch : Scratch, optional
+            Memory for the result, which then holds until the next one.
 
         Returns
         -------
         ndarray, shape (bands, window.height + 2 rows, LEFT + window.width + 2 columns + RIGHT)
         """
-        width, height = window.width + 2 * self.columns, window.height + 2 * self.rows
-        out = np.zeros((pixels.shape[0], height, LEFT + width + RIGHT), np.float32)
-        wide = Window(window.col - self.columns, window.row - self.rows, width, height)
+        wide = Window(
+            window.col - self.columns,
+            window.row - self.rows,
+            window.width + 2 * self.columns,
+            window.height + 2 * self.rows,
+        )
+        shape = (pixels.shape[0], wide.height, LEFT + wide.width + RIGHT)
+        out = np.empty(shape, np.float32) if scratch is None else scratch.array("source", shape)
+        out[..., :LEFT] = 0
+        out[..., LEFT + wide.width :] = 0
         common = wide & at
-        of = _part(common, at)
-        to = _part(common, wide)
-        known = np.zeros((height, width), bool)
-        known[to] = True if valid is None else valid[of]
-        out[:, to[0], LEFT + to[1].start : LEFT + to[1].stop] = np.where(known[to], pixels[:, *of], np.float32(0.0))
-        if not known.all():
-            usable = np.ones((at.height, at.width), bool) if valid is None else valid
-            wanted = self._near(usable, at, wide) & ~known
+        of, to = _part(common, at), _part(common, wide)
+        body = out[..., LEFT : LEFT + wide.width]
+        body[:, *to] = pixels[:, *of]
+        gaps = valid is not None and not valid[of].all()
+        if gaps or (valid is not None and common.size < wide.size):
+            assert valid is not None
+            known = np.zeros((wide.height, wide.width), bool)
+            known[to] = valid[of]
+            body[:, ~known] = 0
+            wanted = self._near(valid, at, wide) & ~known
             place = (wide.row - at.row, wide.col - at.col, LEFT)
-            extend_oddly(np.ascontiguousarray(pixels), usable, wanted, _offsets(self.columns, self.rows), place, out)
+            light = np.ascontiguousarray(pixels, np.float32)
+            extend_oddly(light, valid, wanted, _offsets(self.columns, self.rows), place, out)
+        elif common.size < wide.size:
+            _beyond_edges(pixels, at, wide, to, body)
         return out
 
     def _near(self, valid: NDArray[np.bool_], at: Window, wide: Window) -> NDArray[np.bool_]:
@@ -105,6 +126,29 @@ def _part(common: Window, of: Window) -> tuple[slice, slice]:
         slice(common.row - of.row, common.stop[1] - of.row),
         slice(common.col - of.col, common.stop[0] - of.col),
     )
+
+
+def _beyond_edges(
+    pixels: NDArray[Any], at: Window, wide: Window, to: tuple[slice, slice], body: NDArray[np.float32]
+) -> None:
+    """What `extend_oddly` does where the image has no gaps: its nearest pixel is found without search."""
+    rows, cols = np.arange(wide.row, wide.stop[1]) - at.row, np.arange(wide.col, wide.stop[0]) - at.col
+    above, below, left, right = (
+        slice(0, to[0].start),
+        slice(to[0].stop, None),
+        slice(0, to[1].start),
+        slice(to[1].stop, None),
+    )
+    for part in ((above, slice(None)), (below, slice(None)), (to[0], left), (to[0], right)):
+        y, x = rows[part[0]], cols[part[1]]
+        if not y.size or not x.size:
+            continue
+        py, px = np.clip(y, 0, at.height - 1), np.clip(x, 0, at.width - 1)
+        my, mx = 2 * py - y, 2 * px - x
+        inside = np.logical_and.outer((my >= 0) & (my < at.height), (mx >= 0) & (mx < at.width))
+        nearest = pixels[:, py[:, None], px].astype(np.float32)
+        mirror = pixels[:, np.clip(my, 0, at.height - 1)[:, None], np.clip(mx, 0, at.width - 1)].astype(np.float32)
+        body[:, *part] = np.where(inside, np.float32(2.0) * nearest - mirror, nearest)
 
 
 @lru_cache(maxsize=16)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +13,13 @@ from photoplan.kernels.convolve import CHUNK, EVEN_TAPS, GENERAL_TAPS, convolve_
 from photoplan.kernels.jit import is_ready
 from photoplan.quality.filters import FilterKernel
 
-__all__ = ["LEFT", "RIGHT", "Convolution"]
+__all__ = ["LEFT", "RIGHT", "Convolution", "limits_of"]
 
 #: Columns of zeros that a source has before and behind its pixels, for vectors and unrolled loops.
 LEFT, RIGHT = max(EVEN_TAPS), CHUNK + max(GENERAL_TAPS)
 #: Part of a kernel's largest value by which mirrored values of a symmetric one may differ: the rounding of its making.
 SAME = 1e-9
+_ALL = np.empty((0, 0), bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,21 +27,44 @@ class Convolution:
     """One kernel, convolved in float32.
 
     Kernels that are the same upside down and left to right, to `SAME` of their largest value, are folded to a quarter;
-    all others are summed as they are.
-    The result of a pixel differs from exact arithmetic by at most ``2e-7 · (rows + columns) · Σ|weights|`` times the
-    largest pixel below the kernel (rounding of float32 sums).
+    all others are summed as they are. The result of a pixel differs from exact arithmetic by at most
+    ``2e-7 · (rows + columns) · Σ|weights|`` times the largest pixel below the kernel (rounding of float32 sums).
     """
 
     kernel: FilterKernel
+    even: bool = field(init=False)
+    """Whether the fast way for symmetric kernels is taken."""
+    _weights: NDArray[np.float32] = field(init=False, repr=False)
+    """As the compiled code wants them, filled up with columns of zeros."""
+    _tag: tuple[int, ...] = field(init=False, repr=False)
+    _zeros: int = field(init=False, repr=False)
+    """Columns of zeros before the kernel's first."""
 
-    @property
-    def even(self) -> bool:
-        """Whether the fast way for symmetric kernels is taken."""
-        values = self.kernel.values
+    def __post_init__(self) -> None:
+        # A convolution turns the kernel round: its weights by the order of the pixels that they are for.
+        values = self.kernel.values[::-1, ::-1]
+        m, n = (side // 2 for side in values.shape)
         differs = max(float(np.abs(values - turned).max()) for turned in (values[::-1], values[:, ::-1]))
-        return differs <= SAME * float(np.abs(values).max())
+        even = differs <= SAME * float(np.abs(values).max())
+        if even:
+            taps = min(EVEN_TAPS, key=lambda t: -(-n // t) * t)
+            zeros = -n % taps if n else taps
+            part, before = values[m:, n:], zeros
+        else:
+            taps = min(GENERAL_TAPS, key=lambda t: -(-(2 * n + 1) // t) * t)
+            zeros = -(2 * n + 1) % taps
+            part, before = values, 0
+        weights = np.ascontiguousarray(np.pad(part, ((0, 0), (0, zeros))), np.float32)
+        for name, value in (("even", even), ("_weights", weights), ("_tag", (0,) * taps), ("_zeros", before)):
+            object.__setattr__(self, name, value)
 
-    def __call__(self, source: NDArray[np.float32], margin: tuple[int, int]) -> NDArray[np.float32]:
+    def __call__(
+        self,
+        source: NDArray[np.float32],
+        margin: tuple[int, int],
+        out: NDArray[Any],
+        valid: NDArray[np.bool_] | None = None,
+    ) -> tuple[int, int]:
         """Convolve the inner part of an array.
 
         Parameters
@@ -48,38 +73,36 @@ class Convolution:
             Pixels with a margin; the columns LEFT and RIGHT of it are 0.
         margin : (columns, rows)
             At least what the kernel reaches.
+        out : ndarray, shape (height, width)
+            Gets the result; whole numbers are rounded to the nearest and clipped.
+        valid : ndarray of bool, shape (height, width)
+            Pixels that are counted; None: all.
 
         Returns
         -------
-        ndarray, shape (height, width)
+        below, above : int
+            Pixels that were clipped, see `photoplan.kernels.convolve.round_clipped`.
         """
         rows, columns = (side // 2 for side in self.kernel.values.shape)
         if margin[0] < columns or margin[1] < rows:
             raise UsageError(f"a margin of {margin} pixels; the kernel reaches {(columns, rows)}")
-        shape = source.shape[0] - 2 * margin[1], source.shape[1] - 2 * margin[0] - LEFT - RIGHT
-        out = np.empty(shape, np.float32)
-        weights, tag, extra = self._weights()
-        start = margin[1] - rows, LEFT + margin[0] - columns - extra
-        (convolve_even if self.even else convolve_general)(source, start, weights, tag, out)
-        return out
+        start = margin[1] - rows, LEFT + margin[0] - columns - self._zeros
+        usable = _ALL if valid is None else valid
+        return self._code()(source, start, self._weights, self._tag, usable, limits_of(out.dtype), out)
 
-    @property
-    def is_compiled(self) -> bool:
-        """Whether the code for it is compiled already, here or on the disk."""
-        empty = np.zeros((1, 1), np.float32)
-        weights, tag, _ = self._weights()
-        arguments = (empty, (0, 0), weights, tag, empty)
-        return bool(is_ready(convolve_even if self.even else convolve_general, arguments))
+    def is_compiled(self, out: np.dtype[Any]) -> bool:
+        """Whether the code for results of a type is compiled already, here or on the disk."""
+        source, result = np.zeros((1, 1), np.float32), np.zeros((1, 1), out)
+        arguments = (source, (0, 0), self._weights, self._tag, _ALL, limits_of(out), result)
+        return bool(is_ready(self._code(), arguments))
 
-    def _weights(self) -> tuple[NDArray[np.float32], tuple[int, ...], int]:
-        """Weights as the compiled code wants them, its tag, and the columns of zeros before the kernel's first."""
-        # A convolution turns the kernel round: its weights by the order of the pixels that they are for.
-        values = self.kernel.values[::-1, ::-1].astype(np.float32)
-        m, n = (side // 2 for side in values.shape)
-        if not self.even:
-            taps = min(GENERAL_TAPS, key=lambda t: -(-(2 * n + 1) // t) * t)
-            zeros = -(2 * n + 1) % taps
-            return np.ascontiguousarray(np.pad(values, ((0, 0), (0, zeros)))), (0,) * taps, 0
-        taps = min(EVEN_TAPS, key=lambda t: -(-n // t) * t)
-        zeros = -n % taps
-        return np.ascontiguousarray(np.pad(values[m:, n:], ((0, 0), (0, zeros)))), (0,) * taps, zeros
+    def _code(self) -> Any:
+        return convolve_even if self.even else convolve_general
+
+
+def limits_of(dtype: np.dtype[Any]) -> tuple[float, float]:
+    """Least and largest whole number of a type; low > high: it is floating point."""
+    if dtype.kind == "f":
+        return 1.0, 0.0
+    limits = np.iinfo(dtype)
+    return float(limits.min), float(limits.max)

@@ -12,12 +12,15 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.convolve import round_clipped
 from photoplan.quality.borders import Margin
-from photoplan.quality.convolution import Convolution
+from photoplan.quality.convolution import Convolution, limits_of
 from photoplan.quality.field_weights import field_weights
 from photoplan.quality.filters import RestorationFilter
 from photoplan.quality.linearise import Linearisation
+from photoplan.quality.scratch import Scratch
 
 __all__ = ["RestoredPixels", "Restorer"]
+
+_SCRATCH = Scratch()
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +53,8 @@ class Restorer:
     """How grey values become light, which is what is filtered; the result is encoded again."""
     nodata: float | None = None
     """A value of whole numbers that restored pixels do not take: they become its neighbour."""
+    _ready: tuple[tuple[Convolution, ...], ...] = field(init=False, repr=False)
+    """Convolutions of each band."""
 
     def __post_init__(self) -> None:
         known = self.filter.image_size
@@ -61,6 +66,9 @@ class Restorer:
         for kernel in self.filter.kernels:
             if kernel.band is not None and not 1 <= kernel.band <= self.bands:
                 raise InputError(f"the filter has a kernel for band {kernel.band}; the image has {self.bands}")
+        ready = {id(kernel): Convolution(kernel) for kernel in self.filter.kernels}
+        bands = (self.filter.for_band(band + 1) for band in range(self.bands))
+        object.__setattr__(self, "_ready", tuple(tuple(ready[id(k)] for k in kernels) for kernels in bands))
 
     @property
     def margin(self) -> Margin:
@@ -70,7 +78,12 @@ class Restorer:
     @property
     def is_compiled(self) -> bool:
         """Whether the code for all kernels is compiled already."""
-        return all(Convolution(kernel).is_compiled for kernel in self.filter.kernels)
+        direct = self.linearisation.is_linear
+        return all(
+            each.is_compiled(self.out if direct and len(ready) == 1 else np.dtype(np.float32))
+            for ready in self._ready
+            for each in ready
+        )
 
     def restore(
         self, window: Window, pixels: NDArray[Any], at: Window, valid: NDArray[np.bool_] | None
@@ -103,35 +116,46 @@ class Restorer:
             if mask is not None and not mask.any():
                 counts.append((0, 0))
                 continue
-            if self.filter.for_band(band + 1):
+            if self._ready[band]:
                 light = self._light(pixels[band], valid, band + 1)
-                source = self.margin.source(window, light[None], at, valid)[0]
-                grey, lost = self._grey(self._filtered(source, window, band + 1), mask, band + 1)
+                source = self.margin.source(window, light[None], at, valid, _SCRATCH)[0]
+                counts.append(self._convolved(source, window, mask, band, values[band]))
             else:
-                grey, lost = np.ascontiguousarray(pixels[band, rows, cols], np.float32), (0, 0)
-            clipped = self._store(grey, mask, values[band])
-            counts.append((lost[0] + clipped[0], lost[1] + clipped[1]))
+                grey = np.ascontiguousarray(pixels[band, rows, cols], np.float32)
+                counts.append(_store(grey, mask, values[band]))
+        self._keep_apart(values)
         if mask is not None:
             values[:, ~mask] = 0
         return RestoredPixels(values, mask, tuple(c[0] for c in counts), tuple(c[1] for c in counts))
 
-    def _filtered(self, source: NDArray[np.float32], window: Window, band: int) -> NDArray[np.float32]:
-        """Light of a window, convolved; between places the results of their filters are interpolated."""
-        kernels, margin = self.filter.for_band(band), self.filter.margin
-        places = [kernel.at or (0.0, 0.0) for kernel in kernels]
-        total: NDArray[np.float32] | None = None
+    def _convolved(
+        self,
+        source: NDArray[np.float32],
+        window: Window,
+        mask: NDArray[np.bool_] | None,
+        band: int,
+        values: NDArray[Any],
+    ) -> tuple[int, int]:
+        """Grey values of a window of light, filtered; returns how many pixels were clipped."""
+        ready, margin = self._ready[band], self.filter.margin
+        places = [each.kernel.at or (0.0, 0.0) for each in ready]
+        if len(ready) == 1 and self.linearisation.is_linear:
+            return ready[0](source, margin, values, mask)
+        part, total = (_SCRATCH.array(name, values.shape) for name in ("part", "total"))
+        total[:] = 0
         for index, weights in field_weights(places, window):
-            part = Convolution(kernels[index])(source, margin)
+            ready[index](source, margin, part if weights is not None else total)
             if weights is not None:
-                part = np.where(weights > 0, weights * part, np.float32(0.0))
-            total = part if total is None else total + part
-        assert total is not None
-        return total
+                np.multiply(part, weights, out=part)
+                np.add(total, part, out=total, where=weights > 0)
+        grey, lost = self._grey(total, mask, band + 1)
+        clipped = _store(grey, mask, values)
+        return lost[0] + clipped[0], lost[1] + clipped[1]
 
-    def _light(self, grey: NDArray[Any], valid: NDArray[np.bool_] | None, band: int) -> NDArray[np.float32]:
-        """Light of grey values; invalid pixels hold any finite number."""
+    def _light(self, grey: NDArray[Any], valid: NDArray[np.bool_] | None, band: int) -> NDArray[Any]:
+        """Light of grey values; what invalid pixels hold is of no account."""
         if self.linearisation.is_linear:
-            return grey.astype(np.float32)
+            return grey
         if self.linearisation.kind == "srgb" and grey.dtype.kind == "u":
             table = self.linearisation.to_linear(np.arange(np.iinfo(grey.dtype).max + 1, dtype=grey.dtype), band)
             return table.astype(np.float32)[grey]
@@ -152,17 +176,21 @@ class Restorer:
             lost = int(((light < np.float32(low)) & count).sum()), int(((light > np.float32(high)) & count).sum())
         return self.linearisation.to_values(light.astype(np.float64), self.dtype, band).astype(np.float32), lost
 
-    def _store(
-        self, grey: NDArray[np.float32], mask: NDArray[np.bool_] | None, values: NDArray[Any]
-    ) -> tuple[int, int]:
-        """Round into the type of the result; returns how many pixels were clipped."""
-        if self.out.kind == "f":
-            values[:] = grey
-            return 0, 0
+    def _keep_apart(self, values: NDArray[Any]) -> None:
+        """Give the neighbour of the nodata value to pixels that happen to have it."""
+        if self.nodata is None or self.out.kind == "f":
+            return
         limits = np.iinfo(self.out)
-        usable = np.empty((0, 0), bool) if mask is None else mask
-        below, above = round_clipped(grey, usable, (float(limits.min), float(limits.max)), values)
-        if self.nodata is not None and limits.min <= self.nodata <= limits.max:
+        if limits.min <= self.nodata <= limits.max:
             step = 1 if self.nodata < limits.max else -1
             values[values == self.out.type(self.nodata)] = self.out.type(self.nodata + step)
-        return int(below), int(above)
+
+
+def _store(grey: NDArray[np.float32], mask: NDArray[np.bool_] | None, values: NDArray[Any]) -> tuple[int, int]:
+    """Round into the type of the result; returns how many pixels were clipped."""
+    if values.dtype.kind == "f":
+        values[:] = grey
+        return 0, 0
+    usable = np.empty((0, 0), bool) if mask is None else mask
+    below, above = round_clipped(grey, usable, limits_of(values.dtype), values)
+    return int(below), int(above)

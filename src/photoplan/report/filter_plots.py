@@ -82,7 +82,9 @@ class FilterPlots:
         box = (-n - 0.5, n + 0.5, m + 0.5, -m - 0.5)
         axes.imshow(rooted, cmap="RdBu_r", vmin=-most, vmax=most, extent=box, interpolation="nearest")
         axes.grid(visible=False)
-        axes.set_title(kernel.title)
+        axes.set_title(f"{kernel.title} (colour: root of the weight)")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_locator(self._mpl.ticker.MaxNLocator(integer=True))
         axes.set_xlabel("columns")
         axes.set_ylabel("rows")
         if values.size <= 49:
@@ -92,8 +94,8 @@ class FilterPlots:
                     k - n, i - m, f"{value:.2g}", ha="center", va="center", fontsize=6, color="white" if strong else INK
                 )
 
-    @staticmethod
-    def _sections(axes: Any, kernel: KernelPicture) -> None:
+    def _sections(self, axes: Any, kernel: KernelPicture) -> None:
+        """Middle row, middle column, and sums."""
         values = kernel.values
         m, n = (side // 2 for side in values.shape)
         axes.axhline(0.0, color=SOFT, linewidth=0.8)
@@ -104,6 +106,7 @@ class FilterPlots:
         axes.plot(
             np.arange(-n, n + 1), values.sum(0), "^:", color=GREEN, markersize=3, linewidth=1.2, label="column sums"
         )
+        axes.xaxis.set_major_locator(self._mpl.ticker.MaxNLocator(integer=True))
         axes.set_title(f"sections; sum {values.sum():.4g}")
         axes.set_xlabel("pixels from the middle")
         axes.legend(fontsize=7.5)
