@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Literal, cast
 
 import numpy as np
@@ -48,10 +49,21 @@ def analyse(data: SeriesData) -> Outcome:
         below = dark[plane.name]
         image -= below if isinstance(below, float) else _whole(data, setting, plane, below)
         settings = _settings(data, setting, plane, below if isinstance(below, float) else float(below.mean()))
-        found = fit_fall_off(image, settings)
-        parts.append(_outcome(found, settings, plane.name, setting))
+        parts.append(_fitted(image, settings, plane.name, setting))
     first = Outcome(notes=(f"from {len(setting.frames)} frames, {setting.label}; {note}",))
     return joined([first, *parts])
+
+
+def _fitted(image: Array, settings: FallOffSettings, plane: str, setting: Setting) -> Outcome:
+    """The fall-off; without its natural part where the light shows none and nobody asked for it."""
+    try:
+        return _outcome(fit_fall_off(image, settings), settings, plane, setting)
+    except InputError as error:
+        if settings.natural != "estimated" or "natural" in setting.first.group.entry.values:
+            raise
+        rest = replace(settings, natural="none")
+        refused = Outcome(refused={f"natural part{f' ({plane})' if plane else ''}": str(error)})
+        return joined([_outcome(fit_fall_off(image, rest), rest, plane, setting), refused])
 
 
 def _brightest(data: SeriesData) -> Setting:

@@ -10,7 +10,9 @@ from photoplan.io.series_pixels import Plane
 from photoplan.products.characterise_common import Run, black_of, exposure_runs, prefix, saturation_of, tried
 from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
+from photoplan.quality.frame_statistics import Level
 from photoplan.quality.linearity import Linearity, linearity
+from photoplan.quality.saturation import find_saturation
 from photoplan.report.characterise_charts import Chart, Curve
 
 __all__ = ["analyse", "missing"]
@@ -51,7 +53,7 @@ def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
         for level in levels
     ]
     sigma = [sqrt(s**2 + black.sigma**2) for s, black in zip(sigmas, blacks)]
-    full = saturation_of(data, levels) - blacks[-1].mean
+    full = _full(data, run, levels, signal)
     found = linearity(run.values, signal, sigma, full)
     where = {"plane": plane.name, "at": run.label}
     unit = f"DN/{run.unit}"
@@ -89,6 +91,17 @@ def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
         notes=tuple(f"{prefix(plane.name, run.label)}: {rule}".lstrip(": ") for rule in rules if "cut off" in rule),
         details={prefix("linearity", plane.name, run.label).replace(" ", "_"): found.to_dict()},
     )
+
+
+def _full(data: SeriesData, run: Run, levels: list[Level], signal: list[float]) -> float:
+    """Signal at saturation: where this run shows it, else what the camera can write."""
+    if len(levels) >= 4:
+        variance = np.array([level.temporal_variance for level in levels])
+        shares = [level.saturated_share for level in levels]
+        found = find_saturation(run.values, signal, 0.0, shares, variance if np.isfinite(variance).all() else None)
+        if found is not None:
+            return found.level_dn
+    return saturation_of(data, levels) - (levels[-1].mean - signal[-1])
 
 
 def _table(found: Linearity, run: Run, name: str) -> Table:
