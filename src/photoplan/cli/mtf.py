@@ -1,4 +1,4 @@
-"""`photoplan mtf`: spread function and MTF of images from edges."""
+"""`photoplan mtf`: spread function and MTF of images from edges, and from test patterns."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Any
 import click
 
 from photoplan.cli.failures import end_with_failures
+from photoplan.cli.mtf_patterns import edge_options, pattern_options, run_patterns
 from photoplan.cli.options import json_option
 
 __all__ = ["command"]
 
 
-# Test patterns (bars, star, USAF groups) are another way to measure: their options stand after --roi, and
-# `photoplan.products.mtf_patterns` is asked instead of `measure_mtf` where --pattern is given.
 @click.command("mtf")
 @click.argument("images", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="IMAGE…")
 @click.option("--roi", "rois", type=int, nargs=4, multiple=True, metavar="COL ROW WIDTH HEIGHT",
               help="Window with one edge; may be repeated [edges are sought in the whole image].")  # fmt: skip
+@pattern_options
 @click.option("--linearisation", metavar="linear|srgb|TABLE", help="How grey values become light [linear].")
 @click.option("--band", metavar="N|all", help="Band, or luminance and every band [luminance, or the only band].")
 @click.option("--pixel-size", "pixel_um", type=float, metavar="UM", help="On the sensor, for cycles/mm.")
@@ -29,6 +29,8 @@ __all__ = ["command"]
 @click.option("--most-edges", type=int, default=60, show_default=True, metavar="N", help="Measured in an image.")
 @click.option("--least-length", type=click.FloatRange(8.0, 10_000.0), metavar="PX",
               help="Of an edge [20, with --roi 12].")  # fmt: skip
+@click.option("--half-width", type=int, default=20, show_default=True, metavar="PX",
+              help="Largest distance from the edge that is used.")  # fmt: skip
 @click.option("--least-snr", type=click.FloatRange(3.0, 1e6), default=8.0, show_default=True, metavar="R",
               help="Contrast of an edge over its noise.")  # fmt: skip
 @click.option("--report", type=click.Path(path_type=Path), metavar="FILE.html", help="Report with plots.")
@@ -39,17 +41,24 @@ __all__ = ["command"]
 def command(images: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any) -> None:
     """Measure sharpness: edges are found, or given by --roi, and their spread function and MTF measured.
 
+    With --pattern a test pattern is measured instead: bars (a window for each frequency group), a Siemens star, or a
+    USAF-1951 target.
+
     An image that fails does not stop the others; they are listed at the end (exit code 4). No figure is given for an
     edge that is saturated, noisy, or has texture beside it.
     """
+    if options["pattern"] is not None:
+        run_patterns(images, as_json, quiet, options)
+        return
     from photoplan.cli.progress import progress
     from photoplan.products.mtf import MtfRequest, measure_mtf
+    from photoplan.products.mtf_result import group_lines
 
     def talk(text: str) -> None:
         if not quiet:
             click.echo(text, err=True)
 
-    request = MtfRequest(images, **options)
+    request = MtfRequest(images, **edge_options(options))
     report = measure_mtf(request, lambda total: progress(total, quiet, "tiles"), talk)
     if as_json:
         click.echo(json.dumps(report.to_dict(), indent=2, ensure_ascii=False))
@@ -58,6 +67,11 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any
             click.echo(str(image))
         for note in image.notes:
             talk(f"{image.name}: {note}")
+    if len(report.images) > 1:
+        if not as_json:
+            click.echo(f"all {len(report.images)} images\n{group_lines(report.groups)}")
+        if report.enhancement is not None and report.enhancement.enhanced:
+            talk(f"all images: {report.enhancement.warning}")
     if not as_json:
         for path in (report.csv, report.report):
             if path is not None:

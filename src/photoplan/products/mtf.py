@@ -13,11 +13,13 @@ from photoplan.io.disk import write_atomically
 from photoplan.io.mtf_file import read_mtf_table
 from photoplan.io.named_table import write_named_table
 from photoplan.io.product import check_output
+from photoplan.products.mtf_groups import group_edges
 from photoplan.products.mtf_image import LightImage, linearisation_of
 from photoplan.products.mtf_measure import Measuring, measure_image
 from photoplan.products.mtf_page import mtf_page
-from photoplan.products.mtf_result import ImageMtf, MtfReport
+from photoplan.products.mtf_result import EdgeGroup, ImageMtf, MtfReport
 from photoplan.quality.edge_find import EdgeRules
+from photoplan.quality.enhancement import Enhancement, enhancement_of
 from photoplan.quality.linearise import Linearisation
 from photoplan.report.mtf_plots import MtfPlots
 
@@ -57,6 +59,8 @@ class MtfRequest:
     """Pixels; None: 20, in given windows 12."""
     least_snr: float = 8.0
     """Contrast over noise."""
+    half_width: int = 20
+    """Pixels of an edge reach at most so far to both sides."""
     report: Path | None = None
     """HTML."""
     csv: Path | None = None
@@ -101,7 +105,11 @@ def measure_mtf(
     measuring = Measuring(
         request.rois,
         request.band,
-        EdgeRules(request.least_length or (20.0 if not request.rois else 12.0), request.least_snr),
+        EdgeRules.within(
+            request.half_width,
+            least_length=request.least_length or (20.0 if not request.rois else 12.0),
+            least_snr=request.least_snr,
+        ),
         request.most_edges,
         request.grid,
         request.flight,
@@ -125,6 +133,7 @@ def measure_mtf(
     made = MtfReport(
         tuple(results),
         failed,
+        *_together(results, measuring),
         linearisation.describe(),
         request.pixel_um,
         request.flight,
@@ -137,6 +146,20 @@ def measure_mtf(
         text = mtf_page(made, {result.file: opened[result.file] for result in results}, plots)
         write_atomically(made.report, text.encode("utf-8", errors="replace"))
     return made
+
+
+def _together(results: Sequence[ImageMtf], measuring: Measuring) -> tuple[tuple[EdgeGroup, ...], Enhancement | None]:
+    """Means and edge enhancement by the edges of all images."""
+    edges = [edge for image in results for edge in image.edges]
+    if not edges:
+        return (), None
+    if len(results) == 1:
+        return results[0].groups, results[0].enhancement
+    sizes = {image.size for image in results}
+    grid = 0 if measuring.rois else measuring.grid
+    groups = group_edges(edges, sizes.pop() if len(sizes) == 1 else None, grid, measuring.lab)
+    first = [edge.measured for edge in edges if edge.channel == groups[0].channel]
+    return tuple(groups), enhancement_of(first)
 
 
 def _opened(
@@ -179,6 +202,8 @@ def _check(request: MtfRequest) -> None:
         raise UsageError(f"--grid {request.grid}; 1 to {MOST_CELLS} cells are allowed")
     if not 1 <= request.most_edges <= MOST_EDGES:
         raise UsageError(f"--most-edges {request.most_edges}; 1 to {MOST_EDGES} are allowed")
+    if not 6 <= request.half_width <= 60:
+        raise UsageError(f"--half-width {request.half_width}; 6 to 60 px are allowed")
     if request.pixel_um is not None and not 0.01 <= request.pixel_um <= 1e4:
         raise UsageError(f"--pixel-size {request.pixel_um:g}; 0.01 to 10000 micrometres are allowed")
     inputs = [*request.images, *(p for p in (request.lab,) if p is not None)]

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
+from photoplan.products.mtf_groups import ENOUGH, group_edges
 from photoplan.products.mtf_image import LightImage
-from photoplan.products.mtf_result import EdgeGroup, ImageMtf, LabComparison, MeasuredEdge, rejected_words
+from photoplan.products.mtf_result import ImageMtf, MeasuredEdge, rejected_words
 from photoplan.products.mtf_search import Found, parted, search_edges, select_spread, tiles_of
 from photoplan.quality.edge_find import EdgeRegion, EdgeRules
-from photoplan.quality.edge_groups import combine, field_cell, fit_gaussian, mean_curve, quantiles, sigma_of_interval
 from photoplan.quality.edge_response import EdgeSettings, measure_edge
 from photoplan.quality.enhancement import enhancement_of
 
@@ -28,8 +28,6 @@ Advance = Callable[[int, int], None]
 
 #: A bent edge is not parted into pieces shorter than this, pixels.
 _SHORT = 40.0
-#: Slanted edges from which on those along rows and columns do not count in a mean.
-_ENOUGH = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,9 +99,7 @@ def measure_image(name: tuple[str, Path], image: LightImage, how: Measuring, adv
     notes = [f"{n} edges were refused: {why}" for why, n in refusals.most_common(3)]
     aligned = sum(edge.measured.sampling != "super-sampled" for edge in first)
     if aligned:
-        used = (
-            "they do not count in means" if len(first) - aligned >= _ENOUGH else "few others are there, so they count"
-        )
+        used = "they do not count in means" if len(first) - aligned >= ENOUGH else "few others are there, so they count"
         notes.append(
             f"{aligned} of {len(first)} edges are parallel to rows or columns: their profiles hold few positions "
             f"within a pixel; {used}"
@@ -117,7 +113,7 @@ def measure_image(name: tuple[str, Path], image: LightImage, how: Measuring, adv
         image.size,
         image.linearisation.describe(),
         tuple(edges),
-        tuple(group for channel in channels for group in _groups(edges, channel, image, how)),
+        tuple(group_edges(edges, image.size, 0 if how.rois else how.grid, how.lab)),
         enhancement,
         count,
         how.grid,
@@ -220,7 +216,11 @@ def _measured(image: LightImage, channel: int, number: int, region: EdgeRegion, 
         if bad is not None:
             mask &= ~bad
     light = picture.grey.astype(float)
-    settings = EdgeSettings(least_snr=min(how.rules.least_snr, 5.0), least_length=min(how.rules.least_length, 12.0))
+    settings = EdgeSettings(
+        least_snr=min(how.rules.least_snr, 5.0),
+        least_length=min(how.rules.least_length, 12.0),
+        most_structure=how.rules.evenness,
+    )
     try:
         measured = measure_edge(light, mask, origin=window[:2], settings=settings)
     except InputError as error:
@@ -229,75 +229,10 @@ def _measured(image: LightImage, channel: int, number: int, region: EdgeRegion, 
         measured = measure_edge(light, mask, origin=window[:2], settings=replace(settings, curve=2))
     flight = None if how.flight is None else "along" if measured.direction == how.flight else "across"
     name = image.channel_name(channel)
-    return MeasuredEdge(number, region.line.ends, region.half, region.aligned, channel, name, flight, measured)
+    return MeasuredEdge(
+        number, region.of, region.line.ends, region.half, region.aligned, channel, name, flight, measured
+    )
 
 
 def _bent(error: InputError) -> bool:
     return str(error).startswith("bent")
-
-
-def _groups(edges: Sequence[MeasuredEdge], channel: int, image: LightImage, how: Measuring) -> list[EdgeGroup]:
-    """Means of a channel: all edges, each direction, and both for every cell of the field that has edges."""
-    own = [edge for edge in edges if edge.channel == channel]
-    if not own:
-        return []
-    groups = [_group(own, None, None, image, how)]
-    groups += [_group(part, way, None, image, how) for way in ("x", "y") if (part := _in(own, way))]
-    if how.grid == 1 or how.rois:
-        return groups
-    cells: dict[tuple[int, int], list[MeasuredEdge]] = {}
-    for edge in own:
-        cells.setdefault(field_cell(edge.col, edge.row, image.size, how.grid), []).append(edge)
-    for cell, members in sorted(cells.items()):
-        groups.append(_group(members, None, cell, image, how))
-        groups += [_group(part, way, cell, image, how) for way in ("x", "y") if (part := _in(members, way))]
-    return groups
-
-
-def _in(edges: Sequence[MeasuredEdge], direction: str) -> list[MeasuredEdge]:
-    return [edge for edge in edges if edge.direction == direction]
-
-
-def _group(
-    edges: Sequence[MeasuredEdge],
-    direction: str | None,
-    cell: tuple[int, int] | None,
-    image: LightImage,
-    how: Measuring,
-) -> EdgeGroup:
-    dense = [edge.measured for edge in edges if edge.measured.sampling == "super-sampled"]
-    own = dense if len(dense) >= _ENOUGH else [edge.measured for edge in edges]
-    curve = mean_curve([m.mtf for m in own])
-    lab = None
-    if how.lab is not None and cell is None:
-        frequency, modulation = how.lab
-        lab = LabComparison(frequency, modulation, np.array([curve.at(f) for f in frequency]))
-    low, middle, high = quantiles([m.mtf50 for m in own], (0.1, 0.5, 0.9))
-    return EdgeGroup(
-        edges[0].channel,
-        edges[0].band,
-        direction,
-        edges[0].flight if direction is not None else None,
-        cell,
-        None if cell is None else _bounds(cell, image.size, how.grid),
-        combine([m.mtf50 for m in own], [sigma_of_interval(m.mtf50_interval) for m in own]),
-        combine([m.mtf10 for m in own], [sigma_of_interval(m.mtf10_interval) for m in own]),
-        combine([m.fwhm for m in own], [sigma_of_interval(m.fwhm_interval) for m in own]),
-        combine([m.overshoot for m in own], [m.overshoot_sigma for m in own]),
-        combine([m.undershoot for m in own], [m.undershoot_sigma for m in own]),
-        (low, middle, high),
-        curve,
-        fit_gaussian(curve),
-        lab,
-    )
-
-
-def _bounds(cell: tuple[int, int], size: tuple[int, int], cells: int) -> tuple[float, float, float, float]:
-    width, height = size[0] / cells, size[1] / cells
-    row, col = cell
-    return (
-        round(col * width - 0.5, 1),
-        round(row * height - 0.5, 1),
-        round((col + 1) * width - 0.5, 1),
-        round((row + 1) * height - 0.5, 1),
-    )

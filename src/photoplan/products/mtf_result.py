@@ -18,7 +18,7 @@ from photoplan.quality.edge_response import EdgeMeasurement
 from photoplan.quality.enhancement import Enhancement
 from photoplan.quality.mtf_curve import MtfCurve
 
-__all__ = ["EdgeGroup", "ImageMtf", "LabComparison", "MeasuredEdge", "MtfReport", "rejected_words"]
+__all__ = ["EdgeGroup", "ImageMtf", "LabComparison", "MeasuredEdge", "MtfReport", "group_lines", "rejected_words"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +27,8 @@ class MeasuredEdge:
 
     number: int
     """From 1; the same edge in another channel has the same number."""
+    line: int
+    """Number of the straight line that it is a part of: long ones are measured in parts."""
     ends: tuple[tuple[float, float], tuple[float, float]]
     """Column and row of both ends."""
     half: int
@@ -62,6 +64,7 @@ class MeasuredEdge:
         m = self.measured
         return {
             "number": self.number,
+            "line": self.line,
             "col": round(self.col, 2),
             "row": round(self.row, 2),
             "ends": [[round(v, 1) for v in end] for end in self.ends],
@@ -227,11 +230,13 @@ class ImageMtf:
 
     def __str__(self) -> str:
         """A line for each direction and channel of the whole field."""
-        lines = [f"{self.name}: {self.total.mtf50.edges} edges of {self.found} · {self.linearisation}"]
-        for group in self.groups:
-            if group.cell is None:
-                lines.append(f"  {_label(group):<22} {_figures(group)}")
-        return "\n".join(lines)
+        number = len({edge.number for edge in self.edges})
+        return f"{self.name}: {number} edges of {self.found} · {self.linearisation}\n" + group_lines(self.groups)
+
+
+def group_lines(groups: Sequence[EdgeGroup]) -> str:
+    """A line for each mean over the whole field."""
+    return "\n".join(f"  {_label(group):<22} {_figures(group)}" for group in groups if group.cell is None)
 
 
 def _label(group: EdgeGroup) -> str:
@@ -267,6 +272,10 @@ class MtfReport:
     images: tuple[ImageMtf, ...]
     failed: dict[str, str]
     """Why, by name of the image."""
+    groups: tuple[EdgeGroup, ...]
+    """Means over the edges of all images; the first is that of all edges of the first channel."""
+    enhancement: Enhancement | None
+    """By the edges of all images; None if there is none."""
     linearisation: str
     pixel_um: float | None
     flight: str | None
@@ -281,6 +290,8 @@ class MtfReport:
                 "pixel_size_um": self.pixel_um,
                 "flight": self.flight,
                 "images": [image.to_dict(self.pixel_um) for image in self.images],
+                "summary": [group.to_dict(self.pixel_um) for group in self.groups],
+                "enhancement": self.enhancement and self.enhancement.to_dict(),
                 "failed": [{"image": name, "reason": reason} for name, reason in self.failed.items()],
                 "report": self.report and str(self.report),
                 "csv": self.csv and str(self.csv),
@@ -303,6 +314,7 @@ class MtfReport:
 _COLUMNS = (
     "image",
     "number",
+    "line",
     "col",
     "row",
     "band",

@@ -105,7 +105,8 @@ def search_edges(
     for line in join_lines(open_lines):
         for part in _pieces(line):
             _examine_alone(image, channel, (area, part), rules, found)
-    parts = [part for region in found.regions for part in parted(region, ceil(region.line.length / PART))]
+    numbered = [replace(region, of=k) for k, region in enumerate(sorted(found.regions, key=lambda r: -r.merit), 1)]
+    parts = [part for region in numbered for part in parted(region, ceil(region.line.length / PART))]
     found.regions = sorted(parts, key=lambda region: -region.merit)
     return found
 

@@ -50,9 +50,16 @@ class EdgeRules:
     halves: tuple[int, ...] = _HALVES
     """Half widths of the window that are tried, pixels."""
 
+    @classmethod
+    def within(cls, half: int, least_length: float, least_snr: float) -> EdgeRules:
+        """Rules with windows that reach no farther than half a width, pixels."""
+        return cls(halves=(*(h for h in _HALVES if h < half), half), least_length=least_length, least_snr=least_snr)
+
     def __post_init__(self) -> None:
         if not 8.0 <= self.least_length <= 10_000.0:
             raise InputError(f"least length of an edge {self.least_length:g} px; 8 to 10000 px are allowed")
+        if not self.halves or min(self.halves) < 5 or max(self.halves) > 100:
+            raise InputError(f"half widths of a window {self.halves}; 5 to 100 px are allowed")
         if not self.least_snr >= 3.0:
             raise InputError(f"least contrast over noise {self.least_snr:g}; at least 3 is needed")
 
@@ -96,6 +103,8 @@ class EdgeRegion:
     """Too nearly parallel to rows or columns for all positions within a pixel to occur along it."""
     gaps: tuple[tuple[float, float], ...] = ()
     """Stretches that are left out, from and to distances along the line from its middle, pixels."""
+    of: int = 0
+    """Number of the straight line that it is a part of."""
 
     @property
     def merit(self) -> float:

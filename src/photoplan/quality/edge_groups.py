@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isfinite, nan, sqrt
+from math import inf, isfinite, nan, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,13 +52,16 @@ class CombinedValue:
     """Edges that have the figure."""
 
 
-def combine(values: Sequence[float], sigmas: Sequence[float], confidence: float = 0.95) -> CombinedValue:
+def combine(
+    values: Sequence[float], sigmas: Sequence[float], confidence: float = 0.95, *, least: float = -inf
+) -> CombinedValue:
     """Mean of figures that have errors of their own and differ from edge to edge besides.
 
     Weights are 1 / (σ² + τ²): τ, what edges differ by beyond their noise, follows from their spread (the estimate of
     Paule and Mandel 1982), so that neither the sharpest measured edge decides alone nor a noisy one counts in full.
     Edges far from the others get less weight (Huber, 2.5 standard deviations). The standard deviation of the mean is
-    that of the weighted residuals (Hartung and Knapp 2001), the interval that of Student's distribution.
+    that of the weighted residuals (Hartung and Knapp 2001), the interval that of Student's distribution; where the
+    edges' own errors explain their spread (τ = 0), that of the normal distribution with these errors.
 
     Parameters
     ----------
@@ -68,6 +71,8 @@ def combine(values: Sequence[float], sigmas: Sequence[float], confidence: float 
         Standard deviations; where one is unknown (NaN) the median of the others stands for it.
     confidence : float
         Of the interval.
+    least : float
+        What the figure cannot fall below: the interval ends there.
 
     Raises
     ------
@@ -87,8 +92,8 @@ def combine(values: Sequence[float], sigmas: Sequence[float], confidence: float 
     # An error that is stated as far too small must not decide alone.
     s = np.maximum(s, 0.2 * float(np.median(s)))
     if n == 1:
-        reach = 1.96 * float(s[0]) if good.any() else nan
-        return CombinedValue(float(v[0]), (float(v[0]) - reach, float(v[0]) + reach), float(s[0]), 0.0, 1)
+        reach = float(ndtri(0.5 + confidence / 2)) * float(s[0]) if good.any() else nan
+        return CombinedValue(float(v[0]), (max(float(v[0]) - reach, least), float(v[0]) + reach), float(s[0]), 0.0, 1)
     keep = np.ones(n)
     mean = float(np.median(v))
     tau2 = 0.0
@@ -108,8 +113,9 @@ def combine(values: Sequence[float], sigmas: Sequence[float], confidence: float 
     sigma = sqrt(float(share @ (v - mean) ** 2) / (n - 1))
     # Less than the edges' own errors allow is luck, not accuracy.
     sigma = max(sigma, sqrt(float((share**2) @ (s**2))))
-    reach = float(stdtrit(n - 1, 0.5 + confidence / 2)) * sigma
-    return CombinedValue(mean, (mean - reach, mean + reach), sigma, sqrt(tau2), n)
+    part = 0.5 + confidence / 2
+    reach = float(stdtrit(n - 1, part) if tau2 > 0.0 else ndtri(part)) * sigma
+    return CombinedValue(mean, (max(mean - reach, least), mean + reach), sigma, sqrt(tau2), n)
 
 
 def _between(v: Array, s: Array, keep: Array) -> float:
