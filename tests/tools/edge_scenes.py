@@ -57,7 +57,7 @@ def blocks(size: tuple[int, int], angle_deg: float, sigma: float, seed: int, pit
 
 
 def noisy(scene: Array, snr: float, seed: int, dtype: str = "uint8", contrast: float = 0.5) -> NDArray[np.generic]:
-    """The scene as pixels of a type, with noise of so many parts of a contrast; integers use nine tenths of the range."""
+    """The scene as pixels of a type with noise: a contrast over `snr`; integers use nearly their whole range."""
     rng = np.random.default_rng(seed)
     light = scene + rng.normal(0, contrast / snr, scene.shape)
     if dtype == "float32":
