@@ -15,7 +15,7 @@ from photoplan.geometry.grid import Window
 from photoplan.io.disk import write_atomically
 from photoplan.io.named_table import write_named_table
 from photoplan.io.product import check_output
-from photoplan.products.mtf_image import LightImage, linearisation_of
+from photoplan.products.mtf_image import LUMINANCE, LightImage, linearisation_of
 from photoplan.products.mtf_pattern_result import ImagePattern, PatternReport, PatternResult
 from photoplan.quality.bar_curve import bar_curve
 from photoplan.quality.bars import measure_bars
@@ -158,7 +158,9 @@ def _read(image: LightImage, window: Window, channel: int) -> tuple[Array, NDArr
     light = np.array(picture.grey, np.float64)
     if picture.valid is not None:
         light[~picture.valid] = np.nan
-    clipped = clipped_pixels(light)
+    stored, _ = image.reader.read(window)
+    used = stored[:3] if channel == LUMINANCE and len(stored) >= 3 else stored[max(channel, 1) - 1][None]
+    clipped = np.logical_or.reduce([clipped_pixels(band) for band in used])
     if picture.saturated is not None:
         clipped |= picture.saturated
     return light, clipped

@@ -26,6 +26,8 @@ LEAST_PERIODS = 2.5
 LEAST_SIGNIFICANCE = 5.0
 #: A level is the top of a parabola over so many periods to each side of a bar's middle.
 _REACH = 0.125
+#: Side of the part of a window that is used, pixels.
+_MOST = 1024
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ def measure_bars(
     Parameters
     ----------
     light : ndarray
-        Shape (rows, columns), proportional to light; only bars.
+        Shape (rows, columns), proportional to light; only bars. Of larger windows the middle 1024 pixels are used.
     clipped : ndarray, optional
         True where a pixel is cut off at an end of its range, same shape.
     what : str
@@ -81,7 +83,7 @@ def measure_bars(
     InputError
         No bars, bars and other structure, too few bars, bars below the noise, clipped pixels.
     """
-    values = pattern_window(light, clipped, what)
+    values = _middle_part(pattern_window(light, clipped, what))
     wave = find_wave(values, what)
     phase = wave.phases(values.shape)
     periods = float(np.ptp(phase))
@@ -125,6 +127,12 @@ def measure_bars(
         bend=bend / contrast,
         aligned=bool(hidden),
     )
+
+
+def _middle_part(values: Array) -> Array:
+    """The middle of a large window: more pixels than these add nothing but time."""
+    rows, columns = (slice(max(0, (n - _MOST) // 2), max(0, (n - _MOST) // 2) + _MOST) for n in values.shape)
+    return values[rows, columns]
 
 
 def _fit(values: Array, phase: Array, wave: BarWave) -> tuple[Array, Array, Array, Array, tuple[int, ...]]:

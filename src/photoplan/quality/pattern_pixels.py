@@ -39,11 +39,16 @@ def clipped_pixels(stored: NDArray[Any]) -> NDArray[np.bool_]:
     low, high = float(np.nanmin(stored)), float(np.nanmax(stored))
     at_low, at_high = stored == low, stored == high
     few, many = 0.002, 0.01
-    if at_high.mean() >= many and at_low.mean() < few:
+    if at_high.mean() >= many and at_low.mean() < few and _heaped(stored, high, -1, at_high):
         clipped |= at_high
-    if at_low.mean() >= many and at_high.mean() < few:
+    if at_low.mean() >= many and at_high.mean() < few and _heaped(stored, low, 1, at_low):
         clipped |= at_low
     return clipped
+
+
+def _heaped(stored: NDArray[Any], end: float, step: int, at_end: NDArray[np.bool_]) -> bool:
+    """An end of integers is cut off if it holds far more pixels than the value beside it: noise rounds to both."""
+    return not np.issubdtype(stored.dtype, np.integer) or at_end.sum() >= 4 * (stored == end + step).sum()
 
 
 def pattern_window(
@@ -61,7 +66,10 @@ def pattern_window(
         size = " × ".join(map(str, values.shape[::-1]))
         raise InputError(f"{what}: a window of {size} pixels; at least {least} × {least} are needed")
     if max(values.shape) > most:
-        raise InputError(f"{what}: a window of {values.shape[1]} × {values.shape[0]} pixels; at most {most} a side")
+        raise InputError(
+            f"{what}: a window of {values.shape[1]} × {values.shape[0]} pixels; at most {most} a side, give the part "
+            "with the pattern"
+        )
     missing = int(values.size - np.isfinite(values).sum())
     if missing:
         raise InputError(f"{what}: {missing} of its pixels have no value; choose a window without gaps")

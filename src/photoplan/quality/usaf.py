@@ -23,7 +23,7 @@ __all__ = ["UsafBars", "UsafResult", "UsafRules", "measure_usaf"]
 
 Array = NDArray[np.float64]
 
-_MOST_SIDE = 8192
+_MOST_SIDE = 4096
 #: Part of the full contrast by which a grey square stands out.
 _SEEN = 0.1
 #: Cycles per pixel beyond which three bars meet too few pixels.

@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 
 #: Bars that are looked at, the largest first.
 _MOST_BARS = 3000
+_MOST_THREES = 300
 #: Threes that have to agree.
 _LEAST_MATCHES = 5
 
@@ -136,6 +137,8 @@ def _threes(bars: Sequence[_Bar]) -> list[_Three]:
     lengths = np.array([bar.length for bar in bars])
     alongs = np.array([bar.along for bar in bars])
     for bar in bars:
+        if len(threes) >= 2 * _MOST_THREES:
+            break
         across = np.array([-bar.along[1], bar.along[0]])
         offset = centres - bar.centre
         u, v = offset @ across / bar.length, offset @ bar.along / bar.length
@@ -151,7 +154,7 @@ def _threes(bars: Sequence[_Bar]) -> list[_Three]:
                     ends = centres[right] - centres[left]
                     threes.append(_Three(centre, ends / np.hypot(*ends), period))
     threes.sort(key=lambda three: -three.period)
-    return threes[:300]
+    return threes[:_MOST_THREES]
 
 
 def _place(threes: Sequence[_Three], bright: bool) -> UsafPlace | None:
