@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite, nan
 
+import numpy as np
+
 from photoplan.errors import InputError
 from photoplan.io.series_pixels import Plane
 from photoplan.products.characterise_data import SeriesData, Setting
@@ -89,20 +91,36 @@ class Black:
 
 
 def black_of(data: SeriesData, setting: Setting, plane: Plane) -> Black:
-    """Black of a setting: dark frames of the same exposure (and temperature, if both state it), else what is stated."""
-    stated = data.series.camera.black_level_dn
+    """Black of a setting: dark frames of its exposure, else between those of others, else what is stated.
+
+    Dark frames of another temperature (by more than half a degree), and those whose black is cut off, do not count.
+    """
+    known: list[tuple[float, Level]] = []
     clipped = False
     for dark in data.settings("dark"):
-        if dark.first.exposure_ms != setting.first.exposure_ms or _differ(dark, setting):
+        if _differ(dark, setting):
             continue
         level = data.levels(dark)[plane.name]
+        clipped = clipped or is_clipped_dark(level)
         if is_clipped_dark(level):
-            clipped = True
             continue
-        sigma = level.mean_sigma
-        return Black(level.mean, sigma if isfinite(sigma) else 0.0, level, "dark frames of the same exposure")
-    why = "black is cut off in the dark frames" if clipped else "no dark frames of the same exposure"
+        if dark.first.exposure_ms == setting.first.exposure_ms:
+            return Black(level.mean, _sigma(level), level, "dark frames of the same exposure")
+        if dark.first.exposure_ms is not None:
+            known.append((dark.first.exposure_ms, level))
+    if known and setting.first.exposure_ms is not None:
+        known.sort(key=lambda item: item[0])
+        means = [level.mean for _, level in known]
+        mean = float(np.interp(setting.first.exposure_ms, [exposure for exposure, _ in known], means))
+        sigma = max(_sigma(level) for _, level in known)
+        return Black(mean, sigma, None, "between dark frames of other exposures")
+    stated = data.series.camera.black_level_dn
+    why = "black is cut off in the dark frames" if clipped else "no dark frames that fit"
     return Black(stated, 0.0, None, f"{why}: black level {stated:g} DN as stated")
+
+
+def _sigma(level: Level) -> float:
+    return level.mean_sigma if isfinite(level.mean_sigma) else 0.0
 
 
 def _differ(dark: Setting, setting: Setting) -> bool:

@@ -25,8 +25,8 @@ __all__ = ["Blooming", "find_blooming"]
 _NEAR, _FAR = 2, 4
 #: Standard deviations by which neighbours must exceed what was expected.
 _SIGNIFICANT = 4.0
-#: Part of the range up to saturation in which the object gives the responses.
-_SAFE = 0.5
+#: Part of the brightest grey value that the object reaches, up to which it gives the responses.
+_SAFE = 0.55
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,10 +84,13 @@ def find_blooming(
         raise InputError(f"{len(exposures)} exposures; blooming needs four that increase")
     span = saturation - black
     tops = [_brightest(image) - black for image in images]
-    safe = [k for k, top in enumerate(tops) if top <= _SAFE * span]
+    # Charge that runs over may keep the object far below the largest grey value.
+    reached = min(span, max(tops))
+    safe = [k for k, top in enumerate(tops) if top <= _SAFE * reached]
     if len(safe) < 2:
         raise InputError(
-            f"{len(safe)} exposures in which the bright object is below half of saturation; blooming needs two or more"
+            f"the bright object is below half of its brightest grey value in {len(safe)} of {len(tops)} exposures; "
+            "blooming needs two or more: expose shorter"
         )
     response = _response(exposures, images, safe, black)
     bright = _object(response)
@@ -104,7 +107,7 @@ def find_blooming(
         raise InputError(
             f"no blooming, but the bright object reaches only {object_dn[-1]:.4g} DN of {span:.4g}; expose it longer"
         )
-    threshold = max(_SIGNIFICANT * float(sigma[-1]) * sqrt(near.sum()), 0.03 * span)
+    threshold = max(_SIGNIFICANT * float(sigma[-1]) * sqrt(near.sum()), 0.03 * reached)
     lifted = images[-1] - black - np.minimum(response * times[-1], span) > threshold
     rows, columns = _extent(lifted, bright)
     return Blooming(

@@ -189,9 +189,10 @@ class LogHistogram:
         return {name: getattr(self, name).tolist() for name in ("deviation", "count", "model")}
 
 
-def log_histogram(deviation: NDArray[np.float64], scatter: float, classes: int = 200) -> LogHistogram:
-    """Histogram for a logarithmic axis, over the whole range of the deviations."""
+def log_histogram(deviation: NDArray[np.float64], scatter: float) -> LogHistogram:
+    """Histogram for a logarithmic axis, over the whole range; classes of a third of the scatter, 4000 at most."""
     low, high = float(deviation.min()), float(deviation.max())
+    classes = int(np.clip(3 * (high - low) / scatter, 20, 4000)) if scatter > 0 else 200
     edges = np.linspace(low, high if high > low else low + 1.0, classes + 1)
     count, _ = np.histogram(deviation, edges)
     model = np.diff(norm.cdf(edges, float(np.median(deviation)), scatter)) * deviation.size

@@ -89,8 +89,10 @@ def pattern_variance(
     measured_sigma = inner * sqrt(2 / (mean.size - 1))
     row_sigma = of_rows * sqrt(2 / (height - 1))
     column_sigma = of_columns * sqrt(2 / (width - 1))
-    pixel_sigma = measured_sigma
-    total_sigma = sqrt(row_sigma**2 + column_sigma**2 + measured_sigma**2)
+    # What is left of the temporal noise is itself estimated.
+    rest_sigma = rest * sqrt(2 / ((frames - 1) * (mean.size - 1)))
+    pixel_sigma = sqrt(measured_sigma**2 + rest_sigma**2)
+    total_sigma = sqrt(row_sigma**2 + column_sigma**2 + pixel_sigma**2)
     return PatternVariance(
         total,
         total_sigma,
