@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +25,13 @@ class EdgeSettings:
 
     curve: int = 1
     """1: a straight line; 2: a parabola, for edges that a lens bends."""
-    shading: bool = True
-    """Whether both levels may change linearly along the edge (illumination, fall-off)."""
+    reach: float = 16.0
+    """Distance in pixels up to which light counts as spread by the camera (8 standard deviations of wider edges). What
+    lies farther counts to the levels, since no image tells it from uneven light. Infinite: the whole region, for evenly
+    lit targets."""
+    shading: Literal["none", "along", "plane"] = "along"
+    """Whether both levels may change linearly: not at all, along the edge, or along and across it. Across, a slope can
+    hardly be told from stray light, so that figures become less certain."""
     blocks: int = 20
     """Into how many independent profiles an edge is split at most; a block has two rows at least."""
     confidence: float = 0.95
@@ -46,6 +52,10 @@ class EdgeSettings:
             raise InputError(f"the line of an edge has degree 1 (straight) or 2 (parabola); given: {self.curve}")
         if self.blocks < 5:
             raise InputError(f"an interval needs 5 blocks of an edge at least; given: {self.blocks}")
+        if not self.reach >= 4.0:
+            raise InputError(f"the reach of an edge is 4 pixels at least; given: {self.reach}")
+        if self.shading not in ("none", "along", "plane"):
+            raise InputError(f"shading is none, along or plane; given: {self.shading!r}")
         if not 0.5 <= self.confidence < 1.0:
             raise InputError(f"a confidence is 0.5 or more and below 1; given: {self.confidence}")
 
@@ -76,8 +86,11 @@ def check_region(image: NDArray[np.float64], valid: NDArray[np.bool_]) -> None:
         raise InputError(
             f"a region for an edge has 16 million pixels at most; given: {image.shape[1]} × {image.shape[0]}"
         )
-    if np.count_nonzero(valid) < 0.5 * image.size:
-        raise InputError("less than half of the region's pixels are valid; choose a region inside the image")
+    # The pixels along an oblique edge fill a small part of the rectangle around them.
+    if np.count_nonzero(valid) < max(0.02 * image.size, 100):
+        raise InputError(
+            f"{np.count_nonzero(valid)} of the region's {image.size} pixels are valid; choose a region inside the image"
+        )
 
 
 def check_clipping(
@@ -95,8 +108,8 @@ def check_clipping(
         share = float(np.mean((values <= low + slack) | (values >= high - slack)))
         if share > most:
             raise InputError(
-                f"saturated edge: {100 * share:.1f} % of the pixels on its {name} side are clipped ({low:g} or {high:g}), "
-                f"allowed are {100 * most:g} %; take an image with another exposure"
+                f"saturated edge: {100 * share:.1f} % of the pixels on its {name} side are clipped ({low:g} or "
+                f"{high:g}), allowed are {100 * most:g} %; take an image with another exposure"
             )
 
 
@@ -108,7 +121,7 @@ def check_step(step: float, noise: float, count: int, least: float) -> None:
         )
     if step < least * noise:
         raise InputError(
-            f"edge too noisy: the step is {step / noise:.1f} times the noise of a pixel, at least {least:g} are needed; "
+            f"edge too noisy: the step is {step / noise:.1f} times a pixel's noise, {least:g} at least are needed; "
             "use a stronger edge, or the mean of several images"
         )
 
@@ -127,8 +140,8 @@ def check_line(residuals: Residuals, most: float, curve: int) -> float:
     good = weight > 0.5 * np.median(weight[weight > 0.0])
     if np.count_nonzero(good) < 12:
         return 0.0
-    stretch = max(4, np.count_nonzero(good) // 12)
-    groups = np.arange(np.count_nonzero(good)) // stretch
+    rows = int(np.count_nonzero(good))
+    groups = np.arange(rows) // max(4, rows // 12)
     total, sums = np.bincount(groups, weight[good]), np.bincount(groups, moment[good])
     shift = sums / total
     noise = float(residuals.value[near].var())
@@ -136,11 +149,10 @@ def check_line(residuals: Residuals, most: float, curve: int) -> float:
     chance = float(chdtrc(shift.size, (shift**2 * total).sum() / max(noise, 1e-30)))
     deviation = float(np.sqrt(max(excess, 0.0)))
     if chance < CHANCE and deviation > most:
-        advice = (
-            "measure it as a curve of degree 2, or choose a shorter region" if curve == 1 else "choose a shorter region"
-        )
+        advice = ("measure it as a curve of degree 2, or " if curve == 1 else "") + "choose a shorter region"
         raise InputError(
-            f"bent edge: it deviates from its line by {deviation:.2f} pixels (root mean square), allowed are {most:g}; {advice}"
+            f"bent edge: it deviates from its line by {deviation:.2f} pixels (root mean square), allowed are {most:g}; "
+            f"{advice}"
         )
     return deviation
 

@@ -24,8 +24,8 @@ MOST_STEPS = 25
 class EdgeLine:
     """The line ``across = offset + slope · along + bend · along²`` of the frame in which it is steep.
 
-    In direction ``x`` *across* is the column and *along* the row, in direction ``y`` the other way round; *along* counts
-    from `middle`.
+    In direction ``x`` *across* is the column and *along* the row, in direction ``y`` the other way round; *along*
+    counts from `middle`.
     """
 
     direction: str
@@ -108,7 +108,7 @@ def find_line(image: NDArray[np.float64], valid: NDArray[np.bool_]) -> EdgeLine:
         filled = np.where(valid, image, smooth)
     columns = gaussian_filter(filled, SMOOTHING, order=(0, 1), mode="nearest")
     rows = gaussian_filter(filled, SMOOTHING, order=(1, 0), mode="nearest")
-    direction = "x" if (columns**2).sum() >= (rows**2).sum() else "y"
+    direction = "x" if (columns[valid] ** 2).sum() >= (rows[valid] ** 2).sum() else "y"
     main, other, mask = (columns, rows, valid) if direction == "x" else (rows.T, columns.T, valid.T)
     power = np.where(mask, main**2 + other**2, 0.0)
     strong = power > 0.25 * np.quantile(power.max(axis=1), 0.75)
@@ -137,13 +137,22 @@ def find_line(image: NDArray[np.float64], valid: NDArray[np.bool_]) -> EdgeLine:
 
 
 def fit_line(
-    pixels: EdgePixels, line: EdgeLine, curve: int, shading: bool
+    pixels: EdgePixels, line: EdgeLine, curve: int, shading: bool, settled: float = 1e-4
 ) -> tuple[EdgeLine, PixelEdge, NDArray[np.float64]]:
     """Line and blur of least squares for the pixels of an edge, by the profile of a Gaussian and the pixel.
 
     Offset, slope (and bend), blur, both levels and, where asked, their slopes are adjusted together (Levenberg and
     Marquardt). Where the true line spread function has another form the line is still right: its slope does not depend
     on the form, and a shift of its offset is taken up by the profile that is measured afterwards.
+
+    Parameters
+    ----------
+    curve
+        Degree of the line, 1 or 2.
+    shading
+        Whether both levels may change along the edge.
+    settled
+        Change of place and blur, in pixels, at which the fit ends.
 
     Returns
     -------
@@ -155,15 +164,15 @@ def fit_line(
     state = _State(line, blur)
     best = _linearised(pixels, state, curve, shading)
     for _ in range(MOST_STEPS):
-        design, residual, levels = best
+        design, residual, _ = best
         cost = float(residual @ residual)
         normal = design.T @ design
         right = design.T @ residual
-        step = np.linalg.lstsq(normal + damping * np.diag(np.diag(normal)), right, rcond=1e-12)[0]
+        step = np.asarray(np.linalg.lstsq(normal + damping * np.diag(np.diag(normal)), right, rcond=1e-12)[0], float)
         trial = state.moved(step[: curve + 2], curve)
         following = _linearised(pixels, trial, curve, shading)
         if float(following[1] @ following[1]) <= cost:
-            done = bool(np.abs(step[[0, curve + 1]]).max() < 1e-5)
+            done = bool(np.abs(step[[0, curve + 1]]).max() < settled)
             state, best, damping = trial, following, damping / 10.0
             if done:
                 break

@@ -19,7 +19,7 @@ LEAST_BLUR = 0.05
 
 @dataclass(frozen=True)
 class PixelEdge:
-    """Half plane ⊗ Gaussian ⊗ square pixel, across the edge: a Gaussian and two boxes, |cos| and |sin| of the angle wide.
+    """Half plane ⊗ Gaussian ⊗ square pixel, across the edge: a Gaussian and boxes |cos| and |sin| of the angle wide.
 
     Seen across an edge, the unit square of a pixel is a trapezoid, the convolution of both boxes. Integrals of the
     normal distribution give edge profile, line spread function and their derivatives without any sampling.

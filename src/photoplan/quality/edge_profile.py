@@ -4,8 +4,8 @@ Every pixel is one observation of the edge profile at its own distance from the 
 profile many times per pixel). The observations are adjusted together by linear prediction, as heights are in a terrain
 model: the *trend* is the profile of Gaussian optics and a square pixel with free levels, place and width; the *signal*
 is what the true line spread function has beyond that (asymmetry, tails of stray light, edge enhancement), a random
-function that is smooth at the scale of the edge's width, and wide and faint far from it; its variance and smoothness are
-those of the largest restricted likelihood, so the data say how much of it there is; the rest is *noise*.
+function that is smooth at the scale of the edge's width, and wide and faint far from it; restricted likelihood says
+how smooth and how large, so the data decide how much of it there is; the rest is *noise*.
 
 ISO 12233 and its relatives average pixels into bins of a quarter pixel, difference the bins and multiply with a
 Hamming window; bins and differences filter the result (corrected there approximately), bins hold unequal numbers of
@@ -19,6 +19,8 @@ Biometrika 58, 1971.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
 from math import asinh, ceil, pi, sinh, sqrt
 
 import numpy as np
@@ -38,6 +40,9 @@ CORE = 3.0
 CORRELATION = (0.7, 1.4, 2.8)
 #: Standard deviations of the signal that are tried, in units of the noise's and of the trend's.
 SCALES = 10.0 ** np.linspace(-3.0, 3.5, 53)
+#: The largest scale is taken whose logarithmic likelihood is not this far below the best (95 %): a signal that is too
+#: small hides a form that the pixels cannot exclude.
+UNLIKELY = 1.92
 #: How many unknowns of the shape belong to the trend: step, shift, width.
 TREND = 3
 
@@ -123,13 +128,18 @@ class ProfileBasis:
         return np.concatenate([[1.0, 0.0, 0.0], signal[0]])
 
     def root(self, correlation: float) -> NDArray[np.float64]:
-        """Matrix R with R Rᵀ the covariance of the signal's coefficients, for unit variance in the middle."""
+        """Matrix R with R Rᵀ the covariance of the signal's coefficients, for unit variance in the middle.
+
+        Twice differentiable (Matérn 5/2) in a coordinate that grows like the logarithm of the distance in the tails,
+        where it fades as 1 / distance², as the lines of diffraction and of veiling light do.
+        """
         unit = self.model.total * CORE
         place = np.arcsinh(self.centres / unit) * CORE
         fading = 1.0 / (1.0 + (self.centres / unit) ** 2) / self.model.total
         apart = np.abs(np.subtract.outer(place, place)) * (sqrt(5.0) / correlation)
-        value, vector = np.linalg.eigh((1.0 + apart + apart**2 / 3.0) * np.exp(-apart))
-        return fading[:, None] * (vector * np.sqrt(np.maximum(value, 0.0)))
+        matern = (1.0 + apart + apart**2 / 3.0) * np.exp(-apart)
+        value, vector = eigh(matern)
+        return np.asarray(fading[:, None] * (vector * np.sqrt(np.maximum(value, 0.0))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +162,7 @@ class EdgeFit:
     unknowns: float
     """Effective number of unknowns."""
     signal: float
-    """Standard deviation of the signal relative to the noise; the smallest one tried means: the trend is enough."""
+    """Standard deviation of the signal relative to the noise."""
 
 
 def fit_profile(
@@ -217,7 +227,7 @@ def _best_prior(
     right: NDArray[np.float64],
     counts: tuple[float, int, int],
 ) -> tuple[NDArray[np.float64], float, float]:
-    """Covariance root, scale and noise of the largest restricted likelihood, of all that are tried.
+    """Covariance root, scale and noise: smoothness of the best restricted likelihood, scale as large as it allows.
 
     With the unknowns of the trend eliminated, the signal's normal equations are brought to diagonal form, in which
     the likelihood of every scale is a sum (Patterson and Thompson 1971).
@@ -237,9 +247,10 @@ def _best_prior(
         gain = 1.0 + np.multiply.outer(SCALES**2, np.maximum(value, 0.0))
         residual = np.maximum(rest - (SCALES[:, None] ** 2 * along / gain).sum(axis=1), 1e-12 * square)
         likelihood = -0.5 * (np.log(gain).sum(axis=1) + free * np.log(residual / free))
-        i = int(np.argmax(likelihood))
-        if likelihood[i] > best[0] + 1e-9:
-            best = (float(likelihood[i]), root, float(SCALES[i]), sqrt(residual[i] / free))
+        top = float(likelihood.max())
+        if top > best[0] + 1e-9:
+            i = int(np.flatnonzero(likelihood >= top - UNLIKELY)[-1])
+            best = (top, root, float(SCALES[i]), sqrt(residual[i] / free))
     return best[1], best[2], best[3]
 
 
@@ -250,7 +261,7 @@ def _looked_up(basis: ProfileBasis, distance: NDArray[np.float64]) -> NDArray[np
     lines = int((float(distance.max()) - first) / step) + 2
     if lines > 2 * distance.size:
         return basis.edge(distance)
-    table = basis.edge(first + step * np.arange(lines))
+    table = basis.edge(np.asarray(first + step * np.arange(lines), np.float64))
     place = (distance - first) / step
     at = np.minimum(place.astype(np.intp), lines - 2)
     part = (place - at)[:, None]
@@ -260,8 +271,14 @@ def _looked_up(basis: ProfileBasis, distance: NDArray[np.float64]) -> NDArray[np
 def _quadrature(knots: NDArray[np.float64], most: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Places and weights of Gauss' quadrature between nodes, for cubic pieces times waves up to a frequency."""
     places, weights = [], []
-    for a, b in zip(knots[:-1], knots[1:]):
-        x, w = np.polynomial.legendre.leggauss(min(4 + ceil(3.0 * most * (b - a)), 64))
+    for a, b in pairwise(knots):
+        x, w = _gauss(min(4 + ceil(3.0 * most * (b - a)), 64))
         places.append(0.5 * (a + b) + 0.5 * (b - a) * x)
         weights.append(0.5 * (b - a) * w)
     return np.concatenate(places), np.concatenate(weights)
+
+
+@lru_cache(maxsize=64)
+def _gauss(order: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    places, weights = np.polynomial.legendre.leggauss(order)
+    return places, weights

@@ -1,4 +1,4 @@
-"""Edge, line spread and modulation transfer functions of one edge, with intervals; no figure where none can be known."""
+"""Edge, line spread and modulation transfer functions of one edge, with intervals; no figure where there is none."""
 
 from __future__ import annotations
 
@@ -161,13 +161,13 @@ def measure_edge(
     check_region(image, mask)
     line = find_line(image, mask)
     every = EdgePixels.of(image, mask, line.direction)
-    line, model, levels = fit_line(every, line, chosen.curve, chosen.shading)
+    line, model, levels = fit_line(every, line, chosen.curve, chosen.shading != "none", 1e-2)
     near = np.abs(line.distance(every.across, every.along)) < 2.5 * model.total
     if np.count_nonzero(near) > 40:
         line, model, levels = fit_line(every.where(near), line, chosen.curve, False)
     distance = line.distance(every.across, every.along)
     check_clipping(every.light, distance, limits, chosen.most_clipped)
-    low, high = _window(distance, model)
+    low, high = _window(distance, model, max(chosen.reach, 8.0 * model.total))
     inside = (distance >= low) & (distance <= high)
     seen, distance = every.where(inside), distance[inside]
     span = _span(seen, distance, model, line, chosen)
@@ -188,16 +188,17 @@ class _Context:
     settings: EdgeSettings
 
 
-def _window(distance: NDArray[np.float64], model: PixelEdge) -> tuple[float, float]:
-    """Distances up to which every step of a pixel holds a third of the pixels that the edge itself has."""
+def _window(distance: NDArray[np.float64], model: PixelEdge, reach: float) -> tuple[float, float]:
+    """Distances within a reach up to which every step of a pixel holds a third as many pixels as the edge itself."""
     count = np.bincount((np.floor(distance) - np.floor(distance.min())).astype(np.intp))
     zero = int(-np.floor(distance.min()))
-    reach = max(1, round(2.0 * model.total))
-    usual = float(np.median(count[max(zero - reach, 0) : zero + reach]))
+    core = max(1, round(2.0 * model.total))
+    usual = float(np.median(count[max(zero - core, 0) : zero + core]))
     poor = count < usual / 3.0
     before, after = np.flatnonzero(poor[:zero]), np.flatnonzero(poor[zero:])
     low = float(before[-1] + 1 - zero) if before.size else float(distance.min())
     high = float(after[0]) if after.size else float(distance.max())
+    low, high = max(low, -reach), min(high, reach)
     if min(-low, high) < 3.0 * model.total:
         raise InputError(
             f"the region is too narrow for the edge, or holds none: it reaches {min(-low, high):.1f} pixels beside a "
@@ -229,9 +230,7 @@ def _weights(
     The variance of photon noise grows in proportion to the light, so it is interpolated between both sides.
     """
     rise = model.profile(distance)[0]
-    t = pixels.along - line.middle
-    columns = [1.0 - rise, rise] + ([t * (1.0 - rise), t * rise] if settings.shading else [])
-    design = np.stack(columns, axis=1)
+    design = np.concatenate([rise[:, None], _levels(pixels, distance, line, rise, settings)], axis=1)
     levels = np.linalg.lstsq(design.T @ design, design.T @ pixels.light, rcond=1e-12)[0]
     residual = pixels.light - design @ levels
     dark, bright = residual[distance < -2.0 * model.total], residual[distance > 2.0 * model.total]
@@ -245,6 +244,23 @@ def _weights(
     return usual / (low + (high - low) * np.clip(rise, 0.0, 1.0)), float(np.sqrt(usual))
 
 
+def _levels(
+    pixels: EdgePixels,
+    distance: NDArray[np.float64],
+    line: EdgeLine,
+    rise: NDArray[np.float64],
+    settings: EdgeSettings,
+) -> NDArray[np.float64]:
+    """Columns of the dark level and of the changes of both levels along, and across, the edge."""
+    columns = [np.ones_like(distance)]
+    if settings.shading != "none":
+        t = (pixels.along - line.middle) / max(float(np.ptp(pixels.along)), 1.0)
+        columns += [t * (1.0 - rise), t * rise]
+    if settings.shading == "plane":
+        columns += [distance * (1.0 - rise) / 10.0, distance * rise / 10.0]
+    return np.stack(columns, axis=1)
+
+
 def _fit(
     pixels: EdgePixels,
     observed: tuple[NDArray[np.float64], NDArray[np.float64]],
@@ -255,16 +271,12 @@ def _fit(
     distance, weight = observed
     model, low, high = window
     basis = ProfileBasis.between(model, low, high)
-    extra = [np.ones_like(distance)]
-    if settings.shading:
-        rise = model.profile(distance)[0]
-        t = (pixels.along - line.middle) / max(float(np.ptp(pixels.along)), 1.0)
-        extra += [t * (1.0 - rise), t * rise]
+    extra = _levels(pixels, distance, line, model.profile(distance)[0], settings)
     near = pixels.along[np.abs(distance) <= max(model.total, 0.5)]
     blocks = int(min(settings.blocks, max(5, np.ptp(near) // 2)))
     borders = np.linspace(near.min(), near.max() + 1.0, blocks + 1)[1:-1]
     starts = np.concatenate([[0], np.searchsorted(pixels.along, borders)])
-    return fit_profile(basis, (distance, pixels.light, weight), np.stack(extra, axis=1), starts)
+    return fit_profile(basis, (distance, pixels.light, weight), extra, starts)
 
 
 def _measured(found: _Context) -> EdgeMeasurement:
@@ -324,12 +336,10 @@ def _phase_gap(distance: NDArray[np.float64], model: PixelEdge) -> float:
 
 def _residual_checks(found: _Context, step: float) -> tuple[float, float]:
     fit, pixels, settings = found.fit, found.pixels, found.settings
-    t = (pixels.along - found.line.middle) / max(float(np.ptp(pixels.along)), 1.0)
     rise, spread, _ = fit.basis.model.profile(found.distance)
     table = np.linspace(fit.basis.low, fit.basis.high, 4 * int(fit.basis.high - fit.basis.low) * 8)
-    fitted = fit.levels[0] + np.interp(found.distance, table, fit.basis.edge(table) @ fit.shape)
-    if settings.shading:
-        fitted += fit.levels[1] * t * (1.0 - rise) + fit.levels[2] * t * rise
+    fitted = np.interp(found.distance, table, fit.basis.edge(table) @ fit.shape)
+    fitted += _levels(pixels, found.distance, found.line, rise, settings) @ fit.levels
     value = (pixels.light - fitted) / step
     residuals = Residuals(pixels.across, pixels.along, found.distance, value, spread, fit.basis.model.total)
     structure = check_sides(residuals, settings.most_structure)

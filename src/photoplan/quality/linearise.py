@@ -69,8 +69,8 @@ class Linearisation:
             table = table[:, None]
         if table.ndim != 2 or table.shape[1] not in (1, 2, 3, 4):
             raise InputError(
-                "a linearisation table has one column (light of grey value 0, 1, …), two (grey value, light), three (light "
-                f"in three bands) or four (grey value, light in three bands); given is shape {table.shape}"
+                "a linearisation table has one column (light of grey value 0, 1, …), two (grey value, light), "
+                f"three (light in three bands) or four (grey value, light in three bands); given is shape {table.shape}"
             )
         if table.shape[1] in (2, 4):
             return cls("table", table[:, 0], table[:, 1:])
@@ -182,8 +182,8 @@ def _checked_table(
         if not (rise > 0.0).all():
             line = int(np.argmin(rise > 0.0)) + 2
             raise InputError(
-                f"the light of a linearisation table rises, or falls, from line to line (else one light had several grey "
-                f"values); line {line} of column {column + 1} holds {second[line - 1, column]:g} after "
+                f"the light of a linearisation table rises, or falls, from line to line (else one light had "
+                f"several grey values); line {line} of column {column + 1} holds {second[line - 1, column]:g} after "
                 f"{second[line - 2, column]:g}"
             )
     return first, second
