@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ __all__ = ["Target", "locate_target"]
 
 _SMALLEST, _MARGIN = 2.0, 3.0
 """Least diameter, and background that is compared around the target, pixels."""
+_STEPS = 8
+"""Steps of a pixel in which discs are drawn: a disc that is a little too large or small lies where it lies."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +84,7 @@ def locate_target(image: NDArray[np.floating], *, bright: bool = True, least: fl
     # The area at half contrast is that of the disc, whatever the blur.
     area = _area(grey, piece)
     diameter = 2 * math.sqrt(area / math.pi)
-    disc = _disc(diameter)
+    disc = _disc(round(diameter * _STEPS) / _STEPS)
     tried = best_blur(grey, disc, one, near, False)
     blur = _BLURS[int(np.nanargmax(tried))] if np.isfinite(tried).any() else 0.7
     at = locate_mark(grey, disc, one, blur_px=blur, near=(*near, half))
@@ -103,7 +106,9 @@ def _area(grey: NDArray[np.float64], piece: NDArray[np.bool_]) -> float:
     return max(float((grey[inside] - background).sum()) / (top - background), 1.0)
 
 
+@lru_cache(maxsize=16)
 def _disc(diameter: float) -> MarkPattern:
+    """The same object for the same diameter, so that templates of a target in many frames are drawn once."""
     angle = np.linspace(0, 2 * math.pi, 72, endpoint=False)
     circle = diameter / 2 * np.column_stack([np.cos(angle), np.sin(angle)])
     half = diameter / 2 + _MARGIN - 0.5

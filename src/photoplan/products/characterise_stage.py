@@ -116,7 +116,7 @@ def _outcome(found: StageCalibration, given: _Points, number: int) -> Outcome:
             figure(f"mean_error_{axis}_px", value, value / math.sqrt(2 * (n - 3)), f"mean error {axis}", "px")
         )
     figures.append(figure("m0_px", found.sigma0, found.sigma0 / math.sqrt(2 * found.redundancy), "M0", "px"))
-    matrices = [
+    matrices: list[tuple[str | float | int, ...]] = [
         (at, way, *(float(getattr(t, f"a{k}")) for k in range(1, 7)))
         for way, t in (("stage to image", found.to_image), ("image to stage", found.to_stage))
     ]

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 SEPARABLE = 0.05
 _KNOWN = 0.1
 """Largest standard deviation of an estimated camera constant as part of it."""
-_DIRTY = 5.0
+_DIRTY = 5.5
 _MOST_DIRT = 100
 _SATURATED = 0.001
 
@@ -172,7 +172,7 @@ def _rank(fit: Fit, shares: dict[str, float], settings: FallOffSettings) -> str:
     sigmas = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
     lost = [
         f"{name} ({100 * (1 - share**2):.2f} % of what it changes, the other unknowns can do as well; its standard "
-        f"deviation would be {100 * sigma:.3g} % of {'it' if name == 'camera constant' else 'half the diagonal'})"
+        f"deviation would be {100 * sigma:.0f} % of {'it' if name == 'camera constant' else 'half the diagonal'})"
         for (name, share), sigma in zip(shares.items(), sigmas)
         if share < SEPARABLE or not sigma < _KNOWN
     ]
@@ -215,7 +215,7 @@ def _result(blocks: Blocks, settings: FallOffSettings, fit: Fit, rank: tuple[str
         float(np.abs((fit.residuals / computed)[clean]).max()),
         blocks.neighbour_correlation(np.where(clean, fit.residuals, np.nan)),
         float(np.ptp(computed)) / level,
-        _dirt(blocks, relative),
+        _dirt(blocks, blocks.spread_out(fit.residuals), relative),
         blocks,
         relative,
     )
@@ -260,13 +260,14 @@ def _corners(model: FallOffModel, fit: Fit, size: tuple[int, int]) -> tuple[Corn
     )
 
 
-def _dirt(blocks: Blocks, relative: Array) -> tuple[Dirt, ...]:
+def _dirt(blocks: Blocks, residuals: Array, relative: Array) -> tuple[Dirt, ...]:
     """Connected blocks that stand out, the deepest first."""
-    known = np.isfinite(relative)
-    limit = _DIRTY * 1.4826 * float(np.median(np.abs(relative[known])))
+    known = np.isfinite(residuals)
+    # In grey values: the relative noise is larger in the corners.
+    limit = _DIRTY * 1.4826 * float(np.median(np.abs(residuals[known])))
     if not limit > 0.0:
         return ()
-    pieces, _ = ndimage.label(known & (np.abs(relative) > limit), np.ones((3, 3)))
+    pieces, _ = ndimage.label(known & (np.abs(residuals) > limit), np.ones((3, 3)))
     found = []
     for number, place in enumerate(ndimage.find_objects(pieces), 1):
         values = np.where(pieces[place] == number, relative[place], 0.0)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, stats
 
 from photoplan.errors import InputError
-from photoplan.quality.line_period import Adjusted, Harmonic, Spectrum, adjust_periods, false_alarm, spectrum
+from photoplan.quality.line_period import Adjusted, Harmonic, Spectrum, Waves, adjust_periods, false_alarm, spectrum
 from photoplan.quality.plumb_edge import LEAST_LINES
 
 __all__ = ["LineJitter", "Spike", "grey_error", "line_jitter", "position_error"]
@@ -175,7 +175,8 @@ def _base(t: Array, degree: int, lines: int) -> tuple[Array, Array]:
 
 def _chosen(t: Array, y: Array, degree: int | None, lines: int) -> tuple[int, Adjusted, Spectrum]:
     """Degree of the polynomial with the adjustment, and the spectrum beside this polynomial."""
-    tried = {d: _adjusted(t, y, d, lines) for d in ([degree] if degree else range(1, _MOST_DEGREE + 1))}
+    waves = Waves(t)
+    tried = {d: _adjusted(waves, t, y, (d, lines)) for d in ([degree] if degree else range(1, _MOST_DEGREE + 1))}
     best = min(tried)
     for d, (fit, _) in tried.items():
         # The last but one unknown is the highest polynomial's; the last, that of the fields.
@@ -186,17 +187,16 @@ def _chosen(t: Array, y: Array, degree: int | None, lines: int) -> tuple[int, Ad
     return best, *tried[best]
 
 
-def _adjusted(t: Array, y: Array, degree: int, lines: int) -> tuple[Adjusted, Spectrum]:
+def _adjusted(waves: Waves, t: Array, y: Array, shape: tuple[int, int]) -> tuple[Adjusted, Spectrum]:
     """Oscillations one after the other, each searched beside all that were found before."""
-    base = np.column_stack(_base(t, degree, lines))
-    first = found = spectrum(t, y, base)
+    base = np.column_stack(_base(t, *shape))
+    first = found = spectrum(waves, y, base)
     frequencies: list[float] = []
     chances: list[float] = []
     fit = adjust_periods(t, y, base, frequencies, chances)
-    extent = float(t[-1] - t[0]) + 1.0
     floor = 1e-12 * float(y @ y) / len(y)
     while len(frequencies) < _MOST_PERIODS and fit.sigma0**2 > floor:
-        chance = false_alarm(found, len(t) - base.shape[1] - 3 * len(frequencies) - 3, extent)
+        chance = false_alarm(found, len(t) - base.shape[1] - 3 * len(frequencies) - 3, waves.extent)
         if not chance < LEVEL:
             break
         frequencies.append(float(found.frequency[found.best]))
@@ -204,7 +204,7 @@ def _adjusted(t: Array, y: Array, degree: int, lines: int) -> tuple[Adjusted, Sp
         fit = adjust_periods(t, y, base, frequencies, chances)
         frequencies = [1.0 / h.period for h in fit.harmonics]
         angle = 2.0 * math.pi * np.multiply.outer(t, np.array(frequencies))
-        found = spectrum(t, y, np.column_stack([base, np.cos(angle), np.sin(angle)]))
+        found = spectrum(waves, y, np.column_stack([base, np.cos(angle), np.sin(angle)]))
     return fit, first
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Harmonic", "Spectrum", "adjust_periods", "spectrum"]
+__all__ = ["Adjusted", "Harmonic", "Spectrum", "Waves", "adjust_periods", "false_alarm", "spectrum"]
 
 Array = NDArray[np.float64]
 
@@ -16,11 +17,13 @@ _OVERSAMPLING = 4
 _LONGEST = 1.5
 """Least number of periods in the series: fewer cannot be told from a curve."""
 _AT_ONCE = 256
+_KEPT = 4_000_000
+"""Cosines that are kept in memory."""
 
 
 @dataclass(frozen=True)
 class Harmonic:
-    """A oscillation: amplitude · sin(2π t / period + phase), with t the line counted from the window's first."""
+    """An oscillation: amplitude · sin(2π t / period + phase), with t the line counted from the window's first."""
 
     period: float
     """Lines."""
@@ -60,13 +63,35 @@ class Spectrum:
         return int(self.power.argmax())
 
 
-def spectrum(t: Array, y: Array, base: Array, chance: float = 0.001) -> Spectrum:
+class Waves:
+    """Cosines and sines of all frequencies at the lines of one series; kept where they are few."""
+
+    def __init__(self, t: Array) -> None:
+        extent = float(t[-1] - t[0]) + 1.0
+        low, high = _LONGEST / extent, 0.5 - 1.0 / extent
+        self.extent = extent
+        self.frequency = np.linspace(low, high, max(2, math.ceil((high - low) * extent * _OVERSAMPLING)))
+        self._t = t - t[0]
+        self._kept = list(self._parts()) if len(t) * len(self.frequency) <= _KEPT else None
+
+    def parts(self) -> Iterable[tuple[slice, Array, Array]]:
+        """Some frequencies at a time: which, cosines and sines of shape (n, some)."""
+        return self._parts() if self._kept is None else self._kept
+
+    def _parts(self) -> Iterator[tuple[slice, Array, Array]]:
+        for first in range(0, len(self.frequency), _AT_ONCE):
+            part = slice(first, first + _AT_ONCE)
+            angle = 2.0 * math.pi * np.multiply.outer(self._t, self.frequency[part])
+            yield part, np.cos(angle), np.sin(angle)
+
+
+def spectrum(waves: Waves, y: Array, base: Array, chance: float = 0.001) -> Spectrum:
     """Least-squares spectrum: at every frequency the base functions are adjusted anew (Lomb, Scargle).
 
     Parameters
     ----------
-    t : ndarray, shape (n,)
-        Lines; some may be missing.
+    waves : Waves
+        Of the lines, of which some may be missing.
     y : ndarray, shape (n,)
         Values.
     base : ndarray, shape (n, k)
@@ -74,20 +99,15 @@ def spectrum(t: Array, y: Array, base: Array, chance: float = 0.001) -> Spectrum
     chance : float
         Of a false alarm, for `Spectrum.level`.
     """
-    n = len(t)
-    extent = float(t[-1] - t[0]) + 1.0
-    low, high = _LONGEST / extent, 0.5 - 1.0 / extent
-    frequency = np.linspace(low, high, max(2, math.ceil((high - low) * extent * _OVERSAMPLING)))
+    frequency = waves.frequency
     Q, _ = np.linalg.qr(base)
     rest = y - Q @ (Q.T @ y)
     rss0 = max(float(rest @ rest), 1e-300)
     power = np.empty(len(frequency))
-    for first in range(0, len(frequency), _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
-        angle = 2.0 * math.pi * np.multiply.outer(t - t[0], frequency[part])
-        power[part] = _explained(np.cos(angle), np.sin(angle), Q, rest) / rss0
-    freedom = n - base.shape[1] - 3
-    trials = max(1.0, (high - low) * extent)
+    for part, c, s in waves.parts():
+        power[part] = _explained(c, s, Q, rest) / rss0
+    freedom = len(y) - base.shape[1] - 3
+    trials = max(1.0, float(frequency[-1] - frequency[0]) * waves.extent)
     single = -math.expm1(math.log1p(-chance) / trials)
     return Spectrum(frequency, np.clip(power, 0.0, 1.0), 1.0 - single ** (2.0 / freedom))
 
@@ -101,13 +121,16 @@ def false_alarm(found: Spectrum, freedom: int, extent: float) -> float:
 
 def _explained(c: Array, s: Array, Q: Array, rest: Array) -> Array:
     """Sum of squares that cosine and sine explain, after both are freed of what the base can do."""
-    c, s = c - Q @ (Q.T @ c), s - Q @ (Q.T @ s)
-    cc, ss, cs = (c * c).sum(axis=0), (s * s).sum(axis=0), (c * s).sum(axis=0)
+    of_c, of_s = Q.T @ c, Q.T @ s
+    cc = np.einsum("ij,ij->j", c, c) - (of_c * of_c).sum(axis=0)
+    ss = np.einsum("ij,ij->j", s, s) - (of_s * of_s).sum(axis=0)
+    cs = np.einsum("ij,ij->j", c, s) - (of_c * of_s).sum(axis=0)
+    # The rest is free of the base already.
     yc, ys = rest @ c, rest @ s
     det = cc * ss - cs**2
     with np.errstate(divide="ignore", invalid="ignore"):
         out = (yc**2 * ss - 2.0 * yc * ys * cs + ys**2 * cc) / det
-    return np.where(det > 1e-8 * cc * ss, out, 0.0)
+    return np.where(det > 1e-6 * np.maximum(cc * ss, 1e-12), out, 0.0)
 
 
 @dataclass(frozen=True, eq=False)

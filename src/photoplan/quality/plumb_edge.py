@@ -95,14 +95,15 @@ def fit_edge(grey: NDArray[np.floating], *, name: str = "edge", saturation: floa
     _refuse_cut(g, coarse, contrast, name, saturation)
     fit = _adjusted(g, coarse)
     noise = math.sqrt(_typical_square(fit.residuals))
-    typical = float(np.median(np.abs(fit.contrast)))
+    seen = np.abs(fit.contrast) > _CLEAR * fit.sigma_contrast
+    seen &= (np.sign(fit.contrast) == np.sign(contrast)) & (np.abs(fit.position - coarse) < _REACH / 2)
+    _refuse_missing(seen, name)
+    typical = float(np.median(np.abs(fit.contrast[seen])))
     if not noise < _GRAIN * typical:
         raise InputError(
             f"{name}: residuals of {noise:.1f} grey values about an edge of contrast {typical:.1f}: texture or noise, "
             "no clean edge; choose another window"
         )
-    seen = np.abs(fit.contrast) > _CLEAR * fit.sigma_contrast
-    seen &= (np.sign(fit.contrast) == np.sign(contrast)) & (np.abs(fit.position - coarse) < _REACH / 2)
     seen &= np.abs(fit.contrast) > typical / 4.0
     _refuse_missing(seen, name)
     position, sigma = np.where(seen, fit.position, np.nan), np.where(seen, fit.sigma, np.nan)
