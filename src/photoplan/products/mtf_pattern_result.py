@@ -163,8 +163,10 @@ def _bars(found: BarCurve) -> dict[str, Any]:
 
 def _star(found: StarMtf, window: Window) -> dict[str, Any]:
     return {
-        "center": [found.centre[0] + window.col, found.centre[1] + window.row],
-        "center_sigma": found.centre_sigma,
+        "col": found.centre[0] + window.col,
+        "row": found.centre[1] + window.row,
+        "col_sigma": found.centre_sigma[0],
+        "row_sigma": found.centre_sigma[1],
         "sectors": found.sectors,
         "wave": found.wave,
         "low": found.low,

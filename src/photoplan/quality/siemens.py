@@ -31,7 +31,7 @@ class StarRules:
     """How a star is measured."""
 
     sectors: int | None = None
-    """Bright sectors; None: counted."""
+    """Bright sectors, to be confirmed; None: as counted."""
     wave: Literal["square", "sine"] | None = None
     """Sharp sectors, or light that changes as a sine; None: told apart by the third harmonic wave."""
     levels: tuple[float, float] | None = None
@@ -110,7 +110,9 @@ def measure_star(
     centre = rules.centre or rough_centre(values)
     outer = _outer(values, centre, rules, what)
     pixels = StarPixels.of(values, centre)
-    sectors = rules.sectors or count_sectors(pixels, (0.3 * outer, outer), what)
+    sectors = count_sectors(pixels, (0.3 * outer, outer), what)
+    if rules.sectors not in (None, sectors):
+        raise InputError(f"{what}: {rules.sectors} bright sectors are stated, but {sectors} are counted")
     inner = max(sectors / (2.0 * pi * rules.highest), 4.0)
     if outer < 2.0 * inner:
         raise InputError(
@@ -200,6 +202,8 @@ def _refuse_weak(rings: list[Ring], noise: float, what: str) -> None:
     """Refuse what is no star: weak waves, or other structure on the rings."""
     if len(rings) < 3:
         raise InputError(f"{what}: only {len(rings)} rings can be measured; the star is too small")
+    if min(ring.mean for ring in rings) <= 0.0:
+        raise InputError(f"{what}: the mean light of a ring is not positive; is the dark level subtracted twice?")
     widest = rings[0]
     strongest = max(ring.amplitude for ring in rings)
     if strongest < 5.0 * widest.sigma or strongest == 0.0:

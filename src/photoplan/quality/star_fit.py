@@ -195,7 +195,8 @@ def find_centre(
         limit = 0.25 * 2.0 * pi * radii[0] / sectors + 0.25
         factor = min(1.0, limit / long) if long else 1.0
         pixels = pixels.about((pixels.centre[0] + factor * solution[0], pixels.centre[1] + factor * solution[1]))
-        sigma = (float(np.sqrt(covariance[0, 0])), float(np.sqrt(covariance[1, 1])))
+        variance = np.diag(covariance)
+        sigma = tuple(np.sqrt(np.where(variance >= 0.0, variance, np.inf)).tolist())
         if long < 1e-4 and step > 1:
             break
     if not (np.isfinite(sigma).all() and max(sigma) < 1.0):

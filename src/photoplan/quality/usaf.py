@@ -92,7 +92,7 @@ class UsafResult:
     @property
     def groups(self) -> tuple[int, ...]:
         """Groups of which something is seen, be it as grey squares."""
-        return tuple(sorted({bars.group for bars in self.bars if bars.seen or bars.resolved}))
+        return tuple(sorted({bars.group for bars in self.bars if bars.seen}))
 
     @property
     def resolved_groups(self) -> tuple[int, ...]:
@@ -216,6 +216,8 @@ def _bars(item: UsafElement, three: ThreeBars, full: Array, first: int, rules: U
     if three.frequency > _FINEST or sigma > _UNKNOWN:
         contrast = sigma = float("nan")
     group = first + item.step
+    resolved = bool(contrast >= rules.least_contrast and contrast > 3.0 * sigma)
+    square = bool(three.square / level > _SEEN and three.square > 3.0 * three.square_sigma)
     return UsafBars(
         group,
         item.element,
@@ -225,6 +227,6 @@ def _bars(item: UsafElement, three: ThreeBars, full: Array, first: int, rules: U
         three.centre,
         contrast,
         sigma,
-        bool(contrast >= rules.least_contrast and contrast > 3.0 * sigma),
-        bool(three.square / level > _SEEN and three.square > 3.0 * three.square_sigma),
+        resolved,
+        resolved or square,
     )
