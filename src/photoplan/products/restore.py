@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 #: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
-BASE_MEMORY = 320 * 2**20
+BASE_MEMORY = 416 * 2**20
 
 Begin = Callable[[int], AbstractContextManager[Callable[[int, int], None]]]
 
