@@ -1,0 +1,99 @@
+"""Models of lateral chromatic aberration: TOML that can be read and edited."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, Strict, ValidationError
+
+from photoplan.errors import InputError
+from photoplan.io.camera_model import Entry, Number, Pair, Pixels
+from photoplan.io.disk import write_atomically
+from photoplan.io.project_errors import explain
+from photoplan.io.toml_file import read_toml
+
+__all__ = ["ChromaticBand", "ChromaticFile", "read_chromatic", "write_chromatic"]
+
+_MAX_BYTES = 1_000_000
+_Band = Annotated[int, Strict(), Field(ge=1, le=1000)]
+_Power = Annotated[int, Strict(), Field(ge=0, le=5)]
+_Count = Annotated[int, Strict(), Field(ge=0)]
+
+
+class ChromaticBand(Entry):
+    """``[[bands]]``: one band."""
+
+    band: _Band
+    terms: Annotated[tuple[tuple[_Power, _Power, Number, Number], ...], Field(max_length=60)] = ()
+    sigmas: Annotated[tuple[Pair, ...], Field(max_length=60)] = ()
+    kind: Annotated[str, Field(max_length=100)] = "polynomial"
+    residual: Number | None = None
+    count: _Count = 0
+    rejected: _Count = 0
+
+
+class ChromaticFile(Entry):
+    """A whole file."""
+
+    format: Literal["photoplan chromatic 1"]
+    image_size: tuple[Pixels, Pixels]
+    reference: _Band
+    description: Annotated[str, Field(max_length=10_000)] = ""
+    bands: Annotated[tuple[ChromaticBand, ...], Field(max_length=1000)] = ()
+
+
+def read_chromatic(path: Path) -> ChromaticFile:
+    """A model of lateral chromatic aberration.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or an entry is missing, unknown or of a wrong type; the message names its line.
+    """
+    contents, text = read_toml(path, _MAX_BYTES)
+    try:
+        return ChromaticFile.model_validate(contents)
+    except ValidationError as error:
+        raise InputError(explain(error, contents, str(path), text)) from None
+
+
+def write_chromatic(path: Path, contents: Mapping[str, Any], bands: Sequence[Mapping[str, Any]]) -> None:
+    """Write a model; the name holds the old or the whole new file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    contents
+        `image_size`, `reference`, `description`.
+    bands
+        Entries of `ChromaticBand` by name.
+    """
+    lines = ["# Lateral chromatic aberration: where a band lies against the reference, pixels.",
+             "# A term [i, j, a, b] adds (a, b) u^i v^j; u, v from the image's middle in units of half its diagonal.",
+             'format = "photoplan chromatic 1"']  # fmt: skip
+    lines += [f"{name} = {_text(value)}" for name, value in contents.items()]
+    for band in bands:
+        lines += ["", "[[bands]]"]
+        for name, value in band.items():
+            if name in ("terms", "sigmas"):
+                lines += [f"{name} = [", *(f"  {_text(each)}," for each in value), "]"]
+            elif not (isinstance(value, float) and not math.isfinite(value)):
+                lines.append(f"{name} = {_text(value)}")
+    write_atomically(path, ("\n".join(lines) + "\n").encode())
+
+
+def _text(value: Any) -> str:
+    """A plain value as TOML."""
+    if isinstance(value, str):
+        escaped = "".join(c if c >= " " and c not in '"\\' else f"\\u{ord(c):04x}" for c in value)
+        return f'"{escaped}"'
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_text(each) for each in value) + "]"
+    if isinstance(value, int):
+        return str(value)
+    number = f"{float(value):.9g}"
+    return number if any(c in number for c in ".en") else number + ".0"

@@ -1,0 +1,252 @@
+"""Lateral chromatic aberration of images: measured on their own discs or edges, kept in files, corrected."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.grid import Window
+from photoplan.io.chromatic_file import read_chromatic, write_chromatic
+from photoplan.io.raster import RasterReader
+from photoplan.products.aligned_reader import AlignedReader
+from photoplan.quality.chromatic import BandModel, ChromaticModel, Displacements, fit_band
+from photoplan.quality.chromatic_discs import disc_displacements
+from photoplan.quality.chromatic_edges import edge_displacements
+from photoplan.quality.discs import DiscSettings, find_discs
+from photoplan.quality.edge_find import EdgePicture, find_edges
+
+__all__ = [
+    "ChromaticRequest",
+    "correct_chromatic",
+    "load_chromatic",
+    "measure_chromatic",
+    "model_figures",
+    "save_chromatic",
+]
+
+#: Side of the parts in which edges are sought, pixels; it bounds memory.
+_PART = 2048
+#: Pixels of a band in which discs are sought at once.
+_MOST_DISC_PIXELS = 60_000_000
+#: Edges that are used of a part, the best ones.
+_MOST_EDGES = 300
+#: Discs from which on an image counts as a chart.
+_CHART = 12
+
+
+@dataclass(frozen=True)
+class ChromaticRequest:
+    """How lateral chromatic aberration is measured."""
+
+    image: Path
+    reference: int | None = None
+    """Band that stays; None: the second (green) of three and more, else the first."""
+    method: Literal["auto", "discs", "edges"] = "auto"
+    """``auto``: discs where the image shows twelve and more, else edges."""
+    kind: str | None = None
+    """A name of `photoplan.quality.chromatic.KINDS`; None: chosen by cross-validation."""
+
+
+def measure_chromatic(request: ChromaticRequest) -> ChromaticModel:
+    """Measure where the bands of an image lie against its reference band.
+
+    Raises
+    ------
+    UsageError
+        The reference is no band of the image.
+    InputError
+        The image has a single band, or shows neither discs nor edges that can be measured in all bands; the message
+        says what was found.
+    """
+    source = RasterReader(request.image)
+    if source.bands < 2:
+        raise InputError(
+            f"{request.image}: has a single band; lateral chromatic aberration is a difference between bands: give an "
+            "image with its colours"
+        )
+    reference = request.reference or (2 if source.bands >= 3 else 1)
+    if not 1 <= reference <= source.bands:
+        raise UsageError(f"{request.image}: reference band {reference}; the image has {source.bands}")
+    others = [band for band in range(1, source.bands + 1) if band != reference]
+    try:
+        method, measured = _measured(source, request.method, reference, others)
+        bands = tuple(fit_band(band, source.size, measured[band], request.kind) for band in others)
+    except InputError as error:
+        raise type(error)(f"{request.image}: {error}") from None
+    return ChromaticModel(source.size, reference, bands, f"{method} of {request.image.name}")
+
+
+def _measured(
+    source: RasterReader, method: str, reference: int, others: list[int]
+) -> tuple[str, dict[int, Displacements]]:
+    """By which method, and the displacements of each band."""
+    told = ""
+    if method in ("auto", "discs"):
+        try:
+            return "discs", _by_discs(source, reference, others, 4 if method == "discs" else _CHART)
+        except InputError as error:
+            if method == "discs":
+                raise
+            told = f"by discs: {error}; "
+    try:
+        return "edges", _by_edges(source, reference, others)
+    except InputError as error:
+        raise InputError(f"{told}{'by edges: ' if told else ''}{error}") from None
+
+
+def _by_discs(source: RasterReader, reference: int, others: list[int], least: int) -> dict[int, Displacements]:
+    width, height = source.size
+    if width * height > _MOST_DISC_PIXELS:
+        raise InputError(
+            f"{width} × {height} pixels; discs are sought in at most {_MOST_DISC_PIXELS:,} at once: measure a part"
+        )
+    pixels, valid = source.read(Window(0, 0, width, height))
+    settings = DiscSettings(saturation=_saturation(source))
+    found = {}
+    for band in (reference, *others):
+        grey: NDArray[Any] = pixels[band - 1]
+        if valid is not None:
+            grey = np.where(valid, grey.astype(np.float64), np.nan)
+        try:
+            found[band] = find_discs(grey, settings)
+        except InputError as error:
+            raise InputError(f"band {band}: {error}") from None
+        if len(found[band]) < least:
+            raise InputError(f"band {band}: {len(found[band])} discs; a chart shows at least {least}")
+    return {band: disc_displacements(found[reference], found[band]) for band in others}
+
+
+def _saturation(source: RasterReader) -> float:
+    return float(np.iinfo(source.dtype).max) if source.dtype.kind in "iu" else float("inf")
+
+
+def _by_edges(source: RasterReader, reference: int, others: list[int]) -> dict[int, Displacements]:
+    limit = _saturation(source)
+    gathered: dict[int, list[Displacements]] = {band: [] for band in others}
+    count = 0
+    for window in Window(0, 0, *source.size).tiles(_PART):
+        pixels, valid = source.read(window)
+        bands = pixels.astype(np.float64)
+        if valid is not None:
+            bands[:, ~valid] = np.nan
+        base = bands[reference - 1]
+        if not np.isfinite(base).any() or min(base.shape) < 24:
+            continue
+        grey = np.nan_to_num(base).astype(np.float32)
+        edges, _ = find_edges(EdgePicture(grey, valid, base >= limit))
+        edges = sorted(edges, key=lambda e: -e.merit)[:_MOST_EDGES]
+        count += len(edges)
+        for band in others:
+            gathered[band] += _of_part(base, bands[band - 1], edges, (limit, window, len(gathered[band])))
+    result = {}
+    for band, parts in gathered.items():
+        if not parts:
+            raise InputError(
+                f"band {band}: {count} edges in the reference band and no part of the image with four of them that can "
+                "be measured in both bands"
+            )
+        result[band] = _joined(parts)
+    return result
+
+
+def _of_part(base: Any, other: Any, edges: Any, where: tuple[float, Window, int]) -> Iterator[Displacements]:
+    """Displacements of a part, in coordinates of the image; none where too few edges can be measured."""
+    limit, window, number = where
+    try:
+        found = edge_displacements(base, other, edges, limit)
+    except InputError:
+        return
+    place = found.place + np.array([window.col, window.row])
+    yield Displacements(place, found.direction, found.value, found.sigma, found.group + 100_000 * number)
+
+
+def _joined(parts: list[Displacements]) -> Displacements:
+    return Displacements(
+        *(np.concatenate([getattr(p, n) for p in parts]) for n in ("place", "direction", "value", "sigma", "group"))
+    )
+
+
+def correct_chromatic(source: RasterReader, model: ChromaticModel) -> AlignedReader:
+    """An image whose bands are brought to the place of the reference band while it is read; see `AlignedReader`."""
+    return AlignedReader(source, model)
+
+
+def load_chromatic(path: Path) -> ChromaticModel:
+    """The model of a file.
+
+    Raises
+    ------
+    InputError
+        It cannot be read or used.
+    """
+    entries = read_chromatic(path)
+    try:
+        bands = tuple(
+            BandModel(
+                each.band,
+                each.terms,
+                each.sigmas,
+                each.kind,
+                float("nan") if each.residual is None else each.residual,
+                each.count,
+                each.rejected,
+            )
+            for each in entries.bands
+        )
+        return ChromaticModel(entries.image_size, entries.reference, bands, entries.description)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def save_chromatic(path: Path, model: ChromaticModel) -> None:
+    """Write a model; raises as `photoplan.io.disk.write_atomically`."""
+    contents = {"image_size": model.size, "reference": model.reference, "description": model.description}
+    bands = [
+        {
+            "band": band.band,
+            "kind": band.kind,
+            "terms": band.terms,
+            "sigmas": band.sigmas,
+            "residual": band.residual,
+            "count": band.count,
+            "rejected": band.rejected,
+        }
+        for band in model.bands
+    ]
+    write_chromatic(path, contents, bands)
+
+
+def model_figures(model: ChromaticModel) -> dict[str, Any]:
+    """A model as plain values for JSON and records."""
+    return {
+        "description": model.description,
+        "reference": model.reference,
+        "image_size": list(model.size),
+        "bands": [
+            {
+                "band": band.band,
+                "kind": band.kind,
+                "shift": [float(d.item()) for d in _middle(model, band.band)],
+                "corner": model.corner(band.band),
+                "largest": model.largest(band.band),
+                "residual": band.residual if np.isfinite(band.residual) else None,
+                "count": band.count,
+                "rejected": band.rejected,
+                "terms": [list(term) for term in band.terms],
+                "sigmas": [list(pair) for pair in band.sigmas],
+                "tried": [{"kind": t.kind, "unknowns": t.unknowns, "predicted": t.predicted} for t in band.trials],
+            }
+            for band in model.bands
+        ],
+    }
+
+
+def _middle(model: ChromaticModel, band: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    w, h = model.size
+    return model.displacement(band, np.array((w - 1) / 2.0), np.array((h - 1) / 2.0))

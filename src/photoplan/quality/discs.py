@@ -1,0 +1,311 @@
+"""Discs in an image located to a small part of a pixel: an ellipse with a blurred border fitted by least squares."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, special
+
+from photoplan.errors import InputError
+
+__all__ = ["Disc", "DiscSettings", "find_discs"]
+
+_Array = NDArray[np.float64]
+#: Half the side of the part of an image that a disc is fitted in, in radii.
+_REACH = 1.7
+_ROUNDS = 25
+#: A disc is the same in all directions to within this ratio of its axes; anything longer is no disc of a chart.
+_MOST_AXES = 2.5
+
+
+@dataclass(frozen=True)
+class DiscSettings:
+    """What counts as a disc."""
+
+    dark: bool | None = None
+    """Dark on bright ground; False: bright on dark; None: whichever covers less of the image."""
+    least_radius: float = 2.5
+    """Pixels."""
+    most_radius: float = 500.0
+    """Pixels."""
+    saturation: float | None = None
+    """Grey values from here on are saturated; None: the largest of the image's type, none for floats."""
+    least_contrast: float = 8.0
+    """Times the noise of a pixel that the step at the border has at least."""
+    most_sigma: float = 0.1
+    """Standard deviation of a coordinate, pixels; a centre known less well is left out."""
+    most: int = 20_000
+    """More spots than this are no chart."""
+
+
+@dataclass(frozen=True)
+class Disc:
+    """A disc, located."""
+
+    x: float
+    """Column of the centre."""
+    y: float
+    """Row of the centre."""
+    sigma_x: float
+    """Standard deviation of the column, pixels."""
+    sigma_y: float
+    """Standard deviation of the row, pixels."""
+    radius: float
+    """Root of the product of both half axes, pixels."""
+    blur: float
+    """Standard deviation of the Gaussian across the border, pixels."""
+    contrast: float
+    """Ground minus disc, grey values; the largest of the planes of a mosaic."""
+    noise: float
+    """Standard deviation of the residuals, grey values."""
+
+
+def find_discs(
+    grey: NDArray[Any], settings: DiscSettings | None = None, planes: NDArray[np.int_] | None = None
+) -> tuple[Disc, ...]:
+    """Locate all discs that lie wholly in an image.
+
+    Parameters
+    ----------
+    grey : (height, width)
+        Grey values; NaN where there is none.
+    settings : DiscSettings, optional
+    planes : (height, width) int, optional
+        Of a colour mosaic: number of the plane that each pixel belongs to, negative: not used. Every plane gets grey
+        values of its own and all share one geometry, so nothing is interpolated and no pixel is moved.
+
+    Returns
+    -------
+    tuple of Disc, by rows of the chart from above, roughly
+
+    Raises
+    ------
+    InputError
+        No disc is found, or all that are found are saturated or too weak; the message counts them.
+    """
+    settings = settings or DiscSettings()
+    limit = settings.saturation
+    if limit is None:
+        limit = float(np.iinfo(grey.dtype).max) if grey.dtype.kind in "iu" else float("inf")
+    values = np.asarray(grey, np.float64)
+    values = np.where(values >= limit, np.inf, values)
+    numbers = np.zeros(values.shape, int) if planes is None else planes
+    found: list[Disc] = []
+    refused: dict[str, int] = {}
+    for start in _spots(_even(values, numbers), settings):
+        result = _located(values, numbers, start, settings)
+        if isinstance(result, Disc):
+            found.append(result)
+        else:
+            refused[result] = refused.get(result, 0) + 1
+    if not found:
+        told = "; ".join(f"{count} spots: {why}" for why, count in refused.items()) or "no round spot at all"
+        raise InputError(
+            f"no disc was found in {values.shape[1]} × {values.shape[0]} pixels ({told}); needed are round, "
+            f"unsaturated spots of {settings.least_radius:g} to {settings.most_radius:g} pixels radius on even ground"
+        )
+    return tuple(found)
+
+
+def _even(values: _Array, planes: NDArray[np.int_]) -> _Array:
+    """An image to look for spots in: the planes of a mosaic brought to one level, gaps filled by their neighbours."""
+    out = np.full(values.shape, np.nan)
+    for plane in np.unique(planes[planes >= 0]):
+        mine = (planes == plane) & ~np.isnan(values)
+        if mine.any():
+            high = np.percentile(np.minimum(values[mine], 1e30), 95)
+            out[mine] = np.minimum(values[mine], high) / high if high > 0.0 else 0.0
+    known = np.isfinite(out)
+    if not known.any():
+        raise InputError("no pixel of the image has a value; there are no discs to be found")
+    width = 1.0 if len(np.unique(planes[planes >= 0])) == 1 and (planes >= 0).all() else 1.2
+    weight = ndimage.gaussian_filter(known.astype(float), width)
+    smooth = ndimage.gaussian_filter(np.where(known, out, 0.0), width)
+    return np.asarray(smooth / np.maximum(weight, 1e-9))
+
+
+def _spots(even: _Array, settings: DiscSettings) -> Iterator[tuple[float, float, float]]:
+    """Centre and radius of round spots: connected parts beyond the middle between ground and disc."""
+    low, high = np.percentile(even, [1, 99])
+    dark = settings.dark
+    if dark is None:
+        dark = bool((even < (low + high) / 2.0).mean() < 0.5)
+    picture = even if dark else -even
+    disc = np.percentile(picture, 1)
+    side = max(16, min(picture.shape) // 4)
+    ground = ndimage.zoom(_blocks(picture, side), 1.0, order=0)
+    rows = np.minimum(np.arange(picture.shape[0]) // side, ground.shape[0] - 1)
+    columns = np.minimum(np.arange(picture.shape[1]) // side, ground.shape[1] - 1)
+    level = ndimage.uniform_filter(ground[rows[:, None], columns[None, :]], side)
+    labels, count = ndimage.label(picture < (level + disc) / 2.0)
+    if count > settings.most:
+        raise InputError(
+            f"{count} spots in the image; at most {settings.most} are a chart of discs: choose a part of it"
+        )
+    for index, box in enumerate(ndimage.find_objects(labels), 1):
+        area = labels[box] == index
+        height, width = area.shape
+        radius = float(np.sqrt(area.sum() / np.pi))
+        inside = box[0].start > 0 and box[1].start > 0
+        inside &= box[0].stop < even.shape[0] and box[1].stop < even.shape[1]
+        long = max(height, width) / max(min(height, width), 1)
+        full = area.sum() / (np.pi / 4.0 * height * width)
+        if not inside or not settings.least_radius <= radius <= settings.most_radius or long > _MOST_AXES:
+            continue
+        if 0.8 < full < 1.2:
+            y, x = ndimage.center_of_mass(area)
+            yield x + box[1].start, y + box[0].start, radius
+
+
+def _blocks(picture: _Array, side: int) -> _Array:
+    """Level of the ground in blocks: what three quarters of the pixels stay below."""
+    rows, columns = max(1, picture.shape[0] // side), max(1, picture.shape[1] // side)
+    return np.array(
+        [
+            [np.percentile(part, 75) for part in np.array_split(strip, columns, 1)]
+            for strip in np.array_split(picture, rows, 0)
+        ]
+    )
+
+
+def _located(
+    values: _Array, planes: NDArray[np.int_], start: tuple[float, float, float], settings: DiscSettings
+) -> Disc | str:
+    """The disc at a place, or why it is none."""
+    x0, y0, radius = start
+    reach = _REACH * radius + 2.0
+    top, left = int(np.floor(y0 - reach)), int(np.floor(x0 - reach))
+    bottom, right = int(np.ceil(y0 + reach)) + 1, int(np.ceil(x0 + reach)) + 1
+    if y0 - radius - 2.0 < 0 or x0 - radius - 2.0 < 0:
+        return "too near the border"
+    if y0 + radius + 2.0 > values.shape[0] - 1 or x0 + radius + 2.0 > values.shape[1] - 1:
+        return "too near the border"
+    part = (slice(max(top, 0), bottom), slice(max(left, 0), right))
+    y, x = np.mgrid[part[0].start : min(bottom, values.shape[0]), part[1].start : min(right, values.shape[1])]
+    near = (np.hypot(x - x0, y - y0) <= reach) & (planes[part] >= 0)
+    grey, number = values[part][near], planes[part][near]
+    if np.isinf(grey).any():
+        return "saturated"
+    if np.isnan(grey).any():
+        return "pixels without value"
+    used, index = np.unique(number, return_inverse=True)
+    fit = _Fit(x[near] - x0, y[near] - y0, grey, index, used.size)
+    return fit.run(start, settings)
+
+
+class _Fit:
+    """Gauss-Newton of one disc.
+
+    Unknown: centre, size, two of the shape, blur, and per plane the grey of the ground with its slopes and the step.
+    """
+
+    def __init__(self, x: _Array, y: _Array, grey: _Array, plane: NDArray[np.int_], planes: int) -> None:
+        self.x, self.y, self.grey, self.plane, self.planes = x, y, grey, plane, planes
+        self.share = np.stack([plane == k for k in range(planes)], 1).astype(float)
+
+    def run(self, start: tuple[float, float, float], settings: DiscSettings) -> Disc | str:
+        """The disc, or why it is none."""
+        shape = np.array([0.0, 0.0, np.log(start[2]), 0.0, 0.0, np.log(0.08 * start[2] + 0.5)])
+        damping, best = 1e-3, self._linear(shape)[2]
+        for _ in range(_ROUNDS):
+            levels, cover, _ = self._linear(shape)
+            jacobian, residual = self._jacobian(shape, levels, cover)
+            normal = jacobian.T @ jacobian
+            step = _solved(normal + damping * np.diag(np.diag(normal)), jacobian.T @ residual)
+            step[:6] = np.clip(step[:6], -0.3 * start[2], 0.3 * start[2])
+            trial = shape + np.clip(step[:6], *_bounds(start[2]))
+            left = self._linear(trial)[2]
+            if left <= best * (1.0 + 1e-12):
+                small = float(np.abs(step[:2]).max()) < 1e-4
+                shape, best, damping = trial, left, damping / 5.0
+                if small:
+                    break
+            else:
+                damping *= 8.0
+                if damping > 1e6:
+                    break
+        return self._disc(shape, start, settings)
+
+    def _cover(self, shape: _Array) -> _Array:
+        """Share of the disc in each pixel: the normal distribution of the distance from the ellipse."""
+        u, v = self.x - shape[0], self.y - shape[1]
+        radius, p, q = np.exp(shape[2]), shape[3], shape[4]
+        form = u * u * (1.0 + p) + v * v * (1.0 - p) + 2.0 * q * u * v
+        length = np.sqrt(np.maximum(form, 1e-12))
+        gradient = np.hypot(u * (1.0 + p) + q * v, v * (1.0 - p) + q * u)
+        distance = (length - radius) * length / np.maximum(gradient, 1e-9)
+        return np.asarray(special.ndtr(-distance / np.exp(shape[5])))
+
+    def _basis(self, cover: _Array) -> _Array:
+        """Columns of what enters linearly: ground, its slopes relative to it, and step, for every plane."""
+        ground = self.share
+        slopes = np.concatenate([ground * self.x[:, None], ground * self.y[:, None]], 1)
+        # Light that falls unevenly is as uneven inside the disc; a share of a slope there is left to the noise.
+        return np.concatenate([ground, slopes * (1.0 - cover)[:, None], ground * cover[:, None]], 1)
+
+    def _linear(self, shape: _Array) -> tuple[_Array, _Array, float]:
+        """Grey values that fit best to a shape, the cover, and the sum of squares left."""
+        cover = self._cover(shape)
+        basis = self._basis(cover)
+        levels = _solved(basis.T @ basis, basis.T @ self.grey)
+        residual = self.grey - basis @ levels
+        return levels, cover, float(residual @ residual)
+
+    def _jacobian(self, shape: _Array, levels: _Array, cover: _Array) -> tuple[_Array, _Array]:
+        basis = self._basis(cover)
+        columns = []
+        for k in range(6):
+            moved = shape.copy()
+            moved[k] += 1e-5
+            columns.append((self._basis(self._cover(moved)) @ levels - basis @ levels) / 1e-5)
+        return np.column_stack([*columns, basis]), self.grey - basis @ levels
+
+    def _disc(self, shape: _Array, start: tuple[float, float, float], settings: DiscSettings) -> Disc | str:
+        levels, cover, left = self._linear(shape)
+        jacobian, _ = self._jacobian(shape, levels, cover)
+        free = self.grey.size - jacobian.shape[1]
+        if free < 10:
+            return "too few pixels"
+        noise = float(np.sqrt(left / free))
+        try:
+            cofactors = np.linalg.inv(jacobian.T @ jacobian)
+        except np.linalg.LinAlgError:
+            return "not determined"
+        sigma = noise * np.sqrt(np.maximum(np.diag(cofactors)[:2], 0.0))
+        steps = -levels[-self.planes :]
+        contrast = float(steps[np.argmax(np.abs(steps))])
+        axes = np.sqrt(np.maximum(1.0 - shape[3] ** 2 - shape[4] ** 2, 1e-9))
+        radius = float(np.exp(shape[2]) / np.sqrt(axes))
+        # A curved border that is blurred has its half level further inside.
+        radius += float(np.exp(2.0 * shape[5])) / (2.0 * radius)
+        if not np.isfinite([*shape, *sigma]).all() or max(np.abs(shape[:2])) > 0.5 * start[2]:
+            return "no disc"
+        if not 0.5 * start[2] < radius < 2.0 * start[2] or np.exp(shape[5]) > 0.7 * radius:
+            return "too blurred"
+        if abs(contrast) < settings.least_contrast * max(noise, 1.0 / np.sqrt(12.0) if _whole(self.grey) else 0.0):
+            return "too weak"
+        if sigma.max() > settings.most_sigma:
+            return "centre too uncertain"
+        x, y = start[0] + float(shape[0]), start[1] + float(shape[1])
+        return Disc(x, y, float(sigma[0]), float(sigma[1]), radius, float(np.exp(shape[5])), contrast, noise)
+
+
+def _solved(normal: _Array, right: _Array) -> _Array:
+    """Solution of normal equations, scaled to ones on the diagonal; a little is added so that there always is one."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    inside = normal * np.multiply.outer(scale, scale) + 1e-11 * np.eye(scale.size)
+    return np.asarray(scale * np.linalg.solve(inside, scale * right), np.float64)
+
+
+def _whole(grey: _Array) -> bool:
+    return bool((grey == np.round(grey)).all())
+
+
+def _bounds(radius: float) -> tuple[_Array, _Array]:
+    """Steps that one round may go at most."""
+    most = np.array([0.3 * radius, 0.3 * radius, 0.2, 0.2, 0.2, 0.5])
+    return -most, most
