@@ -3,65 +3,14 @@
 import numpy as np
 import pytest
 from scipy.ndimage import convolve
-from scipy.stats import norm
+from tools.blurred_scenes import FINE, NOISE, SIZE, any_edges, discrete_spread, sharpness, taken, whole_pixels
 
 from photoplan.errors import InputError
 from photoplan.quality.design import DesignOptions, Sharpness, design_filter
-from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.regularised import SceneStatistics
 from photoplan.quality.spread import SpreadFunction
 
-FINE = 8
-SIZE = 256
-NOISE = 0.5
 INSIDE = np.s_[24:-24, 24:-24]
-FREQUENCY = np.linspace(0.0, 2.0, 401)
-
-
-def discrete_spread(sigma):
-    """Of a Gaussian and the sensor's aperture, as an edge on the border of two pixels shows it."""
-
-    def ramp(z):
-        return z * norm.cdf(z / sigma) + sigma * norm.pdf(z / sigma)
-
-    borders = np.arange(-20.5, 21.0)
-    response = ramp(borders + 0.5) - ramp(borders - 0.5)
-    return SpreadFunction.normalised(np.diff(response))
-
-
-def sharpness(sigma):
-    curve = MtfCurve(FREQUENCY, np.exp(-2 * (np.pi * sigma * FREQUENCY) ** 2) * np.sinc(FREQUENCY))
-    return Sharpness(discrete_spread(sigma), curve)
-
-
-def whole_pixels(rng):
-    """Objects whose borders are borders of pixels (Kölbl's model)."""
-    scene = np.full((SIZE, SIZE), 90.0)
-    for _ in range(150):
-        (col, row), (width, height) = rng.integers(0, SIZE, 2), rng.integers(1, 30, 2)
-        scene[row : row + height, col : col + width] = rng.uniform(20, 230)
-    return np.kron(scene, np.ones((FINE, FINE)))
-
-
-def any_edges(rng):
-    """Rectangles in any place and direction."""
-    row, col = np.mgrid[: SIZE * FINE, : SIZE * FINE] / FINE
-    scene = np.full(row.shape, 90.0)
-    for _ in range(60):
-        (x, y), angle, (width, height) = rng.uniform(0, SIZE, 2), rng.uniform(0, np.pi), rng.uniform(3, 40, 2)
-        along = (col - x) * np.cos(angle) + (row - y) * np.sin(angle)
-        across = (row - y) * np.cos(angle) - (col - x) * np.sin(angle)
-        scene[(abs(along) < width) & (abs(across) < height)] = rng.uniform(20, 230)
-    return scene
-
-
-def taken(scene, sigma, rng, noise=NOISE):
-    """The image: Gaussian blur, a pixel's aperture, sampled in the middle of the pixels, noise; and the object."""
-    frequency = np.fft.fftfreq(scene.shape[0], 1 / FINE)
-    blur = np.exp(-2 * (np.pi * sigma * frequency) ** 2) * np.sinc(frequency) / np.sinc(frequency / FINE)
-    blur = blur * np.exp(2j * np.pi * frequency * (0.5 - 0.5 / FINE))
-    image = np.fft.ifft2(np.fft.fft2(scene) * np.outer(blur, blur)).real[::FINE, ::FINE]
-    return image + rng.normal(0, noise, image.shape), scene.reshape(SIZE, FINE, SIZE, FINE).mean(axis=(1, 3))
 
 
 def rms(a):

@@ -1,0 +1,259 @@
+"""The restoration filter of images, measured in the images themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.grid import Window
+from photoplan.products.mtf import MtfRequest, measure_mtf
+from photoplan.products.mtf_image import LightImage, linearisation_of
+from photoplan.products.mtf_result import ImageMtf, MtfReport
+from photoplan.quality.design import Design, DesignOptions, Sharpness, design_filter
+from photoplan.quality.edge_response import EdgeMeasurement
+from photoplan.quality.filters import FilterKernel, RestorationFilter
+from photoplan.quality.image_noise import block_noise, image_noise
+from photoplan.quality.regularised import SceneStatistics
+from photoplan.quality.sharpness import LEAST_EDGES, sharpness_of
+
+__all__ = ["DesignRequest", "DesignedPart", "MeasuredFilter", "design_restoration"]
+
+#: Windows of an image in which its contrast is looked for, in each direction, and their side.
+_WINDOWS = 5
+_SIDE = 256
+
+
+@dataclass(frozen=True)
+class DesignRequest:
+    """What is asked."""
+
+    images: tuple[Path, ...]
+    linearisation: str = "linear"
+    """``linear``, ``srgb`` or a file with a table: the light in which the filter holds."""
+    per_band: bool = False
+    """A filter for each band instead of one for all, from the luminance."""
+    cells: int = 1
+    """Parts of the field in each direction that get filters of their own, where they have edges enough."""
+    most_edges: int = 200
+    """Edges of an image that are measured."""
+    options: DesignOptions = field(default_factory=DesignOptions)
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.cells <= 15:
+            raise UsageError(f"a field of {self.cells} × {self.cells} parts; allowed are 1 to 15")
+
+
+@dataclass(frozen=True, eq=False)
+class DesignedPart:
+    """The filter of one band in one part of the field."""
+
+    band: int | None
+    """None: all bands."""
+    at: tuple[float, float] | None
+    """Column and row of the middle of the part; None: the whole field."""
+    edges: int
+    """Edges it was measured with."""
+    x: Sharpness
+    y: Sharpness
+    scene: SceneStatistics
+    design: Design
+
+    def facts(self) -> dict[str, Any]:
+        """Figures for the filter's file."""
+        return {
+            "band": self.band,
+            "at": None if self.at is None else list(self.at),
+            "edges": self.edges,
+            "noise": self.scene.noise,
+            "contrast": self.scene.contrast,
+            "mtf50_x": round(self.x.modulation().mtf50, 4),
+            "mtf50_y": round(self.y.modulation().mtf50, 4),
+            "spread_x": [round(float(v), 5) for v in self.x.spread.side()],
+            "spread_y": [round(float(v), 5) for v in self.y.spread.side()],
+            "condition_x": str(self.design.condition_x),
+            "condition_y": str(self.design.condition_y),
+            "noise_gain": round(self.design.noise_gain, 3),
+            "method": self.design.method,
+            "rule": self.design.reason,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredFilter:
+    """A filter and what it was measured with."""
+
+    filter: RestorationFilter
+    parts: tuple[DesignedPart, ...]
+    mtf: MtfReport
+    notes: tuple[str, ...]
+    """What a user should know: edge enhancement, parts of the field without edges."""
+
+
+def _unwatched(total: int) -> AbstractContextManager[Callable[[int, int], None]]:
+    return nullcontext(lambda tiles, pixels: None)
+
+
+def design_restoration(
+    request: DesignRequest,
+    begin: Callable[[int], AbstractContextManager[Callable[[int, int], None]]] = _unwatched,
+    talk: Callable[[str], None] = lambda text: None,
+) -> MeasuredFilter:
+    """Measure the sharpness of images at their edges, all together, and design the filter that restores them.
+
+    Parameters
+    ----------
+    request : DesignRequest
+    begin : callable
+        Gets the number of tiles; what it returns is entered, and called with (tiles, pixels) as they are done.
+    talk : callable
+        Called with what a user should know while it goes on.
+
+    Raises
+    ------
+    UsageError
+        Images of different size or bands: they cannot have one filter.
+    InputError
+        No image can be used, the edges are too few, or an exact inverse is asked for that does not exist.
+    """
+    band = "all" if request.per_band else None
+    asked = MtfRequest(
+        request.images, linearisation=request.linearisation, band=band, most_edges=request.most_edges, grid=1
+    )
+    mtf = measure_mtf(asked, begin, talk)
+    if not mtf.images:
+        raise InputError("no image can be measured: " + "; ".join(f"{n}: {why}" for n, why in mtf.failed.items()))
+    size = _common_size(mtf.images)
+    light = linearisation_of(request.linearisation)
+    opened = [LightImage.open(image.file, light) for image in mtf.images]
+    parts: list[DesignedPart] = []
+    notes = [f"{name}: not measured ({why})" for name, why in mtf.failed.items()]
+    for channel in _channels(mtf.images, request.per_band):
+        scene = _scene(opened, channel)
+        edges = [e.measured for image in mtf.images for e in image.edges if e.channel == channel]
+        parts += _parts(request, (channel if request.per_band else None, size), edges, scene, notes)
+    if mtf.enhancement is not None and mtf.enhancement.enhanced:
+        notes.append(mtf.enhancement.warning)
+    return MeasuredFilter(_filter(request, parts, size), tuple(parts), mtf, tuple(notes))
+
+
+def _common_size(images: Sequence[ImageMtf]) -> tuple[int, int]:
+    sizes = {image.size for image in images}
+    if len(sizes) > 1:
+        listed = ", ".join(f"{w} × {h}" for w, h in sorted(sizes))
+        raise UsageError(
+            f"the images are of different size ({listed}); measure a filter for those of each camera alone"
+        )
+    return sizes.pop()
+
+
+def _channels(images: Sequence[ImageMtf], per_band: bool) -> list[int]:
+    """Channels that get a filter of their own."""
+    channels = sorted({edge.channel for image in images for edge in image.edges})
+    return [c for c in channels if c > 0] if per_band else channels[:1]
+
+
+def _parts(
+    request: DesignRequest,
+    where: tuple[int | None, tuple[int, int]],
+    edges: Sequence[EdgeMeasurement],
+    scene: SceneStatistics,
+    notes: list[str],
+) -> list[DesignedPart]:
+    """The filters of a band: for the whole field, or for each part of it that has edges enough."""
+    band, size = where
+    whole = _designed(request, band, None, edges, scene)
+    if request.cells == 1:
+        return [whole]
+    n, found = request.cells, []
+    poor = 0
+    for row in range(n):
+        for col in range(n):
+            at = ((col + 0.5) * size[0] / n - 0.5, (row + 0.5) * size[1] / n - 0.5)
+            here = [edge for edge in edges if _cell(edge, size, n) == (col, row)]
+            try:
+                found.append(_designed(request, band, at, here, scene))
+            except InputError:
+                poor += 1
+                found.append(DesignedPart(band, at, 0, whole.x, whole.y, whole.scene, whole.design))
+    if poor:
+        name = "" if band is None else f"band {band}: "
+        notes.append(
+            f"{name}{poor} of {n * n} parts of the field have fewer than {LEAST_EDGES} edges in a direction; they get "
+            "the filter of the whole field"
+        )
+    return found
+
+
+def _cell(edge: EdgeMeasurement, size: tuple[int, int], n: int) -> tuple[int, int]:
+    """Column and row of the part of the field that an edge lies in."""
+    return int((edge.col + 0.5) * n / size[0]), int((edge.row + 0.5) * n / size[1])
+
+
+def _designed(
+    request: DesignRequest,
+    band: int | None,
+    at: tuple[float, float] | None,
+    edges: Sequence[EdgeMeasurement],
+    scene: SceneStatistics,
+) -> DesignedPart:
+    x, y = sharpness_of(edges)
+    return DesignedPart(band, at, len(edges), x, y, scene, design_filter(x, y, scene, request.options))
+
+
+def _scene(images: Sequence[LightImage], channel: int) -> SceneStatistics:
+    """Noise and contrast of images, from windows over the whole of them, in their light."""
+    blocks: list[NDArray[np.float64]] = []
+    squares, count = 0.0, 0
+    for image in images:
+        for window in _windows(image.size):
+            picture = image.picture(window, channel)
+            grey = picture.grey.astype(np.float64)
+            if picture.valid is not None:
+                grey[~picture.valid] = np.nan
+            blocks.append(block_noise(grey))
+            for difference in (np.diff(grey, axis=0), np.diff(grey, axis=1)):
+                known = difference[np.isfinite(difference)]
+                squares += float(known @ known)
+                count += known.size
+    if count == 0 or squares == 0.0:
+        raise InputError("the images have no contrast")
+    noise = image_noise(np.concatenate(blocks))
+    noise = noise if np.isfinite(noise) else 0.0
+    # Differences of neighbours hold the noise of both.
+    contrast = max(squares / count - 2.0 * noise**2, 1e-4 * squares / count)
+    return SceneStatistics(noise, float(np.sqrt(contrast)))
+
+
+def _windows(size: tuple[int, int]) -> list[Window]:
+    """Windows spread over an image."""
+    side = min(_SIDE, size[0]), min(_SIDE, size[1])
+    places = [
+        (round(j * (size[0] - side[0]) / (_WINDOWS - 1)), round(i * (size[1] - side[1]) / (_WINDOWS - 1)))
+        for i in range(_WINDOWS)
+        for j in range(_WINDOWS)
+    ]
+    return [Window(*place, *side) for place in sorted(set(places))]
+
+
+def _filter(request: DesignRequest, parts: Sequence[DesignedPart], size: tuple[int, int]) -> RestorationFilter:
+    kernels = tuple(FilterKernel(part.design.kernel, part.at, part.band) for part in parts)
+    first = parts[0]
+    names = ", ".join(path.name for path in request.images[:3])
+    more = f" and {len(request.images) - 3} more" if len(request.images) > 3 else ""
+    facts: dict[str, Any] = {
+        "condition": f"along rows: {first.design.condition_x}; along columns: {first.design.condition_y}",
+        "rule": first.design.reason,
+        "rotation": f"{request.options.rotation}: weights off the axes follow from those on them",
+        "linearisation": request.linearisation,
+        "noise_gain": round(max(part.design.noise_gain for part in parts), 3),
+        "parts": [{k: v for k, v in part.facts().items() if v is not None} for part in parts],
+    }
+    placed = any(part.at is not None for part in parts)
+    return RestorationFilter(kernels, size if placed else None, f"measured at edges of {names}{more}", facts)

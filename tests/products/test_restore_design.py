@@ -1,0 +1,103 @@
+"""Filters measured in images: simulated scenes as files, whose spread function and truth are known."""
+
+import numpy as np
+import pytest
+import rasterio
+from scipy.ndimage import convolve
+from tools.blurred_scenes import any_edges, discrete_spread, taken
+
+from photoplan.errors import InputError, UsageError
+from photoplan.products.restore_design import DesignRequest, design_restoration
+from photoplan.quality.design import DesignOptions
+
+SIZE = 320
+MOST = 40
+SIGMA = 0.5
+
+
+def write(path, bands):
+    values = np.clip(np.rint(bands), 0, 65535).astype(np.uint16)
+    with rasterio.open(
+        path, "w", driver="GTiff", width=values.shape[2], height=values.shape[1], count=values.shape[0], dtype="uint16"
+    ) as file:
+        file.write(values)
+    return path
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    """Two images of one camera, their objects, and their files; grey values times 100."""
+    rng = np.random.default_rng(21)
+    folder = tmp_path_factory.mktemp("scenes")
+    made = [taken(any_edges(rng, SIZE), SIGMA, rng) for _ in range(2)]
+    files = [write(folder / f"image_{i}.tif", 100.0 * image[None]) for i, (image, _) in enumerate(made)]
+    return made, tuple(files)
+
+
+def test_a_filter_is_measured_and_restores_other_images(scenes):
+    """Measured in one image, used for the other."""
+    made, files = scenes
+    found = design_restoration(DesignRequest(files[:1], most_edges=MOST, options=DesignOptions("regularised")))
+    (part,) = found.parts
+    truth = discrete_spread(SIGMA).side()[:3]
+    print(part.facts())
+    for one in (part.x, part.y):
+        assert one.spread.side()[:3] == pytest.approx(truth, abs=0.02)
+        frequency = np.array([0.1, 0.25, 0.4])
+        curve = np.exp(-2 * (np.pi * SIGMA * frequency) ** 2) * np.sinc(frequency)
+        assert [one.modulation().at(f) for f in frequency] == pytest.approx(curve, abs=0.03)
+    # 50 of a full scale of 65535 (few blocks of this scene are even), and the contrast as the image has it.
+    assert part.scene.noise * 65535 == pytest.approx(50.0, rel=0.15)
+    image, object_ = made[1]
+    seen = np.sqrt((np.diff(image, axis=1) ** 2).mean())
+    assert part.scene.contrast * 655.35 == pytest.approx(seen, rel=0.3)
+    restored = convolve(image, part.design.kernel, mode="nearest")
+    before, after = ((a - object_)[20:-20, 20:-20].std() for a in (image, restored))
+    print(f"rms {before:.2f} -> {after:.2f}")
+    assert after < 0.56 * before
+
+
+def test_the_exact_inverse_where_the_condition_holds(scenes):
+    _, files = scenes
+    found = design_restoration(DesignRequest(files, most_edges=MOST))
+    (part,) = found.parts
+    assert part.design.method == "exact"
+    assert found.filter.facts["rule"].startswith("exact: the condition holds")
+    assert found.filter.kernels[0].total == pytest.approx(1.0)
+    assert found.filter.facts["noise_gain"] == pytest.approx(found.filter.noise_gain, abs=1e-3)
+    assert not found.mtf.enhancement.enhanced
+
+
+def test_parts_of_the_field_without_edges_get_the_filter_of_the_whole(scenes):
+    _, files = scenes
+    found = design_restoration(DesignRequest(files[:1], cells=6, most_edges=MOST, options=DesignOptions("regularised")))
+    assert len(found.filter.kernels) == 36
+    assert found.filter.image_size == (SIZE, SIZE)
+    assert any("get the filter of the whole field" in note for note in found.notes)
+    assert sum(part.edges == 0 for part in found.parts) > 10
+
+
+def test_bands_of_different_sharpness_get_filters_of_their_own(tmp_path):
+    rng = np.random.default_rng(22)
+    scene = any_edges(rng, 256)
+    bands = [taken(scene, sigma, rng)[0] for sigma in (0.35, 0.5, 0.65)]
+    file = write(tmp_path / "colour.tif", 100.0 * np.array(bands))
+    found = design_restoration(DesignRequest((file,), per_band=True, most_edges=20))
+    assert [kernel.band for kernel in found.filter.kernels] == [1, 2, 3]
+    gains = [kernel.noise_gain for kernel in found.filter.kernels]
+    print("noise gains", np.round(gains, 2))
+    assert gains[0] < gains[1] < gains[2]
+
+
+def test_images_of_different_size_are_refused(scenes, tmp_path):
+    made, files = scenes
+    other = write(tmp_path / "other.tif", 100.0 * made[0][0][None, :300])
+    with pytest.raises(UsageError, match="different size"):
+        design_restoration(DesignRequest((files[0], other), most_edges=5))
+
+
+def test_images_without_edges_give_no_filter(tmp_path):
+    rng = np.random.default_rng(23)
+    file = write(tmp_path / "flat.tif", rng.normal(1000.0, 20.0, (1, 300, 300)))
+    with pytest.raises(InputError, match="no image can be measured"):
+        design_restoration(DesignRequest((file,)))

@@ -1,0 +1,64 @@
+"""Simulated scenes and their images: Gaussian blur, the aperture of a pixel, noise."""
+
+import numpy as np
+from scipy.stats import norm
+
+from photoplan.quality.design import Sharpness
+from photoplan.quality.mtf_curve import MtfCurve
+from photoplan.quality.spread import SpreadFunction
+
+FINE = 8
+SIZE = 256
+NOISE = 0.5
+FREQUENCY = np.linspace(0.0, 2.0, 401)
+
+
+def discrete_spread(sigma):
+    """Of a Gaussian and the sensor's aperture, as an edge on the border of two pixels shows it."""
+
+    def ramp(z):
+        return z * norm.cdf(z / sigma) + sigma * norm.pdf(z / sigma)
+
+    borders = np.arange(-20.5, 21.0)
+    response = ramp(borders + 0.5) - ramp(borders - 0.5)
+    return SpreadFunction.normalised(np.diff(response))
+
+
+def sharpness(sigma):
+    curve = MtfCurve(FREQUENCY, np.exp(-2 * (np.pi * sigma * FREQUENCY) ** 2) * np.sinc(FREQUENCY))
+    return Sharpness(discrete_spread(sigma), curve)
+
+
+def whole_pixels(rng, size=SIZE):
+    """Objects whose borders are borders of pixels (Kölbl's model)."""
+    scene = np.full((size, size), 90.0)
+    for _ in range(150):
+        (col, row), (width, height) = rng.integers(0, size, 2), rng.integers(1, 30, 2)
+        scene[row : row + height, col : col + width] = rng.uniform(20, 230)
+    return np.kron(scene, np.ones((FINE, FINE)))
+
+
+def any_edges(rng, size=SIZE):
+    """Rectangles in any place and direction."""
+    scene = np.full((size * FINE, size * FINE), 90.0)
+    for _ in range(round(60 * (size / SIZE) ** 2)):
+        (x, y), angle, (width, height) = rng.uniform(0, size, 2), rng.uniform(0, np.pi), rng.uniform(3, 40, 2)
+        reach = np.hypot(width, height)
+        rows, cols = (slice(max(0, int((at - reach) * FINE)), int((at + reach) * FINE) + 1) for at in (y, x))
+        row, col = np.ogrid[: scene.shape[0], : scene.shape[1]]
+        row, col = row[rows] / FINE - y, col[:, cols] / FINE - x
+        along = col * np.cos(angle) + row * np.sin(angle)
+        across = row * np.cos(angle) - col * np.sin(angle)
+        scene[rows, cols][(abs(along) < width) & (abs(across) < height)] = rng.uniform(20, 230)
+    return scene
+
+
+def taken(scene, sigma, rng, noise=NOISE):
+    """The image: Gaussian blur, a pixel's aperture, sampled in the middle of the pixels, noise; and the object."""
+    frequency = np.fft.fftfreq(scene.shape[0], 1 / FINE)
+    blur = np.exp(-2 * (np.pi * sigma * frequency) ** 2) * np.sinc(frequency) / np.sinc(frequency / FINE)
+    blur = blur * np.exp(2j * np.pi * frequency * (0.5 - 0.5 / FINE))
+    image = np.fft.ifft2(np.fft.fft2(scene) * np.outer(blur, blur)).real[::FINE, ::FINE]
+    return image + rng.normal(0, noise, image.shape), scene.reshape(image.shape[0], FINE, image.shape[1], FINE).mean(
+        axis=(1, 3)
+    )
