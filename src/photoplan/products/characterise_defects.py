@@ -8,7 +8,7 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.io.series_pixels import Plane
-from photoplan.products.characterise_common import prefix
+from photoplan.products.characterise_common import prefix, tried
 from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
 from photoplan.quality.defects import Defect, DefectList, find_blinking, find_defects, find_lines, log_histogram
@@ -43,7 +43,9 @@ def _plane(data: SeriesData, plane: Plane) -> Outcome:
     flat = min(flats, key=lambda s: abs(data.levels(s)[plane.name].mean - half), default=None)
     for setting, kinds, share in ((dark, ("hot",), 0.0), (flat, ("hot", "dark"), _FLAT_SHARE)):
         if setting is not None:
-            outcomes.append(_setting(data, setting, plane, (kinds, share)))
+            key = prefix("defect elements", plane.name, setting.label)
+            how = (kinds, share)
+            outcomes.append(tried(key, lambda s=setting, h=how: _setting(data, s, plane, h)))  # type: ignore[misc]
     if flat is None:
         why = "no flat frames, two or more at a setting, that are not saturated"
         outcomes.append(Outcome(refused={prefix("dark pixels", plane.name): why}))

@@ -6,11 +6,12 @@ from math import isfinite, sqrt
 
 import numpy as np
 
+from photoplan.errors import InputError
 from photoplan.io.series_pixels import Plane
 from photoplan.products.characterise_common import Run, black_of, exposure_runs, prefix, saturation_of, tried
 from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
-from photoplan.quality.frame_statistics import Level
+from photoplan.quality.frame_statistics import Level, check_level
 from photoplan.quality.linearity import Linearity, linearity
 from photoplan.quality.saturation import find_saturation
 from photoplan.report.characterise_charts import Chart, Curve
@@ -44,6 +45,8 @@ def analyse(data: SeriesData) -> Outcome:
 
 def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
     levels = [data.levels(setting)[plane.name] for setting in run.settings]
+    for level in levels:
+        check_level(level)
     blacks = [black_of(data, setting, plane) for setting in run.settings]
     signal = [level.mean - black.mean for level, black in zip(levels, blacks)]
     # A single frame says nothing of its noise: shot noise is not known either, so that rounding and the scatter between
@@ -54,6 +57,8 @@ def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
     ]
     sigma = [sqrt(s**2 + black.sigma**2) for s, black in zip(sigmas, blacks)]
     full = _full(data, run, levels, signal)
+    if not full > 0:
+        raise InputError(f"the frames are not brighter than black ({blacks[-1].mean:.4g} DN)")
     found = linearity(run.values, signal, sigma, full)
     where = {"plane": plane.name, "at": run.label}
     unit = f"DN/{run.unit}"

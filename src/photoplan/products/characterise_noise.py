@@ -41,7 +41,9 @@ def _plane(name: str, levels: list[tuple[str, Level]]) -> Outcome:
     for label, level in ordered:
         sigma = sqrt(level.temporal_variance)
         of_sigma = level.variance_sigma / (2 * sigma) if sigma > 0 else 0.0
-        sound = level.zero_share <= 0.005 and level.saturated_share <= 0.005
+        if not np.isfinite(sigma):
+            continue
+        sound = sigma > 0 and level.zero_share <= 0.005 and level.saturated_share <= 0.005
         rows.append((name, level.mean, sigma, of_sigma, level.frames, level.pixels, "yes" if sound else "no", label))
     sound_rows = [row for row in rows if row[6] == "yes"]
     figures = []
@@ -54,7 +56,7 @@ def _plane(name: str, levels: list[tuple[str, Level]]) -> Outcome:
         ]
     else:
         refused[prefix("noise", name)] = (
-            "every level is cut off at black or saturated, so that its noise is not the sensor's"
+            "every level is cut off at black or saturated or has no noise at all, so that its noise is not the sensor's"
         )
     head = ("plane", "mean_dn", "sigma_dn", "sigma_of_sigma_dn", "frames", "pixels", "not_clipped", "setting")
     x = np.array([row[1] for row in sound_rows])

@@ -8,7 +8,7 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.io.series_pixels import Plane
-from photoplan.products.characterise_common import prefix, tried
+from photoplan.products.characterise_common import black_of, prefix, tried
 from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
 from photoplan.quality.fixed_pattern import (
@@ -19,7 +19,7 @@ from photoplan.quality.fixed_pattern import (
     signed_root,
     spectrogram,
 )
-from photoplan.quality.frame_statistics import FrameStack
+from photoplan.quality.frame_statistics import FrameStack, check_level
 from photoplan.quality.photon_transfer import is_clipped_dark
 from photoplan.report.characterise_charts import Chart, Curve
 
@@ -75,7 +75,7 @@ def _half_bright(data: SeriesData, plane: Plane) -> Setting | None:
     best, distance = None, np.inf
     for setting in _flats(data):
         level = data.levels(setting)[plane.name]
-        share = level.mean / full if isfinite(full) else _HALF
+        share = (level.mean - black_of(data, setting, plane).mean) / full if isfinite(full) else _HALF
         if 0.05 <= share <= 0.95 and level.saturated_share < 1e-3 and abs(share - _HALF) < distance:
             best, distance = setting, abs(share - _HALF)
     return best
@@ -91,6 +91,9 @@ def _matching_dark(data: SeriesData, flat: Setting | None) -> Setting | None:
 
 
 def _variance(stack: FrameStack, filtered: bool) -> PatternVariance:
+    check_level(stack.level)
+    if stack.level.saturated_share > 1e-2:
+        raise InputError("over 1 % of the samples are saturated, which hides the pattern")
     if stack.counted is not None:
         raise InputError("a mask or brightest is in use; rows and columns need a rectangle: give a roi instead")
     return pattern_variance(stack.mean, stack.level.temporal_variance, stack.level.frames, filtered=filtered)
@@ -114,8 +117,8 @@ def _prnu(data: SeriesData, flat: Setting, plane: Plane, dark: PatternVariance |
     even = _variance(stack, filtered=True)
     black = dark.mean if dark is not None else data.series.camera.black_level_dn
     signal = raw.mean - black
-    if signal <= 0:
-        raise InputError("flat frames are not brighter than black")
+    if signal <= 3 * np.sqrt(stack.level.temporal_variance):
+        raise InputError(f"flat frames ({raw.mean:.4g} DN) are not clearly brighter than black ({black:.4g} DN)")
     name = plane.name
     figures = []
     for kind, found, remark in (

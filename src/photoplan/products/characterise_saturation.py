@@ -10,6 +10,7 @@ from photoplan.io.series_pixels import Plane
 from photoplan.products.characterise_common import Run, black_of, exposure_runs, prefix, tried
 from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_result import Figure, Outcome, joined
+from photoplan.quality.frame_statistics import check_level
 from photoplan.quality.saturation import find_saturation
 from photoplan.report.characterise_charts import Chart, Curve
 
@@ -47,6 +48,8 @@ def analyse(data: SeriesData) -> Outcome:
 
 def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
     levels = [data.levels(setting)[plane.name] for setting in run.settings]
+    for level in levels:
+        check_level(level)
     black = black_of(data, run.settings[0], plane)
     mean = np.array([level.mean for level in levels])
     variance = np.array([level.temporal_variance for level in levels])

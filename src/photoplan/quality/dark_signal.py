@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from photoplan.errors import InputError
-from photoplan.quality.frame_statistics import Level
+from photoplan.quality.frame_statistics import Level, check_level
 from photoplan.quality.photon_transfer import is_clipped_dark
 from photoplan.quality.straight_line import StraightLine, fit_line
 
@@ -76,6 +76,8 @@ def dark_current(exposures_ms: Sequence[float], levels: Sequence[Level]) -> Dark
         raise InputError(f"{len(set(exposures_ms))} different exposures of dark frames; the dark current needs 3")
     if any(level.frames < 2 for level in levels):
         raise InputError("a single dark frame at an exposure; the noise of its mean needs two or more")
+    for level in levels:
+        check_level(level)
     seconds = np.array(exposures_ms, float) / 1000.0
     sigma = np.array([max(level.mean_sigma, 1e-9) for level in levels])
     line = fit_line(seconds, [level.mean for level in levels], sigma)

@@ -24,6 +24,8 @@ Kind = Literal["hot", "dark", "blinking", "row", "column"]
 _ALARMS = 0.01
 #: Defects that are listed at most.
 MOST = 5000
+#: Side of the smallest image in which a pixel has surroundings.
+LEAST_SIDE = 16
 
 
 @dataclass(frozen=True)
@@ -86,11 +88,21 @@ def find_defects(
     share : float
         A pixel must differ by this part of its surroundings' grey value, whatever the scatter.
 
+    Raises
+    ------
+    InputError
+        The image is smaller than 16 × 16 pixels.
+
     Notes
     -----
     The threshold is the number of scatters that Gaussian noise exceeds once in a hundred images; the scatter is at
     least that of rounding and of the temporal noise of the mean.
     """
+    if min(mean.shape) < LEAST_SIDE:
+        raise InputError(
+            f"image of {mean.shape[1]} × {mean.shape[0]} pixels; defects are looked for in {LEAST_SIDE} × {LEAST_SIDE} "
+            "pixels or more"
+        )
     ground = background(mean)
     deviation = mean - ground
     rest = temporal_variance / frames if np.isfinite(temporal_variance) else 0.0

@@ -16,7 +16,10 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 
-__all__ = ["FrameStack", "Level", "StackSums"]
+__all__ = ["LEAST_PIXELS", "FrameStack", "Level", "StackSums", "check_level"]
+
+#: Pixels below which no figure is derived.
+LEAST_PIXELS = 64
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,7 @@ class Level:
     saturated_share: float
     """Share of samples at or above saturation."""
     zero_share: float
-    """Share of samples at zero."""
+    """Share of samples at zero, where black may be cut off; 0 where samples are negative too."""
     largest: float
     smallest: float
 
@@ -60,6 +63,23 @@ class Level:
     def variance_sigma(self) -> float:
         """Standard deviation of the temporal variance, for noise that is nearly Gaussian."""
         return float(self.temporal_variance * np.sqrt(2.0 / self.degrees)) if self.degrees else float("nan")
+
+
+def check_level(level: Level) -> None:
+    """Refuse a level that says nothing: too few pixels, or frames that are copies of each other.
+
+    Raises
+    ------
+    InputError
+        It is one.
+    """
+    if level.pixels < LEAST_PIXELS:
+        raise InputError(f"{level.pixels} pixels count; {LEAST_PIXELS} or more are needed: give a larger roi or mask")
+    if level.frames > 1 and not level.temporal_variance > 0 and level.saturated_share < 0.5 and level.zero_share < 0.5:
+        raise InputError(
+            f"the {level.frames} frames of mean {level.mean:.4g} DN do not differ in a single pixel: they are copies of "
+            "one file, or their noise was removed; give raw frames"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +128,7 @@ class StackSums:
             raise InputError("no pixel of the frame counts")
         values = frame.astype(np.float64)
         self._saturated += int(np.count_nonzero(seen >= self._saturation))
-        self._zero += int(np.count_nonzero(seen <= 0))
+        self._zero += int(np.count_nonzero(seen == 0))
         self._largest = max(self._largest, float(seen.max()))
         self._smallest = min(self._smallest, float(seen.min()))
         self._means.append(float(np.mean(seen, dtype=np.float64)))
@@ -157,7 +177,7 @@ class StackSums:
             spatial_variance=float(seen.var(ddof=1)) if pixels > 1 else float("nan"),
             frame_mean_sigma=sigma,
             saturated_share=self._saturated / (count * pixels),
-            zero_share=self._zero / (count * pixels),
+            zero_share=0.0 if self._smallest < 0 else self._zero / (count * pixels),
             largest=self._largest,
             smallest=self._smallest,
         )

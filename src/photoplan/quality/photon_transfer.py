@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.quality.frame_statistics import Level
+from photoplan.quality.frame_statistics import Level, check_level
 from photoplan.quality.straight_line import StraightLine, fit_line
 
 __all__ = ["QUANTISATION", "PhotonTransfer", "is_clipped_dark", "photon_transfer"]
@@ -93,6 +93,8 @@ def photon_transfer(bright: Sequence[Level], dark: Sequence[Level] = (), black_l
     levels = sorted((x for x in bright if x.frames >= 2), key=lambda x: x.mean)
     if len(levels) < len(bright):
         raise InputError(f"{len(bright) - len(levels)} levels have a single frame; variance needs two or more of each")
+    for level in levels:
+        check_level(level)
     clipped = [level for level in dark if is_clipped_dark(level)]
     usable_dark = [level for level in dark if level.frames >= 2 and not is_clipped_dark(level)]
     everything = [*levels, *usable_dark]
