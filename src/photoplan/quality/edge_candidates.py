@@ -26,9 +26,9 @@ _LEAST_STEP = 0.02
 _TURN = radians(15.0)
 #: Distance of a point from its line at which the line is parted, pixels.
 _APART = 0.8
-#: How far the middle of a line may be off the straight between its ends, pixels: lenses bend lines, and the
-#: measurement fits a parabola.
-_BOW = 1.5
+#: How far the middle of a line may be off the straight between its ends: pixels, and share of its length; at most.
+#: Lenses bend lines, and the measurement fits a parabola.
+_BOW, _BOW_SHARE, _MOST_BOW = 0.3, 0.006, 1.5
 #: Chains with more points than this are cut.
 _MOST = 20_000
 #: Pixels that are looked at for the range of values.
@@ -235,7 +235,10 @@ def _cut(t: Array, d: Array) -> float | None:
         at = float(ts[worst + width // 2])
         # A wild end is cut off, not halved away.
         return float(np.clip(at, ts[0] + 0.1 * length, ts[-1] - 0.1 * length))
-    return float((ts[0] + ts[-1]) / 2) if abs(curve[0]) * length**2 / 8.0 > _BOW else None
+    most = min(_BOW + _BOW_SHARE * length, _MOST_BOW)
+    # Noise of the points bends short lines; it must not part them.
+    noise = float(np.std(ds - np.polyval(curve, ts))) / sqrt(len(ts))
+    return float((ts[0] + ts[-1]) / 2) if abs(curve[0]) * length**2 / 8.0 > most + 5 * noise else None
 
 
 def _solid(

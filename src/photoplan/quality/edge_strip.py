@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 #: Length of a block along the line, pixels.
 _BLOCK = 6.0
 #: Factor by which means of cells may scatter more than single pixels let expect: noise of compressed or interpolated
-#: images hangs together over two or three pixels.
-_TOGETHER = 3.0
+#: images hangs together over two pixels.
+_TOGETHER = 2.0
 #: Shares of a block's pixels that may be saturated or invalid.
 _SPOILT = 0.01
 #: Share of the contrast by which grey values may go beyond both sides next to an edge: more is a line, not enhancement.
@@ -154,12 +154,14 @@ class Sides:
     def reason(self, evenness: float, least_snr: float) -> str:
         """Why the blocks together are no edge to measure; empty if they are one."""
         contrast = self.contrast
-        if not contrast > 0.0 or self.snr < least_snr:
-            return "weak"
         inner = self.strip.profile()[self.dark.stop : self.bright.start]
         low, high = (float(_median(self._means(side))) for side in (self.dark, self.bright))
-        if np.nanmin(inner) < low - _SEAM * contrast or np.nanmax(inner) > high + _SEAM * contrast:
+        beyond = max(low - float(np.nanmin(inner)), float(np.nanmax(inner)) - high)
+        # A line or a narrow bar: what rises at the edge falls again within the blur.
+        if beyond > max(_SEAM * contrast, least_snr * self.noise / 2):
             return "two_sided"
+        if not contrast > 0.0 or self.snr < least_snr:
+            return "weak"
         for side in (self.dark, self.bright):
             mean, noise, s = self._means(side), self._noise(side), self.strip
             count = s.count[:, side].sum(axis=1)
@@ -169,11 +171,28 @@ class Sides:
             expected = _TOGETHER * noise / sqrt(float(np.median(count)))
             if scatter > max(evenness / 2 * contrast, 2 * expected):
                 return "textured"
+            if self._grain(side, noise) > 0.6 * evenness * contrast:
+                return "textured"
             bins = s.total[:, side].sum(axis=0) / np.maximum(s.count[:, side].sum(axis=0), 1)
             error = _TOGETHER**0.5 * noise / np.sqrt(np.maximum(s.count[:, side].sum(axis=0), 1))
             if (np.abs(bins - np.median(bins)) > np.maximum(evenness * contrast, 4 * error)).any():
                 return "two_sided"
         return ""
+
+    def _grain(self, side: slice, noise: float) -> float:
+        """Deviation of the means of cells, three bins wide and a block long, beyond what single pixels let expect."""
+        s = self.strip
+        count, total = ((a[:, side][:, : (side.stop - side.start) // 3 * 3]) for a in (s.count, s.total))
+        count, total = (a.reshape(len(a), -1, 3).sum(axis=2) for a in (count, total))
+        full = count >= 6
+        if np.count_nonzero(full) < 6:
+            return 0.0
+        means = np.where(full, total / np.maximum(count, 1), np.nan)
+        # Slow changes along the edge are light, not texture.
+        local = np.stack([_running_median(column, 9) for column in means.T], axis=1)
+        apart = (means - local)[full]
+        expected = _TOGETHER * noise**2 / float(np.median(count[full]))
+        return sqrt(max(float(np.mean(apart**2)) - expected, 0.0))
 
     def _means(self, side: slice) -> Array:
         count = self.strip.count[:, side].sum(axis=1)
