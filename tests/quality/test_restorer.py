@@ -187,17 +187,22 @@ class TestBorders:
 
 
 class TestGaps:
-    def test_nothing_of_invalid_pixels_leaks(self):
-        """Whatever value invalid pixels hold, NaN too, valid ones come out the same; invalid ones become 0."""
+    @pytest.mark.parametrize("shape", [None, (3, 3), (11, 11)])
+    def test_nothing_of_invalid_pixels_leaks(self, shape):
+        """Whatever value invalid pixels hold, NaN too, valid ones come out the same; invalid ones become 0.
+
+        Small kernels are filled up with columns of zeros, which must not meet NaN either.
+        """
         rng = np.random.default_rng(7)
         image = scene("float32", bands=1)
         valid = rng.random(image.shape[1:]) > 0.1
-        valid[:, 30:34] = False
+        valid[:, 30:44] = False
+        used = RestorationFilter((FilterKernel(random_kernel(1, shape)),)) if shape else sharpening(1)
         made = []
         for poison in (0.0, 1e30, np.nan, np.inf):
             spoilt = image.copy()
             spoilt[:, ~valid] = poison
-            made.append(restore(spoilt, sharpening(), valid)[0])
+            made.append(restore(spoilt, used, valid)[0])
         assert np.isfinite(made[0]).all() and (made[0][:, ~valid] == 0).all()
         for other in made[1:]:
             assert other.tobytes() == made[0].tobytes()
