@@ -67,7 +67,7 @@ def test_camera_constant_and_point_of_a_pure_natural_fall_off() -> None:
     model = FallOffModel(SIZE, POINT, FOCAL, (), ())
     settings = FallOffSettings("estimated", estimate_principal_point=True, artificial="none")
     errors = []
-    for seed in range(60):
+    for seed in range(40):
         found = fit_fall_off(flat(model, seed), settings)
         assert found.sigma_camera_constant is not None and found.sigma_principal_point is not None
         errors.append((found.camera_constant - FOCAL) / found.sigma_camera_constant)

@@ -10,7 +10,7 @@ from tools.camera_series import edge_lines
 
 from photoplan.errors import InputError
 from photoplan.quality.line_jitter import grey_error, line_jitter, position_error
-from photoplan.quality.line_period import Harmonic
+from photoplan.quality.line_period import Harmonic, Waves, spectrum
 from photoplan.quality.parallel_edges import above_control, compare_edges
 from photoplan.quality.plumb_edge import correlate_edge, fit_edge
 
@@ -121,6 +121,20 @@ def test_two_oscillations_are_both_found() -> None:
     assert first.period == pytest.approx(120, abs=1.5) and second.period == pytest.approx(7.3, abs=0.01)
 
 
+def test_spectrum_is_what_least_squares_explain() -> None:
+    """At every frequency: the sum of squares that cosine and sine take away beside trend and fields."""
+    rng = np.random.default_rng(20)
+    t = np.sort(rng.choice(120, 90, replace=False)).astype(float)
+    y = rng.normal(0, 1, 90) + 0.05 * t + np.sin(t / 9)
+    base = np.column_stack([np.ones(90), t, t**2, t % 2])
+    found = spectrum(Waves(t), y, base)
+    rss0 = np.linalg.lstsq(base, y, rcond=None)[1][0]
+    for k in range(0, len(found.frequency), 9):
+        angle = 2 * np.pi * found.frequency[k] * t
+        rss = np.linalg.lstsq(np.column_stack([base, np.cos(angle), np.sin(angle)]), y, rcond=None)[1][0]
+        assert found.power[k] == pytest.approx(1 - rss / rss0, abs=1e-9)
+
+
 def test_spikes_are_listed_and_do_not_count() -> None:
     rng = np.random.default_rng(7)
     y = 20 + 0.003 * LINES + rng.normal(0, 0.1, 400)
@@ -227,6 +241,8 @@ def test_bad_edges_are_refused_in_words() -> None:
         fit_edge(half)
     with pytest.raises(InputError, match="at least 18 columns"):
         fit_edge(half[:, :12])
+    with pytest.raises(InputError, match="10000 lines are taken"):
+        fit_edge(np.zeros((10_001, 40), np.float32))
     with pytest.raises(InputError, match="and 16 lines"):
         fit_edge(half[:10])
     with pytest.raises(InputError, match="edge in 8 lines"):

@@ -146,9 +146,9 @@ class FramesEntry(Entry):
     """Exposure of the reference frame; default the longest in which under 0.1 % of the pixels are saturated."""
     steps: tuple[StepEntry, ...] = ()
     """Patches of a grey wedge."""
-    edges: tuple[EdgeEntry, ...] = ()
+    edges: Annotated[tuple[EdgeEntry, ...], Field(max_length=200)] = ()
     """Straight edges in plumb frames."""
-    targets: tuple[TargetEntry, ...] = ()
+    targets: Annotated[tuple[TargetEntry, ...], Field(max_length=200)] = ()
     """Round targets in target or stage frames; None named: one in the roi."""
     name: Name | None = None
     values: dict[Name, Number | str] = Field(default_factory=dict)

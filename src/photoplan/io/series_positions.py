@@ -15,7 +15,7 @@ from photoplan.io.series_table import read_columns
 __all__ = ["MeasuredPosition", "MeasuredPositions", "read_positions"]
 
 _NEEDED = {"stage": ("x", "y", "stage_x", "stage_y"), "target": ("x", "y", "time_s")}
-_MOST = 1_000_000
+_MOST = 100_000
 
 
 @dataclass(frozen=True)

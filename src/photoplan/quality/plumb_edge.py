@@ -11,12 +11,14 @@ from scipy import special
 
 from photoplan.errors import InputError
 
-__all__ = ["LEAST_LINES", "PATTERN", "EdgeLines", "correlate_edge", "fit_edge"]
+__all__ = ["LEAST_LINES", "MOST_LINES", "PATTERN", "EdgeLines", "correlate_edge", "fit_edge"]
 
 Array = NDArray[np.float64]
 
 #: Lines below which a straight line and what leaves it cannot be told apart.
 LEAST_LINES = 16
+#: Lines above which a spectrum would take minutes.
+MOST_LINES = 10_000
 #: Length of the pattern in pixels (Behr 1989, §4.1.2).
 PATTERN = 10
 _REACH = 7
@@ -155,8 +157,11 @@ def _window(grey: NDArray[np.floating], name: str) -> Array:
             f"{name}: a window of {grey.shape[-1]} columns and {len(grey)} lines; at least {2 * _REACH + 4} columns "
             f"and {LEAST_LINES} lines are needed"
         )
-    if grey.size > _LARGEST:
-        raise InputError(f"{name}: a window of {grey.size} pixels; at most {_LARGEST} are taken, choose a narrower one")
+    if grey.size > _LARGEST or len(grey) > MOST_LINES:
+        raise InputError(
+            f"{name}: a window of {grey.shape[1]} columns and {len(grey)} lines; at most {_LARGEST} pixels and "
+            f"{MOST_LINES} lines are taken, choose a smaller one"
+        )
     return np.asarray(grey, float)
 
 

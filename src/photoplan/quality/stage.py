@@ -19,6 +19,7 @@ __all__ = ["LEAST_POINTS", "StageCalibration", "b4_lines", "stage_calibration"]
 Array = NDArray[np.float64]
 
 LEAST_POINTS = 4
+MOST_POINTS = 10_000
 _GON = 200.0 / math.pi
 #: Chance of a false alarm for a gross error among all points, and for a systematic part of the residuals.
 LEVEL = 0.001
@@ -136,6 +137,8 @@ def _checked(names: Iterable[str], stage: Array, measured: Array) -> tuple[tuple
             f"stage calibration: {len(labels)} names, stage coordinates of shape {S.shape}, measured of {P.shape}; two "
             "columns of equal length are needed"
         )
+    if len(labels) > MOST_POINTS:
+        raise InputError(f"stage calibration: {len(labels)} points; at most {MOST_POINTS} are taken")
     seen: set[str] = set()
     for name, s, p in zip(labels, S, P):
         if name in seen:
