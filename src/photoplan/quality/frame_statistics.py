@@ -77,7 +77,7 @@ def check_level(level: Level) -> None:
         raise InputError(f"{level.pixels} pixels count; {LEAST_PIXELS} or more are needed: give a larger roi or mask")
     if level.frames > 1 and not level.temporal_variance > 0 and level.saturated_share < 0.5 and level.zero_share < 0.5:
         raise InputError(
-            f"the {level.frames} frames of mean {level.mean:.4g} DN do not differ in a single pixel: they are copies of "
+            f"the {level.frames} frames of mean {level.mean:.4g} DN do not differ in any pixel: they are copies of "
             "one file, or their noise was removed; give raw frames"
         )
 
