@@ -25,6 +25,8 @@ __all__ = ["command"]
               help="Folder of the results [restored, beside the first image].")  # fmt: skip
 @click.option("--band", "bands", multiple=True, type=click.IntRange(1), metavar="N",
               help="Restore this band; may be repeated [all]. Others stay as they are.")  # fmt: skip
+@click.option("--chromatic", metavar="FILE|measure",
+              help="First bring the bands together: by a model, or by each image's own discs or edges.")  # fmt: skip
 @click.option("--linearisation", default="linear", show_default=True, metavar="linear|srgb|TABLE",
               help="How grey values become light, which is what is filtered.")  # fmt: skip
 @click.option("--dtype", default="same", show_default=True, metavar="same|float32|uint16", help="Type of the results.")
@@ -53,6 +55,8 @@ def command(
         if not quiet:
             click.echo(text, err=True)
 
+    if options["chromatic"] not in (None, "measure"):
+        options["chromatic"] = Path(options["chromatic"])
     options["quicklook"] = not options.pop("no_quicklook")
     options["workers"] = options["workers"] or psutil.cpu_count() or 1
     request = RestoreRequest(images, filter_file, **options)
@@ -90,7 +94,17 @@ def _before(plan: RestorePlan) -> list[str]:
     for name in ("condition", "rule"):
         if name in figures["facts"]:
             lines.append(f"{name}: {figures['facts'][name]}")
-    return lines
+    return lines + [line for job in plan.jobs for line in _chromatic(job.reader.source)]
+
+
+def _chromatic(source: Any) -> list[str]:
+    """How far the bands of an image lie apart, where that is corrected."""
+    from photoplan.products.aligned_reader import AlignedReader
+    from photoplan.products.chromatic import model_lines
+
+    if not isinstance(source, AlignedReader):
+        return []
+    return [f"{source.path.name}: {line}" for line in model_lines(source.model)]
 
 
 def _show(plan: RestorePlan, as_json: bool) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,7 +27,9 @@ __all__ = [
     "correct_chromatic",
     "load_chromatic",
     "measure_chromatic",
+    "measured_once",
     "model_figures",
+    "model_lines",
     "save_chromatic",
 ]
 
@@ -80,6 +83,20 @@ def measure_chromatic(request: ChromaticRequest) -> ChromaticModel:
     except InputError as error:
         raise type(error)(f"{request.image}: {error}") from None
     return ChromaticModel(source.size, reference, bands, f"{method} of {request.image.name}")
+
+
+def measured_once(image: Path) -> ChromaticModel:
+    """What `measure_chromatic` says of an image; an image that did not change since is not measured again."""
+    try:
+        state = image.stat()
+    except OSError:
+        return measure_chromatic(ChromaticRequest(image))
+    return _known(image.resolve(), (state.st_mtime_ns, state.st_size))
+
+
+@lru_cache(maxsize=64)
+def _known(image: Path, state: tuple[int, int]) -> ChromaticModel:
+    return measure_chromatic(ChromaticRequest(image))
 
 
 def _measured(
@@ -245,6 +262,23 @@ def model_figures(model: ChromaticModel) -> dict[str, Any]:
             for band in model.bands
         ],
     }
+
+
+def model_lines(model: ChromaticModel) -> list[str]:
+    """A model in words, a line for each band, with the criterion that chose it."""
+    lines = []
+    for band in model_figures(model)["bands"]:
+        text = (
+            f"band {band['band']} against {model.reference}: {band['kind']}, shift {band['shift'][0]:+.3f} "
+            f"{band['shift'][1]:+.3f} px, {band['corner']:+.3f} px more in the corners"
+        )
+        if band["residual"] is not None:
+            text += f"; residuals {band['residual']:.3f} px of {band['count'] - band['rejected']} {model.description}"
+        if band["tried"]:
+            predicted = ", ".join(f"{t['kind']} {t['predicted']:.3f}" for t in band["tried"])
+            text += f"; errors of prediction: {predicted} px"
+        lines.append(text)
+    return lines
 
 
 def _middle(model: ChromaticModel, band: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,10 +22,13 @@ from photoplan.io.product import check_output
 from photoplan.io.raster import RasterReader
 from photoplan.io.run_record import record_path
 from photoplan.io.storage import Nodata
+from photoplan.products.aligned_reader import AlignedReader
+from photoplan.products.chromatic import load_chromatic, measured_once, model_figures
 from photoplan.products.filter_files import entries_of, load_filter
 from photoplan.products.restore_execute import Job, RestoredImage, earlier_result, memory_of_a_tile, restore_one
 from photoplan.products.restore_request import RestoreRequest
 from photoplan.products.restored_reader import RestoredReader, kept_nodata, linearisation_of, restored_reader
+from photoplan.quality.chromatic import ChromaticModel
 from photoplan.quality.filters import RestorationFilter
 
 __all__ = [
@@ -107,17 +110,19 @@ def plan_restoration(request: RestoreRequest) -> RestorePlan:
     filter_ = load_filter(given) if isinstance(given, Path) else given
     text = filter_text(entries_of(filter_))
     light = linearisation_of(request.linearisation)
+    given_model = load_chromatic(request.chromatic) if isinstance(request.chromatic, Path) else request.chromatic
     files = [path.resolve() for path in request.images]
     twice = [path for path in files if files.count(path) > 1]
     if twice:
         raise UsageError(f"image {twice[0]} is given twice")
     stems = unique_stems(path.name for path in request.images)
     inputs = [*request.images, *([given] if isinstance(given, Path) else [])]
+    inputs += [request.chromatic] if isinstance(request.chromatic, Path) else []
     inputs += [] if request.linearisation in ("linear", "srgb") else [Path(request.linearisation)]
     jobs, failed = [], {}
     for path in request.images:
         try:
-            source = RasterReader(path)
+            source = _source(path, request, given_model)
             out = source.dtype if request.dtype == "same" else np.dtype(request.dtype)
             _check_bands(path, source.bands, request.bands)
             chosen = _only(filter_, request.bands, source.bands)
@@ -129,6 +134,16 @@ def plan_restoration(request: RestoreRequest) -> RestorePlan:
     for job in jobs:
         _check_outputs(job, request)
     return RestorePlan(request, filter_, tuple(jobs), failed, _in_flight(request, jobs))
+
+
+def _source(
+    path: Path, request: RestoreRequest, model: ChromaticModel | Literal["measure"] | None
+) -> RasterReader | AlignedReader:
+    """The image, its bands brought together where that is asked for."""
+    source = RasterReader(path)
+    if model is None:
+        return source
+    return AlignedReader(source, measured_once(path) if model == "measure" else model)
 
 
 def _check_bands(path: Path, count: int, wanted: Iterable[int]) -> None:
@@ -151,6 +166,8 @@ def _job(request: RestoreRequest, reader: RestoredReader, target: Path, text: st
     info = reader.info
     digest = fingerprint(info.path).digest
     facts = [__version__, digest, text, request.settings["bands"], str(reader.dtype), request.linearisation]
+    if isinstance(reader.source, AlignedReader):
+        facts.append(model_figures(reader.source.model))
     light = reader.restorer.linearisation
     if light.grey is not None and light.light is not None:
         facts += [light.grey.tolist(), light.light.tolist()]
@@ -168,6 +185,7 @@ def _check_outputs(job: Job, request: RestoreRequest) -> None:
     """Refuse results that exist, but for those of this very run when it was interrupted."""
     mine = earlier_result(job, request.settings) is not None
     outputs = [job.target, record_path(job.target), *([job.picture] if request.quicklook else [])]
+    outputs += [job.chromatic_file] if request.chromatic == "measure" else []
     for path in outputs:
         check_output(path, job.inputs, overwrite=request.overwrite or mine)
 

@@ -22,6 +22,8 @@ from photoplan.io.quicklook import write_quicklook
 from photoplan.io.run_record import peak_memory_bytes, record_path, versions, write_run_record
 from photoplan.io.storage import Nodata
 from photoplan.io.tile_log import TileLog
+from photoplan.products.aligned_reader import AlignedReader
+from photoplan.products.chromatic import model_figures, save_chromatic
 from photoplan.products.restore_request import RestoreRequest
 from photoplan.products.restored_reader import PART, RestoredReader
 
@@ -48,6 +50,11 @@ class Job:
         """Tiles of the image."""
         width, height = self.reader.size
         return -(-width // PART) * -(-height // PART)
+
+    @property
+    def chromatic_file(self) -> Path:
+        """Where a measured model of lateral chromatic aberration is written."""
+        return self.target.with_name(self.target.stem.removesuffix("_restored") + "_chromatic.toml")
 
     @property
     def picture(self) -> Path:
@@ -172,6 +179,8 @@ def restore_one(
     ) as file:
         facts = _all_tiles(job, how, file, (in_flight, counted), advance, talk)
     below, above = counted.sums(reader.bands)
+    if how.chromatic == "measure" and isinstance(job.reader.source, AlignedReader):
+        save_chromatic(job.chromatic_file, job.reader.source.model)
     if how.quicklook:
         write_quicklook(job.target, job.picture)
     result = RestoredImage(
@@ -261,6 +270,7 @@ def _record(job: Job, how: RestoreRequest, result: RestoredImage, facts: Product
         + [{"path": path} for path in job.inputs if path.resolve() != job.reader.info.path.resolve()],
         "settings": how.settings,
         "linearisation": restorer.linearisation.describe(),
+        "chromatic": model_figures(job.reader.source.model) if isinstance(job.reader.source, AlignedReader) else None,
         "filter": {
             "description": restorer.filter.description,
             "image_size": restorer.filter.image_size,

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from photoplan.errors import UsageError
 from photoplan.io.storage import COMPRESSIONS
+from photoplan.quality.chromatic import ChromaticModel
 from photoplan.quality.filters import RestorationFilter
 
 __all__ = ["RestoreRequest"]
@@ -31,6 +32,9 @@ class RestoreRequest:
     """``linear``, ``srgb`` or a file with a table."""
     dtype: str = "same"
     """Type of the results: ``same``, ``float32`` or ``uint16``."""
+    chromatic: ChromaticModel | Path | Literal["measure"] | None = None
+    """Lateral chromatic aberration, which is corrected before the filter: a model, its file, or ``measure``: every
+    image's own discs or edges; None: the bands stay where they are."""
     compress: str = "deflate"
     workers: int = 1
     memory: int | None = None
@@ -60,5 +64,8 @@ class RestoreRequest:
             "bands": list(self.bands),
             "linearisation": self.linearisation,
             "dtype": self.dtype,
+            "chromatic": "a model"
+            if isinstance(self.chromatic, ChromaticModel)
+            else self.chromatic and str(self.chromatic),
             "compress": self.compress,
         }

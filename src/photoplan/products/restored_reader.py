@@ -15,6 +15,7 @@ from photoplan.io.linearisation_file import read_linearisation_table
 from photoplan.io.raster import RasterReader
 from photoplan.io.raster_info import RasterInfo
 from photoplan.io.storage import Nodata
+from photoplan.products.aligned_reader import AlignedReader
 from photoplan.quality.filters import RestorationFilter
 from photoplan.quality.linearise import Linearisation
 from photoplan.quality.restorer import RestoredPixels, Restorer
@@ -35,7 +36,7 @@ class RestoredReader:
         When read: damaged pixels, or grey values that the linearisation's table does not have.
     """
 
-    source: RasterReader
+    source: RasterReader | AlignedReader
     restorer: Restorer
 
     @property
@@ -117,7 +118,7 @@ def kept_nodata(info: RasterInfo, out: np.dtype[Any]) -> Nodata:
 
 
 def restored_reader(
-    source: RasterReader,
+    source: RasterReader | AlignedReader,
     filter_: RestorationFilter,
     linearisation: Linearisation | None = None,
     out: np.dtype[Any] | None = None,
@@ -126,7 +127,7 @@ def restored_reader(
 
     Parameters
     ----------
-    source : RasterReader
+    source : RasterReader or AlignedReader
     filter_ : RestorationFilter
     linearisation : Linearisation, optional
         How grey values become light; they are light already if it is None.
