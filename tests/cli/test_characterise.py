@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 from tools.camera_model import Sensor, write_frame
 from tools.command import Here
 
@@ -273,3 +274,25 @@ def test_blooming_from_files(tmp_path, run):
     told = json.loads(run("characterise", tmp_path / "s.toml", "--only", "blooming", "--json", "-q").out)
     onset = figures(told, "blooming")["blooming_onset_dn"]
     assert onset["value"] == pytest.approx(150, abs=3 * onset["sigma"])
+
+
+def test_fault_08_frame_whose_pixels_are_damaged_stops_its_analysis_only(folder, tmp_path, run):
+    with rasterio.open(folder / "wedge/wedge_0.5_0.tif") as file:
+        pixels = file.read(1)
+    profile = {"driver": "GTiff", "count": 1, "height": 64, "width": 80, "dtype": "uint16", "compress": "deflate"}
+    for density in (0.1, 0.4, 0.8):
+        with rasterio.open(tmp_path / f"w_{density}.tif", "w", **profile) as file:
+            file.write(pixels, 1)
+    bad = tmp_path / "w_0.4.tif"
+    content = bytearray(bad.read_bytes())
+    for k in range(len(content) // 2, len(content) // 2 + 40):
+        content[k] ^= 0x5A
+    bad.write_bytes(content)
+    (tmp_path / "s.toml").write_text(
+        f'[camera]\nbits = 12\n[[frames]]\nkind = "wedge"\nfiles = "w_{{density}}.tif"\n'
+        f'[[frames]]\nkind = "flat"\nfiles = "{folder}/flat/flat_{{exposure}}ms_*.tif"\n'
+    )
+    said = run("characterise", tmp_path / "s.toml", "--only", "wedge", "--only", "linearity")
+    assert said.code == 4
+    assert "wedge:" in said.err and "w_0.4.tif" in said.err and "damaged" in said.err
+    assert "linearity error" in said.out and "gamma" not in said.out
