@@ -5,7 +5,7 @@
 One real aerial frame, enlarged 6 and 12 times; cubic, three bands, uncompressed, no overviews, one thread where the
 program lets itself be told. Whole processes are measured, from start to end. Runs of the programs alternate, medians
 are compared. Whatever is missing (a program, the data) is named and its rows are left out. Terrain models from
-measured points (terrain.py) and orientation (orientation.py) follow.
+measured points (terrain.py), orientation (orientation.py) and the rate of filters (filter.py) follow.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from pathlib import Path
 
 import rasterio
 from agreement import compare
+from filter import report_filter
 from orientation import report_orientation
 from prepare import DATA, LARGE, SMALL, WORK, Source, prepare
 from programs import Bounds, Missing, Program, gdalwarp, orthority, photoplan
@@ -204,6 +205,7 @@ def main() -> int:
             results["sizes"].append(compare_at(source, entries))
             report(results["sizes"][-1])
     WORK.mkdir(exist_ok=True)
+    results["filter"] = report_filter(options.quick)
     results["terrain"] = report_terrain(options.quick, options.large)
     results["orientation"] = report_orientation(options.quick)
     if options.json:
