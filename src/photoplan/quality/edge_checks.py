@@ -11,7 +11,17 @@ from scipy.special import chdtrc
 
 from photoplan.errors import InputError
 
-__all__ = ["EdgeSettings", "Residuals", "check_clipping", "check_line", "check_region", "check_sides", "check_step"]
+__all__ = [
+    "EdgeSettings",
+    "Residuals",
+    "check_clipping",
+    "check_line",
+    "check_one_peak",
+    "check_region",
+    "check_sides",
+    "check_step",
+    "grain",
+]
 
 #: Side of the squares beside the edge whose means are tested for structure, pixels.
 CELL = 5
@@ -74,8 +84,8 @@ class Residuals:
     """Standard deviation of the line spread function, pixels."""
 
 
-def check_region(image: NDArray[np.float64], valid: NDArray[np.bool_]) -> None:
-    """Refuse what is no region of pixels: wrong shape, too small, too large, no valid or no finite pixels."""
+def check_region(image: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mask of the valid and finite pixels; refuse what is no region: wrong shape, too small, too large, empty."""
     if image.ndim != 2 or valid.shape != image.shape:
         raise InputError(
             f"a region is an array of rows and columns with a mask like it; given: {image.shape}, {valid.shape}"
@@ -87,10 +97,10 @@ def check_region(image: NDArray[np.float64], valid: NDArray[np.bool_]) -> None:
             f"a region for an edge has 16 million pixels at most; given: {image.shape[1]} × {image.shape[0]}"
         )
     # The pixels along an oblique edge fill a small part of the rectangle around them.
-    if np.count_nonzero(valid) < max(0.02 * image.size, 100):
-        raise InputError(
-            f"{np.count_nonzero(valid)} of the region's {image.size} pixels are valid; choose a region inside the image"
-        )
+    valid = valid & np.isfinite(image)
+    if np.count_nonzero(valid) < 100:
+        raise InputError(f"the region has {np.count_nonzero(valid)} valid pixels; 100 at least are needed")
+    return valid
 
 
 def check_clipping(
@@ -113,17 +123,62 @@ def check_clipping(
             )
 
 
-def check_step(step: float, noise: float, count: int, least: float) -> None:
-    """Refuse a region without a significant step, and a step that is drowned in noise."""
-    if not step > 6.0 * noise / np.sqrt(max(count, 1) / 4.0):
+def check_step(step: float, noise: float, grain: float, settings: EdgeSettings) -> None:
+    """Refuse a region without a significant step, a step drowned in noise, and pixels that one edge does not explain.
+
+    Parameters
+    ----------
+    step
+        Difference of both levels.
+    noise
+        Standard deviation of a pixel from the fitted edge.
+    grain
+        Noise of a pixel from its neighbours along the edge alone.
+    settings
+        What is allowed.
+    """
+    if not step > 1.5 * noise or not step > 1.5 * grain:
         raise InputError(
-            f"no edge: both sides differ by {step:.3g} with a noise of {noise:.3g} per pixel, which may be chance"
+            f"no edge: both sides differ by {step:.3g}, while single pixels deviate by {noise:.3g} from one edge"
         )
-    if step < least * noise:
+    if step < settings.least_snr * noise:
+        if noise > 1.7 * grain:
+            raise InputError(
+                f"the sides of the edge are not even: pixels deviate from one edge by {100 * noise / step:.0f} % of "
+                f"its step, {noise / grain if grain > 0.0 else np.inf:.1f} times their noise (a second edge, a corner "
+                "or texture); choose a cleaner or narrower region"
+            )
         raise InputError(
-            f"edge too noisy: the step is {step / noise:.1f} times a pixel's noise, {least:g} at least are needed; "
-            "use a stronger edge, or the mean of several images"
+            f"edge too noisy: the step is {step / noise:.1f} times a pixel's noise, at least {settings.least_snr:g} "
+            "are needed; use a stronger edge, or the mean of several images"
         )
+
+
+def check_one_peak(positions: NDArray[np.float64], line: NDArray[np.float64], sigma: NDArray[np.float64]) -> None:
+    """Refuse a line spread function with a second peak: a second edge beside the first.
+
+    A peak counts if it lies 3 pixels or more from the main one, has a sixth of its height and four standard deviations,
+    and the line between both falls below half of it (ripples of edge enhancement stay far below that).
+    """
+    top = int(np.argmax(line))
+    for side in (slice(top, None), slice(top, None, -1)):
+        away, height, error = np.abs(positions[side] - positions[top]), line[side], sigma[side]
+        valley = np.minimum.accumulate(height)
+        second = (away >= 3.0) & (height > line[top] / 6.0) & (height > 4.0 * error) & (valley < 0.5 * height)
+        if second.any():
+            i = int(np.argmax(np.where(second, height, 0.0)))
+            raise InputError(
+                f"the sides of the edge are not even: a second edge {away[i]:.1f} pixels beside the first one, "
+                f"{100 * height[i] / line[top]:.0f} % as steep; choose a narrower region"
+            )
+
+
+def grain(pixels: NDArray[np.float64], along: NDArray[np.float64], across: NDArray[np.float64]) -> float:
+    """Noise of a pixel from differences of neighbours along the edge; robust, so that the edge itself hardly counts."""
+    order = np.lexsort((along, across))
+    near = (np.diff(along[order]) == 1.0) & (np.diff(across[order]) == 0.0)
+    steps = np.diff(pixels[order])[near]
+    return float(np.median(np.abs(steps)) / 0.6745 / np.sqrt(2.0)) if steps.size else 0.0
 
 
 def check_line(residuals: Residuals, most: float, curve: int) -> float:

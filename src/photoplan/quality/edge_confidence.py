@@ -106,14 +106,13 @@ def _spread(values: NDArray[np.float64], blocks: int) -> NDArray[np.float64]:
 
 
 def _width(at: NDArray[np.float64], line: NDArray[np.float64]) -> float:
-    """Distance between the outermost crossings of half the maximum next to it; NaN if a side does not fall so low."""
+    """Distance between the outermost crossings of half the maximum; NaN if a side does not fall so low."""
     top = int(np.argmax(line))
     half = _peak(line, top) / 2.0
-    below = line < half
-    left, right = np.flatnonzero(below[:top]), np.flatnonzero(below[top:])
-    if half <= 0.0 or left.size == 0 or right.size == 0:
+    above = np.flatnonzero(line >= half)
+    if half <= 0.0 or above.size == 0 or above[0] == 0 or above[-1] == line.size - 1:
         return nan
-    a, b = int(left[-1]), top + int(right[0])
+    a, b = int(above[0]) - 1, int(above[-1]) + 1
     start = at[a] + (half - line[a]) / (line[a + 1] - line[a]) * (at[a + 1] - at[a])
     end = at[b] - (half - line[b]) / (line[b - 1] - line[b]) * (at[b] - at[b - 1])
     return float(end - start)

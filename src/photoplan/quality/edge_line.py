@@ -226,9 +226,9 @@ def _first_blur(pixels: EdgePixels, line: EdgeLine) -> float:
     mean = np.bincount(distance - first, pixels.light) / np.maximum(count, 1)
     keep = count > 0
     at, mean = np.flatnonzero(keep) + first, mean[keep]
-    dark, bright = np.median(mean[at < 0]) if (at < 0).any() else mean[0], mean[-1]
-    if (at > 0).any():
-        bright = np.median(mean[at > 0])
+    if not ((at < 0).any() and (at > 0).any()):
+        return 1.0
+    dark, bright = np.median(mean[at < 0]), np.median(mean[at > 0])
     if not bright > dark:
         return 1.0
     share = np.clip((mean - dark) / (bright - dark), 0.0, 1.0)

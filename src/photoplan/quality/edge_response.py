@@ -13,9 +13,11 @@ from photoplan.quality.edge_checks import (
     Residuals,
     check_clipping,
     check_line,
+    check_one_peak,
     check_region,
     check_sides,
     check_step,
+    grain,
 )
 from photoplan.quality.edge_confidence import EdgeFigures, EdgeShape, edge_figures, gaussian_width
 from photoplan.quality.edge_line import EdgeLine, EdgePixels, find_line, fit_line
@@ -157,8 +159,8 @@ def measure_edge(
     """
     chosen = settings or EdgeSettings()
     image = np.asarray(pixels, np.float64)
-    mask = np.isfinite(image) if valid is None else np.isfinite(image) & np.asarray(valid, bool)
-    check_region(image, mask)
+    mask = np.ones(image.shape, bool) if valid is None else np.asarray(valid, bool)
+    mask = check_region(image, mask)
     line = find_line(image, mask)
     every = EdgePixels.of(image, mask, line.direction)
     line, model, levels = fit_line(every, line, chosen.curve, chosen.shading != "none", 1e-2)
@@ -172,7 +174,8 @@ def measure_edge(
     seen, distance = every.where(inside), distance[inside]
     span = _span(seen, distance, model, line, chosen)
     weight, first_noise = _weights(seen, distance, line, model, chosen)
-    check_step(levels[1], first_noise, distance.size, chosen.least_snr)
+    own = grain(seen.light, seen.along, seen.across)
+    check_step(float(levels[1]), first_noise, own, chosen)
     fit = _fit(seen, (distance, weight), line, (model, low, high), chosen)
     return _measured(_Context(seen, distance, line, fit, span, origin, chosen))
 
@@ -190,6 +193,8 @@ class _Context:
 
 def _window(distance: NDArray[np.float64], model: PixelEdge, reach: float) -> tuple[float, float]:
     """Distances within a reach up to which every step of a pixel holds a third as many pixels as the edge itself."""
+    if not distance.min() < 0.0 < distance.max():
+        raise InputError("no edge: the line that suits the brightness best lies outside the region")
     count = np.bincount((np.floor(distance) - np.floor(distance.min())).astype(np.intp))
     zero = int(-np.floor(distance.min()))
     core = max(1, round(2.0 * model.total))
@@ -283,9 +288,11 @@ def _measured(found: _Context) -> EdgeMeasurement:
     fit, line, settings = found.fit, found.line, found.settings
     step = float(fit.basis.steps() @ fit.shape)
     noise = fit.noise
-    check_step(step, noise, found.distance.size, settings.least_snr)
+    check_step(step, noise, grain(found.pixels.light, found.pixels.along, found.pixels.across), settings)
     straightness, structure = _residual_checks(found, step)
     gap = _phase_gap(found.distance, fit.basis.model)
+    profiles = _profiles(found, step, gap)
+    check_one_peak(profiles["lsf"].positions, profiles["lsf"].values, profiles["lsf"].sigma)
     shape = EdgeShape.of(fit, min(1.0, 0.5 / gap))
     figures = edge_figures(fit, shape, settings.confidence)
     mtf50, mtf10, fwhm, over, under, nyquist = (float(v) for v in figures.values)
@@ -300,7 +307,7 @@ def _measured(found: _Context) -> EdgeMeasurement:
         dark=dark,
         bright=dark + step,
         noise=noise,
-        **_profiles(found, step, gap),
+        **profiles,
         mtf=MtfCurve(shape.frequency, figures.modulation, figures.modulation_sigma),
         mtf50=mtf50,
         mtf50_interval=_interval(figures, 0),

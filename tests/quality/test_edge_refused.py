@@ -1,0 +1,109 @@
+"""Regions that give no figure: each is refused with its reason, and never answered with a number."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from tools.edges import edge_image, gaussian
+
+from photoplan.errors import InputError
+from photoplan.quality.edge_response import EdgeSettings, measure_edge
+
+SHAPE = (100, 60)
+
+
+def _clean(seed=1, noise=0.02, angle=6.0, through=(29.3, 50.2)):
+    random = np.random.default_rng(seed)
+    return edge_image(SHAPE, angle, through, gaussian(0.7)) + random.normal(0.0, noise, SHAPE)
+
+
+def _refused(image, words, **options):
+    with pytest.raises(InputError, match=words):
+        measure_edge(image, **options)
+
+
+def test_the_clean_edge_is_measured():
+    for seed in range(20):
+        measure_edge(_clean(seed), limits=(-1.0, 2.0))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_noise_alone_is_no_edge(seed):
+    image = np.random.default_rng(seed).normal(100.0, 3.0, SHAPE)
+    _refused(image, "no edge|too narrow|noisy|too short|not even")
+
+
+def test_a_constant_region_is_no_edge():
+    _refused(np.full(SHAPE, 7.0), "no edge")
+
+
+def test_a_ramp_is_no_edge():
+    _refused(np.tile(np.linspace(0.0, 1.0, 60), (100, 1)) + _clean() * 0.0, "no edge|too narrow")
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_smooth_texture_alone_is_no_edge(seed):
+    image = gaussian_filter(np.random.default_rng(seed).normal(0.0, 1.0, SHAPE), 3.0) * 50.0
+    _refused(image, "no edge|too narrow|noisy|too short|not even|bent")
+
+
+@pytest.mark.parametrize(("low", "high", "side"), [(-1.0, 0.99, "bright"), (0.03, 2.0, "dark")])
+def test_a_clipped_side_is_refused(low, high, side):
+    _refused(np.clip(_clean(), low, high), f"saturated edge: .* % of the pixels on its {side}", limits=(low, high))
+
+
+def test_an_edge_drowned_in_noise_is_refused():
+    _refused(_clean(noise=0.35), "noisy")
+
+
+def test_a_second_edge_is_refused():
+    second = edge_image(SHAPE, 186.0, (42.0, 50.2), gaussian(0.7))
+    _refused(_clean() + second - 1.0, "not even|no edge")
+    step = 0.5 * edge_image(SHAPE, 6.0, (42.0, 50.2), gaussian(0.7))
+    _refused(_clean() + step, "a second edge 1[23].* pixels beside")
+
+
+def test_a_corner_is_refused():
+    corner = np.minimum(
+        edge_image(SHAPE, 6.0, (29.3, 50.0), gaussian(0.7)), edge_image(SHAPE, 96.0, (29.0, 45.0), gaussian(0.7))
+    )
+    _refused(corner + np.random.default_rng(1).normal(0.0, 0.02, SHAPE), "not even")
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_textured_side_is_refused(seed):
+    random = np.random.default_rng(seed)
+    texture = gaussian_filter(random.normal(0.0, 1.0, SHAPE), 2.0)
+    texture *= 0.1 / texture.std()
+    dark = edge_image(SHAPE, 186.0, (29.3, 50.2), gaussian(0.7))
+    _refused(_clean(seed) + texture * dark, "not even: .* of .* % of the step")
+
+
+def test_a_bent_edge_is_refused_and_the_parabola_named():
+    rows, columns = np.mgrid[:100, :60].astype(float)
+    image = 1.0 / (1.0 + np.exp(-2.0 * (columns - 30.0 - 0.06 * rows - 0.0012 * (rows - 50.0) ** 2)))
+    image += np.random.default_rng(2).normal(0.0, 0.02, SHAPE)
+    _refused(image, "bent edge: .* degree 2")
+    measure_edge(image, settings=EdgeSettings(curve=2))
+
+
+def test_a_short_edge_is_refused():
+    image = edge_image((10, 60), 5.0, (29.3, 5.0), gaussian(0.7)) + np.random.default_rng(3).normal(0.0, 0.01, (10, 60))
+    _refused(image, "too short: 10.0 pixels, at least 12")
+
+
+def test_a_narrow_region_is_refused():
+    image = edge_image((60, 12), 2.0, (5.3, 30.0), gaussian(3.0)) + np.random.default_rng(3).normal(0.0, 0.01, (60, 12))
+    _refused(image, "too narrow")
+
+
+@pytest.mark.parametrize("shape", [(3, 50), (50, 3), (0, 0)])
+def test_hardly_any_pixels_are_refused(shape):
+    _refused(np.zeros(shape), "8 × 8")
+
+
+def test_other_shapes_and_empty_masks_are_refused():
+    _refused(np.zeros((3, 50, 50)), "rows and columns")
+    _refused(np.full(SHAPE, np.nan), "valid pixels")
+    _refused(_clean(), "mask like it", valid=np.ones((5, 5), bool))
