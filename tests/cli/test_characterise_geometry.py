@@ -126,6 +126,26 @@ def test_fall_off_of_unknown_camera_constant_states_no_parts(photoplan: Here, tm
     assert "all flat frames are saturated" in refused(photoplan, tmp_path, bright, "fall_off")
 
 
+def test_fall_off_of_a_bayer_pattern_and_a_roi(photoplan: Here, tmp_path: Path) -> None:
+    """Planes have every second pixel, from another first one each; the roi begins at odd places."""
+    rng = np.random.default_rng(10)
+    model = FallOffModel((200, 160), (104.0, 77.0), 250.0, ((2, 0), (1, 1)), (-0.05, 0.06))
+    light = 220 * model.relative(np.arange(200.0)[None], np.arange(160.0)[:, None])
+    light[0::2, 0::2] *= 0.6
+    light[1::2, 1::2] *= 0.4
+    write_series(tmp_path, "f", [light + rng.normal(0, 1.0, light.shape) for _ in range(6)], {"n": range(6)})
+    text = '[camera]\nfocal_px = 250.0\nprincipal_point_px = [104.0, 77.0]\nbayer = "RGGB"\n'
+    text += '[[frames]]\nfiles = "f_*.tif"\nkind = "flat"\nroi = [7, 5, 190, 150]\nvalues = { degree = 4 }\n'
+    _, whole = figures(photoplan, tmp_path, text, "fall_off", "--csv", tmp_path / "out")
+    for plane, (column, row) in {"R": (0, 0), "G1": (1, 0), "G2": (0, 1), "B": (1, 1)}.items():
+        rows = [r for r in whole["tables"]["corners"]["rows"] if r[0] == plane]
+        for corner, x, y in (("upper left", column, row), ("lower right", 198 + column, 158 + row)):
+            want = 100 * (1 - model.relative(np.array(float(x)), np.array(float(y))))
+            value, sigma = next(r[2:4] for r in rows if r[1] == corner)
+            assert abs(value - want) < 5 * sigma and sigma < 0.3, (plane, corner)
+        assert (tmp_path / "out" / f"fall_off_gain_{plane}.tif").exists()
+
+
 def test_drift_has_the_figures_of_table_4_1(photoplan: Here, tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     lamp = 150 + np.arange(24) * 0.8 + rng.normal(0, 0.3, 24)

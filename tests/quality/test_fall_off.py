@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.grid import Window
@@ -151,6 +152,9 @@ def test_bad_input_is_refused_in_words() -> None:
     image = flat(MODEL, 5)
     with pytest.raises(InputError, match="saturated"):
         fit_fall_off(np.minimum(image, 150.0), GIVEN, saturation=150.0)
+    structure = ndimage.gaussian_filter(np.random.default_rng(6).normal(0, 1, image.shape), 6)
+    with pytest.raises(InputError, match="shows a structure"):
+        fit_fall_off(image * (1 + 0.1 * structure / structure.std()), GIVEN)
     with pytest.raises(InputError, match="no brightness"):
         fit_fall_off(np.random.default_rng(0).normal(-1.0, 1.0, (240, 320)), GIVEN)
     with pytest.raises(InputError, match="at least 16"):

@@ -133,7 +133,9 @@ def _settings(data: SeriesData, setting: Setting, plane: Plane, dark: float) -> 
 def _outcome(found: FallOff, settings: FallOffSettings, plane: str, setting: Setting) -> Outcome:
     suffix = f"_{plane.replace(' ', '_')}" if plane else ""
     names = f"fall_off_model{suffix}.toml", f"fall_off_gain{suffix}.tif"
-    factor = max(1, math.ceil(max(found.model.size) / _GAIN_SIDE))
+    group = FrameGroup(setting.first.group, setting.frames)
+    usual = max(1, math.ceil(max(found.model.size) / _GAIN_SIDE))
+    factor = int(group.number("gain_reduction", usual, 1, 1000))
     refused = {f"natural and artificial part{f' ({plane})' if plane else ''}": found.rank} if found.rank else {}
     notes = []
     if found.neighbour_correlation > 0.3:

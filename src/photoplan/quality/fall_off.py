@@ -25,6 +25,8 @@ _KNOWN = 0.1
 _DIRTY = 5.5
 _MOST_DIRT = 100
 _SATURATED = 0.001
+_UNEVEN, _STRUCTURE = 0.02, 0.5
+"""Residual as part of the brightness, and correlation of neighbours, above which the surface is not even."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,7 @@ def fit_fall_off(
     Raises
     ------
     InputError
-        The image is too small or dark, saturated, or mostly unknown.
+        The image is too small or dark, saturated, mostly unknown, or shows a structure.
     GeometryError
         Nothing of what was asked can be estimated.
     """
@@ -145,7 +147,14 @@ def fit_fall_off(
     kept = significant(blocks, fit)
     if kept != fit.terms:
         fit = adjust(blocks, settings, kept, fit.weights)
-    return _result(blocks, settings, fit, (rank, shares))
+    found = _result(blocks, settings, fit, (rank, shares))
+    if found.residual_rms > _UNEVEN and found.neighbour_correlation > _STRUCTURE:
+        raise InputError(
+            f"flat image: {100 * found.residual_rms:.1f} % (rms) is left beside any smooth surface, and neighbouring "
+            f"blocks resemble each other ({found.neighbour_correlation:.2f}): it shows a structure, not an evenly lit "
+            "surface. Take flat frames of one, or out of focus"
+        )
+    return found
 
 
 def _checked(flat: NDArray[np.floating], saturation: float | None) -> Blocks:
