@@ -296,3 +296,34 @@ def test_fault_08_frame_whose_pixels_are_damaged_stops_its_analysis_only(folder,
     assert said.code == 4
     assert "wedge:" in said.err and "w_0.4.tif" in said.err and "damaged" in said.err
     assert "linearity error" in said.out and "gamma" not in said.out
+
+
+def test_black_is_that_of_the_exposure_and_temperature(tmp_path):
+    from photoplan.io.series_file import read_series
+    from photoplan.products.characterise_common import black_of
+    from photoplan.products.characterise_data import SeriesData
+
+    noise = np.random.default_rng(8)
+    for kind, exposure, celsius, mean in (
+        ("flat", 10, 20, 900),
+        ("flat", 20, 20, 900),
+        ("flat", 10, 30, 900),
+        ("flat", 10, 40, 900),
+        ("dark", 10, 20, 100),
+        ("dark", 30, 20, 120),
+        ("dark", 10, 30, 150),
+    ):
+        for k in range(2):
+            pixels = np.rint(mean + 3 * noise.standard_normal((20, 20))).astype(np.uint16)
+            write_frame(tmp_path / f"{kind}_{exposure}ms_{celsius}C_{k}.tif", pixels)
+    text = "[camera]\nblack_level_dn = 7.0\n" + "".join(
+        f'[[frames]]\nkind = "{kind}"\nfiles = "{kind}_{{exposure}}ms_{{temperature}}C_*.tif"\n'
+        for kind in ("flat", "dark")
+    )
+    (tmp_path / "s.toml").write_text(text)
+    data = SeriesData(read_series(tmp_path / "s.toml"))
+    found = {}
+    for setting in data.settings("flat"):
+        black = black_of(data, setting, data.planes[0])
+        found[setting.first.exposure_ms, setting.first.temperature_c] = black.mean
+    assert found == pytest.approx({(10, 20): 100, (20, 20): 110, (10, 30): 150, (10, 40): 7}, abs=1)

@@ -53,6 +53,36 @@ def test_normalised_errors_of_gain_and_read_noise_spread_by_one():
         assert abs(np.mean(normalised)) < 0.15
 
 
+def test_normalised_errors_of_read_noise_without_dark_frames_spread_by_one():
+    """Far extrapolated: the errors of slope and offset of the line belong together."""
+    read = []
+    for run in range(RUNS):
+        noise = np.random.default_rng(7000 + run)
+        bright = [level_of(SMALL, p, 20.0, noise) for p in (60, 120, 200, 300, 400)]
+        found = photon_transfer(bright, black_level=SMALL.bias)
+        read.append((found.read_noise_e - SMALL.read_noise) / found.read_noise_e_sigma)
+    assert 0.9 < spread_of(read, "read noise e without dark frames") < 1.1
+
+
+def test_rounding_is_no_read_noise():
+    coarse = Sensor(gain=0.08)  # 0.64 DN of read noise, 0.29 DN of rounding
+    found = transfer_of(coarse, np.random.default_rng(4))
+    assert found.read_noise_dn == pytest.approx(0.64, abs=4 * found.read_noise_dn_sigma)
+    assert np.hypot(0.64, 12**-0.5) - 0.64 > 8 * found.read_noise_dn_sigma
+    dark = level_of(coarse, 0, 20.0, np.random.default_rng(5))
+    photons = np.linspace(500, 5000, 9)
+    bright = [level_of(coarse, p, 20.0, np.random.default_rng(6)) for p in photons]
+    means, variances = [x.mean for x in bright], [x.temporal_variance for x in bright]
+    nine = np.ones(9)
+    sheet = emva_sheet(
+        EmvaPoints(
+            photons, means, variances, dark.mean * nine, dark.temporal_variance * nine, np.full(9, dark.degrees, float)
+        )
+    )
+    assert sheet.temporal_dark_noise_e == pytest.approx(8.0, abs=4 * sheet.temporal_dark_noise_e_sigma)
+    assert 8 * (np.hypot(0.64, 12**-0.5) / 0.64 - 1) > 8 * sheet.temporal_dark_noise_e_sigma
+
+
 def test_flicker_of_the_lamp_does_not_change_the_gain():
     steady, flickering = Sensor(), Sensor(flicker=0.02)
     a, b = (transfer_of(s, np.random.default_rng(3)) for s in (steady, flickering))
