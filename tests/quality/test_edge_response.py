@@ -91,15 +91,43 @@ def _least_error(blur, length):
 def test_long_edges_reach_the_bounds_one_by_one():
     random = np.random.default_rng(8)
     worst = np.zeros(2)
-    for angle in random.uniform(0.0, 360.0, 8):
+    for angle in random.uniform(0.0, 360.0, 5):
         spread = gaussian(0.7)
-        edge = measure_edge(
-            _edge(angle, spread, random, length=1200, width=60 if abs(sin(radians(2 * angle))) < 0.2 else 1200)
-        )
+        edge = measure_edge(_edge(angle, spread, random, length=800, width=400))
         error = [edge.mtf50 / true_mtf50(angle, spread) - 1.0, edge.fwhm / true_fwhm(angle, spread) - 1.0]
         worst = np.maximum(worst, np.abs(error))
-    print(f"largest errors of single edges of 700 pixels and more: MTF50 {worst[0]:.4f}, FWHM {worst[1]:.4f}")
+    print(f"largest errors of single edges of 560 pixels and more: MTF50 {worst[0]:.4f}, FWHM {worst[1]:.4f}")
     assert worst[0] < 0.015 and worst[1] < 0.01
+
+
+def _with_tails(length, number):
+    """Errors of MTF50 and FWHM of edges with coma and stray light out to 12 pixels, and whether intervals hold them."""
+    random = np.random.default_rng(3)
+    errors, covered = [], []
+    for _ in range(number):
+        angle = random.uniform(3.0, 12.0) + 180.0 * random.integers(2)
+        edge = measure_edge(_edge(angle, TAILED, random, length=length, width=60 + length // 5))
+        truth = true_mtf50(angle, TAILED), true_fwhm(angle, TAILED)
+        errors.append([edge.mtf50 / truth[0] - 1.0, edge.fwhm / truth[1] - 1.0])
+        covered.append([edge.mtf50_interval[0] <= truth[0] <= edge.mtf50_interval[1]])
+    error = np.sqrt((np.array(errors) ** 2).mean(axis=0))
+    print(f"tails, {length} pixels: rms MTF50 {error[0]:.4f} FWHM {error[1]:.4f}, MTF50 covered {np.mean(covered):.2f}")
+    return error, float(np.mean(covered))
+
+
+def test_edges_with_tails_reach_the_bounds_from_800_pixels_on():
+    error, covered = _with_tails(800, 12)
+    assert error[0] < 0.015 and error[1] < 0.01 and covered > 0.8
+
+
+def test_short_edges_with_tails_reach_the_bound_of_mtf50():
+    error, covered = _with_tails(100, 60)
+    assert error[0] < 0.015 and covered >= 0.88
+
+
+@pytest.mark.xfail(reason="2 %: on 100 pixels the noise hides a form that is neither Gaussian nor symmetric")
+def test_short_edges_with_tails_reach_the_bound_of_fwhm():
+    assert _with_tails(100, 30)[0][1] < 0.01
 
 
 @pytest.mark.parametrize("angle", [0.0, 90.0, 180.0, 270.0, 45.0])

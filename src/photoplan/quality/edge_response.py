@@ -29,6 +29,8 @@ __all__ = ["EdgeMeasurement", "EdgeProfile", "EdgeSettings", "measure_edge"]
 
 #: Distance between the lines of the profile that is handed out, pixels.
 SPACING = 0.125
+#: Pixels beyond which those far from the edge are left out at once.
+MANY = 50_000
 #: Largest distance between neighbouring samples in the edge, pixels, at which it counts as super-sampled.
 DENSE = 0.25
 
@@ -163,6 +165,8 @@ def measure_edge(
     mask = check_region(image, mask)
     line = find_line(image, mask)
     every = EdgePixels.of(image, mask, line.direction)
+    if every.light.size > MANY:
+        every = every.where(np.abs(line.distance(every.across, every.along)) <= max(4.0 * chosen.reach, 64.0))
     line, model, levels = fit_line(every, line, chosen.curve, chosen.shading != "none", 1e-2)
     near = np.abs(line.distance(every.across, every.along)) < 2.5 * model.total
     if np.count_nonzero(near) > 40:
