@@ -12,7 +12,7 @@ def shifted(source, moved, name="lanczos3", valid=None, offset=(0, 0)):
     out, good = np.empty((h, w), source.dtype), np.ones((h, w), bool)
     coefficients = np.array(KERNELS[name].coefficients)
     shift_band(
-        source, no_mask() if valid is None else valid, offset, moved, coefficients, limits_of(source.dtype), out, good
+        source, no_mask() if valid is None else valid, offset, moved, (coefficients, limits_of(source.dtype)), out, good
     )
     return out, good
 

@@ -144,6 +144,7 @@ def test_quantisation_noise():
     ramp = np.linspace(10.0, 200.0, 500 * 400).reshape(400, 500)
     image = form_image(ImageModel(quantisation=Quantisation(8)), ramp)
     assert image.values.dtype == np.uint8
+    assert (image.values - ramp).mean() == pytest.approx(0.0, abs=5e-3)
     assert (image.values - ramp).std() == pytest.approx(1 / np.sqrt(12), rel=2e-3)
     clipped = form_image(ImageModel(quantisation=Quantisation(12)), np.array([[-5.0, 4095.4, 9000.0]]))
     assert clipped.values.tolist() == [[0, 4095, 4095]] and clipped.values.dtype == np.uint16

@@ -79,8 +79,8 @@ def test_edge_at_an_angle_is_that_of_the_transfer_function():
 @pytest.mark.parametrize("aperture", [Aperture(), Aperture("round", (0.75, 0.75)), Aperture("square", (0.4, 1.0))])
 def test_modulation_of_a_wave_is_the_transfer_function(spread, aperture):
     model = ImageModel(spread, aperture)
-    # Cells that the aperture cuts are taken as even where nothing smooths them.
-    bound = 3e-3 if max(spread.gaussian) else 6e-3
+    # Cells that the aperture cuts are taken as even where nothing smooths them; Airy's rings are cut off.
+    bound = 3e-4 if max(spread.gaussian) else 6e-3
     for frequency in (0.125, 0.3125):
         image = form_image(model, wave(frequency)).values
         # Far from the border, over whole periods.
@@ -142,15 +142,15 @@ def test_fall_off():
 def test_jitter_moves_lines_by_what_the_truth_says():
     jitter = LineJitter(sigma=0.3, field=0.4, amplitude=0.5, period=40.0, phase_deg=30.0)
     model = ImageModel(Spread(gaussian=(0.7, 0.7)), jitter=jitter, seed=5)
-    image = form_image(model, PatternScene("edge", (64, 4000), (0.0,), 8), frame=2)
+    image = form_image(model, PatternScene("edge", (64, 2000), (0.0,), 8), frame=2)
     edge = 64 - image.values.sum(1) - 0.5
     assert np.abs(edge - 31.5 - image.line_shift).max() < 1e-9
-    line = np.arange(4000)
+    line = np.arange(2000)
     rest = image.line_shift - 0.5 * np.sin(2 * np.pi * line / 40 + np.radians(30)) - np.where(line % 2, 0.2, -0.2)
     assert rest.std() == pytest.approx(0.3, rel=0.05)
     assert abs(rest.mean()) < 0.02
-    other = form_image(model, PatternScene("edge", (64, 4000), (0.0,), 8), frame=3).line_shift
-    assert abs(np.corrcoef(rest, other - image.line_shift + rest)[0, 1]) < 0.06
+    other = form_image(model, PatternScene("edge", (64, 2000), (0.0,), 8), frame=3).line_shift
+    assert abs(np.corrcoef(rest, other - image.line_shift + rest)[0, 1]) < 0.08
 
 
 def test_lateral_colour_moves_discs():

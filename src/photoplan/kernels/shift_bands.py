@@ -13,7 +13,7 @@ __all__ = ["limits_of", "no_mask", "shift_band"]
 
 
 @kernel
-def shift_band(source, valid, offset, moved, coefficients, limits, out, out_valid):
+def shift_band(source, valid, offset, moved, rule, out, out_valid):
     """Values of a band at (column + dx, row + dy), by a separable kernel whose weights are polynomials.
 
     Beyond the border of the image the pixels at the border stand in; a value is valid where every pixel that carries
@@ -28,14 +28,14 @@ def shift_band(source, valid, offset, moved, coefficients, limits, out, out_vali
         Column and row of the window's first pixel in `source`.
     moved : (2, h, w) float64
         dx and dy of every pixel of the window.
-    coefficients : (degree + 1, taps) float64
-        As `photoplan.kernels.weights.Kernel` holds them.
-    limits : (float, float)
-        Smallest and largest value of whole-number types; the first above the second for floats: no rounding.
+    rule : (coefficients, limits)
+        Coefficients (degree + 1, taps) float64 as `photoplan.kernels.weights.Kernel` holds them; smallest and largest
+        value of whole-number types, the first above the second for floats: no rounding.
     out : (h, w), same type as the source
     out_valid : (h, w) bool
         Only ever set to False.
     """
+    coefficients, limits = rule
     height, width = source.shape
     taps = coefficients.shape[1]
     degree = coefficients.shape[0] - 1
@@ -80,7 +80,7 @@ def shift_band(source, valid, offset, moved, coefficients, limits, out, out_vali
 
 
 def limits_of(dtype: np.dtype[Any]) -> tuple[float, float]:
-    """The `limits` of `shift_band` for a type of pixels."""
+    """The limits in the `rule` of `shift_band` for a type of pixels."""
     if dtype.kind not in "iu":
         return 1.0, 0.0
     info = np.iinfo(dtype)

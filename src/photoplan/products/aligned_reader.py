@@ -110,7 +110,7 @@ class AlignedReader:
             _keep_inside(moved, (x, y), self.size)
             coefficients = np.array(KERNELS[self.kernel].coefficients)
             band = np.require(pixels[each.band - 1], None, ("C", "A"))
-            shift_band(band, mask, offset, moved, coefficients, limits_of(self.dtype), out[each.band - 1], good)
+            shift_band(band, mask, offset, moved, (coefficients, limits_of(self.dtype)), out[each.band - 1], good)
         return out, None if good.all() else good
 
 
