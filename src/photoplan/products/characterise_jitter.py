@@ -147,19 +147,18 @@ def _figures(data: SeriesData, group: FrameGroup, edges: list[Edge], control: li
     ) -> None:
         figures.append(Figure(name, *_mean(values, sigmas), label, unit, "", at, remark))
 
-    def spread(values: list[float]) -> list[float]:
-        return [v / math.sqrt(2.0 * max(n - 3, 1)) for v, n in zip(values, lines)]
+    def with_spread(values: list[float]) -> tuple[list[float], list[float]]:
+        return values, [v / math.sqrt(2.0 * max(n - 3, 1)) for v, n in zip(values, lines)]
 
     sigma = [e.jitter.sigma for e in edges]
-    add("sigma_px", sigma, spread(sigma), "standard deviation of d_i, least squares")
+    add("sigma_px", *with_spread(sigma), "standard deviation of d_i, least squares")
     by_correlation = [e.correlated.sigma for e in edges]
-    add("sigma_correlation_px", by_correlation, spread(by_correlation), "the same by correlation (eq. 4.8 to 4.10)")
+    add("sigma_correlation_px", *with_spread(by_correlation), "the same by correlation (eq. 4.8 to 4.10)")
     formal = [float(np.nanmean(e.fitted.sigma)) for e in edges]
-    add("pixel_noise_px", formal, spread(formal), "of it from noise of the pixels")
+    add("pixel_noise_px", *with_spread(formal), "of it from noise of the pixels")
     beside = [e.jitter.neighbour_sigma for e in edges]
-    add("neighbours_px", beside, spread(beside), "difference of neighbouring lines, rms")
-    rest = [e.jitter.residual_sigma for e in edges]
-    add("residual_px", rest, spread(rest), "without fields and periodic parts")
+    add("neighbours_px", *with_spread(beside), "difference of neighbouring lines, rms")
+    add("residual_px", *with_spread([e.jitter.residual_sigma for e in edges]), "without fields and periodic parts")
     if entry.direction == "vertical":
         offsets, theirs = [e.field_offset for e in edges], [e.jitter.sigma_field_offset for e in edges]
         remark = "significant" if any(e.jitter.fields_differ for e in edges) else "not significant"
@@ -169,7 +168,7 @@ def _figures(data: SeriesData, group: FrameGroup, edges: list[Edge], control: li
         if group.has("pixel_frequency_hz"):
             clock = group.number("pixel_frequency_hz", 1.0, 1.0, 1e12)
             nanoseconds = [1e9 * s / clock for s in sigma]
-            add("jitter_ns", nanoseconds, spread(nanoseconds), "standard deviation as time (eq. 4.5)", "ns")
+            add("jitter_ns", *with_spread(nanoseconds), "standard deviation as time (eq. 4.5)", "ns")
         if control is not None:
             beyond = [above_control(e.jitter, control[k % len(control)].jitter) for k, e in enumerate(edges)]
             remark = f"chance of none {max(b.probability for b in beyond):.1g}"
