@@ -181,8 +181,6 @@ def restore_one(
     below, above = counted.sums(reader.bands)
     if how.chromatic == "measure" and isinstance(job.reader.source, AlignedReader):
         save_chromatic(job.chromatic_file, job.reader.source.model)
-    if how.quicklook:
-        write_quicklook(job.target, job.picture)
     result = RestoredImage(
         reader.info.path.name,
         job.target,
@@ -197,7 +195,10 @@ def restore_one(
         time.perf_counter() - started,
         job.picture if how.quicklook else None,
     )
+    # The record first: a disk that is full for the picture does not leave a result without it.
     write_run_record(record_path(job.target), _record(job, how, result, facts))
+    if how.quicklook:
+        write_quicklook(job.target, job.picture)
     return result
 
 
