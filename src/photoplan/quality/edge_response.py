@@ -369,8 +369,11 @@ def _profiles(found: _Context, step: float, gap: float) -> dict[str, EdgeProfile
         relative = rows - np.multiply.outer(share, area)
         sigma = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", relative, fit.covariance, relative), 0.0))
         profiles[name] = EdgeProfile(at, share, sigma)
-    width = 0.25 if gap <= DENSE else min(max(gap, 0.25), 1.0)
-    place = np.floor(found.distance / width + 0.5).astype(np.intp)
+    aligned = 1.0 / found.line.length_of_normal if abs(found.line.slope) < 0.05 else min(gap, 1.0)
+    width = 0.25 if gap <= DENSE else aligned
+    # Bins are centred on the phase that occurs most, so that no column of an aligned edge is split.
+    phase = float(np.angle(np.exp(2j * np.pi * found.distance / width).mean())) / (2.0 * np.pi)
+    place = np.floor(found.distance / width - phase + 0.5).astype(np.intp)
     place -= place.min()
     count = np.bincount(place)
     mean = np.bincount(place, found.distance)[count > 0] / count[count > 0]
