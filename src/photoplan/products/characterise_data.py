@@ -84,13 +84,13 @@ class SeriesData:
         """Mean image, temporal variance and summary of a condition, by plane."""
         key = _key(setting)
         if key not in self._last:
+            self._last.clear()  # before the next images need its place
             sums = {
                 plane.name: StackSums(self.series.saturation_dn, self.counted(setting, plane)) for plane in self.planes
             }
             for frame in setting.frames:
                 for name, pixels in self.pixels(frame).items():
                     sums[name].add(pixels)
-            self._last.clear()
             self._last[key] = {name: total.stack() for name, total in sums.items()}
             self._levels[key] = {name: stack.level for name, stack in self._last[key].items()}
         return self._last[key]

@@ -13,7 +13,7 @@ from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
 from photoplan.quality.defects import Defect, DefectList, find_blinking, find_defects, find_lines, log_histogram
 from photoplan.quality.frame_statistics import FrameStack
-from photoplan.report.characterise_charts import Chart, Curve, Picture
+from photoplan.report.characterise_charts import Chart, Curve, Picture, shrunk
 
 __all__ = ["analyse", "missing"]
 
@@ -177,11 +177,13 @@ def _plots(found: DefectList, stack: FrameStack, plane: Plane, setting: Setting)
         marks=((found.threshold, "threshold"),),
     )
     points = tuple((d.col, d.row) for d in found.defects[:_FOLLOWED])
+    small, factor = shrunk(stack.mean)
     shown = Picture(
         f"Defect pixels, {title}",
         f"Mean image; the {len(points)} strongest of {found.count} are circled. Positions are those of the plane.",
-        stack.mean,
+        small,
         "grey value DN",
         points,
+        factor=factor,
     )
     return histogram, shown

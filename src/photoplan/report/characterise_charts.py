@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from photoplan.report.drawing import BLUE, GREEN, ORANGE, PURPLE, RED, SKY, SOFT, STYLE, load_matplotlib, png
 
-__all__ = ["Chart", "ChartDrawer", "Curve", "Picture"]
+__all__ = ["Chart", "ChartDrawer", "Curve", "Picture", "shrunk"]
 
 COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
 _SIZE = (6.6, 3.6)
@@ -64,6 +64,8 @@ class Picture:
     """(x, y) in pixels of `values`; drawn as circles."""
     limits: tuple[float, float] | None = None
     """Of the scale; None: 0.5 % and 99.5 % of the values."""
+    factor: int = 1
+    """Side of the block of pixels of which each value is the mean, see `shrunk`; positions count whole pixels."""
     extent: tuple[float, float, float, float] | None = field(default=None)
     """Left, right, bottom, top of the axes where they are no pixels of `values`."""
 
@@ -120,7 +122,7 @@ class ChartDrawer:
         known = values[np.isfinite(values)]
         low, high = picture.limits or _limits(known)
         small = _reduced(values, factor)
-        height, width = values.shape
+        height, width = values.shape[0] * picture.factor, values.shape[1] * picture.factor
         left, right, bottom, top = picture.extent or (-0.5, width - 0.5, height - 0.5, -0.5)
         tall = float(np.clip(5.6 * height / width, 1.2, 7.0)) if picture.extent is None else 3.6
         fig = self._mpl.figure.Figure(figsize=(_SIZE[0], tall + 0.6), layout="constrained")
@@ -134,6 +136,13 @@ class ChartDrawer:
         fig.colorbar(shown, ax=axes, label=picture.label, shrink=0.8)
         axes.set(xlabel="column px", ylabel="row px")
         return png(fig)
+
+
+def shrunk(values: NDArray[Any]) -> tuple[NDArray[np.float64], int]:
+    """An image as small as a picture of the report shows it anyway, and the side of the blocks it was averaged over."""
+    image = np.asarray(values, np.float64)
+    factor = max(1, -(-max(image.shape) // _SIDE))
+    return np.array(_reduced(image, factor)), factor
 
 
 def _draw_curve(axes: Any, curve: Curve, colour: str) -> None:
