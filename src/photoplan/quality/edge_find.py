@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.quality.edge_candidates import StraightEdge, find_lines, range_of
-from photoplan.quality.edge_strip import Strip, strip_along
+from photoplan.quality.edge_strip import Blur, Strip, strip_along
 
 __all__ = ["REASONS", "EdgePicture", "EdgeRegion", "EdgeRules", "cut_region", "examine", "find_edges"]
 
@@ -31,8 +31,6 @@ REASONS = {
 _HALVES = (20, 16, 13, 11, 9, 7)
 #: Good blocks that must lie before and behind a gap.
 _RUN = 5
-#: Pixels of a side that must lie beyond the blur.
-_SIDE = 3
 
 
 @dataclass(frozen=True)
@@ -186,7 +184,7 @@ def examine(picture: EdgePicture, line: StraightEdge, rules: EdgeRules) -> tuple
     best: tuple[float, EdgeRegion] | None = None
     reasons: Counter[str] = Counter()
     for half in sorted(rules.halves, reverse=True):
-        if half < max(blur) + _SIDE:
+        if half < blur.least_half:
             break
         region, reason = _clean_part(strip, blur, half, (rules, least_contrast))
         if region is None:
@@ -203,9 +201,7 @@ def examine(picture: EdgePicture, line: StraightEdge, rules: EdgeRules) -> tuple
     return None, reasons.most_common(1)[0][0] if reasons else "blurred"
 
 
-def _clean_part(
-    strip: Strip, blur: tuple[float, float], half: int, demands: tuple[EdgeRules, float]
-) -> tuple[EdgeRegion | None, str]:
+def _clean_part(strip: Strip, blur: Blur, half: int, demands: tuple[EdgeRules, float]) -> tuple[EdgeRegion | None, str]:
     rules, least_contrast = demands
     sides = strip.sides(blur, half)
     good, why = sides.good_blocks(rules.evenness)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from photoplan.quality.edge_candidates import StraightEdge
 
-__all__ = ["Sides", "Strip", "strip_along"]
+__all__ = ["SIDE", "Blur", "Sides", "Strip", "strip_along"]
 
 Array = NDArray[np.float64]
 
@@ -24,8 +24,26 @@ _TOGETHER = 2.0
 _SPOILT = 0.01
 #: Share of the contrast by which grey values may go beyond both sides next to an edge: more is a line, not enhancement.
 _SEAM = 0.35
+#: Pixels of a side that must lie beyond the blur.
+SIDE = 3
 #: Pixels that one strip may take at most.
 _MOST = 16_000_000
+
+
+@dataclass(frozen=True)
+class Blur:
+    """How far an edge reaches, pixels."""
+
+    dark: float
+    """From the line to the even dark side."""
+    bright: float
+    seam: float
+    """Width beyond that in which edge enhancement shows."""
+
+    @property
+    def least_half(self) -> float:
+        """Half width of the narrowest window that holds something of both sides."""
+        return 1.2 * max(self.dark, self.bright) + SIDE
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +72,11 @@ class Strip:
             means = np.where(self.count >= 2, self.total / self.count, np.nan)
         return _median(means.T)
 
-    def blur(self) -> tuple[float, float] | None:
-        """Distances from the line, on the dark and the bright side, from which the grey values are even; None: unknown.
+    def blur(self) -> Blur | None:
+        """How far the step reaches to both sides, and the seam beside it; None: unknown.
 
-        The step ends where its slope has fallen to a twentieth; the same width is added for what edge enhancement
-        does beside it.
+        The step ends where its slope has fallen to a twentieth; the seam is as wide as the step's rise: there is what
+        edge enhancement does.
         """
         profile = self.profile()
         middle = self.half
@@ -77,13 +95,14 @@ class Strip:
         low, high = (profile[middle + s] for s in (-max(1, round(ends[0])), max(0, round(ends[1]) - 1)))
         width = 1.02 * (high - low) / slope[peak] if np.isfinite(high - low) else 3.0
         ring = float(np.clip(width, 2.0, 6.0))
-        return ends[0] + ring, ends[1] + ring
+        return Blur(ends[0], ends[1], ring)
 
-    def sides(self, blur: tuple[float, float], half: int) -> Sides:
-        """Both sides beyond the blur, in a window of half a width."""
+    def sides(self, blur: Blur, half: int) -> Sides:
+        """Both sides beyond blur and seam, in a window of half a width; narrow ones hold a part of the seam."""
         outer = self.half - half
-        dark = slice(outer, floor(self.half - blur[0]))
-        bright = slice(ceil(self.half + blur[1]), self.half + half)
+        dark_end, bright_end = (min(end + blur.seam, half - SIDE) for end in (blur.dark, blur.bright))
+        dark = slice(outer, floor(self.half - dark_end))
+        bright = slice(ceil(self.half + bright_end), self.half + half)
         return Sides(self, dark, bright, slice(outer, 2 * self.half - outer))
 
     def worst_reason(self) -> str:
