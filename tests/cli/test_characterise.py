@@ -105,6 +105,9 @@ TRUTH = {
     ("emva1288", "quantum_efficiency_percent"): 50,
     ("emva1288", "gain_dn_e"): 0.4,
     ("emva1288", "temporal_dark_noise_e"): 8.0,
+    ("emva1288", "dsnu_e"): 4.0,
+    ("emva1288", "dark_current_e_s@20 °C"): 20 + 1300 / (64 * 80),
+    ("emva1288", "doubling_temperature_k"): 7.0,
 }
 
 

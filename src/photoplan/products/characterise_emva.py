@@ -7,19 +7,30 @@ from math import isfinite, nan
 
 import numpy as np
 
+from photoplan.errors import InputError
+from photoplan.io.series_pixels import Plane
 from photoplan.io.series_statistics import ReducedPoint
+from photoplan.products import characterise_dark, characterise_pattern
 from photoplan.products.characterise_common import Run, exposure_runs, prefix, tried
 from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
+from photoplan.products.characterise_transfer import reduced_level
+from photoplan.quality.dark_signal import dark_current
 from photoplan.quality.emva import EmvaPoints, EmvaSheet, emva_sheet
+from photoplan.quality.frame_statistics import Level
 from photoplan.quality.photon_transfer import is_clipped_dark
 from photoplan.report.characterise_charts import Chart, Curve
 
 __all__ = ["analyse", "missing"]
 
 _LEAST = 5
-#: What this sheet leaves to the analyses `fixed_pattern` and `dark_signal`.
-_ELSEWHERE = "DSNU and PRNU are in fixed_pattern, the dark current in dark_signal; both need frames"
+#: Figures of other analyses that belong to the sheet: name there, name here, words, unit, and whether K divides them.
+_TAKEN = (
+    ("dsnu_dn", "dsnu_e", "DSNU", "e", True),
+    ("prnu_percent", "prnu_percent", "PRNU", "%", False),
+    ("dark_current_dn_s", "dark_current_e_s", "dark current", "e/s", True),
+    ("doubling_temperature_k", "doubling_temperature_k", "doubling temperature", "K", False),
+)
 
 
 @dataclass(frozen=True)
@@ -52,23 +63,72 @@ def _runs(data: SeriesData) -> list[Run]:
 def analyse(data: SeriesData) -> Outcome:
     """Sheets of every plane and run."""
     if data.series.reduced_of("flat"):
-        bright, dark = ([_reduced(p) for p in data.series.reduced_of(kind)] for kind in ("flat", "dark"))
-        return tried("EMVA 1288", lambda: _sheet(bright, dark, "", ""))
+        return _of_reduced(data)
     outcomes = []
+    others = _others(data)
     for run in _runs(data):
         for plane in data.planes:
-            bright = [_point(data, s, plane.name) for s in run.settings if len(s.frames) >= 2]
-            settings = [s for s in data.settings("dark") if len(s.frames) >= 2]
-            clipped = [s for s in settings if is_clipped_dark(data.levels(s)[plane.name])]
             key = prefix("EMVA 1288", plane.name, run.label)
-            if clipped:
-                share = 100 * max(data.levels(s)[plane.name].zero_share for s in clipped)
-                why = f"black is cut off: {share:.3g} % of the samples of dark frames are zero; raise the black level"
-                outcomes.append(Outcome(refused={key: why}))
-                continue
-            dark = [_point(data, s, plane.name) for s in settings]
-            outcomes.append(tried(key, lambda b=bright, d=dark, p=plane, r=run: _sheet(b, d, p.name, r.label)))  # type: ignore[misc]
+            found = tried(key, lambda p=plane, r=run: _of_frames(data, r, p))  # type: ignore[misc]
+            gain = next((f for f in found.figures if f.name == "gain_dn_e"), None)
+            taken = Outcome() if gain is None else _taken(others, plane, gain, run.label)
+            outcomes += [found, taken]
     return joined(outcomes)
+
+
+def _of_reduced(data: SeriesData) -> Outcome:
+    bright, dark = ([_reduced(p) for p in data.series.reduced_of(kind)] for kind in ("flat", "dark"))
+    found = tried("EMVA 1288", lambda: _sheet(bright, dark, "", ""))
+    gain = next((f for f in found.figures if f.name == "gain_dn_e"), None)
+    no_images = Outcome(refused={"DSNU and PRNU": "reduced figures hold no images; give frames"})
+    if gain is None:
+        return found
+    points = [p for p in data.series.reduced_of("dark") if p.exposure_ms is not None]
+    levels = [reduced_level(data, p) for p in points]
+    exposures = [p.exposure_ms or 0.0 for p in points]
+    return joined([found, tried("dark current", lambda: _dark_current(exposures, levels, gain)), no_images])
+
+
+def _dark_current(exposures: list[float], levels: list[Level], gain: Figure) -> Outcome:
+    found = dark_current(exposures, levels)
+    value = found.current_dn_s / gain.value
+    relative = np.hypot(found.current_dn_s_sigma / found.current_dn_s, gain.sigma / gain.value)
+    return Outcome((Figure("dark_current_e_s", value, abs(value) * float(relative), "dark current", "e/s"),))
+
+
+def _others(data: SeriesData) -> Outcome:
+    """What the analyses of the pattern and of the dark signal say."""
+    parts = [module for module in (characterise_pattern, characterise_dark) if module.missing(data) is None]
+    return joined([module.analyse(data) for module in parts])
+
+
+def _taken(others: Outcome, plane: Plane, gain: Figure, label: str) -> Outcome:
+    """Figures of other analyses in the units of the sheet, and those that they refused."""
+    figures, refused = [], {}
+    for there, here, words, unit, divided in _TAKEN:
+        known = [f for f in others.figures if f.name == there and f.plane == plane.name]
+        for f in known:
+            value = f.value / gain.value if divided else f.value
+            relative = np.hypot(f.sigma / f.value, gain.sigma / gain.value) if divided and f.value else 0.0
+            sigma = abs(value) * float(relative) if divided and f.value else f.sigma
+            figures.append(Figure(here, value, sigma, words, unit, plane.name, prefix(label, f.at)))
+        if not known:
+            why = [w for what, w in others.refused.items() if what.lower().startswith(words.lower())]
+            refused[prefix(words, plane.name, label)] = why[0] if why else "the series lacks frames for it"
+    return Outcome(tuple(figures), refused)
+
+
+def _of_frames(data: SeriesData, run: Run, plane: Plane) -> Outcome:
+    bright = [_point(data, s, plane.name) for s in run.settings if len(s.frames) >= 2]
+    settings = [s for s in data.settings("dark") if len(s.frames) >= 2]
+    levels = [data.levels(s)[plane.name] for s in settings]
+    clipped = [level for level in levels if is_clipped_dark(level)]
+    if clipped:
+        share = 100 * max(level.zero_share for level in clipped)
+        raise InputError(
+            f"black is cut off: {share:.3g} % of the samples of dark frames are zero; raise the camera's black level"
+        )
+    return _sheet(bright, [_point(data, s, plane.name) for s in settings], plane.name, run.label)
 
 
 def _reduced(point: ReducedPoint) -> _Point:
@@ -116,7 +176,7 @@ def _sheet(bright: list[_Point], dark: list[_Point], plane: str, label: str) -> 
         {prefix(what, plane, label): why for what, why in found.refused.items()},
         {"points": Table(head, tuple(rows), "Levels of the sheet")},
         _plots(found, p, prefix("EMVA 1288", plane, label)),
-        (*notes, _ELSEWHERE),
+        tuple(notes),
         {prefix("sheet", plane, label).replace(" ", "_"): found.to_dict()},
     )
 

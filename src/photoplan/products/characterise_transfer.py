@@ -13,7 +13,7 @@ from photoplan.quality.frame_statistics import Level
 from photoplan.quality.photon_transfer import PhotonTransfer, photon_transfer
 from photoplan.report.characterise_charts import Chart, Curve
 
-__all__ = ["analyse", "missing"]
+__all__ = ["analyse", "missing", "reduced_level"]
 
 _LEAST = 3
 
@@ -32,9 +32,9 @@ def missing(data: SeriesData) -> str | None:
 def analyse(data: SeriesData) -> Outcome:
     """Gain, read noise and full well with sigmas, of every plane."""
     if data.series.reduced_of("flat"):
-        bright = [_level(data, point) for point in data.series.reduced_of("flat")]
+        bright = [reduced_level(data, point) for point in data.series.reduced_of("flat")]
         dark = sorted(data.series.reduced_of("dark"), key=lambda point: point.exposure_ms or 0.0)
-        return tried("gain", lambda: _plane("", bright, [_level(data, point) for point in dark], data))
+        return tried("gain", lambda: _plane("", bright, [reduced_level(data, point) for point in dark], data))
     flats = [setting for setting in data.settings("flat") if len(setting.frames) >= 2]
     levels = [data.levels(setting) for setting in flats]
     return joined([_of_frames(data, plane, [level[plane.name] for level in levels]) for plane in data.planes])
@@ -45,7 +45,7 @@ def _of_frames(data: SeriesData, plane: Plane, bright: list[Level]) -> Outcome:
     return tried(prefix("gain", plane.name), lambda: _plane(plane.name, bright, dark, data))
 
 
-def _level(data: SeriesData, point: ReducedPoint) -> Level:
+def reduced_level(data: SeriesData, point: ReducedPoint) -> Level:
     """A reduced figure as a level; from a mean of 99.9 % of saturation on, samples are clipped."""
     clipped = 1.0 if point.mean > 0.999 * data.series.saturation_dn else 0.0
     return Level(
