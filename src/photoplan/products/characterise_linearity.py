@@ -12,7 +12,7 @@ from photoplan.products.characterise_common import Run, black_of, exposure_runs,
 from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
 from photoplan.quality.frame_statistics import Level, check_level
-from photoplan.quality.linearity import Linearity, linearity
+from photoplan.quality.linearity import HIGH, Linearity, linearity
 from photoplan.quality.saturation import find_saturation
 from photoplan.report.characterise_charts import Chart, Curve
 
@@ -60,42 +60,31 @@ def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
     if not full > 0:
         raise InputError(f"the frames are not brighter than black ({blacks[-1].mean:.4g} DN)")
     found = linearity(run.values, signal, sigma, full)
-    where = {"plane": plane.name, "at": run.label}
-    unit = f"DN/{run.unit}"
-    count = f"{np.count_nonzero(found.used)} levels"
-    figures = [
-        Figure(
-            "linearity_error_percent",
-            found.error_percent,
-            found.error_percent_sigma,
-            "linearity error",
-            "%",
-            remark=count,
-            **where,
-        ),
-        Figure("response", found.slope, found.slope_sigma, "response", unit, **where),
-    ]
-    for k in np.flatnonzero(found.signal < 0.95 * full):
-        at = prefix(run.label, f"{found.exposure[k]:g} {run.unit}")
-        figures.append(
-            Figure(
-                "response_at",
-                float(found.response[k]),
-                float(found.response_sigma[k]),
-                "signal over exposure",
-                unit,
-                plane.name,
-                at,
-            )
-        )
     rules = tuple(dict.fromkeys(black.rule for black in blacks))
     return Outcome(
-        tuple(figures),
+        _figures(found, run, plane.name, full),
         tables={"levels": _table(found, run, plane.name)},
         plots=_plots(found, run, plane.name, full),
         notes=tuple(f"{prefix(plane.name, run.label)}: {rule}".lstrip(": ") for rule in rules if "cut off" in rule),
         details={prefix("linearity", plane.name, run.label).replace(" ", "_"): found.to_dict()},
     )
+
+
+def _figures(found: Linearity, run: Run, plane: str, full: float) -> tuple[Figure, ...]:
+    """Error, response of the line, and response of every level that is not saturated."""
+    unit = f"DN/{run.unit}"
+    where = {"plane": plane, "at": run.label}
+    error, sigma = found.error_percent, found.error_percent_sigma
+    count = f"{np.count_nonzero(found.used)} levels"
+    figures = [
+        Figure("linearity_error_percent", error, sigma, "linearity error", "%", remark=count, **where),
+        Figure("response", found.slope, found.slope_sigma, "response", unit, **where),
+    ]
+    for k in np.flatnonzero(found.signal < HIGH * full):
+        at = prefix(run.label, f"{found.exposure[k]:g} {run.unit}")
+        response, of_response = float(found.response[k]), float(found.response_sigma[k])
+        figures.append(Figure("response_at", response, of_response, "signal over exposure", unit, plane, at))
+    return tuple(figures)
 
 
 def _full(data: SeriesData, run: Run, levels: list[Level], signal: list[float]) -> float:

@@ -15,8 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
 
-__all__ = ["Linearity", "linearity"]
+__all__ = ["HIGH", "LOW", "Linearity", "linearity"]
 
+#: Parts of saturation between which levels count (EMVA 1288 release 4 linear).
 LOW, HIGH = 0.05, 0.95
 
 
