@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from photoplan.errors import GeometryError, InputError
 from photoplan.quality.chromatic import BandModel, ChromaticModel, Displacements, fit_band
 from photoplan.quality.chromatic_discs import disc_displacements
 from photoplan.quality.chromatic_edges import edge_displacements
+from photoplan.quality.chromatic_patches import patch_displacements
 from photoplan.quality.discs import DiscSettings, find_discs
 from photoplan.quality.edge_find import EdgePicture, find_edges
 from photoplan.quality.simulation import ImageModel, form_image
@@ -129,6 +131,25 @@ def test_displacements_from_edges_of_a_scene():
         print(f"\nband {each.band}: {fitted.count} edges, {fitted.kind}, largest error {error:.4f} px")
         assert fitted.kind == "scale"
         assert error < 0.02
+
+
+def test_displacements_from_the_structure_of_a_scene():
+    rng = np.random.default_rng(0)
+    size, k = (420, 320), 3
+    noises = [ndimage.gaussian_filter(rng.normal(size=(size[1] * k, size[0] * k)), s * k) * s * k for s in (1, 3, 8)]
+    scene = sum(noises) / np.std(sum(noises)) * 0.13 + 0.5
+    lateral = (Lateral(1, (0.6, -0.4), 0.003, 0.0), Lateral(3, (-0.3, 0.2), -0.002, 0.0))
+    # A band is brighter and flatter than the other. Contrast 4 σ of the scene = 104, noise 2.
+    bands = form_image(
+        camera(lateral, Gain(200.0, 10.0, 2.0)), ArrayScene(np.stack([0.7 * scene + 0.2, scene, scene]), k)
+    ).values.astype(float)
+    for each in lateral:
+        fitted = fit_band(each.band, size, patch_displacements(bands[1], bands[each.band - 1], 255.0))
+        error = worst(ChromaticModel(size, 2, (fitted,)), each)
+        print(f"\nband {each.band}: {fitted.count} windows, {fitted.kind}, largest error {error:.4f} px")
+        assert error < 0.02
+    with pytest.raises(InputError, match=r"0 of .* windows"):
+        patch_displacements(bands[1], rng.normal(100, 10, bands[1].shape))
 
 
 def displacements(n, make, sigma, seed=1):

@@ -26,7 +26,7 @@ __all__ = ["command"]
 @click.option("--band", "bands", multiple=True, type=click.IntRange(1), metavar="N",
               help="Restore this band; may be repeated [all]. Others stay as they are.")  # fmt: skip
 @click.option("--chromatic", metavar="FILE|measure",
-              help="First bring the bands together: by a model, or by each image's own discs or edges.")  # fmt: skip
+              help="First bring the bands together: by a model, or as measured in each image.")  # fmt: skip
 @click.option("--linearisation", default="linear", show_default=True, metavar="linear|srgb|TABLE",
               help="How grey values become light, which is what is filtered.")  # fmt: skip
 @click.option("--dtype", default="same", show_default=True, metavar="same|float32|uint16", help="Type of the results.")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,6 +19,7 @@ from photoplan.products.aligned_reader import AlignedReader
 from photoplan.quality.chromatic import BandModel, ChromaticModel, Displacements, fit_band
 from photoplan.quality.chromatic_discs import disc_displacements
 from photoplan.quality.chromatic_edges import edge_displacements
+from photoplan.quality.chromatic_patches import patch_displacements
 from photoplan.quality.discs import DiscSettings, find_discs
 from photoplan.quality.edge_find import EdgePicture, find_edges
 
@@ -39,8 +40,14 @@ _PART = 2048
 _MOST_DISC_PIXELS = 60_000_000
 #: Edges that are used of a part, the best ones.
 _MOST_EDGES = 300
+#: Windows that are matched in an image, evenly spread.
+_MOST_WINDOWS = 600
 #: Discs from which on an image counts as a chart.
 _CHART = 12
+
+_Grey = NDArray[np.float64]
+_OfPart = Callable[[_Grey, _Grey, float, int], Displacements]
+"""Displacements of a part of a band: reference, band, saturation, number of parts of the image."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +57,8 @@ class ChromaticRequest:
     image: Path
     reference: int | None = None
     """Band that stays; None: the second (green) of three and more, else the first."""
-    method: Literal["auto", "discs", "edges"] = "auto"
-    """``auto``: discs where the image shows twelve and more, else edges."""
+    method: Literal["auto", "discs", "windows", "edges"] = "auto"
+    """``auto``: discs where the image shows twelve and more, else windows that are matched, else straight edges."""
     kind: str | None = None
     """A name of `photoplan.quality.chromatic.KINDS`; None: chosen by cross-validation."""
 
@@ -64,8 +71,8 @@ def measure_chromatic(request: ChromaticRequest) -> ChromaticModel:
     UsageError
         The reference is no band of the image.
     InputError
-        The image has a single band, or shows neither discs nor edges that can be measured in all bands; the message
-        says what was found.
+        The image has a single band, or shows nothing that can be measured in all bands; the message says what was
+        found.
     """
     source = RasterReader(request.image)
     if source.bands < 2:
@@ -103,18 +110,20 @@ def _measured(
     source: RasterReader, method: str, reference: int, others: list[int]
 ) -> tuple[str, dict[int, Displacements]]:
     """By which method, and the displacements of each band."""
-    told = ""
-    if method in ("auto", "discs"):
+    ways: dict[str, Callable[[], dict[int, Displacements]]] = {
+        "discs": lambda: _by_discs(source, reference, others, 4 if method == "discs" else _CHART),
+        "windows": lambda: _by_parts(source, reference, others, _windows_of),
+        "edges": lambda: _by_parts(source, reference, others, _edges_of),
+    }
+    if method != "auto":
+        return method, ways[method]()
+    told = []
+    for name, measure in ways.items():
         try:
-            return "discs", _by_discs(source, reference, others, 4 if method == "discs" else _CHART)
+            return name, measure()
         except InputError as error:
-            if method == "discs":
-                raise
-            told = f"by discs: {error}; "
-    try:
-        return "edges", _by_edges(source, reference, others)
-    except InputError as error:
-        raise InputError(f"{told}{'by edges: ' if told else ''}{error}") from None
+            told.append(f"by {name}: {error}")
+    raise InputError("; ".join(told))
 
 
 def _by_discs(source: RasterReader, reference: int, others: list[int], least: int) -> dict[int, Displacements]:
@@ -143,44 +152,42 @@ def _saturation(source: RasterReader) -> float:
     return float(np.iinfo(source.dtype).max) if source.dtype.kind in "iu" else float("inf")
 
 
-def _by_edges(source: RasterReader, reference: int, others: list[int]) -> dict[int, Displacements]:
-    limit = _saturation(source)
+def _by_parts(source: RasterReader, reference: int, others: list[int], measure: _OfPart) -> dict[int, Displacements]:
+    """Displacements of each band from all parts of an image."""
+    parts = list(Window(0, 0, *source.size).tiles(_PART))
     gathered: dict[int, list[Displacements]] = {band: [] for band in others}
-    count = 0
-    for window in Window(0, 0, *source.size).tiles(_PART):
+    why = dict.fromkeys(others, "")
+    for number, window in enumerate(parts):
         pixels, valid = source.read(window)
         bands = pixels.astype(np.float64)
         if valid is not None:
             bands[:, ~valid] = np.nan
-        base = bands[reference - 1]
-        if not np.isfinite(base).any() or min(base.shape) < 24:
+        if not np.isfinite(bands).any() or min(bands.shape[1:]) < 24:
             continue
-        grey = np.nan_to_num(base).astype(np.float32)
-        edges, _ = find_edges(EdgePicture(grey, valid, base >= limit))
-        edges = sorted(edges, key=lambda e: -e.merit)[:_MOST_EDGES]
-        count += len(edges)
         for band in others:
-            gathered[band] += _of_part(base, bands[band - 1], edges, (limit, window, len(gathered[band])))
-    result = {}
-    for band, parts in gathered.items():
-        if not parts:
-            raise InputError(
-                f"band {band}: {count} edges in the reference band and no part of the image with four of them that can "
-                "be measured in both bands"
-            )
-        result[band] = _joined(parts)
-    return result
+            try:
+                found = measure(bands[reference - 1], bands[band - 1], _saturation(source), len(parts))
+            except InputError as error:
+                why[band] = str(error)
+                continue
+            place = found.place + np.array([window.col, window.row])
+            group = found.group + 100_000 * number
+            gathered[band].append(Displacements(place, found.direction, found.value, found.sigma, group))
+    for band in others:
+        if not gathered[band]:
+            raise InputError(f"band {band}: {why[band] or 'no part of the image is large enough'}")
+    return {band: _joined(found) for band, found in gathered.items()}
 
 
-def _of_part(base: Any, other: Any, edges: Any, where: tuple[float, Window, int]) -> Iterator[Displacements]:
-    """Displacements of a part, in coordinates of the image; none where too few edges can be measured."""
-    limit, window, number = where
-    try:
-        found = edge_displacements(base, other, edges, limit)
-    except InputError:
-        return
-    place = found.place + np.array([window.col, window.row])
-    yield Displacements(place, found.direction, found.value, found.sigma, found.group + 100_000 * number)
+def _edges_of(base: _Grey, other: _Grey, limit: float, parts: int) -> Displacements:
+    valid = np.isfinite(base)
+    grey = np.nan_to_num(base).astype(np.float32)
+    edges, _ = find_edges(EdgePicture(grey, None if valid.all() else valid, base >= limit))
+    return edge_displacements(base, other, sorted(edges, key=lambda e: -e.merit)[:_MOST_EDGES], limit)
+
+
+def _windows_of(base: _Grey, other: _Grey, limit: float, parts: int) -> Displacements:
+    return patch_displacements(base, other, limit, most=max(25, _MOST_WINDOWS // parts))
 
 
 def _joined(parts: list[Displacements]) -> Displacements:
