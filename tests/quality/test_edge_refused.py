@@ -57,6 +57,12 @@ def test_an_edge_drowned_in_noise_is_refused():
     _refused(_clean(noise=0.35), "noisy")
 
 
+def test_an_edge_that_says_hardly_anything_is_refused():
+    image = edge_image((14, 40), 4.0, (19.3, 7.2), gaussian(0.4))
+    random = np.random.default_rng(2)
+    _refused(image + random.normal(0.0, 0.17, image.shape), "noisy or too short: MTF50 would be")
+
+
 def test_a_second_edge_is_refused():
     second = edge_image(SHAPE, 186.0, (42.0, 50.2), gaussian(0.7))
     _refused(_clean() + second - 1.0, "not even|no edge")
@@ -107,3 +113,40 @@ def test_other_shapes_and_empty_masks_are_refused():
     _refused(np.zeros((3, 50, 50)), "rows and columns")
     _refused(np.full(SHAPE, np.nan), "valid pixels")
     _refused(_clean(), "mask like it", valid=np.ones((5, 5), bool))
+
+
+def _any_region(random):
+    """Rubbish of many kinds: noise, steps of few grey values, single pixels, lines, holes, huge and tiny numbers."""
+    shape = tuple(random.integers(8, 40, 2))
+    image = random.normal(0.0, 1.0, shape) * 10.0 ** random.integers(-12, 12)
+    kind = random.integers(6)
+    if kind == 0:
+        image = np.round(image / np.abs(image).max())
+    elif kind == 1:
+        image = np.zeros(shape)
+        image[tuple(random.integers(0, n) for n in shape)] = 1e6
+    elif kind == 2:
+        image[random.uniform(size=shape) < 0.7] = np.nan
+    elif kind == 3:
+        image = edge_image(shape, random.uniform(0.0, 360.0), (5.0, 5.0), gaussian(0.3))
+    elif kind == 4:
+        image[:, shape[1] // 2 :] = np.inf
+    else:
+        image = np.add.outer(np.arange(shape[0]) % 2, np.arange(shape[1]) // 9 % 2) * 1.0
+    return image
+
+
+@pytest.mark.filterwarnings("error")
+def test_any_region_gives_figures_or_a_reason():
+    random = np.random.default_rng(20)
+    measured = 0
+    for _ in range(150):
+        image = _any_region(random)
+        try:
+            edge = measure_edge(image, limits=(-1e30, 1e30))
+        except InputError as refusal:
+            assert len(str(refusal)) > 10
+        else:
+            measured += 1
+            assert 0.0 < edge.fwhm < max(image.shape) or np.isnan(edge.fwhm)
+    assert measured < 40

@@ -14,6 +14,7 @@ from photoplan.errors import InputError
 __all__ = [
     "EdgeSettings",
     "Residuals",
+    "check_certainty",
     "check_clipping",
     "check_line",
     "check_one_peak",
@@ -54,6 +55,8 @@ class EdgeSettings:
     """Largest share of clipped pixels on a side."""
     most_structure: float = 0.03
     """Largest structure beside the edge that is not noise, root mean square relative to the step."""
+    most_uncertain: float = 0.5
+    """Widest interval of MTF50 to each side, relative to it."""
     most_bend: float = 0.1
     """Largest deviation from the line, root mean square in pixels, that is more than noise."""
 
@@ -171,6 +174,15 @@ def check_one_peak(positions: NDArray[np.float64], line: NDArray[np.float64], si
                 f"the sides of the edge are not even: a second edge {away[i]:.1f} pixels beside the first one, "
                 f"{100 * height[i] / line[top]:.0f} % as steep; choose a narrower region"
             )
+
+
+def check_certainty(mtf50: float, reach: float, most: float) -> None:
+    """Refuse an edge whose MTF50 is hardly known; one that is not determined at all (NaN) says so itself."""
+    if reach > most * mtf50:
+        raise InputError(
+            f"edge too noisy or too short: MTF50 would be {mtf50:.3f} ± {reach:.3f} cycles per pixel, allowed are "
+            f"{100 * most:g} %; use a longer or stronger edge"
+        )
 
 
 def grain(pixels: NDArray[np.float64], along: NDArray[np.float64], across: NDArray[np.float64]) -> float:

@@ -11,6 +11,7 @@ from photoplan.errors import InputError
 from photoplan.quality.edge_checks import (
     EdgeSettings,
     Residuals,
+    check_certainty,
     check_clipping,
     check_line,
     check_one_peak,
@@ -180,7 +181,10 @@ def measure_edge(
     weight, first_noise = _weights(seen, distance, line, model, chosen)
     own = grain(seen.light, seen.along, seen.across)
     check_step(float(levels[1]), first_noise, own, chosen)
-    fit = _fit(seen, (distance, weight), line, (model, low, high), chosen)
+    try:
+        fit = _fit(seen, (distance, weight), line, (model, low, high), chosen)
+    except np.linalg.LinAlgError as error:
+        raise InputError("the region's pixels do not determine a profile; choose a larger region") from error
     return _measured(_Context(seen, distance, line, fit, span, origin, chosen))
 
 
@@ -300,6 +304,7 @@ def _measured(found: _Context) -> EdgeMeasurement:
     shape = EdgeShape.of(fit, min(1.0, 0.5 / gap))
     figures = edge_figures(fit, shape, settings.confidence)
     mtf50, mtf10, fwhm, over, under, nyquist = (float(v) for v in figures.values)
+    check_certainty(mtf50, figures.factor * float(figures.sigma[0]), settings.most_uncertain)
     middle = line.place(0.5 * (found.span[0] + found.span[1]))
     dark = float(fit.levels[0])
     return EdgeMeasurement(
