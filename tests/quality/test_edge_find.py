@@ -118,7 +118,7 @@ class TestRejected:
     def test_invalid(self) -> None:
         grey = one_edge(0.0)
         valid = np.ones(grey.shape, bool)
-        valid[:, 52:] = False
+        valid[:, 48:] = False
         assert set(reasons(grey, valid=valid)) <= {"invalid", "two_sided"}
 
     def test_uniform_and_tiny_pictures(self) -> None:

@@ -85,10 +85,15 @@ class Strip:
         if not np.isfinite(near).all() or near.max() <= 0.0:
             return None
         peak = middle - 3 + int(np.argmax(near))
+        # Second differences tell the noise of the slopes: 0.6745 and 6 of medians and of their own weights.
+        bends = np.abs(np.diff(profile, 2))
+        noise = float(_median(bends)) / 0.6745 / 6**0.5 * 2**0.5
+        even = max(0.05 * slope[peak], 2.0 * noise)
         ends = []
         for step in (-1, 1):
             k = peak
-            while 0 <= k + step < len(slope) and slope[k + step] > 0.05 * slope[peak]:
+            # Two bins must be even: noise may hide a part of a wide edge.
+            while 0 <= k + 2 * step < len(slope) and max(slope[k + step], slope[k + 2 * step]) > even:
                 k += step
             # Slope k lies between bins k and k + 1, at distance k + 1 - half from the line.
             ends.append(abs(k + 1 - middle) + 0.5)
