@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -12,6 +10,7 @@ from typing import Any
 
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.io.disk import write_atomically
+from photoplan.io.named_table import write_named_table
 from photoplan.io.product import check_output
 from photoplan.io.series_file import Series, read_series
 from photoplan.io.whole_image import write_whole_image
@@ -136,9 +135,10 @@ def characterise(
             if run.missing is None:
                 runs[k] = _run(run.analysis, data)
                 advance(1, 0)
-    written = _write_tables(request, runs)
+    written = _write_tables(request, series, runs)
     if request.report is not None and drawer is not None:
         text = characterise_page(_facts(series), [_part(run) for run in runs], drawer)
+        request.report.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(request.report, text.encode("utf-8"))
         written = [request.report, *written]
     return CharacteriseReport(series, tuple(runs), tuple(written))
@@ -189,10 +189,9 @@ def _check_outputs(request: CharacteriseRequest, series: Series) -> ChartDrawer 
     return ChartDrawer()
 
 
-def _write_tables(request: CharacteriseRequest, runs: Sequence[AnalysisRun]) -> list[Path]:
+def _write_tables(request: CharacteriseRequest, series: Series, runs: Sequence[AnalysisRun]) -> list[Path]:
     if request.csv is None:
         return []
-    request.csv.mkdir(parents=True, exist_ok=True)
     done = [run for run in runs if run.outcome is not None]
     figures = [(run.analysis.name, figure) for run in done if run.outcome for figure in run.outcome.figures]
     tables = {"figures": _figure_table(figures)}
@@ -201,22 +200,20 @@ def _write_tables(request: CharacteriseRequest, runs: Sequence[AnalysisRun]) -> 
         tables |= {f"{run.analysis.name}_{name}": table for name, table in run.outcome.tables.items()}
     written = []
     for name, table in tables.items():
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(table.head)
-        writer.writerows(table.rows)
         path = request.csv / f"{name}.csv"
-        write_atomically(path, text.getvalue().encode("utf-8"))
+        write_named_table(path, table.head, table.rows)
         written.append(path)
-    return written + _write_files(request.csv, done)
+    return written + _write_files(request, series, done)
 
 
-def _write_files(folder: Path, done: Sequence[AnalysisRun]) -> list[Path]:
+def _write_files(request: CharacteriseRequest, series: Series, done: Sequence[AnalysisRun]) -> list[Path]:
+    assert request.csv is not None
     written = []
     for run in done:
         assert run.outcome is not None
         for name, content in run.outcome.files.items():
-            path = folder / name
+            path = request.csv / name
+            check_output(path, list(series.inputs), overwrite=request.overwrite)
             if isinstance(content, bytes):
                 write_atomically(path, content)
             else:
