@@ -79,6 +79,18 @@ def test_result_does_not_depend_on_windows(image: Path, model: ChromaticModel) -
         assert np.array_equal(reader.read(window)[0], whole[:, rows, columns])
 
 
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "int16", "float32"])
+def test_whole_pixels_are_moved_without_change(dtype: str, tmp_path: Path) -> None:
+    values = np.random.default_rng(1).normal(100, 20, (3, 90, 110)).astype(dtype)
+    write_whole_image(tmp_path / "t.tif", values)
+    moved = ChromaticModel((110, 90), 2, (BandModel(1, ((0, 0, 1.0, 0.0),)), BandModel(3, ((0, 0, -2.0, 3.0),))))
+    out, valid = AlignedReader(RasterReader(tmp_path / "t.tif"), moved).read(Window(0, 0, 110, 90))
+    assert valid is None and out.dtype == dtype
+    # Where the band lies 1 px to the right, its value there is that of the reference's pixel; the border's is repeated.
+    assert np.array_equal(out[0], values[0][:, np.minimum(np.arange(110) + 1, 109)])
+    assert np.array_equal(out[2][:-3, 2:], values[2][3:, :-2])
+
+
 def test_pixels_without_value_stay_so(tmp_path: Path, model: ChromaticModel) -> None:
     values = np.full((3, 220, 300), 50.0, np.float32)
     values[:, 100, 150] = np.nan

@@ -113,6 +113,9 @@ def memory_of_a_tile(reader: RestoredReader) -> int:
     margin = reader.restorer.margin
     area = (PART + 6 * margin.columns) * (PART + 6 * margin.rows)
     each = reader.bands * (2 * reader.source.dtype.itemsize + 2 * reader.dtype.itemsize) + 48
+    if isinstance(reader.source, AlignedReader):
+        # The same pixels before they are displaced, and the displacements.
+        each += 2 * reader.bands * reader.source.dtype.itemsize + 56
     return int(area * each)
 
 
