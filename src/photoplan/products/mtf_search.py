@@ -16,8 +16,8 @@ __all__ = ["Found", "join_lines", "parted", "search_edges", "select_spread", "ti
 
 #: Side of a tile, pixels: its arrays take some 200 MB.
 TILE = 2048
-#: Longest line that is examined as one, pixels: bounds the window that is read for it.
-LONGEST = 1600.0
+#: Longest line that is examined as one, pixels: bounds the window that is read for it, and how far lenses bend it.
+LONGEST = 512.0
 #: Longest part that is measured as one: no lens, print or roof is straight to a tenth of a pixel for longer.
 PART = 256.0
 #: Cells of the field, in each direction, among which edges are chosen in turn.
@@ -92,14 +92,15 @@ def search_edges(
             if inside is None:
                 continue
             # A line that leaves the tile goes on in the next one.
-            if inside.length < line.length - 0.5 or line.length > LONGEST:
+            if inside.length < line.length - 0.5:
                 open_lines.append(inside.moved(col, row))
                 continue
-            region, reason = examine(picture, line, rules)
-            if region is None:
-                found.rejected[reason] += 1
-            else:
-                found.regions.append(_placed(region, col, row))
+            for part in _pieces(line):
+                region, reason = examine(picture, part, rules)
+                if region is None:
+                    found.rejected[reason] += 1
+                else:
+                    found.regions.append(_placed(region, col, row))
         found.regions = _best_of_cells(found.regions, image.size)
         advance(1, tile.size)
     for line in join_lines(open_lines):
