@@ -41,7 +41,7 @@ def test_a_filter_is_measured_and_restores_other_images(scenes):
     (part,) = found.parts
     truth = discrete_spread(SIGMA).side()[:3]
     print(part.facts())
-    for one in (part.x, part.y):
+    for one in part.sharpness:
         assert one.spread.side()[:3] == pytest.approx(truth, abs=0.02)
         frequency = np.array([0.1, 0.25, 0.4])
         curve = np.exp(-2 * (np.pi * SIGMA * frequency) ** 2) * np.sinc(frequency)

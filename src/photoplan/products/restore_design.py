@@ -43,6 +43,8 @@ class DesignRequest:
     """Parts of the field in each direction that get filters of their own, where they have edges enough."""
     most_edges: int = 200
     """Edges of an image that are measured."""
+    least_length: float | None = None
+    """Of an edge, pixels; None: 20."""
     options: DesignOptions = field(default_factory=DesignOptions)
 
     def __post_init__(self) -> None:
@@ -60,8 +62,10 @@ class DesignedPart:
     """Column and row of the middle of the part; None: the whole field."""
     edges: int
     """Edges it was measured with."""
-    x: Sharpness
-    y: Sharpness
+    sharpness: tuple[Sharpness, Sharpness]
+    """Along rows and along columns."""
+    missing: tuple[str, ...]
+    """``x`` or ``y`` where no edges show the sharpness along rows or columns and that of the other stands for it."""
     scene: SceneStatistics
     design: Design
 
@@ -73,10 +77,10 @@ class DesignedPart:
             "edges": self.edges,
             "noise": self.scene.noise,
             "contrast": self.scene.contrast,
-            "mtf50_x": round(self.x.modulation().mtf50, 4),
-            "mtf50_y": round(self.y.modulation().mtf50, 4),
-            "spread_x": [round(float(v), 5) for v in self.x.spread.side()],
-            "spread_y": [round(float(v), 5) for v in self.y.spread.side()],
+            "mtf50_x": round(self.sharpness[0].modulation().mtf50, 4),
+            "mtf50_y": round(self.sharpness[1].modulation().mtf50, 4),
+            "spread_x": [round(float(v), 5) for v in self.sharpness[0].spread.side()],
+            "spread_y": [round(float(v), 5) for v in self.sharpness[1].spread.side()],
             "condition_x": str(self.design.condition_x),
             "condition_y": str(self.design.condition_y),
             "noise_gain": round(self.design.noise_gain, 3),
@@ -124,7 +128,12 @@ def design_restoration(
     """
     band = "all" if request.per_band else None
     asked = MtfRequest(
-        request.images, linearisation=request.linearisation, band=band, most_edges=request.most_edges, grid=1
+        request.images,
+        linearisation=request.linearisation,
+        band=band,
+        most_edges=request.most_edges,
+        least_length=request.least_length,
+        grid=1,
     )
     mtf = measure_mtf(asked, begin, talk)
     if not mtf.images:
@@ -169,6 +178,9 @@ def _parts(
     """The filters of a band: for the whole field, or for each part of it that has edges enough."""
     band, size = where
     whole = _designed(request, band, None, edges, scene)
+    for axis in whole.missing:
+        lacking, other = ("rows", "columns") if axis == "x" else ("columns", "rows")
+        notes.append(f"too few edges show the sharpness along {lacking}; that along {other} stands for it")
     if request.cells == 1:
         return [whole]
     n, found = request.cells, []
@@ -181,7 +193,7 @@ def _parts(
                 found.append(_designed(request, band, at, here, scene))
             except InputError:
                 poor += 1
-                found.append(DesignedPart(band, at, 0, whole.x, whole.y, whole.scene, whole.design))
+                found.append(DesignedPart(band, at, 0, whole.sharpness, whole.missing, whole.scene, whole.design))
     if poor:
         name = "" if band is None else f"band {band}: "
         notes.append(
@@ -203,8 +215,8 @@ def _designed(
     edges: Sequence[EdgeMeasurement],
     scene: SceneStatistics,
 ) -> DesignedPart:
-    x, y = sharpness_of(edges)
-    return DesignedPart(band, at, len(edges), x, y, scene, design_filter(x, y, scene, request.options))
+    x, y, missing = sharpness_of(edges)
+    return DesignedPart(band, at, len(edges), (x, y), missing, scene, design_filter(x, y, scene, request.options))
 
 
 def _scene(images: Sequence[LightImage], channel: int) -> SceneStatistics:

@@ -23,57 +23,82 @@ LEAST_EDGES = 3
 _HALF = 5
 #: A mean curve ends where the share of edges that know it falls below this.
 _KNOWN = 0.5
+#: Share by which the MTF50 of edges may differ from the upper quartile.
+_AGREE = 0.08
 _POSITIONS = np.linspace(-10.0, 10.0, 401)
 _FREQUENCIES = np.linspace(0.0, 1.0, 201)
 
 
-def sharpness_of(edges: Sequence[EdgeMeasurement]) -> tuple[Sharpness, Sharpness]:
+def sharpness_of(edges: Sequence[EdgeMeasurement]) -> tuple[Sharpness, Sharpness, tuple[str, ...]]:
     """Spread function and MTF along rows (x) and along columns (y).
 
     Edges of the object that are not sharp themselves, such as those of shadows and embankments, are left out, as Kölbl
-    sought the sharpest (2006, §3): those whose MTF50 is below the upper quartile by more than two of their own standard
-    deviations. An edge counts for the direction that brightness rises in, with the cosine of twice its angle to it:
-    edges that run diagonally count for neither. It also counts by its length and the square of its contrast over noise,
-    up to four times the median edge, so that none decides alone.
+    sought the sharpest (2006, §3): the edges count whose MTF50 agrees with the upper quartile to 8 % or two of their
+    own standard deviations. An edge counts for the direction that brightness rises in, with the cosine of twice its
+    angle to it: edges that run diagonally count for neither. It also counts by its length and the square of its
+    contrast over noise, up to four times the median edge, so that none decides alone.
+
+    Where one direction has fewer than three edges, that of the other stands for it.
 
     Parameters
     ----------
     edges : sequence of EdgeMeasurement
         Of one channel and one part of the field.
 
+    Returns
+    -------
+    x, y : Sharpness
+    missing : tuple of str
+        ``x`` or ``y`` where the other direction stands in; empty if both are measured.
+
     Raises
     ------
     InputError
-        Fewer than three edges for a direction.
+        Fewer than three edges for both directions.
     """
-    found = []
-    for name, axis in (("along rows", 0.0), ("along columns", 90.0)):
-        shares = np.array([max(0.0, cos(2.0 * radians(edge.angle_deg - axis))) for edge in edges])
-        used = [edge for edge, share in zip(edges, shares, strict=True) if share > 0.1]
-        if len(used) < LEAST_EDGES:
-            raise InputError(
-                f"{len(used)} edges show the sharpness {name}; at least {LEAST_EDGES} are needed. Give images with "
-                "more edges, or a filter"
-            )
-        keep = _sharp(used)
-        weights = shares[shares > 0.1][keep]
-        used = [edge for edge, kept in zip(used, keep, strict=True) if kept]
-        strength = np.array([min(edge.snr, 1e6) ** 2 * edge.length for edge in used])
-        strength = np.minimum(strength, 4.0 * np.median(strength))
-        found.append(_together(used, strength * weights))
-    return found[0], found[1]
+    found = {name: _along(edges, axis) for name, axis in (("x", 0.0), ("y", 90.0))}
+    x, y = found["x"], found["y"]
+    if x is None and y is None:
+        raise InputError(
+            f"{len(edges)} edges; at least {LEAST_EDGES} are needed that run along rows or along columns. Give images "
+            "with more edges, or a filter"
+        )
+    if x is None or y is None:
+        one = x or y
+        assert one is not None
+        return one, one, ("x" if x is None else "y",)
+    return x, y, ()
 
 
-def _sharp(edges: Sequence[EdgeMeasurement]) -> NDArray[np.bool_]:
-    """Which edges are as sharp as the sharpest, for all that is known; at least three."""
+def _along(edges: Sequence[EdgeMeasurement], axis: float) -> Sharpness | None:
+    """Sharpness in the direction of an axis, degrees; None if too few edges show it."""
+    shares = np.array([max(0.0, cos(2.0 * radians(edge.angle_deg - axis))) for edge in edges])
+    used = [edge for edge, share in zip(edges, shares, strict=True) if share > 0.1]
+    if len(used) < LEAST_EDGES:
+        return None
+    # A profile of few phases is a model between its samples, and no help beyond 0.5 cycles/pixel.
+    sampled = np.array([edge.sampling == "super-sampled" for edge in used])
+    trusted = sampled if sampled.sum() >= LEAST_EDGES else np.ones(len(used), bool)
+    strength = np.array([min(edge.snr, 1e6) ** 2 * edge.length for edge in used])
+    strength = np.minimum(strength, 4.0 * np.median(strength[trusted])) * shares[shares > 0.1]
+    used, strength = [edge for edge, kept in zip(used, trusted, strict=True) if kept], strength[trusted]
+    keep = _sharp(used, strength)
+    return _together([edge for edge, kept in zip(used, keep, strict=True) if kept], strength[keep])
+
+
+def _sharp(edges: Sequence[EdgeMeasurement], strength: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which edges agree with the upper quartile of all; at least the three that are nearest to it."""
     mtf50 = np.array([edge.mtf50 for edge in edges])
     sigma = np.array([sigma_of_interval(edge.mtf50_interval, edge.confidence) for edge in edges])
     known = np.isfinite(mtf50)
     if known.sum() < LEAST_EDGES:
         return np.ones(mtf50.size, bool)
-    limit = float(np.quantile(mtf50[known], 0.75))
-    keep = mtf50 + 2.0 * np.nan_to_num(sigma) >= limit
-    keep[np.argsort(-np.nan_to_num(mtf50))[:LEAST_EDGES]] = True
+    order = np.argsort(np.where(known, mtf50, np.inf))
+    share = np.cumsum(np.where(known, strength, 0.0)[order])
+    quartile = float(mtf50[order][int(np.searchsorted(share, 0.75 * share[-1]))])
+    apart = np.where(known, np.abs(mtf50 - quartile), np.inf)
+    keep = apart <= np.maximum(2.0 * np.nan_to_num(sigma), _AGREE * quartile)
+    keep[np.argsort(apart)[:LEAST_EDGES]] = True
     return np.asarray(keep)
 
 
