@@ -10,6 +10,7 @@ import click
 
 from photoplan.cli.failures import end_with_failures
 from photoplan.cli.options import BYTES, json_option
+from photoplan.cli.restore_options import filter_options, filter_request
 
 if TYPE_CHECKING:
     from photoplan.products.restore import RestoredImage, RestorePlan
@@ -19,8 +20,7 @@ __all__ = ["command"]
 
 @click.command("restore")
 @click.argument("images", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="IMAGE…")
-@click.option("--filter", "filter_file", required=True, type=click.Path(path_type=Path), metavar="FILE",
-              help="Restoration filter: TOML, or one kernel as rows of numbers.")  # fmt: skip
+@filter_options
 @click.option("--output", type=click.Path(path_type=Path), metavar="FOLDER",
               help="Folder of the results [restored, beside the first image].")  # fmt: skip
 @click.option("--band", "bands", multiple=True, type=click.IntRange(1), metavar="N",
@@ -38,18 +38,18 @@ __all__ = ["command"]
 @click.option("--dry-run", is_flag=True, help="Say what would be done, and stop.")
 @json_option
 @click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
-def command(
-    images: tuple[Path, ...], filter_file: Path, as_json: bool, quiet: bool, dry_run: bool, **options: Any
-) -> None:
-    """Restore images of any size with a filter: NAME_restored.tif (a cloud-optimised GeoTIFF) and its run record.
+def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool, **options: Any) -> None:
+    """Restore images of any size: NAME_restored.tif (a cloud-optimised GeoTIFF) and its run record.
 
-    Noise grows by the figure that is printed first. An image that fails does not stop the others (exit code 4). The
-    same command continues a run that was interrupted.
+    Without --filter the sharpness of the images is measured at edges that they show, all together as images of one
+    camera, and the filter follows from it; it is kept as a file. Noise grows by the figure that is printed first. An
+    image that fails does not stop the others (exit code 4). The same command continues a run that was interrupted.
     """
     import psutil
 
     from photoplan.cli.progress import progress
     from photoplan.products.restore import RestoreRequest, plan_restoration, restore_images
+    from photoplan.products.restore_filter import FILTER_NAME, keep_filter, requested_filter
 
     def talk(text: str) -> None:
         if not quiet:
@@ -59,7 +59,10 @@ def command(
         options["chromatic"] = Path(options["chromatic"])
     options["quicklook"] = not options.pop("no_quicklook")
     options["workers"] = options["workers"] or psutil.cpu_count() or 1
-    request = RestoreRequest(images, filter_file, **options)
+    asked = filter_request(images, options)
+    kept = options.pop("save_filter")
+    found = asked.file or requested_filter(asked, lambda total: progress(total, quiet, "tiles"), talk)
+    request = RestoreRequest(images, found, **options)
     plan = plan_restoration(request)
     for line in _before(plan):
         talk(line)
@@ -67,6 +70,9 @@ def command(
         _show(plan, as_json)
         end_with_failures(plan.failed, len(plan.jobs))
         return
+
+    if asked.design is not None:
+        talk(f"filter: {keep_filter(kept or request.folder / FILTER_NAME, plan.filter, overwrite=request.overwrite)}")
 
     def finished(image: RestoredImage) -> None:
         if not as_json:

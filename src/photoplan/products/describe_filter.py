@@ -29,7 +29,10 @@ def describe_filter(path: Path) -> dict[str, Any]:
     if used.image_size is not None:
         facts["images"] = f"{used.image_size[0]} × {used.image_size[1]} pixels"
     for name, value in used.facts.items():
-        facts[str(name)] = value if isinstance(value, str | int | float) else str(value)
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            facts[str(name)] = f"{len(value)}, see the file"
+        else:
+            facts[str(name)] = value if isinstance(value, str | int | float) else str(value)
     return facts
 
 
