@@ -91,10 +91,22 @@ class TestRejected:
         assert sum(rejected.values()) < 4
 
     def test_texture(self) -> None:
-        rng = np.random.default_rng(3)
-        grain = np.kron(rng.uniform(-0.12, 0.12, (20, 23)), np.ones((4, 4)))[:80, :90]
-        grey = one_edge() + np.where(half_plane((90, 80), (44.3, 40.2), 8, 0.8) > 0.5, grain, 0)
-        assert set(reasons(grey.astype(np.float32))) <= {"textured", "two_sided", "weak", "curved"}
+        """Grains of 3 to 8 pixels with 17 % of the contrast on the bright side, 50 times: at most a sixth passes.
+
+        What passes lies by chance where the texture is even; the measurement tests it once more.
+        """
+        passed, why = 0, set()
+        for seed in range(10):
+            for size in (3, 4, 5, 6, 8):
+                rng = np.random.default_rng(seed)
+                grain = np.kron(rng.uniform(-0.15, 0.15, (30, 33)), np.ones((size, size)))[:80, :90]
+                grey = one_edge() + np.where(half_plane((90, 80), (44.3, 40.2), 8, 0.8) > 0.5, grain, 0)
+                found, rejected = find_edges(EdgePicture(grey.astype(np.float32)))
+                passed += bool(found)
+                why |= set(rejected)
+        print(f"{passed} of 50 edges beside texture pass, the others are {sorted(why)}")
+        assert passed <= 8
+        assert "textured" in why
 
     def test_a_bar_has_two_sides(self) -> None:
         bar = half_plane((90, 80), (42.0, 40.0), 8, 0.8) - half_plane((90, 80), (47.0, 40.0), 8, 0.8)

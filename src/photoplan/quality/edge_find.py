@@ -210,6 +210,9 @@ def _clean_part(strip: Strip, blur: Blur, half: int, demands: tuple[EdgeRules, f
     length = (end - start) * step
     if length < rules.least_length:
         return None, why.most_common(1)[0][0] if why else "short"
+    # A short clean part of a line that is mostly not clean is so by chance.
+    if length < 2 * rules.least_length and length < 0.5 * strip.line.length and why:
+        return None, why.most_common(1)[0][0]
     chosen = good.copy()
     chosen[:start] = chosen[end:] = False
     part = sides.blocks(chosen)

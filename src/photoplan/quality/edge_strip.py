@@ -209,7 +209,7 @@ class Sides:
         count, total = ((a[:, side][:, : (side.stop - side.start) // 3 * 3]) for a in (s.count, s.total))
         count, total = (a.reshape(len(a), -1, 3).sum(axis=2) for a in (count, total))
         full = count >= 6
-        if np.count_nonzero(full) < 6:
+        if np.count_nonzero(full) < 3:
             return 0.0
         means = np.where(full, total / np.maximum(count, 1), np.nan)
         # Slow changes along the edge are light, not texture.
