@@ -22,8 +22,8 @@ from photoplan.products.mtf_image import LUMINANCE, LightImage, linearisation_of
 from photoplan.products.mtf_result import MeasuredEdge
 from photoplan.products.restore import RestoreRequest, restore_images
 from photoplan.products.restore_design import DesignRequest, design_restoration
-from photoplan.quality.design import DesignOptions
-from photoplan.quality.edge_response import EdgeMeasurement, measure_edge
+from photoplan.quality.edges.response import EdgeMeasurement, measure_edge
+from photoplan.quality.restoration.design import DesignOptions
 
 LIGHT = "srgb"
 FREQUENCIES = np.linspace(0.0, 0.5, 51)

@@ -8,9 +8,9 @@ import pytest
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.convolve import round_clipped
-from photoplan.quality.borders import Margin
-from photoplan.quality.convolution import LEFT, RIGHT, Convolution
-from photoplan.quality.filters import FilterKernel
+from photoplan.quality.restoration.borders import Margin
+from photoplan.quality.restoration.convolution import LEFT, RIGHT, Convolution
+from photoplan.quality.restoration.filters import FilterKernel
 
 NONE = np.empty((0, 0), bool)
 ROUNDING = 2e-7

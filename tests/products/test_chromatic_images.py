@@ -21,11 +21,11 @@ from photoplan.products.chromatic import (
     model_lines,
     save_chromatic,
 )
-from photoplan.quality.chromatic import BandModel, ChromaticModel
-from photoplan.quality.simulation import ImageModel, form_image
-from photoplan.quality.simulation_optics_parts import Lateral, Spread
-from photoplan.quality.simulation_scenes import PatternScene
-from photoplan.quality.simulation_sensor_parts import Gain, Quantisation
+from photoplan.quality.colour.model import BandModel, ChromaticModel
+from photoplan.quality.formation.model import ImageModel, form_image
+from photoplan.quality.formation.optics_parts import Lateral, Spread
+from photoplan.quality.formation.scenes import PatternScene
+from photoplan.quality.formation.sensor_parts import Gain, Quantisation
 
 LATERAL = (Lateral(1, (0.6, -0.4), 0.004, 0.0), Lateral(3, (-0.5, 0.2), -0.003, 0.0))
 SCENE = PatternScene("discs", (300, 220), (24.0, 11.0), 4, bands=3)

@@ -14,8 +14,8 @@ from photoplan.geometry.grid import Window
 from photoplan.products import mtf_search
 from photoplan.products.mtf_image import LightImage
 from photoplan.products.mtf_search import join_lines, parted, search_edges, select_spread, tiles_of
-from photoplan.quality.edge_candidates import StraightEdge
-from photoplan.quality.edge_find import EdgeRegion, EdgeRules
+from photoplan.quality.edges.candidates import StraightEdge
+from photoplan.quality.edges.find import EdgeRegion, EdgeRules
 from photoplan.quality.linearise import Linearisation
 
 

@@ -8,7 +8,7 @@ from tools.blurred_scenes import any_edges, discrete_spread, taken
 
 from photoplan.errors import InputError, UsageError
 from photoplan.products.restore_design import DesignRequest, design_restoration
-from photoplan.quality.design import DesignOptions
+from photoplan.quality.restoration.design import DesignOptions
 
 SIZE = 320
 MOST = 40

@@ -20,7 +20,7 @@ from photoplan.products.filter_files import save_filter
 from photoplan.products.orthophoto import plan_orthophotos
 from photoplan.products.restore import RestoreRequest, restore_images
 from photoplan.products.scene import input_files, open_scene
-from photoplan.quality.filters import FilterKernel, RestorationFilter
+from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
 
 
 def sharpening(size: tuple[int, int] = (200, 150)) -> RestorationFilter:

@@ -13,7 +13,7 @@ from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
 from photoplan.products.restore import RestoreRequest, restore_images
 from photoplan.products.restored_reader import restored_reader
-from photoplan.quality.filters import FilterKernel, RestorationFilter
+from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
 
 SIZE = (700, 560)
 

@@ -9,10 +9,10 @@ import pytest
 from tools.patterns import bars, gauss_box, star
 
 from photoplan.errors import InputError
-from photoplan.quality.bar_curve import bar_curve, coltman_factor, coltman_mtf
-from photoplan.quality.bars import measure_bars
 from photoplan.quality.mtf_curve import MtfCurve
-from photoplan.quality.pattern_pixels import clipped_pixels
+from photoplan.quality.patterns.bar_curve import bar_curve, coltman_factor, coltman_mtf
+from photoplan.quality.patterns.bars import measure_bars
+from photoplan.quality.patterns.pixels import clipped_pixels
 
 SIGMA, LEVELS = 0.6, (40.0, 200.0)
 TRANSFER = gauss_box(SIGMA)

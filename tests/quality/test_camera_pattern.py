@@ -8,11 +8,11 @@ from scipy import ndimage
 from tools.camera_model import Sensor
 
 from photoplan.errors import InputError
-from photoplan.quality.blooming import find_blooming
-from photoplan.quality.defects import find_blinking, find_defects, find_lines, log_histogram
-from photoplan.quality.fixed_pattern import pattern_variance, prnu_percent, signed_root, spectrogram
-from photoplan.quality.frame_statistics import StackSums
-from photoplan.quality.high_pass import LINE_SHARE, WHITE_SHARE, background, high_pass
+from photoplan.quality.camera.blooming import find_blooming
+from photoplan.quality.camera.defects import find_blinking, find_defects, find_lines, log_histogram
+from photoplan.quality.camera.fixed_pattern import pattern_variance, prnu_percent, signed_root, spectrogram
+from photoplan.quality.camera.frame_statistics import StackSums
+from photoplan.quality.camera.high_pass import LINE_SHARE, WHITE_SHARE, background, high_pass
 
 RUNS = 150
 

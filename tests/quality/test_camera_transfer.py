@@ -7,13 +7,13 @@ import pytest
 from tools.camera_model import Sensor
 
 from photoplan.errors import InputError
-from photoplan.quality.dark_signal import dark_current, doubling_temperature
-from photoplan.quality.emva import EmvaPoints, emva_sheet
-from photoplan.quality.frame_statistics import Level, StackSums
-from photoplan.quality.grey_wedge import grey_wedge
-from photoplan.quality.linearity import linearity
-from photoplan.quality.photon_transfer import photon_transfer
-from photoplan.quality.saturation import find_saturation
+from photoplan.quality.camera.dark_signal import dark_current, doubling_temperature
+from photoplan.quality.camera.emva import EmvaPoints, emva_sheet
+from photoplan.quality.camera.frame_statistics import Level, StackSums
+from photoplan.quality.camera.grey_wedge import grey_wedge
+from photoplan.quality.camera.linearity import linearity
+from photoplan.quality.camera.photon_transfer import photon_transfer
+from photoplan.quality.camera.saturation import find_saturation
 from photoplan.quality.straight_line import fit_line
 
 #: Small images for the many runs that a standard deviation of standard deviations needs.

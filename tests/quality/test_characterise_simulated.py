@@ -7,15 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from photoplan.quality.fall_off import fit_fall_off
-from photoplan.quality.fall_off_adjust import FallOffSettings
-from photoplan.quality.gain_control import gain_control
-from photoplan.quality.line_jitter import line_jitter
-from photoplan.quality.plumb_edge import correlate_edge, fit_edge
-from photoplan.quality.simulation import ImageModel, form_image, form_series
-from photoplan.quality.simulation_optics_parts import Falloff, LineJitter, Spread
-from photoplan.quality.simulation_scenes import PatternScene
-from photoplan.quality.simulation_sensor_parts import (
+from photoplan.quality.camera.fall_off import fit_fall_off
+from photoplan.quality.camera.fall_off_adjust import FallOffSettings
+from photoplan.quality.camera.gain_control import gain_control
+from photoplan.quality.camera.line_jitter import line_jitter
+from photoplan.quality.camera.plumb_edge import correlate_edge, fit_edge
+from photoplan.quality.formation.model import ImageModel, form_image, form_series
+from photoplan.quality.formation.optics_parts import Falloff, LineJitter, Spread
+from photoplan.quality.formation.scenes import PatternScene
+from photoplan.quality.formation.sensor_parts import (
     AutomaticGain,
     Exposure,
     FixedPattern,

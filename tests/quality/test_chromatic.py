@@ -5,16 +5,16 @@ import pytest
 from scipy import ndimage
 
 from photoplan.errors import GeometryError, InputError
-from photoplan.quality.chromatic import BandModel, ChromaticModel, Displacements, fit_band
-from photoplan.quality.chromatic_discs import disc_displacements
-from photoplan.quality.chromatic_edges import edge_displacements
-from photoplan.quality.chromatic_patches import patch_displacements
-from photoplan.quality.discs import DiscSettings, find_discs
-from photoplan.quality.edge_find import EdgePicture, find_edges
-from photoplan.quality.simulation import ImageModel, form_image
-from photoplan.quality.simulation_optics_parts import Falloff, Lateral, Spread
-from photoplan.quality.simulation_scenes import ArrayScene, PatternScene
-from photoplan.quality.simulation_sensor_parts import Gain, Quantisation
+from photoplan.quality.colour.disc_displacements import disc_displacements
+from photoplan.quality.colour.discs import DiscSettings, find_discs
+from photoplan.quality.colour.edge_displacements import edge_displacements
+from photoplan.quality.colour.model import BandModel, ChromaticModel, Displacements, fit_band
+from photoplan.quality.colour.patch_displacements import patch_displacements
+from photoplan.quality.edges.find import EdgePicture, find_edges
+from photoplan.quality.formation.model import ImageModel, form_image
+from photoplan.quality.formation.optics_parts import Falloff, Lateral, Spread
+from photoplan.quality.formation.scenes import ArrayScene, PatternScene
+from photoplan.quality.formation.sensor_parts import Gain, Quantisation
 
 LATERAL = (Lateral(1, (0.3, -0.2), 0.002, 0.001), Lateral(3, (-0.15, 0.05), -0.001, 0.0))
 #: Contrast 200 with noise 4: a signal-to-noise ratio of 50.

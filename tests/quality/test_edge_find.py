@@ -9,8 +9,8 @@ import pytest
 from tools.edge_scenes import blocks, half_plane, noisy
 
 from photoplan.errors import InputError
-from photoplan.quality.edge_candidates import find_lines, noise_of
-from photoplan.quality.edge_find import EdgePicture, EdgeRegion, EdgeRules, cut_region, find_edges
+from photoplan.quality.edges.candidates import find_lines, noise_of
+from photoplan.quality.edges.find import EdgePicture, EdgeRegion, EdgeRules, cut_region, find_edges
 
 
 def one_edge(angle: float = 8.0, sigma: float = 0.8, snr: float = 50.0, size: tuple[int, int] = (90, 80)) -> np.ndarray:

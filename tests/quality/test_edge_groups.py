@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError
-from photoplan.quality.edge_groups import combine, field_cell, fit_gaussian, mean_curve, quantiles, sigma_of_interval
+from photoplan.quality.edges.groups import combine, field_cell, fit_gaussian, mean_curve, quantiles, sigma_of_interval
 from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.spread import gaussian_modulation
 

@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 from tools.edges import edge_image, gaussian
 
 from photoplan.errors import InputError
-from photoplan.quality.edge_response import EdgeSettings, measure_edge
+from photoplan.quality.edges.response import EdgeSettings, measure_edge
 
 SHAPE = (100, 60)
 

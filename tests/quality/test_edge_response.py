@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from tools.edges import TAILED, edge_image, gaussian, line_spread, modulation, true_fwhm, true_mtf50
 
-from photoplan.quality.edge_model import PixelEdge
-from photoplan.quality.edge_response import EdgeSettings, measure_edge
+from photoplan.quality.edges.model import PixelEdge
+from photoplan.quality.edges.response import EdgeSettings, measure_edge
 
 SNR = 50.0
 

@@ -10,8 +10,8 @@ from scipy.ndimage import gaussian_filter
 from tools.edge_scenes import half_plane, noisy
 
 from photoplan.errors import InputError
-from photoplan.quality.edge_response import measure_edge
-from photoplan.quality.enhancement import enhancement_of
+from photoplan.quality.edges.enhancement import enhancement_of
+from photoplan.quality.edges.response import measure_edge
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from scipy import ndimage
 
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.grid import Window
-from photoplan.quality.fall_off import fit_fall_off
-from photoplan.quality.fall_off_adjust import FallOffSettings
-from photoplan.quality.fall_off_model import FallOffModel, correct_fall_off, gain_image, surface_terms
+from photoplan.quality.camera.fall_off import fit_fall_off
+from photoplan.quality.camera.fall_off_adjust import FallOffSettings
+from photoplan.quality.camera.fall_off_model import FallOffModel, correct_fall_off, gain_image, surface_terms
 
 SIZE, POINT, FOCAL = (320, 240), (165.0, 118.0), 350.0
 TERMS = ((2, 0), (4, 0), (1, 1), (2, 2))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError
-from photoplan.quality.approach import fit_approach
-from photoplan.quality.gain_control import compare_transitions, gain_control
+from photoplan.quality.camera.approach import fit_approach
+from photoplan.quality.camera.gain_control import compare_transitions, gain_control
 
 TIMES = np.arange(80) * 0.2
 STEP = 4.0

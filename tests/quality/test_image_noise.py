@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tools.blurred_scenes import any_edges, taken
 
-from photoplan.quality.image_noise import BLOCK, block_noise, image_noise
+from photoplan.quality.restoration.image_noise import BLOCK, block_noise, image_noise
 
 
 def test_pure_noise():

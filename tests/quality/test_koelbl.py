@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError
-from photoplan.quality.koelbl import normalised_edge, spread_from_edge, spread_from_response
+from photoplan.quality.edges.koelbl import normalised_edge, spread_from_edge, spread_from_response
 from photoplan.quality.spread import SpreadFunction
 
 TABLE_1 = np.array([150.0, 148, 133, 67, 52, 50])

@@ -9,10 +9,10 @@ import pytest
 from tools.camera_series import edge_lines
 
 from photoplan.errors import InputError
-from photoplan.quality.line_jitter import grey_error, line_jitter, position_error
-from photoplan.quality.line_period import Harmonic, Waves, spectrum
-from photoplan.quality.parallel_edges import above_control, compare_edges
-from photoplan.quality.plumb_edge import correlate_edge, fit_edge
+from photoplan.quality.camera.line_jitter import grey_error, line_jitter, position_error
+from photoplan.quality.camera.line_period import Harmonic, Waves, spectrum
+from photoplan.quality.camera.parallel_edges import above_control, compare_edges
+from photoplan.quality.camera.plumb_edge import correlate_edge, fit_edge
 
 LINES = np.arange(400.0)
 

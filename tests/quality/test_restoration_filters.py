@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError
-from photoplan.quality.aperture import aperture_filter
-from photoplan.quality.filter_design import radial_filter, separable_filter
-from photoplan.quality.filters import FilterKernel
-from photoplan.quality.inverse import band_matrix, condition_of, exact_inverse, spread_of_inverse
+from photoplan.quality.restoration.aperture import aperture_filter
+from photoplan.quality.restoration.filter_design import radial_filter, separable_filter
+from photoplan.quality.restoration.filters import FilterKernel
+from photoplan.quality.restoration.inverse import band_matrix, condition_of, exact_inverse, spread_of_inverse
 from photoplan.quality.spread import SpreadFunction, gaussian_modulation
 
 # Kölbl 2006, figures 4 and 6: the octant's rows from the centre outwards, [distance down][distance right].

@@ -6,8 +6,8 @@ from scipy.ndimage import convolve
 from tools.blurred_scenes import FINE, NOISE, SIZE, any_edges, discrete_spread, sharpness, taken, whole_pixels
 
 from photoplan.errors import InputError
-from photoplan.quality.design import DesignOptions, Sharpness, design_filter
-from photoplan.quality.regularised import SceneStatistics
+from photoplan.quality.restoration.design import DesignOptions, Sharpness, design_filter
+from photoplan.quality.restoration.regularised import SceneStatistics
 from photoplan.quality.spread import SpreadFunction
 
 INSIDE = np.s_[24:-24, 24:-24]

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError
-from photoplan.quality import sensor, sensor_noise, video_norm
-from photoplan.quality.sensor_noise import NoiseBudget
-from photoplan.quality.video_norm import VideoNorm
+from photoplan.quality.sensor import figures as sensor
+from photoplan.quality.sensor import noise as sensor_noise
+from photoplan.quality.sensor import video_norm
+from photoplan.quality.sensor.noise import NoiseBudget
+from photoplan.quality.sensor.video_norm import VideoNorm
 
 CCIR = VideoNorm(625, 64e-6, 12e-6, 25 * 64e-6 + 12e-6, 4 / 3, 0.67)
 

@@ -9,9 +9,9 @@ import pytest
 from tools.patterns import bars, box_edge, formed, gauss_box, star
 
 from photoplan.errors import InputError
-from photoplan.quality.edge_response import measure_edge
-from photoplan.quality.pattern_pixels import clipped_pixels
-from photoplan.quality.siemens import StarRules, measure_star
+from photoplan.quality.edges.response import measure_edge
+from photoplan.quality.patterns.pixels import clipped_pixels
+from photoplan.quality.patterns.siemens import StarRules, measure_star
 
 TURN = np.linspace(0.0, pi, 180, endpoint=False)
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError
-from photoplan.quality.simulation import ImageModel, form_image, form_series
-from photoplan.quality.simulation_optics_parts import Spread
-from photoplan.quality.simulation_scenes import PatternScene
-from photoplan.quality.simulation_sensor import overflow
-from photoplan.quality.simulation_sensor_parts import (
+from photoplan.quality.formation.model import ImageModel, form_image, form_series
+from photoplan.quality.formation.optics_parts import Spread
+from photoplan.quality.formation.scenes import PatternScene
+from photoplan.quality.formation.sensor import overflow
+from photoplan.quality.formation.sensor_parts import (
     AutomaticGain,
     DarkCurrent,
     Defect,

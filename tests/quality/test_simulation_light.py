@@ -6,10 +6,10 @@ from scipy import special
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.quality.simulation import ImageModel, form_image
-from photoplan.quality.simulation_optics_parts import Aperture, Falloff, Lateral, LineJitter, Spread
-from photoplan.quality.simulation_scenes import ArrayScene, PatternScene, parse_pattern
-from photoplan.quality.simulation_truth import line_spread_width, model_modulation, model_mtf50
+from photoplan.quality.formation.model import ImageModel, form_image
+from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitter, Spread
+from photoplan.quality.formation.scenes import ArrayScene, PatternScene, parse_pattern
+from photoplan.quality.formation.truth import line_spread_width, model_modulation, model_mtf50
 from photoplan.quality.spread import GAUSSIAN_WIDTH
 
 

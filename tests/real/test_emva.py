@@ -16,7 +16,7 @@ from tools.command import Here
 
 from photoplan.io.series_model import StatisticsEntry
 from photoplan.io.series_statistics import read_statistics
-from photoplan.quality.emva import EmvaPoints, EmvaSheet, emva_sheet
+from photoplan.quality.camera.emva import EmvaPoints, EmvaSheet, emva_sheet
 
 #: By `emva1288` 0.6.3.
 ORACLE = {

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 import rasterio
 
-from photoplan.quality.chromatic import ChromaticModel, fit_band
-from photoplan.quality.chromatic_discs import disc_displacements
-from photoplan.quality.discs import find_discs
+from photoplan.quality.colour.disc_displacements import disc_displacements
+from photoplan.quality.colour.discs import find_discs
+from photoplan.quality.colour.model import ChromaticModel, fit_band
 
 SIZE = (408, 344)
 PLANES = {"G": (0, 3), "B": (1,), "R": (2,)}

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from photoplan.quality.edge_response import EdgeSettings, measure_edge
+from photoplan.quality.edges.response import EdgeSettings, measure_edge
 from photoplan.quality.linearise import Linearisation
 from photoplan.quality.mtf_curve import MtfCurve
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from photoplan.quality.usaf import UsafRules, measure_usaf
+from photoplan.quality.patterns.usaf import UsafRules, measure_usaf
 
 FILE = Path(__file__).parent / "usaf1951" / "3.npy"
 

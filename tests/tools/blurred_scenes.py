@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.stats import norm
 
-from photoplan.quality.design import Sharpness
 from photoplan.quality.mtf_curve import MtfCurve
+from photoplan.quality.restoration.design import Sharpness
 from photoplan.quality.spread import SpreadFunction
 
 FINE = 8

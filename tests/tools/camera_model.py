@@ -1,6 +1,6 @@
 """Frames of a camera whose figures are known: a small model of a sensor.
 
-Kept apart from `photoplan.quality.simulation` on purpose, so that the estimators are tested against a second model.
+Kept apart from `photoplan.quality.formation` on purpose, so that the estimators are tested against a second model.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ def filter_request(images: tuple[Path, ...], options: dict[str, Any]) -> FilterR
     """What the options ask for; takes them out of `options`, but for those that others need too."""
     from photoplan.products.restore_design import DesignRequest
     from photoplan.products.restore_filter import FilterRequest
-    from photoplan.quality.design import DesignOptions
+    from photoplan.quality.restoration.design import DesignOptions
 
     file, aperture = options.pop("filter_file"), options.pop("aperture")
     asked = {name: options.pop(name) for name in _MEASURED if name != "save_filter"}

@@ -1,7 +1,7 @@
 """Descriptions of image formation models: TOML with one table for each part.
 
-Units, meaning and admissible values of the entries are those of `photoplan.quality.simulation_optics_parts` and
-`photoplan.quality.simulation_sensor_parts`; what an entry that is left out stands for is said there too.
+Units, meaning and admissible values of the entries are those of `photoplan.quality.formation.optics_parts` and
+`photoplan.quality.formation.sensor_parts`; what an entry that is left out stands for is said there too.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from photoplan.io.raster import RasterReader
 from photoplan.io.raster_info import RasterInfo
 from photoplan.kernels.shift_bands import limits_of, no_mask, shift_band
 from photoplan.kernels.weights import KERNELS
-from photoplan.quality.chromatic import ChromaticModel
+from photoplan.quality.colour.model import ChromaticModel
 
 __all__ = ["AlignedReader"]
 

@@ -11,7 +11,7 @@ from photoplan.io.series_pixels import Plane
 from photoplan.products.characterise_common import Run, black_of, exposure_runs, prefix, tried
 from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
-from photoplan.quality.blooming import Blooming, find_blooming
+from photoplan.quality.camera.blooming import Blooming, find_blooming
 from photoplan.report.characterise_charts import Chart, Curve
 
 __all__ = ["analyse", "missing"]

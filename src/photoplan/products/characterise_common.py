@@ -12,8 +12,8 @@ from photoplan.errors import InputError
 from photoplan.io.series_pixels import Plane
 from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_result import Outcome
-from photoplan.quality.frame_statistics import Level
-from photoplan.quality.photon_transfer import is_clipped_dark
+from photoplan.quality.camera.frame_statistics import Level
+from photoplan.quality.camera.photon_transfer import is_clipped_dark
 
 __all__ = ["Black", "Run", "black_of", "dark_levels", "exposure_runs", "prefix", "saturation_of", "tried"]
 

@@ -11,8 +11,8 @@ from photoplan.io.series_pixels import Plane
 from photoplan.products.characterise_common import prefix, tried
 from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
-from photoplan.quality.dark_signal import DarkCurrent, dark_current, doubling_temperature
-from photoplan.quality.frame_statistics import Level
+from photoplan.quality.camera.dark_signal import DarkCurrent, dark_current, doubling_temperature
+from photoplan.quality.camera.frame_statistics import Level
 from photoplan.report.characterise_charts import Chart, Curve
 
 __all__ = ["analyse", "missing"]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.io.series_file import Frame, Series
 from photoplan.io.series_pixels import Plane, frame_pixels, plane_mask, series_planes, split
-from photoplan.quality.frame_statistics import FrameStack, Level, StackSums
+from photoplan.quality.camera.frame_statistics import FrameStack, Level, StackSums
 
 __all__ = ["SeriesData", "Setting"]
 

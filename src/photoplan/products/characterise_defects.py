@@ -11,8 +11,8 @@ from photoplan.io.series_pixels import Plane
 from photoplan.products.characterise_common import prefix, tried
 from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
-from photoplan.quality.defects import Defect, DefectList, find_blinking, find_defects, find_lines, log_histogram
-from photoplan.quality.frame_statistics import FrameStack
+from photoplan.quality.camera.defects import Defect, DefectList, find_blinking, find_defects, find_lines, log_histogram
+from photoplan.quality.camera.frame_statistics import FrameStack
 from photoplan.report.characterise_charts import Chart, Curve, Picture, shrunk
 
 __all__ = ["analyse", "missing"]

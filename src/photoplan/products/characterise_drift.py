@@ -11,7 +11,7 @@ from photoplan.errors import InputError
 from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_groups import FrameGroup, central_window, frame_groups
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
-from photoplan.quality.brightness_drift import LEAST_MEASUREMENTS, BrightnessDrift, brightness_drift
+from photoplan.quality.camera.brightness_drift import LEAST_MEASUREMENTS, BrightnessDrift, brightness_drift
 from photoplan.report.characterise_charts import Chart, Curve
 
 __all__ = ["analyse", "missing"]

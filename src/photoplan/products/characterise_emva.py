@@ -15,10 +15,10 @@ from photoplan.products.characterise_common import Run, exposure_runs, prefix, t
 from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
 from photoplan.products.characterise_transfer import reduced_level
-from photoplan.quality.dark_signal import dark_current
-from photoplan.quality.emva import EmvaPoints, EmvaSheet, emva_sheet
-from photoplan.quality.frame_statistics import Level
-from photoplan.quality.photon_transfer import is_clipped_dark
+from photoplan.quality.camera.dark_signal import dark_current
+from photoplan.quality.camera.emva import EmvaPoints, EmvaSheet, emva_sheet
+from photoplan.quality.camera.frame_statistics import Level
+from photoplan.quality.camera.photon_transfer import is_clipped_dark
 from photoplan.report.characterise_charts import Chart, Curve
 
 __all__ = ["analyse", "missing"]

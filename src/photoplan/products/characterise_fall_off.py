@@ -16,9 +16,9 @@ from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_groups import FrameGroup
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
 from photoplan.products.fall_off_correction import correction_text
-from photoplan.quality.fall_off import FallOff, fit_fall_off
-from photoplan.quality.fall_off_adjust import FallOffSettings
-from photoplan.quality.fall_off_model import FallOffModel, gain_image
+from photoplan.quality.camera.fall_off import FallOff, fit_fall_off
+from photoplan.quality.camera.fall_off_adjust import FallOffSettings
+from photoplan.quality.camera.fall_off_model import FallOffModel, gain_image
 from photoplan.report.characterise_charts import Chart, Curve, Picture
 
 __all__ = ["analyse", "missing"]

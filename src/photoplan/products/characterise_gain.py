@@ -11,8 +11,8 @@ from photoplan.errors import InputError
 from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_groups import FrameGroup, frame_groups
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
-from photoplan.quality.approach import LEAST_VALUES
-from photoplan.quality.gain_control import GainControl, compare_transitions, gain_control
+from photoplan.quality.camera.approach import LEAST_VALUES
+from photoplan.quality.camera.gain_control import GainControl, compare_transitions, gain_control
 from photoplan.report.characterise_charts import Chart, Curve
 
 __all__ = ["analyse", "missing"]

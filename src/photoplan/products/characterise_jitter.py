@@ -19,9 +19,9 @@ from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_groups import FrameGroup, frame_groups
 from photoplan.products.characterise_jitter_charts import jitter_charts
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
-from photoplan.quality.line_jitter import LineJitter, grey_error, line_jitter
-from photoplan.quality.parallel_edges import EdgePair, above_control, compare_edges
-from photoplan.quality.plumb_edge import EdgeLines, correlate_edge, fit_edge
+from photoplan.quality.camera.line_jitter import LineJitter, grey_error, line_jitter
+from photoplan.quality.camera.parallel_edges import EdgePair, above_control, compare_edges
+from photoplan.quality.camera.plumb_edge import EdgeLines, correlate_edge, fit_edge
 
 __all__ = ["Edge", "analyse", "missing"]
 

@@ -11,9 +11,9 @@ from photoplan.io.series_pixels import Plane
 from photoplan.products.characterise_common import Run, black_of, exposure_runs, prefix, saturation_of, tried
 from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
-from photoplan.quality.frame_statistics import Level, check_level
-from photoplan.quality.linearity import HIGH, Linearity, linearity
-from photoplan.quality.saturation import find_saturation
+from photoplan.quality.camera.frame_statistics import Level, check_level
+from photoplan.quality.camera.linearity import HIGH, Linearity, linearity
+from photoplan.quality.camera.saturation import find_saturation
 from photoplan.report.characterise_charts import Chart, Curve
 
 __all__ = ["analyse", "missing"]

@@ -9,7 +9,7 @@ import numpy as np
 from photoplan.products.characterise_common import prefix
 from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
-from photoplan.quality.frame_statistics import Level
+from photoplan.quality.camera.frame_statistics import Level
 from photoplan.report.characterise_charts import Chart, Curve
 
 __all__ = ["analyse", "missing"]

@@ -11,7 +11,7 @@ from photoplan.io.series_pixels import Plane
 from photoplan.products.characterise_common import black_of, prefix, tried
 from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
-from photoplan.quality.fixed_pattern import (
+from photoplan.quality.camera.fixed_pattern import (
     PatternVariance,
     Spectrogram,
     pattern_variance,
@@ -19,8 +19,8 @@ from photoplan.quality.fixed_pattern import (
     signed_root,
     spectrogram,
 )
-from photoplan.quality.frame_statistics import FrameStack, check_level
-from photoplan.quality.photon_transfer import is_clipped_dark
+from photoplan.quality.camera.frame_statistics import FrameStack, check_level
+from photoplan.quality.camera.photon_transfer import is_clipped_dark
 from photoplan.report.characterise_charts import Chart, Curve
 
 __all__ = ["analyse", "missing"]

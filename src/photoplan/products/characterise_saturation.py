@@ -10,8 +10,8 @@ from photoplan.io.series_pixels import Plane
 from photoplan.products.characterise_common import Run, black_of, exposure_runs, prefix, tried
 from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_result import Figure, Outcome, joined
-from photoplan.quality.frame_statistics import check_level
-from photoplan.quality.saturation import find_saturation
+from photoplan.quality.camera.frame_statistics import check_level
+from photoplan.quality.camera.saturation import find_saturation
 from photoplan.report.characterise_charts import Chart, Curve
 
 __all__ = ["analyse", "missing"]

@@ -13,7 +13,7 @@ from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_groups import FrameGroup, frame_groups
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
 from photoplan.products.characterise_targets import locate_targets
-from photoplan.quality.stage import LEAST_POINTS, StageCalibration, b4_lines, stage_calibration
+from photoplan.quality.camera.stage import LEAST_POINTS, StageCalibration, b4_lines, stage_calibration
 from photoplan.report.characterise_charts import Chart, Curve
 from photoplan.report.drawing import round_down
 

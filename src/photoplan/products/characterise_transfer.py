@@ -9,8 +9,8 @@ from photoplan.io.series_statistics import ReducedPoint
 from photoplan.products.characterise_common import dark_levels, prefix, tried
 from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
-from photoplan.quality.frame_statistics import Level
-from photoplan.quality.photon_transfer import PhotonTransfer, photon_transfer
+from photoplan.quality.camera.frame_statistics import Level
+from photoplan.quality.camera.photon_transfer import PhotonTransfer, photon_transfer
 from photoplan.report.characterise_charts import Chart, Curve
 
 __all__ = ["analyse", "missing", "reduced_level"]

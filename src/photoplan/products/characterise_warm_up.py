@@ -14,8 +14,8 @@ from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_groups import FrameGroup, frame_groups
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
 from photoplan.products.characterise_targets import locate_targets
-from photoplan.quality.approach import LEAST_VALUES
-from photoplan.quality.warm_up import Course, WarmUp, warm_up
+from photoplan.quality.camera.approach import LEAST_VALUES
+from photoplan.quality.camera.warm_up import Course, WarmUp, warm_up
 from photoplan.report.characterise_charts import Chart, Curve
 
 __all__ = ["analyse", "missing"]

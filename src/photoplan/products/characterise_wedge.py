@@ -14,8 +14,8 @@ from photoplan.io.series_pixels import Plane, plane_pixels
 from photoplan.products.characterise_common import black_of, prefix, saturation_of, tried
 from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
-from photoplan.quality.frame_statistics import Level, StackSums
-from photoplan.quality.grey_wedge import GreyWedge, grey_wedge
+from photoplan.quality.camera.frame_statistics import Level, StackSums
+from photoplan.quality.camera.grey_wedge import GreyWedge, grey_wedge
 from photoplan.report.characterise_charts import Chart, Curve
 
 __all__ = ["analyse", "missing"]

@@ -16,12 +16,12 @@ from photoplan.geometry.grid import Window
 from photoplan.io.chromatic_file import read_chromatic, write_chromatic
 from photoplan.io.raster import RasterReader
 from photoplan.products.aligned_reader import AlignedReader
-from photoplan.quality.chromatic import BandModel, ChromaticModel, Displacements, fit_band
-from photoplan.quality.chromatic_discs import disc_displacements
-from photoplan.quality.chromatic_edges import edge_displacements
-from photoplan.quality.chromatic_patches import patch_displacements
-from photoplan.quality.discs import DiscSettings, find_discs
-from photoplan.quality.edge_find import EdgePicture, find_edges
+from photoplan.quality.colour.disc_displacements import disc_displacements
+from photoplan.quality.colour.discs import DiscSettings, find_discs
+from photoplan.quality.colour.edge_displacements import edge_displacements
+from photoplan.quality.colour.model import BandModel, ChromaticModel, Displacements, fit_band
+from photoplan.quality.colour.patch_displacements import patch_displacements
+from photoplan.quality.edges.find import EdgePicture, find_edges
 
 __all__ = [
     "ChromaticRequest",
@@ -60,7 +60,7 @@ class ChromaticRequest:
     method: Literal["auto", "discs", "windows", "edges"] = "auto"
     """``auto``: discs where the image shows twelve and more, else windows that are matched, else straight edges."""
     kind: str | None = None
-    """A name of `photoplan.quality.chromatic.KINDS`; None: chosen by cross-validation."""
+    """A name of `photoplan.quality.colour.model.KINDS`; None: chosen by cross-validation."""
 
 
 def measure_chromatic(request: ChromaticRequest) -> ChromaticModel:

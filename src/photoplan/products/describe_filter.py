@@ -8,8 +8,8 @@ from typing import Any
 from photoplan.io.disk import write_atomically
 from photoplan.io.product import check_output
 from photoplan.products.filter_files import load_filter
-from photoplan.quality.convolution import Convolution
-from photoplan.quality.filters import FilterKernel
+from photoplan.quality.restoration.convolution import Convolution
+from photoplan.quality.restoration.filters import FilterKernel
 from photoplan.report.filter_plots import FilterPlots, KernelPicture
 
 __all__ = ["describe_filter", "draw_filter"]

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 from photoplan.io.fall_off_file import FallOffEntry, TermEntry, fall_off_text, read_fall_off_entry
-from photoplan.quality.fall_off import FallOff
-from photoplan.quality.fall_off_model import FallOffModel
+from photoplan.quality.camera.fall_off import FallOff
+from photoplan.quality.camera.fall_off_model import FallOffModel
 
 __all__ = ["correction_text", "read_fall_off"]
 

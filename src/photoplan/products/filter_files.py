@@ -8,7 +8,7 @@ from photoplan.errors import InputError, UsageError
 from photoplan.io.disk import write_atomically
 from photoplan.io.filter_file import FilterEntries, KernelEntry, filter_text, plain_fact, read_filter_file
 from photoplan.io.product import check_output
-from photoplan.quality.filters import FilterKernel, RestorationFilter
+from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
 
 __all__ = ["entries_of", "load_filter", "save_filter"]
 

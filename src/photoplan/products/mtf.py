@@ -18,8 +18,8 @@ from photoplan.products.mtf_image import LightImage, linearisation_of
 from photoplan.products.mtf_measure import Measuring, measure_image
 from photoplan.products.mtf_page import mtf_page
 from photoplan.products.mtf_result import EdgeGroup, ImageMtf, MtfReport
-from photoplan.quality.edge_find import EdgeRules
-from photoplan.quality.enhancement import Enhancement, enhancement_of
+from photoplan.quality.edges.enhancement import Enhancement, enhancement_of
+from photoplan.quality.edges.find import EdgeRules
 from photoplan.quality.linearise import Linearisation
 from photoplan.report.mtf_plots import MtfPlots
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.products.mtf_result import EdgeGroup, LabComparison, MeasuredEdge
-from photoplan.quality.edge_groups import combine, field_cell, fit_gaussian, mean_curve, quantiles, sigma_of_interval
+from photoplan.quality.edges.groups import combine, field_cell, fit_gaussian, mean_curve, quantiles, sigma_of_interval
 
 __all__ = ["ENOUGH", "group_edges"]
 

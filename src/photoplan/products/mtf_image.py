@@ -12,8 +12,8 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io.linearisation_file import read_linearisation_table
 from photoplan.io.raster import RasterReader
-from photoplan.quality.edge_candidates import range_of
-from photoplan.quality.edge_find import EdgePicture
+from photoplan.quality.edges.candidates import range_of
+from photoplan.quality.edges.find import EdgePicture
 from photoplan.quality.linearise import Linearisation
 
 __all__ = ["LUMINANCE", "LightImage", "linearisation_of"]

@@ -18,9 +18,9 @@ from photoplan.products.mtf_groups import ENOUGH, group_edges
 from photoplan.products.mtf_image import LightImage
 from photoplan.products.mtf_result import ImageMtf, MeasuredEdge, rejected_words
 from photoplan.products.mtf_search import Found, parted, search_edges, select_spread, tiles_of
-from photoplan.quality.edge_find import EdgeRegion, EdgeRules
-from photoplan.quality.edge_response import EdgeSettings, measure_edge
-from photoplan.quality.enhancement import enhancement_of
+from photoplan.quality.edges.enhancement import enhancement_of
+from photoplan.quality.edges.find import EdgeRegion, EdgeRules
+from photoplan.quality.edges.response import EdgeSettings, measure_edge
 
 __all__ = ["Measuring", "measure_image"]
 

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from photoplan.geometry.grid import Window
 from photoplan.products.plain_values import plain
-from photoplan.quality.bar_curve import BarCurve, coltman_mtf
 from photoplan.quality.mtf_curve import MtfCurve
-from photoplan.quality.siemens import StarMtf
-from photoplan.quality.usaf import UsafBars, UsafResult
+from photoplan.quality.patterns.bar_curve import BarCurve, coltman_mtf
+from photoplan.quality.patterns.siemens import StarMtf
+from photoplan.quality.patterns.usaf import UsafBars, UsafResult
 from photoplan.report.pattern_plots import Curve, PatternFacts, PolarCurve
 
 __all__ = ["ImagePattern", "PatternReport", "PatternResult"]

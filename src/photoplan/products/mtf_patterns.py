@@ -17,12 +17,12 @@ from photoplan.io.named_table import write_named_table
 from photoplan.io.product import check_output
 from photoplan.products.mtf_image import LUMINANCE, LightImage, linearisation_of
 from photoplan.products.mtf_pattern_result import ImagePattern, PatternReport, PatternResult
-from photoplan.quality.bar_curve import bar_curve
-from photoplan.quality.bars import measure_bars
 from photoplan.quality.linearise import Linearisation
-from photoplan.quality.pattern_pixels import clipped_pixels
-from photoplan.quality.siemens import StarRules, measure_star
-from photoplan.quality.usaf import UsafRules, measure_usaf
+from photoplan.quality.patterns.bar_curve import bar_curve
+from photoplan.quality.patterns.bars import measure_bars
+from photoplan.quality.patterns.pixels import clipped_pixels
+from photoplan.quality.patterns.siemens import StarRules, measure_star
+from photoplan.quality.patterns.usaf import UsafRules, measure_usaf
 from photoplan.report.pattern_plots import PatternPlots, pattern_page
 
 __all__ = ["PatternRequest", "measure_patterns"]

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.products.plain_values import plain
-from photoplan.quality.edge_find import REASONS
-from photoplan.quality.edge_groups import CombinedValue, GaussianFit
-from photoplan.quality.edge_response import EdgeMeasurement
-from photoplan.quality.enhancement import Enhancement
+from photoplan.quality.edges.enhancement import Enhancement
+from photoplan.quality.edges.find import REASONS
+from photoplan.quality.edges.groups import CombinedValue, GaussianFit
+from photoplan.quality.edges.response import EdgeMeasurement
 from photoplan.quality.mtf_curve import MtfCurve
 
 __all__ = ["EdgeGroup", "ImageMtf", "LabComparison", "MeasuredEdge", "MtfReport", "group_lines", "rejected_words"]

@@ -9,8 +9,8 @@ from math import ceil, cos, floor, hypot, radians
 
 from photoplan.geometry.grid import Window
 from photoplan.products.mtf_image import LightImage
-from photoplan.quality.edge_candidates import StraightEdge, find_lines
-from photoplan.quality.edge_find import EdgeRegion, EdgeRules, examine
+from photoplan.quality.edges.candidates import StraightEdge, find_lines
+from photoplan.quality.edges.find import EdgeRegion, EdgeRules, examine
 
 __all__ = ["Found", "join_lines", "parted", "search_edges", "select_spread", "tiles_of"]
 

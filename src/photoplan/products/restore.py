@@ -28,8 +28,8 @@ from photoplan.products.filter_files import entries_of, load_filter
 from photoplan.products.restore_execute import Job, RestoredImage, earlier_result, memory_of_a_tile, restore_one
 from photoplan.products.restore_request import RestoreRequest
 from photoplan.products.restored_reader import RestoredReader, kept_nodata, linearisation_of, restored_reader
-from photoplan.quality.chromatic import ChromaticModel
-from photoplan.quality.filters import RestorationFilter
+from photoplan.quality.colour.model import ChromaticModel
+from photoplan.quality.restoration.filters import RestorationFilter
 
 __all__ = [
     "RestorePlan",

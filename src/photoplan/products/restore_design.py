@@ -16,12 +16,12 @@ from photoplan.geometry.grid import Window
 from photoplan.products.mtf import MtfRequest, measure_mtf
 from photoplan.products.mtf_image import LightImage, linearisation_of
 from photoplan.products.mtf_result import ImageMtf, MtfReport
-from photoplan.quality.design import Design, DesignOptions, Sharpness, design_filter
-from photoplan.quality.edge_response import EdgeMeasurement
-from photoplan.quality.filters import FilterKernel, RestorationFilter
-from photoplan.quality.image_noise import block_noise, image_noise
-from photoplan.quality.regularised import SceneStatistics
-from photoplan.quality.sharpness import LEAST_EDGES, sharpness_of
+from photoplan.quality.edges.response import EdgeMeasurement
+from photoplan.quality.edges.sharpness import LEAST_EDGES, sharpness_of
+from photoplan.quality.restoration.design import Design, DesignOptions, Sharpness, design_filter
+from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
+from photoplan.quality.restoration.image_noise import block_noise, image_noise
+from photoplan.quality.restoration.regularised import SceneStatistics
 
 __all__ = ["DesignRequest", "DesignedPart", "MeasuredFilter", "design_restoration"]
 

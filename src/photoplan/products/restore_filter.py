@@ -12,8 +12,8 @@ from photoplan.errors import UsageError
 from photoplan.io.filter_file import filter_text
 from photoplan.products.filter_files import entries_of, load_filter, save_filter
 from photoplan.products.restore_design import DesignRequest, MeasuredFilter, design_restoration
-from photoplan.quality.aperture import aperture_filter
-from photoplan.quality.filters import FilterKernel, RestorationFilter
+from photoplan.quality.restoration.aperture import aperture_filter
+from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
 
 __all__ = ["FilterRequest", "keep_filter", "requested_filter"]
 

@@ -8,8 +8,8 @@ from typing import Any, Literal
 
 from photoplan.errors import UsageError
 from photoplan.io.storage import COMPRESSIONS
-from photoplan.quality.chromatic import ChromaticModel
-from photoplan.quality.filters import RestorationFilter
+from photoplan.quality.colour.model import ChromaticModel
+from photoplan.quality.restoration.filters import RestorationFilter
 
 __all__ = ["RestoreRequest"]
 

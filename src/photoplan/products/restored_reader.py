@@ -16,9 +16,9 @@ from photoplan.io.raster import RasterReader
 from photoplan.io.raster_info import RasterInfo
 from photoplan.io.storage import Nodata
 from photoplan.products.aligned_reader import AlignedReader
-from photoplan.quality.filters import RestorationFilter
 from photoplan.quality.linearise import Linearisation
-from photoplan.quality.restorer import RestoredPixels, Restorer
+from photoplan.quality.restoration.filters import RestorationFilter
+from photoplan.quality.restoration.restorer import RestoredPixels, Restorer
 
 __all__ = ["RestoredReader", "kept_nodata", "linearisation_of", "restored_reader"]
 

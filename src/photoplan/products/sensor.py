@@ -13,7 +13,7 @@ from photoplan.io.disk import write_atomically
 from photoplan.io.product import check_output
 from photoplan.io.sensor_file import SensorDescription, read_sensor
 from photoplan.products.sensor_figures import Figure, noise_budget, sensor_figures
-from photoplan.quality import sensor
+from photoplan.quality.sensor import figures as sensor
 from photoplan.report.sensor_report import SensorFacts, SensorPlots, sensor_report
 
 __all__ = ["SensorReport", "SensorRequest", "describe_sensor"]

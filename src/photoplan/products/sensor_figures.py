@@ -8,9 +8,11 @@ from math import degrees, radians
 
 from photoplan.errors import InputError
 from photoplan.io.sensor_file import Chip, Noise, Optics, Picture, SensorDescription, Transfer, Video, Viewing
-from photoplan.quality import sensor, sensor_noise, video_norm
-from photoplan.quality.sensor_noise import NoiseBudget
-from photoplan.quality.video_norm import VideoNorm
+from photoplan.quality.sensor import figures as sensor
+from photoplan.quality.sensor import noise as sensor_noise
+from photoplan.quality.sensor import video_norm
+from photoplan.quality.sensor.noise import NoiseBudget
+from photoplan.quality.sensor.video_norm import VideoNorm
 
 __all__ = ["SHARES", "Figure", "noise_budget", "sensor_figures"]
 

@@ -20,10 +20,10 @@ from photoplan.io.run_record import record_path, versions, write_run_record
 from photoplan.io.simulation_file import read_simulation
 from photoplan.io.whole_image import write_whole_image
 from photoplan.products.simulate_model import model_of
-from photoplan.quality.simulation import MOST_PIXELS, FormedImage, ImageModel, form_series
-from photoplan.quality.simulation_scenes import PATTERNS, PatternScene, Scene, parse_pattern
-from photoplan.quality.simulation_sensor_parts import Quantisation
-from photoplan.quality.simulation_truth import model_mtf50
+from photoplan.quality.formation.model import MOST_PIXELS, FormedImage, ImageModel, form_series
+from photoplan.quality.formation.scenes import PATTERNS, PatternScene, Scene, parse_pattern
+from photoplan.quality.formation.sensor_parts import Quantisation
+from photoplan.quality.formation.truth import model_mtf50
 
 __all__ = ["SimulateReport", "SimulateRequest", "SimulatedImage", "simulate"]
 

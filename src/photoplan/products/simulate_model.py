@@ -6,9 +6,9 @@ from typing import Any
 
 from photoplan.errors import InputError
 from photoplan.io.simulation_file import SimulationFile
-from photoplan.quality.simulation import ImageModel
-from photoplan.quality.simulation_optics_parts import Aperture, Falloff, Lateral, LineJitter, Spread
-from photoplan.quality.simulation_sensor_parts import (
+from photoplan.quality.formation.model import ImageModel
+from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitter, Spread
+from photoplan.quality.formation.sensor_parts import (
     AutomaticGain,
     DarkCurrent,
     Defect,

@@ -1,0 +1,211 @@
+"""Defect elements: pixels, rows and columns that do not behave as their neighbours (Behr 1989, §4.2.6).
+
+A pixel is compared with the median of its surroundings; what counts as noise is the scatter that most pixels have
+(median of absolute deviations), so that defects do not hide themselves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import sqrt
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, norm
+
+from photoplan.errors import InputError
+from photoplan.quality.camera.high_pass import background
+
+__all__ = ["Defect", "DefectList", "LogHistogram", "find_blinking", "find_defects", "find_lines", "log_histogram"]
+
+Kind = Literal["hot", "dark", "blinking", "row", "column"]
+#: False alarms that are expected in a whole image.
+_ALARMS = 0.01
+#: Defects that are listed at most.
+MOST = 5000
+#: Side of the smallest image in which a pixel has surroundings.
+LEAST_SIDE = 16
+
+
+@dataclass(frozen=True)
+class Defect:
+    """One element; positions are those of the plane's array."""
+
+    kind: Kind
+    col: float
+    """NaN for a whole row."""
+    row: float
+    """NaN for a whole column."""
+    value: float
+    """Deviation from the surroundings, grey values; for blinking the temporal standard deviation."""
+    ratio: float
+    """The same over the threshold."""
+
+
+@dataclass(frozen=True, eq=False)
+class DefectList:
+    """Defects of one kind and how they were told."""
+
+    defects: tuple[Defect, ...]
+    """The strongest first; `MOST` at most."""
+    count: int
+    """All of them."""
+    threshold: float
+    """Grey values."""
+    scatter: float
+    """Standard deviation of what most pixels show, grey values."""
+    deviation: NDArray[np.float64] | None
+    """Deviation of every pixel; None for lines and blinking."""
+
+
+def _scatter(values: NDArray[np.float64], least: float) -> float:
+    """Robust standard deviation, not below `least`."""
+    middle = float(np.median(values))
+    return max(1.4826 * float(np.median(np.abs(values - middle))), least)
+
+
+def _factor(count: int) -> float:
+    """How many standard deviations a Gaussian value exceeds by chance in 0.01 of such images."""
+    return float(norm.isf(_ALARMS / max(count, 1) / 2))
+
+
+def find_defects(
+    mean: NDArray[np.float64], temporal_variance: float, frames: int, kinds: tuple[Kind, ...], share: float = 0.0
+) -> DefectList:
+    """Pixels that differ from their surroundings.
+
+    Parameters
+    ----------
+    mean : array, shape (h, w)
+        Mean image of dark or flat frames.
+    temporal_variance : float
+        Of one sample; NaN: unknown.
+    frames : int
+        Frames of the mean.
+    kinds : tuple
+        ``hot`` (brighter), ``dark`` (darker), or both.
+    share : float
+        A pixel must differ by this part of its surroundings' grey value, whatever the scatter.
+
+    Raises
+    ------
+    InputError
+        The image is smaller than 16 × 16 pixels.
+
+    Notes
+    -----
+    The threshold is the number of scatters that Gaussian noise exceeds once in a hundred images; the scatter is at
+    least that of rounding and of the temporal noise of the mean.
+    """
+    if min(mean.shape) < LEAST_SIDE:
+        raise InputError(
+            f"image of {mean.shape[1]} × {mean.shape[0]} pixels; defects are looked for in {LEAST_SIDE} × {LEAST_SIDE} "
+            "pixels or more"
+        )
+    ground = background(mean)
+    deviation = mean - ground
+    rest = temporal_variance / frames if np.isfinite(temporal_variance) else 0.0
+    scatter = _scatter(deviation, sqrt(1 / 12 / frames + max(rest, 0.0)))
+    # A mean of few frames has rounded values: a step of one grey value in one of them is no defect.
+    threshold = max(_factor(mean.size) * scatter, 1.5 / frames)
+    limit = np.maximum(threshold, share * np.abs(ground))
+    found = np.zeros(mean.shape, bool)
+    if "hot" in kinds:
+        found |= deviation > limit
+    if "dark" in kinds:
+        found |= deviation < -limit
+    rows, cols = np.nonzero(found)
+    ratio = np.abs(deviation[rows, cols]) / limit[rows, cols]
+    order = np.argsort(-ratio, kind="stable")[:MOST]
+    listed = tuple(
+        Defect("hot" if deviation[r, c] > 0 else "dark", float(c), float(r), float(deviation[r, c]), float(q))
+        for r, c, q in zip(rows[order], cols[order], ratio[order])
+    )
+    return DefectList(listed, int(found.sum()), threshold, scatter, deviation)
+
+
+def find_blinking(variance: NDArray[np.float64], frames: int) -> DefectList:
+    """Pixels whose grey value changes from frame to frame far more than that of most.
+
+    Parameters
+    ----------
+    variance : array, shape (h, w)
+        Temporal variance of every pixel over `frames` frames.
+
+    Raises
+    ------
+    InputError
+        There are fewer than four frames, or most pixels never change, so that there is no noise to compare with.
+    """
+    if frames < 4:
+        raise InputError(f"{frames} frames at a setting; blinking pixels need four or more")
+    usual = float(np.median(variance)) * (frames - 1) / float(chi2.median(frames - 1))
+    if usual < 1e-3:
+        raise InputError(
+            "most pixels do not change at all from frame to frame (black cut off, or rounding): there is no noise with "
+            "which a blinking pixel could be compared"
+        )
+    usual = max(usual, float(np.mean(np.minimum(variance, 16 * usual))))
+    # Shot noise differs from pixel to pixel with its light, so the limit is taken generously.
+    limit = 1.5 * usual * float(chi2.isf(_ALARMS / variance.size, frames - 1)) / (frames - 1)
+    rows, cols = np.nonzero(variance > limit)
+    sigma = np.sqrt(variance[rows, cols])
+    order = np.argsort(-sigma, kind="stable")[:MOST]
+    listed = tuple(
+        Defect("blinking", float(cols[k]), float(rows[k]), float(sigma[k]), float(sigma[k] / sqrt(limit)))
+        for k in order
+    )
+    return DefectList(listed, len(rows), sqrt(limit), sqrt(usual), None)
+
+
+def find_lines(mean: NDArray[np.float64]) -> DefectList:
+    """Whole rows and columns brighter or darker than their neighbours: by their medians against running ones."""
+    listed: list[Defect] = []
+    worst_limit = worst_scatter = 0.0
+    kinds: tuple[tuple[Kind, int], ...] = (("row", 1), ("column", 0))
+    for kind, axis in kinds:
+        profile = np.median(mean, axis=axis)
+        mixed = profile + (mean.mean(axis=axis) - profile) * 0.1  # medians of grey values come in steps
+        deviation = mixed - _running_median(mixed)
+        pixel = _scatter(mean - background(mean), sqrt(1 / 12))
+        scatter = _scatter(deviation, pixel / sqrt(mean.shape[axis]) + 0.02)
+        # A quarter more: the scatter of a hundred lines is itself known to a tenth only.
+        limit = max(1.25 * _factor(profile.size) * scatter, 0.5)
+        for k in np.flatnonzero(np.abs(deviation) > limit):
+            col, row = (float("nan"), float(k)) if kind == "row" else (float(k), float("nan"))
+            listed.append(Defect(kind, col, row, float(deviation[k]), float(abs(deviation[k]) / limit)))
+        worst_limit, worst_scatter = max(worst_limit, limit), max(worst_scatter, scatter)
+    listed.sort(key=lambda d: -d.ratio)
+    return DefectList(tuple(listed[:MOST]), len(listed), worst_limit, worst_scatter, None)
+
+
+def _running_median(profile: NDArray[np.float64], reach: int = 8) -> NDArray[np.float64]:
+    padded = np.pad(profile, min(reach, profile.size - 1), mode="reflect")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, padded.size - profile.size + 1)
+    return np.asarray(np.median(windows, axis=-1))
+
+
+@dataclass(frozen=True, eq=False)
+class LogHistogram:
+    """How many pixels deviate by how much, and how many would by Gaussian noise."""
+
+    deviation: NDArray[np.float64]
+    """Middles of the classes, grey values."""
+    count: NDArray[np.int64]
+    model: NDArray[np.float64]
+    """Expected counts of a Gaussian with the robust scatter."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {name: getattr(self, name).tolist() for name in ("deviation", "count", "model")}
+
+
+def log_histogram(deviation: NDArray[np.float64], scatter: float) -> LogHistogram:
+    """Histogram for a logarithmic axis, over the whole range; classes of a third of the scatter, 4000 at most."""
+    low, high = float(deviation.min()), float(deviation.max())
+    classes = int(np.clip(3 * (high - low) / scatter, 20, 4000)) if scatter > 0 else 200
+    edges = np.linspace(low, high if high > low else low + 1.0, classes + 1)
+    count, _ = np.histogram(deviation, edges)
+    model = np.diff(norm.cdf(edges, float(np.median(deviation)), scatter)) * deviation.size
+    return LogHistogram((edges[:-1] + edges[1:]) / 2, count, model)

@@ -1,0 +1,290 @@
+"""Light fall-off measured in a flat image: natural and artificial part, told apart where they can be (Behr, §4.2.1)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from photoplan.errors import GeometryError, InputError
+from photoplan.quality.camera.fall_off_adjust import FallOffSettings, Fit, adjust, columns, separability, significant
+from photoplan.quality.camera.fall_off_blocks import Blocks, to_blocks
+from photoplan.quality.camera.fall_off_model import FallOffModel, half_diagonal
+
+__all__ = ["Corner", "Dirt", "FallOff", "FallOffSettings", "Term", "fit_fall_off"]
+
+Array = NDArray[np.float64]
+
+#: Least part of what an unknown changes that no other one can do as well.
+SEPARABLE = 0.05
+_KNOWN = 0.1
+"""Largest standard deviation of an estimated camera constant as part of it."""
+_DIRTY = 5.5
+_MOST_DIRT = 100
+_SATURATED = 0.001
+_UNEVEN, _STRUCTURE = 0.02, 0.5
+"""Residual as part of the brightness, and correlation of neighbours, above which the surface is not even."""
+
+
+@dataclass(frozen=True)
+class Term:
+    """A term of the artificial part."""
+
+    n: int
+    m: int
+    coefficient: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class Corner:
+    """Brightness that is lost in a corner against the principal point, parts of it."""
+
+    name: str
+    total: float
+    sigma: float
+    natural: float | None
+    """None: not told apart."""
+    artificial: float | None
+
+
+@dataclass(frozen=True)
+class Dirt:
+    """A place that differs from the smooth surface: dust, a scratch, a stain."""
+
+    x: float
+    y: float
+    """Column and row of its middle."""
+    width: int
+    height: int
+    """Of the blocks that it covers, pixels."""
+    depth: float
+    """Largest difference, part of the brightness there; negative: darker."""
+
+
+@dataclass(frozen=True, eq=False)
+class FallOff:
+    """Result of the adjustment."""
+
+    model: FallOffModel
+    level: float
+    """Grey value at the principal point, above dark."""
+    sigma_level: float
+    terms: tuple[Term, ...]
+    camera_constant: float | None
+    sigma_camera_constant: float | None
+    """None: given, or not determined."""
+    sigma_principal_point: tuple[float, float] | None
+    """None: it was given."""
+    corners: tuple[Corner, ...]
+    rank: str
+    """What the fall-off does not determine, and why; empty: everything asked is determined."""
+    separability: dict[str, float] = field(default_factory=dict)
+    """For every estimated unknown of the natural part: which share of its effect no other unknown can imitate."""
+    residual_rms: float = math.nan
+    """Of the blocks after correction, parts of the brightness."""
+    residual_largest: float = math.nan
+    neighbour_correlation: float = math.nan
+    """Of residuals of neighbouring blocks: 0 for noise; more tells structure that the model does not describe."""
+    range_before: float = math.nan
+    """Brightest minus darkest block before the correction, part of the level."""
+    dirt: tuple[Dirt, ...] = ()
+    blocks: Blocks | None = None
+    residuals: Array | None = None
+    """Relative residuals of the blocks, measured minus model, shape (h, w); NaN: block not known."""
+
+    @property
+    def asymmetry(self) -> float:
+        """Largest difference of two corners' brightness, part of that at the principal point."""
+        totals = [c.total for c in self.corners]
+        return max(totals) - min(totals)
+
+
+def fit_fall_off(
+    flat: NDArray[np.floating], settings: FallOffSettings | None = None, saturation: float | None = None
+) -> FallOff:
+    """Fit a model of light fall-off to the image of an evenly lit surface.
+
+    The image is reduced to blocks, each the mean of the middle half of its values, and adjusted with weights that
+    leave out dirt. Terms that are not significant are dropped. Where an estimated camera constant cannot be told from
+    the polynomial, it is not stated: the whole is then modelled by the terms alone, and `rank` says so.
+
+    Parameters
+    ----------
+    flat : ndarray, shape (h, w)
+        Mean of flat frames, dark frame subtracted; NaN: pixels not to be used.
+    settings : FallOffSettings, optional
+    saturation : float, optional
+        Grey value (above dark) of saturated pixels.
+
+    Raises
+    ------
+    InputError
+        The image is too small or dark, saturated, mostly unknown, or shows a structure.
+    GeometryError
+        Nothing of what was asked can be estimated.
+    """
+    settings = settings or FallOffSettings()
+    blocks = _checked(flat, saturation)
+    terms, rank, shares = settings.terms(), "", {}
+    fit = adjust(blocks, settings, terms)
+    if fit.free:
+        shares = separability(blocks, fit)
+        rank = _rank(fit, shares, settings)
+        if rank and settings.artificial == "none":
+            raise GeometryError(rank)
+        if rank:
+            settings = FallOffSettings(
+                principal_point=settings.principal_point,
+                artificial=settings.artificial,
+                degree=settings.degree,
+                dark=settings.dark,
+            )
+            fit = adjust(blocks, settings, terms)
+    kept = significant(blocks, fit)
+    if kept != fit.terms:
+        fit = adjust(blocks, settings, kept, fit.weights)
+    found = _result(blocks, settings, fit, (rank, shares))
+    # A surface that is not general leaves asymmetry too; only the general one can say that nothing smooth fits.
+    general = settings.artificial == "surface"
+    if general and found.residual_rms > _UNEVEN and found.neighbour_correlation > _STRUCTURE:
+        raise InputError(
+            f"flat image: {100 * found.residual_rms:.1f} % (rms) is left beside any smooth surface, and neighbouring "
+            f"blocks resemble each other ({found.neighbour_correlation:.2f}): it shows a structure, not an evenly lit "
+            "surface. Take flat frames of one, or out of focus"
+        )
+    return found
+
+
+def _checked(flat: NDArray[np.floating], saturation: float | None) -> Blocks:
+    if flat.ndim != 2 or min(flat.shape) < 16:
+        raise InputError(f"flat image of shape {flat.shape}; at least 16 × 16 pixels are needed")
+    if saturation is not None and float((flat >= saturation).mean()) > _SATURATED:
+        raise InputError(
+            f"flat image: {100 * float((flat >= saturation).mean()):.1f} % of its pixels are saturated "
+            f"({saturation:g}); their fall-off is hidden. Take it with less light"
+        )
+    blocks = to_blocks(flat)
+    known = blocks.values[np.isfinite(blocks.values)]
+    if known.size < 0.5 * blocks.values.size or known.size < 64:
+        raise InputError(
+            f"flat image: {known.size} of {blocks.values.size} blocks have values; half of them are needed"
+        )
+    if not float(np.median(known)) > 0.0:
+        raise InputError("flat image: no brightness above the dark frame; is it a dark frame itself?")
+    return blocks
+
+
+def _rank(fit: Fit, shares: dict[str, float], settings: FallOffSettings) -> str:
+    """Which unknowns cannot be told apart; empty: none."""
+    sigmas = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
+    lost = [
+        f"{name} ({100 * (1 - share**2):.2f} % of what it changes, the other unknowns can do as well; its standard "
+        f"deviation would be {100 * sigma:.0f} % of {'it' if name == 'camera constant' else 'half the diagonal'})"
+        for (name, share), sigma in zip(shares.items(), sigmas)
+        if share < SEPARABLE or not sigma < _KNOWN
+    ]
+    if not lost:
+        return ""
+    # Without an artificial part the level is the only other unknown: the fall-off is then too weak.
+    other = f"the {settings.artificial} polynomial" if settings.artificial != "none" else "the noise"
+    return (
+        f"natural and artificial light fall-off are not told apart: {'; '.join(lost)} cannot be separated from "
+        f"{other}. Give the camera constant and principal point of a calibration, or ask for one of the two parts alone"
+    )
+
+
+def _result(blocks: Blocks, settings: FallOffSettings, fit: Fit, rank: tuple[str, dict[str, float]]) -> FallOff:
+    k, level = len(fit.free), float(fit.linear[0])
+    factors = fit.linear[1:] / level
+    c, unit = fit.camera_constant, half_diagonal(blocks.size)
+    model = FallOffModel(blocks.size, fit.point, c, fit.terms, tuple(float(f) for f in factors), settings.dark)
+    C = fit.covariance
+    # a_k = (level · a_k) / level
+    L = np.column_stack([-factors / level, np.eye(len(factors)) / level])
+    sigmas = np.sqrt(np.maximum(np.diag(L @ C[k:, k:] @ L.T), 0.0))
+    free = {name: math.sqrt(max(float(C[i, i]), 0.0)) for i, name in enumerate(fit.free)}
+    constant = free.get("camera constant")
+    across, down = (free.get(f"{side} of the principal point") for side in ("column", "row"))
+    computed = columns(blocks, fit.point, c, fit.terms) @ fit.linear
+    relative = blocks.spread_out(fit.residuals / computed)
+    clean = fit.weights > 0.0
+    return FallOff(
+        model,
+        level,
+        math.sqrt(float(C[k, k])),
+        tuple(Term(n, m, float(f), float(s)) for (n, m), f, s in zip(fit.terms, factors, sigmas)),
+        c,
+        None if constant is None or c is None else constant * c,
+        None if across is None or down is None else (across * unit, down * unit),
+        _corners(model, fit, blocks.size),
+        *rank,
+        float(np.sqrt(np.mean((fit.residuals / computed)[clean] ** 2))),
+        float(np.abs((fit.residuals / computed)[clean]).max()),
+        blocks.neighbour_correlation(np.where(clean, fit.residuals, np.nan)),
+        float(np.ptp(computed)) / level,
+        _dirt(blocks, blocks.spread_out(fit.residuals), relative),
+        blocks,
+        relative,
+    )
+
+
+def _corners(model: FallOffModel, fit: Fit, size: tuple[int, int]) -> tuple[Corner, ...]:
+    """Fall-off in the centres of the four corner pixels, with standard deviations by differences."""
+    names = ("upper left", "upper right", "lower left", "lower right")
+    x = np.array([0.0, size[0] - 1.0, 0.0, size[0] - 1.0])
+    y = np.array([0.0, 0.0, size[1] - 1.0, size[1] - 1.0])
+    unit, k = half_diagonal(size), len(fit.free)
+    linear = fit.linear
+
+    def relative(free: Array, coefficients: Array) -> Array:
+        point, c = list(fit.point), fit.camera_constant
+        for name, value in zip(fit.free, free):
+            if name == "camera constant":
+                c = c * math.exp(value) if c is not None else None
+            else:
+                point[0 if name.startswith("column") else 1] += value * unit
+        factors = tuple(float(v) for v in coefficients[1:] / coefficients[0])
+        return FallOffModel(size, (point[0], point[1]), c, fit.terms, factors).relative(x, y)
+
+    J = np.empty((4, k + len(linear)))
+    for i in range(J.shape[1]):
+        step = np.zeros(J.shape[1])
+        step[i] = 1e-5 if i < k else 1e-5 * abs(linear[0])
+        ends = [relative(s * step[:k], linear + s * step[k:]) for s in (1.0, -1.0)]
+        J[:, i] = (ends[0] - ends[1]) / (2.0 * step[i])
+    sigmas = np.sqrt(np.maximum(np.diag(J @ fit.covariance @ J.T), 0.0))
+    apart = model.camera_constant is not None
+    natural, artificial = model.natural(x, y), model.artificial(x, y)
+    return tuple(
+        Corner(
+            names[i],
+            float(1.0 - natural[i] * artificial[i]),
+            float(sigmas[i]),
+            float(1.0 - natural[i]) if apart else None,
+            float(1.0 - artificial[i]) if apart else None,
+        )
+        for i in range(4)
+    )
+
+
+def _dirt(blocks: Blocks, residuals: Array, relative: Array) -> tuple[Dirt, ...]:
+    """Connected blocks that stand out, the deepest first."""
+    known = np.isfinite(residuals)
+    # In grey values: the relative noise is larger in the corners.
+    limit = _DIRTY * 1.4826 * float(np.median(np.abs(residuals[known])))
+    if not limit > 0.0:
+        return ()
+    pieces, _ = ndimage.label(known & (np.abs(residuals) > limit), np.ones((3, 3)))
+    found = []
+    for number, place in enumerate(ndimage.find_objects(pieces), 1):
+        values = np.where(pieces[place] == number, relative[place], 0.0)
+        rows, columns = (s for s in place)
+        deepest = float(values.flat[int(np.abs(values).argmax())])
+        x0, y0 = blocks.corner(columns.start, rows.start)
+        x1, y1 = blocks.corner(columns.stop, rows.stop)
+        found.append(Dirt((x0 + x1) / 2.0, (y0 + y1) / 2.0, round(x1 - x0), round(y1 - y0), deepest))
+    return tuple(sorted(found, key=lambda d: -abs(d.depth))[:_MOST_DIRT])

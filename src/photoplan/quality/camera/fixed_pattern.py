@@ -1,0 +1,181 @@
+"""Fixed pattern: what differs from pixel to pixel and stays from frame to frame.
+
+Spatial variances as in EMVA 1288 release 4 linear, section 8: that of a mean image, without what is left of the
+temporal noise, split into rows, columns and single pixels by the variances of the row and column means; DSNU from dark,
+PRNU from dark and bright frames; spectrograms along rows and columns with the excess over white noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from math import nan, sqrt
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.quality.camera.high_pass import LINE_SHARE, WHITE_SHARE, high_pass
+
+__all__ = ["PatternVariance", "Spectrogram", "pattern_variance", "prnu_percent", "signed_root", "spectrogram"]
+
+#: Side of an image from which rows and columns can be told from pixels.
+_LEAST_SIDE = 16
+
+
+@dataclass(frozen=True)
+class PatternVariance:
+    """Spatial variances of a mean image in squared grey values; a small negative one is the noise of zero."""
+
+    total: float
+    total_sigma: float
+    row: float
+    """Of rows against each other."""
+    row_sigma: float
+    column: float
+    column_sigma: float
+    pixel: float
+    pixel_sigma: float
+    mean: float
+    """Grey value."""
+    temporal_rest: float
+    """Temporal variance of the mean image, which was taken out."""
+    filtered: bool
+    """Whether the slow variation was taken out."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+
+def pattern_variance(
+    mean: NDArray[np.float64], temporal_variance: float, frames: int, *, filtered: bool = False
+) -> PatternVariance:
+    """Spatial variances of the mean image of several frames.
+
+    Parameters
+    ----------
+    mean : array, shape (h, w)
+        Mean of the frames.
+    temporal_variance : float
+        Of one sample.
+    frames : int
+        How many were averaged.
+    filtered : bool
+        Take the slow variation out (uneven light) by the high pass of EMVA 1288; what it takes from white noise is
+        given back.
+
+    Raises
+    ------
+    InputError
+        The image is smaller than 16 × 16 pixels, or the temporal variance is unknown.
+    """
+    height, width = mean.shape
+    if min(height, width) < _LEAST_SIDE:
+        raise InputError(f"image of {width} × {height} pixels; the fixed pattern needs {_LEAST_SIDE} × {_LEAST_SIDE}")
+    if not np.isfinite(temporal_variance) or frames < 2:
+        raise InputError("a single frame; the fixed pattern needs two or more, to tell it from the temporal noise")
+    values = high_pass(mean) if filtered else mean
+    white, line = (WHITE_SHARE, LINE_SHARE) if filtered else (1.0, 1.0)
+    rest = temporal_variance / frames
+    measured = float(values.var(ddof=1))
+    of_rows = float(values.mean(axis=1).var(ddof=1)) / line
+    of_columns = float(values.mean(axis=0).var(ddof=1)) / line
+    # With q = pixel + rest: E[of_rows] = row + q / width, E[of_columns] = column + q / height and
+    # E[measured] = line (row + column) + white q; without the filter line = white = 1.
+    inner = (measured - line * (of_rows + of_columns)) / (white - line / width - line / height)
+    row, column, pixel = of_rows - inner / width, of_columns - inner / height, inner - rest
+    total = row + column + pixel
+    measured_sigma = inner * sqrt(2 / (mean.size - 1))
+    row_sigma = of_rows * sqrt(2 / (height - 1))
+    column_sigma = of_columns * sqrt(2 / (width - 1))
+    # What is left of the temporal noise is itself estimated.
+    rest_sigma = rest * sqrt(2 / ((frames - 1) * (mean.size - 1)))
+    pixel_sigma = sqrt(measured_sigma**2 + rest_sigma**2)
+    total_sigma = sqrt(row_sigma**2 + column_sigma**2 + pixel_sigma**2)
+    return PatternVariance(
+        total,
+        total_sigma,
+        row,
+        row_sigma,
+        column,
+        column_sigma,
+        pixel,
+        pixel_sigma,
+        float(mean.mean()),
+        rest,
+        filtered,
+    )
+
+
+def signed_root(variance: float, sigma: float) -> tuple[float, float]:
+    """Standard deviation of a variance and its sigma; 0 where the variance is not above zero."""
+    if variance <= 0:
+        return 0.0, sqrt(sigma) if sigma > 0 else 0.0
+    root = sqrt(variance)
+    return root, min(sigma / (2 * root), sqrt(sigma))
+
+
+def prnu_percent(bright: PatternVariance, dark: PatternVariance | None) -> tuple[float, float]:
+    """Photo response non-uniformity in percent of the signal, and its sigma.
+
+    Parameters
+    ----------
+    bright : PatternVariance
+        Of flat frames, at half of saturation by the standard.
+    dark : PatternVariance, optional
+        Of dark frames at the same exposure; None: black is 0 and has no pattern.
+
+    Raises
+    ------
+    InputError
+        The bright frames are not brighter than the dark ones.
+    """
+    variance, sigma = bright.total, bright.total_sigma
+    signal = bright.mean
+    if dark is not None:
+        variance, sigma, signal = variance - dark.total, sqrt(sigma**2 + dark.total_sigma**2), signal - dark.mean
+    if signal <= 0:
+        raise InputError(f"flat frames of mean {bright.mean:.4g} DN are not brighter than the dark ones")
+    root, root_sigma = signed_root(variance, sigma)
+    return 100 * root / signal, 100 * root_sigma / signal
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrogram:
+    """Spectrum along rows or columns, mean over them."""
+
+    frequency: NDArray[np.float64]
+    """Cycles per pixel of the plane, without 0."""
+    amplitude: NDArray[np.float64]
+    """Root of the power, grey values; white noise of standard deviation s has s everywhere."""
+    white: float
+    """Level of the white part: the median."""
+    excess: float
+    """Whole power over that of the white part; 1 for white noise."""
+    peak_frequency: float
+    """Frequency of the largest peak that stands out (5 times its neighbourhood); NaN: there is none."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(self).items()}
+
+
+def spectrogram(mean: NDArray[np.float64], axis: int) -> Spectrogram:
+    """Spectrogram of a mean image along an axis: 1 along rows (horizontal), 0 along columns."""
+    values = mean - mean.mean()
+    length = values.shape[axis]
+    power = (np.abs(np.fft.rfft(values, axis=axis)) ** 2).mean(axis=1 - axis) / length
+    power, frequency = power[1:], np.fft.rfftfreq(length)[1:]
+    white = float(np.median(power))
+    excess = float(power.mean() / white) if white > 0 else nan
+    peak = int(np.argmax(power))
+    around = np.delete(power[max(0, peak - 8) : peak + 9], min(peak, 8))
+    standing = around.size and power[peak] > 5 * float(np.median(around)) and power[peak] > 5 * white
+    return Spectrogram(
+        np.asarray(frequency, np.float64),
+        np.sqrt(power),
+        sqrt(max(white, 0.0)),
+        excess,
+        float(frequency[peak]) if standing else nan,
+    )

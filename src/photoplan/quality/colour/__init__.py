@@ -1,0 +1,1 @@
+"""Lateral chromatic aberration: measured between bands, modelled over the field."""

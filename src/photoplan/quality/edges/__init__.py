@@ -1,0 +1,1 @@
+"""Edges of images: found, measured, summed up: spread functions and MTF with intervals."""

@@ -1,0 +1,387 @@
+"""Edge, line spread and modulation transfer functions of one edge, with intervals; no figure where there is none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.quality.edges.checks import (
+    EdgeSettings,
+    Residuals,
+    check_certainty,
+    check_clipping,
+    check_line,
+    check_one_peak,
+    check_region,
+    check_sides,
+    check_step,
+    grain,
+)
+from photoplan.quality.edges.confidence import EdgeFigures, EdgeShape, edge_figures, gaussian_width
+from photoplan.quality.edges.line import EdgeLine, EdgePixels, find_line, fit_line
+from photoplan.quality.edges.model import PixelEdge
+from photoplan.quality.edges.profile import EdgeFit, ProfileBasis, fit_profile
+from photoplan.quality.mtf_curve import MtfCurve
+
+__all__ = ["EdgeMeasurement", "EdgeProfile", "EdgeSettings", "measure_edge"]
+
+#: Distance between the lines of the profile that is handed out, pixels.
+SPACING = 0.125
+#: Pixels beyond which those far from the edge are left out at once.
+MANY = 50_000
+#: Largest distance between neighbouring samples in the edge, pixels, at which it counts as super-sampled.
+DENSE = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeProfile:
+    """A function of the distance from the edge."""
+
+    positions: NDArray[np.float64]
+    """Distances from the line in pixels, positive on the bright side, shape (n,)."""
+    values: NDArray[np.float64]
+    """Shape (n,)."""
+    sigma: NDArray[np.float64]
+    """Standard deviations, shape (n,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeMeasurement:
+    """One edge of an image; lengths in pixels, frequencies in cycles per pixel, both along the normal of the edge.
+
+    Edge and line spread functions hold all that lies between object and grey value: optics, movement, and the pixel
+    itself. Figures that the edge does not determine are NaN.
+    """
+
+    col: float
+    """Column of the middle of the edge in the image."""
+    row: float
+    """Row of the middle of the edge in the image."""
+    angle_deg: float
+    """Direction in which brightness rises across the edge: 0 along a row to the right (a vertical edge), 90 down a
+    column, in −180 < angle ≤ 180."""
+    direction: str
+    """``x``: the transition is closer to the rows, so it shows the quality across columns; ``y``: across rows."""
+    length: float
+    """Length of the edge in the region."""
+    dark: float
+    """Light on the dark side, far from the edge, at its middle."""
+    bright: float
+    """Light on the bright side, far from the edge, at its middle."""
+    noise: float
+    """Standard deviation of a pixel."""
+    esf: EdgeProfile
+    """Edge spread function from 0 to 1 (as fitted to all pixels)."""
+    lsf: EdgeProfile
+    """Line spread function, per pixel; area 1."""
+    samples: EdgeProfile
+    """Means of the pixels themselves from 0 to 1: of one pixel width each where the edge is aligned with the pixels,
+    else of a quarter pixel."""
+    mtf: MtfCurve
+    """Modulation transfer function with standard deviations, up to 1 cycle per pixel or, where the samples are farther
+    apart than half a pixel, to the highest frequency that they determine."""
+    mtf50: float
+    mtf50_interval: tuple[float, float]
+    mtf10: float
+    mtf10_interval: tuple[float, float]
+    fwhm: float
+    """Full width at half maximum of the line spread function."""
+    fwhm_interval: tuple[float, float]
+    gaussian_fwhm: float
+    """FWHM of the Gaussian with the same MTF50; it differs from `fwhm` as the form differs from a Gaussian."""
+    overshoot: float
+    """How far the profile rises above the bright level beside the edge, relative to the step; 0 if it does not."""
+    overshoot_sigma: float
+    undershoot: float
+    """How far the profile falls below the dark level beside the edge, relative to the step; 0 if it does not."""
+    undershoot_sigma: float
+    nyquist: float
+    """Modulation at 0.5 cycles per pixel."""
+    straightness: float
+    """Root mean square deviation from the line beyond what noise explains."""
+    structure: float
+    """Root mean square structure beside the edge beyond what noise explains, relative to the step."""
+    phase_gap: float
+    """Largest distance between neighbouring samples of the profile in the edge: 1 if it is aligned with the pixels."""
+    window: tuple[float, float]
+    """Distances between which the profile is determined; light spread farther than this is not seen: it counts to the
+    levels."""
+    confidence: float
+    """Probability of the intervals."""
+
+    @property
+    def sampling(self) -> str:
+        """``super-sampled`` if all phases of the pixel occur, else ``few phases``.
+
+        With few phases the form between the samples is that of the model (Gaussian and pixel, with smooth deviations),
+        which the pixels cannot test.
+        """
+        return "super-sampled" if self.phase_gap <= DENSE else "few phases"
+
+    @property
+    def snr(self) -> float:
+        """Step from dark to bright relative to the noise of a pixel."""
+        return (self.bright - self.dark) / self.noise if self.noise > 0.0 else float("inf")
+
+    @property
+    def slant_deg(self) -> float:
+        """Smallest angle between the edge and the pixel grid, −45 to 45 degrees."""
+        return (self.angle_deg + 45.0) % 90.0 - 45.0
+
+
+def measure_edge(
+    pixels: NDArray[np.float64],
+    valid: NDArray[np.bool_] | None = None,
+    *,
+    limits: tuple[float, float] | None = None,
+    origin: tuple[float, float] = (0.0, 0.0),
+    settings: EdgeSettings | None = None,
+) -> EdgeMeasurement:
+    """Measure the one edge that a region holds.
+
+    Parameters
+    ----------
+    pixels
+        Linear light, shape (rows, columns); NaN is not valid.
+    valid
+        Mask of the same shape; None: all finite pixels.
+    limits
+        Light at which pixels are clipped, low and high (`Linearisation.limits`); None: not checked.
+    origin
+        Column and row of the region's first pixel in the image.
+    settings
+        What the edge must be like.
+
+    Raises
+    ------
+    InputError
+        For no edge, a saturated, too noisy, too short or bent one, a second edge, a corner, or textured sides.
+    """
+    chosen = settings or EdgeSettings()
+    image = np.asarray(pixels, np.float64)
+    mask = np.ones(image.shape, bool) if valid is None else np.asarray(valid, bool)
+    mask = check_region(image, mask)
+    line = find_line(image, mask)
+    every = EdgePixels.of(image, mask, line.direction)
+    if every.light.size > MANY:
+        every = every.where(np.abs(line.distance(every.across, every.along)) <= max(4.0 * chosen.reach, 64.0))
+    line, model, levels = fit_line(every, line, chosen.curve, chosen.shading != "none", 1e-2)
+    near = np.abs(line.distance(every.across, every.along)) < 2.5 * model.total
+    if np.count_nonzero(near) > 40:
+        line, model, levels = fit_line(every.where(near), line, chosen.curve, False)
+    distance = line.distance(every.across, every.along)
+    check_clipping(every.light, distance, limits, chosen.most_clipped)
+    low, high = _window(distance, model, max(chosen.reach, 8.0 * model.total))
+    inside = (distance >= low) & (distance <= high)
+    seen, distance = every.where(inside), distance[inside]
+    span = _span(seen, distance, model, line, chosen)
+    weight, first_noise = _weights(seen, distance, line, model, chosen)
+    own = grain(seen.light, seen.along, seen.across)
+    check_step(float(levels[1]), first_noise, own, chosen)
+    try:
+        fit = _fit(seen, (distance, weight), line, (model, low, high), chosen)
+    except np.linalg.LinAlgError as error:
+        raise InputError("the region's pixels do not determine a profile; choose a larger region") from error
+    return _measured(_Context(seen, distance, line, fit, span, origin, chosen))
+
+
+@dataclass(frozen=True, eq=False)
+class _Context:
+    pixels: EdgePixels
+    distance: NDArray[np.float64]
+    line: EdgeLine
+    fit: EdgeFit
+    span: tuple[float, float]
+    origin: tuple[float, float]
+    settings: EdgeSettings
+
+
+def _window(distance: NDArray[np.float64], model: PixelEdge, reach: float) -> tuple[float, float]:
+    """Distances within a reach up to which every step of a pixel holds a third as many pixels as the edge itself."""
+    if not distance.min() < 0.0 < distance.max():
+        raise InputError("no edge: the line that suits the brightness best lies outside the region")
+    count = np.bincount((np.floor(distance) - np.floor(distance.min())).astype(np.intp))
+    zero = int(-np.floor(distance.min()))
+    core = max(1, round(2.0 * model.total))
+    usual = float(np.median(count[max(zero - core, 0) : zero + core]))
+    poor = count < usual / 3.0
+    before, after = np.flatnonzero(poor[:zero]), np.flatnonzero(poor[zero:])
+    low = float(before[-1] + 1 - zero) if before.size else float(distance.min())
+    high = float(after[0]) if after.size else float(distance.max())
+    low, high = max(low, -reach), min(high, reach)
+    if min(-low, high) < 3.0 * model.total:
+        raise InputError(
+            f"the region is too narrow for the edge, or holds none: it reaches {min(-low, high):.1f} pixels beside a "
+            f"transition {2.35 * model.total:.1f} pixels wide; {3.0 * model.total:.1f} are needed on both sides"
+        )
+    return low, high
+
+
+def _span(
+    pixels: EdgePixels, distance: NDArray[np.float64], model: PixelEdge, line: EdgeLine, settings: EdgeSettings
+) -> tuple[float, float]:
+    """First and last row (or column) in which the edge lies in the region."""
+    rows = pixels.along[np.abs(distance) <= max(model.total, 0.5)]
+    length = (np.ptp(rows) + 1.0) * line.length_of_normal if rows.size else 0.0
+    if length < settings.least_length:
+        raise InputError(f"edge too short: {length:.1f} pixels, at least {settings.least_length:g} are needed")
+    return float(rows.min()), float(rows.max())
+
+
+def _weights(
+    pixels: EdgePixels,
+    distance: NDArray[np.float64],
+    line: EdgeLine,
+    model: PixelEdge,
+    settings: EdgeSettings,
+) -> tuple[NDArray[np.float64], float]:
+    """Weights of pixels whose noise differs between dark and bright side, and their mean noise.
+
+    The variance of photon noise grows in proportion to the light, so it is interpolated between both sides.
+    """
+    rise = model.profile(distance)[0]
+    design = np.concatenate([rise[:, None], _levels(pixels, distance, line, rise, settings)], axis=1)
+    levels = np.linalg.lstsq(design.T @ design, design.T @ pixels.light, rcond=1e-12)[0]
+    residual = pixels.light - design @ levels
+    dark, bright = residual[distance < -2.0 * model.total], residual[distance > 2.0 * model.total]
+    if min(dark.size, bright.size) < 30:
+        return np.ones_like(distance), float(residual.std())
+    low, high = float(dark.var()), float(bright.var())
+    usual = 0.5 * (low + high)
+    if not usual > 0.0:
+        return np.ones_like(distance), 0.0
+    low, high = max(low, 0.01 * usual), max(high, 0.01 * usual)
+    return usual / (low + (high - low) * np.clip(rise, 0.0, 1.0)), float(np.sqrt(usual))
+
+
+def _levels(
+    pixels: EdgePixels,
+    distance: NDArray[np.float64],
+    line: EdgeLine,
+    rise: NDArray[np.float64],
+    settings: EdgeSettings,
+) -> NDArray[np.float64]:
+    """Columns of the dark level and of the changes of both levels along, and across, the edge."""
+    columns = [np.ones_like(distance)]
+    if settings.shading != "none":
+        t = (pixels.along - line.middle) / max(float(np.ptp(pixels.along)), 1.0)
+        columns += [t * (1.0 - rise), t * rise]
+    if settings.shading == "plane":
+        columns += [distance * (1.0 - rise) / 10.0, distance * rise / 10.0]
+    return np.stack(columns, axis=1)
+
+
+def _fit(
+    pixels: EdgePixels,
+    observed: tuple[NDArray[np.float64], NDArray[np.float64]],
+    line: EdgeLine,
+    window: tuple[PixelEdge, float, float],
+    settings: EdgeSettings,
+) -> EdgeFit:
+    distance, weight = observed
+    model, low, high = window
+    basis = ProfileBasis.between(model, low, high)
+    extra = _levels(pixels, distance, line, model.profile(distance)[0], settings)
+    near = pixels.along[np.abs(distance) <= max(model.total, 0.5)]
+    blocks = int(min(settings.blocks, max(5, np.ptp(near) // 2)))
+    borders = np.linspace(near.min(), near.max() + 1.0, blocks + 1)[1:-1]
+    starts = np.concatenate([[0], np.searchsorted(pixels.along, borders)])
+    return fit_profile(basis, (distance, pixels.light, weight), extra, starts)
+
+
+def _measured(found: _Context) -> EdgeMeasurement:
+    fit, line, settings = found.fit, found.line, found.settings
+    step = float(fit.basis.steps() @ fit.shape)
+    noise = fit.noise
+    check_step(step, noise, grain(found.pixels.light, found.pixels.along, found.pixels.across), settings)
+    straightness, structure = _residual_checks(found, step)
+    gap = _phase_gap(found.distance, fit.basis.model)
+    profiles = _profiles(found, step, gap)
+    check_one_peak(profiles["lsf"].positions, profiles["lsf"].values, profiles["lsf"].sigma)
+    shape = EdgeShape.of(fit, min(1.0, 0.5 / gap))
+    figures = edge_figures(fit, shape, settings.confidence)
+    mtf50, mtf10, fwhm, over, under, nyquist = (float(v) for v in figures.values)
+    check_certainty(mtf50, figures.factor * float(figures.sigma[0]), settings.most_uncertain)
+    middle = line.place(0.5 * (found.span[0] + found.span[1]))
+    dark = float(fit.levels[0])
+    return EdgeMeasurement(
+        col=found.origin[0] + middle[0],
+        row=found.origin[1] + middle[1],
+        angle_deg=line.angle_deg,
+        direction=line.direction,
+        length=(found.span[1] - found.span[0] + 1.0) * line.length_of_normal,
+        dark=dark,
+        bright=dark + step,
+        noise=noise,
+        **profiles,
+        mtf=MtfCurve(shape.frequency, figures.modulation, figures.modulation_sigma),
+        mtf50=mtf50,
+        mtf50_interval=_interval(figures, 0),
+        mtf10=mtf10,
+        mtf10_interval=_interval(figures, 1),
+        fwhm=fwhm,
+        fwhm_interval=_interval(figures, 2),
+        gaussian_fwhm=gaussian_width(mtf50),
+        overshoot=over,
+        overshoot_sigma=float(figures.sigma[3]),
+        undershoot=under,
+        undershoot_sigma=float(figures.sigma[4]),
+        nyquist=nyquist,
+        straightness=straightness,
+        structure=structure,
+        phase_gap=gap,
+        window=(fit.basis.low, fit.basis.high),
+        confidence=settings.confidence,
+    )
+
+
+def _interval(figures: EdgeFigures, which: int) -> tuple[float, float]:
+    value, reach = float(figures.values[which]), figures.factor * float(figures.sigma[which])
+    return value - reach, value + reach
+
+
+def _phase_gap(distance: NDArray[np.float64], model: PixelEdge) -> float:
+    """Largest distance between neighbouring samples within 1.5 standard deviations of the edge."""
+    reach = max(1.5 * model.total, 1.0)
+    core = np.sort(distance[np.abs(distance) <= reach])
+    return float(np.diff(core).max()) if core.size > 1 else 2.0 * reach
+
+
+def _residual_checks(found: _Context, step: float) -> tuple[float, float]:
+    fit, pixels, settings = found.fit, found.pixels, found.settings
+    rise, spread, _ = fit.basis.model.profile(found.distance)
+    table = np.linspace(fit.basis.low, fit.basis.high, 4 * int(fit.basis.high - fit.basis.low) * 8)
+    fitted = np.interp(found.distance, table, fit.basis.edge(table) @ fit.shape)
+    fitted += _levels(pixels, found.distance, found.line, rise, settings) @ fit.levels
+    value = (pixels.light - fitted) / step
+    residuals = Residuals(pixels.across, pixels.along, found.distance, value, spread, fit.basis.model.total)
+    structure = check_sides(residuals, settings.most_structure)
+    return check_line(residuals, settings.most_bend, settings.curve), structure
+
+
+def _profiles(found: _Context, step: float, gap: float) -> dict[str, EdgeProfile]:
+    """Edge and line spread functions as lines, and the pixels' own means."""
+    fit = found.fit
+    first, last = np.ceil(fit.basis.low / SPACING), np.floor(fit.basis.high / SPACING)
+    at = np.arange(first, last + 1.0) * SPACING
+    edge, line = fit.basis.edge(at) / step, fit.basis.line(at) / step
+    area = fit.basis.steps() / step
+    profiles = {}
+    for name, rows, share in (("esf", edge, edge @ fit.shape), ("lsf", line, line @ fit.shape)):
+        relative = rows - np.multiply.outer(share, area)
+        sigma = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", relative, fit.covariance, relative), 0.0))
+        profiles[name] = EdgeProfile(at, share, sigma)
+    aligned = 1.0 / found.line.length_of_normal if abs(found.line.slope) < 0.05 else min(gap, 1.0)
+    width = 0.25 if gap <= DENSE else aligned
+    # Bins are centred on the phase that occurs most, so that no column of an aligned edge is split.
+    phase = float(np.angle(np.exp(2j * np.pi * found.distance / width).mean())) / (2.0 * np.pi)
+    place = np.floor(found.distance / width - phase + 0.5).astype(np.intp)
+    place -= place.min()
+    count = np.bincount(place)
+    mean = np.bincount(place, found.distance)[count > 0] / count[count > 0]
+    value = np.bincount(place, (found.pixels.light - fit.levels[0]) / step)[count > 0] / count[count > 0]
+    sigma = fit.noise / step / np.sqrt(count[count > 0])
+    return profiles | {"samples": EdgeProfile(mean, value, sigma)}

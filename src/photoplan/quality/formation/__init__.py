@@ -1,0 +1,1 @@
+"""The formation of an image from a scene, step by step."""

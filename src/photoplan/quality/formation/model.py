@@ -1,0 +1,253 @@
+"""The image formation model: what a camera makes of a scene, with the truth beside it.
+
+Scene → spread → sampling by the pixels' apertures, lines and bands displaced → fall-off → electrons → overflow → smear
+and transfer → noise → gain → edge enhancement → tone curve → whole grey values. Every part is optional; a model without
+parts returns the scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.quality.formation.optics import Optics, falloff_factors, line_displacements, sample_scene
+from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitter, Spread, check_range
+from photoplan.quality.formation.scenes import ArrayScene, Scene
+from photoplan.quality.formation.sensor import Pattern, add_shot_noise, fixed_pattern, moved_charge, overflow
+from photoplan.quality.formation.sensor_parts import (
+    AutomaticGain,
+    DarkCurrent,
+    Defect,
+    Enhancement,
+    Exposure,
+    FixedPattern,
+    Gain,
+    Quantisation,
+    Readout,
+    Tone,
+    Well,
+)
+from photoplan.quality.formation.signal import enhanced, next_gain, quantised, toned
+
+__all__ = ["MOST_PIXELS", "FormedImage", "ImageModel", "form_image", "form_series"]
+
+_Array = NDArray[np.float64]
+#: Pixels × bands of an image that is formed: it is held in memory several times as float64.
+MOST_PIXELS = 40_000_000
+
+
+@dataclass(frozen=True)
+class ImageModel:
+    """How an image comes about. Each part's default changes nothing."""
+
+    spread: Spread = field(default_factory=Spread)
+    aperture: Aperture = field(default_factory=Aperture)
+    lateral: tuple[Lateral, ...] = ()
+    falloff: Falloff = field(default_factory=Falloff)
+    jitter: LineJitter = field(default_factory=LineJitter)
+    exposure: Exposure = field(default_factory=Exposure)
+    dark: DarkCurrent = field(default_factory=DarkCurrent)
+    fixed_pattern: FixedPattern = field(default_factory=FixedPattern)
+    defects: tuple[Defect, ...] = ()
+    well: Well | None = None
+    readout: Readout = field(default_factory=Readout)
+    gain: Gain = field(default_factory=Gain)
+    automatic_gain: AutomaticGain | None = None
+    enhancement: Enhancement | None = None
+    tone: Tone | None = None
+    quantisation: Quantisation | None = None
+    seed: int = 0
+    """Of all that is random: the same seed gives the same sensor, the same seed and frame the same image."""
+
+    def __post_init__(self) -> None:
+        check_range("model", "seed", self.seed, 0, 2**63)
+        if len({each.band for each in self.lateral}) < len(self.lateral):
+            raise InputError("lateral: a band is described twice")
+        if len(self.defects) > 1_000_000:
+            raise InputError(f"{len(self.defects)} defects; at most 1000000 are allowed")
+
+    @property
+    def optics(self) -> Optics:
+        """The parts that decide how a scene is sampled."""
+        return Optics(self.spread, self.aperture, self.lateral)
+
+
+@dataclass(frozen=True, eq=False)
+class FormedImage:
+    """An image and the truth about it."""
+
+    values: NDArray[Any]
+    """Grey values, shape (height, width), or (bands, height, width) where the scene has several bands; uint8 or uint16
+    with a quantisation, else float64."""
+    light: _Array
+    """What fell on the pixels in the units of the scene, without noise, after spread, aperture and fall-off; same
+    shape."""
+    line_shift: _Array
+    """By how many pixels each line was moved to the right, shape (height,)."""
+    gain: float
+    """Automatic gain of this frame, relative to the fixed one."""
+    next_gain: float
+    """Automatic gain of the frame after it."""
+    facts: Mapping[str, object]
+    """Figures: electrons (means), overflow, clipped pixels; plain values."""
+
+
+def form_image(
+    model: ImageModel, scene: Scene | NDArray[Any], frame: int = 0, exposure: float = 1.0, gain: float = 1.0
+) -> FormedImage:
+    """Form one image of a scene.
+
+    Parameters
+    ----------
+    model : ImageModel
+    scene : Scene or array
+        An array is taken as a scene with one cell per pixel.
+    frame : int
+        Number in a series: frames differ in what is random in time, not in the fixed pattern.
+    exposure : float
+        Factor of the light and of the time.
+    gain : float
+        Automatic gain that earlier frames led to; see `form_series`.
+
+    Raises
+    ------
+    InputError
+        The scene is too large, or a part of the model does not fit it.
+    """
+    scene = _checked(scene)
+    if not exposure >= 0.0 or not np.isfinite(exposure) or frame < 0:
+        raise InputError(f"frame {frame} with exposure {exposure}; neither may be negative")
+    shift, light = _light(model, scene, frame)
+    return _exposed(model, light, shift, _Frame(frame, exposure, gain))
+
+
+def form_series(
+    model: ImageModel, scenes: Scene | Sequence[Scene], exposures: Sequence[float] = (1.0,)
+) -> Iterator[FormedImage]:
+    """Form the frames of a series one after the other; automatic gain runs through them.
+
+    Parameters
+    ----------
+    model : ImageModel
+    scenes : Scene or sequence of Scene
+        One for all frames, or one for each frame.
+    exposures : sequence of float
+        One for each frame; with several scenes a single one holds for all.
+    """
+    several = list(scenes) if isinstance(scenes, list | tuple) else None
+    factors = list(exposures) * len(several) if several and len(exposures) == 1 else list(exposures)
+    if several is not None and len(several) != len(factors):
+        raise InputError(f"{len(several)} scenes and {len(factors)} exposures; needed are equal numbers")
+    gain, known = 1.0, None
+    for frame, exposure in enumerate(factors):
+        scene = _checked(several[frame] if several is not None else scenes)
+        # Light that is the same in all frames is sampled once.
+        if several is not None or model.jitter.sigma or known is None:
+            known = _light(model, scene, frame)
+        image = _exposed(model, known[1], known[0], _Frame(frame, exposure, gain))
+        gain = image.next_gain
+        yield image
+
+
+@dataclass(frozen=True)
+class _Frame:
+    number: int
+    exposure: float
+    gain: float
+
+
+def _checked(scene: Any) -> Scene:
+    """A scene that is small enough."""
+    made: Any = ArrayScene(scene) if isinstance(scene, np.ndarray) else scene
+    width, height = made.size
+    if width * height * made.bands > MOST_PIXELS:
+        raise InputError(
+            f"a scene of {made.bands} × {width} × {height} pixels; at most {MOST_PIXELS:,} are formed at once: cut it"
+        )
+    found: Scene = made
+    return found
+
+
+def _random(model: ImageModel, *key: int) -> np.random.Generator:
+    """A generator of its own for each purpose, so that no part changes the numbers of another."""
+    return np.random.default_rng(np.random.SeedSequence([model.seed, *key]))
+
+
+def _light(model: ImageModel, scene: Scene, frame: int) -> tuple[_Array, _Array]:
+    """Displacement of the lines, and light on the pixels, shape (bands, height, width)."""
+    shift = line_displacements(model.jitter, scene.size[1], _random(model, 1, frame))
+    light = sample_scene(scene, model.optics, shift if shift.any() else None)
+    if model.falloff != Falloff():
+        light *= falloff_factors(model.falloff, scene.size)
+    return shift, light
+
+
+def _exposed(model: ImageModel, light: _Array, shift: _Array, frame: _Frame) -> FormedImage:
+    """Image of light on the pixels."""
+    bands, height, width = light.shape
+    grey = np.empty_like(light)
+    facts: dict[str, float] = {"electrons": 0.0, "dark_electrons": 0.0, "overflow": 0.0, "drained": 0.0, "lost": 0.0}
+    for band in range(bands):
+        pattern = fixed_pattern(
+            model.fixed_pattern, model.dark, model.defects, (width, height), _random(model, 2, band)
+        )
+        noise = _random(model, 3, band, frame.number)
+        electrons = _electrons(model, light[band], pattern, frame.exposure, noise, facts)
+        grey[band] = electrons * model.gain.factor
+    gain = frame.gain if model.automatic_gain is not None else 1.0
+    after = next_gain(model.automatic_gain, gain, float(grey.mean())) if model.automatic_gain is not None else 1.0
+    values = _grey(model, grey * gain, frame)
+    if model.quantisation is not None:
+        facts["saturated_pixels"] = int((values == model.quantisation.most).sum())
+        facts["black_pixels"] = int((values == 0).sum())
+    facts |= {name: facts[name] / light.size for name in ("electrons", "dark_electrons")}
+    single = bands == 1
+    return FormedImage(values[0] if single else values, light[0] if single else light, shift, gain, after, facts)
+
+
+def _electrons(
+    model: ImageModel,
+    light: _Array,
+    pattern: Pattern,
+    exposure: float,
+    noise: np.random.Generator,
+    facts: dict[str, float],
+) -> _Array:
+    """Charge that is read, shape (height, width); sums are added to the facts."""
+    source = model.exposure
+    signal = light * (source.light * source.quantum_efficiency * exposure) * pattern.response
+    dark = pattern.dark_rate * (source.seconds * exposure)
+    charge = signal + dark
+    facts["electrons"] += float(signal.sum())
+    facts["dark_electrons"] += float(dark.sum())
+    if model.readout.shot_noise:
+        charge = add_shot_noise(charge, noise)
+    if model.well is not None:
+        flown = overflow(charge, model.well)
+        charge = flown.electrons
+        facts["overflow"] += flown.excess
+        facts["drained"] += flown.drained
+        facts["lost"] += flown.lost
+    charge = moved_charge(charge, model.readout) + pattern.offset
+    stuck = np.isfinite(pattern.stuck)
+    charge[stuck] = pattern.stuck[stuck]
+    if model.readout.noise:
+        charge = charge + noise.normal(0.0, model.readout.noise, charge.shape)
+    return np.asarray(charge)
+
+
+def _grey(model: ImageModel, grey: _Array, frame: _Frame) -> NDArray[Any]:
+    """Stored grey values of the amplified signal, shape (bands, height, width)."""
+    if model.gain.noise:
+        grey = grey + _random(model, 4, frame.number).normal(0.0, model.gain.noise, grey.shape)
+    if model.enhancement is not None:
+        grey = np.stack([enhanced(band, model.enhancement) for band in grey])
+    grey = grey + model.gain.offset
+    if model.tone is not None:
+        grey = toned(grey, model.tone)
+    return grey if model.quantisation is None else quantised(grey, model.quantisation)

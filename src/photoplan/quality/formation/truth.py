@@ -1,0 +1,94 @@
+"""What a model puts into its images, as estimators should find it: transfer function, MTF50, line spread width."""
+
+from __future__ import annotations
+
+from math import cos, radians, sin
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.quality.formation.kernels import aperture_transfer, spread_transfer
+from photoplan.quality.formation.model import ImageModel
+
+__all__ = ["line_spread", "line_spread_width", "model_modulation", "model_mtf50", "model_transfer"]
+
+_Array = NDArray[np.float64]
+_MOST_FREQUENCY = 40.0
+
+
+def model_transfer(
+    model: ImageModel, frequency: _Array, angle_deg: float = 0.0, radius: float = 0.0
+) -> NDArray[np.complex128]:
+    """Optical transfer function of spread and aperture together, of a continuous scene.
+
+    Parameters
+    ----------
+    model : ImageModel
+    frequency : array
+        Cycles per pixel along the direction.
+    angle_deg : float
+        Direction: 0 along x, 90 along y. An edge of `PatternScene` at an angle shows it across itself.
+    radius : float
+        Place in the field: 0 in the middle, 1 in the corners.
+    """
+    f = np.asarray(frequency, float)
+    fx, fy = f * cos(radians(angle_deg)), f * sin(radians(angle_deg))
+    scale = model.spread.scale_at(radius)
+    return np.asarray(spread_transfer(model.spread, fx, fy, scale) * aperture_transfer(model.aperture, fx, fy))
+
+
+def model_modulation(model: ImageModel, frequency: _Array, angle_deg: float = 0.0, radius: float = 0.0) -> _Array:
+    """Modulus of `model_transfer`: the MTF."""
+    return np.abs(model_transfer(model, frequency, angle_deg, radius))
+
+
+def model_mtf50(model: ImageModel, angle_deg: float = 0.0, radius: float = 0.0, modulation: float = 0.5) -> float:
+    """First frequency at which the MTF falls to a modulation, cycles per pixel; NaN if it does not below 20."""
+    f = np.linspace(0.0, 20.0, 40001)
+    values = model_modulation(model, f, angle_deg, radius)
+    below = np.flatnonzero(values <= modulation)
+    if below.size == 0:
+        return float("nan")
+    i = int(below[0])
+    part = (values[i - 1] - modulation) / (values[i - 1] - values[i])
+    return float(f[i - 1] + part * (f[i] - f[i - 1]))
+
+
+def line_spread(model: ImageModel, offsets: _Array, angle_deg: float = 0.0, radius: float = 0.0) -> _Array:
+    """Line spread function at offsets in pixels, its integral 1, by Fourier's integral.
+
+    Raises
+    ------
+    InputError
+        The line spread function has steps (an aperture or a motion without other spread): the integral does not
+        converge.
+    """
+    f = np.linspace(0.0, _MOST_FREQUENCY, 16001)
+    transfer = model_transfer(model, f, angle_deg, radius)
+    if np.abs(transfer[-2000:]).max() > 2e-3:
+        raise InputError(
+            "the line spread function of this model has steps; give it some Gaussian spread, or ask for its MTF"
+        )
+    waves = np.exp(2j * np.pi * np.multiply.outer(np.asarray(offsets, float), f))
+    weights = np.full(f.size, f[1])
+    weights[[0, -1]] /= 2.0
+    return np.asarray(2.0 * (waves * transfer).real @ weights)
+
+
+def line_spread_width(model: ImageModel, angle_deg: float = 0.0, radius: float = 0.0) -> float:
+    """Full width at half maximum of the line spread function, pixels; raises as `line_spread`."""
+    step = 0.01
+    coarse_offsets = np.asarray(np.arange(-200, 201) * (10.0 * step), np.float64)
+    coarse = line_spread(model, coarse_offsets, angle_deg, radius)
+    near = coarse_offsets[coarse > 0.25 * coarse.max()]
+    fine = np.asarray(np.arange(near[0] - 0.2, near[-1] + 0.2, step), np.float64)
+    values = line_spread(model, fine, angle_deg, radius)
+    above = np.flatnonzero(values >= values.max() / 2.0)
+    first, last = int(above[0]), int(above[-1])
+    if first == 0 or last == fine.size - 1:
+        return float("nan")
+    half = values.max() / 2.0
+    left = fine[first] - step * (values[first] - half) / (values[first] - values[first - 1])
+    right = fine[last] + step * (values[last] - half) / (values[last] - values[last + 1])
+    return float(right - left)

@@ -1,0 +1,1 @@
+"""Test patterns: bars, Siemens stars and USAF targets."""

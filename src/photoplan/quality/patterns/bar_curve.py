@@ -1,0 +1,168 @@
+"""Frequency groups of bars joined to a contrast transfer function, and its conversion into an MTF."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import hypot, pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.quality.mtf_curve import MtfCurve
+from photoplan.quality.patterns.bars import BarContrast, fundamental_of_square
+
+__all__ = ["BarCurve", "bar_curve", "coltman_factor", "coltman_mtf"]
+
+Array = NDArray[np.float64]
+
+#: Bars with less bend than this have a flat middle, where their levels are those of wide areas.
+FLAT = 0.02
+#: With less bend the duty can be read from the profile.
+_SHARP = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class BarCurve:
+    """Transfer of bars against frequency."""
+
+    groups: tuple[BarContrast, ...]
+    """By increasing frequency."""
+    low: float
+    """Light of wide dark areas."""
+    high: float
+    """Light of wide bright areas."""
+    levels_from: str
+    """Where these levels come from, in words."""
+    contrast: MtfCurve
+    """Contrast transfer of square waves (CTF), from the extremes; not an MTF."""
+    mtf: MtfCurve
+    """Modulation transfer, from the fundamental waves."""
+
+
+def bar_curve(groups: Sequence[BarContrast], levels: tuple[float, float] | None = None) -> BarCurve:
+    """Contrast transfer and MTF of frequency groups.
+
+    Parameters
+    ----------
+    groups : sequence of BarContrast
+        In any order; one is enough where `levels` are given.
+    levels : tuple of float, optional
+        Light of wide dark and bright areas. None: those of the widest bars, if their middle is flat.
+
+    Raises
+    ------
+    InputError
+        No group; no levels and no bars with a flat middle; two groups have the same frequency.
+    """
+    if not groups:
+        raise InputError("no group of bars is given")
+    ordered = tuple(sorted(groups, key=lambda group: group.frequency))
+    frequency = np.array([group.frequency for group in ordered])
+    close = np.flatnonzero(np.diff(frequency) <= 1e-9)
+    if close.size:
+        raise InputError(f"two groups of bars have the frequency {frequency[close[0]]:.4g} cycles per pixel; keep one")
+    low, high, source = _levels(ordered, levels)
+    modulation = (high - low) / (high + low)
+    contrast = np.array([group.modulation / modulation for group in ordered])
+    contrast_sigma = np.array([group.modulation_sigma / modulation for group in ordered])
+    duties, duty_sigma = _duties(ordered, low, high)
+    share = np.array([_fundamental(duty, low, high) for duty in duties])
+    transfer = np.array([group.fundamental for group in ordered]) / share
+    transfer_sigma = np.hypot(np.array([group.fundamental_sigma for group in ordered]) / share, transfer * duty_sigma)
+    return BarCurve(
+        ordered,
+        low,
+        high,
+        source,
+        _curve(frequency, contrast, contrast_sigma),
+        _curve(frequency, transfer, transfer_sigma),
+    )
+
+
+def _levels(groups: Sequence[BarContrast], levels: tuple[float, float] | None) -> tuple[float, float, str]:
+    if levels is not None:
+        if not 0.0 <= levels[0] < levels[1] < np.inf:
+            raise InputError(f"levels of {levels[0]:g} and {levels[1]:g}; the first is the lower one and not negative")
+        return levels[0], levels[1], "as given"
+    widest = groups[0]
+    if widest.bend > FLAT:
+        raise InputError(
+            f"the widest bars, {1 / widest.frequency:.1f} pixels a period, have no flat middle (bend "
+            f"{widest.bend:.3f}, at most {FLAT}), so that the object's contrast is unknown; add wider bars or give the "
+            "grey values of wide dark and bright areas"
+        )
+    return widest.low, widest.high, f"widest bars, {1 / widest.frequency:.1f} pixels a period"
+
+
+def _duties(groups: Sequence[BarContrast], low: float, high: float) -> tuple[list[float], float]:
+    """Duty of each group, and the relative standard deviation of the fundamental wave that its error makes.
+
+    Blur moves the duty of narrow bars towards a half: theirs is that of the widest group, if that is sharp, and else
+    follows from the mean level.
+    """
+    sharp = [group.duty for group in groups if group.bend < _SHARP and not group.aligned]
+    if sharp:
+        return [g.duty if g.bend < _SHARP and not g.aligned else sharp[0] for g in groups], 0.002
+    means = [(group.mean - low) / (high - low) for group in groups]
+    return [min(max(mean, 0.2), 0.8) for mean in means], 0.01
+
+
+def _fundamental(duty: float, low: float, high: float) -> float:
+    """Fundamental wave through the mean of bars of these levels."""
+    return (high - low) * fundamental_of_square(duty) / (low + duty * (high - low))
+
+
+def _curve(frequency: Array, transfer: Array, sigma: Array) -> MtfCurve:
+    return MtfCurve(
+        np.concatenate([[0.0], frequency]), np.concatenate([[1.0], transfer]), np.concatenate([[0.0], sigma])
+    )
+
+
+def coltman_factor(k: int) -> float:
+    """Factor of the contrast at k times the frequency in Coltman's series; 0 for even k and those with a square.
+
+    J. W. Coltman, "The specification of imaging properties by response to a sine wave input", Journal of the Optical
+    Society of America 44 (1954) 468–471.
+    """
+    if k % 2 == 0:
+        return 0.0
+    primes, rest, p = 0, k, 3
+    while rest > 1:
+        if rest % p == 0:
+            rest //= p
+            primes += 1
+            if rest % p == 0:
+                return 0.0
+        p += 2
+    return float((-1.0) ** primes * (-1.0) ** ((k - 1) // 2) / k)
+
+
+def coltman_mtf(contrast: MtfCurve) -> MtfCurve:
+    """MTF from a contrast transfer function of square waves with equal bars, by Coltman's series.
+
+    MTF(f) = π/4 [C(f) + C(3f)/3 − C(5f)/5 + C(7f)/7 + C(11f)/11 − …]. C is interpolated linearly; beyond the last
+    frequency it is 0, and what this may miss is in the standard deviations.
+
+    Parameters
+    ----------
+    contrast : MtfCurve
+        Contrast transfer, 1 at frequency 0.
+    """
+    modulation, sigma = [1.0], [0.0]
+    given = np.zeros(contrast.frequency.size) if contrast.sigma is None else contrast.sigma
+    last, end = float(contrast.frequency[-1]), float(contrast.modulation[-1])
+    for f in contrast.frequency[1:]:
+        total, variance, missed = 0.0, 0.0, 0.0
+        for k in range(1, 32, 2):
+            factor = coltman_factor(k)
+            if k * f <= last * (1.0 + 1e-12):
+                total += factor * float(np.interp(k * f, contrast.frequency, contrast.modulation))
+                variance += (factor * float(np.interp(k * f, contrast.frequency, given))) ** 2
+            elif factor and not missed:
+                # Contrast falls on, at least in proportion to the frequency.
+                missed = abs(factor) * end * last / (k * f)
+        modulation.append(pi / 4.0 * total)
+        sigma.append(pi / 4.0 * hypot(float(np.sqrt(variance)), missed))
+    return MtfCurve(contrast.frequency, np.array(modulation), np.array(sigma))

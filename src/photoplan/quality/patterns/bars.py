@@ -1,0 +1,215 @@
+"""Contrast transfer from bar patterns, at any angle and phase (Behr 1989, §3.6.7).
+
+A window with parallel bars is one frequency group. Its fundamental wave and its extremes are measured separately: the
+extremes give the contrast transfer of square waves (CTF), the fundamental wave the modulation transfer (MTF).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import atan2, cos, degrees, hypot, pi, sin, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.quality.patterns.bar_wave import BarWave, find_wave, wave_columns
+from photoplan.quality.patterns.pixels import least_squares, pattern_window, white_noise
+
+__all__ = ["BarContrast", "fundamental_of_square", "measure_bars"]
+
+Array = NDArray[np.float64]
+
+#: Periods of the pattern that a window has to hold.
+LEAST_PERIODS = 2.5
+#: Standard deviations by which a wave stands out of the noise.
+LEAST_SIGNIFICANCE = 5.0
+#: A level is the top of a parabola over so many periods to each side of a bar's middle.
+_REACH = 0.125
+#: Side of the part of a window that is used, pixels.
+_MOST = 1024
+
+
+@dataclass(frozen=True)
+class BarContrast:
+    """One frequency group of a bar pattern."""
+
+    frequency: float
+    """Cycles per pixel across the bars."""
+    angle_deg: float
+    """Direction across the bars, from the columns' direction towards increasing rows, 0 to 180."""
+    phase: float
+    """Position of the middle of a bright bar from the window's middle along that direction, periods, -0.5 to 0.5."""
+    duty: float
+    """Share of a period that is bright, from the mean between the levels; narrow bars seem nearer to a half."""
+    periods: float
+    """Periods across the window."""
+    low: float
+    """Grey value in the middle of dark bars."""
+    high: float
+    """Grey value in the middle of bright bars."""
+    mean: float
+    """Mean grey value of a period."""
+    modulation: float
+    """(high - low) / (high + low), Behr 1989, §3.6.7."""
+    modulation_sigma: float
+    fundamental: float
+    """Amplitude of the fundamental wave through the mean."""
+    fundamental_sigma: float
+    bend: float
+    """By how much of the contrast a bar's middle stands out over the place an eighth of a period away: 0 for bars with
+    a flat middle, 0.15 for a sine wave."""
+    aligned: bool
+    """The bars meet the pixels at few phases, so that harmonic waves cannot be told from the fundamental one; the
+    standard deviations hold what they may add."""
+
+
+def measure_bars(
+    light: NDArray[np.floating], *, clipped: NDArray[np.bool_] | None = None, what: str = "bars"
+) -> BarContrast:
+    """Frequency, direction, phase, duty and modulation of a window with parallel bars.
+
+    Parameters
+    ----------
+    light : ndarray
+        Shape (rows, columns), proportional to light; only bars. Of larger windows the middle 1024 pixels are used.
+    clipped : ndarray, optional
+        True where a pixel is cut off at an end of its range, same shape.
+    what : str
+        Names the window in messages.
+
+    Raises
+    ------
+    InputError
+        No bars, bars and other structure, too few bars, bars below the noise, clipped pixels.
+    """
+    values = _middle_part(pattern_window(light, clipped, what))
+    wave = find_wave(values, what)
+    phase = wave.phases(values.shape)
+    periods = float(np.ptp(phase))
+    if periods < LEAST_PERIODS:
+        raise InputError(f"{what}: {periods:.1f} periods of bars in the window; at least {LEAST_PERIODS} are needed")
+    flat, solution, covariance, residuals, hidden = _fit(values, phase, wave)
+    a, b = float(solution[3]), float(solution[4])
+    amplitude = hypot(a, b)
+    along = np.array([a, b]) / amplitude
+    sigma = sqrt(float(along @ covariance[3:5, 3:5] @ along))
+    noise = white_noise(residuals.reshape(values.shape))
+    if amplitude < LEAST_SIGNIFICANCE * max(sigma, noise * sqrt(2.0 / values.size)):
+        raise InputError(f"{what}: the bars are below the noise (amplitude {amplitude:.3g} ± {sigma:.2g})")
+    rest = float(np.sqrt((residuals**2).mean()))
+    if rest**2 > 2.0 * noise**2 + (0.12 * amplitude) ** 2:
+        raise InputError(
+            f"{what}: more than bars of one frequency is in the window (rest {rest:.3g} beside bars of {amplitude:.3g} "
+            f"and noise of {noise:.3g}); choose a window inside the bars"
+        )
+    turn = phase - atan2(b, a) / (2.0 * pi)
+    turn -= np.round(turn)
+    mean = float(solution[0])
+    low, high, levels_sigma, bend = _levels(flat, turn, solution, (1, *wave.harmonics(values.shape)[0]))
+    contrast = high - low
+    if contrast <= 0.0 or high + low <= 0.0:
+        raise InputError(f"{what}: bars of {high:.4g} on {low:.4g}; their light is positive")
+    alias = _alias(hidden, amplitude)
+    return BarContrast(
+        frequency=wave.frequency,
+        angle_deg=degrees(atan2(wave.fy, wave.fx)) % 180.0,
+        phase=_middle(wave, atan2(b, a) / (2.0 * pi)),
+        duty=(mean - low) / contrast,
+        periods=periods,
+        low=low,
+        high=high,
+        mean=mean,
+        modulation=contrast / (high + low),
+        modulation_sigma=hypot(levels_sigma, 2.0 * alias) / (high + low),
+        fundamental=amplitude / mean,
+        fundamental_sigma=hypot(sigma, alias) / mean,
+        bend=bend / contrast,
+        aligned=bool(hidden),
+    )
+
+
+def _middle_part(values: Array) -> Array:
+    """The middle of a large window: more pixels than these add nothing but time."""
+    rows, columns = (slice(max(0, (n - _MOST) // 2), max(0, (n - _MOST) // 2) + _MOST) for n in values.shape)
+    return values[rows, columns]
+
+
+def _fit(values: Array, phase: Array, wave: BarWave) -> tuple[Array, Array, Array, Array, tuple[int, ...]]:
+    """Values with a uniform mean level, solution, covariance and residuals of the wave, harmonics that are hidden.
+
+    Illumination acts as a factor: the plane of the mean level is divided out.
+    """
+    harmonics, hidden = wave.harmonics(values.shape)
+    columns = wave_columns(values.shape, phase, (1, *harmonics))
+    solution, _, _ = least_squares(columns, values.ravel())
+    plane = (columns[:, :3] @ solution[:3]).reshape(values.shape)
+    if plane.min() <= 0.0:
+        raise InputError(
+            f"the mean level of the bars falls to {plane.min():.3g}; modulation needs positive light: is the dark "
+            "level subtracted twice, or the window larger than the pattern?"
+        )
+    flat = values / plane * float(plane.mean())
+    solution, covariance, residuals = least_squares(columns, flat.ravel())
+    return flat, solution, covariance, residuals, hidden
+
+
+def _levels(flat: Array, turn: Array, solution: Array, waves: tuple[int, ...]) -> tuple[float, float, float, float]:
+    """Levels of dark and bright bars in their middle, the standard deviation of their difference, and their bend."""
+    found = []
+    start = atan2(float(solution[4]), float(solution[3]))
+    for middle in (0.5, 0.0):
+        away = turn - middle
+        away -= np.round(away)
+        near = np.abs(away) <= _REACH
+        x, y = away[near], flat[near]
+        if np.unique(np.floor((x / _REACH + 1.0) * 5.999)).size < 7:
+            found.append(_few_level(x, y, middle + start / (2.0 * pi), solution, waves))
+            continue
+        columns = np.stack([np.ones_like(x), x**2], axis=1)
+        keep = np.ones(x.size, bool)
+        for _ in range(2):
+            top, covariance, _ = least_squares(columns[keep], y[keep])
+            rest = y - columns @ top
+            keep = np.abs(rest) <= 4.0 * max(float(np.sqrt((rest[keep] ** 2).mean())), 1e-12 * abs(float(top[0])))
+        found.append((float(top[0]), sqrt(float(covariance[0, 0])), float(top[1]) * _REACH**2))
+    (low, low_sigma, low_bend), (high, high_sigma, high_bend) = found
+    return low, high, hypot(low_sigma, high_sigma), (low_bend - high_bend) / 2.0
+
+
+def _few_level(x: Array, y: Array, phase: float, solution: Array, waves: tuple[int, ...]) -> tuple[float, float, float]:
+    """Level of bars that meet the pixels at few phases: what the waves add up to; its deviation from the pixels there
+    as standard deviation; and the bend of the waves."""
+
+    def at(turn: float) -> float:
+        value = float(solution[0])
+        for k, wave in enumerate(waves):
+            value += float(solution[3 + 2 * k]) * cos(2.0 * pi * wave * turn)
+            value += float(solution[4 + 2 * k]) * sin(2.0 * pi * wave * turn)
+        return value
+
+    level = at(phase)
+    beside = (at(phase - _REACH) + at(phase + _REACH)) / 2.0
+    if x.size == 0:
+        return level, abs(level - beside), beside - level
+    return level, abs(float(np.mean([at(phase + t) for t in x[:200]])) - level) / 2.0, beside - level
+
+
+def _alias(hidden: tuple[int, ...], amplitude: float) -> float:
+    """What waves that are hidden may add to the amplitude: those of a square wave, blurred as a Gaussian blurs.
+
+    A Gaussian that leaves the share m of the fundamental wave leaves m to the power k² of the k-th one. m is not
+    known here; it is at most 1, and 0.5 is taken: bars so fine that harmonics hide are seldom transferred better.
+    """
+    return sum(amplitude * 0.5 ** (k * k - 1) / k for k in hidden)
+
+
+def _middle(wave: BarWave, turn: float) -> float:
+    """Phase of the middle of a bright bar; the direction is turned so that it points to increasing rows or columns."""
+    sense = 1.0 if degrees(atan2(wave.fy, wave.fx)) % 360.0 < 180.0 else -1.0
+    return float((sense * turn + 0.5) % 1.0 - 0.5)
+
+
+def fundamental_of_square(duty: float) -> float:
+    """Amplitude of the fundamental wave of bars with levels 0 and 1, of which the share `duty` is bright."""
+    return 2.0 / pi * sin(pi * duty)

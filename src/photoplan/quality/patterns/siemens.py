@@ -1,0 +1,278 @@
+"""MTF in all directions from a Siemens star.
+
+A star with N bright sectors has N/(2πr) cycles per pixel at the radius r. On each ring a wave with N periods is fitted
+by least squares; its amplitude against that of the object is the modulation transfer. For stars with sharp sectors the
+object's fundamental wave is 4/π times the half contrast.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import degrees, pi
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.quality.mtf_curve import MtfCurve
+from photoplan.quality.patterns.pixels import pattern_window, white_noise
+from photoplan.quality.patterns.star_fit import (
+    SECTORS,
+    Ring,
+    StarPixels,
+    count_sectors,
+    find_centre,
+    fit_ring,
+    rough_centre,
+)
+
+__all__ = ["StarMtf", "StarRules", "measure_star"]
+
+Array = NDArray[np.float64]
+
+_MOST_SIDE = 4096
+
+
+@dataclass(frozen=True)
+class StarRules:
+    """How a star is measured."""
+
+    sectors: int | None = None
+    """Bright sectors, to be confirmed; None: as counted."""
+    wave: Literal["square", "sine"] | None = None
+    """Sharp sectors, or light that changes as a sine; None: told apart by the third harmonic wave."""
+    levels: tuple[float, float] | None = None
+    """Light of wide dark and bright areas; None: from the middle of the widest sectors."""
+    centre: tuple[float, float] | None = None
+    """Column and row of the centre, to a few pixels; None: found."""
+    radius: float | None = None
+    """Outer radius; None: as far as the star reaches."""
+    directions: int = 8
+    """Directions of the frequency that are measured apart, over half a turn."""
+    highest: float = 0.6
+    """Frequency up to which is measured, cycles per pixel."""
+
+    def __post_init__(self) -> None:
+        if self.sectors is not None and not SECTORS[0] <= self.sectors <= SECTORS[1]:
+            raise InputError(f"a star with {self.sectors} sectors; {SECTORS[0]} to {SECTORS[1]} are allowed")
+        if not 1 <= self.directions <= 36:
+            raise InputError(f"{self.directions} directions; 1 to 36 are allowed")
+        if not 0.0 < self.highest <= 1.0:
+            raise InputError(f"a highest frequency of {self.highest:g} cycles per pixel; it is at most 1")
+        if self.radius is not None and not self.radius > 0.0:
+            raise InputError(f"a radius of {self.radius:g} pixels; it is positive")
+        if self.levels is not None and not 0.0 <= self.levels[0] < self.levels[1] < np.inf:
+            raise InputError(f"levels of {self.levels[0]:g} and {self.levels[1]:g}; the first is the lower one")
+
+
+@dataclass(frozen=True, eq=False)
+class StarMtf:
+    """What a Siemens star says of an image."""
+
+    centre: tuple[float, float]
+    """Column and row in the window."""
+    centre_sigma: tuple[float, float]
+    sectors: int
+    wave: Literal["square", "sine"]
+    low: float
+    """Light of dark sectors where they are wide."""
+    high: float
+    """Light of bright sectors where they are wide."""
+    levels_from: str
+    radii: tuple[float, float]
+    """Inner and outer radius that were measured, pixels."""
+    mtf: MtfCurve
+    """Of whole rings: the mean over all directions."""
+    directional: dict[float, MtfCurve]
+    """By direction of the frequency, degrees from the columns' direction towards increasing rows, 0 to 180. A star's
+    sectors at an angle hold frequencies across it."""
+
+
+def measure_star(
+    light: NDArray[np.floating],
+    rules: StarRules | None = None,
+    *,
+    clipped: NDArray[np.bool_] | None = None,
+    what: str = "star",
+) -> StarMtf:
+    """Modulation transfer of a window with a Siemens star.
+
+    Parameters
+    ----------
+    light : ndarray
+        Shape (rows, columns), proportional to light.
+    rules : StarRules, optional
+    clipped : ndarray, optional
+        True where a pixel is cut off at an end of its range, same shape.
+    what : str
+        Names the window in messages.
+
+    Raises
+    ------
+    InputError
+        No star, too few pixels or sectors, clipped pixels, or an unknown contrast of the object.
+    """
+    rules = rules or StarRules()
+    values = pattern_window(light, clipped, what, 32, _MOST_SIDE)
+    centre = rules.centre or rough_centre(values)
+    outer = _outer(values, centre, rules, what)
+    pixels = StarPixels.of(values, centre)
+    sectors = count_sectors(pixels, (0.3 * outer, outer), what)
+    if rules.sectors not in (None, sectors):
+        raise InputError(f"{what}: {rules.sectors} bright sectors are stated, but {sectors} are counted")
+    inner = max(sectors / (2.0 * pi * rules.highest), 4.0)
+    if outer < 2.0 * inner:
+        raise InputError(
+            f"{what}: {sectors} sectors within a radius of {outer:.0f} pixels; the finest that can be measured have a "
+            f"radius of {inner:.0f}, and the star has to be twice as large at least"
+        )
+    pixels, sigma = find_centre(pixels, (max(0.35 * outer, inner), outer), sectors, what)
+    outer = rules.radius or _extent(values, pixels, sectors, outer)
+    rings = [fit_ring(*pixels.between(r - w, r + w), r, sectors, whole=True) for r, w in _radii(inner, outer)]
+    _refuse_weak(rings, white_noise(values), what)
+    wave = rules.wave or _wave(rings)
+    low, high, source = _levels(pixels, rings, rules.levels, wave, sectors, outer, what)
+    full = (high - low) / 2.0 * (4.0 / pi if wave == "square" else 1.0) / ((high + low) / 2.0)
+    directional = {}
+    for k in range(rules.directions):
+        parts = [_direction(pixels, r, w, k, rules.directions, sectors) for r, w in _radii(inner, outer, 1.25)]
+        kept = [ring for ring in parts if ring is not None]
+        if len(kept) >= 2:
+            directional[degrees(pi * k / rules.directions)] = _curve(kept, sectors, full)
+    return StarMtf(
+        pixels.centre,
+        sigma,
+        sectors,
+        wave,
+        low,
+        high,
+        source,
+        (inner, outer),
+        _curve(rings, sectors, full),
+        directional,
+    )
+
+
+def _outer(values: Array, centre: tuple[float, float], rules: StarRules, what: str) -> float:
+    """Radius of the largest circle about the centre that the window holds."""
+    rows, columns = values.shape
+    if not (0 <= centre[0] <= columns - 1 and 0 <= centre[1] <= rows - 1):
+        raise InputError(f"{what}: the centre {centre[0]:.1f}, {centre[1]:.1f} is outside of the window")
+    room = min(centre[0], centre[1], columns - 1 - centre[0], rows - 1 - centre[1])
+    if rules.radius is not None and rules.radius > room:
+        raise InputError(f"{what}: a radius of {rules.radius:.1f} pixels leaves the window; {room:.1f} is the largest")
+    if room < 12.0:
+        raise InputError(f"{what}: no star is found; its centre seems to be {room:.0f} pixels from the window's border")
+    return rules.radius or room
+
+
+def _extent(values: Array, pixels: StarPixels, sectors: int, outer: float) -> float:
+    """Radius up to which the wave goes on: the outermost ring that keeps 90 % of the strongest wave, and a margin."""
+    step = max(1.5, outer / 200.0)
+    radii = np.arange(outer / 3.0, outer - 1.0, step)
+    rings = [fit_ring(*pixels.between(r - step, r + step), r, sectors, whole=True) for r in radii]
+    if not rings:
+        return outer
+    amplitude = np.array([ring.amplitude for ring in rings])
+    reach = float(rings[int(np.flatnonzero(amplitude >= 0.9 * amplitude.max())[-1])].radius)
+    return outer if reach >= outer - 3.0 else reach - 3.0
+
+
+def _radii(inner: float, outer: float, least: float = 0.75) -> list[tuple[float, float]]:
+    """Radii of rings and half their widths: 3 % of the radius, and `least` pixels at least."""
+    radii: list[tuple[float, float]] = []
+    r = outer - 1.0
+    while r > inner and len(radii) < 400:
+        half = float(np.clip(0.03 * r, least, 6.0))
+        radii.append((r - half, half))
+        r -= 2.0 * half
+    return radii[:-1] if len(radii) > 1 and radii[-1][0] < inner else radii
+
+
+def _direction(pixels: StarPixels, radius: float, half: float, k: int, count: int, sectors: int) -> Ring | None:
+    """The wave of both opposite parts of a ring whose frequency has the k-th direction; None: too few pixels."""
+    values, angle = pixels.between(radius - half, radius + half)
+    # Across the sectors: a quarter turn from the direction in which they lie.
+    away = (angle + pi / 2.0 - pi * k / count + pi / 2.0) % pi - pi / 2.0
+    reach = max(pi / count / 2.0, 1.5 * pi / sectors)
+    part = np.abs(away) <= reach
+    if reach > pi / 4.0 or part.sum() < 20:
+        return None
+    try:
+        ring = fit_ring(values[part], angle[part], radius, sectors, whole=False)
+    except InputError:
+        return None
+    return ring if np.isfinite(ring.sigma) and ring.mean > 0.0 else None
+
+
+def _refuse_weak(rings: list[Ring], noise: float, what: str) -> None:
+    """Refuse what is no star: weak waves, or other structure on the rings."""
+    if len(rings) < 3:
+        raise InputError(f"{what}: only {len(rings)} rings can be measured; the star is too small")
+    if min(ring.mean for ring in rings) <= 0.0:
+        raise InputError(f"{what}: the mean light of a ring is not positive; is the dark level subtracted twice?")
+    widest = rings[0]
+    strongest = max(ring.amplitude for ring in rings)
+    if strongest < 5.0 * widest.sigma or strongest == 0.0:
+        raise InputError(f"{what}: the star is below the noise (amplitude {strongest:.3g} ± {widest.sigma:.2g})")
+    rest = float(np.median([ring.residual for ring in rings[: max(3, len(rings) // 2)]]))
+    if rest**2 > (1.5 * noise) ** 2 + (0.35 * strongest) ** 2:
+        raise InputError(
+            f"{what}: more than a star is in the window (rest {rest:.3g} beside waves of {strongest:.3g}); no MTF"
+        )
+
+
+def _wave(rings: list[Ring]) -> Literal["square", "sine"]:
+    """A third harmonic wave of more than a tenth of the fundamental one comes from sharp sectors."""
+    widest = rings[0]
+    third = 0.0 if widest.third is None else float(np.hypot(*widest.third))
+    return "square" if third > 0.1 * widest.amplitude else "sine"
+
+
+def _levels(
+    pixels: StarPixels,
+    rings: list[Ring],
+    levels: tuple[float, float] | None,
+    wave: str,
+    sectors: int,
+    outer: float,
+    what: str,
+) -> tuple[float, float, str]:
+    """Light of wide dark and bright areas."""
+    if levels is not None:
+        return levels[0], levels[1], "as given"
+    widest = rings[0]
+    if wave == "sine":
+        # Next to frequency 0 the transfer falls with the square of the frequency.
+        squares = np.array([(sectors / (2.0 * pi * ring.radius)) ** 2 for ring in rings[:8]])
+        share = np.array([ring.amplitude / ring.mean for ring in rings[:8]])
+        top = float(np.polyfit(squares, share, 1)[1]) * widest.mean
+        return widest.mean - top, widest.mean + top, "widest sectors, continued to frequency 0"
+    values, angle = pixels.between(0.87 * outer, 0.99 * outer)
+    turn = (sectors * angle - np.arctan2(widest.sine, widest.cosine)) / (2.0 * pi)
+    found = []
+    for middle in (0.5, 0.0):
+        away = np.abs((turn - middle + 0.5) % 1.0 - 0.5)
+        inside, beside = values[away <= 0.07], values[(away > 0.07) & (away <= 0.12)]
+        if min(inside.size, beside.size) < 12:
+            raise InputError(f"{what}: the widest sectors hold too few pixels; give the light of dark and bright areas")
+        found.append((float(inside.mean()), float(beside.mean()), float(inside.std() / np.sqrt(inside.size))))
+    (low, low_beside, low_sigma), (high, high_beside, high_sigma) = found
+    bend = max(low_beside - low, high - high_beside)
+    if bend > 0.01 * (high - low) + 4.0 * max(low_sigma, high_sigma):
+        raise InputError(
+            f"{what}: even the widest sectors, {2 * pi * outer / sectors:.1f} pixels a period, have no flat middle, so "
+            "that the object's contrast is unknown; give the light of wide dark and bright areas"
+        )
+    return low, high, f"middle of the widest sectors, {2 * pi * outer / sectors:.1f} pixels a period"
+
+
+def _curve(rings: list[Ring], sectors: int, full: float) -> MtfCurve:
+    """Rings as a curve; each ring's wave through its mean, against that of the object."""
+    frequency = np.array([sectors / (2.0 * pi * ring.radius) for ring in rings])
+    return MtfCurve(
+        np.concatenate([[0.0], frequency]),
+        np.concatenate([[1.0], [ring.amplitude / ring.mean / full for ring in rings]]),
+        np.concatenate([[0.0], [ring.sigma / ring.mean / full for ring in rings]]),
+    )

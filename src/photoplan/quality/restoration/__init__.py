@@ -1,0 +1,1 @@
+"""Restoration: inverses of spread functions, filters designed and applied."""
