@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+from tools.blurred_scenes import discrete_spread
+from tools.edges import edge_image, gaussian
 
 from photoplan.errors import InputError
-from photoplan.quality.edges.koelbl import normalised_edge, spread_from_edge, spread_from_response
+from photoplan.quality.edges.koelbl import normalised_edge, spread_from_edge, spread_from_response, spread_of_edge
+from photoplan.quality.edges.response import measure_edge
 from photoplan.quality.spread import SpreadFunction
 
 TABLE_1 = np.array([150.0, 148, 133, 67, 52, 50])
@@ -91,3 +94,15 @@ def test_response_to_discrete_spread():
     assert spread.sigma == pytest.approx(0.01 * np.sqrt(2.0))
     with pytest.raises(InputError, match=r"known from -8\.0 to 8\.0"):
         spread_from_response(position, response, 8)
+
+
+@pytest.mark.parametrize(("angle", "phase"), [(6.0, 0.0), (96.0, 0.3), (0.0, 0.2), (90.0, -0.4), (180.0, 0.5)])
+def test_slanted_and_aligned_edges_show_the_same_shares(angle, phase):
+    """At any place of the edge between the borders of pixels."""
+    sigma = 0.5
+    pixels = edge_image((60, 60), angle, (29.5 + phase, 29.5 + phase), gaussian(sigma))
+    pixels += np.random.default_rng(3).normal(0.0, 1 / 200, pixels.shape)
+    found = spread_of_edge(measure_edge(pixels))
+    print(angle, phase, np.round(found.spread.side()[:3], 4))
+    assert found.spread.side()[:3] == pytest.approx(discrete_spread(sigma).side()[:3], abs=0.015)
+    assert abs(found.beyond) < 0.02

@@ -5,7 +5,7 @@ import pytest
 
 from photoplan.errors import InputError
 from photoplan.quality.restoration.aperture import aperture_filter
-from photoplan.quality.restoration.filter_design import radial_filter, separable_filter
+from photoplan.quality.restoration.filter_design import point_spread, radial_filter, separable_filter
 from photoplan.quality.restoration.filters import FilterKernel
 from photoplan.quality.restoration.inverse import band_matrix, condition_of, exact_inverse, spread_of_inverse
 from photoplan.quality.spread import SpreadFunction, gaussian_modulation
@@ -203,3 +203,12 @@ def test_gaussian_widths():
     offsets = np.arange(-12, 13)
     sampled = SpreadFunction.normalised(np.exp(-(offsets**2) / (2 * 1.3**2)))
     assert sampled.gaussian_fwhm() == pytest.approx(1.3 * 2.3548200450309493, rel=1e-6)
+
+
+def test_point_spread_functions_have_the_sums_that_were_measured():
+    x, y = SpreadFunction.symmetric([0.66, 0.15, 0.02]), SpreadFunction.symmetric([0.55, 0.2, 0.02, 0.005])
+    both = point_spread(x, y)
+    assert both.shape == (7, 7)
+    assert both.sum(axis=0)[1:-1] == pytest.approx(x.values)
+    assert both.sum(axis=1) == pytest.approx(y.values)
+    assert both.sum() == pytest.approx(1.0)

@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import nan
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.products.mtf_result import EdgeGroup, LabComparison, MeasuredEdge
-from photoplan.quality.edges.groups import combine, field_cell, fit_gaussian, mean_curve, quantiles, sigma_of_interval
+from photoplan.quality.edges.groups import (
+    CombinedValue,
+    combine,
+    field_cell,
+    fit_gaussian,
+    mean_curve,
+    quantiles,
+    sigma_of_interval,
+)
+from photoplan.quality.edges.koelbl import EdgeSpread, spread_of_edge
 
 __all__ = ["ENOUGH", "group_edges"]
 
 #: Slanted edges from which on those along rows and columns do not count in a mean.
 ENOUGH = 3
+#: Shares of light that means are given for: Z, A, B and the next.
+SHARES = 4
 
 Lab = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -66,6 +78,7 @@ def _group(
     beside = None
     if lab is not None:
         beside = LabComparison(lab[0], lab[1], np.array([curve.at(float(f)) for f in lab[0]]))
+    spreads = [found for m in own if (found := spread_of_edge(m)) is not None]
     low, middle, high = quantiles([m.mtf50 for m in own], (0.1, 0.5, 0.9))
     return EdgeGroup(
         edges[0].channel,
@@ -82,8 +95,21 @@ def _group(
         (low, middle, high),
         curve,
         fit_gaussian(curve),
+        tuple(_coefficient(spreads, k) for k in range(SHARES)) if direction is not None and spreads else (),
         beside,
     )
+
+
+def _coefficient(spreads: Sequence[EdgeSpread], place: int) -> CombinedValue:
+    """Mean share of light so many pixels away; edges that are not seen so far do not count."""
+    values, sigmas = [], []
+    for found in spreads:
+        spread = found.spread
+        seen = place <= spread.half
+        values.append(float(spread.side()[place]) if seen else nan)
+        both = spread.sigma
+        sigmas.append(float(both[spread.half + place]) if seen and both is not None else nan)
+    return combine(values, sigmas, least=0.0)
 
 
 def _bounds(cell: tuple[int, int], size: tuple[int, int], cells: int) -> tuple[float, float, float, float]:

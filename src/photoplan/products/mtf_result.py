@@ -15,8 +15,11 @@ from photoplan.products.plain_values import plain
 from photoplan.quality.edges.enhancement import Enhancement
 from photoplan.quality.edges.find import REASONS
 from photoplan.quality.edges.groups import CombinedValue, GaussianFit
+from photoplan.quality.edges.koelbl import spread_of_edge
 from photoplan.quality.edges.response import EdgeMeasurement
 from photoplan.quality.mtf_curve import MtfCurve
+from photoplan.quality.restoration.filter_design import point_spread
+from photoplan.quality.spread import SpreadFunction
 
 __all__ = ["EdgeGroup", "ImageMtf", "LabComparison", "MeasuredEdge", "MtfReport", "group_lines", "rejected_words"]
 
@@ -62,6 +65,7 @@ class MeasuredEdge:
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
         m = self.measured
+        found = spread_of_edge(m)
         return {
             "number": self.number,
             "line": self.line,
@@ -87,6 +91,8 @@ class MeasuredEdge:
             "fwhm_interval": m.fwhm_interval,
             "gaussian_fwhm": m.gaussian_fwhm,
             "modulation_at_half": m.nyquist,
+            "spread": [] if found is None else [round(float(v), 6) for v in found.spread.values],
+            "spread_beyond": None if found is None else found.beyond,
             "overshoot": m.overshoot,
             "overshoot_sigma": m.overshoot_sigma,
             "undershoot": m.undershoot,
@@ -143,6 +149,9 @@ class EdgeGroup:
     """Quantiles 0.1, 0.5 and 0.9 of the edges' MTF50."""
     curve: MtfCurve
     gaussian: GaussianFit
+    spread: tuple[CombinedValue, ...]
+    """Shares of light on the pixel itself and on those 1, 2, 3 pixels away (Kölbl's Z, A, B …); empty unless for one
+    direction."""
     lab: LabComparison | None
 
     def to_dict(self, pixel_um: float | None) -> dict[str, Any]:
@@ -161,6 +170,8 @@ class EdgeGroup:
             "overshoot": self.overshoot.value,
             "undershoot": self.undershoot.value,
             "gaussian": {"fwhm": self.gaussian.fwhm, "rms_difference": self.gaussian.rms},
+            "spread": [share.value for share in self.spread],
+            "spread_sigma": [share.sigma for share in self.spread],
             "laboratory": self.lab and self.lab.to_dict(),
             "curve": {
                 "cycles_per_px": self.curve.frequency,
@@ -222,6 +233,7 @@ class ImageMtf:
             "linearisation": self.linearisation,
             "edges": [edge.to_dict() for edge in self.edges],
             "summary": [group.to_dict(pixel_um) for group in self.groups],
+            "point_spread": point_spread_of(self.groups),
             "enhancement": self.enhancement.to_dict(),
             "edges_found": self.found,
             "rejected": dict(self.rejected),
@@ -232,6 +244,19 @@ class ImageMtf:
         """A line for each direction and channel of the whole field."""
         number = len({edge.number for edge in self.edges})
         return f"{self.name}: {number} edges of {self.found} · {self.linearisation}\n" + group_lines(self.groups)
+
+
+def point_spread_of(groups: Sequence[EdgeGroup]) -> list[list[float]] | None:
+    """Point spread function of the first channel from both directions' shares; None if one is not known."""
+    shares = {
+        group.direction: [share.value for share in group.spread if isfinite(share.value)]
+        for group in groups
+        if group.cell is None and group.channel == groups[0].channel and group.spread
+    }
+    if not shares.get("x") or not shares.get("y"):
+        return None
+    both = (SpreadFunction.symmetric(shares[name]) for name in ("x", "y"))
+    return [[round(float(v), 6) for v in row] for row in point_spread(*both)]
 
 
 def group_lines(groups: Sequence[EdgeGroup]) -> str:
@@ -251,8 +276,13 @@ def _figures(group: EdgeGroup) -> str:
     return (
         f"MTF50 {group.mtf50.value:.4f} [{low:.4f}, {high:.4f}] cy/px  MTF10 {_number(group.mtf10.value)}  "
         f"FWHM {_number(group.fwhm.value)} px  Gaussian {group.gaussian.fwhm:.2f} px (rms {group.gaussian.rms:.3f})  "
-        f"{group.mtf50.edges} edges"
+        f"{group.mtf50.edges} edges" + _shares(group)
     )
+
+
+def _shares(group: EdgeGroup) -> str:
+    names = zip("ZAB", group.spread, strict=False)
+    return "".join(f"  {name} {share.value:.3f}" for name, share in names)
 
 
 def _number(value: float) -> str:

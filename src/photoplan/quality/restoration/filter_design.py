@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
+from photoplan.quality.spread import SpreadFunction
 
-__all__ = ["radial_filter", "separable_filter"]
+__all__ = ["point_spread", "radial_filter", "separable_filter"]
 
 
 def radial_filter(
@@ -47,6 +48,17 @@ def radial_filter(
     right = np.concatenate([across[half:], along[half:]])
     axes = np.linalg.lstsq(equations, right, rcond=None)[0]
     return np.asarray(weights @ axes)
+
+
+def point_spread(x: SpreadFunction, y: SpreadFunction) -> NDArray[np.float64]:
+    """Point spread function whose sums are the spread functions along a row and along a column.
+
+    Between the axes by the rotation assumption of `radial_filter`; both spread functions are made symmetric, and the
+    shorter one is continued with 0. Shape (2 n + 1, 2 n + 1), sum 1.
+    """
+    half = max(x.half, y.half)
+    across, along = (np.pad(one.side(), (0, half - one.half)) for one in (x, y))
+    return radial_filter(np.concatenate([across[:0:-1], across]), np.concatenate([along[:0:-1], along]))
 
 
 def separable_filter(
