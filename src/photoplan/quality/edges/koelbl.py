@@ -202,9 +202,9 @@ def spread_from_response(
 def spread_of_edge(edge: EdgeMeasurement) -> EdgeSpread | None:
     """Discrete spread function of a measured edge, five pixels to each side or as far as it is seen.
 
-    It follows from the edge spread function as measured. Also for edges that run along the pixels: an edge beside the
-    border of two pixels is not the same as an object pixel of mixed grey value, by which `spread_from_edge` explains it;
-    half a pixel from the border that would give Z = 0.83 where it is 0.61.
+    It follows from the edge spread function as measured. An edge that runs along the pixels shows that at one phase
+    only, and what lies between its samples is a model (`EdgeMeasurement.sampling`). The solution by a mixed object pixel
+    (`spread_from_edge`) is no help there: half a pixel from the border it gives Z = 0.83 where it is 0.61.
 
     Returns
     -------
