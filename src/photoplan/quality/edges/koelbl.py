@@ -203,8 +203,8 @@ def spread_of_edge(edge: EdgeMeasurement) -> EdgeSpread | None:
     """Discrete spread function of a measured edge, five pixels to each side or as far as it is seen.
 
     It follows from the edge spread function as measured. An edge that runs along the pixels shows that at one phase
-    only, and what lies between its samples is a model (`EdgeMeasurement.sampling`). The solution by a mixed object pixel
-    (`spread_from_edge`) is no help there: half a pixel from the border it gives Z = 0.83 where it is 0.61.
+    only, and what lies between its samples is a model (`EdgeMeasurement.sampling`). The solution by a mixed object
+    pixel (`spread_from_edge`) is no help there: half a pixel from the border it gives Z = 0.83 where it is 0.61.
 
     Returns
     -------
