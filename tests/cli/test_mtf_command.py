@@ -277,7 +277,6 @@ class TestFaults:
         [
             (("--band", "7"), "--band 7; the file has bands 1 to 1"),
             (("--band", "red"), "--band red"),
-            (("--linearisation", "gamma"), "--linearisation gamma: is no file"),
             (("--roi", "300", "0", "100", "100"), "leaves"),
             (("--grid", "0"), "--grid 0"),
             (("--most-edges", "0"), "--most-edges 0"),
@@ -289,6 +288,9 @@ class TestFaults:
     )
     def test_wrong_use(self, image: Path, photoplan: Here, words: tuple[str, ...], says: str) -> None:
         assert says in refused(photoplan, image, *words, code=2)
+
+    def test_a_linearisation_that_is_no_file(self, image: Path, photoplan: Here) -> None:
+        assert "linearisation gamma: is no file" in refused(photoplan, image, "--linearisation", "gamma", code=3)
 
     def test_an_image_given_twice(self, image: Path, photoplan: Here) -> None:
         assert "given twice" in refused(photoplan, image, image, code=2)

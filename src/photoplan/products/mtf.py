@@ -13,8 +13,9 @@ from photoplan.io.disk import write_atomically
 from photoplan.io.mtf_file import read_mtf_table
 from photoplan.io.named_table import write_named_table
 from photoplan.io.product import check_output
+from photoplan.products.linearisation import linearisation_of
 from photoplan.products.mtf_groups import group_edges
-from photoplan.products.mtf_image import LightImage, linearisation_of
+from photoplan.products.mtf_image import LightImage
 from photoplan.products.mtf_measure import Measuring, measure_image
 from photoplan.products.mtf_page import mtf_page
 from photoplan.products.mtf_result import EdgeGroup, ImageMtf, MtfReport

@@ -8,15 +8,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.errors import InputError, UsageError
+from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
-from photoplan.io.linearisation_file import read_linearisation_table
 from photoplan.io.raster import RasterReader
 from photoplan.quality.edges.candidates import range_of
 from photoplan.quality.edges.find import EdgePicture
 from photoplan.quality.linearise import Linearisation
 
-__all__ = ["LUMINANCE", "LightImage", "linearisation_of"]
+__all__ = ["LUMINANCE", "LightImage"]
 
 #: Channel 0.
 LUMINANCE = 0
@@ -28,28 +27,6 @@ _OFTEN = 20
 """Pixels that must have such a value."""
 _SAMPLES = 24
 """Windows in which the range of values is looked for."""
-
-
-def linearisation_of(words: str) -> Linearisation:
-    """What ``linear``, ``srgb`` or the name of a table stand for.
-
-    Raises
-    ------
-    InputError
-        The table cannot be read or used.
-    UsageError
-        It is neither a word nor a file.
-    """
-    if words in ("linear", "srgb"):
-        return Linearisation(words)  # type: ignore[arg-type]
-    path = Path(words)
-    if not path.is_file():
-        raise UsageError(f"--linearisation {words}: is no file; give linear, srgb, or a table that exists")
-    table = read_linearisation_table(path)
-    try:
-        return Linearisation.from_table(table)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,8 @@ from photoplan.geometry.grid import Window
 from photoplan.io.disk import write_atomically
 from photoplan.io.named_table import write_named_table
 from photoplan.io.product import check_output
-from photoplan.products.mtf_image import LUMINANCE, LightImage, linearisation_of
+from photoplan.products.linearisation import linearisation_of
+from photoplan.products.mtf_image import LUMINANCE, LightImage
 from photoplan.products.mtf_pattern_result import ImagePattern, PatternReport, PatternResult
 from photoplan.quality.linearise import Linearisation
 from photoplan.quality.patterns.bar_curve import bar_curve

@@ -25,9 +25,10 @@ from photoplan.io.storage import Nodata
 from photoplan.products.aligned_reader import AlignedReader
 from photoplan.products.chromatic import load_chromatic, measured_once, model_figures
 from photoplan.products.filter_files import entries_of, load_filter
+from photoplan.products.linearisation import linearisation_of
 from photoplan.products.restore_execute import Job, RestoredImage, earlier_result, memory_of_a_tile, restore_one
 from photoplan.products.restore_request import RestoreRequest
-from photoplan.products.restored_reader import RestoredReader, kept_nodata, linearisation_of, restored_reader
+from photoplan.products.restored_reader import RestoredReader, kept_nodata, restored_reader
 from photoplan.quality.colour.model import ChromaticModel
 from photoplan.quality.restoration.filters import RestorationFilter
 

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
+from photoplan.products.linearisation import linearisation_of
 from photoplan.products.mtf import MtfRequest, measure_mtf
-from photoplan.products.mtf_image import LightImage, linearisation_of
+from photoplan.products.mtf_image import LightImage
 from photoplan.products.mtf_result import ImageMtf, MtfReport
 from photoplan.quality.edges.response import EdgeMeasurement
 from photoplan.quality.edges.sharpness import LEAST_EDGES, sharpness_of

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,6 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.io.linearisation_file import read_linearisation_table
 from photoplan.io.raster import RasterReader
 from photoplan.io.raster_info import RasterInfo
 from photoplan.io.storage import Nodata
@@ -20,7 +18,7 @@ from photoplan.quality.linearise import Linearisation
 from photoplan.quality.restoration.filters import RestorationFilter
 from photoplan.quality.restoration.restorer import RestoredPixels, Restorer
 
-__all__ = ["RestoredReader", "kept_nodata", "linearisation_of", "restored_reader"]
+__all__ = ["RestoredReader", "kept_nodata", "restored_reader"]
 
 #: Side of the parts in which a large window is restored: what bounds memory. The result does not depend on it.
 PART = 512
@@ -148,21 +146,3 @@ def restored_reader(
     except InputError as error:
         raise InputError(f"{source.path}: {error}") from None
     return RestoredReader(source, restorer)
-
-
-def linearisation_of(text: str) -> Linearisation:
-    """The linearisation that a user names: `linear`, `srgb`, or a file with a table.
-
-    Raises
-    ------
-    InputError
-        The table cannot be used.
-    """
-    if text in ("linear", "srgb"):
-        return Linearisation("linear" if text == "linear" else "srgb")
-    path = Path(text)
-    try:
-        return Linearisation.from_table(read_linearisation_table(path))
-    except InputError as error:
-        message = str(error)
-        raise InputError(message if message.startswith(str(path)) else f"{path}: {message}") from None

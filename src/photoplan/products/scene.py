@@ -26,9 +26,10 @@ from photoplan.io.project_cameras import interior_of, lens_of
 from photoplan.io.project_model import Image, Project, Terrain
 from photoplan.io.raster import RasterReader
 from photoplan.products.filter_files import load_filter
+from photoplan.products.linearisation import linearisation_of
 from photoplan.products.open_terrain import open_terrain
 from photoplan.products.reach import reach
-from photoplan.products.restored_reader import RestoredReader, linearisation_of, restored_reader
+from photoplan.products.restored_reader import RestoredReader, restored_reader
 from photoplan.surfaces.base import Surface
 from photoplan.surfaces.level import LevelSurface
 from photoplan.surfaces.shifted import ShiftedSurface
