@@ -14,7 +14,7 @@ from photoplan.quality.camera.grey_wedge import grey_wedge
 from photoplan.quality.camera.linearity import linearity
 from photoplan.quality.camera.photon_transfer import photon_transfer
 from photoplan.quality.camera.saturation import find_saturation
-from photoplan.quality.straight_line import fit_line
+from photoplan.quality.camera.straight_line import fit_line
 
 #: Small images for the many runs that a standard deviation of standard deviations needs.
 SMALL = Sensor(shape=(24, 30))

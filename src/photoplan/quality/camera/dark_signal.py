@@ -1,7 +1,7 @@
 """Dark signal: what a sensor shows without light, how it grows with the exposure and with temperature.
 
 The mean grey value of dark frames grows with the exposure by the dark current, and the current doubles every few
-degrees: I(T) = I₀ 2^((T − T₀)/T_d) (EMVA 1288 release 4 linear, section 7).
+degrees: I(T) = I₀ 2^((T − T₀)/T_d) (EMVA 1288 release 4 linear, sections 3 and 7).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from photoplan.errors import InputError
 from photoplan.quality.camera.frame_statistics import Level, check_level
 from photoplan.quality.camera.photon_transfer import is_clipped_dark
-from photoplan.quality.straight_line import StraightLine, fit_line
+from photoplan.quality.camera.straight_line import StraightLine, fit_line
 
 __all__ = ["DarkCurrent", "DoublingTemperature", "dark_current", "doubling_temperature"]
 

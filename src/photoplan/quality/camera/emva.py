@@ -1,10 +1,14 @@
 """Result sheet of EMVA 1288 release 4 linear: quantum efficiency, gain, noise, saturation, dynamic range, threshold.
 
-Unlike `photon_transfer`, which weighs, the sheet follows the standard to the letter: unweighted lines through the
-origin between 0 and 70 % of saturation, saturation at the largest variance (section 6). With y for grey values and p
-for photons: R = slope of μ_y − μ_y.dark over μ_p, K = slope of σ²_y − σ²_y.dark over μ_y − μ_y.dark, η = R / K,
-σ_d = √(σ²_y.dark − 1/12) / K, μ_p.min = (√(σ²_y.dark / K² + 1/4) + 1/2) / η, DR = μ_p.sat / μ_p.min,
-SNR_max = √μ_e.sat.
+Unlike `photon_transfer`, which weighs, the sheet follows section 6 of the standard: unweighted lines between 0 and 70 %
+of saturation, saturation at the largest variance. With y for grey values and p for photons: R = slope of
+μ_y − μ_y.dark over μ_p (eq. 49), K = slope of σ²_y − σ²_y.dark over μ_y − μ_y.dark (eq. 50), η = R / K (eq. 52),
+σ_d = √(σ²_y.dark − 1/12) / K (eq. 53; below 0.24 DN² only σ_d < 0.40 / K is known, eq. 54),
+μ_p.min = (√(σ²_y.dark / K² + 1/4) + 1/2) / η (eq. 26, 27), DR = μ_p.sat / μ_p.min (eq. 28), SNR_max = √μ_e.sat
+(eq. 55).
+
+Both lines go through the origin, as those of the package `emva1288` do. Eq. 50 is also read with an offset; a curved
+photon transfer then gives another gain, 1.1 % less in that package's own example.
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ from photoplan.quality.camera.photon_transfer import LEAST_VARIANCE, QUANTISATIO
 
 __all__ = ["EmvaPoints", "EmvaSheet", "emva_sheet"]
 
+#: Part of the signal at saturation up to which levels count, by the standard.
 _RANGE = 0.7
 
 

@@ -1,8 +1,10 @@
 """Fixed pattern: what differs from pixel to pixel and stays from frame to frame.
 
-Spatial variances as in EMVA 1288 release 4 linear, section 8: that of a mean image, without what is left of the
-temporal noise, split into rows, columns and single pixels by the variances of the row and column means; DSNU from dark,
-PRNU from dark and bright frames; spectrograms along rows and columns with the excess over white noise.
+Spatial variances as in EMVA 1288 release 4 linear: that of a mean image, without what is left of the temporal noise
+(eq. 33–36), split into rows, columns and single pixels by the variances of the row and column means (eq. 41, 42); DSNU
+from dark (eq. 66), PRNU from dark and bright frames (eq. 67); spectrograms along rows and columns with the excess over
+white noise. Sums are divided by n − 1, those of the standard by n. The standard filters dark frames like bright ones;
+whether a mean image is filtered is the caller's choice here.
 """
 
 from __future__ import annotations

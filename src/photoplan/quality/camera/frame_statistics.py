@@ -2,7 +2,7 @@
 
 The mean image, the temporal variance of every pixel, and their summary. A lamp that flickers makes whole frames
 brighter or darker; the summary takes the differences of the frames' means out of the temporal variance (as
-EMVA 1288 release 4 linear does for two frames; here for any number).
+EMVA 1288 release 4 linear, eq. 18, does for two frames; here for any number).
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
-from photoplan.quality.straight_line import fit_line
+from photoplan.quality.camera.straight_line import fit_line
 
 __all__ = ["GreyWedge", "grey_wedge"]
 

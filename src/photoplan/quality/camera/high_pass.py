@@ -1,8 +1,8 @@
 """Background of a sensor's image taken away, so that only what differs from pixel to pixel is left.
 
-`high_pass` is the filter of EMVA 1288 (release 3.1, appendix C.5): the image minus itself smoothed by a 7 × 7 box, an
-11 × 11 box and a 3 × 3 binomial filter. `background` follows the image by medians of blocks: single
-pixels, however bright, leave no trace in it.
+`high_pass` is the filter of EMVA 1288 release 4 linear, section 8.1 (as in release 3.1, appendix C.5): the image minus
+itself smoothed by a 7 × 7 box, an 11 × 11 box and a 3 × 3 binomial filter. `background` follows the image by medians of
+blocks: single pixels, however bright, leave no trace in it.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from scipy import ndimage
 
 __all__ = ["LINE_SHARE", "WHITE_SHARE", "background", "high_pass"]
 
+#: Sides of the boxes, pixels, and one row of the binomial filter, by the standard.
 _BOXES = (7, 11)
 _BINOMIAL = (0.25, 0.5, 0.25)
 #: Side of a block of `background`, pixels.

@@ -1,8 +1,8 @@
 """Linearity: how exactly grey values are proportional to the light.
 
-The linearity error is that of EMVA 1288 release 4 linear: a line fitted to the levels between 5 % and 95 % of
-saturation by least squares of the relative deviations, and the mean of their absolute values in percent. The response
-between neighbouring levels shows where a curve bends (Behr 1989, §4.2.2 and fig. 4.12).
+The linearity error is that of EMVA 1288 release 4 linear, eq. 58–63: a line fitted to the levels between 5 % and 95 %
+of saturation by least squares of the relative deviations, and the mean of their absolute values in percent. The
+response between neighbouring levels shows where a curve bends (Behr 1989, §4.2.2 and fig. 4.12).
 """
 
 from __future__ import annotations

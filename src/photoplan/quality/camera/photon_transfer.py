@@ -2,7 +2,7 @@
 
 Photons arrive independently, so the variance of electrons is their number, and with a gain K (grey values per electron)
 the variance in squared grey values grows as K times the mean (Janesick 2007, ch. 5; EMVA 1288 release 4 linear,
-section 2: σ²_y = σ²_read + K (μ_y − μ_bias)). Electrons of the dark current obey the same law, so dark frames lie on
+section 2.4: σ²_y = σ²_read + K (μ_y − μ_bias)). Electrons of the dark current obey the same law, so dark frames lie on
 the same line.
 """
 
@@ -18,18 +18,18 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.quality.camera.frame_statistics import Level, check_level
-from photoplan.quality.straight_line import StraightLine, fit_line
+from photoplan.quality.camera.straight_line import StraightLine, fit_line
 
 __all__ = ["QUANTISATION", "PhotonTransfer", "is_clipped_dark", "photon_transfer"]
 
 #: Variance of rounding to whole grey values (Behr 1989, eq. 3.14).
 QUANTISATION = 1.0 / 12.0
-#: Below this variance rounding hides the noise (EMVA 1288 release 4 linear, limits of the method).
+#: Below this variance rounding hides the noise (EMVA 1288 release 4 linear, eq. 53, 54).
 LEAST_VARIANCE = 0.24
 #: Share of zeros beyond which black is cut off and mean and variance are not those of the signal.
 ZERO_SHARE = 0.005
 _SATURATED_SHARE = 1e-3
-#: Part of the range up to saturation in which variance and mean are taken as linear (EMVA 1288).
+#: Part of the range up to saturation in which variance and mean are taken as linear (EMVA 1288, as for eq. 50).
 _RANGE = 0.7
 
 

@@ -2,7 +2,7 @@
 
 Three signs, the first that is found counts: grey values stop at the largest that the camera writes; the response falls
 below the line of the darker levels; the temporal variance falls although the mean grows (EMVA 1288 release 4 linear,
-saturation).
+section 6.6).
 """
 
 from __future__ import annotations
