@@ -14,6 +14,7 @@ from photoplan.cli.restore_options import filter_options, filter_request
 
 if TYPE_CHECKING:
     from photoplan.products.restore import RestoredImage, RestorePlan
+    from photoplan.products.restore_report import ReportFile
 
 __all__ = ["command"]
 
@@ -33,6 +34,7 @@ __all__ = ["command"]
 @click.option("--compress", default="deflate", show_default=True, help="deflate, zstd, lzw, jpeg or none.")
 @click.option("--workers", type=click.IntRange(1), default=None, help="Tiles computed at once [all cores].")
 @click.option("--memory", type=BYTES, default=None, metavar="SIZE", help="Stay under this, e.g. 2GB.")
+@click.option("--report", type=click.Path(path_type=Path), metavar="FILE.html", help="Report with plots.")
 @click.option("--overwrite", is_flag=True, help="Replace results that exist.")
 @click.option("--no-quicklook", is_flag=True, help="Write no pictures.")
 @click.option("--dry-run", is_flag=True, help="Say what would be done, and stop.")
@@ -60,9 +62,9 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
     options["quicklook"] = not options.pop("no_quicklook")
     options["workers"] = options["workers"] or psutil.cpu_count() or 1
     asked = filter_request(images, options)
-    kept = options.pop("save_filter")
-    found = asked.file or requested_filter(asked, lambda total: progress(total, quiet, "tiles"), talk)
-    request = RestoreRequest(images, found, **options)
+    kept, page = options.pop("save_filter"), _page(options, [*images, *([asked.file] if asked.file else [])])
+    found = requested_filter(asked, lambda total: progress(total, quiet, "tiles"), talk)
+    request = RestoreRequest(images, asked.file or found.filter, **options)
     plan = plan_restoration(request)
     for line in _before(plan):
         talk(line)
@@ -81,9 +83,21 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
             talk(line)
 
     report = restore_images(request, lambda total: progress(total, quiet), talk, finished)
+    if page is not None:
+        report = page.write(found, plan.jobs, report)
     if as_json:
         click.echo(json.dumps(report.to_dict(), indent=2, ensure_ascii=False))
+    elif report.report is not None:
+        click.echo(str(report.report))
     end_with_failures(report.failed, len(report.images))
+
+
+def _page(options: dict[str, Any], inputs: list[Path]) -> ReportFile | None:
+    """The report that the options ask for, which are taken out; refused before any work."""
+    from photoplan.products.restore_report import open_report
+
+    path: Path | None = options.pop("report")
+    return None if path is None else open_report(path, inputs, overwrite=options["overwrite"])
 
 
 def _before(plan: RestorePlan) -> list[str]:

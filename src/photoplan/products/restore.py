@@ -57,6 +57,8 @@ class RestoreReport:
     """Why an image could not be restored, by its name."""
     filter: RestorationFilter
     folder: Path
+    report: Path | None = None
+    """The report with plots, where one was written."""
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for `--json`."""
@@ -65,6 +67,7 @@ class RestoreReport:
             "images": [image.to_dict() for image in self.images],
             "failed": dict(self.failed),
             "folder": str(self.folder),
+            "report": None if self.report is None else str(self.report),
         }
 
 

@@ -15,7 +15,7 @@ from photoplan.products.restore_design import DesignRequest, MeasuredFilter, des
 from photoplan.quality.restoration.aperture import aperture_filter
 from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
 
-__all__ = ["FilterRequest", "keep_filter", "requested_filter"]
+__all__ = ["FilterRequest", "FoundFilter", "keep_filter", "requested_filter"]
 
 #: File that a measured filter is written to, in the folder of the results.
 FILTER_NAME = "restoration_filter.toml"
@@ -35,11 +35,22 @@ class FilterRequest:
             raise UsageError("give a filter file, the aperture of a scanner, or images to measure; one of them")
 
 
+@dataclass(frozen=True, eq=False)
+class FoundFilter:
+    """A filter and where it comes from."""
+
+    filter: RestorationFilter
+    origin: str
+    """In words: "the file …"."""
+    measured: MeasuredFilter | None = None
+    """What was measured, where it was."""
+
+
 def requested_filter(
     request: FilterRequest,
     begin: Callable[[int], AbstractContextManager[Callable[[int, int], None]]],
     talk: Callable[[str], None] = lambda text: None,
-) -> RestorationFilter:
+) -> FoundFilter:
     """The filter that is asked for.
 
     Parameters
@@ -58,14 +69,14 @@ def requested_filter(
         The file is no filter, the aperture cannot be undone, or the images do not determine a filter.
     """
     if request.file is not None:
-        return load_filter(request.file)
+        return FoundFilter(load_filter(request.file), f"the file {request.file}")
     if request.aperture is not None:
-        return _for_aperture(request.aperture)
+        return FoundFilter(_for_aperture(request.aperture), f"the aperture of a scanner, {request.aperture}")
     assert request.design is not None
     found = design_restoration(request.design, begin, talk)
     for line in _lines(found):
         talk(line)
-    return found.filter
+    return FoundFilter(found.filter, "edges of the images", found)
 
 
 def keep_filter(path: Path, filter_: RestorationFilter, *, overwrite: bool = False) -> Path:
