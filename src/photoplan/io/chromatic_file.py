@@ -7,13 +7,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, Strict, ValidationError
+from pydantic import Field, Strict
 
-from photoplan.errors import InputError
 from photoplan.io.camera_model import Entry, Number, Pair, Pixels
 from photoplan.io.disk import write_atomically
-from photoplan.io.project_errors import explain
-from photoplan.io.toml_file import read_toml
+from photoplan.io.project_write import toml_value
+from photoplan.io.toml_entries import read_entries
 
 __all__ = ["ChromaticBand", "ChromaticFile", "read_chromatic", "write_chromatic"]
 
@@ -53,11 +52,7 @@ def read_chromatic(path: Path) -> ChromaticFile:
     InputError
         The file cannot be read, or an entry is missing, unknown or of a wrong type; the message names its line.
     """
-    contents, text = read_toml(path, _MAX_BYTES)
-    try:
-        return ChromaticFile.model_validate(contents)
-    except ValidationError as error:
-        raise InputError(explain(error, contents, str(path), text)) from None
+    return read_entries(path, ChromaticFile, _MAX_BYTES)
 
 
 def write_chromatic(path: Path, contents: Mapping[str, Any], bands: Sequence[Mapping[str, Any]]) -> None:
@@ -87,13 +82,7 @@ def write_chromatic(path: Path, contents: Mapping[str, Any], bands: Sequence[Map
 
 
 def _text(value: Any) -> str:
-    """A plain value as TOML."""
-    if isinstance(value, str):
-        escaped = "".join(c if c >= " " and c not in '"\\' else f"\\u{ord(c):04x}" for c in value)
-        return f'"{escaped}"'
+    """A plain value as TOML; numbers with nine digits, which is far below what is measured."""
     if isinstance(value, list | tuple):
         return "[" + ", ".join(_text(each) for each in value) + "]"
-    if isinstance(value, int):
-        return str(value)
-    number = f"{float(value):.9g}"
-    return number if any(c in number for c in ".en") else number + ".0"
+    return toml_value(float(f"{value:.9g}") if isinstance(value, float) else value)

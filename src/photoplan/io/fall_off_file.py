@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, Strict, ValidationError
+from pydantic import Field, Strict
 
-from photoplan.errors import InputError
 from photoplan.io.camera_model import Entry, Number, Positive
-from photoplan.io.project_errors import explain
-from photoplan.io.toml_file import read_toml
+from photoplan.io.project_write import toml_value
+from photoplan.io.toml_entries import read_entries
 
 __all__ = ["FallOffEntry", "fall_off_text", "read_fall_off_entry"]
 
@@ -60,11 +58,7 @@ def read_fall_off_entry(path: Path) -> FallOffEntry:
     InputError
         The file is not of this form; the message names the entry.
     """
-    contents, text = read_toml(path, _MAX_BYTES)
-    try:
-        return FallOffEntry.model_validate(contents)
-    except ValidationError as error:
-        raise InputError(explain(error, contents, str(path), text)) from None
+    return read_entries(path, FallOffEntry, _MAX_BYTES)
 
 
 def fall_off_text(entry: FallOffEntry) -> str:
@@ -77,13 +71,13 @@ def fall_off_text(entry: FallOffEntry) -> str:
         f"size = [{entry.size[0]}, {entry.size[1]}]",
     ]
     if entry.plane:
-        lines.append(f"plane = {_quoted(entry.plane)}")
-    lines.append(f"principal_point_px = {_numbers(entry.principal_point_px)}")
+        lines.append(f"plane = {toml_value(entry.plane)}")
+    lines.append(f"principal_point_px = {toml_value(entry.principal_point_px)}")
     if entry.camera_constant_px is not None:
         lines.append(f"camera_constant_px = {entry.camera_constant_px!r}")
     lines.append(f"dark_dn = {entry.dark_dn!r}")
     if entry.gain_image is not None:
-        lines.append(f"gain_image = {_quoted(entry.gain_image)}")
+        lines.append(f"gain_image = {toml_value(entry.gain_image)}")
     if entry.gain_reduction is not None:
         lines.append(f"gain_reduction = {entry.gain_reduction}")
     for term in entry.terms:
@@ -91,11 +85,3 @@ def fall_off_text(entry: FallOffEntry) -> str:
         if term.sigma is not None:
             lines.append(f"sigma = {term.sigma!r}")
     return "\n".join(lines) + "\n"
-
-
-def _numbers(values: Sequence[float]) -> str:
-    return "[" + ", ".join(repr(float(v)) for v in values) + "]"
-
-
-def _quoted(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import Field, Strict, ValidationError, model_validator
+from pydantic import Field, Strict, model_validator
 
 from photoplan.errors import InputError
 from photoplan.io.camera_model import Entry, Name, Number
-from photoplan.io.project_errors import explain
-from photoplan.io.toml_file import read_toml
+from photoplan.io.toml_entries import read_entries
 
 __all__ = ["SensorDescription", "read_sensor"]
 
@@ -195,12 +194,8 @@ def read_sensor(path: Path) -> SensorDescription:
     InputError
         The file cannot be read, an entry is unknown, wrong or missing (with its line), or nothing is described.
     """
-    contents, text = read_toml(path, _MAX_BYTES)
-    try:
-        described = SensorDescription.model_validate(contents)
-    except ValidationError as error:
-        raise InputError(explain(error, contents, str(path), text)) from None
-    if not set(contents) - {"name", "stated"}:
+    described = read_entries(path, SensorDescription, _MAX_BYTES)
+    if not described.model_fields_set - {"name", "stated"}:
         raise InputError(
             f"{path}: describes nothing; write at least one of the tables [viewing], [video], [sensor], [image], "
             "[transfer], [noise], [optics]"

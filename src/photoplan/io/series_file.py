@@ -10,20 +10,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.camera_model import Entry
 from photoplan.io.names import resolve_input
-from photoplan.io.project_errors import explain
 from photoplan.io.raster import RasterReader
 from photoplan.io.series_model import CameraFacts, FramesEntry, SeriesEntry
 from photoplan.io.series_names import Values, find_files, number_of_time
 from photoplan.io.series_positions import MeasuredPositions, read_positions
 from photoplan.io.series_statistics import ReducedPoint, read_statistics
 from photoplan.io.series_table import read_conditions
-from photoplan.io.toml_file import read_toml
+from photoplan.io.toml_entries import read_entries
 
 __all__ = ["Frame", "Group", "Series", "read_series"]
 
@@ -102,11 +99,7 @@ def read_series(path: Path) -> Series:
     InputError
         An entry is wrong, names no file, or its images differ in size or type; the message names the entry.
     """
-    contents, text = read_toml(path, _MAX_BYTES)
-    try:
-        entries = SeriesEntry.model_validate(contents)
-    except ValidationError as error:
-        raise InputError(explain(error, contents, str(path), text)) from None
+    entries = read_entries(path, SeriesEntry, _MAX_BYTES)
     folder = path.absolute().parent
     frames: list[Frame] = []
     inputs: list[Path] = [path]

@@ -9,12 +9,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, Strict, ValidationError
+from pydantic import Field, Strict
 
-from photoplan.errors import InputError
 from photoplan.io.camera_model import Entry, Number, Pair
-from photoplan.io.project_errors import explain
-from photoplan.io.toml_file import read_toml
+from photoplan.io.toml_entries import read_entries
 
 __all__ = ["SimulationFile", "read_simulation"]
 
@@ -207,8 +205,4 @@ def read_simulation(path: Path) -> SimulationFile:
     InputError
         The file cannot be read, or an entry is unknown or of a wrong type; the message names its line.
     """
-    contents, text = read_toml(path, _MAX_BYTES)
-    try:
-        return SimulationFile.model_validate(contents)
-    except ValidationError as error:
-        raise InputError(explain(error, contents, str(path), text)) from None
+    return read_entries(path, SimulationFile, _MAX_BYTES)
