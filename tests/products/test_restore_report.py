@@ -16,10 +16,10 @@ from tools.command import Here
 
 from photoplan.errors import UsageError
 from photoplan.io.raster import RasterReader
-from photoplan.products.restore_design import DesignRequest
+from photoplan.products.restore_design import DesignedPart, DesignRequest
 from photoplan.products.restore_details import compare
 from photoplan.products.restore_filter import FilterRequest, FoundFilter, requested_filter
-from photoplan.products.restore_page import _expected, filter_facts
+from photoplan.products.restore_page import _pictures, filter_facts
 from photoplan.products.restore_report import open_report
 from photoplan.quality.restoration.design import DesignOptions, design_filter
 from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
@@ -81,13 +81,17 @@ def test_the_expected_curve_is_mtf_times_response(found: FoundFilter) -> None:
 
 def test_an_exact_inverse_is_expected_to_lift_the_curve_to_that_of_whole_pixels() -> None:
     """MTF × response = MTF / transfer of the discrete spread function: for Gaussian blur it passes 1."""
-    one = sharpness(0.5)
-    design = design_filter(one, one, SceneStatistics(0.01, 0.05), DesignOptions("exact"))
-    frequency = np.linspace(0.0, 0.5, 101)
-    exact = np.interp(frequency, one.modulation().frequency, one.modulation().modulation)
-    exact = exact / np.abs(one.spread.transfer(frequency))
-    assert _expected(one.modulation(), design.kernel, (1.0, 0.0)) == pytest.approx(exact, abs=0.02)
-    assert exact.max() > 1.1
+    both = (sharpness(0.4), sharpness(0.5))
+    scene = SceneStatistics(0.01, 0.05)
+    design = design_filter(*both, scene, DesignOptions("exact", "separable"))
+    pictures = _pictures(DesignedPart(None, None, 9, both, (), scene, design))
+    for one, picture in zip(both, pictures):
+        curve = one.modulation()
+        exact = np.interp(picture.frequency, curve.frequency, curve.modulation)
+        exact = exact / np.abs(one.spread.transfer(picture.frequency))
+        assert picture.expected == pytest.approx(exact, abs=0.02)
+        assert exact.max() > 1.1
+    assert np.abs(pictures[0].expected - pictures[1].expected).max() > 0.05
 
 
 def test_facts_of_a_measured_filter(found: FoundFilter) -> None:
