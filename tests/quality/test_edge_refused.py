@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
-from tools.edges import edge_image, gaussian
+from tools.edges import edge_image, gaussian, true_mtf50
 
 from photoplan.errors import InputError
 from photoplan.quality.edges.response import EdgeSettings, measure_edge
@@ -25,7 +25,8 @@ def _refused(image, words, **options):
 
 def test_the_clean_edge_is_measured():
     for seed in range(20):
-        measure_edge(_clean(seed), limits=(-1.0, 2.0))
+        edge = measure_edge(_clean(seed), limits=(-1.0, 2.0))
+        assert edge.mtf50 == pytest.approx(true_mtf50(6.0, gaussian(0.7)), rel=0.1)
 
 
 @pytest.mark.parametrize("seed", range(10))

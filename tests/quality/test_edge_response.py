@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from math import cos, pi, radians, sin, sqrt
 
 import numpy as np
@@ -100,6 +101,7 @@ def test_long_edges_reach_the_bounds_one_by_one():
     assert worst[0] < 0.015 and worst[1] < 0.01
 
 
+@cache
 def _with_tails(length, number):
     """Errors of MTF50 and FWHM of edges with coma and stray light out to 12 pixels, and whether intervals hold them."""
     random = np.random.default_rng(3)
@@ -127,7 +129,7 @@ def test_short_edges_with_tails_reach_the_bound_of_mtf50():
 
 @pytest.mark.xfail(reason="2 %: on 100 pixels the noise hides a form that is neither Gaussian nor symmetric")
 def test_short_edges_with_tails_reach_the_bound_of_fwhm():
-    assert _with_tails(100, 30)[0][1] < 0.01
+    assert _with_tails(100, 60)[0][1] < 0.01
 
 
 @pytest.mark.parametrize("angle", [0.0, 90.0, 180.0, 270.0, 45.0])

@@ -15,7 +15,7 @@ from photoplan.geometry.grid import Window
 from photoplan.io.camera_model import Entry
 from photoplan.io.names import resolve_input
 from photoplan.io.raster import RasterReader
-from photoplan.io.series_model import CameraFacts, FramesEntry, SeriesEntry
+from photoplan.io.series_model import CONDITIONS, CameraFacts, FramesEntry, SeriesEntry
 from photoplan.io.series_names import Values, find_files, number_of_time
 from photoplan.io.series_positions import MeasuredPositions, read_positions
 from photoplan.io.series_statistics import ReducedPoint, read_statistics
@@ -231,10 +231,10 @@ def _refuse_twice(path: Path, frames: list[Frame]) -> None:
 
 def _frame(file: Path, group: Group, named: Values, row: Values, camera: CameraFacts) -> Frame:
     """A frame with its conditions: the table counts before the name, the name before the entry."""
-    from_entry = {k: v for k in _CONDITIONS if (v := getattr(group.entry, k)) is not None}
+    from_entry = {k: v for k in CONDITIONS if (v := getattr(group.entry, k)) is not None}
     values: dict[str, float | str] = {**group.entry.values, **from_entry, **named, **row}
     known: dict[str, float] = {}
-    for key in _CONDITIONS:
+    for key in CONDITIONS:
         value = values.pop(key, None)
         if value is None:
             continue
@@ -248,16 +248,6 @@ def _frame(file: Path, group: Group, named: Values, row: Values, camera: CameraF
     return Frame(file, group, group.entry.kind, **known, values=values)
 
 
-_CONDITIONS = (
-    "exposure_ms",
-    "temperature_c",
-    "wavelength_nm",
-    "photons_per_pixel",
-    "irradiance_uw_cm2",
-    "illumination",
-    "density",
-    "time_s",
-)
 _NOT_NEGATIVE = ("exposure_ms", "photons_per_pixel", "irradiance_uw_cm2", "density", "wavelength_nm")
 
 

@@ -11,20 +11,14 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.series_file import Frame, Series
+from photoplan.io.series_model import CONDITIONS
 from photoplan.io.series_pixels import Plane, frame_pixels, plane_mask, series_planes, split
 from photoplan.quality.camera.frame_statistics import FrameStack, Level, StackSums
 
 __all__ = ["SeriesData", "Setting"]
 
-_CONDITIONS = (
-    ("kind", ""),
-    ("exposure_ms", "ms"),
-    ("temperature_c", "°C"),
-    ("wavelength_nm", "nm"),
-    ("photons_per_pixel", "photons"),
-    ("illumination", ""),
-    ("density", ""),
-)
+#: What tells settings apart, and the units. Light is told by its photons; time is no setting.
+_CONDITIONS = (("kind", ""), *(each for each in CONDITIONS.items() if each[0] not in ("irradiance_uw_cm2", "time_s")))
 #: Share of saturated pixels up to which a frame may be the reference of `brightest`.
 _UNSATURATED = 1e-3
 

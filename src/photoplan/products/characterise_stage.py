@@ -20,7 +20,6 @@ from photoplan.report.drawing import round_down
 __all__ = ["analyse", "missing"]
 
 _GON = 200.0 / math.pi
-_MATRIX = ("series", "way", "a1", "a2", "a3", "b1", "b2", "b3")
 
 Array = NDArray[np.float64]
 

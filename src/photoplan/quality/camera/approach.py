@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 LEAST_VALUES = 8
 #: Chance of error below which a change is taken as real.
 LEVEL = 0.01
+#: Time constants that are tried before the best is refined.
 _CANDIDATES = 80
 #: A time constant is known when its standard deviation is below this part of it.
 _KNOWN = 0.5

@@ -23,7 +23,9 @@ SEPARABLE = 0.05
 _KNOWN = 0.1
 """Largest standard deviation of an estimated camera constant as part of it."""
 _DIRTY = 5.5
+#: Stains that are listed, the deepest.
 _MOST_DIRT = 100
+#: Share of saturated pixels from which on the brightest part of the image says nothing of the light.
 _SATURATED = 0.001
 _UNEVEN, _STRUCTURE = 0.02, 0.5
 """Residual as part of the brightness, and correlation of neighbours, above which the surface is not even."""

@@ -27,12 +27,15 @@ Array = NDArray[np.float64]
 
 #: Chance of a false alarm below which an oscillation, a curve or an offset of the fields is taken as real.
 LEVEL = 0.001
+#: Oscillations that are taken out, and degree of the polynomial beside them: more would follow the jitter itself.
 _MOST_PERIODS = 3
 _MOST_DEGREE = 3
 _SPIKE = 6.0
 """Standard deviations beyond which a single line is a spike."""
 _LEAST_SPIKE = 0.02
+#: Lines whose median a spike is compared with.
 _NEIGHBOURS = 11
+#: Share of lines that may be spikes: with more there is no edge to speak of.
 _MOST_SPIKES = 0.2
 
 

@@ -13,6 +13,7 @@ __all__ = ["Adjusted", "Harmonic", "Spectrum", "Waves", "adjust_periods", "false
 
 Array = NDArray[np.float64]
 
+#: Frequencies that are tried within the width of a spectral line, so that none is passed by.
 _OVERSAMPLING = 4
 _LONGEST = 1.5
 """Least number of periods in the series: fewer cannot be told from a curve."""

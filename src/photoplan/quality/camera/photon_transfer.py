@@ -28,6 +28,7 @@ QUANTISATION = 1.0 / 12.0
 LEAST_VARIANCE = 0.24
 #: Share of zeros beyond which black is cut off and mean and variance are not those of the signal.
 ZERO_SHARE = 0.005
+#: Share of saturated samples beyond which the variance is cut off.
 _SATURATED_SHARE = 1e-3
 #: Part of the range up to saturation in which variance and mean are taken as linear (EMVA 1288, as for eq. 50).
 _RANGE = 0.7

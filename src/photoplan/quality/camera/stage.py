@@ -18,11 +18,14 @@ __all__ = ["LEAST_POINTS", "StageCalibration", "b4_lines", "stage_calibration"]
 
 Array = NDArray[np.float64]
 
+#: Points of a calibration: three determine an affine transformation, the fourth checks it. More than
+#: the most are no targets that somebody measured.
 LEAST_POINTS = 4
 MOST_POINTS = 10_000
 _GON = 200.0 / math.pi
 #: Chance of a false alarm for a gross error among all points, and for a systematic part of the residuals.
 LEVEL = 0.001
+#: Relative step of the numerical derivatives.
 _STEP = 1e-6
 
 

@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 
 #: Parameters of each model, in the order of its unknowns after the shift.
 MODELS = {"shift": (), "similarity": ("scale", "rotation"), "affine": ("scale_x", "scale_y", "rotation", "shear")}
+#: Targets that determine the parameters of each model.
 _LEAST_TARGETS = {"shift": 1, "similarity": 2, "affine": 3}
-_GROSS = 5.0
 
 
 @dataclass(frozen=True, eq=False)

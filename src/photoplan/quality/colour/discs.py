@@ -17,6 +17,7 @@ __all__ = ["Disc", "DiscSettings", "find_discs"]
 _Array = NDArray[np.float64]
 #: Half the side of the part of an image that a disc is fitted in, in radii.
 _REACH = 1.7
+#: Steps of a fit; those that have not settled by then are no discs.
 _ROUNDS = 25
 #: A disc is the same in all directions to within this ratio of its axes; anything longer is no disc of a chart.
 _MOST_AXES = 2.5

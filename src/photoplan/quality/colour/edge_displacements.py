@@ -15,6 +15,7 @@ from photoplan.quality.edges.find import EdgeRegion
 __all__ = ["edge_displacements"]
 
 _Array = NDArray[np.float64]
+#: Steps of a fit at most.
 _ROUNDS = 30
 #: Least step at an edge in units of the noise of a pixel, in each band.
 _LEAST_SNR = 5.0

@@ -16,8 +16,9 @@ _Array = NDArray[np.float64]
 Term = tuple[int, int, float, float]
 """Powers i of u and j of v, and coefficients of the displacement along x and y."""
 
-#: Kinds of models, simple ones first: the columns that they fit, each a pair of polynomials for x and y.
+#: Highest degree of the terms that a model may have.
 _MOST_DEGREE = 5
+#: Standard deviations, by the median of residuals, beyond which a displacement does not count.
 _GROSS = 4.5
 
 
@@ -44,7 +45,7 @@ KINDS: dict[str, tuple[tuple[Term, ...], ...]] = {
     "polynomial 2": _full(2),
     "polynomial 3": _full(3),
 }
-"""What each kind of model fits: shift; shift and scale; these and a radial cubic part; polynomials of x and y."""
+"""What each kind fits, simple ones first: shift; shift and scale; these and a radial cubic part; polynomials."""
 
 
 @dataclass(frozen=True, eq=False)

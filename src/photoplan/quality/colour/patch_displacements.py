@@ -12,12 +12,15 @@ from photoplan.quality.colour.model import Displacements
 __all__ = ["patch_displacements"]
 
 _Array = NDArray[np.float64]
+#: Steps of a match at most.
 _ROUNDS = 15
 #: Least correlation of both bands in a window: below it they do not show the same structure.
 _LEAST_CORRELATION = 0.9
+#: A match with a larger standard deviation, pixels, says nothing of fractions of a pixel.
 _MOST_SIGMA = 0.1
 #: Windows of natural scenes are not known better than this, since colours change across edges, pixels.
 _FLOOR = 0.01
+#: Pixels around a window in which its counterpart may lie, with room for interpolation.
 _MARGIN = 6
 
 

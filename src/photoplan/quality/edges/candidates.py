@@ -23,6 +23,7 @@ SMOOTHING = 1.2
 _ABOVE_NOISE = 5.0
 #: Share of the picture's range of values below which a step over the gradient's width is no edge.
 _LEAST_STEP = 0.02
+#: By how much the gradient may turn within a chain.
 _TURN = radians(15.0)
 #: Distance of a point from its line at which the line is parted, pixels.
 _APART = 0.8

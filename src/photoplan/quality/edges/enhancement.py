@@ -25,6 +25,7 @@ __all__ = ["EnhancedEdge", "Enhancement", "enhancement_of"]
 LEAST = 0.02
 #: How many standard deviations it must be above that.
 _CLEAR = 2.0
+#: With fewer edges a warning says so.
 _FEW = 3
 
 

@@ -25,6 +25,7 @@ _HALF = 5
 _KNOWN = 0.5
 #: Share by which the MTF50 of edges may differ from the upper quartile.
 _AGREE = 0.08
+#: Where mean spread and transfer functions are tabulated: pixels, cycles per pixel.
 _POSITIONS = np.linspace(-10.0, 10.0, 401)
 _FREQUENCIES = np.linspace(0.0, 1.0, 201)
 

@@ -16,7 +16,7 @@ from photoplan.errors import InputError
 from photoplan.quality.formation.optics_parts import Aperture, Spread
 from photoplan.quality.formation.shapes import disc_share
 
-__all__ = ["PixelKernel", "aperture_transfer", "aperture_weights", "pixel_kernel", "spread_transfer"]
+__all__ = ["PixelKernel", "aperture_transfer", "pixel_kernel", "spread_transfer"]
 
 _Array = NDArray[np.float64]
 _Transfer = Callable[[_Array, _Array], NDArray[Any]]
@@ -26,6 +26,7 @@ _NOTHING = 1e-4
 _ALIASES = 3
 #: Kernels of more cells than this to a side are refused.
 MOST_CELLS = 6000
+#: Lengths of an exponential tail after which it ends: 0.3 % of its light lies beyond.
 _TAIL_REACH = 8.0
 #: The Airy pattern falls slowly; at this multiple of λN its rings hold 0.5 % of the light.
 _AIRY_REACH = 40.0
@@ -238,7 +239,7 @@ def pixel_kernel(spread: Spread, aperture: Aperture, scale: float, cells: int, c
         return np.asarray(smooth(fx, fy) * aperture_transfer(aperture, fx, fy) * turn / averaging)
 
     kernel, reach = _discrete(spread, scale * cells), _reach(spread, scale)
-    weights, row, column = aperture_weights(aperture, cells)
+    weights, row, column = _aperture_weights(aperture, cells)
     if reach > 0.0 and continuous and _is_smooth(smooth, cells):
         wide = reach + max(aperture.width) + 1.0
         kernel = signal.convolve(kernel, _of_smooth(with_aperture, cells, wide))
@@ -266,7 +267,7 @@ def _trimmed(kernel: _Array) -> _Array:
 
 
 @lru_cache(maxsize=64)
-def aperture_weights(aperture: Aperture, cells: int) -> tuple[_Array, int, int]:
+def _aperture_weights(aperture: Aperture, cells: int) -> tuple[_Array, int, int]:
     """Shares of the cells in a pixel's value, and the cell of the first weight.
 
     Returns

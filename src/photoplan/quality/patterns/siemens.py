@@ -31,6 +31,7 @@ __all__ = ["StarMtf", "StarRules", "measure_star"]
 
 Array = NDArray[np.float64]
 
+#: Side of the largest window, pixels: all of its pixels are fitted at once.
 _MOST_SIDE = 4096
 
 

@@ -23,6 +23,7 @@ __all__ = ["UsafBars", "UsafResult", "UsafRules", "measure_usaf"]
 
 Array = NDArray[np.float64]
 
+#: Side of the largest window, pixels.
 _MOST_SIDE = 4096
 #: Part of the full contrast by which a grey square stands out.
 _SEEN = 0.1

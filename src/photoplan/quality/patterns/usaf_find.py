@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 
 #: Bars that are looked at, the largest first.
 _MOST_BARS = 3000
+#: Threes of bars that are compared with the layout; a target shows far fewer.
 _MOST_THREES = 300
 #: Threes that have to agree.
 _LEAST_MATCHES = 5
