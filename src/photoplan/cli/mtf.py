@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 
 from photoplan.cli.failures import end_with_failures
+from photoplan.cli.mtf_output import say_files, say_images, talking
 from photoplan.cli.mtf_patterns import edge_options, pattern_options, run_patterns
 from photoplan.cli.options import json_option
 
@@ -54,26 +54,15 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any
     from photoplan.products.mtf import MtfRequest, measure_mtf
     from photoplan.products.mtf_result import group_lines
 
-    def talk(text: str) -> None:
-        if not quiet:
-            click.echo(text, err=True)
-
+    talk = talking(quiet)
     request = MtfRequest(images, **edge_options(options))
     report = measure_mtf(request, lambda total: progress(total, quiet, "tiles"), talk)
-    if as_json:
-        click.echo(json.dumps(report.to_dict(), indent=2, ensure_ascii=False))
-    for image in report.images:
-        if not as_json:
-            click.echo(str(image))
-        for note in image.notes:
-            talk(f"{image.name}: {note}")
+    say_images(report, as_json, talk)
     if len(report.images) > 1:
         if not as_json:
             click.echo(f"all {len(report.images)} images\n{group_lines(report.groups)}")
         if report.enhancement is not None and report.enhancement.enhanced:
             talk(f"all images: {report.enhancement.warning}")
     if not as_json:
-        for path in (report.csv, report.report):
-            if path is not None:
-                click.echo(str(path))
+        say_files(report)
     end_with_failures(report.failed, len(report.images))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import click
 
 from photoplan.cli.failures import end_with_failures
+from photoplan.cli.mtf_output import say_files, say_images, talking
 
 __all__ = ["edge_options", "pattern_options", "run_patterns"]
 
@@ -62,23 +62,12 @@ def run_patterns(images: tuple[Path, ...], as_json: bool, quiet: bool, options: 
 
     _refuse(_OF_EDGES, f"is for edges, not for --pattern {options['pattern']}")
 
-    def talk(text: str) -> None:
-        if not quiet:
-            click.echo(text, err=True)
-
+    talk = talking(quiet)
     kept = {name: value for name, value in options.items() if name not in _OF_EDGES}
     report = measure_patterns(PatternRequest(images, **kept), talk)
-    if as_json:
-        click.echo(json.dumps(report.to_dict(), indent=2, ensure_ascii=False))
-    for image in report.images:
-        if not as_json:
-            click.echo(str(image))
-        for note in image.notes:
-            talk(f"{image.name}: {note}")
+    say_images(report, as_json, talk)
     if not as_json:
-        for path in (report.csv, report.report):
-            if path is not None:
-                click.echo(str(path))
+        say_files(report)
     end_with_failures(report.failed, len(report.images))
 
 
