@@ -6,51 +6,22 @@ import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from photoplan.errors import InputError
-from photoplan.geometry.grid import Window
-from photoplan.io.series_file import Frame
 from photoplan.io.series_model import EdgeEntry
-from photoplan.io.series_pixels import frame_pixels
 from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_groups import FrameGroup, frame_groups
 from photoplan.products.characterise_jitter_charts import jitter_charts
+from photoplan.products.characterise_jitter_edge import Edge, measured_edge
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
-from photoplan.quality.camera.line_jitter import LineJitter, grey_error, line_jitter
+from photoplan.quality.camera.line_jitter import grey_error
 from photoplan.quality.camera.parallel_edges import EdgePair, above_control, compare_edges
-from photoplan.quality.camera.plumb_edge import EdgeLines, correlate_edge, fit_edge
 
-__all__ = ["Edge", "analyse", "missing"]
+__all__ = ["analyse", "missing"]
 
 _CHARTS = 4
 """Frames that are drawn."""
-
-
-@dataclass(frozen=True, eq=False)
-class Edge:
-    """An edge in a frame."""
-
-    entry: EdgeEntry
-    frame: Frame
-    window: Window
-    fitted: EdgeLines
-    jitter: LineJitter
-    """Of the least-squares positions."""
-    correlated: LineJitter
-    """Of the positions by correlation and parabola."""
-
-    @property
-    def first_line(self) -> int:
-        """Row (column, of a horizontal edge) of the image in which line 0 lies."""
-        return self.window.row if self.entry.direction == "vertical" else self.window.col
-
-    @property
-    def field_offset(self) -> float:
-        """Odd rows minus even rows of the image."""
-        return -self.jitter.field_offset if self.first_line % 2 else self.jitter.field_offset
 
 
 def missing(data: SeriesData) -> str | None:
@@ -81,7 +52,7 @@ def _measured(data: SeriesData, group: FrameGroup) -> dict[str, list[Edge]]:
     found: dict[str, list[Edge]] = {e.name: [] for e in entries}
     for frame in group.frames:
         for entry in entries:
-            found[entry.name].append(_edge(data, frame, entry, degree))
+            found[entry.name].append(measured_edge(data, frame, entry, degree))
         data.watch(1)
     return found
 
@@ -104,30 +75,6 @@ def _group(data: SeriesData, group: FrameGroup, found: dict[str, list[Edge]], co
     charts = tuple(chart for each in plots for chart in each)
     name = f"line_jitter_lines_{group.group.index + 1}.csv"
     return joined([*parts, Outcome(tables={"edges": table}, plots=charts, files={name: _lines_text(found)})])
-
-
-def _edge(data: SeriesData, frame: Frame, entry: EdgeEntry, degree: int | None) -> Edge:
-    window = Window(*entry.roi)
-    assert data.series.size is not None
-    if window.stop[0] > data.series.size[0] or window.stop[1] > data.series.size[1]:
-        raise InputError(
-            f"{frame.group.label}: edge {entry.name}: roi {list(entry.roi)} leaves the image of "
-            f"{data.series.size[0]} × {data.series.size[1]} pixels"
-        )
-    grey = frame_pixels(frame, window)[0].astype(float)
-    lines = grey if entry.direction == "vertical" else grey.T
-    name = f"{frame.file.name}, edge {entry.name}"
-    saturation = data.series.saturation_dn if math.isfinite(data.series.saturation_dn) else None
-    fitted = fit_edge(lines, name=name, saturation=saturation)
-    by_correlation = correlate_edge(lines, fitted, name=name)
-    return Edge(
-        entry,
-        frame,
-        window,
-        fitted,
-        line_jitter(fitted.position, name, degree),
-        line_jitter(by_correlation.position, name, degree),
-    )
 
 
 def _mean(values: list[float], sigmas: list[float]) -> tuple[float, float]:

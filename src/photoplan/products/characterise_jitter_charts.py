@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from photoplan.products.characterise_jitter_edge import Edge
 from photoplan.report.characterise_charts import Chart, Curve
-
-if TYPE_CHECKING:
-    from photoplan.products.characterise_jitter import Edge
 
 __all__ = ["jitter_charts"]
 

@@ -20,6 +20,7 @@ __all__ = [
     "SKY",
     "SOFT",
     "STYLE",
+    "axes_of",
     "load_matplotlib",
     "png",
     "round_down",
@@ -78,6 +79,12 @@ def load_matplotlib(what: str, otherwise: str = "") -> Any:
         raise UsageError(
             f"{what} needs matplotlib; install it with: pip install 'photoplan[report]'{way_out}"
         ) from None
+
+
+def axes_of(mpl: Any, width: float, height: float) -> tuple[Any, Any]:
+    """A new figure of a size in inches, and its only axes."""
+    fig = mpl.figure.Figure(figsize=(width, height), layout="constrained")
+    return fig, fig.subplots()
 
 
 def png(fig: Any, dpi: int = _DPI, **options: Any) -> bytes:

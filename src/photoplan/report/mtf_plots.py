@@ -8,7 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, PURPLE, RED, SKY, SOFT, STYLE, load_matplotlib, png
+from photoplan.report.drawing import (
+    BLUE,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    RED,
+    SKY,
+    SOFT,
+    STYLE,
+    axes_of,
+    load_matplotlib,
+    png,
+)
 
 __all__ = ["CellFacts", "CurveFacts", "EdgeFacts", "MtfPlots", "ProfileFacts"]
 
@@ -92,8 +105,7 @@ class MtfPlots:
         width, height = size
         with self._mpl.rc_context(STYLE):
             tall = float(np.clip(_WIDTH * height / width, 2.0, 9.0))
-            fig = self._mpl.figure.Figure(figsize=(_WIDTH, tall + 0.6), layout="constrained")
-            axes = fig.subplots()
+            fig, axes = axes_of(self._mpl, _WIDTH, tall + 0.6)
             box = (-0.5, width - 0.5, height - 0.5, -0.5)
             axes.imshow(small, cmap="gray", vmin=-60, vmax=300, extent=box, interpolation="antialiased")
             values = np.array([e.mtf50 for e in edges])
@@ -132,8 +144,7 @@ class MtfPlots:
     ) -> bytes:
         """Mean MTF curves with intervals of two standard deviations, single edges, a Gaussian, laboratory values."""
         with self._mpl.rc_context(STYLE):
-            fig = self._mpl.figure.Figure(figsize=(_WIDTH, 3.9), layout="constrained")
-            axes = fig.subplots()
+            fig, axes = axes_of(self._mpl, _WIDTH, 3.9)
             for mean in means:
                 for frequency, modulation in mean.single[:_SINGLE]:
                     axes.plot(frequency, modulation, color="#c9d2d8", linewidth=0.5, zorder=1)

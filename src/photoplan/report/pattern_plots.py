@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SOFT, STYLE, load_matplotlib, png
+from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SOFT, STYLE, axes_of, load_matplotlib, png
 from photoplan.report.page import figure, page, section, text
 
 __all__ = ["Curve", "PatternFacts", "PatternPlots", "PolarCurve", "pattern_page"]
@@ -76,14 +75,10 @@ class PatternPlots:
     def __init__(self) -> None:
         self._mpl = load_matplotlib("a report", "leave --report out")
 
-    def _axes(self, height: float) -> tuple[Any, Any]:
-        fig = self._mpl.figure.Figure(figsize=(_WIDTH, height), layout="constrained")
-        return fig, fig.subplots()
-
     def curves(self, facts: PatternFacts) -> bytes:
         """Transfer against frequency, with two standard deviations."""
         with self._mpl.rc_context(STYLE):
-            fig, axes = self._axes(3.5)
+            fig, axes = axes_of(self._mpl, _WIDTH, 3.5)
             for curve, colour in zip(facts.curves, _COLOURS):
                 dashed = "--" if curve.kind == "contrast" and len({c.kind for c in facts.curves}) > 1 else "-"
                 axes.plot(curve.frequency, curve.value, dashed, color=colour, linewidth=1.3, label=curve.name)
@@ -132,7 +127,7 @@ class PatternPlots:
         assert facts.picture is not None
         rows, columns = facts.picture.shape
         with self._mpl.rc_context({**STYLE, "axes.grid": False}):
-            fig, axes = self._axes(float(np.clip(_WIDTH * rows / columns, 2.0, 8.5)))
+            fig, axes = axes_of(self._mpl, _WIDTH, float(np.clip(_WIDTH * rows / columns, 2.0, 8.5)))
             low, high = np.nanquantile(facts.picture, [0.005, 0.995])
             axes.imshow(facts.picture, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
             for resolved, colour in ((True, GREEN), (False, RED)):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.report.drawing import BLUE, INK, RED, SOFT, STYLE, load_matplotlib, png, round_down
+from photoplan.report.drawing import BLUE, INK, RED, SOFT, STYLE, axes_of, load_matplotlib, png, round_down
 from photoplan.report.page import Cell, figure, headline, page, section, table, text
 
 __all__ = ["ResectFacts", "ResectPlots", "resect_report"]
@@ -65,8 +65,7 @@ class ResectPlots:
         scale = round_down(0.09 * max(width, height) / typical)
         with self._mpl.rc_context(STYLE):
             tall = float(np.clip(_WIDTH * height / width, 2.5, 8.0))
-            fig = self._mpl.figure.Figure(figsize=(_WIDTH, tall + 0.5), layout="constrained")
-            axes = fig.subplots()
+            fig, axes = axes_of(self._mpl, _WIDTH, tall + 0.5)
             for keep, colour, label in ((used, BLUE, "points"), (facts.rejected, RED, "gross errors")):
                 if not keep.any():
                     continue

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, PURPLE, RED, SOFT, STYLE, load_matplotlib, png
+from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, PURPLE, RED, SOFT, STYLE, axes_of, load_matplotlib, png
 from photoplan.report.page import Cell, figure, page, section, table
 
 __all__ = ["SensorFacts", "SensorPlots", "sensor_report"]
@@ -57,15 +56,11 @@ class SensorPlots:
     def __init__(self) -> None:
         self._mpl = load_matplotlib("a report", "leave --report out")
 
-    def _axes(self, height: float) -> tuple[Any, Any]:
-        fig = self._mpl.figure.Figure(figsize=(_WIDTH, height), layout="constrained")
-        return fig, fig.subplots()
-
     def transfer(self, product: float) -> bytes:
         """Modulation against signal through clock frequency, for some transfer inefficiency products (fig. 3.15)."""
         ratio = np.linspace(0.0, 0.5, 201)
         with self._mpl.rc_context(STYLE):
-            fig, axes = self._axes(3.4)
+            fig, axes = axes_of(self._mpl, _WIDTH, 3.4)
             for others in (0.01, 0.1, 0.3, 0.7, 2.0):
                 curve = np.exp(-others * (1.0 - np.cos(2.0 * np.pi * ratio)))
                 axes.plot(ratio, curve, color=SOFT, linewidth=0.9)
@@ -83,7 +78,7 @@ class SensorPlots:
         low, high = min(periods.values()) / 2.0, max(periods.values()) * 2.0
         period = np.geomspace(low, high, 200)
         with self._mpl.rc_context(STYLE):
-            fig, axes = self._axes(3.4)
+            fig, axes = axes_of(self._mpl, _WIDTH, 3.4)
             axes.plot(period, 500.0 / period, color=INK, linewidth=1.2)
             same = {value: [n for n, v in periods.items() if v == value] for value in periods.values()}
             for (value, names), colour in zip(same.items(), _COLOURS):
@@ -98,7 +93,7 @@ class SensorPlots:
     def noise(self, sources: Mapping[str, float], total: float) -> bytes:
         """Noise of each source as bars, and the total."""
         with self._mpl.rc_context(STYLE):
-            fig, axes = self._axes(0.75 + 0.36 * (len(sources) + 1))
+            fig, axes = axes_of(self._mpl, _WIDTH, 0.75 + 0.36 * (len(sources) + 1))
             names = [*sources, "total"]
             values = [*sources.values(), total]
             axes.barh(names, values, color=[BLUE] * len(sources) + [INK], height=0.62)
@@ -113,7 +108,7 @@ class SensorPlots:
     def curves(self, facts: SensorFacts) -> bytes:
         """Transfer functions of lens and sensitive width."""
         with self._mpl.rc_context(STYLE):
-            fig, axes = self._axes(3.4)
+            fig, axes = axes_of(self._mpl, _WIDTH, 3.4)
             for (name, (frequency, modulation)), colour in zip(facts.curves.items(), _COLOURS):
                 wide = 2.0 if name.startswith("both") else 1.2
                 axes.plot(frequency, modulation, color=colour, linewidth=wide, label=name)
