@@ -15,6 +15,7 @@ from photoplan.cli.restore_options import filter_options, filter_request
 if TYPE_CHECKING:
     from photoplan.products.restore import RestoredImage, RestorePlan
     from photoplan.products.restore_report import ReportFile
+    from photoplan.products.restored_reader import RestoredReader
 
 __all__ = ["command"]
 
@@ -26,6 +27,8 @@ __all__ = ["command"]
               help="Folder of the results [restored, beside the first image].")  # fmt: skip
 @click.option("--band", "bands", multiple=True, type=click.IntRange(1), metavar="N",
               help="Restore this band; may be repeated [all]. Others stay as they are.")  # fmt: skip
+@click.option("--fall-off", type=click.Path(path_type=Path), metavar="MODEL.toml",
+              help="Before all else correct the light fall-off, by a model of 'photoplan characterise'.")  # fmt: skip
 @click.option("--chromatic", metavar="FILE|measure",
               help="First bring the bands together: by a model, or as measured in each image.")  # fmt: skip
 @click.option("--linearisation", default="linear", show_default=True, metavar="linear|srgb|TABLE",
@@ -62,7 +65,7 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
     options["quicklook"] = not options.pop("no_quicklook")
     options["workers"] = options["workers"] or psutil.cpu_count() or 1
     asked = filter_request(images, options)
-    kept, page = options.pop("save_filter"), _page(options, [*images, *([asked.file] if asked.file else [])])
+    kept, page = options.pop("save_filter"), _page(options, [*images, asked.file])
     found = requested_filter(asked, lambda total: progress(total, quiet, "tiles"), talk)
     request = RestoreRequest(images, asked.file or found.filter, **options)
     plan = plan_restoration(request)
@@ -92,39 +95,45 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
     end_with_failures(report.failed, len(report.images))
 
 
-def _page(options: dict[str, Any], inputs: list[Path]) -> ReportFile | None:
+def _page(options: dict[str, Any], inputs: list[Path | None]) -> ReportFile | None:
     """The report that the options ask for, which are taken out; refused before any work."""
     from photoplan.products.restore_report import open_report
 
     path: Path | None = options.pop("report")
-    return None if path is None else open_report(path, inputs, overwrite=options["overwrite"])
+    files = [each for each in (*inputs, options["chromatic"], options["fall_off"]) if isinstance(each, Path)]
+    return None if path is None else open_report(path, files, overwrite=options["overwrite"])
 
 
 def _before(plan: RestorePlan) -> list[str]:
     """What a user should know before the filter is used."""
     from photoplan.products.restore import filter_figures
+    from photoplan.products.restore_filter import NO_FILTER
 
     figures = filter_figures(plan.filter)
     sums = ", ".join(f"{total:.4g}" for total in figures["sums"][:6])
     kernels = "1 kernel" if figures["kernels"] == 1 else f"{figures['kernels']} kernels"
-    lines = [
-        f"filter {figures['size'][0]} × {figures['size'][1]}, {kernels}, sum {sums}: noise grows "
-        f"{figures['noise_gain']:.3g} times"
-    ]
+    lines = (
+        []
+        if plan.filter.description == NO_FILTER
+        else [
+            f"filter {figures['size'][0]} × {figures['size'][1]}, {kernels}, sum {sums}: noise grows "
+            f"{figures['noise_gain']:.3g} times"
+        ]
+    )
     for name in ("condition", "rule"):
         if name in figures["facts"]:
             lines.append(f"{name}: {figures['facts'][name]}")
-    return lines + [line for job in plan.jobs for line in _chromatic(job.reader.source)]
+    return lines + [line for job in plan.jobs for line in _corrections(job.reader)]
 
 
-def _chromatic(source: Any) -> list[str]:
-    """How far the bands of an image lie apart, where that is corrected."""
-    from photoplan.products.aligned_reader import AlignedReader
+def _corrections(reader: RestoredReader) -> list[str]:
+    """What is corrected in an image before the filter."""
     from photoplan.products.chromatic import model_lines
+    from photoplan.products.fall_off_reader import fall_off_line
 
-    if not isinstance(source, AlignedReader):
-        return []
-    return [f"{source.path.name}: {line}" for line in model_lines(source.model)]
+    lines = [] if reader.lit is None else [fall_off_line(reader.lit.fall_off)]
+    lines += [] if reader.aligned is None else model_lines(reader.aligned.model)
+    return [f"{reader.info.path.name}: {line}" for line in lines]
 
 
 def _show(plan: RestorePlan, as_json: bool) -> None:

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 __all__ = ["filter_options", "filter_request"]
 
 _OPTIONS = (
-    click.option("--filter", "filter_file", type=click.Path(path_type=Path), metavar="FILE",
-                 help="TOML, or one kernel as rows of numbers [measured at edges of the images]."),
+    click.option("--filter", "filter_file", type=click.Path(path_type=Path), metavar="FILE|none",
+                 help="TOML, or one kernel as rows of numbers; none: no filter [measured at edges of the images]."),
     click.option("--aperture", metavar="SHAPE[:RATIO]",
                  help="Undo a scanner's aperture: square or round, RATIO of aperture by step [1]."),
     click.option("--method", type=click.Choice(["auto", "exact", "regularised"]), default="auto", show_default=True,
@@ -53,7 +53,8 @@ def filter_request(images: tuple[Path, ...], options: dict[str, Any]) -> FilterR
     asked = {name: options.pop(name) for name in _MEASURED if name != "save_filter"}
     if file is not None or aperture is not None:
         _refuse_measuring("--filter" if file is not None else "--aperture")
-        return FilterRequest(file, aperture)
+        none = file == Path("none")
+        return FilterRequest(None if none else file, aperture, none=none)
     size = asked["size"]
     if size is not None and size % 2 == 0:
         raise click.UsageError(f"--size {size}: a filter has an odd number of rows and columns")

@@ -16,6 +16,7 @@ from photoplan.io.raster import RasterReader
 from photoplan.io.raster_info import RasterInfo
 from photoplan.kernels.shift_bands import limits_of, no_mask, shift_band
 from photoplan.kernels.weights import KERNELS
+from photoplan.products.fall_off_reader import FallOffReader
 from photoplan.quality.colour.model import ChromaticModel
 
 __all__ = ["AlignedReader"]
@@ -35,7 +36,8 @@ class AlignedReader:
         pixels.
     """
 
-    source: RasterReader
+    source: RasterReader | FallOffReader
+    """Grey values, or light whose fall-off is corrected."""
     model: ChromaticModel
     kernel: str = "lanczos3"
     """A name of `photoplan.kernels.weights.KERNELS`."""

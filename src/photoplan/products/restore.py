@@ -24,12 +24,14 @@ from photoplan.io.run_record import record_path
 from photoplan.io.storage import Nodata
 from photoplan.products.aligned_reader import AlignedReader
 from photoplan.products.chromatic import load_chromatic, measured_once, model_figures
+from photoplan.products.fall_off_reader import FallOffFile, FallOffReader, load_fall_off
 from photoplan.products.filter_files import entries_of, load_filter
 from photoplan.products.linearisation import linearisation_of
 from photoplan.products.restore_execute import Job, RestoredImage, earlier_result, memory_of_a_tile, restore_one
 from photoplan.products.restore_request import RestoreRequest
-from photoplan.products.restored_reader import RestoredReader, kept_nodata, restored_reader
+from photoplan.products.restored_reader import RestoredReader, Source, kept_nodata, restored_reader
 from photoplan.quality.colour.model import ChromaticModel
+from photoplan.quality.linearise import Linearisation
 from photoplan.quality.restoration.filters import RestorationFilter
 
 __all__ = [
@@ -85,6 +87,30 @@ def filter_figures(filter_: RestorationFilter) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, eq=False)
+class Corrections:
+    """What is corrected before the filter: light fall-off, then lateral chromatic aberration."""
+
+    fall_off: FallOffFile | None
+    chromatic: ChromaticModel | Literal["measure"] | None
+    light: Linearisation
+
+    @classmethod
+    def of(cls, request: RestoreRequest, light: Linearisation) -> Corrections:
+        """Those that are asked for, their files read."""
+        fall_off = None if request.fall_off is None else load_fall_off(request.fall_off)
+        model = load_chromatic(request.chromatic) if isinstance(request.chromatic, Path) else request.chromatic
+        return cls(fall_off, model, light)
+
+    def source(self, path: Path) -> Source:
+        """The pixels of an image, corrected."""
+        raw = RasterReader(path)
+        lit = raw if self.fall_off is None else FallOffReader(raw, self.fall_off, self.light)
+        if self.chromatic is None:
+            return lit
+        return AlignedReader(lit, measured_once(path) if self.chromatic == "measure" else self.chromatic)
+
+
+@dataclass(frozen=True, eq=False)
 class RestorePlan:
     """All images that can be restored, before any pixel is."""
 
@@ -114,20 +140,20 @@ def plan_restoration(request: RestoreRequest) -> RestorePlan:
     filter_ = load_filter(given) if isinstance(given, Path) else given
     text = filter_text(entries_of(filter_))
     light = linearisation_of(request.linearisation)
-    given_model = load_chromatic(request.chromatic) if isinstance(request.chromatic, Path) else request.chromatic
+    corrections = Corrections.of(request, light)
     files = [path.resolve() for path in request.images]
     twice = [path for path in files if files.count(path) > 1]
     if twice:
         raise UsageError(f"image {twice[0]} is given twice")
     stems = unique_stems(path.name for path in request.images)
     inputs = [*request.images, *([given] if isinstance(given, Path) else [])]
-    inputs += [request.chromatic] if isinstance(request.chromatic, Path) else []
+    inputs += [path for path in (request.chromatic, request.fall_off) if isinstance(path, Path)]
     inputs += [] if request.linearisation in ("linear", "srgb") else [Path(request.linearisation)]
     jobs, failed = [], {}
     for path in request.images:
         try:
-            source = _source(path, request, given_model)
-            out = source.dtype if request.dtype == "same" else np.dtype(request.dtype)
+            source = corrections.source(path)
+            out = np.dtype(source.info.dtype if request.dtype == "same" else request.dtype)
             _check_bands(path, source.bands, request.bands)
             chosen = _only(filter_, request.bands, source.bands)
             reader = restored_reader(source, chosen, light, out)
@@ -138,16 +164,6 @@ def plan_restoration(request: RestoreRequest) -> RestorePlan:
     for job in jobs:
         _check_outputs(job, request)
     return RestorePlan(request, filter_, tuple(jobs), failed, _in_flight(request, jobs))
-
-
-def _source(
-    path: Path, request: RestoreRequest, model: ChromaticModel | Literal["measure"] | None
-) -> RasterReader | AlignedReader:
-    """The image, its bands brought together where that is asked for."""
-    source = RasterReader(path)
-    if model is None:
-        return source
-    return AlignedReader(source, measured_once(path) if model == "measure" else model)
 
 
 def _check_bands(path: Path, count: int, wanted: Iterable[int]) -> None:
@@ -170,8 +186,10 @@ def _job(request: RestoreRequest, reader: RestoredReader, target: Path, text: st
     info = reader.info
     digest = fingerprint(info.path).digest
     facts = [__version__, digest, text, request.settings["bands"], str(reader.dtype), request.linearisation]
-    if isinstance(reader.source, AlignedReader):
-        facts.append(model_figures(reader.source.model))
+    if reader.aligned is not None:
+        facts.append(model_figures(reader.aligned.model))
+    if reader.lit is not None:
+        facts += ["light fall-off", reader.lit.fall_off.digest]
     light = reader.restorer.linearisation
     if light.grey is not None and light.light is not None:
         facts += [light.grey.tolist(), light.light.tolist()]

@@ -22,7 +22,6 @@ from photoplan.io.quicklook import write_quicklook
 from photoplan.io.run_record import peak_memory_bytes, record_path, versions, write_run_record
 from photoplan.io.storage import Nodata
 from photoplan.io.tile_log import TileLog
-from photoplan.products.aligned_reader import AlignedReader
 from photoplan.products.chromatic import model_figures, save_chromatic
 from photoplan.products.restore_request import RestoreRequest
 from photoplan.products.restored_reader import PART, RestoredReader
@@ -113,7 +112,10 @@ def memory_of_a_tile(reader: RestoredReader) -> int:
     margin = reader.restorer.margin
     area = (PART + 6 * margin.columns) * (PART + 6 * margin.rows)
     each = reader.bands * (2 * reader.source.dtype.itemsize + 2 * reader.dtype.itemsize) + 48
-    if isinstance(reader.source, AlignedReader):
+    if reader.lit is not None:
+        # Stored pixels, light before and after, and the terms of the gain.
+        each += reader.bands * (np.dtype(reader.info.dtype).itemsize + 20) + 100
+    if reader.aligned is not None:
         # The same pixels before they are displaced, and the displacements.
         each += 2 * reader.bands * reader.source.dtype.itemsize + 56
     return int(area * each)
@@ -182,8 +184,8 @@ def restore_one(
     ) as file:
         facts = _all_tiles(job, how, file, (in_flight, counted), advance, talk)
     below, above = counted.sums(reader.bands)
-    if how.chromatic == "measure" and isinstance(job.reader.source, AlignedReader):
-        save_chromatic(job.chromatic_file, job.reader.source.model)
+    if how.chromatic == "measure" and reader.aligned is not None:
+        save_chromatic(job.chromatic_file, reader.aligned.model)
     result = RestoredImage(
         reader.info.path.name,
         job.target,
@@ -274,7 +276,8 @@ def _record(job: Job, how: RestoreRequest, result: RestoredImage, facts: Product
         + [{"path": path} for path in job.inputs if path.resolve() != job.reader.info.path.resolve()],
         "settings": how.settings,
         "linearisation": restorer.linearisation.describe(),
-        "chromatic": model_figures(job.reader.source.model) if isinstance(job.reader.source, AlignedReader) else None,
+        "chromatic": None if job.reader.aligned is None else model_figures(job.reader.aligned.model),
+        "fall_off": None if job.reader.lit is None else job.reader.lit.fall_off.to_dict(),
         "filter": {
             "description": restorer.filter.description,
             "image_size": restorer.filter.image_size,

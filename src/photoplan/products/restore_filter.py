@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
 
+import numpy as np
+
 from photoplan.errors import UsageError
 from photoplan.io.filter_file import filter_text
 from photoplan.products.filter_files import entries_of, load_filter, save_filter
@@ -19,6 +21,8 @@ __all__ = ["FilterRequest", "FoundFilter", "keep_filter", "requested_filter"]
 
 #: File that a measured filter is written to, in the folder of the results.
 FILTER_NAME = "restoration_filter.toml"
+#: Description of the filter that leaves images as they are.
+NO_FILTER = "none"
 
 
 @dataclass(frozen=True)
@@ -29,9 +33,11 @@ class FilterRequest:
     aperture: str | None = None
     """``square`` or ``round``, with ``:RATIO`` of aperture by step where that is not 1."""
     design: DesignRequest | None = None
+    none: bool = False
+    """No filter: the image is corrected otherwise alone."""
 
     def __post_init__(self) -> None:
-        if sum(source is not None for source in (self.file, self.aperture, self.design)) != 1:
+        if sum(source is not None for source in (self.file, self.aperture, self.design)) + self.none != 1:
             raise UsageError("give a filter file, the aperture of a scanner, or images to measure; one of them")
 
 
@@ -41,7 +47,7 @@ class FoundFilter:
 
     filter: RestorationFilter
     origin: str
-    """In words: "the file …"."""
+    """In words: "the file …"; empty: there is no filter."""
     measured: MeasuredFilter | None = None
     """What was measured, where it was."""
 
@@ -68,6 +74,8 @@ def requested_filter(
     InputError
         The file is no filter, the aperture cannot be undone, or the images do not determine a filter.
     """
+    if request.none:
+        return FoundFilter(RestorationFilter((FilterKernel(np.ones((1, 1))),), description=NO_FILTER), "")
     if request.file is not None:
         return FoundFilter(load_filter(request.file), f"the file {request.file}")
     if request.aperture is not None:

@@ -81,7 +81,7 @@ def _pair(values: Sequence[float]) -> str:
 def _origin(found: FoundFilter) -> str:
     """Where the filter comes from, in a sentence."""
     if found.measured is None:
-        return f"The filter comes from {found.origin}."
+        return f"The filter comes from {found.origin}." if found.origin else "There is no filter."
     names = [image.name for image in found.measured.mtf.images]
     listed = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
     return f"The filter was measured at edges of {listed}. Linearisation: {found.measured.mtf.linearisation}."

@@ -10,8 +10,8 @@ from photoplan.errors import UsageError
 from photoplan.io.disk import write_atomically
 from photoplan.io.product import check_output
 from photoplan.io.raster import RasterReader
-from photoplan.products.aligned_reader import AlignedReader
 from photoplan.products.chromatic import model_figures
+from photoplan.products.fall_off_reader import fall_off_line
 from photoplan.products.restore import RestoreReport
 from photoplan.products.restore_details import compare
 from photoplan.products.restore_execute import Job, RestoredImage
@@ -68,8 +68,7 @@ def open_report(path: Path, inputs: Sequence[Path], *, overwrite: bool = False) 
 
 
 def _facts(image: RestoredImage, job: Job) -> RestoredFacts:
-    source = job.reader.source
-    model = source.model if isinstance(source, AlignedReader) else None
+    aligned = job.reader.aligned
     before, after = RasterReader(job.reader.info.path), RasterReader(image.path)
     seen = compare(before, after)
     window, size = seen.window, job.reader.size
@@ -88,9 +87,16 @@ def _facts(image: RestoredImage, job: Job) -> RestoredFacts:
         seen.after,
         f"Columns {window.col} to {window.stop[0] - 1}, rows {window.row} to {window.stop[1] - 1}",
         seen.ends,
-        (f"The result is {image.path.name}; light: {job.reader.restorer.linearisation.describe()}.",),
-        () if model is None else tuple(_chromatic_rows(model)),
+        tuple(_notes(image, job)),
+        () if aligned is None else tuple(_chromatic_rows(aligned.model)),
     )
+
+
+def _notes(image: RestoredImage, job: Job) -> list[str]:
+    notes = [f"The result is {image.path.name}; light: {job.reader.restorer.linearisation.describe()}."]
+    if job.reader.lit is not None:
+        notes.append(f"{fall_off_line(job.reader.lit.fall_off)}, before the filter.")
+    return notes
 
 
 def _band_rows(image: RestoredImage) -> list[tuple[str, ...]]:

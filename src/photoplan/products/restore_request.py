@@ -35,6 +35,8 @@ class RestoreRequest:
     chromatic: ChromaticModel | Path | Literal["measure"] | None = None
     """Lateral chromatic aberration, which is corrected before the filter: a model, its file, or ``measure``: every
     image's own discs or edges; None: the bands stay where they are."""
+    fall_off: Path | None = None
+    """A correction of light fall-off, which comes before all others."""
     compress: str = "deflate"
     workers: int = 1
     memory: int | None = None
@@ -67,5 +69,6 @@ class RestoreRequest:
             "chromatic": "a model"
             if isinstance(self.chromatic, ChromaticModel)
             else self.chromatic and str(self.chromatic),
+            "fall_off": self.fall_off and str(self.fall_off),
             "compress": self.compress,
         }

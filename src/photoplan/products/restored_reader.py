@@ -14,12 +14,15 @@ from photoplan.io.raster import RasterReader
 from photoplan.io.raster_info import RasterInfo
 from photoplan.io.storage import Nodata
 from photoplan.products.aligned_reader import AlignedReader
+from photoplan.products.fall_off_reader import FallOffReader
 from photoplan.quality.linearise import Linearisation
 from photoplan.quality.restoration.filters import RestorationFilter
 from photoplan.quality.restoration.restorer import RestoredPixels, Restorer
 
-__all__ = ["RestoredReader", "kept_nodata", "restored_reader"]
+__all__ = ["RestoredReader", "Source", "kept_nodata", "restored_reader"]
 
+#: An image, with corrections that come before the filter.
+Source = RasterReader | FallOffReader | AlignedReader
 #: Side of the parts in which a large window is restored: what bounds memory. The result does not depend on it.
 PART = 512
 
@@ -34,13 +37,23 @@ class RestoredReader:
         When read: damaged pixels, or grey values that the linearisation's table does not have.
     """
 
-    source: RasterReader | AlignedReader
+    source: Source
     restorer: Restorer
 
     @property
     def info(self) -> RasterInfo:
         """Facts of the file."""
         return self.source.info
+
+    @property
+    def aligned(self) -> AlignedReader | None:
+        """The correction of lateral chromatic aberration, if there is one."""
+        return self.source if isinstance(self.source, AlignedReader) else None
+
+    @property
+    def lit(self) -> FallOffReader | None:
+        """The correction of light fall-off, if there is one."""
+        return _lit(self.source)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -62,9 +75,10 @@ class RestoredReader:
         used = self.restorer.filter
         columns, rows = used.margin
         name = f' "{used.description}"' if used.description else ""
+        lit = "light fall-off corrected; " if self.lit is not None else ""
         return (
-            f"restored with the filter{name}, {2 * columns + 1} × {2 * rows + 1}; noise grows {used.noise_gain:.3g} "
-            f"times; {self.restorer.linearisation.describe()}"
+            f"{lit}restored with the filter{name}, {2 * columns + 1} × {2 * rows + 1}; noise grows "
+            f"{used.noise_gain:.3g} times; {self.restorer.linearisation.describe()}"
         )
 
     def read(self, window: Window) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
@@ -116,7 +130,7 @@ def kept_nodata(info: RasterInfo, out: np.dtype[Any]) -> Nodata:
 
 
 def restored_reader(
-    source: RasterReader | AlignedReader,
+    source: Source,
     filter_: RestorationFilter,
     linearisation: Linearisation | None = None,
     out: np.dtype[Any] | None = None,
@@ -125,10 +139,10 @@ def restored_reader(
 
     Parameters
     ----------
-    source : RasterReader or AlignedReader
+    source : RasterReader, FallOffReader or AlignedReader
     filter_ : RestorationFilter
     linearisation : Linearisation, optional
-        How grey values become light; they are light already if it is None.
+        How grey values become light; they are light already if it is None. Of a `FallOffReader` it is the same.
     out : dtype, optional
         Type of the restored pixels; the image's own if it is None.
 
@@ -137,12 +151,18 @@ def restored_reader(
     InputError
         The filter is not for an image of this size or number of bands.
     """
-    out = source.dtype if out is None else out
+    stored = np.dtype(source.info.dtype)
+    out = stored if out is None else out
     nodata = kept_nodata(source.info, out)
     avoided = nodata if isinstance(nodata, float) and out.kind != "f" else None
     light = linearisation or Linearisation()
     try:
-        restorer = Restorer(filter_, source.size, source.bands, source.dtype, out, light, avoided)
+        restorer = Restorer(filter_, source.size, source.bands, stored, out, light, avoided, _lit(source) is not None)
     except InputError as error:
         raise InputError(f"{source.path}: {error}") from None
     return RestoredReader(source, restorer)
+
+
+def _lit(source: Source) -> FallOffReader | None:
+    inner = source.source if isinstance(source, AlignedReader) else source
+    return inner if isinstance(inner, FallOffReader) else None

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 
-__all__ = ["FallOffModel", "correct_fall_off", "gain_image", "surface_terms", "term_values"]
+__all__ = ["FallOffModel", "correct_fall_off", "gain_image", "largest_gain", "surface_terms", "term_values"]
 
 Array = NDArray[np.float64]
 
@@ -169,6 +169,18 @@ def gain_image(model: FallOffModel, factor: int = 1) -> NDArray[np.float32]:
         y = (np.arange(first, min(first + rows, height)) + 0.5)[:, None] * factor - 0.5
         out[first : first + rows] = _gain(model, x, y)
     return out
+
+
+def largest_gain(model: FallOffModel) -> float:
+    """The largest gain, 1 / relative brightness, of 65 × 65 places over the image, its corners among them.
+
+    Raises
+    ------
+    InputError
+        The model gives no brightness somewhere.
+    """
+    x, y = (np.linspace(0.0, side - 1.0, 65) for side in model.size)
+    return float(_gain(model, x[None, :], y[:, None]).max())
 
 
 def _gain(model: FallOffModel, x: NDArray[np.floating], y: NDArray[np.floating]) -> Array:

@@ -18,7 +18,7 @@ from photoplan.quality.restoration.field_weights import field_weights
 from photoplan.quality.restoration.filters import RestorationFilter
 from photoplan.quality.restoration.scratch import Scratch
 
-__all__ = ["RestoredPixels", "Restorer"]
+__all__ = ["RestoredPixels", "Restorer", "light_of"]
 
 _SCRATCH = Scratch()
 
@@ -53,6 +53,8 @@ class Restorer:
     """How grey values become light, which is what is filtered; the result is encoded again."""
     nodata: float | None = None
     """A value of whole numbers that restored pixels do not take: they become its neighbour."""
+    light_given: bool = False
+    """Whether windows hold light as float32, on the scale of `dtype`, instead of grey values."""
     _ready: tuple[tuple[Convolution, ...], ...] = field(init=False, repr=False)
     """Convolutions of each band."""
 
@@ -95,7 +97,7 @@ class Restorer:
         window : Window
             Inside the image.
         pixels : ndarray, shape (bands, at.height, at.width)
-            Grey values of the image.
+            Grey values of the image, or light where that is given.
         at : Window
             Where they are; see `Margin.around`.
         valid : ndarray of bool, shape (at.height, at.width)
@@ -117,12 +119,18 @@ class Restorer:
                 counts.append((0, 0))
                 continue
             if self._ready[band]:
-                light = self._light(pixels[band], valid, band + 1)
+                light = pixels[band]
+                if not self.light_given:
+                    light = light_of(self.linearisation, light, valid, band + 1)
                 source = self.margin.source(window, light[None], at, valid, _SCRATCH)[0]
                 counts.append(self._convolved(source, window, mask, band, values[band]))
             else:
                 grey = np.ascontiguousarray(pixels[band, rows, cols], np.float32)
-                counts.append(_store(grey, mask, values[band]))
+                lost = (0, 0)
+                if self.light_given:
+                    grey, lost = self._grey(grey, mask, band + 1)
+                clipped = _store(grey, mask, values[band])
+                counts.append((lost[0] + clipped[0], lost[1] + clipped[1]))
         self._keep_apart(values)
         if mask is not None:
             values[:, ~mask] = 0
@@ -152,17 +160,6 @@ class Restorer:
         clipped = _store(grey, mask, values)
         return lost[0] + clipped[0], lost[1] + clipped[1]
 
-    def _light(self, grey: NDArray[Any], valid: NDArray[np.bool_] | None, band: int) -> NDArray[Any]:
-        """Light of grey values; what invalid pixels hold is of no account."""
-        if self.linearisation.is_linear:
-            return grey
-        if self.linearisation.kind == "srgb" and grey.dtype.kind == "u":
-            table = self.linearisation.to_linear(np.arange(np.iinfo(grey.dtype).max + 1, dtype=grey.dtype), band)
-            return table.astype(np.float32)[grey]
-        if valid is not None and valid.any():
-            grey = np.where(valid, grey, grey[valid][0])
-        return self.linearisation.to_linear(grey, band).astype(np.float32)
-
     def _grey(
         self, light: NDArray[np.float32], mask: NDArray[np.bool_] | None, band: int
     ) -> tuple[NDArray[np.float32], tuple[int, int]]:
@@ -184,6 +181,23 @@ class Restorer:
         if limits.min <= self.nodata <= limits.max:
             step = 1 if self.nodata < limits.max else -1
             values[values == self.out.type(self.nodata)] = self.out.type(self.nodata + step)
+
+
+def light_of(
+    linearisation: Linearisation, grey: NDArray[Any], valid: NDArray[np.bool_] | None, band: int
+) -> NDArray[Any]:
+    """Light of grey values of a band (from 1), float32; as they are where they are light already.
+
+    What invalid pixels hold is of no account.
+    """
+    if linearisation.is_linear:
+        return grey
+    if linearisation.kind == "srgb" and grey.dtype.kind == "u":
+        table = linearisation.to_linear(np.arange(np.iinfo(grey.dtype).max + 1, dtype=grey.dtype), band)
+        return table.astype(np.float32)[grey]
+    if valid is not None and valid.any():
+        grey = np.where(valid, grey, grey[valid][0])
+    return linearisation.to_linear(grey, band).astype(np.float32)
 
 
 def _store(grey: NDArray[np.float32], mask: NDArray[np.bool_] | None, values: NDArray[Any]) -> tuple[int, int]:
