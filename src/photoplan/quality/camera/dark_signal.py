@@ -89,6 +89,13 @@ def doubling_temperature(
 ) -> DoublingTemperature:
     """Doubling temperature from dark currents at two temperatures or more.
 
+    Parameters
+    ----------
+    temperatures_c : sequence of float
+        Of the sensor, °C.
+    currents, sigmas : sequence of float
+        Dark currents and their standard deviations, in one unit.
+
     Raises
     ------
     InputError

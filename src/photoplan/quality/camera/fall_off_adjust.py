@@ -78,7 +78,10 @@ def solve(A: Array, y: Array) -> Array:
 
 
 def columns(blocks: Blocks, point: tuple[float, float], c: float | None, terms: tuple[tuple[int, int], ...]) -> Array:
-    """Design of the linear unknowns for all known blocks."""
+    """Design of the linear unknowns for all known blocks, shape (n, 1 + terms): the level, then each term.
+
+    The principal point is in pixels, and the camera constant c too; without one there is no natural part.
+    """
     unit = half_diagonal(blocks.size)
     u, v = (blocks.x - point[0]) / unit, (blocks.y - point[1]) / unit
     natural = np.ones_like(u) if c is None else (1.0 + (u**2 + v**2) * (unit / c) ** 2) ** -2
@@ -88,7 +91,10 @@ def columns(blocks: Blocks, point: tuple[float, float], c: float | None, terms: 
 def adjust(
     blocks: Blocks, settings: FallOffSettings, terms: tuple[tuple[int, int], ...], weights: Array | None = None
 ) -> Fit:
-    """Gauss-Newton for the unknowns of the natural part, robust weights beside it."""
+    """Gauss-Newton for the unknowns of the natural part beside the linear ones.
+
+    Weights are those of the blocks, shape (n,); None: all equal.
+    """
     free = (("camera constant",) if settings.natural == "estimated" else ()) + (
         ("column of the principal point", "row of the principal point") if settings.estimate_principal_point else ()
     )

@@ -114,7 +114,16 @@ def spectrum(waves: Waves, y: Array, base: Array, chance: float = 0.001) -> Spec
 
 
 def false_alarm(found: Spectrum, freedom: int, extent: float) -> float:
-    """Chance that noise alone has its strongest power this high."""
+    """Chance that noise alone has its strongest power this high.
+
+    Parameters
+    ----------
+    found : Spectrum
+    freedom : int
+        Degrees of freedom that are left beside the base functions and one oscillation.
+    extent : float
+        Lines from the first to the last: independent frequencies lie 1 / extent apart.
+    """
     single = (1.0 - float(found.power[found.best])) ** (freedom / 2.0)
     trials = max(1.0, float(found.frequency[-1] - found.frequency[0]) * extent)
     return -math.expm1(trials * math.log1p(-min(single, 1.0 - 1e-12)))

@@ -1,4 +1,8 @@
-"""Reasons why a region gives no figure of an edge: each with what was found, what is allowed and what to do."""
+"""Reasons why a region gives no figure of an edge: each with what was found, what is allowed and what to do.
+
+Every function that refuses raises `InputError`. Places and distances are pixels; light is what the linearisation made
+of grey values.
+"""
 
 from __future__ import annotations
 

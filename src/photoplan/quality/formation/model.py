@@ -138,6 +138,11 @@ def form_series(
         One for all frames, or one for each frame.
     exposures : sequence of float
         One for each frame; with several scenes a single one holds for all.
+
+    Raises
+    ------
+    InputError
+        There are several scenes and another number of exposures, or a frame cannot be formed.
     """
     several = list(scenes) if isinstance(scenes, list | tuple) else None
     factors = list(exposures) * len(several) if several and len(exposures) == 1 else list(exposures)

@@ -15,7 +15,7 @@ MOST_WIDTH_PX = 200.0
 
 
 def check_range(part: str, name: str, value: float, least: float, most: float = float("inf")) -> None:
-    """Refuse a number of a part outside its range, or one that is not finite."""
+    """Refuse a number of a part outside its range, or one that is not finite, with an `InputError`."""
     if not isinstance(value, int | float) or isinstance(value, bool) or not isfinite(value):
         raise InputError(f"{part}: {name} = {value!r}; it must be a finite number")
     if not least <= value <= most:

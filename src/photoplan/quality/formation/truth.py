@@ -40,12 +40,15 @@ def model_transfer(
 
 
 def model_modulation(model: ImageModel, frequency: _Array, angle_deg: float = 0.0, radius: float = 0.0) -> _Array:
-    """Modulus of `model_transfer`: the MTF."""
+    """Modulus of `model_transfer`, which says what the arguments are: the MTF."""
     return np.abs(model_transfer(model, frequency, angle_deg, radius))
 
 
 def model_mtf50(model: ImageModel, angle_deg: float = 0.0, radius: float = 0.0, modulation: float = 0.5) -> float:
-    """First frequency at which the MTF falls to a modulation, cycles per pixel; NaN if it does not below 20."""
+    """First frequency at which the MTF falls to a modulation, cycles per pixel; NaN if it does not below 20.
+
+    Direction and place are those of `model_transfer`.
+    """
     f = np.linspace(0.0, 20.0, 40001)
     values = model_modulation(model, f, angle_deg, radius)
     below = np.flatnonzero(values <= modulation)
@@ -58,6 +61,8 @@ def model_mtf50(model: ImageModel, angle_deg: float = 0.0, radius: float = 0.0, 
 
 def line_spread(model: ImageModel, offsets: _Array, angle_deg: float = 0.0, radius: float = 0.0) -> _Array:
     """Line spread function at offsets in pixels, its integral 1, by Fourier's integral.
+
+    Direction and place are those of `model_transfer`.
 
     Raises
     ------

@@ -73,7 +73,10 @@ def _wrapped(wave: Array) -> Array:
 
 
 def wave_columns(shape: tuple[int, ...], phase: Array, harmonics: tuple[int, ...]) -> Array:
-    """Columns of the linear model: level, its slopes in x and y, and cosine and sine of each harmonic wave."""
+    """Columns of the linear model: level, its slopes in x and y, and cosine and sine of each harmonic wave.
+
+    The phase is in periods, one for each pixel of a window of this shape; a row of the result is a pixel.
+    """
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]]
     x, y = x / max(shape[1] - 1, 1) - 0.5, y / max(shape[0] - 1, 1) - 0.5
     columns = [np.ones(phase.size), x.ravel(), y.ravel()]

@@ -56,6 +56,17 @@ def pattern_window(
 ) -> Array:
     """The window of a pattern as float64, checked.
 
+    Parameters
+    ----------
+    light : ndarray
+        Proportional to light.
+    clipped : ndarray, optional
+        True where a pixel is cut off at an end of its range, same shape.
+    what : str
+        Names the window in messages.
+    least, most : int
+        Shortest and longest side, pixels.
+
     Raises
     ------
     InputError
