@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import ceil
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,9 +12,9 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
-from photoplan.io.raster_info import RasterInfo
 from photoplan.kernels.shift_bands import limits_of, no_mask, shift_band
 from photoplan.kernels.weights import KERNELS
+from photoplan.products.derived_reader import DerivedReader
 from photoplan.products.fall_off_reader import FallOffReader
 from photoplan.quality.colour.model import ChromaticModel
 
@@ -23,7 +22,7 @@ __all__ = ["AlignedReader"]
 
 
 @dataclass(frozen=True, eq=False)
-class AlignedReader:
+class AlignedReader(DerivedReader):
     """A source image behind the engine's `Reader`, corrected for lateral chromatic aberration.
 
     The value of a band at a pixel is taken where the model says that the band shows what the reference shows at that
@@ -60,26 +59,6 @@ class AlignedReader:
                 f"{self.source.path}: the chromatic model displaces a band by {worst:.0f} pixels; up to 200 and a "
                 "quarter of the image are allowed"
             )
-
-    @property
-    def info(self) -> RasterInfo:
-        """Facts of the file."""
-        return self.source.info
-
-    @property
-    def path(self) -> Path:
-        """The file."""
-        return self.source.path
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height in pixels."""
-        return self.source.size
-
-    @property
-    def bands(self) -> int:
-        """Number of bands, without alpha."""
-        return self.source.bands
 
     @property
     def dtype(self) -> np.dtype[Any]:

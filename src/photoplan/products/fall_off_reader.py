@@ -13,7 +13,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.raster import RasterReader
-from photoplan.io.raster_info import RasterInfo
+from photoplan.products.derived_reader import DerivedReader
 from photoplan.products.fall_off_correction import read_fall_off
 from photoplan.quality.camera.fall_off_model import FallOffModel, correct_fall_off, largest_gain
 from photoplan.quality.linearise import Linearisation
@@ -69,7 +69,7 @@ def fall_off_line(used: FallOffFile) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class FallOffReader:
+class FallOffReader(DerivedReader):
     """A source image behind the engine's `Reader` as light, with the same gain in all bands.
 
     Grey values are decoded to light and corrected; what is read is float32 on the scale of the image's type, neither
@@ -94,26 +94,6 @@ class FallOffReader:
                 f"{self.source.path}: {size[0]} × {size[1]} pixels; the light fall-off in {self.fall_off.path} is for "
                 f"images of {known[0]} × {known[1]}: an image that was cropped or scaled needs a correction of its own"
             )
-
-    @property
-    def info(self) -> RasterInfo:
-        """Facts of the file."""
-        return self.source.info
-
-    @property
-    def path(self) -> Path:
-        """The file."""
-        return self.source.path
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height in pixels."""
-        return self.source.size
-
-    @property
-    def bands(self) -> int:
-        """Number of bands, without alpha."""
-        return self.source.bands
 
     @property
     def dtype(self) -> np.dtype[Any]:

@@ -14,6 +14,7 @@ from photoplan.io.raster import RasterReader
 from photoplan.io.raster_info import RasterInfo
 from photoplan.io.storage import Nodata
 from photoplan.products.aligned_reader import AlignedReader
+from photoplan.products.derived_reader import DerivedReader
 from photoplan.products.fall_off_reader import FallOffReader
 from photoplan.quality.linearise import Linearisation
 from photoplan.quality.restoration.filters import RestorationFilter
@@ -28,7 +29,7 @@ PART = 512
 
 
 @dataclass(frozen=True, eq=False)
-class RestoredReader:
+class RestoredReader(DerivedReader):
     """A source image behind the engine's `Reader`, restored: the pixels that `photoplan restore` writes.
 
     Raises
@@ -41,11 +42,6 @@ class RestoredReader:
     restorer: Restorer
 
     @property
-    def info(self) -> RasterInfo:
-        """Facts of the file."""
-        return self.source.info
-
-    @property
     def aligned(self) -> AlignedReader | None:
         """The correction of lateral chromatic aberration, if there is one."""
         return self.source if isinstance(self.source, AlignedReader) else None
@@ -54,16 +50,6 @@ class RestoredReader:
     def lit(self) -> FallOffReader | None:
         """The correction of light fall-off, if there is one."""
         return _lit(self.source)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height in pixels."""
-        return self.source.size
-
-    @property
-    def bands(self) -> int:
-        """Number of bands, without alpha."""
-        return self.source.bands
 
     @property
     def dtype(self) -> np.dtype[Any]:
