@@ -198,10 +198,12 @@ def _maps(used: RestorationFilter, measured: MeasuredFilter | None) -> list[tupl
             continue
         maps = [FieldMap("noise grows, times", np.array([[gains[x, y] for x in columns] for y in rows]), 2)]
         parts = {} if measured is None else {p.at: p for p in measured.parts if p.band == band and p.edges}
-        for number, (_, name, _) in enumerate(_AXES if parts else ()):
+        for number, (axis, name, _) in enumerate(_AXES if parts else ()):
             values = np.full((len(rows), len(columns)), np.nan)
             for at, part in parts.items():
                 assert at is not None
+                if axis in part.missing:
+                    continue
                 values[rows.index(at[1]), columns.index(at[0])] = part.sharpness[number].modulation().mtf50
             maps.append(FieldMap(f"MTF50 along {name}", values, 3))
         found.append(("all bands" if band is None else f"band {band}", tuple(maps)))

@@ -95,7 +95,7 @@ def _facts(image: RestoredImage, job: Job) -> RestoredFacts:
 def _notes(image: RestoredImage, job: Job) -> list[str]:
     notes = [f"The result is {image.path.name}; light: {job.reader.restorer.linearisation.describe()}."]
     if job.reader.lit is not None:
-        notes.append(f"{fall_off_line(job.reader.lit.fall_off)}, before the filter.")
+        notes.append(f"Before the filter: {fall_off_line(job.reader.lit.fall_off)}.")
     return notes
 
 

@@ -82,10 +82,10 @@ class FilterPlots:
         box = (-n - 0.5, n + 0.5, m + 0.5, -m - 0.5)
         axes.imshow(rooted, cmap="RdBu_r", vmin=-most, vmax=most, extent=box, interpolation="nearest")
         axes.grid(visible=False)
-        axes.set_title(f"{kernel.title} (colour: root of the weight)")
+        axes.set_title(kernel.title)
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_locator(self._mpl.ticker.MaxNLocator(integer=True))
-        axes.set_xlabel("columns")
+        axes.set_xlabel("columns (colour: root of the weight)")
         axes.set_ylabel("rows")
         if values.size <= 49:
             for (i, k), value in np.ndenumerate(values):

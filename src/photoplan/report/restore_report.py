@@ -111,7 +111,7 @@ def _filter(used: FilterFacts, plots: RestorePlots) -> list[str]:
     caption = "Weights, sections through the middle, and by what factor the filter changes the amplitude of waves."
     parts.append(figure(plots.filters(used.title, used.kernels), "Restoration filter", caption))
     for name, maps in used.maps:
-        caption = "In each part of the field. A dash: too few edges; the filter of the whole field is used there."
+        caption = "In each part of the field. A dash: too few edges; whole field or other direction stand for it."
         parts.append(figure(plots.field(maps), f"Over the field, {name}", caption))
     return parts
 
