@@ -118,7 +118,7 @@ def test_facts_of_a_measured_filter(found: FoundFilter) -> None:
 
 def test_parts_without_edges_are_named_once_and_stay_empty_in_the_map(found: FoundFilter) -> None:
     measured = found.measured
-    whole = measured.parts[0]
+    whole = replace(measured.parts[0], missing=())
     poor = tuple(replace(p, edges=0, design=whole.design, sharpness=whole.sharpness) for p in measured.parts[1:])
     kernels = tuple(FilterKernel(whole.design.kernel, p.at) for p in measured.parts)
     filter_ = RestorationFilter(kernels, found.filter.image_size)
