@@ -14,7 +14,7 @@ from photoplan.quality.restoration.design import Sharpness
 from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
 from photoplan.report.filter_plots import KernelPicture, frequency_response
 from photoplan.report.restore_plots import AxisPicture, FieldMap
-from photoplan.report.restore_report import FilterFacts, PartFacts
+from photoplan.report.restore_report import STANDS_FOR, FilterFacts, PartFacts
 
 __all__ = ["filter_facts"]
 
@@ -105,8 +105,8 @@ def _name(part: DesignedPart) -> str:
     if part.at is None:
         return band
     if part.edges == 0:
-        return f"{band}, whole field (for parts with too few edges)"
-    return f"{band} at {part.at[0]:.0f}, {part.at[1]:.0f}"
+        return "whole field" if part.band is None else f"{band}, whole field"
+    return f"{'' if part.band is None else f'{band} '}at {part.at[0]:.0f}, {part.at[1]:.0f}"
 
 
 def _expected_mtf50(sharpness: Sharpness, kernel: np.ndarray, direction: tuple[float, float]) -> float:
@@ -150,7 +150,7 @@ def _rows(part: DesignedPart) -> list[tuple[str, ...]]:
                 _name(part),
                 str(part.edges or "–"),
                 part.design.method,
-                name + (" (by the others)" if axis in part.missing else ""),
+                name + (STANDS_FOR if axis in part.missing else ""),
                 *side[:3],
                 f"{condition.neighbour_ratio:.3f}",
                 f"{condition.smallest_singular:.3f} – {condition.largest_singular:.3f}",

@@ -21,8 +21,8 @@ _COLOURS = (BLUE, ORANGE)
 _NAMES = ("Z", "A", "B")
 #: Values of a spread function that are drawn to each side.
 _SPREAD = 6
-#: Side of a drawn detail, pixels of the picture; and resolution.
-_DETAIL, _DPI = 480, 150
+#: Side of a drawn detail, pixels of the picture, so many that a page that makes it smaller leaves squares; resolution.
+_DETAIL, _DPI = 960, 300
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +153,7 @@ class RestorePlots:
         """
         height, width = before.shape[:2]
         factor = max(1, _DETAIL // max(height, width))
-        wide, tall, gap, head = factor * width, factor * height, 24, 34
+        wide, tall, gap, head = factor * width, factor * height, 48, 68
         total = 2 * wide + gap, tall + head
         with self._mpl.rc_context(STYLE):
             fig = self._mpl.figure.Figure(figsize=(total[0] / _DPI, total[1] / _DPI))
@@ -162,7 +162,7 @@ class RestorePlots:
                 axes = fig.add_axes(place)
                 axes.imshow(picture, cmap="gray", vmin=0, vmax=255, interpolation="nearest", aspect="auto")
                 axes.set_axis_off()
-                axes.set_title(f" {name}, {factor} : 1", fontsize=9, color=INK)
+                axes.set_title(f" {name}", fontsize=9, color=INK)
             return png(fig, _DPI)
 
     def ends(self, picture: EndsPicture) -> bytes:

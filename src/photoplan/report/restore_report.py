@@ -12,14 +12,15 @@ from photoplan.report.filter_plots import MOST_DRAWN, KernelPicture
 from photoplan.report.page import Cell, figure, headline, page, section, table, text
 from photoplan.report.restore_plots import AxisPicture, EndsPicture, FieldMap, RestorePlots
 
-__all__ = ["FilterFacts", "PartFacts", "RestoredFacts", "restore_report"]
+__all__ = ["STANDS_FOR", "FilterFacts", "PartFacts", "RestoredFacts", "restore_report"]
 
 #: Images that get pictures, and parts of the field that are listed.
 _PICTURED = 30
 _LISTED = 300
 PART_HEAD = ("part", "edges", "method", "along", "Z", "A", "B", "A/Z", "singular values", "least transfer", "MTF50",
              "expected", "noise ×")  # fmt: skip
-_WORDS = 4
+#: Marks a direction without edges enough.
+STANDS_FOR = " †"
 BAND_HEAD = ("band", "below", "above", "clipped")
 CHROMATIC_HEAD = ("band", "kind", "shift x px", "shift y px", "corners px", "residual px", "used", "left out")
 
@@ -93,7 +94,7 @@ def _filter(used: FilterFacts, plots: RestorePlots) -> list[str]:
     rules = list(dict.fromkeys(part.rule for part in used.parts))
     for rule in rules:
         names = [part.name for part in used.parts if part.rule == rule]
-        where = f"{', '.join(names[:4])}{' …' if len(names) > 4 else ''}: " if len(rules) > 1 else ""
+        where = f"{'; '.join(names[:4])}{' …' if len(names) > 4 else ''}: " if len(rules) > 1 else ""
         parts.append(f"<p>Rule: {text(where + rule)}.</p>")
     for part in used.parts[:MOST_DRAWN]:
         caption = (
@@ -103,7 +104,9 @@ def _filter(used: FilterFacts, plots: RestorePlots) -> list[str]:
         )
         parts.append(figure(plots.sharpness(part.axes), f"Sharpness, {part.name}", caption))
     if used.rows:
-        parts.append(table(PART_HEAD, [_cells(row, _WORDS) for row in used.rows[:_LISTED]]))
+        parts.append(table(PART_HEAD, [_cells(row, 1) for row in used.rows[:_LISTED]]))
+        if any(STANDS_FOR in row[3] for row in used.rows[:_LISTED]):
+            parts.append(f"<p>{STANDS_FOR.strip()} too few edges; the other direction stands for this one.</p>")
         if len(used.rows) > _LISTED:
             parts.append(f"<p>{len(used.rows) - _LISTED} more rows; the filter file has them all.</p>")
     if used.facts:
