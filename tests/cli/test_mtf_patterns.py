@@ -151,3 +151,16 @@ def test_an_image_that_fails_does_not_stop_the_others(photoplan: Here, tmp_path:
     assert "empty.tif" in said.err and "no pattern" in said.err
     assert "bright.tif" in said.err and "saturated or clipped" in said.err
     assert "0.4000 cy/px" in said.out and "empty" not in said.out
+
+
+def test_images_of_one_name_are_told_apart(photoplan: Here, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    (tmp_path / "other").mkdir()
+    files = [write(tmp_path / part / "bars.tif", strip()) for part in ("", "other")]
+    table = tmp_path / "out.csv"
+    call = ("mtf", *files, "--pattern", "bars", *ROIS, "--linearisation", "linear", "--csv", table, "--json")
+    said = photoplan(*call, "--report", tmp_path / "out.html")
+    assert said.code == 0, said.err
+    assert [image["image"] for image in json.loads(said.out)["images"]] == [str(file) for file in files]
+    assert {row["image"] for row in csv.DictReader(table.open(encoding="utf-8"))} == {str(file) for file in files}
+    assert photoplan("mtf", files[0], files[0], "--pattern", "bars", *ROIS).code == 2

@@ -12,12 +12,12 @@ from photoplan.errors import PhotoplanError, ResourceError, UsageError
 from photoplan.io.disk import write_atomically
 from photoplan.io.mtf_file import read_mtf_table
 from photoplan.io.named_table import write_named_table
-from photoplan.io.product import check_output
 from photoplan.products.linearisation import linearisation_of
 from photoplan.products.mtf_groups import group_edges
 from photoplan.products.mtf_image import LightImage
 from photoplan.products.mtf_measure import Measuring, measure_image
 from photoplan.products.mtf_page import mtf_page
+from photoplan.products.mtf_request import ENCODED, check_files, unique_names
 from photoplan.products.mtf_result import EdgeGroup, ImageMtf, MtfReport
 from photoplan.quality.edges.enhancement import Enhancement, enhancement_of
 from photoplan.quality.edges.find import EdgeRules
@@ -29,10 +29,6 @@ __all__ = ["MtfRequest", "measure_mtf"]
 #: Cells of the field in each direction that a report can show.
 MOST_CELLS = 50
 MOST_EDGES = 5000
-_GAMMA = (
-    "linearisation: linear (by default: grey values are taken as light). Images of 8 bits are usually encoded by a "
-    "curve such as sRGB, and that alone moves MTF50 by about 12 %; say --linearisation srgb, a table, or linear"
-)
 
 
 @dataclass(frozen=True)
@@ -120,7 +116,7 @@ def measure_mtf(
     names = dict(zip(request.images, unique_names(request.images)))
     opened, failed = _opened(request, linearisation, names)
     if request.linearisation is None and any(image.reader.dtype == "uint8" for image in opened.values()):
-        talk(_GAMMA)
+        talk(ENCODED)
     results: list[ImageMtf] = []
     with begin(sum(measuring.steps(image) for image in opened.values())) as advance:
         for path, image in opened.items():
@@ -179,12 +175,6 @@ def _opened(
     return opened, failed
 
 
-def unique_names(paths: Sequence[Path]) -> list[str]:
-    """Names of files; whole paths where two files have one name."""
-    names = [path.name for path in paths]
-    return [str(path) if names.count(path.name) > 1 else path.name for path in paths]
-
-
 def _check(request: MtfRequest) -> None:
     """Refuse what cannot be meant before any work.
 
@@ -193,12 +183,6 @@ def _check(request: MtfRequest) -> None:
     UsageError
         Naming the option.
     """
-    if not request.images:
-        raise UsageError("no image is given; give one or more images")
-    files = [str(path) for path in request.images]
-    twice = sorted({f for f in files if files.count(f) > 1})
-    if twice:
-        raise UsageError(f"image {twice[0]} is given twice")
     if not 1 <= request.grid <= MOST_CELLS:
         raise UsageError(f"--grid {request.grid}; 1 to {MOST_CELLS} cells are allowed")
     if not 1 <= request.most_edges <= MOST_EDGES:
@@ -207,11 +191,5 @@ def _check(request: MtfRequest) -> None:
         raise UsageError(f"--half-width {request.half_width}; 6 to 60 px are allowed")
     if request.pixel_um is not None and not 0.01 <= request.pixel_um <= 1e4:
         raise UsageError(f"--pixel-size {request.pixel_um:g}; 0.01 to 10000 micrometres are allowed")
-    inputs = [*request.images, *(p for p in (request.lab,) if p is not None)]
-    if request.linearisation not in (None, "linear", "srgb"):
-        inputs.append(Path(str(request.linearisation)))
-    outputs = [path for path in (request.report, request.csv) if path is not None]
-    for path in outputs:
-        check_output(path, inputs, overwrite=request.overwrite)
-    if len(outputs) == 2 and outputs[0].resolve() == outputs[1].resolve():
-        raise UsageError(f"--report and --csv both name {outputs[0]}; give two files")
+    tables = (request.linearisation, request.lab)
+    check_files(request.images, tables, (request.report, request.csv), request.overwrite)

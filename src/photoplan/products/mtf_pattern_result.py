@@ -26,7 +26,8 @@ __all__ = ["ImagePattern", "PatternReport", "PatternResult"]
 class PatternResult:
     """One pattern in one channel."""
 
-    file: Path
+    image: tuple[str, Path]
+    """Name, which no other image of the report has, and file."""
     band: str
     window: Window
     found: BarCurve | StarMtf | UsafResult
@@ -38,7 +39,7 @@ class PatternResult:
     def name(self) -> str:
         """Names it within the report."""
         w = self.window
-        return f"{self.file.name}, {self.band}, column {w.col}, row {w.row}, {w.width} × {w.height}"
+        return f"{self.image[0]}, {self.band}, column {w.col}, row {w.row}, {w.width} × {w.height}"
 
     def curves(self) -> dict[str, tuple[str, MtfCurve]]:
         """Curves by name: ``mtf`` or ``contrast``, and the curve."""
@@ -73,7 +74,7 @@ class PatternResult:
 
     def rows(self) -> Iterator[list[object]]:
         """Rows of the table: curve, direction, group, element, frequency, value, standard deviation, resolved."""
-        head = [self.file.name, self.band, self.window.col, self.window.row]
+        head = [self.image[0], self.band, self.window.col, self.window.row]
         if isinstance(self.found, UsafResult):
             for bars in self.found.bars:
                 kind = [_kind(bars), bars.group, bars.element, bars.frequency, bars.lp_mm, bars.contrast, bars.sigma]

@@ -14,10 +14,10 @@ from photoplan.errors import InputError, PhotoplanError, ResourceError, UsageErr
 from photoplan.geometry.grid import Window
 from photoplan.io.disk import write_atomically
 from photoplan.io.named_table import write_named_table
-from photoplan.io.product import check_output
 from photoplan.products.linearisation import linearisation_of
 from photoplan.products.mtf_image import LUMINANCE, LightImage
 from photoplan.products.mtf_pattern_result import ImagePattern, PatternReport, PatternResult
+from photoplan.products.mtf_request import ENCODED, check_files, unique_names
 from photoplan.quality.linearise import Linearisation
 from photoplan.quality.patterns.bar_curve import bar_curve
 from photoplan.quality.patterns.bars import measure_bars
@@ -77,16 +77,20 @@ def measure_patterns(request: PatternRequest, talk: Callable[[str], None] = lamb
     plots = PatternPlots() if request.report is not None else None
     results: list[ImagePattern] = []
     failed: dict[str, str] = {}
+    names = dict(zip(request.images, unique_names(request.images)))
+    encoded = False
     for path in request.images:
         try:
             image = LightImage.open(path, linearisation)
             if request.linearisation is None and image.reader.dtype == "uint8":
-                talk(f"{path.name}: 8 bit grey values are taken as light; say --linearisation srgb if they are encoded")
-            results.append(_measure(path, image, request))
+                encoded = True
+            results.append(_measure((names[path], path), image, request))
         except (ResourceError, UsageError):
             raise
         except PhotoplanError as error:
-            failed[str(path)] = str(error)
+            failed[names[path]] = str(error)
+    if encoded:
+        talk(ENCODED)
     done = bool(results)
     made = PatternReport(
         request.pattern,
@@ -101,7 +105,7 @@ def measure_patterns(request: PatternRequest, talk: Callable[[str], None] = lamb
         write_named_table(made.csv, *made.csv_rows)
     if made.report is not None and plots is not None:
         pictures = {
-            result.name: _overview(LightImage.open(result.file, linearisation), result.window)
+            result.name: _overview(LightImage.open(result.image[1], linearisation), result.window)
             for image_ in results
             for result in image_.results
         }
@@ -112,8 +116,6 @@ def measure_patterns(request: PatternRequest, talk: Callable[[str], None] = lamb
 
 def _check(request: PatternRequest) -> None:
     """Refuse what cannot be meant before any work."""
-    if not request.images:
-        raise UsageError("no image is given; give one or more images")
     if request.sectors is not None and request.pattern != "star":
         raise UsageError(f"--sectors goes with --pattern star, not {request.pattern}")
     if request.group is not None and request.pattern != "usaf":
@@ -124,14 +126,7 @@ def _check(request: PatternRequest) -> None:
         raise UsageError("--levels goes with --pattern bars or star; a USAF target shows its levels itself")
     if request.pixel_um is not None and not 1e-3 <= request.pixel_um <= 1e6:
         raise UsageError(f"--pixel-size {request.pixel_um:g}; 0.001 to 1000000 micrometres are allowed")
-    inputs: list[Path] = [*request.images]
-    if request.linearisation not in (None, "linear", "srgb"):
-        inputs.append(Path(str(request.linearisation)))
-    outputs = [path for path in (request.report, request.csv) if path is not None]
-    for path in outputs:
-        check_output(path, inputs, overwrite=request.overwrite)
-    if len(outputs) == 2 and outputs[0].resolve() == outputs[1].resolve():
-        raise UsageError(f"--report and --csv both name {outputs[0]}; give two files")
+    check_files(request.images, (request.linearisation,), (request.report, request.csv), request.overwrite)
 
 
 def _windows(image: LightImage, rois: tuple[Roi, ...]) -> list[Window]:
@@ -167,8 +162,9 @@ def _read(image: LightImage, window: Window, channel: int) -> tuple[Array, NDArr
     return light, clipped
 
 
-def _measure(path: Path, image: LightImage, request: PatternRequest) -> ImagePattern:
-    """The patterns of an image in every channel that is asked for."""
+def _measure(named: tuple[str, Path], image: LightImage, request: PatternRequest) -> ImagePattern:
+    """The patterns of an image, by its name and file, in every channel that is asked for."""
+    name, path = named
     results: list[PatternResult] = []
     windows = _windows(image, request.rois)
     levels = _levels(image.linearisation, image.reader.dtype, request.levels)
@@ -183,7 +179,7 @@ def _measure(path: Path, image: LightImage, request: PatternRequest) -> ImagePat
                 curve = bar_curve(groups, levels)
             except InputError as error:
                 raise InputError(f"{path}: {error} (--levels LOW HIGH)") from None
-            results.append(PatternResult(path, band, windows[0], curve, request.coltman))
+            results.append(PatternResult(named, band, windows[0], curve, request.coltman))
             continue
         for k, window in enumerate(windows):
             light, clipped = _read(image, window, channel)
@@ -191,12 +187,12 @@ def _measure(path: Path, image: LightImage, request: PatternRequest) -> ImagePat
             if request.pattern == "star":
                 rules = StarRules(sectors=request.sectors, levels=levels)
                 found = measure_star(light, rules, clipped=clipped, what=what)
-                results.append(PatternResult(path, band, window, found))
+                results.append(PatternResult(named, band, window, found))
             else:
                 usaf = UsafRules(request.group, None if request.group is not None else request.pixel_um)
                 target = measure_usaf(light, usaf, clipped=clipped, what=what)
-                results.append(PatternResult(path, band, window, target, notes=_stretched(light)))
-    return ImagePattern(path.name, path, image.size, image.linearisation.describe(), tuple(results))
+                results.append(PatternResult(named, band, window, target, notes=_stretched(light)))
+    return ImagePattern(name, path, image.size, image.linearisation.describe(), tuple(results))
 
 
 def _levels(
