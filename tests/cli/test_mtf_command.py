@@ -313,3 +313,9 @@ class TestReference:
             measured = result(photoplan, path, "--linearisation", how, "--band", 1)["summary"][0]["mtf50"]
             print(f"{name} {how}: {measured:.4f}, reference {reference}: {100 * (measured / reference - 1):+.1f} %")
             assert measured == pytest.approx(reference, rel=0.02)
+
+
+def test_an_image_without_any_value_is_refused_without_warnings(tmp_path: Path, photoplan: Here, recwarn) -> None:
+    said = refused(photoplan, write(tmp_path / "nan.tif", np.full((60, 80), np.nan, np.float32)))
+    assert "no edge found" in said
+    assert not [w for w in recwarn if issubclass(w.category, RuntimeWarning)]

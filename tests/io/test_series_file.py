@@ -58,6 +58,13 @@ def test_units_and_times_in_names(frames: Path):
     assert second.exposure_ms == 1.5
 
 
+def test_time_in_a_name_ends_where_its_form_ends(frames: Path):
+    write_frame(frames / "x_25ms_2019-02-08-171146-0003.tif", PIXELS)
+    text = '[[frames]]\nkind = "dark"\nfiles = "x_{exposure}ms_{time:%Y-%m-%d-%H%M%S}-*.tif"\n'
+    (frame,) = series(frames, text).frames
+    assert (frame.time_s, frame.exposure_ms) == (1549645906, 25)
+
+
 def test_name_counts_before_entry_and_table_before_name(frames: Path):
     (frames / "values.csv").write_text(
         "file;exposure_ms;temperature_c;lamp\nd1_600nm_100ms_c.tif;99,5;20,5;A\n", "utf-8"

@@ -70,6 +70,7 @@ def test_fault_18_rows_of_numbers(tmp_path: Path, text: str) -> None:
         ("# nothing\n", "holds no numbers"),
         ("1 " * 103, ":1: a filter has at most 101 rows and columns"),
         ("1\n" * 103, "at most 101 rows"),
+        ("1e300", "a weight of 1e+300; at most 1e+12 are allowed"),
         ("1,2,\n3,4,\n5,6,", ":1: '1,2,' is no row of numbers"),
     ],
 )

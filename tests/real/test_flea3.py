@@ -65,6 +65,14 @@ def test_response_at_500_nm_and_saturation(analyses):
     assert exposure["value"] == pytest.approx(255 / 0.7595, rel=0.02)
 
 
+def test_no_response_where_black_is_cut_off(analyses):
+    result = analyses("linearity")["linearity"]
+    known = {f["at"] for f in result["figures"] if f["name"] == "response_at" and f.get("plane") == "R"}
+    # At 700 nm and 25 ms the mean is 0.3 DN: most pixels are zero.
+    assert "700 nm 25 ms" not in known and "500 nm 25 ms" in known
+    assert "zero" in result["refused"]["signal over exposure R 700 nm 25 ms"]
+
+
 def test_hot_pixel_is_found_unaided(analyses, shared):
     result = analyses("defects")["defects"]
     growth = result["tables"]["hot_growth_G1"]

@@ -25,6 +25,8 @@ MOST_BYTES = 64_000_000
 MOST_KERNELS = 1024
 #: Kernels have at most this many rows and columns, see `FilterKernel`.
 MOST_ROWS = 101
+#: Weights beyond it would overflow in single precision, times grey values and summed.
+MOST_WEIGHT = 1e12
 
 _ENTRIES = {"kind", "format", "description", "image_size", "facts", "kernels"}
 _KERNEL_ENTRIES = {"band", "at", "values"}
@@ -172,6 +174,8 @@ def _odd(rows: list[list[float]], where: str) -> NDArray[np.float64]:
     values = np.array(rows, np.float64)
     if values.ndim != 2 or values.shape[0] % 2 == 0 or values.shape[1] % 2 == 0:
         raise InputError(f"{where}: values of {len(rows)} rows and {len(rows[0])} columns; both must be odd")
+    if np.abs(values).max() > MOST_WEIGHT:
+        raise InputError(f"{where}: a weight of {np.abs(values).max():.3g}; at most {MOST_WEIGHT:g} are allowed")
     return values
 
 

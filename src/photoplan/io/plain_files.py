@@ -34,7 +34,12 @@ def read_text(path: Path, max_bytes: int) -> str:
         size = path.stat().st_size
         if size > max_bytes:
             raise InputError(f"{path}: {size} bytes; at most {max_bytes} are read from a file of this kind")
-        raw = path.read_bytes()
+        with path.open("rb") as file:  # devices and pipes have no size: never more is read than is allowed
+            raw = file.read(max_bytes + 1)
+        if len(raw) > max_bytes:
+            raise InputError(
+                f"{path}: more than {max_bytes} bytes; at most that many are read from a file of this kind"
+            )
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
     try:

@@ -35,6 +35,9 @@ FIELDS: dict[str, tuple[str, float]] = {
 }
 _TIMES = ("time", "time_s")
 _MAX_ENTRIES = 1_000_000
+_NUMBER = "[-+]?[0-9]*[.]?[0-9]+"
+#: Parts of a time of fixed length, as ``strptime`` knows them.
+_DIGITS = {"%Y": "[0-9]{4}", "%j": "[0-9]{3}"} | {f"%{c}": "[0-9]{2}" for c in "mdHMSyI"} | {"%%": "%"}
 
 
 def condition(name: str, text: str, where: str) -> tuple[str, float | str]:
@@ -125,6 +128,13 @@ def _field(name: str, form: str, text: str, where: str) -> tuple[str, float | st
     return "time_s", when.timestamp()
 
 
+def _time_expression(form: str) -> str:
+    """A regular expression for a time; digits are counted, so that what follows in the name is not taken for a year."""
+    return "".join(
+        _DIGITS.get(part, ".+?" if part[0] == "%" else re.escape(part)) for part in re.findall("%.|[^%]+|%$", form)
+    )
+
+
 def _expression(name: str, where: str) -> tuple[re.Pattern[str], list[tuple[str, str]]]:
     """A regular expression for the last part of a pattern, and its fields with their forms."""
     fields: list[tuple[str, str]] = []
@@ -142,8 +152,8 @@ def _expression(name: str, where: str) -> tuple[re.Pattern[str], list[tuple[str,
                 )
             if field in (f for f, _ in fields):
                 raise InputError(f"{where}: field {part} stands twice in {name!r}")
-            number = field in FIELDS and not form
-            parts.append(f"(?P<f{len(fields)}>{r'[-+]?[0-9]*[.]?[0-9]+' if number else '.+?'})")
+            inside = _time_expression(form) if form else _NUMBER if field in FIELDS else ".+?"
+            parts.append(f"(?P<f{len(fields)}>{inside})")
             fields.append((field, form))
         else:
             parts.append(re.escape(part))

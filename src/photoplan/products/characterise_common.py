@@ -116,7 +116,7 @@ def black_of(data: SeriesData, setting: Setting, plane: Plane) -> Black:
         return Black(mean, sigma, None, "between dark frames of other exposures")
     stated = data.series.camera.black_level_dn
     why = "black is cut off in the dark frames" if clipped else "no dark frames that fit"
-    return Black(stated, 0.0, None, f"{why}: black level {stated:g} DN as stated")
+    return Black(stated, 0.0, None, f"{why}: black level {stated:g} DN, as black_level_dn says")
 
 
 def _sigma(level: Level) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import isfinite, sqrt
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.series_pixels import Plane
@@ -13,6 +14,7 @@ from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
 from photoplan.quality.camera.frame_statistics import Level, check_level
 from photoplan.quality.camera.linearity import HIGH, Linearity, linearity
+from photoplan.quality.camera.photon_transfer import is_clipped_dark
 from photoplan.quality.camera.saturation import find_saturation
 from photoplan.report.characterise_charts import Chart, Curve
 
@@ -61,8 +63,16 @@ def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
         raise InputError(f"the frames are not brighter than black ({blacks[-1].mean:.4g} DN)")
     found = linearity(run.values, signal, sigma, full)
     rules = tuple(dict.fromkeys(black.rule for black in blacks))
+    # Where black hides a part of the pixels, the mean of the others is not the signal.
+    hidden = np.array([is_clipped_dark(level) for level in levels])
     return Outcome(
-        _figures(found, run, plane.name, full),
+        _figures(found, run, plane.name, (found.signal < HIGH * full) & ~hidden),
+        refused={
+            prefix("signal over exposure", plane.name, run.label, f"{found.exposure[k]:g} {run.unit}"): (
+                f"black is cut off: {100 * levels[k].zero_share:.3g} % of the samples are zero"
+            )
+            for k in np.flatnonzero(hidden)
+        },
         tables={"levels": _table(found, run, plane.name)},
         plots=_plots(found, run, plane.name, full),
         notes=tuple(f"{prefix(plane.name, run.label)}: {rule}".lstrip(": ") for rule in rules if "cut off" in rule),
@@ -70,8 +80,8 @@ def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
     )
 
 
-def _figures(found: Linearity, run: Run, plane: str, full: float) -> tuple[Figure, ...]:
-    """Error, response of the line, and response of every level that is not saturated."""
+def _figures(found: Linearity, run: Run, plane: str, known: NDArray[np.bool_]) -> tuple[Figure, ...]:
+    """Error, response of the line, and response of every level whose mean is that of the signal."""
     unit = f"DN/{run.unit}"
     where = {"plane": plane, "at": run.label}
     error, sigma = found.error_percent, found.error_percent_sigma
@@ -80,7 +90,7 @@ def _figures(found: Linearity, run: Run, plane: str, full: float) -> tuple[Figur
         Figure("linearity_error_percent", error, sigma, "linearity error", "%", remark=count, **where),
         Figure("response", found.slope, found.slope_sigma, "response", unit, **where),
     ]
-    for k in np.flatnonzero(found.signal < HIGH * full):
+    for k in np.flatnonzero(known):
         at = prefix(run.label, f"{found.exposure[k]:g} {run.unit}")
         response, of_response = float(found.response[k]), float(found.response_sigma[k])
         figures.append(Figure("response_at", response, of_response, "signal over exposure", unit, plane, at))

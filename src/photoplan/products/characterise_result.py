@@ -34,7 +34,7 @@ class Figure:
     remark: str = ""
 
     def __str__(self) -> str:
-        sigma = f" ± {self.sigma:.2g}" if math.isfinite(self.sigma) else ""
+        sigma = f" ± {_plain(self.sigma, 2)}" if math.isfinite(self.sigma) else ""
         where = " ".join(filter(None, [self.plane, self.at]))
         unit = f" {self.unit}" if self.unit else ""
         more = f" · {self.remark}" if self.remark else ""
@@ -43,7 +43,7 @@ class Figure:
     @property
     def texts(self) -> tuple[str, str, str]:
         """Value, standard deviation (empty: none) and unit as they are printed."""
-        return _short(self.value, self.sigma), f"{self.sigma:.2g}" if math.isfinite(self.sigma) else "", self.unit
+        return _short(self.value, self.sigma), _plain(self.sigma, 2) if math.isfinite(self.sigma) else "", self.unit
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values; keys that say nothing are left out."""
@@ -56,9 +56,18 @@ def _short(value: float, sigma: float = math.nan) -> str:
     """A number with as many digits as its standard deviation allows (two of it)."""
     if not math.isfinite(value):
         return "–"
-    digits = 4
-    if math.isfinite(sigma) and sigma > 0 and value != 0:
-        digits = min(max(math.floor(math.log10(abs(value))) - math.floor(math.log10(sigma)) + 2, 2), 9)
+    if not (math.isfinite(sigma) and sigma > 0) or value == 0:
+        return _plain(value, 4)
+    digits = min(max(math.floor(math.log10(abs(value))) - math.floor(math.log10(sigma)) + 2, 2), 9)
+    text = _plain(value, digits)
+    if "e" in text or len(text.lstrip("-").replace(".", "").lstrip("0")) >= digits:
+        return text
+    # Zeros at the end tell how well a number is known.
+    return f"{value:.{max(digits - 1 - math.floor(math.log10(abs(value))), 0)}f}"
+
+
+def _plain(value: float, digits: int) -> str:
+    """A number with so many digits; powers of ten only where it would be very long."""
     rounded = float(f"{value:.{digits}g}")
     return f"{rounded:.10g}" if 1e-4 <= abs(rounded) < 1e7 or rounded == 0 else f"{value:.{digits}g}"
 

@@ -131,7 +131,8 @@ class LightImage:
         of fewer bits ends with.
         """
         kind = self.reader.dtype
-        largest = float(np.nanmax(stored)) if stored.size else 0.0
+        finite = stored[np.isfinite(stored)] if kind.kind == "f" else stored
+        largest = float(finite.max()) if finite.size else 0.0
         often = largest in _CLIPS and int((stored == largest).sum()) >= _OFTEN
         if kind.kind == "f":
             return -np.inf, largest if often or (largest == 1.0 and int((stored == 1.0).sum()) >= _OFTEN) else np.inf

@@ -96,7 +96,7 @@ def measure_image(name: tuple[str, Path], image: LightImage, how: Measuring, adv
     first = [edge for edge in edges if edge.channel == channels[0]]
     if not first:
         raise InputError(_nothing(image, rejected, how, refusals))
-    notes = [f"{n} edges were refused: {why}" for why, n in refusals.most_common(3)]
+    notes = [f"{n} edge{'s were' if n > 1 else ' was'} refused: {why}" for why, n in refusals.most_common(3)]
     aligned = sum(edge.measured.sampling != "super-sampled" for edge in first)
     if aligned:
         used = "they do not count in means" if len(first) - aligned >= ENOUGH else "few others are there, so they count"

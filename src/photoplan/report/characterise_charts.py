@@ -17,6 +17,8 @@ __all__ = ["Chart", "ChartDrawer", "Curve", "Picture", "shrunk"]
 
 COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
 _SIZE = (6.6, 3.6)
+#: Letters that fit side by side in a legend, and those that the sign of a curve takes.
+_LEGEND, _HANDLE = 84, 7
 #: Side of a picture, pixels, to which larger ones are reduced.
 _SIDE = 900
 
@@ -70,6 +72,12 @@ class Picture:
     """Left, right, bottom, top of the axes where they are no pixels of `values`."""
 
 
+def _columns(labels: list[str]) -> int:
+    """How many columns of a legend fit across a chart."""
+    wide = [len(label) + _HANDLE for label in labels]
+    return len(labels) if sum(wide) <= _LEGEND else max(1, min(4, len(labels), _LEGEND // max(wide)))
+
+
 class ChartDrawer:
     """Draws; made before any work, so that a missing library is known at once.
 
@@ -102,7 +110,11 @@ class ChartDrawer:
         axes.set(xlabel=chart.x_label, ylabel=chart.y_label)
         labelled = sum(bool(curve.label) for curve in chart.curves)
         if labelled > 1 or (labelled and len(chart.curves) > 1):
-            fig.legend(loc="outside upper left", ncols=min(4, labelled), fontsize=8)
+            fig.legend(
+                loc="outside upper left",
+                ncols=_columns([curve.label for curve in chart.curves if curve.label]),
+                fontsize=8,
+            )
         return png(fig)
 
     def _logarithmic(self, axes: Any, name: str) -> None:
