@@ -1,5 +1,7 @@
 """Filters measured in images: simulated scenes as files, whose spread function and truth are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import rasterio
@@ -68,13 +70,26 @@ def test_the_exact_inverse_where_the_condition_holds(scenes):
     assert not found.mtf.enhancement.enhanced
 
 
-def test_parts_of_the_field_without_edges_get_the_filter_of_the_whole(scenes):
+def test_what_a_part_of_the_field_does_not_show_is_taken_from_the_whole(scenes):
+    _, files = scenes
+    asked = DesignRequest(files[:1], cells=3, most_edges=60, options=DesignOptions("regularised"))
+    found = design_restoration(asked)
+    (whole,) = design_restoration(replace(asked, cells=1)).parts
+    assert len(found.filter.kernels) == 9
+    assert found.filter.image_size == (SIZE, SIZE)
+    partly = [part for part in found.parts if part.edges and part.missing]
+    assert partly
+    for part in partly:
+        lacking = "xy".index(part.missing[0])
+        assert part.sharpness[lacking].spread.values == pytest.approx(whole.sharpness[lacking].spread.values)
+        assert part.sharpness[1 - lacking].spread.values != pytest.approx(whole.sharpness[1 - lacking].spread.values)
+
+
+def test_parts_without_edges_get_the_filter_of_the_whole_field(scenes):
     _, files = scenes
     found = design_restoration(DesignRequest(files[:1], cells=6, most_edges=MOST, options=DesignOptions("regularised")))
-    assert len(found.filter.kernels) == 36
-    assert found.filter.image_size == (SIZE, SIZE)
-    assert any("get the filter of the whole field" in note for note in found.notes)
     assert sum(part.edges == 0 for part in found.parts) > 10
+    assert any("get the filter of the whole field" in note for note in found.notes)
 
 
 def test_bands_of_different_sharpness_get_filters_of_their_own(tmp_path):

@@ -127,7 +127,7 @@ def test_short_edges_with_tails_reach_the_bound_of_mtf50():
     assert error[0] < 0.015 and covered >= 0.88
 
 
-@pytest.mark.xfail(reason="2 %: on 100 pixels the noise hides a form that is neither Gaussian nor symmetric")
+@pytest.mark.xfail(strict=True, reason="2 %: noise on 100 px hides a form that is neither Gaussian nor even")
 def test_short_edges_with_tails_reach_the_bound_of_fwhm():
     assert _with_tails(100, 60)[0][1] < 0.01
 

@@ -95,7 +95,7 @@ def test_chart_photo_left_edge_as_a_whole(chart):
     assert parts[0] > 0.24 and parts[-1] < 0.18
 
 
-@pytest.mark.xfail(reason="+5.8 %: the camera's processing makes steps of one pixel on this edge; see the docstring")
+@pytest.mark.xfail(strict=True, reason="+5.8 %: steps of one pixel on this edge, see the docstring")
 def test_chart_photo_right_edge_as_a_whole(chart):
     """Not reached: its profile has steps one pixel apart and a veil of 8 pixels on the bright side.
 

@@ -178,7 +178,7 @@ def _parts(
 ) -> list[DesignedPart]:
     """The filters of a band: for the whole field, or for each part of it that has edges enough."""
     band, size = where
-    whole = _designed(request, band, None, edges, scene)
+    whole = _designed(request, (band, None), edges, scene)
     for axis in whole.missing:
         lacking, other = ("rows", "columns") if axis == "x" else ("columns", "rows")
         notes.append(f"too few edges show the sharpness along {lacking}; that along {other} stands for it")
@@ -190,16 +190,14 @@ def _parts(
         for col in range(n):
             at = ((col + 0.5) * size[0] / n - 0.5, (row + 0.5) * size[1] / n - 0.5)
             here = [edge for edge in edges if _cell(edge, size, n) == (col, row)]
-            try:
-                found.append(_designed(request, band, at, here, scene))
-            except InputError:
-                poor += 1
-                found.append(DesignedPart(band, at, 0, whole.sharpness, whole.missing, whole.scene, whole.design))
+            part = _designed(request, (band, at), here, scene, whole)
+            poor += part.edges == 0
+            found.append(part)
     if poor:
         name = "" if band is None else f"band {band}: "
         notes.append(
-            f"{name}{poor} of {n * n} parts of the field have fewer than {LEAST_EDGES} edges in a direction; they get "
-            "the filter of the whole field"
+            f"{name}{poor} of {n * n} parts of the field have fewer than {LEAST_EDGES} edges along rows and along "
+            "columns; they get the filter of the whole field"
         )
     return found
 
@@ -211,13 +209,22 @@ def _cell(edge: EdgeMeasurement, size: tuple[int, int], n: int) -> tuple[int, in
 
 def _designed(
     request: DesignRequest,
-    band: int | None,
-    at: tuple[float, float] | None,
+    place: tuple[int | None, tuple[float, float] | None],
     edges: Sequence[EdgeMeasurement],
     scene: SceneStatistics,
+    whole: DesignedPart | None = None,
 ) -> DesignedPart:
-    x, y, missing = sharpness_of(edges)
-    return DesignedPart(band, at, len(edges), (x, y), missing, scene, design_filter(x, y, scene, request.options))
+    """The filter of edges; what a part of the field does not show is taken from the whole."""
+    try:
+        x, y, missing = sharpness_of(edges)
+    except InputError:
+        if whole is None:
+            raise
+        return DesignedPart(*place, 0, whole.sharpness, whole.missing, whole.scene, whole.design)
+    if whole is not None:
+        x = whole.sharpness[0] if "x" in missing else x
+        y = whole.sharpness[1] if "y" in missing else y
+    return DesignedPart(*place, len(edges), (x, y), missing, scene, design_filter(x, y, scene, request.options))
 
 
 def _scene(images: Sequence[LightImage], channel: int) -> SceneStatistics:

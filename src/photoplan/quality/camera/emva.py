@@ -1,6 +1,6 @@
 """Result sheet of EMVA 1288 release 4 linear: quantum efficiency, gain, noise, saturation, dynamic range, threshold.
 
-Unlike `photon_transfer`, which weighs, the sheet follows section 6 of the standard: unweighted lines between 0 and 70 %
+Unlike `photon_transfer`, which weighs, the sheet takes unweighted lines between 0 and 70 %
 of saturation, saturation at the largest variance. With y for grey values and p for photons: R = slope of
 μ_y − μ_y.dark over μ_p (eq. 49), K = slope of σ²_y − σ²_y.dark over μ_y − μ_y.dark (eq. 50), η = R / K (eq. 52),
 σ_d = √(σ²_y.dark − 1/12) / K (eq. 53; below 0.24 DN² only σ_d < 0.40 / K is known, eq. 54),
