@@ -61,8 +61,8 @@ def sharpness_of(edges: Sequence[EdgeMeasurement]) -> tuple[Sharpness, Sharpness
     x, y = found["x"], found["y"]
     if x is None and y is None:
         raise InputError(
-            f"{len(edges)} edges; at least {LEAST_EDGES} are needed that run along rows or along columns. Give images "
-            "with more edges, or a filter"
+            f"{len(edges)} edges in all directions; at least {LEAST_EDGES} along rows, or along columns, are needed. "
+            "Give images with more edges, or a filter"
         )
     if x is None or y is None:
         one = x or y
