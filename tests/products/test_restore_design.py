@@ -116,3 +116,15 @@ def test_images_without_edges_give_no_filter(tmp_path):
     file = write(tmp_path / "flat.tif", rng.normal(1000.0, 20.0, (1, 300, 300)))
     with pytest.raises(InputError, match="no image can be measured"):
         design_restoration(DesignRequest((file,)))
+
+
+def test_of_several_parts_the_noisiest_tells_of_the_condition(scenes):
+    _, files = scenes
+    found = design_restoration(DesignRequest(files[:1], cells=3, most_edges=60))
+    worst = max(found.parts, key=lambda part: part.design.noise_gain)
+    exact = sum(part.design.method == "exact" for part in found.parts)
+    assert found.filter.facts["rule"].startswith(
+        f"{exact} of 9 parts exact, {9 - exact} regularised; the noisiest, at col"
+    )
+    assert str(worst.design.condition_x) in found.filter.facts["condition"]
+    assert found.filter.facts["noise_gain"] == pytest.approx(worst.design.noise_gain, abs=1e-3)

@@ -20,7 +20,7 @@ def disk_error(path: Path, error: OSError, doing: str = "written") -> PhotoplanE
     if error.errno in _FULL:
         return ResourceError(
             f"{path}: cannot be {doing} ({reason}; {free_megabytes(path)} MB are free there); free some space and "
-            "run the same command again: finished tiles are kept"
+            "run the same command again; if it makes tiles, finished tiles are kept"
         )
     return UsageError(f"{path}: cannot be {doing} ({reason}); choose a folder that can be written")
 

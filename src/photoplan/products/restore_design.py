@@ -262,14 +262,26 @@ def _windows(size: tuple[int, int]) -> list[Window]:
     return [Window(*place, *side) for place in sorted(set(places))]
 
 
+def _where(part: DesignedPart, parts: Sequence[DesignedPart]) -> str:
+    """Which of several parts is spoken of, and how many are restored how; empty for a single one."""
+    if len(parts) == 1:
+        return ""
+    exact = sum(one.design.method == "exact" for one in parts)
+    band = "" if part.band is None else f"band {part.band} "
+    place = "" if part.at is None else f"at column {part.at[0]:.0f}, row {part.at[1]:.0f}"
+    return f"{exact} of {len(parts)} parts exact, {len(parts) - exact} regularised; the noisiest, {band}{place}: "
+
+
 def _filter(request: DesignRequest, parts: Sequence[DesignedPart], size: tuple[int, int]) -> RestorationFilter:
     kernels = tuple(FilterKernel(part.design.kernel, part.at, part.band) for part in parts)
-    first = parts[0]
+    # Of several parts the one that restoration costs most tells of the condition.
+    worst = max(parts, key=lambda part: part.design.noise_gain)
     names = ", ".join(path.name for path in request.images[:3])
     more = f" and {len(request.images) - 3} more" if len(request.images) > 3 else ""
     facts: dict[str, Any] = {
-        "condition": f"along rows: {first.design.condition_x}; along columns: {first.design.condition_y}",
-        "rule": first.design.reason,
+        "condition": _where(worst, parts)
+        + f"along rows: {worst.design.condition_x}; along columns: {worst.design.condition_y}",
+        "rule": _where(worst, parts) + worst.design.reason,
         "rotation": f"{request.options.rotation}: weights off the axes follow from those on them",
         "linearisation": request.linearisation,
         "noise_gain": round(max(part.design.noise_gain for part in parts), 3),
