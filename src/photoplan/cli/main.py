@@ -78,9 +78,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         code = photoplan.main(arguments, prog_name="photoplan", standalone_mode=False)
     except (click.exceptions.Abort, KeyboardInterrupt):
         stop_children()
-        return _say(
-            "interrupted; the same command continues, or begins anew where nothing is kept", CODE
-        )
+        return _say("interrupted; the same command continues, or begins anew where nothing is kept", CODE)
     except click.ClickException as error:
         error.show()
         return 2

@@ -155,9 +155,13 @@ def _show(plan: RestorePlan, as_json: bool) -> None:
         return
     for row in rows:
         click.echo(
-            f"{row['image']}: {row['size'][0]} × {row['size'][1]}, {row['bands']} bands of {row['dtype']}, "
-            f"{row['tiles']} tiles → {row['path']}"
+            f"{row['image']}: {row['size'][0]} × {row['size'][1]}, {_count(row['bands'], 'band')} of {row['dtype']}, "
+            f"{_count(row['tiles'], 'tile')} → {row['path']}"
         )
+
+
+def _count(number: int, what: str) -> str:
+    return f"1 {what}" if number == 1 else f"{number} {what}s"
 
 
 def _after(image: RestoredImage) -> list[str]:

@@ -243,7 +243,10 @@ class ImageMtf:
     def __str__(self) -> str:
         """A line for each direction and channel of the whole field."""
         number = len({edge.number for edge in self.edges})
-        return f"{self.name}: {number} edges of {self.found} · {self.linearisation}\n" + group_lines(self.groups)
+        return (
+            f"{self.name}: {number} {'edge' if number == 1 else 'edges'} of {self.found} · {self.linearisation}\n"
+            + group_lines(self.groups)
+        )
 
 
 def point_spread_of(groups: Sequence[EdgeGroup]) -> list[list[float]] | None:

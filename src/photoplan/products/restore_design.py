@@ -138,12 +138,12 @@ def design_restoration(
     )
     mtf = measure_mtf(asked, begin, talk)
     if not mtf.images:
-        raise InputError("no image can be measured: " + "; ".join(f"{n}: {why}" for n, why in mtf.failed.items()))
+        raise InputError("no image can be measured: " + "; ".join(mtf.failed.values()))
     size = _common_size(mtf.images)
     light = linearisation_of(request.linearisation)
     opened = [LightImage.open(image.file, light) for image in mtf.images]
     parts: list[DesignedPart] = []
-    notes = [f"{name}: not measured ({why})" for name, why in mtf.failed.items()]
+    notes = [f"not measured: {why}" for why in mtf.failed.values()]
     for channel in _channels(mtf.images, request.per_band):
         scene = _scene(opened, channel)
         edges = [e.measured for image in mtf.images for e in image.edges if e.channel == channel]
