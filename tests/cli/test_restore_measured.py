@@ -54,6 +54,13 @@ def test_the_same_command_goes_on_and_another_filter_is_not_overwritten(photopla
     assert "exists" in again.err
 
 
+def test_what_is_taken_as_light_by_default_is_said(photoplan, image, tmp_path):
+    silent = photoplan("restore", image, "--output", tmp_path / "a", "--dry-run", "--linearisation", "linear")
+    assert "linearisation: linear (by default" not in silent.err
+    said = photoplan("restore", image, "--output", tmp_path / "a", "--dry-run")
+    assert "linearisation: linear (by default" in said.err
+
+
 def test_dry_run_writes_nothing(photoplan, image, tmp_path):
     said = photoplan("restore", image, "--output", tmp_path / "a", "--dry-run", "--json")
     assert said.code == 0

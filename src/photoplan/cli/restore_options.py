@@ -64,13 +64,19 @@ def filter_request(images: tuple[Path, ...], options: dict[str, Any]) -> FilterR
     return FilterRequest(
         design=DesignRequest(
             images,
-            options["linearisation"],
+            _stated("linearisation", options),
             asked["per_band"],
             asked["cells"],
             least_length=asked["least_length"],
             options=design,
         )
     )
+
+
+def _stated(name: str, options: dict[str, Any]) -> Any:
+    """The value of an option that was given; None if it has its default."""
+    given = click.get_current_context().get_parameter_source(name) is not click.core.ParameterSource.DEFAULT
+    return options[name] if given else None
 
 
 def _refuse_measuring(given: str) -> None:

@@ -36,8 +36,9 @@ class DesignRequest:
     """What is asked."""
 
     images: tuple[Path, ...]
-    linearisation: str = "linear"
-    """``linear``, ``srgb`` or a file with a table: the light in which the filter holds."""
+    linearisation: str | None = None
+    """``linear``, ``srgb`` or a file with a table: the light in which the filter holds; None: linear, with a warning for
+    images of 8 bits."""
     per_band: bool = False
     """A filter for each band instead of one for all, from the luminance."""
     cells: int = 1
@@ -140,7 +141,7 @@ def design_restoration(
     if not mtf.images:
         raise InputError("no image can be measured: " + "; ".join(mtf.failed.values()))
     size = _common_size(mtf.images)
-    light = linearisation_of(request.linearisation)
+    light = linearisation_of(request.linearisation or "linear")
     opened = [LightImage.open(image.file, light) for image in mtf.images]
     parts: list[DesignedPart] = []
     notes = [f"not measured: {why}" for why in mtf.failed.values()]
@@ -283,7 +284,7 @@ def _filter(request: DesignRequest, parts: Sequence[DesignedPart], size: tuple[i
         + f"along rows: {worst.design.condition_x}; along columns: {worst.design.condition_y}",
         "rule": _where(worst, parts) + worst.design.reason,
         "rotation": f"{request.options.rotation}: weights off the axes follow from those on them",
-        "linearisation": request.linearisation,
+        "linearisation": request.linearisation or "linear",
         "noise_gain": round(max(part.design.noise_gain for part in parts), 3),
         "parts": [{k: v for k, v in part.facts().items() if v is not None} for part in parts],
     }
