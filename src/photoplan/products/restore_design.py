@@ -37,8 +37,8 @@ class DesignRequest:
 
     images: tuple[Path, ...]
     linearisation: str | None = None
-    """``linear``, ``srgb`` or a file with a table: the light that the filter holds for; None: linear, with a warning for
-    images of 8 bits."""
+    """``linear``, ``srgb`` or a file with a table: the light that the filter holds for; None: linear, with a warning
+    for images of 8 bits."""
     per_band: bool = False
     """A filter for each band instead of one for all, from the luminance."""
     cells: int = 1
