@@ -104,6 +104,27 @@ def test_bands_of_lateral_colour(photoplan: Here, tmp_path: Path) -> None:
     assert np.allclose((40 - bands.sum(2)).mean(1), [20.0, 20.0, 21.0], atol=1e-3)
 
 
+def test_lateral_colour_of_a_band_that_the_scene_lacks(photoplan: Here, tmp_path: Path) -> None:
+    (tmp_path / "m.toml").write_text("[[lateral]]\nband = 1\n[[lateral]]\nband = 3\nshift = [1.0, 0.0]\n")
+    write_whole_image(tmp_path / "grey.tif", np.ones((1, 9, 9), np.uint8))
+    said = photoplan("simulate", tmp_path / "grey.tif", "--model", tmp_path / "m.toml", "--output", tmp_path / "a.tif")
+    assert said.code == 3 and "m.toml: [[lateral]] describes band 3" in said.err and "grey.tif has 1 band;" in said.err
+    assert not (tmp_path / "a.tif").exists()
+
+
+@pytest.mark.parametrize("dry", [(), ("--dry-run",)])
+def test_a_file_without_any_value_is_refused(dry: tuple[str, ...], photoplan: Here, tmp_path: Path) -> None:
+    values = np.full((1, 1100, 1100), np.nan, np.float32)
+    write_whole_image(tmp_path / "empty.tif", values)
+    words = ("--output", tmp_path / "a.tif", *dry)
+    said = photoplan("simulate", tmp_path / "empty.tif", *words)
+    assert said.code == 3 and "empty.tif: not one pixel has a value" in said.err, said
+    assert not (tmp_path / "a.tif").exists()
+    values[0, 1099, 1099] = 1.0
+    write_whole_image(tmp_path / "one.tif", values)
+    assert photoplan("simulate", tmp_path / "one.tif", *words).code == 0
+
+
 def test_dry_run_writes_nothing(photoplan: Here, model: Path, tmp_path: Path) -> None:
     said = photoplan("simulate", "flat", "--model", model, "--output", tmp_path / "a.tif", "--dry-run")
     assert said.code == 0 and said.out.strip() == str(tmp_path / "a.tif")

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
-from scipy import special
+from scipy import ndimage, signal, special
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
+from photoplan.quality.formation import optics
+from photoplan.quality.formation.kernels import pixel_kernel
 from photoplan.quality.formation.model import ImageModel, form_image
 from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitter, Spread
 from photoplan.quality.formation.scenes import ArrayScene, PatternScene, parse_pattern
@@ -119,6 +121,51 @@ def test_spread_grows_over_the_field():
     assert model_mtf50(model, radius=1.0) < 0.75 * model_mtf50(model)
 
 
+def in_one_piece(scene, spread, aperture, moved=None):
+    """Light on the pixels by one convolution of the whole scene for each scale, without any folding or tiles."""
+    (width, height), k, margin = scene.size, scene.oversampling, 60
+    whole = Window(0, 0, width, height)
+    cells = scene.cells(Window(-margin, -margin, width + 2 * margin, height + 2 * margin))[0]
+    levels = optics._levels(spread, scene.size, whole)
+    light = np.zeros((height, width))
+    for index, scale in enumerate(levels):
+        kernel = pixel_kernel(spread, aperture, scale, k, scene.continuous)
+        means = signal.fftconvolve(cells, kernel.spread, mode="same")
+        means = signal.fftconvolve(means, kernel.weights[::-1, ::-1], mode="valid")
+        rows = (margin + np.arange(height)[:, None] + np.zeros((1, width))) * k + kernel.row
+        columns = (margin + np.arange(width) - (0.0 if moved is None else moved[:, None])) * k + kernel.column
+        places = [rows, np.broadcast_to(columns, rows.shape)]
+        order = 1 if moved is None else 3
+        light += optics._level_share(spread, levels, index, scene.size, whole) * ndimage.map_coordinates(
+            means, places, order=order
+        )
+    return light
+
+
+@pytest.mark.parametrize(
+    ("spread", "aperture", "k", "jitter"),
+    [
+        (Spread((0.6, 0.5), tail_share=0.1, tail_length=1.0, field_square=0.3), Aperture(), 4, 0.0),
+        (Spread(defocus=1.5, motion=1.0), Aperture("round", (0.7, 1.4)), 5, 0.0),
+        (Spread(along_x=(0.1, 0.6, 0.3)), Aperture("square", (2.7, 0.4)), 4, 0.0),
+        (Spread(kernel=((0.0, 0.1, 0.0), (0.3, 0.2, 0.1), (0.2, 0.0, 0.1))), Aperture(), 1, 0.0),
+        (Spread(), Aperture("point"), 4, 0.0),
+        (Spread(), Aperture("round"), 3, 0.0),
+        (Spread((0.6, 0.5), field_square=0.3), Aperture(), 3, 0.7),
+    ],
+)
+@pytest.mark.parametrize("kept", [0, 1 << 24])
+def test_tiles_and_transforms_change_nothing(spread, aperture, k, jitter, kept, monkeypatch):
+    monkeypatch.setattr(optics, "_TILE_CELLS", 1)  # tiles of 16 pixels
+    monkeypatch.setattr(optics, "_SMALL_TILE_CELLS", 1)
+    monkeypatch.setattr(optics, "_KEPT_BYTES", kept)
+    rng = np.random.default_rng(7)
+    scene = ArrayScene(rng.random((27 * k, 38 * k)), k)
+    moved = rng.normal(0.0, jitter, 27) if jitter else None
+    light = optics.sample_scene(scene, optics.Optics(spread, aperture), moved)[0]
+    assert np.abs(light - in_one_piece(scene, spread, aperture, moved)).max() < (1e-9 if jitter else 1e-12)
+
+
 def test_figures_of_a_gaussian_with_its_pixel():
     model = ImageModel(Spread(gaussian=(0.8, 0.8)), Aperture("point"))
     assert line_spread_width(model) == pytest.approx(GAUSSIAN_WIDTH * 0.8, rel=1e-4)
@@ -210,6 +257,7 @@ def test_patterns_by_name():
         (lambda: ArrayScene(np.full((4, 4), np.nan)), "finite"),
         (lambda: ArrayScene(np.ones((5, 4)), 2), "multiples"),
         (lambda: form_image(ImageModel(), PatternScene("flat", (90_000, 90_000))), "cut it"),
+        (lambda: form_image(ImageModel(lateral=(Lateral(2),)), np.ones((1, 9, 9))), "band 2"),
         (
             lambda: form_image(ImageModel(Spread(tail_share=0.1, tail_length=50.0)), PatternScene("flat", (9, 9))),
             "lower oversampling",

@@ -133,6 +133,12 @@ class FileScene:
         """Pixels of the file are even squares if they are the image's pixels, else means of a continuous scene."""
         return self.oversampling > 1
 
+    @property
+    def has_values(self) -> bool:
+        """Whether any pixel of the file has a value; reads as far as the first one."""
+        masks = (self.reader.read(tile)[1] for tile in Window(0, 0, *self.reader.size).tiles(1024))
+        return any(valid is None or bool(valid.any()) for valid in masks)
+
     def cells(self, window: Window) -> NDArray[np.float64]:
         """Cells of a window of pixels, shape (bands, height · k, width · k)."""
         k = self.oversampling
@@ -249,9 +255,14 @@ def _scene(request: SimulateRequest, model: ImageModel) -> Scene:
             f"{request.scene}: {scene.bands} × {scene.size[0]} × {scene.size[1]} pixels; at most {MOST_PIXELS:,} are "
             "formed at once: cut the scene"
         )
-    far = [each.band for each in model.lateral if each.band > scene.bands]
-    if far:
-        raise InputError(f"{request.model}: lateral of band {far[0]}; the scene has {scene.bands} bands")
+    absent = [each.band for each in model.lateral if each.band > scene.bands]
+    if absent:
+        raise InputError(
+            f"{request.model}: [[lateral]] describes band {absent[0]}, but {request.scene} has "
+            f"{scene.bands} {'band' if scene.bands == 1 else 'bands'}; leave the entry out, or give a scene with it"
+        )
+    if isinstance(scene, FileScene) and not scene.has_values:
+        raise InputError(f"{request.scene}: not one pixel has a value; nothing can be imaged, give another file")
     return scene
 
 

@@ -119,7 +119,7 @@ def form_image(
     InputError
         The scene is too large, or a part of the model does not fit it.
     """
-    scene = _checked(scene)
+    scene = _checked(model, scene)
     if not exposure >= 0.0 or not np.isfinite(exposure) or frame < 0:
         raise InputError(f"frame {frame} with exposure {exposure}; neither may be negative")
     shift, light = _light(model, scene, frame)
@@ -150,7 +150,7 @@ def form_series(
         raise InputError(f"{len(several)} scenes and {len(factors)} exposures; needed are equal numbers")
     gain, known = 1.0, None
     for frame, exposure in enumerate(factors):
-        scene = _checked(several[frame] if several is not None else scenes)
+        scene = _checked(model, several[frame] if several is not None else scenes)
         # Light that is the same in all frames is sampled once.
         if several is not None or model.jitter.sigma or known is None:
             known = _light(model, scene, frame)
@@ -166,13 +166,19 @@ class _Frame:
     gain: float
 
 
-def _checked(scene: Any) -> Scene:
-    """A scene that is small enough."""
+def _checked(model: ImageModel, scene: Any) -> Scene:
+    """A scene that is small enough and has the bands that the model describes."""
     made: Any = ArrayScene(scene) if isinstance(scene, np.ndarray) else scene
     width, height = made.size
     if width * height * made.bands > MOST_PIXELS:
         raise InputError(
             f"a scene of {made.bands} × {width} × {height} pixels; at most {MOST_PIXELS:,} are formed at once: cut it"
+        )
+    absent = [each.band for each in model.lateral if each.band > made.bands]
+    if absent:
+        raise InputError(
+            f"lateral: band {absent[0]} is described, but the scene has only {made.bands}; leave its "
+            "entry out, or give a scene that has it"
         )
     found: Scene = made
     return found

@@ -2,29 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, signal
+from scipy import fft, ndimage
 
 from photoplan.geometry.grid import Window
-from photoplan.quality.formation.kernels import pixel_kernel
+from photoplan.quality.formation.kernels import PixelKernel, pixel_kernel
 from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitter, Spread
 from photoplan.quality.formation.scenes import Scene
 
 __all__ = ["Optics", "falloff_factors", "line_displacements", "sample_scene"]
 
 _Array = NDArray[np.float64]
-#: Cells of a tile, without the margin of the spread function.
+_Spectrum = NDArray[np.complex128]
+#: Cells of a tile's side, without the margin of the spread function.
 _TILE_CELLS = 1400
-#: The same where the spread function varies: a small tile needs few of its scales.
+#: The least where the spread function varies: a small tile needs few of its scales, but is mostly margin.
 _SMALL_TILE_CELLS = 350
+#: Bytes of the transforms of kernels that are kept; one is kept in any case.
+_KEPT_BYTES = 256 << 20
 #: Ratio of neighbouring scales of a spread function that grows over the field; between them is interpolated.
 _SCALE_STEP = 1.03
 #: Cells around a tile that interpolation between cells may use.
-_SPLINE_MARGIN = 12
+_SPLINE_MARGIN = 20
 
 
 @dataclass(frozen=True)
@@ -81,11 +85,47 @@ def sample_scene(scene: Scene, optics: Optics, moved: _Array | None = None) -> _
     """
     width, height = scene.size
     out = np.empty((scene.bands, height, width))
-    side = max(16, (_SMALL_TILE_CELLS if optics.spread.varies else _TILE_CELLS) // scene.oversampling)
-    for tile in Window(0, 0, width, height).tiles(side):
+    transforms = _Transforms()
+    tiles = Window(0, 0, width, height).tiles(_tile_side(scene, optics))
+    # From the middle outwards: tiles with the same scales of the spread function follow each other.
+    for tile in sorted(tiles, key=lambda t: np.hypot(*(2 * t.col + t.width - width, 2 * t.row + t.height - height))):
         rows, columns = slice(tile.row, tile.stop[1]), slice(tile.col, tile.stop[0])
-        out[:, rows, columns] = _tile(scene, optics, tile, None if moved is None else moved[rows])
+        out[:, rows, columns] = _tile(scene, optics, tile, None if moved is None else moved[rows], transforms)
     return out
+
+
+def _tile_side(scene: Scene, optics: Optics) -> int:
+    """Pixels of a tile's side."""
+    k, cells = scene.oversampling, _TILE_CELLS
+    if optics.spread.varies:
+        ends = (Window(0, 0, 1, 1), Window(scene.size[0] // 2, scene.size[1] // 2, 1, 1))
+        widest = max(_levels(optics.spread, scene.size, end)[-1] for end in ends)
+        kernel = pixel_kernel(optics.spread, optics.aperture, widest, k, scene.continuous)
+        cells = min(cells, max(_SMALL_TILE_CELLS, *kernel.spread.shape))
+    return max(16, cells // k)
+
+
+@dataclass(frozen=True)
+class _Transforms:
+    """Fourier transforms of kernels; those that fit into a bound of memory are kept."""
+
+    kept: dict[tuple[PixelKernel, tuple[int, int]], _Spectrum] = field(default_factory=dict)
+
+    def of(self, kernel: PixelKernel, shape: tuple[int, int]) -> _Spectrum:
+        """Transform of a kernel; the convolution holds a pixel's value at the first cell of the pixel."""
+        known = self.kept.get((kernel, shape))
+        if known is not None:
+            return known
+        cells = np.zeros(shape)
+        rows, columns = kernel.spread.shape
+        cells[:rows, :columns] = kernel.spread
+        made = fft.rfft2(np.roll(cells, (-(rows // 2) - kernel.row, -(columns // 2) - kernel.column), (0, 1)))
+        if kernel.weights.size > 1:
+            made *= np.conj(fft.rfft2(kernel.weights, shape))
+        while self.kept and sum(each.nbytes for each in self.kept.values()) + made.nbytes > _KEPT_BYTES:
+            del self.kept[next(iter(self.kept))]
+        self.kept[kernel, shape] = made
+        return np.asarray(made)
 
 
 def _displacement(
@@ -112,7 +152,7 @@ def _displacement(
     return dx, dy
 
 
-def _tile(scene: Scene, optics: Optics, tile: Window, moved: _Array | None) -> _Array:
+def _tile(scene: Scene, optics: Optics, tile: Window, moved: _Array | None, transforms: _Transforms) -> _Array:
     """Light on the pixels of a tile, shape (bands, height, width)."""
     k = scene.oversampling
     moves = [_displacement(optics.lateral, b, scene.size, tile, moved) for b in range(scene.bands)]
@@ -120,6 +160,7 @@ def _tile(scene: Scene, optics: Optics, tile: Window, moved: _Array | None) -> _
     extra = ceil(far) + -(-_SPLINE_MARGIN // k) if any(m is not None for m in moves) else 0
     levels = _levels(optics.spread, scene.size, tile)
     kernels = [pixel_kernel(optics.spread, optics.aperture, scale, k, scene.continuous) for scale in levels]
+    shares = [_level_share(optics.spread, levels, index, scene.size, tile) for index in range(len(levels))]
     reach = max(
         max(each.spread.shape) // 2 + max(each.weights.shape) + max(-each.row, -each.column, 0) for each in kernels
     )
@@ -127,43 +168,64 @@ def _tile(scene: Scene, optics: Optics, tile: Window, moved: _Array | None) -> _
     window = Window(tile.col - margin, tile.row - margin, tile.width + 2 * margin, tile.height + 2 * margin)
     cells = scene.cells(window)
     light = np.zeros((scene.bands, tile.height, tile.width))
-    for index, kernel in enumerate(kernels):
-        share = _level_share(optics.spread, levels, index, scene.size, tile)
-        if not share.any():
-            continue
-        for band, move in enumerate(moves):
-            means = _convolved(cells[band], kernel.spread, kernel.weights)
-            start = (margin * k + kernel.row, margin * k + kernel.column)
-            light[band] += share * _at_pixels(means, start, k, (tile.height, tile.width), move)
+    for band, move in enumerate(moves):
+        used = [(kernel, share) for kernel, share in zip(kernels, shares) if share.any()]
+        means = _means(cells[band], [kernel for kernel, _ in used], transforms, k, k if move is None else 1)
+        for (_, share), values in zip(used, means):
+            light[band] += share * _at_pixels(values, margin, k, (tile.height, tile.width), move)
     return light
 
 
-def _convolved(cells: _Array, kernel: _Array, weights: _Array) -> _Array:
-    """Cells spread by a kernel; then ``[i, j]`` holds the weighted mean of the cells from i, j on."""
-    if kernel.size > 1:
-        cells = signal.fftconvolve(cells, kernel, mode="same") if kernel.size > 9 else ndimage.convolve(cells, kernel)
-    if weights.size == 1:
-        return cells
-    # Correlation with the weights, its first cell the one where the weights begin; the end is padded and never used.
-    padded = np.pad(cells, ((0, weights.shape[0] - 1), (0, weights.shape[1] - 1)), mode="edge")
-    if np.ptp(weights) == 0.0 or np.linalg.matrix_rank(weights) == 1:
-        down, across = weights.sum(1), weights.sum(0)
-        padded = ndimage.correlate1d(padded, down, axis=0, origin=-(down.size // 2))[: cells.shape[0]]
-        padded = ndimage.correlate1d(padded, across, axis=1, origin=-(across.size // 2))[:, : cells.shape[1]]
-        return np.asarray(padded)
-    return np.asarray(signal.fftconvolve(padded, weights[::-1, ::-1], mode="valid"))
+def _means(cells: _Array, kernels: list[PixelKernel], transforms: _Transforms, k: int, step: int) -> Iterator[_Array]:
+    """For each kernel the values of pixels that begin at the cells, or at every `step`-th cell.
+
+    The margin of the cells is wider than the kernels: what a periodic convolution brings from the other side stays
+    there.
+    """
+    # Whole pixels, of a number whose transform is quick.
+    rows, columns = (k * fft.next_fast_len(n // k, real=True) for n in cells.shape)
+    shape = rows, columns
+    spectrum: _Spectrum | None = None
+    for kernel in kernels:
+        if _is_direct(kernel):
+            yield _convolved(cells, kernel)[::step, ::step]
+            continue
+        spectrum = fft.rfft2(cells, shape) if spectrum is None else spectrum
+        # To take every step-th row is to add the parts of the spectrum that fall on each other.
+        parts = (step, shape[0] // step, -1)
+        folded = np.einsum("kij,kij->ij", spectrum.reshape(parts), transforms.of(kernel, shape).reshape(parts)) / step
+        yield fft.irfft(fft.ifft(folded, axis=0), shape[1], axis=1)[:, ::step]
+
+
+def _is_direct(kernel: PixelKernel) -> bool:
+    """Whether a convolution without Fourier transforms is quick."""
+    weights = kernel.weights
+    separable = np.allclose(weights, np.multiply.outer(weights.sum(1), weights.sum(0)), rtol=0.0, atol=1e-15)
+    return kernel.spread.size <= 9 and separable
+
+
+def _convolved(cells: _Array, kernel: PixelKernel) -> _Array:
+    """Values of pixels that begin at the cells, for a small kernel and weights that are a product."""
+    if kernel.spread.size > 1:
+        cells = ndimage.convolve(cells, kernel.spread)
+    for axis, first in enumerate((kernel.row, kernel.column)):
+        weights = kernel.weights.sum(1 - axis)
+        if weights.size > 1:
+            cells = ndimage.correlate1d(cells, weights, axis=axis, origin=-(weights.size // 2))
+        cells = np.roll(cells, -first, axis)
+    return cells
 
 
 def _at_pixels(
-    means: _Array, start: tuple[int, int], k: int, shape: tuple[int, int], move: tuple[_Array, _Array] | None
+    means: _Array, margin: int, k: int, shape: tuple[int, int], move: tuple[_Array, _Array] | None
 ) -> _Array:
-    """Means of apertures at the pixels of a tile; between cells by cubic splines where pixels are displaced."""
+    """Values at the pixels of a tile: chosen from one for each pixel, or from one for each cell by cubic splines."""
     height, width = shape
     if move is None:
-        return means[start[0] : start[0] + height * k : k, start[1] : start[1] + width * k : k]
+        return means[margin : margin + height, margin : margin + width]
     dx, dy = move
-    rows = start[0] + (np.arange(height)[:, None] + dy) * k
-    columns = start[1] + (np.arange(width)[None, :] + dx) * k
+    rows = (margin + np.arange(height)[:, None] + dy) * k
+    columns = (margin + np.arange(width)[None, :] + dx) * k
     return np.asarray(ndimage.map_coordinates(means, [rows, columns], order=3, mode="nearest"))
 
 
