@@ -83,7 +83,7 @@ class SensorPlots:
             same = {value: [n for n, v in periods.items() if v == value] for value in periods.values()}
             for (value, names), colour in zip(same.items(), _COLOURS):
                 axes.plot([value, value, low], [0, 500.0 / value, 500.0 / value], color=colour, linewidth=0.8)
-                label = f"{'; '.join(names)}: {value:.4g} µm, {500.0 / value:.1f} LP/mm"
+                label = "\n".join([*names, f"{value:.4g} µm, {500.0 / value:.1f} LP/mm"])  # one line is too wide
                 axes.plot([value], [500.0 / value], "o", color=colour, label=label)
             axes.set(xlim=(low, high), ylim=(0, 500.0 / min(periods.values()) * 1.3), xlabel="period of sampling µm",
                      ylabel="Nyquist frequency LP/mm")  # fmt: skip
