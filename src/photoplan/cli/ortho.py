@@ -49,6 +49,9 @@ def command(
     plan = plan_orthophotos(loaded, images or None, **changes)
     folder = output or loaded.folder / "products"
     if dry_run or plan_file is not None:
-        running.show_plan(plan, folder, plan_file, how)
+        # Here, since plans as files need a library for vector data that a product does not: 30 MB of memory.
+        from photoplan.cli.show_plan import show_plan
+
+        show_plan(plan, folder, plan_file, how)
         return
     running.execute_and_report(plan, folder, how)

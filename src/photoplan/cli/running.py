@@ -1,4 +1,4 @@
-"""What `ortho`, `run` and `demo` do with a plan: show it, or execute it and report."""
+"""What `ortho`, `run` and `demo` do with a plan: execute it and report."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ from photoplan.cli.progress import progress
 from photoplan.errors import TilesFailed
 from photoplan.products.execution import ProductResult, Run, execute
 from photoplan.products.orthophoto import OrthoPlan
-from photoplan.products.plan_file import PlanFigures, check_plan_path, compile_figures, write_plan
 
-__all__ = ["How", "execute_and_report", "show_plan"]
+__all__ = ["How", "execute_and_report"]
 
 
 @dataclass(frozen=True)
@@ -49,33 +48,6 @@ class How:
         """Say something on stderr."""
         if not self.quiet:
             click.echo(text, err=True)
-
-
-def show_plan(plan: OrthoPlan, folder: Path, plan_file: Path | None, how: How) -> None:
-    """Compile every tile's geometry, print the figures, write the plan if asked."""
-    if plan_file is not None:
-        check_plan_path(plan_file, plan, how.overwrite)
-    tiles = sum(len(p.plan.tiles) for p in plan.products)
-    with progress(tiles, how.quiet) as report:
-        figures = compile_figures(plan, report)
-    if plan_file is not None:
-        write_plan(plan_file, plan, figures, folder, how.overwrite)
-    if how.as_json:
-        click.echo(json.dumps({"plan": plan_file and str(plan_file), **figures.to_dict(plan)}, indent=2))
-        return
-    click.echo(str(plan))
-    click.echo(_sums(plan, figures))
-    for line in plan.blind:
-        click.echo(f"  sees no terrain: {line}")
-    if plan_file is not None:
-        click.echo(str(plan_file))
-
-
-def _sums(plan: OrthoPlan, figures: PlanFigures) -> str:
-    return (
-        f"plan: {len(plan.products)} products, {figures.tiles} tiles, {figures.cells} cells, "
-        f"worst anchor residual {figures.residual:.3g} px"
-    )
 
 
 def execute_and_report(plan: OrthoPlan, folder: Path, how: How) -> None:

@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
+from photoplan.io.fall_off_file import FallOffEntry, TermEntry, fall_off_text
 from photoplan.io.series_pixels import Plane
 from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_groups import FrameGroup
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
-from photoplan.products.fall_off_correction import correction_text
 from photoplan.quality.camera.fall_off import FallOff, fit_fall_off
 from photoplan.quality.camera.fall_off_adjust import FallOffSettings
 from photoplan.quality.camera.fall_off_model import FallOffModel, gain_image
 from photoplan.report.characterise_charts import Chart, Curve, Picture
 
-__all__ = ["analyse", "missing"]
+__all__ = ["analyse", "correction_text", "missing"]
 
 _SATURATED = 1e-3
 #: Longer side of the gain image that is written.
@@ -262,4 +262,22 @@ def _profile(found: FallOff, of: str) -> Chart:
         "distance from the principal point px",
         "% of the brightness there",
         tuple(curves),
+    )
+
+
+def correction_text(found: FallOff, plane: str, gain_image: str, reduction: int) -> str:
+    """A fitted model as the text of a correction file, which `read_fall_off` reads."""
+    model = found.model
+    return fall_off_text(
+        FallOffEntry(
+            format="photoplan light fall-off 1",
+            size=model.size,
+            plane=plane,
+            principal_point_px=model.principal_point,
+            camera_constant_px=model.camera_constant,
+            dark_dn=model.dark,
+            gain_image=gain_image,
+            gain_reduction=reduction,
+            terms=tuple(TermEntry(n=t.n, m=t.m, coefficient=t.coefficient, sigma=t.sigma) for t in found.terms),
+        )
     )

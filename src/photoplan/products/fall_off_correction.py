@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from photoplan.errors import InputError
-from photoplan.io.fall_off_file import FallOffEntry, TermEntry, fall_off_text, read_fall_off_entry
-from photoplan.quality.camera.fall_off import FallOff
+from photoplan.io.fall_off_file import read_fall_off_entry
 from photoplan.quality.camera.fall_off_model import FallOffModel
 
-__all__ = ["correction_text", "read_fall_off"]
+__all__ = ["read_fall_off"]
 
 
 def read_fall_off(path: Path) -> FallOffModel:
@@ -32,21 +31,3 @@ def read_fall_off(path: Path) -> FallOffModel:
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-
-
-def correction_text(found: FallOff, plane: str, gain_image: str, reduction: int) -> str:
-    """A fitted model as the text of a correction file."""
-    model = found.model
-    return fall_off_text(
-        FallOffEntry(
-            format="photoplan light fall-off 1",
-            size=model.size,
-            plane=plane,
-            principal_point_px=model.principal_point,
-            camera_constant_px=model.camera_constant,
-            dark_dn=model.dark,
-            gain_image=gain_image,
-            gain_reduction=reduction,
-            terms=tuple(TermEntry(n=t.n, m=t.m, coefficient=t.coefficient, sigma=t.sigma) for t in found.terms),
-        )
-    )

@@ -1,0 +1,42 @@
+"""What `ortho` does with a plan that is not to be executed yet: show it, and write it for `photoplan run`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from photoplan.cli.progress import progress
+from photoplan.cli.running import How
+from photoplan.products.orthophoto import OrthoPlan
+from photoplan.products.plan_file import PlanFigures, check_plan_path, compile_figures, write_plan
+
+__all__ = ["show_plan"]
+
+
+def show_plan(plan: OrthoPlan, folder: Path, plan_file: Path | None, how: How) -> None:
+    """Compile every tile's geometry, print the figures, write the plan if asked."""
+    if plan_file is not None:
+        check_plan_path(plan_file, plan, how.overwrite)
+    tiles = sum(len(p.plan.tiles) for p in plan.products)
+    with progress(tiles, how.quiet) as report:
+        figures = compile_figures(plan, report)
+    if plan_file is not None:
+        write_plan(plan_file, plan, figures, folder, how.overwrite)
+    if how.as_json:
+        click.echo(json.dumps({"plan": plan_file and str(plan_file), **figures.to_dict(plan)}, indent=2))
+        return
+    click.echo(str(plan))
+    click.echo(_sums(plan, figures))
+    for line in plan.blind:
+        click.echo(f"  sees no terrain: {line}")
+    if plan_file is not None:
+        click.echo(str(plan_file))
+
+
+def _sums(plan: OrthoPlan, figures: PlanFigures) -> str:
+    return (
+        f"plan: {len(plan.products)} products, {figures.tiles} tiles, {figures.cells} cells, "
+        f"worst anchor residual {figures.residual:.3g} px"
+    )
