@@ -59,7 +59,12 @@ def test_bars_in_windows(photoplan: Here, tmp_path: Path) -> None:
     rows = list(csv.DictReader(table.open(encoding="utf-8")))
     assert len(rows) == 3 * (len(FREQUENCIES) + 1)
     assert {row["curve"] for row in rows} == {"contrast transfer", "mtf", "mtf by Coltman's series"}
-    assert "data:image/png" in report.read_text("utf-8")
+    assert [group["roi"] for group in pattern["groups"]] == [[100 * k, 0, 100, 80] for k in range(len(FREQUENCIES))]
+    assert pattern["roi"] == [0, 0, 100 * len(FREQUENCIES), 80]
+    page = report.read_text("utf-8")
+    assert page.count("data:image/png") == 2  # the curves, and the bars with the outlines of their windows
+    assert page.count("<tr>") == 1 + len(FREQUENCIES)
+    assert "\ufffd" not in page  # what is no character, as line ends are in text, is shown as this
     assert photoplan(*call, "--csv", table).code == 2
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from photoplan.geometry.grid import Window
 from photoplan.products.plain_values import plain
@@ -17,7 +16,6 @@ from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.patterns.bar_curve import BarCurve, coltman_mtf
 from photoplan.quality.patterns.siemens import StarMtf
 from photoplan.quality.patterns.usaf import UsafBars, UsafResult
-from photoplan.report.pattern_plots import Curve, PatternFacts, PolarCurve
 
 __all__ = ["ImagePattern", "PatternReport", "PatternResult"]
 
@@ -30,7 +28,10 @@ class PatternResult:
     """Name, which no other image of the report has, and file."""
     band: str
     window: Window
+    """All that was measured lies in it."""
     found: BarCurve | StarMtf | UsafResult
+    parts: tuple[Window, ...] = ()
+    """Of bars: the window of each frequency group, in the order of these."""
     coltman: bool = False
     """Convert the contrast transfer of bars into an MTF."""
     notes: tuple[str, ...] = ()
@@ -55,10 +56,9 @@ class PatternResult:
 
     def to_dict(self, pixel_um: float | None) -> dict[str, Any]:
         """Plain values for JSON."""
-        window = [self.window.col, self.window.row, self.window.width, self.window.height]
-        values: dict[str, Any] = {"band": self.band, "roi": window, "notes": list(self.notes)}
+        values: dict[str, Any] = {"band": self.band, "roi": _roi(self.window), "notes": list(self.notes)}
         if isinstance(self.found, BarCurve):
-            values |= _bars(self.found)
+            values |= _bars(self.found, self.parts)
         elif isinstance(self.found, StarMtf):
             values |= _star(self.found, self.window)
         else:
@@ -98,10 +98,12 @@ class PatternResult:
             return lines + [f"  {angle:5.1f}°  {_figures(curve)}" for angle, curve in star.directional.items()]
         found = self.found
         lines = [f"bars, full contrast from {found.levels_from}"]
-        for k, group in enumerate(found.groups):
+        series = coltman_mtf(found.contrast) if self.coltman else None
+        for k, group in enumerate(found.groups, 1):
             lines.append(
                 f"  {group.frequency:.4f} cy/px at {group.angle_deg:.1f}°  contrast transfer "
-                f"{_value(found.contrast, k + 1)}  MTF {_value(found.mtf, k + 1)}"
+                f"{_value(found.contrast, k)}  MTF {_value(found.mtf, k)}"
+                + (f"  by Coltman {_value(series, k)}" if series is not None else "")
             )
         return lines
 
@@ -141,9 +143,14 @@ def _curve(curve: MtfCurve, pixel_um: float | None) -> dict[str, Any]:
     return values
 
 
-def _bars(found: BarCurve) -> dict[str, Any]:
+def _roi(window: Window) -> list[int]:
+    return [window.col, window.row, window.width, window.height]
+
+
+def _bars(found: BarCurve, windows: Sequence[Window]) -> dict[str, Any]:
     groups = [
         {
+            "roi": _roi(window),
             "cycles_per_px": g.frequency,
             "angle_deg": g.angle_deg,
             "phase": g.phase,
@@ -157,7 +164,7 @@ def _bars(found: BarCurve) -> dict[str, Any]:
             "fundamental_sigma": g.fundamental_sigma,
             "aligned": g.aligned,
         }
-        for g in found.groups
+        for g, window in zip(found.groups, windows)
     ]
     return {"groups": groups, "low": found.low, "high": found.high, "levels_from": found.levels_from}
 
@@ -307,10 +314,6 @@ class PatternReport:
         rows = [[_field(v) for v in row] for image in self.images for r in image.results for row in r.rows()]
         return header, rows
 
-    def facts(self, pictures: Mapping[str, NDArray[np.float32]]) -> list[PatternFacts]:
-        """What the report shows of each pattern."""
-        return [_facts(result, self, pictures.get(result.name)) for image in self.images for result in image.results]
-
 
 def _field(value: object) -> object:
     if isinstance(value, bool):
@@ -318,37 +321,3 @@ def _field(value: object) -> object:
     if isinstance(value, float | np.floating):
         return f"{float(value):.6g}" if isfinite(value) else ""
     return value
-
-
-def _facts(result: PatternResult, report: PatternReport, picture: NDArray[np.float32] | None) -> PatternFacts:
-    curves, polar, marks = [], [], []
-    window, found = result.window, result.found
-    step = max(1, -(-max(window.width, window.height) // 900))
-    for name, (kind, curve) in result.curves().items():
-        points = np.array(list(_points(curve)))
-        if " at " in name:
-            polar.append(PolarCurve(float(name.split()[-1][:-1]), points[:, 0], points[:, 1]))
-        else:
-            curves.append(Curve(name, kind, points[:, 0], points[:, 1], points[:, 2], len(points) < 40))
-    if isinstance(found, UsafResult):
-        for horizontal in (True, False):
-            rows = [b for b in found.bars if b.horizontal == horizontal and isfinite(b.contrast)]
-            f, c, s = np.array([[b.frequency, b.contrast, b.sigma] for b in rows]).reshape(-1, 3).T
-            kind = "horizontal" if horizontal else "vertical"
-            curves.append(Curve(f"{kind} bars", "contrast", f, c, s, True))
-        for b in found.bars:
-            label = f"{b.group}.{b.element}" if not b.horizontal else ""
-            marks.append((b.centre[0] / step, b.centre[1] / step, label, b.resolved))
-    elif isinstance(found, StarMtf):
-        marks.append((found.centre[0] / step, found.centre[1] / step, "centre", True))
-    return PatternFacts(
-        title=result.name,
-        lines=tuple(result.lines()),
-        notes=result.notes,
-        linearisation=report.linearisation,
-        curves=tuple(curves),
-        polar=tuple(polar),
-        picture=picture if not isinstance(found, BarCurve) else None,
-        marks=tuple(marks),
-        pixel_um=report.pixel_um,
-    )

@@ -16,6 +16,7 @@ from photoplan.io.disk import write_atomically
 from photoplan.io.named_table import write_named_table
 from photoplan.products.linearisation import linearisation_of
 from photoplan.products.mtf_image import LUMINANCE, LightImage
+from photoplan.products.mtf_pattern_facts import pattern_facts, thinning
 from photoplan.products.mtf_pattern_result import ImagePattern, PatternReport, PatternResult
 from photoplan.products.mtf_request import ENCODED, check_files, unique_names
 from photoplan.quality.linearise import Linearisation
@@ -109,7 +110,12 @@ def measure_patterns(request: PatternRequest, talk: Callable[[str], None] = lamb
             for image_ in results
             for result in image_.results
         }
-        text = pattern_page(made.facts(pictures), plots)
+        facts = [
+            pattern_facts(result, made.linearisation, made.pixel_um, pictures[result.name])
+            for image_ in results
+            for result in image_.results
+        ]
+        text = pattern_page(facts, plots)
         write_atomically(made.report, text.encode("utf-8", errors="replace"))
     return made
 
@@ -179,7 +185,8 @@ def _measure(named: tuple[str, Path], image: LightImage, request: PatternRequest
                 curve = bar_curve(groups, levels)
             except InputError as error:
                 raise InputError(f"{path}: {error} (--levels LOW HIGH)") from None
-            results.append(PatternResult(named, band, windows[0], curve, request.coltman))
+            parts = tuple(window for _, window in sorted(zip(groups, windows), key=lambda part: part[0].frequency))
+            results.append(PatternResult(named, band, _hull(windows), curve, parts, request.coltman))
             continue
         for k, window in enumerate(windows):
             light, clipped = _read(image, window, channel)
@@ -234,8 +241,16 @@ def _stretched(light: Array) -> tuple[str, ...]:
     )
 
 
-def _overview(image: LightImage, window: Window) -> NDArray[np.float32]:
-    """Light of a window, thinned to at most 900 pixels a side, for pictures."""
-    step = max(1, -(-max(window.width, window.height) // 900))
+def _hull(windows: list[Window]) -> Window:
+    """The smallest window that holds all of them."""
+    col, row = min(w.col for w in windows), min(w.row for w in windows)
+    return Window(col, row, max(w.col + w.width for w in windows) - col, max(w.row + w.height for w in windows) - row)
+
+
+def _overview(image: LightImage, window: Window) -> NDArray[np.float32] | None:
+    """Light of a window for a picture; None if it is too large (bars far apart)."""
+    if window.width * window.height > _MOST_PIXELS:
+        return None
+    step = thinning(window)
     grey = image.picture(window, image.channels(None)[0]).grey
     return np.asarray(grey[::step, ::step], np.float32)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SOFT, STYLE, axes_of, load_matplotlib, png
-from photoplan.report.page import figure, page, section, text
+from photoplan.report.page import Cell, figure, page, section, table, text
 
-__all__ = ["Curve", "PatternFacts", "PatternPlots", "PolarCurve", "pattern_page"]
+__all__ = ["Curve", "Frame", "Mark", "PatternFacts", "PatternPlots", "PolarCurve", "pattern_page"]
 
 Array = NDArray[np.float64]
 
@@ -46,20 +47,42 @@ class PolarCurve:
     value: Array
 
 
+class Mark(NamedTuple):
+    """A place in the picture."""
+
+    col: float
+    row: float
+    label: str
+    resolved: bool
+
+
+class Frame(NamedTuple):
+    """A window in the picture."""
+
+    col: float
+    row: float
+    width: float
+    height: float
+    label: str
+
+
 @dataclass(frozen=True, eq=False)
 class PatternFacts:
     """What the report shows of a pattern."""
 
     title: str
-    lines: tuple[str, ...]
+    summary: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    """The figures as a table; the first column names the row."""
     notes: tuple[str, ...]
     linearisation: str
     curves: tuple[Curve, ...]
     polar: tuple[PolarCurve, ...]
     picture: NDArray[np.float32] | None
     """Light, shape (rows, columns)."""
-    marks: tuple[tuple[float, float, str, bool], ...]
-    """Column, row, label and whether it is resolved, in the picture."""
+    marks: tuple[Mark, ...]
+    frames: tuple[Frame, ...]
     pixel_um: float | None
 
 
@@ -131,14 +154,20 @@ class PatternPlots:
             low, high = np.nanquantile(facts.picture, [0.005, 0.995])
             axes.imshow(facts.picture, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
             for resolved, colour in ((True, GREEN), (False, RED)):
-                some = [mark for mark in facts.marks if mark[3] == resolved]
+                some = [mark for mark in facts.marks if mark.resolved == resolved]
                 if some:
                     name = "resolved" if resolved else "not resolved"
-                    axes.plot([m[0] for m in some], [m[1] for m in some], "+", color=colour, markersize=7, label=name)
+                    axes.plot([m.col for m in some], [m.row for m in some], "+", color=colour, markersize=7, label=name)
                 for x, y, label, _ in some:
                     axes.annotate(label, (x, y), (3, 3), textcoords="offset points", fontsize=6.5, color=colour)
+            for frame in facts.frames:
+                place = (frame.col - 0.5, frame.row - 0.5)
+                axes.add_patch(self._mpl.patches.Rectangle(place, frame.width, frame.height, fill=False, edgecolor=RED))
+                box = {"boxstyle": "square,pad=0.2", "facecolor": RED, "edgecolor": "none"}
+                axes.annotate(frame.label, place, (3, -3), textcoords="offset points", va="top", fontsize=8,
+                              color="white", bbox=box)  # fmt: skip
             axes.set(xlabel="column px", ylabel="row px")
-            if len({mark[3] for mark in facts.marks}) > 1:
+            if len({mark.resolved for mark in facts.marks}) > 1:
                 fig.legend(loc="outside upper right", ncols=2, labelcolor=INK)
             return png(fig)
 
@@ -156,8 +185,8 @@ def pattern_page(patterns: Sequence[PatternFacts], plots: PatternPlots) -> str:
     """The report as one HTML document."""
     parts = []
     for facts in patterns:
-        found = [f"<p>{text(line)}</p>" for line in facts.lines[:1]]
-        found += [f"<pre>{text(chr(10).join(facts.lines[1:]))}</pre>"] if len(facts.lines) > 1 else []
+        found = [f"<p>{text(facts.summary)}</p>"]
+        found.append(table(facts.head, [[row[0], *(Cell(value, True) for value in row[1:])] for row in facts.rows]))
         found += [f"<p>{text(note)}</p>" for note in facts.notes]
         if any(curve.frequency.size for curve in facts.curves):
             caption = "With two standard deviations; the dotted line is the Nyquist frequency."
