@@ -220,3 +220,13 @@ def test_blooming_is_refused_where_it_cannot_be_seen():
     everywhere = [np.full((80, 90), min(10 + 20 * t, 255.0)) for t in exposures]
     with pytest.raises(InputError, match="small bright object"):
         find_blooming(exposures, everywhere, 10.0, 255.0)
+
+
+def test_extent_counts_from_what_is_full_by_its_own_light():
+    """Far beyond saturation the blurred border of the object is full without any blooming."""
+    exposures = (4.5, 5, 5.5, 6, 6.5, 20, 80, 400)
+    spill = find_blooming(*bright_object(150.0, exposures=exposures), 10.0, 255.0)
+    assert spill.extent_exposure == 80  # the responses of single pixels say nothing of 400
+    assert spill.extent_rows >= 10 and spill.extent_columns <= 3
+    none = find_blooming(*bright_object(1e9, exposures=exposures), 10.0, 255.0)
+    assert none.extent_rows <= 1 and none.extent_columns <= 1

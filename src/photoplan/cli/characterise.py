@@ -63,6 +63,8 @@ def _print(report: CharacteriseReport) -> None:
 
 def _talk(report: CharacteriseReport, dry_run: bool) -> None:
     """What was not done, and remarks, on stderr."""
+    for note in report.notes:
+        click.echo(note, err=True)
     for run in report.runs:
         for note in _notes(run):
             click.echo(note, err=True)

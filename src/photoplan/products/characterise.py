@@ -15,6 +15,7 @@ from photoplan.io.product import check_output
 from photoplan.io.series_file import Series, read_series
 from photoplan.io.whole_image import write_whole_image
 from photoplan.products.characterise_data import SeriesData
+from photoplan.products.characterise_full_well import full_well_notes, with_full_wells
 from photoplan.products.characterise_registry import ANALYSES, Analysis
 from photoplan.products.characterise_result import Figure, Outcome, Table
 from photoplan.products.plain_values import plain
@@ -79,6 +80,8 @@ class CharacteriseReport:
     runs: tuple[AnalysisRun, ...]
     written: tuple[Path, ...]
     """Report, tables and what goes with them."""
+    notes: tuple[str, ...] = ()
+    """What concerns all analyses."""
 
     @property
     def failed(self) -> dict[str, str]:
@@ -94,6 +97,7 @@ class CharacteriseReport:
             "frames": len(series.frames),
             "size": None if series.size is None else list(series.size),
             "saturation_dn": plain(series.saturation_dn),
+            "notes": list(self.notes),
             "analyses": [run.to_dict() for run in self.runs],
             "written": [str(path) for path in self.written],
         }
@@ -131,17 +135,19 @@ def characterise(
     if request.dry_run:
         return CharacteriseReport(series, tuple(runs), ())
     with begin(sum(run.missing is None for run in runs)) as advance:
+        data = with_full_wells(data)
         for k, run in enumerate(runs):
             if run.missing is None:
                 runs[k] = _run(run.analysis, data)
                 advance(1, 0)
+    notes = full_well_notes(data)
     written = _write_tables(request, series, runs)
     if request.report is not None and drawer is not None:
-        text = characterise_page(_facts(series), [_part(run) for run in runs], drawer)
+        text = characterise_page(_facts(data, notes), [_part(run) for run in runs], drawer)
         request.report.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(request.report, text.encode("utf-8"))
         written = [request.report, *written]
-    return CharacteriseReport(series, tuple(runs), tuple(written))
+    return CharacteriseReport(series, tuple(runs), tuple(written), notes)
 
 
 def _chosen(only: Sequence[str]) -> list[Analysis]:
@@ -228,8 +234,10 @@ def _figure_table(figures: Sequence[tuple[str, Figure]]) -> Table:
     return Table(head, tuple(tuple("" if v is None else v for v in row) for row in rows))
 
 
-def _facts(series: Series) -> SeriesFacts:
-    camera = series.camera
+def _facts(data: SeriesData, notes: tuple[str, ...]) -> SeriesFacts:
+    series, camera = data.series, data.series.camera
+    wells = [data.wells.get(plane.name) for plane in data.planes]
+    levels = [series.saturation_dn if well is None else well.level_dn for well in wells]
     kinds = dict.fromkeys(frame.kind for frame in series.frames)
     return SeriesFacts(
         name=camera.name or series.path.stem,
@@ -237,7 +245,8 @@ def _facts(series: Series) -> SeriesFacts:
         frames=", ".join(f"{len(series.of(kind))} {kind}" for kind in kinds)
         or f"{len(series.reduced)} reduced figures",
         size="" if series.size is None else f"{series.size[0]} × {series.size[1]} px, {series.dtype}",
-        saturation=f"{series.saturation_dn:g}",
+        saturation=", ".join(dict.fromkeys(f"{full:.4g}" for full in levels)),
+        notes=notes,
     )
 
 

@@ -59,15 +59,16 @@ def _run(data: SeriesData, run: Run) -> Outcome:
 
 
 def _plane(data: SeriesData, run: Run, plane: Plane, images: list[np.ndarray]) -> Outcome:
-    black = black_of(data, run.settings[0], plane)
-    if not isfinite(data.series.saturation_dn):
+    blacks = [black_of(data, setting, plane).mean for setting in run.settings]
+    if not isfinite(data.saturation_dn(plane.name)):
         raise InputError("the largest grey value is not known; give camera.bits or camera.saturation_dn")
-    found = find_blooming(run.values, images, black.mean, data.series.saturation_dn)
+    found = find_blooming(run.values, images, blacks, data.saturation_dn(plane.name))
     where = {"plane": plane.name, "at": run.label}
     figures: list[Figure] = []
     refused: dict[str, str] = {}
     if isfinite(found.onset_dn):
-        remark = f"{100 * found.onset_dn / (data.series.saturation_dn - black.mean):.0f} % of the grey scale"
+        remark = f"{100 * found.onset_dn / (data.saturation_dn(plane.name) - blacks[0]):.0f} % of the grey scale"
+        longest = f"at {found.extent_exposure:g} {run.unit}"
         figures += [
             Figure(
                 "blooming_onset_dn",
@@ -78,8 +79,10 @@ def _plane(data: SeriesData, run: Run, plane: Plane, images: list[np.ndarray]) -
                 remark=remark,
                 **where,
             ),
-            Figure("blooming_rows_px", found.extent_rows, nan, "extent along columns", "px", **where),
-            Figure("blooming_columns_px", found.extent_columns, nan, "extent along rows", "px", **where),
+            Figure("blooming_rows_px", found.extent_rows, nan, "extent along columns", "px", remark=longest, **where),
+            Figure(
+                "blooming_columns_px", found.extent_columns, nan, "extent along rows", "px", remark=longest, **where
+            ),
         ]
     else:
         refused[prefix("blooming onset", plane.name, run.label)] = (

@@ -15,8 +15,20 @@ from photoplan.products.characterise_result import Outcome
 from photoplan.quality.camera.frame_statistics import Level
 from photoplan.quality.camera.photon_transfer import is_clipped_dark
 
-__all__ = ["Black", "Run", "black_of", "dark_levels", "exposure_runs", "prefix", "saturation_of", "tried"]
+__all__ = [
+    "MOST_SATURATED",
+    "Black",
+    "Run",
+    "black_of",
+    "dark_levels",
+    "exposure_runs",
+    "prefix",
+    "saturation_of",
+    "tried",
+]
 
+#: Share of saturated samples up to which a mean grey value is one.
+MOST_SATURATED = 1e-2
 #: Conditions that may be the abscissa of a run, with what axes say.
 _ABSCISSAS = (
     ("exposure_ms", "exposure ms", "ms"),
@@ -91,9 +103,10 @@ class Black:
 
 
 def black_of(data: SeriesData, setting: Setting, plane: Plane) -> Black:
-    """Black of a setting: dark frames of its exposure, else between those of others, else what is stated.
+    """Black of a setting: dark frames of its exposure, else by lines through the nearest others, else what is stated.
 
-    Dark frames of another temperature (by more than half a degree), and those whose black is cut off, do not count.
+    Dark frames of another temperature (by more than half a degree), and those that are cut off at black or
+    saturated, do not count.
     """
     known: list[tuple[float, Level]] = []
     clipped = False
@@ -102,7 +115,7 @@ def black_of(data: SeriesData, setting: Setting, plane: Plane) -> Black:
             continue
         level = data.levels(dark)[plane.name]
         clipped = clipped or is_clipped_dark(level)
-        if is_clipped_dark(level):
+        if is_clipped_dark(level) or level.saturated_share > MOST_SATURATED:
             continue
         if dark.first.exposure_ms == setting.first.exposure_ms:
             return Black(level.mean, _sigma(level), level, "dark frames of the same exposure")
@@ -110,13 +123,21 @@ def black_of(data: SeriesData, setting: Setting, plane: Plane) -> Black:
             known.append((dark.first.exposure_ms, level))
     if known and setting.first.exposure_ms is not None:
         known.sort(key=lambda item: item[0])
-        means = [level.mean for _, level in known]
-        mean = float(np.interp(setting.first.exposure_ms, [exposure for exposure, _ in known], means))
+        mean = _between(setting.first.exposure_ms, [(exposure, level.mean) for exposure, level in known])
         sigma = max(_sigma(level) for _, level in known)
-        return Black(mean, sigma, None, "between dark frames of other exposures")
+        return Black(mean, sigma, None, "from dark frames of other exposures")
     stated = data.series.camera.black_level_dn
     why = "black is cut off in the dark frames" if clipped else "no dark frames that fit"
     return Black(stated, 0.0, None, f"{why}: black level {stated:g} DN, as black_level_dn says")
+
+
+def _between(exposure: float, known: Sequence[tuple[float, float]]) -> float:
+    """Value at an exposure by the line through the two nearest of the sorted points; that of a single one."""
+    if len(known) == 1:
+        return known[0][1]
+    right = min(max(int(np.searchsorted([x for x, _ in known], exposure)), 1), len(known) - 1)
+    (x0, y0), (x1, y1) = known[right - 1], known[right]
+    return y0 + (y1 - y0) * (exposure - x0) / (x1 - x0)
 
 
 def _sigma(level: Level) -> float:
@@ -134,9 +155,9 @@ def dark_levels(data: SeriesData, plane: Plane) -> list[Level]:
     return [data.levels(s)[plane.name] for s in settings if len(s.frames) >= 2]
 
 
-def saturation_of(data: SeriesData, levels: Sequence[Level]) -> float:
+def saturation_of(data: SeriesData, plane: Plane, levels: Sequence[Level]) -> float:
     """Grey value at which grey values stop: that of the series, or the largest that was seen of a clipped level."""
-    stated = data.series.saturation_dn
+    stated = data.saturation_dn(plane.name)
     return stated if stated < inf else max((level.largest for level in levels), default=nan)
 
 

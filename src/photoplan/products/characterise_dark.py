@@ -8,7 +8,7 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.io.series_pixels import Plane
-from photoplan.products.characterise_common import prefix, tried
+from photoplan.products.characterise_common import MOST_SATURATED, prefix, tried
 from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
 from photoplan.quality.camera.dark_signal import DarkCurrent, dark_current, doubling_temperature
@@ -57,7 +57,14 @@ def _current(
     settings: list[Setting], levels: list[Level], name: str, at: tuple[float | None, str], currents: Currents
 ) -> Outcome:
     exposures = [float(setting.first.exposure_ms or 0.0) for setting in settings]
-    found = dark_current(exposures, levels)
+    full = [k for k, level in enumerate(levels) if level.saturated_share > MOST_SATURATED]
+    used = [k for k in range(len(levels)) if k not in full]
+    if full and len(used) < _LEAST:
+        raise InputError(
+            f"over {100 * MOST_SATURATED:g} % of the samples are saturated from {exposures[full[0]]:g} ms on; take "
+            "shorter exposures"
+        )
+    found = dark_current([exposures[k] for k in used], [levels[k] for k in used])
     currents[at[0]] = found
     shortest = levels[0]
     noise = sqrt(shortest.temporal_variance)
@@ -79,9 +86,10 @@ def _current(
     )
     means = [level.mean for level in levels]
     rows = tuple(
-        (name, at[1], t, level.mean, level.mean_sigma, level.temporal_variance) for t, level in zip(exposures, levels)
+        (name, at[1], t, level.mean, level.mean_sigma, level.temporal_variance, "no" if k in full else "yes")
+        for k, (t, level) in enumerate(zip(exposures, levels))
     )
-    head = ("plane", "temperature", "exposure_ms", "mean_dn", "sigma_dn", "variance_dn2")
+    head = ("plane", "temperature", "exposure_ms", "mean_dn", "sigma_dn", "variance_dn2", "used")
     t = np.array(exposures) / 1000
     chart = Chart(
         f"Dark signal {' '.join(filter(None, [name, at[1]]))}".strip(),
@@ -94,6 +102,7 @@ def _current(
         figures,
         tables={"levels": Table(head, rows, "Dark frames")},
         plots=(chart,),
+        notes=tuple(f"{settings[k].label}: saturated, not used" for k in full),
         details={prefix("dark_current", name, at[1]).replace(" ", "_"): found.to_dict()},
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,6 +14,7 @@ from photoplan.io.series_file import Frame, Series
 from photoplan.io.series_model import CONDITIONS
 from photoplan.io.series_pixels import Plane, frame_pixels, plane_mask, series_planes, split
 from photoplan.quality.camera.frame_statistics import FrameStack, Level, StackSums
+from photoplan.quality.camera.saturation import FullWell
 
 __all__ = ["SeriesData", "Setting"]
 
@@ -52,6 +53,8 @@ class SeriesData:
     series: Series
     watch: Callable[[int], None] = lambda frames: None
     """Called with 1 after each frame that was read."""
+    wells: Mapping[str, FullWell] = field(default_factory=dict)
+    """Planes that are full below the largest grey value of the series."""
     planes: tuple[Plane, ...] = field(init=False)
     _levels: dict[tuple[int, str], dict[str, Level]] = field(default_factory=dict, init=False)
     _last: dict[tuple[int, str], dict[str, FrameStack]] = field(default_factory=dict, init=False)
@@ -68,6 +71,11 @@ class SeriesData:
             found.setdefault(key, []).append(frame)
         return tuple(Setting(tuple(frames)) for frames in found.values())
 
+    def saturation_dn(self, plane: str) -> float:
+        """Grey value from which on samples of a plane count as saturated."""
+        well = self.wells.get(plane)
+        return self.series.saturation_dn if well is None else min(self.series.saturation_dn, well.least_dn)
+
     def pixels(self, frame: Frame) -> dict[str, NDArray[Any]]:
         """Pixels of a frame by plane, each of shape (h, w)."""
         pixels = frame_pixels(frame)
@@ -80,7 +88,8 @@ class SeriesData:
         if key not in self._last:
             self._last.clear()  # before the next images need its place
             sums = {
-                plane.name: StackSums(self.series.saturation_dn, self.counted(setting, plane)) for plane in self.planes
+                plane.name: StackSums(self.saturation_dn(plane.name), self.counted(setting, plane))
+                for plane in self.planes
             }
             for frame in setting.frames:
                 for name, pixels in self.pixels(frame).items():
@@ -127,7 +136,7 @@ class SeriesData:
         ]
         for pixels in self._references(frames, plane, entry.brightest_exposure_ms):
             seen = pixels if mask is None else pixels[mask]
-            if entry.brightest_exposure_ms is None and (seen >= self.series.saturation_dn).mean() > _UNSATURATED:
+            if entry.brightest_exposure_ms is None and (seen >= self.saturation_dn(plane.name)).mean() > _UNSATURATED:
                 continue
             found = pixels > np.quantile(seen, 1.0 - entry.brightest)
             found = found if mask is None else found & mask

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from math import isnan, nan
+from math import isfinite, isnan, nan
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.series_pixels import Plane
-from photoplan.products.characterise_common import prefix, tried
+from photoplan.products.characterise_common import MOST_SATURATED, prefix, tried
 from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
 from photoplan.quality.camera.defects import Defect, DefectList, find_blinking, find_defects, find_lines, log_histogram
@@ -19,6 +20,8 @@ __all__ = ["analyse", "missing"]
 
 #: Hot pixels whose growth with the exposure is followed, and whose places are drawn.
 _FOLLOWED = 40
+#: The strongest hot pixels of the longest exposure, among which the fastest are looked for.
+_CANDIDATES = 1000
 #: A flat pixel must differ by this part of its surroundings.
 _FLAT_SHARE = 0.1
 
@@ -37,9 +40,11 @@ def analyse(data: SeriesData) -> Outcome:
 
 def _plane(data: SeriesData, plane: Plane) -> Outcome:
     outcomes = []
-    dark = max(_pairs(data, "dark"), key=lambda s: s.first.exposure_ms or 0.0, default=None)
+    darks = sorted(_pairs(data, "dark"), key=lambda s: s.first.exposure_ms or 0.0)
+    sound = [s for s in darks if data.levels(s)[plane.name].saturated_share <= MOST_SATURATED]
+    dark = next(iter(sound[-1:] or darks[:1]), None)
     flats = [s for s in _pairs(data, "flat") if data.levels(s)[plane.name].saturated_share < 1e-3]
-    half = data.series.saturation_dn / 2
+    half = data.saturation_dn(plane.name) / 2
     flat = min(flats, key=lambda s: abs(data.levels(s)[plane.name].mean - half), default=None)
     for setting, kinds, share in ((dark, ("hot",), 0.0), (flat, ("hot", "dark"), _FLAT_SHARE)):
         if setting is not None:
@@ -111,7 +116,7 @@ def _figures(lists: dict[str, DefectList], kinds: tuple[str, ...], plane: str, l
 
 def _growth(data: SeriesData, setting: Setting, plane: Plane, found: DefectList) -> Outcome:
     """Grey values of the strongest hot pixels at every dark exposure."""
-    followed = [d for d in found.defects if d.kind == "hot"][:_FOLLOWED]
+    hot = [d for d in found.defects if d.kind == "hot"][:_CANDIDATES]
     settings = sorted(
         (
             s
@@ -119,31 +124,30 @@ def _growth(data: SeriesData, setting: Setting, plane: Plane, found: DefectList)
             if s.first.exposure_ms is not None
             and s.first.group.window == setting.first.group.window
             and s.first.temperature_c == setting.first.temperature_c
+            and s.first.exposure_ms <= (setting.first.exposure_ms or 0.0)
         ),
         key=lambda s: s.first.exposure_ms or 0.0,
     )
-    if not followed or len(settings) < 2:
+    if not hot or len(settings) < 2:
         return Outcome()
     window = setting.first.group.window
     means = [data.stacks(s)[plane.name].mean for s in settings]
     exposures = np.array([s.first.exposure_ms or 0.0 for s in settings])
-    values = np.array([[mean[int(d.row), int(d.col)] for mean in means] for d in followed])
-    rates = [float(np.polyfit(exposures / 1000, v, 1)[0]) for v in values]
+    values = np.array([[mean[int(d.row), int(d.col)] for mean in means] for d in hot])
+    full = values >= data.saturation_dn(plane.name)
+    rates = [_rate(exposures / 1000, v, ~f) for v, f in zip(values, full)]
+    order = sorted(range(len(hot)), key=lambda k: -np.nan_to_num(rates[k], nan=-np.inf))[:_FOLLOWED]
+    followed, values, rates = [hot[k] for k in order], values[order], [rates[k] for k in order]
     head = ("plane", "column", "row", *(f"{e:g}_ms_dn" for e in exposures), "rate_dn_s")
     places = [tuple(int(v) for v in plane.to_image(window, d.col, d.row)) for d in followed]
     rows: list[tuple[str | float | int, ...]] = [
         (plane.name, *at, *(float(x) for x in v), rate) for at, v, rate in zip(places, values, rates)
     ]
-    figures = (
-        Figure(
-            "hottest_dn_s",
-            rates[0],
-            nan,
-            "rate of the hottest pixel",
-            "DN/s",
-            plane.name,
-            remark=f"column {places[0][0]}, row {places[0][1]}",
-        ),
+    remark = f"column {places[0][0]}, row {places[0][1]}"
+    hottest = Figure("hottest_dn_s", rates[0], nan, "rate of the hottest pixel", "DN/s", plane.name, remark=remark)
+    overfull = int(full[:, -1].sum())
+    note = (
+        f"{overfull} hot pixels are full at {exposures[-1]:g} ms; charge that runs over makes their neighbours hot, too"
     )
     curves = tuple(
         Curve(exposures, v, f"column {at[0]}, row {at[1]}", "line and points") for at, v in zip(places[:6], values)
@@ -156,7 +160,17 @@ def _growth(data: SeriesData, setting: Setting, plane: Plane, found: DefectList)
         curves,
     )
     table = Table(head, tuple(rows), "Grey values of the hottest pixels at each dark exposure")
-    return Outcome(figures, tables={f"hot_growth{plane.name and f'_{plane.name}'}": table}, plots=(chart,))
+    return Outcome(
+        (hottest,) if isfinite(rates[0]) else (),
+        tables={f"hot_growth{plane.name and f'_{plane.name}'}": table},
+        plots=(chart,),
+        notes=(note,) if overfull else (),
+    )
+
+
+def _rate(seconds: NDArray[np.float64], values: NDArray[np.float64], usable: NDArray[np.bool_]) -> float:
+    """Slope where the pixel is not full; NaN if that is at fewer than two exposures."""
+    return float(np.polyfit(seconds[usable], values[usable], 1)[0]) if usable.sum() > 1 else nan
 
 
 def _plots(found: DefectList, stack: FrameStack, plane: Plane, setting: Setting) -> tuple[Chart | Picture, ...]:

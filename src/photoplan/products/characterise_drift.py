@@ -44,7 +44,7 @@ def _group(data: SeriesData, group: FrameGroup) -> Outcome:
     for frame, planes in zip(group.frames, group.pixels(data, window)):
         for name, pixels in planes.items():
             values = pixels.astype(float)
-            if float((values >= data.series.saturation_dn).mean()) > 0.01:
+            if float((values >= data.saturation_dn(name)).mean()) > 0.01:
                 raise InputError(f"{group.group.label}: {frame.file.name} is saturated in the window; take less light")
             means[name].append(float(values.mean()))
             if name in last and values.size > 1:

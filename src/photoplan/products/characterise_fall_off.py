@@ -13,6 +13,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.fall_off_file import FallOffEntry, TermEntry, fall_off_text
 from photoplan.io.series_pixels import Plane
+from photoplan.products.characterise_common import black_of
 from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_groups import FrameGroup
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
@@ -77,22 +78,25 @@ def _brightest(data: SeriesData) -> Setting:
         if best is None or mean > best[0]:
             best = mean, setting
     if best is None:
+        full = ", ".join(f"{data.saturation_dn(plane.name):.4g}" for plane in data.planes)
         raise InputError(
             f"{data.series.path}: all flat frames are saturated (more than {100 * _SATURATED:g} % of the pixels at "
-            f"{data.series.saturation_dn:g}); take flat frames with less light"
+            f"{full} DN); take flat frames with less light"
         )
     return best[1]
 
 
 def _dark(data: SeriesData, flat: Setting) -> tuple[dict[str, Array | float], str]:
-    """Mean dark image at the same exposure and window, else the black level that is stated."""
+    """Mean dark image at the same exposure and window, else the grey value that other dark frames or the file tell."""
     for setting in data.settings("dark"):
         same = setting.first.exposure_ms == flat.first.exposure_ms
         if same and setting.first.group.window == flat.first.group.window:
             return {n: s.mean for n, s in data.stacks(setting).items()}, f"{setting.label} subtracted"
-    level = data.series.camera.black_level_dn
-    note = f"no dark frames at their exposure: the black level {level:g} is taken off"
-    return {plane.name: level for plane in data.planes}, note
+    blacks = {plane.name: black_of(data, flat, plane) for plane in data.planes}
+    levels = ", ".join(dict.fromkeys(f"{black.mean:.4g}" for black in blacks.values()))
+    rule = next(iter(blacks.values())).rule
+    note = f"no dark frames at their exposure: {levels} DN are taken off ({rule})"
+    return {name: black.mean for name, black in blacks.items()}, note
 
 
 def _whole(data: SeriesData, setting: Setting, plane: Plane, pixels: Array) -> Array:

@@ -52,7 +52,7 @@ def _transitions(data: SeriesData, group: FrameGroup) -> dict[str, tuple[GainCon
     for frame, planes in zip(group.frames, group.pixels(data)):
         for name, pixels in planes.items():
             values = pixels.astype(float)
-            if float((values >= data.series.saturation_dn).mean()) > 0.01:
+            if float((values >= data.saturation_dn(name)).mean()) > 0.01:
                 raise InputError(
                     f"{group.group.label}: {frame.file.name} is saturated; what the gain does is hidden there. Take "
                     "the series with less light, or choose a darker roi"

@@ -59,8 +59,8 @@ def measured_edge(data: SeriesData, frame: Frame, entry: EdgeEntry, degree: int 
     grey = frame_pixels(frame, window)[0].astype(float)
     lines = grey if entry.direction == "vertical" else grey.T
     name = f"{frame.file.name}, edge {entry.name}"
-    saturation = data.series.saturation_dn if math.isfinite(data.series.saturation_dn) else None
-    fitted = fit_edge(lines, name=name, saturation=saturation)
+    saturation = data.saturation_dn(data.planes[0].name)
+    fitted = fit_edge(lines, name=name, saturation=saturation if math.isfinite(saturation) else None)
     by_correlation = correlate_edge(lines, fitted, name=name)
     return Edge(
         entry,

@@ -9,7 +9,15 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.series_pixels import Plane
-from photoplan.products.characterise_common import Run, black_of, exposure_runs, prefix, saturation_of, tried
+from photoplan.products.characterise_common import (
+    MOST_SATURATED,
+    Run,
+    black_of,
+    exposure_runs,
+    prefix,
+    saturation_of,
+    tried,
+)
 from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
 from photoplan.quality.camera.frame_statistics import Level, check_level
@@ -58,15 +66,16 @@ def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
         for level in levels
     ]
     sigma = [sqrt(s**2 + black.sigma**2) for s, black in zip(sigmas, blacks)]
-    full = _full(data, run, levels, signal)
+    full = _full(data, plane, run, levels, signal)
     if not full > 0:
         raise InputError(f"the frames are not brighter than black ({blacks[-1].mean:.4g} DN)")
-    found = linearity(run.values, signal, sigma, full)
+    partly = np.array([level.saturated_share > MOST_SATURATED for level in levels])
+    found = linearity(run.values, signal, sigma, full, ~partly)
     rules = tuple(dict.fromkeys(black.rule for black in blacks))
     # Where black hides a part of the pixels, the mean of the others is not the signal.
     hidden = np.array([is_clipped_dark(level) for level in levels])
     return Outcome(
-        _figures(found, run, plane.name, (found.signal < HIGH * full) & ~hidden),
+        _figures(found, run, plane.name, (found.signal < HIGH * full) & ~hidden & ~partly),
         refused={
             prefix("signal over exposure", plane.name, run.label, f"{found.exposure[k]:g} {run.unit}"): (
                 f"black is cut off: {100 * levels[k].zero_share:.3g} % of the samples are zero"
@@ -97,7 +106,7 @@ def _figures(found: Linearity, run: Run, plane: str, known: NDArray[np.bool_]) -
     return tuple(figures)
 
 
-def _full(data: SeriesData, run: Run, levels: list[Level], signal: list[float]) -> float:
+def _full(data: SeriesData, plane: Plane, run: Run, levels: list[Level], signal: list[float]) -> float:
     """Signal at saturation: where this run shows it, else what the camera can write."""
     if len(levels) >= 4:
         variance = np.array([level.temporal_variance for level in levels])
@@ -105,7 +114,7 @@ def _full(data: SeriesData, run: Run, levels: list[Level], signal: list[float]) 
         found = find_saturation(run.values, signal, 0.0, shares, variance if np.isfinite(variance).all() else None)
         if found is not None:
             return found.level_dn
-    return saturation_of(data, levels) - (levels[-1].mean - signal[-1])
+    return saturation_of(data, plane, levels) - (levels[-1].mean - signal[-1])
 
 
 def _table(found: Linearity, run: Run, name: str) -> Table:

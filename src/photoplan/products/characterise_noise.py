@@ -14,7 +14,8 @@ from photoplan.report.characterise_charts import Chart, Curve
 
 __all__ = ["analyse", "missing"]
 
-_KINDS = ("dark", "flat", "scene", "wedge", "drift", "step", "target")
+#: What stands still: between frames of other kinds the scene or its brightness changes.
+_KINDS = ("dark", "flat", "scene", "wedge", "drift")
 #: Standard deviation of rounding to whole grey values (Behr 1989, eq. 3.14).
 _ROUNDING = 1 / sqrt(12)
 

@@ -71,7 +71,7 @@ def _plane(data: SeriesData, plane: Plane) -> Outcome:
 
 def _half_bright(data: SeriesData, plane: Plane) -> Setting | None:
     """The flat setting whose mean is nearest to half of saturation."""
-    full = data.series.saturation_dn
+    full = data.saturation_dn(plane.name)
     best, distance = None, np.inf
     for setting in _flats(data):
         level = data.levels(setting)[plane.name]

@@ -56,7 +56,7 @@ ANALYSES: tuple[Analysis, ...] = (
     Analysis(
         "noise",
         "Noise against grey value",
-        "two or more frames of anything at each brightness",
+        "two or more frames of a scene that stands still, at each brightness",
         "characterise_noise",
     ),
     Analysis(

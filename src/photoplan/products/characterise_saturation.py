@@ -7,7 +7,7 @@ from math import isfinite, nan
 import numpy as np
 
 from photoplan.io.series_pixels import Plane
-from photoplan.products.characterise_common import Run, black_of, exposure_runs, prefix, tried
+from photoplan.products.characterise_common import MOST_SATURATED, Run, black_of, exposure_runs, prefix, tried
 from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_result import Figure, Outcome, joined
 from photoplan.quality.camera.frame_statistics import check_level
@@ -23,6 +23,7 @@ _WORDS = {
     "response": "the response falls below the line",
     "variance": "the temporal variance falls",
 }
+_FULL = "the elements are full, below the largest grey value"
 
 
 def missing(data: SeriesData) -> str | None:
@@ -62,13 +63,15 @@ def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
     )
     key = prefix("saturation", plane.name, run.label)
     if found is None:
-        return Outcome(refused={key: f"not reached: the brightest level has a mean of {mean[-1]:.4g} DN"})
+        share = levels[-1].saturated_share
+        spot = f", {100 * share:.3g} % of its samples are saturated: give them a roi, a mask or brightest"
+        why = f"not reached: the brightest level has a mean of {mean[-1]:.4g} DN"
+        return Outcome(refused={key: why + (spot if share > MOST_SATURATED else "")})
     where = {"plane": plane.name, "at": run.label}
+    words = _FULL if found.rule == "clipping" and plane.name in data.wells else _WORDS[found.rule]
     between = f"between {found.last_unsaturated:g} and {found.first_saturated:g} {run.unit}"
     figures = [
-        Figure(
-            "saturation_dn", found.level_dn, nan, "saturation", "DN", remark=f"{_WORDS[found.rule]} {between}", **where
-        ),
+        Figure("saturation_dn", found.level_dn, nan, "saturation", "DN", remark=f"{between}: {words}", **where),
     ]
     if isfinite(found.exposure):
         figures.append(
@@ -79,7 +82,7 @@ def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
     x = np.array(run.values)
     chart = Chart(
         prefix("Saturation", plane.name, run.label),
-        f"Saturated {between}: {_WORDS[found.rule]}.",
+        f"Saturated {between}: {words}.",
         run.axis,
         "mean grey value DN",
         (Curve(x, mean, style="line and points"),),

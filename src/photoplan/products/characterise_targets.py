@@ -72,7 +72,7 @@ def _locate(data: SeriesData, group: FrameGroup, frame: Frame, target: TargetEnt
     grey = frame_pixels(frame, window)[0].astype(np.float32)
     where = f"target {target.name}"
     peak = float(grey.max() if target.bright else grey.min())
-    if target.bright and peak >= data.series.saturation_dn and (grey >= peak).mean() > 0.5:
+    if target.bright and peak >= data.saturation_dn(data.planes[0].name) and (grey >= peak).mean() > 0.5:
         return Located(target.name, frame, math.nan, math.nan, math.nan, f"{where}: the window is saturated")
     try:
         at = locate_target(grey, bright=target.bright).location

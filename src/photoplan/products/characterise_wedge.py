@@ -77,7 +77,7 @@ def _patches(data: SeriesData, setting: Setting, plane: Plane) -> list[_Patch]:
         window = Window(*step.roi)
         if window.stop[0] > size[0] or window.stop[1] > size[1]:
             raise InputError(f"{setting.first.group.label}: step of density {step.density:g}: its roi leaves the image")
-        sums = StackSums(data.series.saturation_dn)
+        sums = StackSums(data.saturation_dn(plane.name))
         for frame in setting.frames:
             sums.add(plane_pixels(frame, plane, window))
         found.append(_Patch(step.density, sums.stack().level, setting))
@@ -93,7 +93,7 @@ def _curve(data: SeriesData, patches: list[_Patch], plane: Plane, label: str) ->
         else sqrt(max(patch.level.spatial_variance, 1 / 12) / patch.level.pixels)
         for patch in patches
     ]
-    full = saturation_of(data, [patch.level for patch in patches]) - blacks[0].mean
+    full = saturation_of(data, plane, [patch.level for patch in patches]) - blacks[0].mean
     found = grey_wedge([patch.density for patch in patches], signal, sigma, full)
     where = {"plane": plane.name, "at": label}
     nan = float("nan")

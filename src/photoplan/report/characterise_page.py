@@ -11,7 +11,7 @@ from photoplan.report.page import Cell, figure, headline, page, section, table, 
 __all__ = ["AnalysisPart", "SeriesFacts", "characterise_page"]
 
 #: Rows of a table that are shown; all of them are in CSV.
-_ROWS = 60
+_ROWS = 25
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,7 @@ class SeriesFacts:
     frames: str
     size: str
     saturation: str
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +54,13 @@ def characterise_page(facts: SeriesFacts, parts: Sequence[AnalysisPart], drawer:
             (facts.saturation, "saturation DN", " · ".join(filter(None, [facts.frames, facts.size]))),
         ]
     )
+    remarks = [f"<p>{text(note)}</p>" for note in facts.notes]
     others = [[part.title, part.state, part.reason] for part in parts if part.state != "done"]
     sections = [_section(part, drawer) for part in done]
     if others:
         sections.append(section("Not done", [table(("analysis", "state", "why"), others)]))
-    return page(f"Camera characterisation: {facts.name}", f"From the image series {facts.file}", [head, *sections])
+    parts_of_page = [head, *remarks, *sections]
+    return page(f"Camera characterisation: {facts.name}", f"From the image series {facts.file}", parts_of_page)
 
 
 def _section(part: AnalysisPart, drawer: ChartDrawer) -> str:
@@ -72,10 +75,12 @@ def _section(part: AnalysisPart, drawer: ChartDrawer) -> str:
     found += [f"<p>{text(note)}</p>" for note in part.notes]
     found += [figure(drawer.draw(plot), plot.title, plot.caption) for plot in part.plots]
     for caption, head, rows_of in part.tables:
-        cells = [[_cell(value) for value in row] for row in rows_of[:_ROWS]]
-        more = f" The first {_ROWS} of {len(rows_of)} lines; all are in the CSV tables." if len(rows_of) > _ROWS else ""
+        shown = [k for k in range(len(head)) if any(row[k] != "" for row in rows_of)]
+        cells = [[_cell(row[k]) for k in shown] for row in rows_of[:_ROWS]]
+        cut = f". The first {_ROWS} of {len(rows_of)} lines; all are in the CSV tables."
+        more = cut if len(rows_of) > _ROWS else ""
         if cells:
-            found += [f"<p>{text(caption + more)}</p>", table(head, cells)]
+            found += [f"<p>{text(caption + more)}</p>", table([head[k] for k in shown], cells)]
     return section(part.title, found)
 
 

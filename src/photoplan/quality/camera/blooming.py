@@ -21,10 +21,13 @@ from photoplan.errors import InputError
 
 __all__ = ["Blooming", "find_blooming"]
 
-#: Pixels from the object that count as its neighbours; the nearest one holds part of the object itself.
-_NEAR, _FAR = 2, 4
+#: Pixels from the object up to which its neighbours lie. The nearest ones count, since charge fills them first; what
+#: they hold of the object's own light belongs to their response.
+_FAR = 4
 #: Standard deviations by which neighbours must exceed what was expected.
 _SIGNIFICANT = 4.0
+#: Part of the range of grey values up to which the threshold of lifted pixels tells them.
+_TOLD = 0.25
 #: Part of the brightest grey value that the object reaches, up to which it gives the responses.
 _SAFE = 0.55
 
@@ -45,9 +48,11 @@ class Blooming:
     """Grey value of the neighbours above what was expected."""
     excess_sigma: NDArray[np.float64]
     extent_rows: int
-    """Pixels beyond the object along columns (up or down) that are lifted at the longest exposure."""
+    """Pixels beyond the object along columns (up or down) that are lifted at `extent_exposure`."""
     extent_columns: int
     """The same along rows."""
+    extent_exposure: float
+    """The longest exposure at which lifted pixels can be told."""
     threshold_dn: float
     """Excess from which on a pixel counts as lifted."""
     object_pixels: int
@@ -59,7 +64,7 @@ class Blooming:
 
 
 def find_blooming(
-    exposures: Sequence[float], images: Sequence[NDArray[Any]], black: float, saturation: float
+    exposures: Sequence[float], images: Sequence[NDArray[Any]], black: float | Sequence[float], saturation: float
 ) -> Blooming:
     """Onset and extent of blooming around the brightest object.
 
@@ -69,10 +74,10 @@ def find_blooming(
         Increasing.
     images : sequence of array, each of shape (h, w)
         Mean images at these exposures.
-    black : float
-        Grey value without light.
+    black : float or sequence of float
+        Grey value without light, of all images or of each.
     saturation : float
-        Largest grey value.
+        Grey value of full pixels.
 
     Raises
     ------
@@ -82,8 +87,11 @@ def find_blooming(
     """
     if len(exposures) < 4 or (np.diff(exposures) <= 0).any():
         raise InputError(f"{len(exposures)} exposures; blooming needs four that increase")
-    span = saturation - black
-    tops = [_brightest(image) - black for image in images]
+    blacks = np.broadcast_to(np.asarray(black, float), len(exposures))
+    lights = [np.asarray(image, np.float32) - np.float32(below) for image, below in zip(images, blacks)]
+    spans = saturation - blacks
+    span = float(spans[0])
+    tops = [_brightest(light) for light in lights]
     # Charge that runs over may keep the object far below the largest grey value.
     reached = min(span, max(tops))
     safe = [k for k, top in enumerate(tops) if top <= _SAFE * reached]
@@ -92,26 +100,47 @@ def find_blooming(
             f"the bright object is below half of its brightest grey value in {len(safe)} of {len(tops)} exposures; "
             "blooming needs two or more: expose shorter"
         )
-    response = _response(exposures, images, safe, black)
+    response = _response(exposures, lights, safe)
     bright = _object(response)
     near = _neighbours(response, bright)
     inside = response[bright]
     of_object = float(inside[inside >= 0.9 * np.percentile(inside, 90)].mean())
     times = np.array(exposures, float)
-    excess = np.array([float((image[near] - black - response[near] * t).mean()) for image, t in zip(images, times)])
-    sigma = _sigmas(images, times, response, near, safe, black)
-    usable = np.array([float(np.median(image[near])) - black < 0.95 * span for image in images])
+    excess = np.array(
+        [
+            float((light[near] - np.minimum(response[near] * t, full)).mean())
+            for light, t, full in zip(lights, times, spans)
+        ]
+    )
+    sigma = _sigmas(lights, times, response, near, safe)
+    usable = np.array([float(np.median(light[near])) < 0.95 * full for light, full in zip(lights, spans)])
     object_dn = of_object * times
     onset, onset_sigma, last = _onset(object_dn, excess, sigma, usable)
     if not np.isfinite(onset) and object_dn[-1] < 0.95 * span:
         raise InputError(
             f"no blooming, but the bright object reaches only {object_dn[-1]:.4g} DN of {span:.4g}; expose it longer"
         )
-    threshold = max(_SIGNIFICANT * float(sigma[-1]) * sqrt(near.sum()), 0.03 * reached)
-    lifted = images[-1] - black - np.minimum(response * times[-1], span) > threshold
-    rows, columns = _extent(lifted, bright)
+    thresholds = np.maximum(_SIGNIFICANT * sigma * sqrt(near.sum()), 0.03 * reached)
+    # Single pixels' responses are uncertain: far beyond the exposures that gave them they promise nothing.
+    last_told = int(np.flatnonzero(thresholds <= _TOLD * span)[-1]) if (thresholds <= _TOLD * span).any() else 0
+    promised = response * times[last_told]
+    full = float(spans[last_told])
+    lifted = lights[last_told] - np.minimum(promised, full) > thresholds[last_told]
+    # What is full by its own light, blurred edges and stray light included, is the object by then.
+    rows, columns = _extent(lifted, bright, _grown(bright, promised >= 0.9 * full))
     return Blooming(
-        onset, onset_sigma, last, object_dn, excess, sigma, rows, columns, threshold, int(bright.sum()), int(near.sum())
+        onset,
+        onset_sigma,
+        last,
+        object_dn,
+        excess,
+        sigma,
+        rows,
+        columns,
+        float(times[last_told]),
+        float(thresholds[last_told]),
+        int(bright.sum()),
+        int(near.sum()),
     )
 
 
@@ -121,13 +150,13 @@ def _brightest(image: NDArray[Any]) -> float:
 
 
 def _response(
-    exposures: Sequence[float], images: Sequence[NDArray[Any]], safe: Sequence[int], black: float
+    exposures: Sequence[float], lights: Sequence[NDArray[np.float32]], safe: Sequence[int]
 ) -> NDArray[np.float64]:
     """Grey values per exposure of every pixel, from the exposures without saturation."""
-    total = np.zeros(images[0].shape)
+    total = np.zeros(lights[0].shape)
     weight = 0.0
     for k in safe:
-        total += exposures[k] * (np.asarray(images[k], np.float64) - black)
+        total += exposures[k] * lights[k].astype(np.float64)
         weight += exposures[k] ** 2
     return total / weight
 
@@ -148,31 +177,35 @@ def _object(response: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(found)
 
 
+def _grown(bright: NDArray[np.bool_], full: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The object with the full pixels that are connected to it."""
+    patches, _ = ndimage.label(bright | full)
+    return np.isin(patches, np.unique(patches[bright]))
+
+
 def _neighbours(response: NDArray[np.float64], bright: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Dark pixels close to the object."""
     square = np.ones((3, 3), bool)
     far = ndimage.binary_dilation(bright, square, _FAR)
-    near = far & ~ndimage.binary_dilation(bright, square, _NEAR - 1)
-    near &= response < 0.25 * float(response[bright].mean())
+    near = far & ~bright & (response < 0.25 * float(response[bright].mean()))
     if near.sum() < 8:
         raise InputError("the bright object has no dark surrounding; give a roi around an object on a dark ground")
     return np.asarray(near)
 
 
 def _sigmas(
-    images: Sequence[NDArray[Any]],
+    lights: Sequence[NDArray[np.float32]],
     times: NDArray[np.float64],
     response: NDArray[np.float64],
     near: NDArray[np.bool_],
     safe: Sequence[int],
-    black: float,
 ) -> NDArray[np.float64]:
     """Standard deviation of the mean excess: noise of the neighbours, and that of their responses."""
-    residual = np.concatenate([(images[k][near] - black - response[near] * times[k]) for k in safe])
+    residual = np.concatenate([(lights[k][near] - response[near] * times[k]) for k in safe])
     freedom = max(residual.size - near.sum(), 1)
     noise = sqrt(max(float(np.sum(residual**2)) / freedom, 1 / 12))
     of_response = noise / sqrt(float(np.sum(times[list(safe)] ** 2)))
-    level = np.array([max(float(image[near].mean()) - black, 1.0) for image in images])
+    level = np.array([max(float(light[near].mean()), 1.0) for light in lights])
     base = max(float(np.mean(level[list(safe)])), 1.0)
     grown = noise * np.sqrt(np.maximum(level / base, 1.0))  # shot noise
     return np.asarray(np.sqrt(grown**2 + (of_response * times) ** 2) / sqrt(near.sum()))
@@ -206,15 +239,15 @@ def _crossing(level: NDArray[np.float64], excess: NDArray[np.float64]) -> float:
     return float(level[0] - excess[0] / slope) if slope > 0 else nan
 
 
-def _extent(lifted: NDArray[np.bool_], bright: NDArray[np.bool_]) -> tuple[int, int]:
-    """Longest unbroken run of lifted pixels from the object along columns and along rows."""
-    return _run(lifted, bright), _run(lifted.T, bright.T)
+def _extent(lifted: NDArray[np.bool_], bright: NDArray[np.bool_], grown: NDArray[np.bool_]) -> tuple[int, int]:
+    """Longest unbroken run of lifted pixels from the grown object along the object's columns and along its rows."""
+    return _run(lifted, bright, grown), _run(lifted.T, bright.T, grown.T)
 
 
-def _run(lifted: NDArray[np.bool_], bright: NDArray[np.bool_]) -> int:
+def _run(lifted: NDArray[np.bool_], bright: NDArray[np.bool_], grown: NDArray[np.bool_]) -> int:
     longest = 0
     for col in np.flatnonzero(bright.any(axis=0)):
-        rows = np.flatnonzero(bright[:, col])
+        rows = np.flatnonzero(grown[:, col])
         below, above = lifted[rows[-1] + 1 :, col], lifted[: rows[0], col][::-1]
         for side in (below, above):
             stop = np.flatnonzero(~side)

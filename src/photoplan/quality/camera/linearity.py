@@ -54,7 +54,9 @@ class Linearity:
         return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(self).items()}
 
 
-def linearity(exposure: ArrayLike, signal: ArrayLike, sigma: ArrayLike, saturation: float) -> Linearity:
+def linearity(
+    exposure: ArrayLike, signal: ArrayLike, sigma: ArrayLike, saturation: float, usable: ArrayLike | None = None
+) -> Linearity:
     """Linearity error and response of levels.
 
     Parameters
@@ -67,18 +69,22 @@ def linearity(exposure: ArrayLike, signal: ArrayLike, sigma: ArrayLike, saturati
         Its standard deviation.
     saturation : float
         Grey value above black at which the sensor saturates.
+    usable : array of bool, shape (n,), optional
+        Levels whose mean grey value is that of the light: not those in which a part of the samples is saturated.
 
     Raises
     ------
     InputError
-        An exposure is not positive or stands twice, fewer than three levels lie between 5 % and 95 % of saturation, or
-        the signal falls where the exposure grows.
+        An exposure is not positive or stands twice, fewer than three usable levels lie between 5 % and 95 % of
+        saturation, or the signal falls where the exposure grows.
     """
     order = np.argsort(np.asarray(exposure, float), kind="stable")
     x, y, s = (np.asarray(v, float)[order] for v in (exposure, signal, sigma))
     if x.size and (x[0] <= 0 or (np.diff(x) <= 0).any()):
         raise InputError("exposures must be positive and differ from level to level")
     used = (y >= LOW * saturation) & (y <= HIGH * saturation)
+    if usable is not None:
+        used &= np.asarray(usable, bool)[order]
     _refuse_falling(x, y, s, HIGH * saturation)
     if np.count_nonzero(used) < 3:
         raise InputError(

@@ -8,7 +8,7 @@ section 6.6).
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from math import inf, nan, sqrt
+from math import inf, isfinite, nan, sqrt
 from typing import Any
 
 import numpy as np
@@ -16,10 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
 
-__all__ = ["Saturation", "find_saturation"]
+__all__ = ["FullWell", "Saturation", "find_saturation", "full_well"]
 
 #: Share of samples at the largest grey value from which on a level is clipped.
 _CLIPPED = 0.01
+#: Share at the last level from which on it shows saturation, not a bright spot.
+_MOSTLY = 0.5
+#: Standard deviations below the level of a full sensor down to which its samples lie.
+_SPREAD = 4.0
 #: Part of the response that is lost where a level departs from the line.
 _DEPARTED = 0.05
 
@@ -44,6 +48,33 @@ class Saturation:
         return asdict(self)
 
 
+@dataclass(frozen=True)
+class FullWell:
+    """A sensor that is full below the largest grey value that is written."""
+
+    level_dn: float
+    """Grey value of its full elements, their median."""
+    least_dn: float
+    """Grey value from which on a sample may be one of a full element."""
+
+
+def full_well(mean: ArrayLike, temporal_variance: float) -> FullWell:
+    """Grey values of full elements, from frames in which most elements are full.
+
+    Parameters
+    ----------
+    mean : array
+        Mean grey value of each element.
+    temporal_variance : float
+        Of a full element; NaN: unknown, taken as none.
+    """
+    values = np.asarray(mean, float)
+    level = float(np.median(values))
+    pattern = 1.4826 * float(np.median(np.abs(values - level)))
+    noise = sqrt(pattern**2 + (temporal_variance if isfinite(temporal_variance) else 0.0) + 1 / 12)
+    return FullWell(level, level - _SPREAD * noise)
+
+
 def find_saturation(
     exposure: ArrayLike, mean: ArrayLike, black: float, saturated_share: ArrayLike, variance: ArrayLike | None = None
 ) -> Saturation | None:
@@ -56,7 +87,8 @@ def find_saturation(
     black : float
         Grey value without light.
     saturated_share : array, shape (n,)
-        Share of samples at the largest grey value.
+        Share of samples at the largest grey value. Where it stays below a half, a bright spot is saturated, and not the
+        area whose mean grey value is given.
     variance : array, shape (n,), optional
         Temporal variance.
 
@@ -70,7 +102,7 @@ def find_saturation(
         raise InputError(f"{x.size} levels; saturation needs four of increasing exposure")
     signal = y - black
     found = {
-        "clipping": _first(share > _CLIPPED),
+        "clipping": _first(share > _CLIPPED) if share[-1] >= _MOSTLY else None,
         "response": _first_departure(x, signal),
         "variance": None if variance is None else _first_collapse(np.asarray(variance, float)),
     }

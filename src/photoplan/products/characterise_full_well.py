@@ -1,0 +1,60 @@
+"""Sensors that are full below the largest grey value: found in flat frames before anything else is analysed.
+
+An amplifier that is set low, or a converter with more bits than the elements hold electrons, leaves grey values that no
+element reaches. Full elements then look like valid ones, with less noise: fall-off, dark current, blooming and defects
+would be measured on them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from photoplan.errors import InputError
+from photoplan.io.series_pixels import Plane
+from photoplan.products.characterise_common import Run, black_of, exposure_runs
+from photoplan.products.characterise_data import SeriesData
+from photoplan.quality.camera.saturation import FullWell, find_saturation, full_well
+
+__all__ = ["full_well_notes", "with_full_wells"]
+
+_LEAST = 4
+
+
+def with_full_wells(data: SeriesData) -> SeriesData:
+    """The same series with the grey values of full elements, where its flat frames show them; reads those frames."""
+    wells: dict[str, FullWell] = {}
+    for run in exposure_runs(data, ("flat",), _LEAST):
+        for plane in data.planes:
+            found = _find(data, run, plane)
+            if found is not None and (plane.name not in wells or found.level_dn < wells[plane.name].level_dn):
+                wells[plane.name] = found
+    return SeriesData(data.series, data.watch, wells) if wells else data
+
+
+def full_well_notes(data: SeriesData) -> tuple[str, ...]:
+    """What to tell of them."""
+    return tuple(
+        f"{f'{name}: ' if name else ''}the sensor is full at {well.level_dn:.4g} DN, below the largest grey value "
+        f"{data.series.saturation_dn:g}: samples from {well.least_dn:.4g} DN on count as saturated"
+        for name, well in data.wells.items()
+    )
+
+
+def _find(data: SeriesData, run: Run, plane: Plane) -> FullWell | None:
+    levels = [data.levels(setting)[plane.name] for setting in run.settings]
+    variance = np.array([level.temporal_variance for level in levels])
+    try:
+        found = find_saturation(
+            run.values,
+            [level.mean for level in levels],
+            black_of(data, run.settings[0], plane).mean,
+            [level.saturated_share for level in levels],
+            variance if np.isfinite(variance).all() else None,
+        )
+    except InputError:  # every level is cut off at the largest grey value: told by the analyses themselves
+        return None
+    if found is None or found.rule == "clipping":
+        return None
+    stack = data.stacks(run.settings[-1])[plane.name]
+    seen = stack.mean if stack.counted is None else stack.mean[stack.counted]
+    return full_well(seen, stack.level.temporal_variance)
