@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from photoplan.errors import GeometryError, InputError
-from photoplan.quality.camera.fall_off_adjust import FallOffSettings, Fit, adjust, columns, separability, significant
+from photoplan.quality.camera.fall_off_adjust import (
+    FallOffSettings,
+    Fit,
+    adjust,
+    columns,
+    separability,
+    significant,
+    weakest,
+)
 from photoplan.quality.camera.fall_off_blocks import Blocks, to_blocks
 from photoplan.quality.camera.fall_off_model import FallOffModel, half_diagonal
 
@@ -149,6 +157,8 @@ def fit_fall_off(
     kept = significant(blocks, fit)
     if kept != fit.terms:
         fit = adjust(blocks, settings, kept, fit.weights)
+    while (weak := weakest(fit)) is not None:
+        fit = adjust(blocks, settings, tuple(term for term in fit.terms if term != weak), fit.weights)
     found = _result(blocks, settings, fit, (rank, shares))
     # A surface that is not general leaves asymmetry too; only the general one can say that nothing smooth fits.
     general = settings.artificial == "surface"

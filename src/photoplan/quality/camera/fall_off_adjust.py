@@ -13,7 +13,7 @@ from photoplan.errors import GeometryError, InputError
 from photoplan.quality.camera.fall_off_blocks import Blocks, robust_weights
 from photoplan.quality.camera.fall_off_model import MOST_DEGREE, half_diagonal, surface_terms, term_values
 
-__all__ = ["FallOffSettings", "Fit", "adjust", "columns", "separability", "significant"]
+__all__ = ["FallOffSettings", "Fit", "adjust", "columns", "separability", "significant", "weakest"]
 
 Array = NDArray[np.float64]
 
@@ -218,3 +218,17 @@ def significant(blocks: Blocks, fit: Fit) -> tuple[tuple[int, int], ...]:
     effect = np.abs(Q.T @ (blocks.known * fit.weights))[1:]
     strong = {term for term, e in zip(fit.terms, effect) if e > SIGNIFICANT * max(spread, 1e-300)}
     return tuple(t for t in fit.terms if any(s[1] == t[1] and s[0] >= t[0] for s in strong))
+
+
+def weakest(fit: Fit) -> tuple[int, int] | None:
+    """The least significant term of those that are the highest of their direction; None: all of these count.
+
+    What `significant` keeps may have carried a part of terms of higher degree, since terms are not at right angles to
+    each other on a rectangle.
+    """
+    first = len(fit.free) + 1
+    sigmas = np.sqrt(np.maximum(np.diag(fit.covariance)[first:], 1e-300))
+    tops = {m: max(n for n, other in fit.terms if other == m) for _, m in fit.terms}
+    values = {term: abs(a) / s for term, a, s in zip(fit.terms, fit.linear[1:], sigmas) if tops[term[1]] == term[0]}
+    term = min(values, key=values.__getitem__, default=None)
+    return term if term is not None and values[term] < SIGNIFICANT else None
