@@ -16,7 +16,7 @@ demo: $(STAMP)
 	$(BIN)/photoplan demo demo
 
 test: lint docs test-nojit
-	$(BIN)/python -m pytest -m "not slow and not bench"
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile -m "not slow and not bench"
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m "slow"
