@@ -19,6 +19,8 @@ from photoplan.io.orientation_file import read_orientation, read_orientation_blo
 from photoplan.io.orientation_table import TableFormat
 
 FORMATS = {"bluh": "", "bingo": "ORIA "}
+#: What a user has to declare of each.
+FORMS = {"bluh": TableFormat(angle_unit="gon"), "bingo": TableFormat()}
 #: φ, ω, κ in gon.
 LINES = {
     "4711": (512345.678, 5274112.875, 2630.44, -1.3894, 0.8331, 98.3333),
@@ -35,7 +37,7 @@ def text(keyword, lines=LINES):
 def test_ground_points_fall_on_the_pixels_of_the_collinearity_equations(tmp_path, name, keyword):
     path = tmp_path / "block.dat"
     path.write_text(text(keyword))
-    table = read_orientation(path, format=name)
+    table = read_orientation(path, FORMS[name], name)
     expected = []
     for X, Y, Z, *pok in LINES.values():
         p, o, k = (v * pi / 200 for v in pok)
@@ -58,7 +60,7 @@ def test_lines_mean_what_a_published_program_takes_them_for(tmp_path, name, keyw
     rows = [f"{keyword}{n}  {'  '.join(map(str, v))}  1" for n, v in LINES.items()]
     others = ["* orientations", "", "CORD 101 512300.0 5274150.0 500.0 0"] if keyword else []
     path.write_text("\n".join([*others, *rows]) + "\n")
-    table = read_orientation(path, format=name)
+    table = read_orientation(path, FORMS[name], name)
     expected = []
     for X, Y, Z, *gon in LINES.values():
         p, o, k = (v / 200 * pi for v in gon)
@@ -78,14 +80,14 @@ def test_lines_mean_what_a_published_program_takes_them_for(tmp_path, name, keyw
 def test_written_and_read_again(tmp_path, name):
     made = block()
     (path,) = write_orientation(made, tmp_path / "out.ori", name)
-    again = read_orientation(path, format=name)
+    again = read_orientation(path, FORMS[name], name)
     np.testing.assert_allclose(again.centers, made.table.centers, atol=5.1e-5)
     # Eight decimals of a gon are 1.6e-10 radians.
     np.testing.assert_allclose(again.rotations, made.table.rotations, atol=2e-10)
     np.testing.assert_allclose(our_pixels(again), our_pixels(made.table), atol=2e-3)
     assert [i.name for i in again.images] == [i.name for i in made.table.images]
     # What was read is written without change.
-    (second,) = write_orientation(read_orientation_block(path, format=name), tmp_path / "second.ori", name)
+    (second,) = write_orientation(read_orientation_block(path, FORMS[name], name), tmp_path / "second.ori", name)
     assert second.read_text() == path.read_text()
 
 
@@ -105,7 +107,8 @@ def test_other_conventions_are_declared(tmp_path):
     assert (table.angle_unit, table.rotation, table.direction) == ("rad", "kpo", "ground-to-camera")
     assert table.images[0].angles == (3.0, 1.0, 2.0)
     # The value that is the default of tables has to be declared expressly.
-    assert read_orientation(path, TableFormat(angle_unit="deg"), "bluh").angle_unit == "gon"
+    with pytest.raises(InputError, match="tells the unit of angles in files of BLUH; declare --angle-unit"):
+        read_orientation(path, TableFormat(angle_unit="deg"), "bluh")
     declared = TableFormat(angle_unit="deg", rotation="opk", declared=frozenset({"angle_unit", "rotation"}))
     table = read_orientation(path, declared, "bluh")
     assert (table.angle_unit, table.rotation) == ("deg", "opk")
@@ -130,7 +133,7 @@ def test_fault_18_broken_files_name_the_line(tmp_path, content, says):
     path = tmp_path / "b.ori"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(InputError, match=says):
-        read_orientation(path, format="bluh")
+        read_orientation(path, FORMS["bluh"], "bluh")
 
 
 def test_fault_18_bingo_names_the_line(tmp_path):
@@ -146,7 +149,7 @@ def test_fault_18_bingo_names_the_line(tmp_path):
 def test_fortran_exponents_and_further_columns(tmp_path):
     path = tmp_path / "b.ori"
     path.write_text("a 1.5D+03 2 3 .4 -5. +6 0.01 0.01 0.01\n")
-    image = read_orientation(path, format="bluh").images[0]
+    image = read_orientation(path, FORMS["bluh"], "bluh").images[0]
     assert image.center == (1500.0, 2.0, 3.0)
     assert image.angles == (0.4, -5.0, 6.0)
 

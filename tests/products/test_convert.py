@@ -19,6 +19,8 @@ from photoplan.products.convert_readings import list_readings
 
 MINE = ("csv", "toml", "patb", "bingo", "bluh", "inpho")
 FROM_CAMERA = TableFormat(declared=frozenset({"direction"}))
+#: What has to be declared of files whose makers do not tell it.
+DECLARED = {"patb": FROM_CAMERA, "bluh": TableFormat(angle_unit="gon")}
 
 
 @pytest.fixture
@@ -35,7 +37,7 @@ def test_there_and_back_every_pixel_stays(tmp_path, toml, target):
     assert done.files[0] == there
     assert (done.source_format, done.target_format, done.images) == ("toml", target, 3)
     back = tmp_path / "back.csv"
-    form = FROM_CAMERA if target == "patb" else TableFormat()
+    form = DECLARED.get(target, TableFormat())
     convert_orientation(ConvertRequest(there, "csv", back, format=target, form=form))
     again = read_orientation_block(back).table
     assert [i.name for i in again.images] == list(NAMES)

@@ -1,8 +1,9 @@
 """Orientation files of BLUH, the bundle adjustment of the University of Hannover.
 
-A line for each image: name, X0, Y0, Z0 in metres, φ, ω, κ in gon; φ about Y is the primary rotation, then ω, then κ
-(rotation: Š. Turek, master's thesis, Czech Technical University in Prague, 2014, who names it BLUH's). For the columns
-no public description was found. Files of other make look the same, so the format has to be stated.
+A line for each image: name, X0, Y0, Z0 in metres, φ, ω, κ; φ about Y is the primary rotation, then ω, then κ
+(rotation: Š. Turek, master's thesis, Czech Technical University in Prague, 2014, who names it BLUH's). For columns and
+unit no public description was found: the unit has to be declared, and since files of other make look the same, the
+format has to be stated.
 """
 
 from __future__ import annotations
@@ -29,10 +30,16 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     Raises
     ------
     InputError
-        A line does not hold a name and six numbers; the message names it.
+        The unit of angles is not declared, or a line does not hold a name and six numbers; the message names it.
     """
     rows = []
-    for line in word_lines(path):
+    lines = word_lines(path)
+    if not form.declares_angle_unit:
+        raise InputError(
+            f"{path}: no public description tells the unit of angles in files of BLUH; declare --angle-unit gon, deg "
+            "or rad (with measured points, --list-readings tells which)"
+        )
+    for line in lines:
         if len(line.words) < COLUMNS:
             raise InputError(
                 f"{line.where}: {len(line.words)} columns; a line of BLUH holds name, X, Y, Z, phi, omega, kappa"
@@ -43,7 +50,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
 
 
 def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
-    """The text of a file."""
+    """The text of a file, angles in gon."""
     require_map(block, path)
     return {path: "".join(f"{line}\n" for line in angle_lines(block, path, NAME))}
 

@@ -50,10 +50,15 @@ class TableFormat:
     def conventions(self, angle_unit: str, rotation: str, direction: Direction) -> tuple[str, str, Direction]:
         """Angle unit, rotation and direction for a format that defines its own: those, unless others are declared."""
         return (
-            self.angle_unit if self._is_declared("angle_unit", "deg") else angle_unit,
+            self.angle_unit if self.declares_angle_unit else angle_unit,
             self.rotation if self._is_declared("rotation", "opk") else rotation,
             self.direction if self.declares_direction else direction,
         )
+
+    @property
+    def declares_angle_unit(self) -> bool:
+        """Whether a user declared the unit of angles."""
+        return self._is_declared("angle_unit", "deg")
 
     @property
     def declares_direction(self) -> bool:
