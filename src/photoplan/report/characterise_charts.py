@@ -136,7 +136,7 @@ class ChartDrawer:
         small = _reduced(values, factor)
         height, width = values.shape[0] * picture.factor, values.shape[1] * picture.factor
         left, right, bottom, top = picture.extent or (-0.5, width - 0.5, height - 0.5, -0.5)
-        tall = float(np.clip(5.6 * height / width, 1.2, 7.0)) if picture.extent is None else 3.6
+        tall = float(np.clip((_SIZE[0] - 1.6) * height / width, 1.2, 7.0)) if picture.extent is None else 3.6
         fig = self._mpl.figure.Figure(figsize=(_SIZE[0], tall + 0.6), layout="constrained")
         axes = fig.subplots()
         aspect = "equal" if picture.extent is None else "auto"

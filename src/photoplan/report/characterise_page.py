@@ -49,7 +49,11 @@ def characterise_page(facts: SeriesFacts, parts: Sequence[AnalysisPart], drawer:
     refused = sum(len(part.refused) for part in done)
     head = headline(
         [
-            (str(len(done)), "analyses", ", ".join(part.title.lower() for part in done)),
+            (
+                str(len(done)),
+                "analysis" if len(done) == 1 else "analyses",
+                ", ".join(part.title.lower() for part in done),
+            ),
             (str(sum(len(part.figures) for part in done)), "figures", f"{refused} refused, with the reason"),
             (facts.saturation, "saturation DN", " · ".join(filter(None, [facts.frames, facts.size]))),
         ]

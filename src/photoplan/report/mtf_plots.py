@@ -104,7 +104,8 @@ class MtfPlots:
         """
         width, height = size
         with self._mpl.rc_context(STYLE):
-            tall = float(np.clip(_WIDTH * height / width, 2.0, 9.0))
+            # Beside the picture are its axis and the colours.
+            tall = float(np.clip((_WIDTH - 1.4) * height / width, 1.4, 9.0))
             fig, axes = axes_of(self._mpl, _WIDTH, tall + 0.6)
             box = (-0.5, width - 0.5, height - 0.5, -0.5)
             axes.imshow(small, cmap="gray", vmin=-60, vmax=300, extent=box, interpolation="antialiased")

@@ -150,7 +150,7 @@ class PatternPlots:
         assert facts.picture is not None
         rows, columns = facts.picture.shape
         with self._mpl.rc_context({**STYLE, "axes.grid": False}):
-            fig, axes = axes_of(self._mpl, _WIDTH, float(np.clip(_WIDTH * rows / columns, 2.0, 8.5)))
+            fig, axes = axes_of(self._mpl, _WIDTH, float(np.clip((_WIDTH - 0.5) * rows / columns + 0.5, 1.4, 8.5)))
             low, high = np.nanquantile(facts.picture, [0.005, 0.995])
             axes.imshow(facts.picture, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
             for resolved, colour in ((True, GREEN), (False, RED)):
