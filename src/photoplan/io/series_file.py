@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 
 from photoplan.errors import InputError
@@ -41,6 +42,8 @@ class Group:
     mask: Path | None
     label: str
     """How messages call it."""
+    most_dn: float = inf
+    """Largest grey value that the stated bits make."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,8 @@ def read_series(path: Path) -> Series:
     frames: list[Frame] = []
     inputs: list[Path] = [path]
     facts = _Facts()
+    bits = entries.camera.bits
+    most = inf if bits is None or entries.camera.saturation_dn else 2.0**bits - 1
     for index, entry in enumerate(entries.frames):
         where = _where(path, index, entry)
         files = _files_of(folder, entry, where)
@@ -115,7 +120,7 @@ def read_series(path: Path) -> Series:
         for file, values in files.items():
             facts = facts.join(file, where)
             assert facts.size is not None
-            group = Group(index, entry, _window(entry, facts.size, where), mask, where)
+            group = Group(index, entry, _window(entry, facts.size, where), mask, where, most)
             frames.append(_frame(file, group, values, _row_of(conditions, file, table), entries.camera))
         if mask is not None:
             _check_mask(mask, facts, where)
@@ -131,7 +136,6 @@ def read_series(path: Path) -> Series:
         positions.append(read_positions(source, table_of))
         inputs.append(source)
     _refuse_twice(path, frames)
-    bits = entries.camera.bits
     saturation = entries.camera.saturation_dn or (2.0**bits - 1.0 if bits else facts.largest)
     return Series(
         path,

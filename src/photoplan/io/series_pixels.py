@@ -74,7 +74,7 @@ def frame_pixels(frame: Frame, window: Window | None = None) -> NDArray[Any]:
     Raises
     ------
     InputError
-        The file is damaged, or has pixels without a value.
+        The file is damaged, has pixels without a value, or grey values that the stated bits cannot make.
     """
     window = frame.group.window if window is None else window
     if window.size > MAX_PIXELS:
@@ -87,6 +87,13 @@ def frame_pixels(frame: Frame, window: Window | None = None) -> NDArray[Any]:
         raise InputError(
             f"{frame.group.label}: {frame.file.name} has {int((~valid).sum())} pixels without a value (nodata, alpha "
             "or NaN); raw frames have a value in every pixel"
+        )
+    largest = float(pixels.max())
+    if largest > frame.group.most_dn:
+        raise InputError(
+            f"{frame.group.label}: {frame.file.name} has the grey value {largest:.10g}, but camera.bits allow "
+            f"{frame.group.most_dn:.10g}; correct the bits (where they are the upper ones of the files' type, leave "
+            "them out)"
         )
     return pixels
 

@@ -18,6 +18,7 @@ from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_full_well import full_well_notes, with_full_wells
 from photoplan.products.characterise_registry import ANALYSES, Analysis
 from photoplan.products.characterise_result import Figure, Outcome, Table
+from photoplan.products.characterise_steps import step_notes, with_grey_step
 from photoplan.products.plain_values import plain
 from photoplan.report.characterise_charts import ChartDrawer
 from photoplan.report.characterise_page import AnalysisPart, SeriesFacts, characterise_page
@@ -135,12 +136,13 @@ def characterise(
     if request.dry_run:
         return CharacteriseReport(series, tuple(runs), ())
     with begin(sum(run.missing is None for run in runs)) as advance:
-        data = with_full_wells(data)
+        data = with_full_wells(with_grey_step(data))
+        series = data.series
         for k, run in enumerate(runs):
             if run.missing is None:
                 runs[k] = _run(run.analysis, data)
                 advance(1, 0)
-    notes = full_well_notes(data)
+    notes = (*step_notes(data), *full_well_notes(data))
     written = _write_tables(request, series, runs)
     if request.report is not None and drawer is not None:
         text = characterise_page(_facts(data, notes), [_part(run) for run in runs], drawer)

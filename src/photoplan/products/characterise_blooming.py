@@ -62,7 +62,7 @@ def _plane(data: SeriesData, run: Run, plane: Plane, images: list[np.ndarray]) -
     blacks = [black_of(data, setting, plane).mean for setting in run.settings]
     if not isfinite(data.saturation_dn(plane.name)):
         raise InputError("the largest grey value is not known; give camera.bits or camera.saturation_dn")
-    found = find_blooming(run.values, images, blacks, data.saturation_dn(plane.name))
+    found = find_blooming(run.values, images, blacks, data.saturation_dn(plane.name), data.step)
     where = {"plane": plane.name, "at": run.label}
     figures: list[Figure] = []
     refused: dict[str, str] = {}

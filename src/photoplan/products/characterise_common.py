@@ -22,6 +22,7 @@ __all__ = [
     "black_of",
     "dark_levels",
     "exposure_runs",
+    "of_one_temperature",
     "prefix",
     "saturation_of",
     "tried",
@@ -111,7 +112,7 @@ def black_of(data: SeriesData, setting: Setting, plane: Plane) -> Black:
     known: list[tuple[float, Level]] = []
     clipped = False
     for dark in data.settings("dark"):
-        if _differ(dark, setting):
+        if not of_one_temperature(dark, setting):
             continue
         level = data.levels(dark)[plane.name]
         clipped = clipped or is_clipped_dark(level)
@@ -144,9 +145,10 @@ def _sigma(level: Level) -> float:
     return level.mean_sigma if isfinite(level.mean_sigma) else 0.0
 
 
-def _differ(dark: Setting, setting: Setting) -> bool:
+def of_one_temperature(dark: Setting, setting: Setting) -> bool:
+    """Whether dark frames fit to a setting: where both state a temperature, to half a degree."""
     a, b = dark.first.temperature_c, setting.first.temperature_c
-    return a is not None and b is not None and abs(a - b) > 0.5
+    return a is None or b is None or abs(a - b) <= 0.5
 
 
 def dark_levels(data: SeriesData, plane: Plane) -> list[Level]:

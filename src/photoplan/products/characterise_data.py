@@ -55,6 +55,8 @@ class SeriesData:
     """Called with 1 after each frame that was read."""
     wells: Mapping[str, FullWell] = field(default_factory=dict)
     """Planes that are full below the largest grey value of the series."""
+    step: float = 1.0
+    """Distance of neighbouring grey values."""
     planes: tuple[Plane, ...] = field(init=False)
     _levels: dict[tuple[int, str], dict[str, Level]] = field(default_factory=dict, init=False)
     _last: dict[tuple[int, str], dict[str, FrameStack]] = field(default_factory=dict, init=False)

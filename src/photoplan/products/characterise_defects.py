@@ -68,13 +68,13 @@ def _setting(data: SeriesData, setting: Setting, plane: Plane, how: tuple[tuple[
     kinds, share = how
     stack = data.stacks(setting)[plane.name]
     level = stack.level
-    found = find_defects(stack.mean, level.temporal_variance, level.frames, kinds, share)  # type: ignore[arg-type]
-    lines = find_lines(stack.mean)
+    found = find_defects(stack.mean, level.temporal_variance, level.frames, kinds, share, data.step)  # type: ignore[arg-type]
+    lines = find_lines(stack.mean, data.step)
     refused: dict[str, str] = {}
     lists = {"pixels": found, "lines": lines}
     try:
         assert stack.variance is not None
-        lists["blinking"] = find_blinking(stack.variance, level.frames)
+        lists["blinking"] = find_blinking(stack.variance, level.frames, data.step)
     except InputError as error:
         refused[prefix("blinking pixels", plane.name, setting.label)] = str(error)
     figures = _figures(lists, kinds, plane.name, setting.label)

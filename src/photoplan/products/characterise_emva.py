@@ -11,7 +11,7 @@ from photoplan.errors import InputError
 from photoplan.io.series_pixels import Plane
 from photoplan.io.series_statistics import ReducedPoint
 from photoplan.products import characterise_dark, characterise_pattern
-from photoplan.products.characterise_common import Run, exposure_runs, prefix, tried
+from photoplan.products.characterise_common import Run, exposure_runs, of_one_temperature, prefix, tried
 from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
 from photoplan.products.characterise_transfer import reduced_level
@@ -78,7 +78,7 @@ def analyse(data: SeriesData) -> Outcome:
 
 def _of_reduced(data: SeriesData) -> Outcome:
     bright, dark = ([_reduced(p) for p in data.series.reduced_of(kind)] for kind in ("flat", "dark"))
-    found = tried("EMVA 1288", lambda: _sheet(bright, dark, "", ""))
+    found = tried("EMVA 1288", lambda: _sheet(bright, dark, ("", ""), 1.0))
     gain = next((f for f in found.figures if f.name == "gain_dn_e"), None)
     no_images = Outcome(refused={"DSNU and PRNU": "reduced figures hold no images; give frames"})
     if gain is None:
@@ -120,7 +120,8 @@ def _taken(others: Outcome, plane: Plane, gain: Figure, label: str) -> Outcome:
 
 def _of_frames(data: SeriesData, run: Run, plane: Plane) -> Outcome:
     bright = [_point(data, s, plane.name) for s in run.settings if len(s.frames) >= 2]
-    settings = [s for s in data.settings("dark") if len(s.frames) >= 2]
+    darks = [s for s in data.settings("dark") if len(s.frames) >= 2]
+    settings = [s for s in darks if of_one_temperature(s, run.settings[0])]
     levels = [data.levels(s)[plane.name] for s in settings]
     clipped = [level for level in levels if is_clipped_dark(level)]
     if clipped:
@@ -128,7 +129,8 @@ def _of_frames(data: SeriesData, run: Run, plane: Plane) -> Outcome:
         raise InputError(
             f"black is cut off: {share:.3g} % of the samples of dark frames are zero; raise the camera's black level"
         )
-    return _sheet(bright, [_point(data, s, plane.name) for s in settings], plane.name, run.label)
+    dark = [_point(data, s, plane.name) for s in settings]
+    return _sheet(bright, dark, (plane.name, run.label), data.step)
 
 
 def _reduced(point: ReducedPoint) -> _Point:
@@ -142,7 +144,8 @@ def _point(data: SeriesData, setting: Setting, name: str) -> _Point:
     return _Point(photons, setting.first.exposure_ms, level.mean, level.temporal_variance, level.degrees)
 
 
-def _sheet(bright: list[_Point], dark: list[_Point], plane: str, label: str) -> Outcome:
+def _sheet(bright: list[_Point], dark: list[_Point], of: tuple[str, str], step: float) -> Outcome:
+    plane, label = of
     by_exposure = {point.exposure: point for point in dark}
     pairs = [(p, by_exposure[p.exposure]) for p in bright if p.exposure in by_exposure]
     notes = []
@@ -160,7 +163,7 @@ def _sheet(bright: list[_Point], dark: list[_Point], plane: str, label: str) -> 
         np.array([d.variance for _, d in pairs], float),
         np.array([p.samples for p, _ in pairs], float),
     )
-    found = emva_sheet(points)
+    found = emva_sheet(points, step)
     where = {"plane": plane, "at": label}
     figures = tuple(
         Figure(name, value, sigma, words, unit, **where)

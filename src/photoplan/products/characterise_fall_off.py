@@ -13,7 +13,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.fall_off_file import FallOffEntry, TermEntry, fall_off_text
 from photoplan.io.series_pixels import Plane
-from photoplan.products.characterise_common import black_of
+from photoplan.products.characterise_common import black_of, of_one_temperature
 from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_groups import FrameGroup
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
@@ -89,7 +89,7 @@ def _brightest(data: SeriesData) -> Setting:
 def _dark(data: SeriesData, flat: Setting) -> tuple[dict[str, Array | float], str]:
     """Mean dark image at the same exposure and window, else the grey value that other dark frames or the file tell."""
     for setting in data.settings("dark"):
-        same = setting.first.exposure_ms == flat.first.exposure_ms
+        same = setting.first.exposure_ms == flat.first.exposure_ms and of_one_temperature(setting, flat)
         if same and setting.first.group.window == flat.first.group.window:
             return {n: s.mean for n, s in data.stacks(setting).items()}, f"{setting.label} subtracted"
     blacks = {plane.name: black_of(data, flat, plane) for plane in data.planes}

@@ -7,6 +7,9 @@ would be measured on them.
 
 from __future__ import annotations
 
+from dataclasses import replace
+from math import isfinite
+
 import numpy as np
 
 from photoplan.errors import InputError
@@ -28,14 +31,16 @@ def with_full_wells(data: SeriesData) -> SeriesData:
             found = _find(data, run, plane)
             if found is not None and (plane.name not in wells or found.level_dn < wells[plane.name].level_dn):
                 wells[plane.name] = found
-    return SeriesData(data.series, data.watch, wells) if wells else data
+    return replace(data, wells=wells) if wells else data
 
 
 def full_well_notes(data: SeriesData) -> tuple[str, ...]:
     """What to tell of them."""
+    largest = data.series.saturation_dn
+    below = f", below the largest grey value {largest:g}" if isfinite(largest) else ""
     return tuple(
-        f"{f'{name}: ' if name else ''}the sensor is full at {well.level_dn:.4g} DN, below the largest grey value "
-        f"{data.series.saturation_dn:g}: samples from {well.least_dn:.4g} DN on count as saturated"
+        f"{f'{name}: ' if name else ''}the sensor is full at {well.level_dn:.4g} DN{below}: "
+        f"samples from {well.least_dn:.4g} DN on count as saturated"
         for name, well in data.wells.items()
     )
 
@@ -57,4 +62,4 @@ def _find(data: SeriesData, run: Run, plane: Plane) -> FullWell | None:
         return None
     stack = data.stacks(run.settings[-1])[plane.name]
     seen = stack.mean if stack.counted is None else stack.mean[stack.counted]
-    return full_well(seen, stack.level.temporal_variance)
+    return full_well(seen, stack.level.temporal_variance, data.step)

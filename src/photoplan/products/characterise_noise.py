@@ -16,8 +16,6 @@ __all__ = ["analyse", "missing"]
 
 #: What stands still: between frames of other kinds the scene or its brightness changes.
 _KINDS = ("dark", "flat", "scene", "wedge", "drift")
-#: Standard deviation of rounding to whole grey values (Behr 1989, eq. 3.14).
-_ROUNDING = 1 / sqrt(12)
 
 
 def missing(data: SeriesData) -> str | None:
@@ -32,11 +30,11 @@ def analyse(data: SeriesData) -> Outcome:
     settings = [setting for setting in data.settings(*_KINDS) if len(setting.frames) >= 2]
     levels = [(setting.label, data.levels(setting)) for setting in settings]
     return joined(
-        [_plane(plane.name, [(label, level[plane.name]) for label, level in levels]) for plane in data.planes]
+        [_plane(data, plane.name, [(label, level[plane.name]) for label, level in levels]) for plane in data.planes]
     )
 
 
-def _plane(name: str, levels: list[tuple[str, Level]]) -> Outcome:
+def _plane(data: SeriesData, name: str, levels: list[tuple[str, Level]]) -> Outcome:
     ordered = sorted(levels, key=lambda item: item[1].mean)
     rows, refused = [], {}
     for label, level in ordered:
@@ -61,9 +59,10 @@ def _plane(name: str, levels: list[tuple[str, Level]]) -> Outcome:
         )
     head = ("plane", "mean_dn", "sigma_dn", "sigma_of_sigma_dn", "frames", "pixels", "not_clipped", "setting")
     x = np.array([row[1] for row in sound_rows])
+    rounding = data.step / sqrt(12)  # Behr 1989, eq. 3.14
     chart = Chart(
         f"Noise against grey value{f' {name}' if name else ''}",
-        f"Standard deviation of a pixel between frames; the dashed line is rounding alone ({_ROUNDING:.3f} DN).",
+        f"Standard deviation of a pixel between frames; the dashed line is rounding alone ({rounding:.3g} DN).",
         "mean grey value DN",
         "noise DN",
         (
@@ -72,7 +71,7 @@ def _plane(name: str, levels: list[tuple[str, Level]]) -> Outcome:
             ),
             Curve(
                 np.array([x.min(), x.max()]) if x.size else x,
-                np.full(min(2, 2 * x.size), _ROUNDING),
+                np.full(min(2, 2 * x.size), rounding),
                 "rounding",
                 "dashed",
             ),

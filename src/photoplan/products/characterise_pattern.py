@@ -8,7 +8,7 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.io.series_pixels import Plane
-from photoplan.products.characterise_common import black_of, prefix, tried
+from photoplan.products.characterise_common import black_of, of_one_temperature, prefix, tried
 from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
 from photoplan.quality.camera.fixed_pattern import (
@@ -36,9 +36,11 @@ def missing(data: SeriesData) -> str | None:
     return "no setting of dark or flat frames has two frames or more"
 
 
-def _best_dark(data: SeriesData) -> Setting | None:
-    """The dark setting with the most frames."""
-    settings = [s for s in data.settings("dark") if len(s.frames) >= 2]
+def _best_dark(data: SeriesData, flat: Setting | None = None) -> Setting | None:
+    """The dark setting with the most frames, of the flat frames' temperature."""
+    settings = [
+        s for s in data.settings("dark") if len(s.frames) >= 2 and (flat is None or of_one_temperature(s, flat))
+    ]
     return max(settings, key=lambda s: len(s.frames), default=None)
 
 
@@ -85,9 +87,10 @@ def _matching_dark(data: SeriesData, flat: Setting | None) -> Setting | None:
     """Dark frames of the same exposure as the flat ones, else those with the most frames."""
     if flat is not None:
         for setting in data.settings("dark"):
-            if setting.first.exposure_ms == flat.first.exposure_ms and len(setting.frames) >= 2:
+            same = setting.first.exposure_ms == flat.first.exposure_ms and of_one_temperature(setting, flat)
+            if same and len(setting.frames) >= 2:
                 return setting
-    return _best_dark(data)
+    return _best_dark(data, flat)
 
 
 def _variance(stack: FrameStack, filtered: bool) -> PatternVariance:

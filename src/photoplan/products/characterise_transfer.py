@@ -56,7 +56,7 @@ def reduced_level(data: SeriesData, point: ReducedPoint) -> Level:
 def _plane(name: str, bright: list[Level], dark: list[Level], data: SeriesData) -> Outcome:
     black = data.series.camera.black_level_dn
     stated = "black_level_dn" in data.series.camera.model_fields_set
-    found = photon_transfer(bright, dark, black if stated else float("nan"))
+    found = photon_transfer(bright, dark, black if stated else float("nan"), data.step)
     figures = [
         Figure("gain_dn_e", found.gain, found.gain_sigma, "system gain K", "DN/e", name),
         Figure(
@@ -97,18 +97,18 @@ def _plane(name: str, bright: list[Level], dark: list[Level], data: SeriesData) 
         tuple(figures),
         refused,
         {"levels": Table(("plane", "mean_dn", "variance_dn2", "used"), rows, "Levels and whether the line uses them")},
-        _plots(found, name),
+        _plots(found, name, data.step),
         details={f"photon_transfer{name and f'_{name}'}": found.to_dict()},
     )
 
 
-def _plots(found: PhotonTransfer, name: str) -> tuple[Chart, ...]:
+def _plots(found: PhotonTransfer, name: str, step: float) -> tuple[Chart, ...]:
     """Logarithmic and linear."""
     title = f"Photon transfer{f' {name}' if name else ''}"
     bias = found.bias_dn if np.isfinite(found.bias_dn) else 0.0
     signal = found.mean - bias
     rest = ~found.used
-    least = max(0.1, 1e-5 * float(signal.max()))
+    least = max(0.1 * step, 1e-5 * float(signal.max()))
     seen = (signal > least) & (found.variance > 0)
     grid = np.geomspace(max(float(signal[seen].min()), least), float(signal.max()), 100)
     curves = [Curve(signal[found.used], found.variance[found.used], "used", colour=0)]
@@ -121,7 +121,11 @@ def _plots(found: PhotonTransfer, name: str) -> tuple[Chart, ...]:
         if k.any()
     ]
     model = Curve(
-        grid, np.sqrt(np.maximum(found.line.at(grid + bias), 1e-9)), "√(read² + K · signal)", "dashed", colour=1
+        grid,
+        np.sqrt(np.maximum(found.line.at(grid + bias), 1e-9 * step**2)),
+        "√(read² + K · signal)",
+        "dashed",
+        colour=1,
     )
     caption = f"Slope K = {found.gain:.4g} ± {found.gain_sigma:.2g} DN/e; each point is a level of two frames or more."
     return (

@@ -90,7 +90,7 @@ def _curve(data: SeriesData, patches: list[_Patch], plane: Plane, label: str) ->
     sigma = [
         patch.level.mean_sigma
         if isfinite(patch.level.mean_sigma)
-        else sqrt(max(patch.level.spatial_variance, 1 / 12) / patch.level.pixels)
+        else sqrt(max(patch.level.spatial_variance, data.step**2 / 12) / patch.level.pixels)
         for patch in patches
     ]
     full = saturation_of(data, plane, [patch.level for patch in patches]) - blacks[0].mean

@@ -64,7 +64,11 @@ class Blooming:
 
 
 def find_blooming(
-    exposures: Sequence[float], images: Sequence[NDArray[Any]], black: float | Sequence[float], saturation: float
+    exposures: Sequence[float],
+    images: Sequence[NDArray[Any]],
+    black: float | Sequence[float],
+    saturation: float,
+    step: float = 1.0,
 ) -> Blooming:
     """Onset and extent of blooming around the brightest object.
 
@@ -78,6 +82,8 @@ def find_blooming(
         Grey value without light, of all images or of each.
     saturation : float
         Grey value of full pixels.
+    step : float
+        Distance of neighbouring grey values.
 
     Raises
     ------
@@ -112,7 +118,7 @@ def find_blooming(
             for light, t, full in zip(lights, times, spans)
         ]
     )
-    sigma = _sigmas(lights, times, response, near, safe)
+    sigma = _sigmas(lights, times, response, near, safe, step)
     usable = np.array([float(np.median(light[near])) < 0.95 * full for light, full in zip(lights, spans)])
     object_dn = of_object * times
     onset, onset_sigma, last = _onset(object_dn, excess, sigma, usable)
@@ -199,14 +205,15 @@ def _sigmas(
     response: NDArray[np.float64],
     near: NDArray[np.bool_],
     safe: Sequence[int],
+    step: float,
 ) -> NDArray[np.float64]:
     """Standard deviation of the mean excess: noise of the neighbours, and that of their responses."""
     residual = np.concatenate([(lights[k][near] - response[near] * times[k]) for k in safe])
     freedom = max(residual.size - near.sum(), 1)
-    noise = sqrt(max(float(np.sum(residual**2)) / freedom, 1 / 12))
+    noise = sqrt(max(float(np.sum(residual**2)) / freedom, step**2 / 12))
     of_response = noise / sqrt(float(np.sum(times[list(safe)] ** 2)))
-    level = np.array([max(float(light[near].mean()), 1.0) for light in lights])
-    base = max(float(np.mean(level[list(safe)])), 1.0)
+    level = np.array([max(float(light[near].mean()), step) for light in lights])
+    base = max(float(np.mean(level[list(safe)])), step)
     grown = noise * np.sqrt(np.maximum(level / base, 1.0))  # shot noise
     return np.asarray(np.sqrt(grown**2 + (of_response * times) ** 2) / sqrt(near.sum()))
 

@@ -71,7 +71,12 @@ def _factor(count: int) -> float:
 
 
 def find_defects(
-    mean: NDArray[np.float64], temporal_variance: float, frames: int, kinds: tuple[Kind, ...], share: float = 0.0
+    mean: NDArray[np.float64],
+    temporal_variance: float,
+    frames: int,
+    kinds: tuple[Kind, ...],
+    share: float = 0.0,
+    step: float = 1.0,
 ) -> DefectList:
     """Pixels that differ from their surroundings.
 
@@ -87,6 +92,8 @@ def find_defects(
         ``hot`` (brighter), ``dark`` (darker), or both.
     share : float
         A pixel must differ by this part of its surroundings' grey value, whatever the scatter.
+    step : float
+        Distance of neighbouring grey values.
 
     Raises
     ------
@@ -106,9 +113,9 @@ def find_defects(
     ground = background(mean)
     deviation = mean - ground
     rest = temporal_variance / frames if np.isfinite(temporal_variance) else 0.0
-    scatter = _scatter(deviation, sqrt(1 / 12 / frames + max(rest, 0.0)))
-    # A mean of few frames has rounded values: a step of one grey value in one of them is no defect.
-    threshold = max(_factor(mean.size) * scatter, 1.5 / frames)
+    scatter = _scatter(deviation, sqrt(step**2 / 12 / frames + max(rest, 0.0)))
+    # A mean of few frames has rounded values: one step of the grey values in one of them is no defect.
+    threshold = max(_factor(mean.size) * scatter, 1.5 * step / frames)
     limit = np.maximum(threshold, share * np.abs(ground))
     found = np.zeros(mean.shape, bool)
     if "hot" in kinds:
@@ -125,13 +132,15 @@ def find_defects(
     return DefectList(listed, int(found.sum()), threshold, scatter, deviation)
 
 
-def find_blinking(variance: NDArray[np.float64], frames: int) -> DefectList:
+def find_blinking(variance: NDArray[np.float64], frames: int, step: float = 1.0) -> DefectList:
     """Pixels whose grey value changes from frame to frame far more than that of most.
 
     Parameters
     ----------
     variance : array, shape (h, w)
         Temporal variance of every pixel over `frames` frames.
+    step : float
+        Distance of neighbouring grey values.
 
     Raises
     ------
@@ -141,7 +150,7 @@ def find_blinking(variance: NDArray[np.float64], frames: int) -> DefectList:
     if frames < 4:
         raise InputError(f"{frames} frames at a setting; blinking pixels need four or more")
     usual = float(np.median(variance)) * (frames - 1) / float(chi2.median(frames - 1))
-    if usual < 1e-3:
+    if usual < 1e-3 * step**2:
         raise InputError(
             "most pixels do not change at all from frame to frame (black cut off, or rounding): there is no noise with "
             "which a blinking pixel could be compared"
@@ -159,8 +168,11 @@ def find_blinking(variance: NDArray[np.float64], frames: int) -> DefectList:
     return DefectList(listed, len(rows), sqrt(limit), sqrt(usual), None)
 
 
-def find_lines(mean: NDArray[np.float64]) -> DefectList:
-    """Whole rows and columns brighter or darker than their neighbours: by their medians against running ones."""
+def find_lines(mean: NDArray[np.float64], step: float = 1.0) -> DefectList:
+    """Whole rows and columns brighter or darker than their neighbours: by their medians against running ones.
+
+    `step` is the distance of neighbouring grey values.
+    """
     listed: list[Defect] = []
     worst_limit = worst_scatter = 0.0
     kinds: tuple[tuple[Kind, int], ...] = (("row", 1), ("column", 0))
@@ -168,10 +180,10 @@ def find_lines(mean: NDArray[np.float64]) -> DefectList:
         profile = np.median(mean, axis=axis)
         mixed = profile + (mean.mean(axis=axis) - profile) * 0.1  # medians of grey values come in steps
         deviation = mixed - _running_median(mixed)
-        pixel = _scatter(mean - background(mean), sqrt(1 / 12))
-        scatter = _scatter(deviation, pixel / sqrt(mean.shape[axis]) + 0.02)
+        pixel = _scatter(mean - background(mean), step * sqrt(1 / 12))
+        scatter = _scatter(deviation, pixel / sqrt(mean.shape[axis]) + 0.02 * step)
         # A quarter more: the scatter of a hundred lines is itself known to a tenth only.
-        limit = max(1.25 * _factor(profile.size) * scatter, 0.5)
+        limit = max(1.25 * _factor(profile.size) * scatter, 0.5 * step)
         for k in np.flatnonzero(np.abs(deviation) > limit):
             col, row = (float("nan"), float(k)) if kind == "row" else (float(k), float("nan"))
             listed.append(Defect(kind, col, row, float(deviation[k]), float(abs(deviation[k]) / limit)))

@@ -99,8 +99,8 @@ class EmvaSheet:
         return found | {"used": self.used.tolist(), "refused": dict(self.refused)}
 
 
-def emva_sheet(points: EmvaPoints) -> EmvaSheet:
-    """The sheet of a measurement.
+def emva_sheet(points: EmvaPoints, step: float = 1.0) -> EmvaSheet:
+    """The sheet of a measurement, whose grey values have a distance of `step`.
 
     Raises
     ------
@@ -126,7 +126,7 @@ def emva_sheet(points: EmvaPoints) -> EmvaSheet:
     light = _responsivity(p, signal, used, refused)
     efficiency = 100 * light[0] / gain
     efficiency_sigma = efficiency * sqrt((light[1] / light[0]) ** 2 + (gain_sigma / gain) ** 2) if light[0] > 0 else nan
-    dark_dn, dark_e, dark_sigma = _dark_noise(p, gain, gain_sigma, refused)
+    dark_dn, dark_e, dark_sigma = _dark_noise(p, (gain, gain_sigma), step, refused)
     well = _saturation(p, signal, top if reached else None, gain, gain_sigma, light[0])
     threshold_e = sqrt(p.dark_variance[0] / gain**2 + 0.25) + 0.5 if isfinite(dark_e) else nan
     threshold = threshold_e / (light[0] / gain) if light[0] > 0 else nan
@@ -183,20 +183,24 @@ def _responsivity(
     return _through_origin(p.photons[used], signal[used], np.sqrt(p.variance[used] / (p.samples[used] + 1)))
 
 
-def _dark_noise(p: EmvaPoints, gain: float, gain_sigma: float, refused: dict[str, str]) -> tuple[float, float, float]:
+def _dark_noise(
+    p: EmvaPoints, gain_of: tuple[float, float], step: float, refused: dict[str, str]
+) -> tuple[float, float, float]:
     """Of the shortest exposure: grey values, electrons, sigma."""
+    gain, gain_sigma = gain_of
+    least, rounding = LEAST_VARIANCE * step**2, QUANTISATION * step**2
     variance = float(p.dark_variance[0])
     if not isfinite(variance):
         refused["dark noise"] = "there are no dark frames, two or more at an exposure"
         return nan, nan, nan
-    if variance < LEAST_VARIANCE:
+    if variance < least:
         refused["dark noise"] = (
-            f"the dark variance is {variance:.3g} DN²; below {LEAST_VARIANCE} DN² rounding hides the noise, the "
-            f"standard states it as below {0.4 / gain:.3g} electrons"
+            f"the dark variance is {variance:.3g} DN²; below {least:.3g} DN² rounding hides the noise, the "
+            f"standard states it as below {0.4 * step / gain:.3g} electrons"
         )
         return sqrt(variance), nan, nan
-    noise = sqrt(variance - QUANTISATION) / gain
-    relative = variance * sqrt(2.0 / p.samples[0]) / (2 * (variance - QUANTISATION))
+    noise = sqrt(variance - rounding) / gain
+    relative = variance * sqrt(2.0 / p.samples[0]) / (2 * (variance - rounding))
     return sqrt(variance), noise, noise * sqrt(relative**2 + (gain_sigma / gain) ** 2)
 
 

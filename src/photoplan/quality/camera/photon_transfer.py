@@ -22,7 +22,7 @@ from photoplan.quality.camera.straight_line import StraightLine, fit_line
 
 __all__ = ["QUANTISATION", "PhotonTransfer", "is_clipped_dark", "photon_transfer"]
 
-#: Variance of rounding to whole grey values (Behr 1989, eq. 3.14).
+#: Variance of rounding to whole grey values (Behr 1989, eq. 3.14); of other steps times their square.
 QUANTISATION = 1.0 / 12.0
 #: Below this variance rounding hides the noise (EMVA 1288 release 4 linear, eq. 53, 54).
 LEAST_VARIANCE = 0.24
@@ -74,7 +74,9 @@ def is_clipped_dark(level: Level) -> bool:
     return level.zero_share > ZERO_SHARE
 
 
-def photon_transfer(bright: Sequence[Level], dark: Sequence[Level] = (), black_level: float = nan) -> PhotonTransfer:
+def photon_transfer(
+    bright: Sequence[Level], dark: Sequence[Level] = (), black_level: float = nan, step: float = 1.0
+) -> PhotonTransfer:
     """Gain, read noise and full well from levels of different brightness.
 
     Parameters
@@ -85,6 +87,8 @@ def photon_transfer(bright: Sequence[Level], dark: Sequence[Level] = (), black_l
         Dark frames, the shortest exposure first; its mean is the bias.
     black_level : float
         The bias where there are no dark frames; NaN: unknown, and the read noise is refused.
+    step : float
+        Distance of neighbouring grey values.
 
     Raises
     ------
@@ -119,7 +123,7 @@ def photon_transfer(bright: Sequence[Level], dark: Sequence[Level] = (), black_l
             "not raw frames of a linear sensor, or their levels are too close together"
         )
     bias, bias_sigma = _bias(usable_dark, black_level)
-    read = _read_noise(line, bias, bias_sigma, clipped)
+    read = _read_noise(line, bias, bias_sigma, clipped, step)
     well = _full_well(mean[: len(levels)], peak, line, bias if np.isfinite(bias) else low)
     return PhotonTransfer(line.slope, line.slope_sigma, *read, *well, bias, line, mean, variance, used)
 
@@ -147,7 +151,7 @@ def _bias(dark: Sequence[Level], black_level: float) -> tuple[float, float]:
     return (dark[0].mean, dark[0].mean_sigma) if dark else (black_level, 0.0)
 
 
-def _no_read_noise(total: float, total_sigma: float, bias: float, clipped: Sequence[Level]) -> str:
+def _no_read_noise(total: float, total_sigma: float, bias: float, clipped: Sequence[Level], step: float) -> str:
     """Why there is no read noise; empty: there is."""
     if clipped:
         share = 100 * max(level.zero_share for level in clipped)
@@ -157,26 +161,26 @@ def _no_read_noise(total: float, total_sigma: float, bias: float, clipped: Seque
         )
     if not np.isfinite(bias):
         return "the grey value without light is not known; add dark frames or camera.black_level_dn"
-    if total < LEAST_VARIANCE:
+    if total < LEAST_VARIANCE * step**2:
         return (
-            f"the variance without light is {total:.3g} DN²; below {LEAST_VARIANCE} DN² rounding hides the noise: "
-            "raise the camera's gain"
+            f"the variance without light is {total:.3g} DN²; below {LEAST_VARIANCE * step**2:.3g} DN² rounding hides "
+            "the noise: raise the camera's gain"
         )
-    if total - QUANTISATION < 2 * total_sigma:
+    if total - QUANTISATION * step**2 < 2 * total_sigma:
         return f"the variance without light is {total:.3g} ± {total_sigma:.2g} DN²: not significant"
     return ""
 
 
 def _read_noise(
-    line: StraightLine, bias: float, bias_sigma: float, clipped: Sequence[Level]
+    line: StraightLine, bias: float, bias_sigma: float, clipped: Sequence[Level], step: float
 ) -> tuple[float, float, float, float, str]:
     """Read noise in grey values and electrons with sigmas, and why there is none."""
     total = float(line.at(bias))
     total_sigma = sqrt(line.sigma_at(bias) ** 2 + (line.slope * bias_sigma) ** 2) if np.isfinite(bias) else nan
-    refused = _no_read_noise(total, total_sigma, bias, clipped)
+    refused = _no_read_noise(total, total_sigma, bias, clipped, step)
     if refused:
         return nan, nan, nan, nan, refused
-    read = sqrt(total - QUANTISATION)
+    read = sqrt(total - QUANTISATION * step**2)
     read_sigma = total_sigma / (2 * read)
     _, c01, c11 = line.covariance
     # The variance at the bias and the slope are correlated.

@@ -58,7 +58,7 @@ class FullWell:
     """Grey value from which on a sample may be one of a full element."""
 
 
-def full_well(mean: ArrayLike, temporal_variance: float) -> FullWell:
+def full_well(mean: ArrayLike, temporal_variance: float, step: float = 1.0) -> FullWell:
     """Grey values of full elements, from frames in which most elements are full.
 
     Parameters
@@ -67,11 +67,13 @@ def full_well(mean: ArrayLike, temporal_variance: float) -> FullWell:
         Mean grey value of each element.
     temporal_variance : float
         Of a full element; NaN: unknown, taken as none.
+    step : float
+        Distance of neighbouring grey values.
     """
     values = np.asarray(mean, float)
     level = float(np.median(values))
     pattern = 1.4826 * float(np.median(np.abs(values - level)))
-    noise = sqrt(pattern**2 + (temporal_variance if isfinite(temporal_variance) else 0.0) + 1 / 12)
+    noise = sqrt(pattern**2 + (temporal_variance if isfinite(temporal_variance) else 0.0) + step**2 / 12)
     return FullWell(level, level - _SPREAD * noise)
 
 

@@ -1,0 +1,115 @@
+"""`photoplan characterise` of frames whose grey values have other steps than 1, and of several temperatures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+from numpy.typing import NDArray
+from tools.command import process
+
+SIZE = (64, 48)
+GAIN, READ, BLACK = 0.6, 4.0, 20.0
+SERIES = """
+[camera]
+{camera}
+
+[[frames]]
+kind = "flat"
+files = "flat_{{exposure}}ms_{{photons}}p_*.tif"
+temperature_c = 20.0
+
+[[frames]]
+kind = "dark"
+files = "dark_{{exposure}}ms_{{temperature}}C_*.tif"
+"""
+Values = Callable[[NDArray[np.float64]], NDArray[Any]]
+
+
+def write_series(folder: Path, camera: str, values: Values, current: dict[float, float] | None = None) -> Path:
+    """A sensor of 12 bits with 0.6 grey values for each of the electrons that 50 % of the photons make."""
+    rng = np.random.default_rng(3)
+    offset = rng.normal(0.0, 3.0, SIZE[::-1])
+    offset[20, 30] += 400.0
+    current = current or {20.0: 0.0}
+
+    def write(name: str, electrons: float) -> None:
+        seen = GAIN * (rng.poisson(electrons, offset.shape) + offset + rng.normal(0.0, READ, offset.shape)) + BLACK
+        grey = values(np.clip(np.rint(seen), 0, 4095))
+        with rasterio.open(folder / name, "w", "GTiff", *SIZE, 1, dtype=grey.dtype) as file:
+            file.write(grey, 1)
+
+    for t in (1, 2, 4, 8, 12, 16, 24, 32, 40, 60):
+        for k in range(2):
+            write(f"flat_{t}ms_{240 * t}p_{k}.tif", 120.0 * t + current[20.0] * t / 1000)
+            for temperature, rate in current.items():
+                write(f"dark_{t}ms_{temperature:g}C_{k}.tif", rate * t / 1000)
+    path = folder / "series.toml"
+    path.write_text(SERIES.format(camera=camera))
+    return path
+
+
+def figures(series: Path) -> tuple[dict[tuple[str, str], float], dict[str, Any]]:
+    """Figures by analysis and name, and all that was said."""
+    wanted = ("photon_transfer", "dark_signal", "saturation", "fixed_pattern", "defects", "emva1288", "fall_off")
+    said = process("characterise", series, "--json", "-q", *(word for name in wanted for word in ("--only", name)))
+    assert said.code == 0, said.err
+    report: dict[str, Any] = json.loads(said.out)
+    found = {
+        (part["name"], figure["name"]): figure["value"]
+        for part in report["analyses"]
+        for figure in part.get("figures", ())
+        if part["name"] in ("photon_transfer", "dark_signal", "saturation", "fixed_pattern", "defects")
+        or (part["name"], figure["name"]) == ("emva1288", "temporal_dark_noise_e")
+    }
+    return found, report
+
+
+@pytest.fixture(scope="module")
+def usual(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], float]:
+    """Whole grey values from 0 to 4095."""
+    folder = tmp_path_factory.mktemp("usual")
+    found, _ = figures(write_series(folder, "bits = 12", lambda grey: grey.astype(np.uint16)))
+    assert found["photon_transfer", "read_noise_e"] == pytest.approx(READ, rel=0.02)
+    return found
+
+
+@pytest.mark.parametrize(("factor", "kind"), [(16.0, "uint16"), (1 / 4095, "float32")])
+def test_the_unit_of_grey_values_changes_nothing_else(
+    tmp_path: Path, usual: dict[tuple[str, str], float], factor: float, kind: str
+) -> None:
+    """12 bits in the upper ones of 16, and values from 0 to 1: rounding is that of their steps."""
+    found, report = figures(write_series(tmp_path, "", lambda grey: (grey * factor).astype(kind)))
+    if kind == "uint16":
+        assert report["saturation_dn"] == 65520
+        assert "steps of 16 DN" in report["notes"][0]
+    assert found.keys() == usual.keys()
+    for (analysis, name), value in usual.items():
+        unit = 1 / factor if name == "conversion_e_dn" else factor if "_dn" in name else 1.0
+        assert found[analysis, name] == pytest.approx(value * unit, rel=2e-5, abs=1e-6 * unit), (analysis, name)
+
+
+def test_more_than_the_stated_bits_is_refused(tmp_path: Path) -> None:
+    """Values in the upper bits of their type are no saturated ones."""
+    series = write_series(tmp_path, "bits = 12", lambda grey: (grey * 16).astype(np.uint16))
+    said = process("characterise", series, "-q")
+    assert said.code == 3
+    assert "has the grey value" in said.err
+    assert "camera.bits allow 4095" in said.err
+
+
+def test_dark_frames_of_another_temperature_are_left_out(tmp_path: Path) -> None:
+    """The sheet takes the dark frames of the flat frames' temperature, wherever they stand in the series."""
+    current = {20.0: 100.0, 50.0: 20000.0}
+    _, report = figures(write_series(tmp_path, "bits = 12", lambda grey: grey.astype(np.uint16), current))
+    sheet = {f["name"]: f for f in next(p for p in report["analyses"] if p["name"] == "emva1288")["figures"]}
+    for name, truth in (("gain_dn_e", GAIN), ("quantum_efficiency_percent", 50.0), ("temporal_dark_noise_e", READ)):
+        assert abs(sheet[name]["value"] - truth) < 3.5 * sheet[name]["sigma"], name
+    parts = {part["name"]: part for part in report["analyses"]}
+    assert "20 °C subtracted" in parts["fall_off"]["notes"][0]
+    assert parts["fixed_pattern"]["details"]["dsnu"]["setting"].endswith("20 °C")
