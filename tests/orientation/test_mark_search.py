@@ -73,6 +73,20 @@ def test_four_equal_corners_do_not_tell_the_rotation_and_that_is_said() -> None:
     assert np.abs(errors(stated, truth)).max() < 0.2
 
 
+def test_rotations_that_the_calibrated_values_exclude_are_not_assumed_though_two_others_fit() -> None:
+    """Marks that mirror each other in a diagonal tell the scan by half a turn, but not from its mirrored twin."""
+    marks = {"1": (-26.0, -26.0), "2": (26.1, -25.9), "3": (-25.9, 26.1), "4": (26.0, 26.0)}
+    layout = MarkLayout.of(marks, dict.fromkeys(marks, PATTERN))
+    grey, truth = simulate(Simulated(marks=marks, rotation=180, shrinkage=(0.0, 0.0)), 4)
+    found = find_fiducials(ArrayScan(grey), layout, FiducialSearch(0.1))
+    assert (found.turn.rotation, found.turn.mirrored) == (180, False)
+    assert np.abs(errors(found, truth)).max() < 0.2
+    assert found.sigma0_um < 10
+    (note,) = found.notes
+    assert "180°, 90° mirrored; 180° is assumed" in note
+    assert "excluded by the calibrated values" in note
+
+
 #: A fifth mark on one side tells all turns but the mirrored ones; a sixth, off its middle, those too.
 FIVE = CORNERS | {"5": (26.0, 9.0)}
 

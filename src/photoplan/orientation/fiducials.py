@@ -206,25 +206,27 @@ def _decide(
             continue
         fit = fit_affine(_calibrated(layout), _places(measured, names), mirrored=p.turn.mirrored)
         fits.append((fit.sigma0, p, fit, names))
-    plain = next(f for f in fits if f[1] is chosen)
-    others = [f for f in fits if f[1] is not chosen]
-    if not others:
-        return chosen.turn, plain[2], plain[3], []
-    listed = ", ".join(str(f[1].turn) for f in sorted(fits, key=lambda f: (f[1].turn.mirrored, f[1].turn.rotation)))
-    if plain[2].redundancy:
-        best, second = sorted(fits, key=lambda f: f[0])[:2]
-        noise = max(best[0], FILM_MM / chosen.pixel_mm, _typical_sigma(measured))
-        if second[0] > CLEARLY * noise:
-            said = (
-                f"rotation {best[1].turn} is told by the calibrated values: sigma0 {best[0]:.2f} px, "
-                f"the next ({second[1].turn}) {second[0]:.2f} px"
-            )
-            return best[1].turn, best[2], best[3], [said]
+    if len(fits) == 1:
+        return fits[0][1].turn, fits[0][2], fits[0][3], []
+    fits.sort(key=lambda f: f[0])
+    left = fits
+    if fits[0][2].redundancy:
+        noise = max(fits[0][0], FILM_MM / chosen.pixel_mm, _typical_sigma(measured))
+        left = [f for f in fits if f[0] <= CLEARLY * noise]
+    told = ""
+    if len(left) < len(fits):
+        best, second = left[0], fits[len(left)]
+        told = f"by the calibrated values: sigma0 {best[0]:.2f} px, the next ({second[1].turn}) {second[0]:.2f} px"
+    if len(left) == 1:
+        return left[0][1].turn, left[0][2], left[0][3], [f"rotation {left[0][1].turn} is told {told}"]
+    usual = _usual([f[1] for f in left], known)
+    taken = next(f for f in left if f[1] is usual)
+    listed = ", ".join(str(f[1].turn) for f in sorted(left, key=lambda f: (f[1].turn.mirrored, f[1].turn.rotation)))
     said = (
-        f"the marks fit every one of these rotations of the scan: {listed}; {chosen.turn} is assumed. "
-        "State --rotation and --mirrored if that is wrong"
+        f"the marks fit every one of these rotations of the scan: {listed}; {usual.turn} is assumed. "
+        f"State --rotation and --mirrored if that is wrong{f' (others are excluded {told})' if told else ''}"
     )
-    return chosen.turn, plain[2], plain[3], [said]
+    return taken[1].turn, taken[2], taken[3], [said]
 
 
 def _renamed(layout: MarkLayout, measured: Measured, chosen: Placement, other: Placement) -> dict[str, str] | None:
