@@ -134,6 +134,31 @@ def test_no_defect_is_found_in_noise_alone():
     assert alarms <= 1
 
 
+def test_a_hot_pixel_makes_no_row_or_column_of_it():
+    image = 100 + 2 * np.random.default_rng(5).standard_normal((120, 160))
+    image[0, 100] = image[60, 0] = 4000.0
+    assert find_lines(image).count == 0
+
+
+def test_pixels_that_do_not_count_are_no_defects():
+    """A lit disc on black: neither its border nor what lies beyond is defective, and its column of weak pixels is."""
+    sensor = Sensor(hot=HOT, dead=((70, 90), (2, 2)))
+    height, width = sensor.shape
+    y, x = np.mgrid[:height, :width]
+    disc = np.hypot(x - width / 2, y - height / 2) < 50
+    stack = stack_of(sensor, 9000, 4, 6, 1.0)
+    assert stack.variance is not None
+    mean = np.where(disc, stack.mean, 0.02 * stack.mean)
+    mean[:, 60] *= 0.8
+    outside = np.where(disc, mean, np.nan)
+    found = find_defects(outside, stack.level.temporal_variance, 4, ("hot", "dark"), 0.1)
+    assert {(int(d.row), int(d.col)) for d in found.defects if d.col != 60} == {(70, 90)}
+    assert sum(d.col == 60 for d in found.defects) == int(disc[:, 60].sum())
+    assert [(d.kind, d.col) for d in find_lines(outside).defects] == [("column", 60.0)]
+    assert find_blinking(np.where(disc, stack.variance, np.nan), 4).count == 0
+    assert find_defects(mean, stack.level.temporal_variance, 4, ("hot", "dark"), 0.1).count > 1000
+
+
 def test_blinking_needs_frames_and_noise():
     with pytest.raises(InputError, match="four or more"):
         find_blinking(np.ones((20, 20)), 3)

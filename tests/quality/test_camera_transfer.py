@@ -76,7 +76,13 @@ def test_rounding_is_no_read_noise():
     nine = np.ones(9)
     sheet = emva_sheet(
         EmvaPoints(
-            photons, means, variances, dark.mean * nine, dark.temporal_variance * nine, np.full(9, dark.degrees, float)
+            photons,
+            means,
+            variances,
+            dark.mean * nine,
+            dark.temporal_variance * nine,
+            np.full(9, dark.degrees, float),
+            np.full(9, dark.mean_sigma),
         )
     )
     assert sheet.temporal_dark_noise_e == pytest.approx(8.0, abs=4 * sheet.temporal_dark_noise_e_sigma)
@@ -197,6 +203,55 @@ def test_linearity_error_of_a_straight_and_of_a_bent_curve():
     assert bent.error_max_percent > 0 > bent.error_min_percent
 
 
+@pytest.mark.parametrize(("bend", "least"), [(0.0, 0.9), (1e-4, 0.6), (1e-3, 0.9)])
+def test_normalised_errors_of_the_linearity_error(bend, least):
+    """The deviations share the noise of the line; on a straight curve all of the error is noise, and said to be."""
+    x = np.linspace(8, 90, 10)
+    exact = 10 * x * (1 - bend * x)
+    sigma = np.sqrt(0.002 * exact)
+    truth = linearity(x, exact, sigma, 1000).error_percent
+    normalised = []
+    for run in range(RUNS):
+        found = linearity(x, exact + sigma * np.random.default_rng(run).standard_normal(x.size), sigma, 1000)
+        normalised.append((found.error_percent - truth) / found.error_percent_sigma)
+    assert least < spread_of(normalised, f"linearity error of a bend of {bend:g}") < 1.1
+
+
+def test_read_noise_is_without_the_dark_current_of_the_shortest_dark_frames():
+    """At 20 ms there are 60 electrons of dark current."""
+    sensor, noise = Sensor(shape=(60, 80), dark_current=3000.0), np.random.default_rng(8)
+    bright = [level_of(sensor, p, 20.0, noise) for p in (400, 1200, 2500, 4500, 7000, 10000)]
+    exposures = (20.0, 40.0, 60.0, 100.0)
+    dark = [level_of(sensor, 0, t, noise) for t in exposures]
+    found = photon_transfer(bright, dark, exposures)
+    assert abs(found.read_noise_e - sensor.read_noise) < 3.5 * found.read_noise_e_sigma
+    assert found.read_noise_e_sigma < 0.05 * sensor.read_noise
+
+
+def test_responsivity_of_a_flickering_lamp_has_the_flicker_in_its_standard_deviation():
+    sensor, normalised = Sensor(shape=(24, 30), flicker=0.02), []
+    photons = np.array([400.0, 1200, 2500, 4500, 7000, 10000, 13000])
+    for run in range(150):
+        noise = np.random.default_rng(run)
+        dark = level_of(sensor, 0, 20.0, noise)
+        bright = [level_of(sensor, p, 20.0, noise) for p in photons]
+        same = np.ones(photons.size)
+        sheet = emva_sheet(
+            EmvaPoints(
+                photons,
+                [level.mean for level in bright],
+                [level.temporal_variance for level in bright],
+                dark.mean * same,
+                dark.temporal_variance * same,
+                dark.degrees * same,
+                [np.hypot(level.mean_sigma, dark.mean_sigma) for level in bright],
+            )
+        )
+        truth = sensor.gain * sensor.efficiency
+        normalised.append((sheet.responsivity - truth) / sheet.responsivity_sigma)
+    assert 0.8 < spread_of(normalised, "responsivity") < 1.2
+
+
 def test_line_of_linearity_has_least_relative_deviations():
     noise = np.random.default_rng(0)
     x = np.linspace(10, 90, 9)
@@ -284,6 +339,7 @@ def test_emva_sheet_of_a_simulated_sensor():
             np.full(30, dark.mean),
             np.full(30, dark.temporal_variance),
             np.full(30, dark.degrees),
+            [np.hypot(level.mean_sigma, dark.mean_sigma) for level in bright],
         )
     )
     assert sheet.gain == pytest.approx(0.4, abs=4 * sheet.gain_sigma)
@@ -295,7 +351,9 @@ def test_emva_sheet_of_a_simulated_sensor():
 
 def test_emva_sheet_says_what_it_cannot_know():
     mean = np.linspace(100, 900, 9)
-    points = EmvaPoints(np.full(9, np.nan), mean, mean * 0.5, np.zeros(9), np.full(9, 0.1), np.full(9, 1e5))
+    points = EmvaPoints(
+        np.full(9, np.nan), mean, mean * 0.5, np.zeros(9), np.full(9, 0.1), np.full(9, 1e5), np.sqrt(mean / 2e5)
+    )
     sheet = emva_sheet(points)
     assert set(sheet.refused) == {"saturation", "quantum efficiency", "dark noise", "linearity error"}
     assert sheet.gain == pytest.approx(0.5, rel=0.01)

@@ -151,10 +151,16 @@ def of_one_temperature(dark: Setting, setting: Setting) -> bool:
     return a is None or b is None or abs(a - b) <= 0.5
 
 
-def dark_levels(data: SeriesData, plane: Plane) -> list[Level]:
-    """Levels of all dark settings with two frames or more, the shortest exposure first."""
-    settings = sorted(data.settings("dark"), key=lambda s: s.first.exposure_ms or 0.0)
-    return [data.levels(s)[plane.name] for s in settings if len(s.frames) >= 2]
+def dark_levels(data: SeriesData, plane: Plane, like: Setting) -> tuple[list[Level], list[float]]:
+    """Levels of the dark settings with two frames or more, the shortest exposure first, and their exposures.
+
+    Of those that have the temperature of a setting, or of the coolest where it states none.
+    """
+    settings = [s for s in data.settings("dark") if len(s.frames) >= 2 and of_one_temperature(s, like)]
+    coolest = min((s.first.temperature_c for s in settings if s.first.temperature_c is not None), default=0.0)
+    settings = [s for s in settings if (s.first.temperature_c or coolest) <= coolest + 0.5]
+    settings.sort(key=lambda s: s.first.exposure_ms or 0.0)
+    return [data.levels(s)[plane.name] for s in settings], [s.first.exposure_ms or 0.0 for s in settings]
 
 
 def saturation_of(data: SeriesData, plane: Plane, levels: Sequence[Level]) -> float:

@@ -68,13 +68,15 @@ def _setting(data: SeriesData, setting: Setting, plane: Plane, how: tuple[tuple[
     kinds, share = how
     stack = data.stacks(setting)[plane.name]
     level = stack.level
-    found = find_defects(stack.mean, level.temporal_variance, level.frames, kinds, share, data.step)  # type: ignore[arg-type]
-    lines = find_lines(stack.mean, data.step)
+    mean = stack.mean if stack.counted is None else np.where(stack.counted, stack.mean, np.nan)
+    found = find_defects(mean, level.temporal_variance, level.frames, kinds, share, data.step)  # type: ignore[arg-type]
+    lines = find_lines(mean, data.step)
     refused: dict[str, str] = {}
     lists = {"pixels": found, "lines": lines}
     try:
         assert stack.variance is not None
-        lists["blinking"] = find_blinking(stack.variance, level.frames, data.step)
+        variance = stack.variance if stack.counted is None else np.where(stack.counted, stack.variance, np.nan)
+        lists["blinking"] = find_blinking(variance, level.frames, data.step)
     except InputError as error:
         refused[prefix("blinking pixels", plane.name, setting.label)] = str(error)
     figures = _figures(lists, kinds, plane.name, setting.label)
@@ -175,7 +177,7 @@ def _rate(seconds: NDArray[np.float64], values: NDArray[np.float64], usable: NDA
 
 def _plots(found: DefectList, stack: FrameStack, plane: Plane, setting: Setting) -> tuple[Chart | Picture, ...]:
     assert found.deviation is not None
-    bars = log_histogram(found.deviation, found.scatter)
+    bars = log_histogram(found.deviation[np.isfinite(found.deviation)], found.scatter)
     seen = bars.count > 0
     title = prefix(plane.name, setting.label)
     histogram = Chart(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite, nan
+from math import hypot, isfinite, nan, sqrt
 
 import numpy as np
 
@@ -40,6 +40,7 @@ class _Point:
     mean: float
     variance: float
     samples: float
+    mean_sigma: float
 
 
 def missing(data: SeriesData) -> str | None:
@@ -91,9 +92,13 @@ def _of_reduced(data: SeriesData) -> Outcome:
 
 def _dark_current(exposures: list[float], levels: list[Level], gain: Figure) -> Outcome:
     found = dark_current(exposures, levels)
-    value = found.current_dn_s / gain.value
-    relative = np.hypot(found.current_dn_s_sigma / found.current_dn_s, gain.sigma / gain.value)
-    return Outcome((Figure("dark_current_e_s", value, abs(value) * float(relative), "dark current", "e/s"),))
+    value, sigma = _in_electrons(found.current_dn_s, found.current_dn_s_sigma, gain)
+    return Outcome((Figure("dark_current_e_s", value, sigma, "dark current", "e/s"),))
+
+
+def _in_electrons(value: float, sigma: float, gain: Figure) -> tuple[float, float]:
+    """Grey values and their standard deviation in electrons."""
+    return value / gain.value, hypot(sigma, value * gain.sigma / gain.value) / gain.value
 
 
 def _others(data: SeriesData) -> Outcome:
@@ -108,9 +113,7 @@ def _taken(others: Outcome, plane: Plane, gain: Figure, label: str) -> Outcome:
     for there, here, words, unit, divided in _TAKEN:
         known = [f for f in others.figures if f.name == there and f.plane == plane.name]
         for f in known:
-            value = f.value / gain.value if divided else f.value
-            relative = np.hypot(f.sigma / f.value, gain.sigma / gain.value) if divided and f.value else 0.0
-            sigma = abs(value) * float(relative) if divided and f.value else f.sigma
+            value, sigma = _in_electrons(f.value, f.sigma, gain) if divided else (f.value, f.sigma)
             figures.append(Figure(here, value, sigma, words, unit, plane.name, prefix(label, f.at)))
         if not known:
             why = [w for what, w in others.refused.items() if what.lower().startswith(words.lower())]
@@ -135,13 +138,16 @@ def _of_frames(data: SeriesData, run: Run, plane: Plane) -> Outcome:
 
 def _reduced(point: ReducedPoint) -> _Point:
     photons = nan if point.photons_per_pixel is None else point.photons_per_pixel
-    return _Point(photons, point.exposure_ms, point.mean, point.variance, (point.frames - 1) * (point.pixels - 1))
+    degrees, of_mean = (point.frames - 1) * (point.pixels - 1), sqrt(point.variance / point.frames / point.pixels)
+    return _Point(photons, point.exposure_ms, point.mean, point.variance, degrees, of_mean)
 
 
 def _point(data: SeriesData, setting: Setting, name: str) -> _Point:
     level = data.levels(setting)[name]
     photons = nan if setting.first.photons_per_pixel is None else setting.first.photons_per_pixel
-    return _Point(photons, setting.first.exposure_ms, level.mean, level.temporal_variance, level.degrees)
+    return _Point(
+        photons, setting.first.exposure_ms, level.mean, level.temporal_variance, level.degrees, level.mean_sigma
+    )
 
 
 def _sheet(bright: list[_Point], dark: list[_Point], of: tuple[str, str], step: float) -> Outcome:
@@ -162,6 +168,7 @@ def _sheet(bright: list[_Point], dark: list[_Point], of: tuple[str, str], step: 
         np.array([d.mean for _, d in pairs], float),
         np.array([d.variance for _, d in pairs], float),
         np.array([p.samples for p, _ in pairs], float),
+        np.array([hypot(p.mean_sigma, d.mean_sigma) for p, d in pairs], float),
     )
     found = emva_sheet(points, step)
     where = {"plane": plane, "at": label}

@@ -7,7 +7,7 @@ import numpy as np
 from photoplan.io.series_pixels import Plane
 from photoplan.io.series_statistics import ReducedPoint
 from photoplan.products.characterise_common import dark_levels, prefix, tried
-from photoplan.products.characterise_data import SeriesData
+from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
 from photoplan.quality.camera.frame_statistics import Level
 from photoplan.quality.camera.photon_transfer import PhotonTransfer, photon_transfer
@@ -34,14 +34,14 @@ def analyse(data: SeriesData) -> Outcome:
     if data.series.reduced_of("flat"):
         bright = [reduced_level(data, point) for point in data.series.reduced_of("flat")]
         dark = sorted(data.series.reduced_of("dark"), key=lambda point: point.exposure_ms or 0.0)
-        return tried("gain", lambda: _plane("", bright, [reduced_level(data, point) for point in dark], data))
+        levels = [reduced_level(data, point) for point in dark]
+        return tried("gain", lambda: _plane("", bright, (levels, [p.exposure_ms or 0.0 for p in dark]), data))
     flats = [setting for setting in data.settings("flat") if len(setting.frames) >= 2]
-    levels = [data.levels(setting) for setting in flats]
-    return joined([_of_frames(data, plane, [level[plane.name] for level in levels]) for plane in data.planes])
+    return joined([_of_frames(data, plane, flats) for plane in data.planes])
 
 
-def _of_frames(data: SeriesData, plane: Plane, bright: list[Level]) -> Outcome:
-    dark = dark_levels(data, plane)
+def _of_frames(data: SeriesData, plane: Plane, flats: list[Setting]) -> Outcome:
+    bright, dark = [data.levels(setting)[plane.name] for setting in flats], dark_levels(data, plane, flats[0])
     return tried(prefix("gain", plane.name), lambda: _plane(plane.name, bright, dark, data))
 
 
@@ -53,10 +53,10 @@ def reduced_level(data: SeriesData, point: ReducedPoint) -> Level:
     )
 
 
-def _plane(name: str, bright: list[Level], dark: list[Level], data: SeriesData) -> Outcome:
+def _plane(name: str, bright: list[Level], dark: tuple[list[Level], list[float]], data: SeriesData) -> Outcome:
     black = data.series.camera.black_level_dn
     stated = "black_level_dn" in data.series.camera.model_fields_set
-    found = photon_transfer(bright, dark, black if stated else float("nan"), data.step)
+    found = photon_transfer(bright, *dark, black if stated else float("nan"), data.step)
     figures = [
         Figure("gain_dn_e", found.gain, found.gain_sigma, "system gain K", "DN/e", name),
         Figure(

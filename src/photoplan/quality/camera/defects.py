@@ -61,8 +61,8 @@ class DefectList:
 
 def _scatter(values: NDArray[np.float64], least: float) -> float:
     """Robust standard deviation, not below `least`."""
-    middle = float(np.median(values))
-    return max(1.4826 * float(np.median(np.abs(values - middle))), least)
+    middle = float(np.nanmedian(values))
+    return max(1.4826 * float(np.nanmedian(np.abs(values - middle))), least)
 
 
 def _factor(count: int) -> float:
@@ -83,7 +83,7 @@ def find_defects(
     Parameters
     ----------
     mean : array, shape (h, w)
-        Mean image of dark or flat frames.
+        Mean image of dark or flat frames; NaN: the pixel does not count.
     temporal_variance : float
         Of one sample; NaN: unknown.
     frames : int
@@ -115,7 +115,7 @@ def find_defects(
     rest = temporal_variance / frames if np.isfinite(temporal_variance) else 0.0
     scatter = _scatter(deviation, sqrt(step**2 / 12 / frames + max(rest, 0.0)))
     # A mean of few frames has rounded values: one step of the grey values in one of them is no defect.
-    threshold = max(_factor(mean.size) * scatter, 1.5 * step / frames)
+    threshold = max(_factor(int(np.isfinite(mean).sum())) * scatter, 1.5 * step / frames)
     limit = np.maximum(threshold, share * np.abs(ground))
     found = np.zeros(mean.shape, bool)
     if "hot" in kinds:
@@ -138,7 +138,7 @@ def find_blinking(variance: NDArray[np.float64], frames: int, step: float = 1.0)
     Parameters
     ----------
     variance : array, shape (h, w)
-        Temporal variance of every pixel over `frames` frames.
+        Temporal variance of every pixel over `frames` frames; NaN: it does not count.
     step : float
         Distance of neighbouring grey values.
 
@@ -149,15 +149,15 @@ def find_blinking(variance: NDArray[np.float64], frames: int, step: float = 1.0)
     """
     if frames < 4:
         raise InputError(f"{frames} frames at a setting; blinking pixels need four or more")
-    usual = float(np.median(variance)) * (frames - 1) / float(chi2.median(frames - 1))
+    usual = float(np.nanmedian(variance)) * (frames - 1) / float(chi2.median(frames - 1))
     if usual < 1e-3 * step**2:
         raise InputError(
             "most pixels do not change at all from frame to frame (black cut off, or rounding): there is no noise with "
             "which a blinking pixel could be compared"
         )
-    usual = max(usual, float(np.mean(np.minimum(variance, 16 * usual))))
+    usual = max(usual, float(np.nanmean(np.minimum(variance, 16 * usual))))
     # Shot noise differs from pixel to pixel with its light, so the limit is taken generously.
-    limit = 1.5 * usual * float(chi2.isf(_ALARMS / variance.size, frames - 1)) / (frames - 1)
+    limit = 1.5 * usual * float(chi2.isf(_ALARMS / np.isfinite(variance).sum(), frames - 1)) / (frames - 1)
     rows, cols = np.nonzero(variance > limit)
     sigma = np.sqrt(variance[rows, cols])
     order = np.argsort(-sigma, kind="stable")[:MOST]
@@ -171,23 +171,33 @@ def find_blinking(variance: NDArray[np.float64], frames: int, step: float = 1.0)
 def find_lines(mean: NDArray[np.float64], step: float = 1.0) -> DefectList:
     """Whole rows and columns brighter or darker than their neighbours: by their medians against running ones.
 
-    `step` is the distance of neighbouring grey values.
+    `step` is the distance of neighbouring grey values. NaN does not count, nor do lines with fewer than 16 values.
     """
     listed: list[Defect] = []
     worst_limit = worst_scatter = 0.0
     kinds: tuple[tuple[Kind, int], ...] = (("row", 1), ("column", 0))
     for kind, axis in kinds:
-        profile = np.median(mean, axis=axis)
-        mixed = profile + (mean.mean(axis=axis) - profile) * 0.1  # medians of grey values come in steps
+        count = np.isfinite(mean).sum(axis=axis)
+        seen = np.flatnonzero(count >= LEAST_SIDE)
+        if not seen.size:
+            continue
+        lines = mean.take(seen, 1 - axis)
+        profile = np.nanmedian(lines, axis=axis, keepdims=True)
+        # Medians of grey values come in steps, so that something of the mean helps; a few hot pixels make no line.
+        around = lines - profile
+        most = 3 * _scatter(around, step * sqrt(1 / 12))
+        mixed = profile.ravel() + 0.1 * np.nanmean(np.clip(around, -most, most), axis=axis)
         deviation = mixed - _running_median(mixed)
         pixel = _scatter(mean - background(mean), step * sqrt(1 / 12))
-        scatter = _scatter(deviation, pixel / sqrt(mean.shape[axis]) + 0.02 * step)
+        of_pixels = pixel / np.sqrt(count[seen]) + 0.02 * step
+        scatter = np.maximum(_scatter(deviation, 0.0), of_pixels)
         # A quarter more: the scatter of a hundred lines is itself known to a tenth only.
-        limit = max(1.25 * _factor(profile.size) * scatter, 0.5 * step)
+        limit = np.maximum(1.25 * _factor(seen.size) * scatter, 0.5 * step)
         for k in np.flatnonzero(np.abs(deviation) > limit):
-            col, row = (float("nan"), float(k)) if kind == "row" else (float(k), float("nan"))
-            listed.append(Defect(kind, col, row, float(deviation[k]), float(abs(deviation[k]) / limit)))
-        worst_limit, worst_scatter = max(worst_limit, limit), max(worst_scatter, scatter)
+            col, row = (float("nan"), float(seen[k])) if kind == "row" else (float(seen[k]), float("nan"))
+            listed.append(Defect(kind, col, row, float(deviation[k]), float(abs(deviation[k]) / limit[k])))
+        worst_limit = max(worst_limit, float(np.median(limit)))
+        worst_scatter = max(worst_scatter, float(np.median(scatter)))
     listed.sort(key=lambda d: -d.ratio)
     return DefectList(tuple(listed[:MOST]), len(listed), worst_limit, worst_scatter, None)
 

@@ -43,10 +43,12 @@ class EmvaPoints:
     dark_variance: NDArray[np.float64]
     samples: NDArray[np.float64]
     """Degrees of freedom of each variance."""
+    mean_sigma: NDArray[np.float64]
+    """Standard deviation of the signal (mean less dark mean), the flicker of the lamp included."""
 
     def __post_init__(self) -> None:
         shapes = set()
-        for name in ("photons", "mean", "variance", "dark_mean", "dark_variance", "samples"):
+        for name in ("photons", "mean", "variance", "dark_mean", "dark_variance", "samples", "mean_sigma"):
             array = np.array(getattr(self, name), np.float64)
             array.setflags(write=False)
             shapes.add(array.shape)
@@ -167,7 +169,9 @@ def _through_origin(x: NDArray[np.float64], y: NDArray[np.float64], sigma: Array
     """Slope of an unweighted line through the origin, and its sigma by propagation, or by the scatter where larger."""
     slope = float(x @ y / (x @ x))
     stated = float(np.sqrt(np.sum((x * np.asarray(sigma)) ** 2)) / (x @ x))
-    scatter = float(np.sqrt(np.sum((y - slope * x) ** 2) / max(x.size - 1, 1) / (x @ x)))
+    # Each residual by itself, since the noise may grow with x; enlarged by what the line took of it.
+    residual = (y - slope * x) / np.sqrt(np.maximum(1 - x**2 / (x @ x), 0.1))
+    scatter = float(np.sqrt(np.sum((x * residual) ** 2)) / (x @ x))
     return slope, max(stated, scatter)
 
 
@@ -180,7 +184,7 @@ def _responsivity(
             "exposure_ms and camera.pixel_size_um"
         )
         return nan, nan
-    return _through_origin(p.photons[used], signal[used], np.sqrt(p.variance[used] / (p.samples[used] + 1)))
+    return _through_origin(p.photons[used], signal[used], p.mean_sigma[used])
 
 
 def _dark_noise(
@@ -227,10 +231,9 @@ def _linearity(
         refused["linearity error"] = "photons per pixel are not stated"
         return None
     limit = float(signal[top]) if top is not None else float(signal.max()) / 0.95
-    sigma = np.sqrt((p.variance + np.nan_to_num(p.dark_variance)) / (p.samples + 1))
     end = signal.size if top is None else top + 1
     try:
-        return linearity(p.photons[:end], signal[:end], sigma[:end], limit)
+        return linearity(p.photons[:end], signal[:end], p.mean_sigma[:end], limit)
     except InputError as error:
         refused["linearity error"] = str(error)
         return None

@@ -53,14 +53,26 @@ def high_pass(image: NDArray[Any]) -> NDArray[np.float64]:
     return values - _smooth(values)
 
 
+def _median(block: NDArray[np.float64]) -> float:
+    known = block[~np.isnan(block)]
+    return float(np.median(known)) if known.size else float("nan")
+
+
 def background(image: NDArray[Any]) -> NDArray[np.float64]:
-    """Slow variation of an image by medians of blocks of 16 × 16 pixels, linear between their middles."""
+    """Slow variation of an image by medians of blocks of 16 × 16 pixels, linear between their middles.
+
+    NaN does not count; a block without a value takes that of the nearest block with one.
+    """
     values = np.asarray(image, np.float64)
     height, width = values.shape
     rows, cols = max(1, height // BLOCK), max(1, width // BLOCK)
     y = np.linspace(0, height, rows + 1).astype(int)
     x = np.linspace(0, width, cols + 1).astype(int)
-    medians = np.array([[np.median(values[a:b, c:d]) for c, d in pairwise(x)] for a, b in pairwise(y)])
+    medians = np.array([[_median(values[a:b, c:d]) for c, d in pairwise(x)] for a, b in pairwise(y)])
+    if np.isnan(medians).any():
+        medians = medians[
+            tuple(ndimage.distance_transform_edt(np.isnan(medians), return_distances=False, return_indices=True))
+        ]
     middle_y, middle_x = (y[:-1] + y[1:] - 1) / 2, (x[:-1] + x[1:] - 1) / 2
     at_y = np.interp(np.arange(height), middle_y, np.arange(rows))
     at_x = np.interp(np.arange(width), middle_x, np.arange(cols))

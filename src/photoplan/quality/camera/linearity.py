@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import erfc
 
 from photoplan.errors import InputError
 
@@ -45,6 +46,7 @@ class Linearity:
     error_percent: float
     """Linearity error: mean absolute deviation of the used levels."""
     error_percent_sigma: float
+    """With what noise alone is expected to add to the error."""
     error_min_percent: float
     """Largest negative deviation of the used levels."""
     error_max_percent: float
@@ -99,8 +101,7 @@ def linearity(
     deviation = 100 * (y - fitted) / fitted
     error = float(np.abs(deviation[used]).mean())
     relative = s[used] / v
-    residual = np.eye(u.size) - design @ solve
-    spread = 100 * np.sqrt((residual**2) @ relative**2)
+    error_sigma = _error_sigma(deviation[used], np.eye(u.size) - design @ solve, 100 * relative)
     with np.errstate(invalid="ignore"):
         segment = np.concatenate([[np.nan], np.diff(y) / np.diff(x)])
     return Linearity(
@@ -115,10 +116,25 @@ def linearity(
         float(np.sqrt((solve[1] ** 2) @ relative**2)),
         deviation,
         error,
-        float(np.sqrt(np.sum(spread**2)) / u.size),
+        error_sigma,
         float(deviation[used].min()),
         float(deviation[used].max()),
     )
+
+
+def _error_sigma(deviation: NDArray[np.float64], residual: NDArray[np.float64], sigma: NDArray[np.float64]) -> float:
+    """Standard deviation of a mean of absolute deviations, which share the noise of the line.
+
+    Noise alone makes an amount larger than 0, so what it is expected to add to each counts as well.
+    """
+    scatter = (np.sign(deviation) @ residual / deviation.size) * sigma
+    spread = np.maximum(np.sqrt(residual**2 @ sigma**2), 1e-12)
+    # What all deviations together have beyond twice the noise: less may be noise alone.
+    share = max(0.0, 1 - 2 * float(np.sum(spread**2)) / max(float(np.sum(deviation**2)), 1e-300))
+    true = np.abs(deviation) * np.sqrt(share)
+    # The mean of the amount of a Gaussian variable about `true`, less that.
+    added = spread * np.sqrt(2 / np.pi) * np.exp(-0.5 * (true / spread) ** 2) - true * erfc(true / spread / np.sqrt(2))
+    return float(np.hypot(np.sqrt(scatter @ scatter), added.mean()))
 
 
 def _refuse_falling(x: NDArray[np.float64], y: NDArray[np.float64], s: NDArray[np.float64], top: float) -> None:

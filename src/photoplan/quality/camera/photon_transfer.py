@@ -75,7 +75,11 @@ def is_clipped_dark(level: Level) -> bool:
 
 
 def photon_transfer(
-    bright: Sequence[Level], dark: Sequence[Level] = (), black_level: float = nan, step: float = 1.0
+    bright: Sequence[Level],
+    dark: Sequence[Level] = (),
+    exposures_ms: Sequence[float] = (),
+    black_level: float = nan,
+    step: float = 1.0,
 ) -> PhotonTransfer:
     """Gain, read noise and full well from levels of different brightness.
 
@@ -85,6 +89,8 @@ def photon_transfer(
         Flat frames, two or more at each level.
     dark : sequence of Level
         Dark frames, the shortest exposure first; its mean is the bias.
+    exposures_ms : sequence of float, optional
+        Of the dark frames. Where they show a dark current, the bias is the grey value at no exposure.
     black_level : float
         The bias where there are no dark frames; NaN: unknown, and the read noise is refused.
     step : float
@@ -101,7 +107,8 @@ def photon_transfer(
     for level in levels:
         check_level(level)
     clipped = [level for level in dark if is_clipped_dark(level)]
-    usable_dark = [level for level in dark if level.frames >= 2 and not is_clipped_dark(level)]
+    usable = [k for k, level in enumerate(dark) if level.frames >= 2 and not is_clipped_dark(level)]
+    usable_dark = [dark[k] for k in usable]
     everything = [*levels, *usable_dark]
     mean = np.array([x.mean for x in everything])
     variance = np.array([x.temporal_variance for x in everything])
@@ -122,7 +129,7 @@ def photon_transfer(
             f"the variance does not grow with the mean (slope {line.slope:.3g} ± {line.slope_sigma:.2g}); these are "
             "not raw frames of a linear sensor, or their levels are too close together"
         )
-    bias, bias_sigma = _bias(usable_dark, black_level)
+    bias, bias_sigma = _bias(usable_dark, [exposures_ms[k] for k in usable if exposures_ms], black_level)
     read = _read_noise(line, bias, bias_sigma, clipped, step)
     well = _full_well(mean[: len(levels)], peak, line, bias if np.isfinite(bias) else low)
     return PhotonTransfer(line.slope, line.slope_sigma, *read, *well, bias, line, mean, variance, used)
@@ -147,8 +154,17 @@ def _peak(mean: NDArray[np.float64], variance: NDArray[np.float64], degrees: NDA
     return top if behind.size and behind[-1] < limit else None
 
 
-def _bias(dark: Sequence[Level], black_level: float) -> tuple[float, float]:
-    return (dark[0].mean, dark[0].mean_sigma) if dark else (black_level, 0.0)
+def _bias(dark: Sequence[Level], exposures_ms: Sequence[float], black_level: float) -> tuple[float, float]:
+    """Grey value without light and dark current, and its sigma."""
+    if not dark:
+        return black_level, 0.0
+    timed = [(t, level) for t, level in zip(exposures_ms, dark) if level.saturated_share <= _SATURATED_SHARE]
+    if len({t for t, _ in timed}) >= 3:
+        sigma = [max(level.mean_sigma, 1e-9) for _, level in timed]
+        line = fit_line([t for t, _ in timed], [level.mean for _, level in timed], sigma)
+        if line.slope > 3 * line.slope_sigma:
+            return line.offset, line.offset_sigma
+    return dark[0].mean, dark[0].mean_sigma
 
 
 def _no_read_noise(total: float, total_sigma: float, bias: float, clipped: Sequence[Level], step: float) -> str:
