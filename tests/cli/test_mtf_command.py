@@ -253,6 +253,46 @@ class TestFaults:
         assert "1 saturated" in refused(photoplan, path, "--linearisation", "linear")
         assert "1 saturated" in refused(photoplan, path, "--linearisation", "linear", "--roi", 5, 5, 70, 60)
 
+    @pytest.mark.parametrize(("low", "high"), [(0.0, 0.695), (0.0, 0.62), (0.33, 1.0)])
+    @pytest.mark.parametrize("kind", ["uint8", "uint16", "float32"])
+    def test_cut_off_within_the_type(self, tmp_path: Path, photoplan: Here, low: float, high: float, kind: str) -> None:
+        """A sensor that is full, or black that is cut off, at no end of the type: MTF50 would be 4 to 30 % too large.
+
+        Pixels without value at the end of the type do not hide it.
+        """
+        light = 0.3 + 0.4 * half_plane((80, 70), (39.6, 35), 9.0, 0.8)
+        light = np.clip(light + np.random.default_rng(1).normal(0, 0.01, light.shape), low, high)
+        pixels = (light * TOPS.get(kind, 1.0)).astype(kind)
+        pixels[:2] = TOPS.get(kind, -9.0)
+        path = write(tmp_path / "a.tif", pixels, nodata=float(pixels[0, 0]))
+        assert "1 saturated" in refused(photoplan, path, "--linearisation", "linear")
+
+    def test_cut_off_in_a_small_part_of_an_image(self, tmp_path: Path, photoplan: Here) -> None:
+        """Too few pixels of a tile to stand out in it: the edge itself is looked at again."""
+        light = np.full((900, 1000), 0.3)
+        light[400:470, 500:580] += 0.4 * half_plane((80, 70), (39.6, 35), 9.0, 0.8)
+        light += np.random.default_rng(1).normal(0, 0.01, light.shape)
+        path = write(tmp_path / "a.tif", np.round(np.clip(light, 0, 0.65) * 65535).astype(np.uint16))
+        assert "saturated" in refused(photoplan, path, "--linearisation", "linear")
+
+    def test_even_areas_are_not_cut_off_where_the_image_is_brighter_elsewhere(
+        self, tmp_path: Path, photoplan: Here
+    ) -> None:
+        light = 0.3 + 0.4 * half_plane((80, 70), (39.6, 35), 9.0, 0.8)
+        noise = np.random.default_rng(1).normal(0, 0.01, light.shape)
+        pixels = np.round((light + np.where(light < 0.5, noise, 0.0)) * 255).astype(np.uint8)
+        wide = np.concatenate([pixels, np.full((70, 60), 190, np.uint8)], axis=1)
+        wide[10:60, 110:] = 250
+        path = write(tmp_path / "a.tif", wide)
+        assert result(photoplan, path, "--linearisation", "linear", "--roi", 5, 5, 70, 60)["images"]
+
+    @pytest.mark.parametrize("unit", [1e-14, 1e12])
+    def test_any_unit_of_light(self, tmp_path: Path, photoplan: Here, unit: float) -> None:
+        """Radiances are as small, and as large, as their unit makes them."""
+        light = half_plane((80, 70), (39.6, 35), 9.0, 0.8) + np.random.default_rng(1).normal(0, 0.01, (70, 80))
+        path = write(tmp_path / "a.tif", (light * unit).astype(np.float32))
+        assert result(photoplan, path)["summary"][0]["mtf50"] == pytest.approx(mtf50_of(0.8, 9.0), rel=0.02)
+
     def test_texture(self, tmp_path: Path, photoplan: Here) -> None:
         grain = np.kron(np.random.default_rng(3).uniform(-0.15, 0.15, (14, 16)), np.ones((5, 5)))[:70, :80]
         light = 0.25 + half_plane((80, 70), (39.6, 35), 9.0, 0.8) * (0.5 + grain)

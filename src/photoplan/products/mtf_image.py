@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
+from photoplan.quality.clipping import piled_ends
 from photoplan.quality.edges.candidates import range_of
 from photoplan.quality.edges.find import EdgePicture
 from photoplan.quality.linearise import Linearisation
@@ -40,6 +41,8 @@ class LightImage:
     linearisation: Linearisation
     span: dict[int, float]
     """Range of the values of each channel that was asked for."""
+    extremes: dict[int, tuple[float, float]]
+    """Smallest and largest grey value that was seen in each band, as stored."""
 
     @classmethod
     def open(cls, path: Path, linearisation: Linearisation) -> LightImage:
@@ -50,7 +53,7 @@ class LightImage:
         InputError
             The file cannot be used.
         """
-        return cls(RasterReader(path), linearisation, {})
+        return cls(RasterReader(path), linearisation, {}, {})
 
     @property
     def size(self) -> tuple[int, int]:
@@ -88,8 +91,10 @@ class LightImage:
         InputError
             The pixels are damaged, or the table of the linearisation does not hold their values.
         """
+        # First the samples of the whole image: they tell whether an end of a window is one of the image.
+        span = self._span(channel)
         grey, valid, saturated = self._light(window, channel)
-        return EdgePicture(grey, valid, saturated, self._span(channel))
+        return EdgePicture(grey, valid, saturated, span)
 
     def _light(
         self, window: Window, channel: int
@@ -102,7 +107,7 @@ class LightImage:
         for weight, band in zip([1.0] if single else _WEIGHTS, bands):
             stored = pixels[band - 1]
             light += np.float32(weight) * self._linear(stored, valid, band)
-            low, high = self._ends(stored)
+            low, high = self._ends(stored if valid is None else stored[valid], band)
             saturated |= (stored >= high) | (stored <= low)
         return light, valid, saturated if saturated.any() else None
 
@@ -124,22 +129,34 @@ class LightImage:
         result[valid] = light / scale
         return result
 
-    def _ends(self, stored: NDArray[np.generic]) -> tuple[float, float]:
-        """Stored values at which a sensor or a file clips.
+    def _ends(self, known: NDArray[np.generic], band: int) -> tuple[float, float]:
+        """Stored values at which a sensor or a file clips, by the valid pixels of a window.
 
         Those of the type, of the bits that the file states, or the largest value of the window if it is what a sensor
-        of fewer bits ends with.
+        of fewer bits ends with; else values at which the pixels pile up, unless the image holds values beyond them.
         """
         kind = self.reader.dtype
-        finite = stored[np.isfinite(stored)] if kind.kind == "f" else stored
-        largest = float(finite.max()) if finite.size else 0.0
-        often = largest in _CLIPS and int((stored == largest).sum()) >= _OFTEN
         if kind.kind == "f":
-            return -np.inf, largest if often or (largest == 1.0 and int((stored == 1.0).sum()) >= _OFTEN) else np.inf
-        limits = np.iinfo(kind)
-        bits = self.reader.info.bits
-        high = float(2**bits - 1) if kind.kind == "u" and 0 < bits < 8 * kind.itemsize else float(limits.max)
-        return float(limits.min), largest if often else high
+            known = known[np.isfinite(known)]
+            low, high = -np.inf, np.inf
+        else:
+            limits, bits = np.iinfo(kind), self.reader.info.bits
+            low = float(limits.min)
+            high = float(2**bits - 1) if kind.kind == "u" and 0 < bits < 8 * kind.itemsize else float(limits.max)
+        if known.size == 0:
+            return low, high
+        largest = float(known.max())
+        if (largest in _CLIPS or (kind.kind == "f" and largest == 1.0)) and int((known == largest).sum()) >= _OFTEN:
+            high = min(high, largest)
+        between = known[(known > low) & (known < high)]
+        if between.size == 0:
+            return low, high
+        seen = (float(between.min()), float(between.max()))
+        before = self.extremes.get(band, seen)
+        self.extremes[band] = min(seen[0], before[0]), max(seen[1], before[1])
+        smallest, largest = self.extremes[band]
+        first, last = piled_ends(between)
+        return (max(low, first) if first <= smallest else low), (min(high, last) if last >= largest else high)
 
     def _span(self, channel: int) -> float:
         """Range of the values of the whole image, from windows spread over it; asked once."""

@@ -26,6 +26,8 @@ __all__ = ["Measuring", "measure_image"]
 
 Advance = Callable[[int, int], None]
 
+#: Share of the pixels of an edge that may be saturated.
+MOST_SATURATED = 0.01
 #: A bent edge is not parted into pieces shorter than this, pixels.
 _SHORT = 40.0
 
@@ -212,9 +214,17 @@ def _measured(image: LightImage, channel: int, number: int, region: EdgeRegion, 
     window = region.window(image.size)
     picture = image.picture(Window(*window), channel)
     mask = region.mask(window)
-    for bad in (None if picture.valid is None else ~picture.valid, picture.saturated):
-        if bad is not None:
-            mask &= ~bad
+    if picture.valid is not None:
+        mask &= picture.valid
+    if picture.saturated is not None:
+        # What saturates here may be too rare in a tile to be seen there.
+        share = float(picture.saturated[mask].mean()) if mask.any() else 0.0
+        if share > MOST_SATURATED:
+            raise InputError(
+                f"saturated edge: {100 * share:.1f} % of its pixels have the largest or smallest grey value; allowed "
+                f"are {100 * MOST_SATURATED:g} %"
+            )
+        mask &= ~picture.saturated
     light = picture.grey.astype(float)
     settings = EdgeSettings(
         least_snr=min(how.rules.least_snr, 5.0),

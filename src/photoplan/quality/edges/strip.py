@@ -144,7 +144,8 @@ class Sides:
     @property
     def snr(self) -> float:
         """Contrast over noise; capped at 10000 where there is none."""
-        return min(self.contrast / max(self.noise, 1e-12), 1e4)
+        contrast = self.contrast
+        return contrast / max(self.noise, 1e-4 * contrast) if contrast > 0.0 else 0.0
 
     def good_blocks(self, evenness: float) -> tuple[NDArray[np.bool_], Counter[str]]:
         """Which blocks are clean, and what the others are."""
