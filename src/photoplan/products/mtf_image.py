@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,7 +130,7 @@ class LightImage:
         result[valid] = light / scale
         return result
 
-    def _ends(self, known: NDArray[np.generic], band: int) -> tuple[float, float]:
+    def _ends(self, known: NDArray[Any], band: int) -> tuple[float, float]:
         """Stored values at which a sensor or a file clips, by the valid pixels of a window.
 
         Those of the type, of the bits that the file states, or the largest value of the window if it is what a sensor
