@@ -273,7 +273,7 @@ print(peak_memory_bytes() - before)
 
 @pytest.mark.skipif(os.name != "posix", reason="memory is measured by the system's own count")
 def test_fault_06_memory_does_not_grow_with_the_product(tmp_path: Path) -> None:
-    """162 MB of pixels with overviews; GDAL's cache takes 64 MiB, compression and overviews about as much."""
+    """162 MB of pixels with overviews; GDAL's cache takes 32 MiB, compression and overviews about as much."""
     out = subprocess.run(
         [sys.executable, "-c", BIG, str(tmp_path / "a.tif")], capture_output=True, text=True, check=True
     )

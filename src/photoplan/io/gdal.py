@@ -29,7 +29,7 @@ __all__ = [
     "warnings_of_gdal",
 ]
 
-CACHE_BYTES = 64 << 20
+CACHE_BYTES = 32 << 20
 """GDAL's block cache of the whole process; its default of a twentieth of the memory is not bounded enough."""
 GDAL_ERRORS = (RasterioError, CPLE_BaseError)
 """What may come out of a call of rasterio: its own errors, and GDAL's where it does not translate them."""
