@@ -168,6 +168,19 @@ def test_gross_errors_in_control_and_positions_are_found() -> None:
     assert result.ground_residuals[wrong, 2] == pytest.approx(-5.0, abs=0.5)
 
 
+@pytest.mark.parametrize("seed", [6, 9])
+def test_a_block_that_only_control_holds_is_not_tilted_to_fit_wrong_control(seed: int) -> None:
+    """Two corners wrong by a tilt's worth: six more heights of seven would go to keep them."""
+    simulated = simulate(seed, strips=2, images=5, per_image=40, gross=0.03, control=9, height=300, relief=30, base=0.3)
+    XYZ = simulated.block.ground.XYZ.copy()
+    XYZ[0] += (-2.0, -1.5, 2.5)
+    XYZ[2] += (2.0, -1.5, -2.5)
+    result = adjust_block(replace(simulated.block, ground=replace(simulated.block.ground, XYZ=XYZ)))
+    assert np.argwhere(result.ground_rejected).tolist() == [[0, 0], [0, 1], [0, 2], [2, 0], [2, 1], [2, 2]]
+    sigma = np.sqrt(np.diagonal(result.pose_covariance, axis1=1, axis2=2))
+    assert np.sqrt(np.mean((errors_of(simulated, result) / sigma) ** 2)) < 1.5
+
+
 def test_check_points_do_not_take_part() -> None:
     simulated = simulate(2, strips=3, images=6)
     check = np.zeros(9, bool)

@@ -306,6 +306,17 @@ def test_fault_17_a_wrong_control_point_is_named(tmp_path: Path) -> None:
     assert gross[0].what == "control point 'G5', Z"
 
 
+def test_control_of_which_half_contradicts_the_rest_is_said(tmp_path: Path) -> None:
+    made = write_project(tmp_path, Make(pixel_noise=0.3))
+    for name, off in {"G1": 20, "G3": -30, "G5": 45, "G7": -60, "G9": 80}.items():
+        edit(tmp_path / "control.csv", f"{made.points[name][2]:.6f}", f"{made.points[name][2] + off:.6f}")
+    facts = adjusted(made, dry_run=True).facts
+    lost = sum(what.what.endswith(", Z") for what in facts.gross)
+    assert lost >= 5
+    assert any(f"{lost} of 9 control heights are taken out as gross errors: nothing tells" in n for n in facts.notes)
+    assert not any("horizontal control" in note for note in facts.notes)
+
+
 def test_fault_16_what_is_not_determined_is_named(tmp_path: Path) -> None:
     made = write_project(tmp_path, Make(control=False))
     with pytest.raises(GeometryError, match=r"."):

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.errors import GeometryError
 from photoplan.orientation.active import Active
 from photoplan.orientation.bundle_model import Model
 from photoplan.orientation.bundle_rows import residuals_of, residuals_of_all, whitened
 from photoplan.orientation.bundle_state import State
+from photoplan.orientation.similarity import robust_similarity
 
 __all__ = [
     "Judged",
@@ -36,6 +38,8 @@ _SOFT = 3.0
 _HUBER = 5
 #: Where the weights begin to fall, in standard deviations.
 _HUBER_LIMIT, _FALL = 2.0, 3.0
+#: Control points from which it is asked with which of them most agree.
+_LEAST_CONTROL = 5
 #: Image points are not judged by less than this part of their stated standard deviation, however small residuals are.
 _BEST = 0.05
 #: An observation that was taken out comes back when its residual is below this part of the critical value.
@@ -185,7 +189,49 @@ def first_taken_out(model: Model, state: State, active: Active, critical: float)
     # Where residuals are small beside the errors this is too strict, so it takes twice as much here; data snooping does
     # the rest.
     bad = size[: len(of)] > 2.0 * critical
-    return _without(model, active, bad)
+    out = _without(model, active, bad)
+    if not len(model.position) and not np.array_equal(out.ground, active.ground):
+        out = replace(out, ground=_agreeing(model, state, active.ground, out.ground, 2.0 * critical))
+    return out
+
+
+def _agreeing(
+    model: Model, state: State, before: NDArray[np.bool_], after: NDArray[np.bool_], limit: float
+) -> NDArray[np.bool_]:
+    """Control with which most of it agrees: `after`, or what a similarity transformation of the block finds if more.
+
+    Nothing but control says where the block lies. Falling weights may tilt and shift it until it fits wrong control
+    as well, and then the right control is taken out.
+    """
+    ground = model.block.ground
+    full, point = [], []
+    for k in np.unique(model.ground):
+        rows = np.flatnonzero(model.ground == k)
+        if len(rows) == 3 and before[k].all():
+            full.append(int(k))
+            point.append(int(model.ground_point[rows[0]]))
+    if len(full) < _LEAST_CONTROL:
+        return after
+    k = slice(2 * len(model.image), 2 * len(model.image) + len(model.ground))
+    sigma = np.ones_like(ground.XYZ)
+    white = np.linalg.norm(model.ground_white, axis=1)
+    sigma[model.ground, model.ground_axis] = 1.0 / (white * np.sqrt(softened(model, state)[k]))
+    found, given = state.XYZ[point], ground.XYZ[full]
+    try:
+        moved, _ = robust_similarity(found, given, 0.5 * limit * float(np.median(sigma[full])))
+    except GeometryError:
+        return after
+    fits = np.abs(moved(found) - given) <= limit * sigma[full]
+    if _agreement(fits) <= _agreement(after[full]):
+        return after
+    ground_after = after.copy()
+    ground_after[full] = fits
+    return ground_after
+
+
+def _agreement(fits: NDArray[np.bool_]) -> tuple[int, int]:
+    """Points of which all coordinates (n, 3) fit, which tell more than coordinates do, and coordinates."""
+    return int(fits.all(axis=1).sum()), int(fits.sum())
 
 
 def _without(model: Model, active: Active, bad: NDArray[np.bool_]) -> Active:

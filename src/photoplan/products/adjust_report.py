@@ -115,6 +115,7 @@ def _advice(result: MapResult, used: NDArray[np.bool_]) -> list[str]:
         if group.unit == "px" and group.factor > 0:
             advice = f"; {float(np.median(points.sigma)) * group.factor:.2g} px would fit"
         out.append(f"{group.name}: the stated standard deviation is {ratio:.1f} times too {how}{advice}")
+    out += _control_out(result)
     out += [
         f"image errors of camera {c.camera} are alike over up to {c.reach:.0f} px: for its orientations "
         f"{c.effect:.1f} measurements count as one"
@@ -124,6 +125,21 @@ def _advice(result: MapResult, used: NDArray[np.bool_]) -> list[str]:
     alone = [name for name in adjusted.images if name not in seen]
     if alone:
         out.append(f"{len(alone)} images have no measured point; their orientation is the observed one: {some(alone)}")
+    return out
+
+
+def _control_out(result: MapResult) -> list[str]:
+    """Control of which as much is taken out as is left: then the wrong half may have been kept."""
+    adjusted, ground = result.adjusted, result.prepared.inputs.ground
+    known = np.isfinite(adjusted.ground_residuals) & ~ground.check[:, None]
+    out = []
+    for name, axes in (("horizontal control coordinates", slice(0, 2)), ("control heights", slice(2, 3))):
+        total, lost = int(known[:, axes].sum()), int((adjusted.ground_rejected & known)[:, axes].sum())
+        if lost and 2 * lost >= total:
+            out.append(
+                f"{lost} of {total} {name} are taken out as gross errors: nothing tells whether they are wrong or "
+                "those that are left; measure more control"
+            )
     return out
 
 
