@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import rasterio
 from numpy.typing import NDArray
-from tools.command import process
+from tools.command import Here, process
 
 SIZE = (64, 48)
 GAIN, READ, BLACK = 0.6, 4.0, 20.0
@@ -113,3 +113,25 @@ def test_dark_frames_of_another_temperature_are_left_out(tmp_path: Path) -> None
     parts = {part["name"]: part for part in report["analyses"]}
     assert "20 °C subtracted" in parts["fall_off"]["notes"][0]
     assert parts["fixed_pattern"]["details"]["dsnu"]["setting"].endswith("20 °C")
+
+
+@pytest.mark.parametrize("largest", [4095.0, 1.0])
+def test_times_with_decimals_in_names_and_values_up_to_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], largest: float
+) -> None:
+    """Frames every half second, so that `up_0.5.tif` comes after `up_0.tif`; the gain settles when it does."""
+    rng = np.random.default_rng(2)
+    for k in range(40):
+        after = 0.5 * k - 5.0
+        level = 2000.0 if after < 0 else 1700.0 - 200.0 * np.exp(-after / 3.0)
+        grey = np.rint(level + rng.normal(0.0, 6.0, (40, 40)))
+        with rasterio.open(tmp_path / f"up_{0.5 * k:g}.tif", "w", "GTiff", 40, 40, 1, dtype="float32") as file:
+            file.write((grey * largest / 4095).astype(np.float32), 1)
+    (tmp_path / "series.toml").write_text('[[frames]]\nkind = "step"\nname = "up"\nfiles = "up_{time_s}.tif"\n')
+    said = Here(capsys)("characterise", tmp_path / "series.toml", "--json", "-q")
+    assert said.code == 0, said.err
+    part = next(part for part in json.loads(said.out)["analyses"] if part["name"] == "gain_control")
+    found = {figure["name"]: figure for figure in part["figures"]}
+    for name, truth in (("change_dn", 200 * largest / 4095), ("time_constant_s", 3.0)):
+        assert abs(found[name]["value"] - truth) < 3.5 * found[name]["sigma"], name
+    assert found["settled_s"]["value"] == pytest.approx(3 * np.log(200 / 0.5), abs=0.5)

@@ -98,6 +98,20 @@ def test_brightness_that_does_not_fall_off_gives_no_camera_constant() -> None:
         fit_fall_off(flat(even, 2, 0.5), FallOffSettings("estimated", artificial="none"))
 
 
+def test_no_fall_off_is_known_no_better_than_a_small_one() -> None:
+    """Which of both it is, chance decides; the standard deviation of the corners must hold for both."""
+    y, x = np.mgrid[:150, :200]
+    square = ((x - 99.5) ** 2 + (y - 74.5) ** 2) / (99.5**2 + 74.5**2)
+    rng = np.random.default_rng(4)
+    sigmas = []
+    for depth in (0.0, 0.0005, 0.01):
+        image = 3000 * (1 - depth * square) + rng.normal(0.0, 25.0, square.shape)
+        for corner in fit_fall_off(image, FallOffSettings("none")).corners:
+            assert abs(corner.total - depth) < 3.5 * corner.sigma
+            sigmas.append(corner.sigma)
+    assert max(sigmas) < 1.3 * min(sigmas)
+
+
 def test_dirt_neither_counts_nor_hides() -> None:
     image = flat(MODEL, 3)
     clean = fit_fall_off(image, GIVEN)

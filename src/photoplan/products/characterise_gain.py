@@ -33,7 +33,7 @@ def analyse(data: SeriesData) -> Outcome:
     found: dict[str, list[GainControl]] = {}
     for group in frame_groups(data, "step"):
         for plane, (control, noise) in _transitions(data, group).items():
-            parts.append(_outcome(control, noise, group.label, plane))
+            parts.append(_outcome(control, noise, (group.label, plane), data.step))
             found.setdefault(plane, []).append(control)
     return joined([*parts, *(_asymmetry(controls, plane) for plane, controls in found.items())])
 
@@ -72,8 +72,8 @@ def _transitions(data: SeriesData, group: FrameGroup) -> dict[str, tuple[GainCon
     return out
 
 
-def _outcome(found: GainControl, pixel: tuple[float, float], at: str, plane: str) -> Outcome:
-    a, refused = found.approach, {}
+def _outcome(found: GainControl, pixel: tuple[float, float], of: tuple[str, str], step: float) -> Outcome:
+    (at, plane), (a, refused) = of, (found.approach, {})
     nan = math.nan
 
     def figure(name: str, value: float, sigma: float, label: str, unit: str = "DN", remark: str = "") -> Figure:
@@ -86,7 +86,7 @@ def _outcome(found: GainControl, pixel: tuple[float, float], at: str, plane: str
         figures.append(figure("change_dn", a.change, a.sigma_change, "change by the gain control", remark=remark))
         assert a.time_constant is not None and a.sigma_time_constant is not None
         figures.append(figure("time_constant_s", a.time_constant, a.sigma_time_constant, "time constant", "s"))
-        settled = a.time_within(max(0.5, a.rms))
+        settled = a.time_within(max(0.5 * step, a.rms))
         if settled is not None:
             figures.append(figure("settled_s", settled, nan, "until within half a grey value or the noise", "s"))
     else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,10 @@ __all__ = ["FrameGroup", "central_window", "frame_groups"]
 
 @dataclass(frozen=True)
 class FrameGroup:
-    """The frames of one ``[[frames]]`` entry, in the order of their names (numbers in them by value)."""
+    """The frames of one ``[[frames]]`` entry, in the order of their names (numbers in them by value).
+
+    Whether a point in a name is that of a decimal, the times decide.
+    """
 
     group: Group
     frames: tuple[Frame, ...]
@@ -101,12 +105,22 @@ def frame_groups(data: SeriesData, kind: str) -> tuple[FrameGroup, ...]:
     found: dict[int, list[Frame]] = {}
     for frame in data.series.of(kind):
         found.setdefault(frame.group.index, []).append(frame)
-    return tuple(FrameGroup(frames[0].group, tuple(sorted(frames, key=_natural))) for frames in found.values())
+    return tuple(FrameGroup(frames[0].group, _ordered(frames)) for frames in found.values())
 
 
-def _natural(frame: Frame) -> tuple[tuple[int, str | int], ...]:
-    parts = re.split(r"(\d+)", frame.file.name)
-    return tuple((1, int(p[:15])) if p.isdigit() and p.isascii() else (0, p) for p in parts)
+def _ordered(frames: list[Frame]) -> tuple[Frame, ...]:
+    whole, decimal = (tuple(sorted(frames, key=lambda f: _natural(f, n))) for n in (r"([0-9]+)", r"([0-9]*\.?[0-9]+)"))
+    return decimal if _grows(decimal) and not _grows(whole) else whole
+
+
+def _grows(frames: tuple[Frame, ...]) -> bool:
+    times = [frame.time_s for frame in frames if frame.time_s is not None]
+    return len(times) == len(frames) and all(a < b for a, b in pairwise(times))
+
+
+def _natural(frame: Frame, number: str) -> tuple[tuple[int, str | float], ...]:
+    parts = re.split(number, frame.file.name)
+    return tuple((1, float(p[:15])) if re.fullmatch(number, p) else (0, p) for p in parts)
 
 
 def central_window(window: Window, side: int, where: str) -> Window:

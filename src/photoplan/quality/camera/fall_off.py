@@ -159,7 +159,10 @@ def fit_fall_off(
         fit = adjust(blocks, settings, kept, fit.weights)
     while (weak := weakest(fit)) is not None:
         fit = adjust(blocks, settings, tuple(term for term in fit.terms if term != weak), fit.weights)
-    found = _result(blocks, settings, fit, (rank, shares))
+    symmetric = fit.camera_constant is not None or any(m == 0 for _, m in fit.terms)
+    # No fall-off was seen: how well that is known, a term of it says.
+    judged = fit if symmetric else adjust(blocks, settings, ((2, 0), *fit.terms), fit.weights)
+    found = _result(blocks, settings, fit, _corner_sigmas(judged, blocks.size), (rank, shares))
     # A surface that is not general leaves asymmetry too; only the general one can say that nothing smooth fits.
     general = settings.artificial == "surface"
     if general and found.residual_rms > _UNEVEN and found.neighbour_correlation > _STRUCTURE:
@@ -209,7 +212,9 @@ def _rank(fit: Fit, shares: dict[str, float], settings: FallOffSettings) -> str:
     )
 
 
-def _result(blocks: Blocks, settings: FallOffSettings, fit: Fit, rank: tuple[str, dict[str, float]]) -> FallOff:
+def _result(
+    blocks: Blocks, settings: FallOffSettings, fit: Fit, of_corners: Array, rank: tuple[str, dict[str, float]]
+) -> FallOff:
     k, level = len(fit.free), float(fit.linear[0])
     factors = fit.linear[1:] / level
     c, unit = fit.camera_constant, half_diagonal(blocks.size)
@@ -232,7 +237,7 @@ def _result(blocks: Blocks, settings: FallOffSettings, fit: Fit, rank: tuple[str
         c,
         None if constant is None or c is None else constant * c,
         None if across is None or down is None else (across * unit, down * unit),
-        _corners(model, fit, blocks.size),
+        _corners(model, of_corners, blocks.size),
         *rank,
         float(np.sqrt(np.mean((fit.residuals / computed)[clean] ** 2))),
         float(np.abs((fit.residuals / computed)[clean]).max()),
@@ -244,11 +249,15 @@ def _result(blocks: Blocks, settings: FallOffSettings, fit: Fit, rank: tuple[str
     )
 
 
-def _corners(model: FallOffModel, fit: Fit, size: tuple[int, int]) -> tuple[Corner, ...]:
-    """Fall-off in the centres of the four corner pixels, with standard deviations by differences."""
-    names = ("upper left", "upper right", "lower left", "lower right")
-    x = np.array([0.0, size[0] - 1.0, 0.0, size[0] - 1.0])
-    y = np.array([0.0, 0.0, size[1] - 1.0, size[1] - 1.0])
+def _corner_places(size: tuple[int, int]) -> tuple[Array, Array]:
+    """Columns and rows of the centres of the four corner pixels."""
+    right, lower = size[0] - 1.0, size[1] - 1.0
+    return np.array([0.0, right, 0.0, right]), np.array([0.0, 0.0, lower, lower])
+
+
+def _corner_sigmas(fit: Fit, size: tuple[int, int]) -> Array:
+    """Standard deviations of the brightness in the corners, by differences."""
+    x, y = _corner_places(size)
     unit, k = half_diagonal(size), len(fit.free)
     linear = fit.linear
 
@@ -268,7 +277,13 @@ def _corners(model: FallOffModel, fit: Fit, size: tuple[int, int]) -> tuple[Corn
         step[i] = 1e-5 if i < k else 1e-5 * abs(linear[0])
         ends = [relative(s * step[:k], linear + s * step[k:]) for s in (1.0, -1.0)]
         J[:, i] = (ends[0] - ends[1]) / (2.0 * step[i])
-    sigmas = np.sqrt(np.maximum(np.diag(J @ fit.covariance @ J.T), 0.0))
+    return np.asarray(np.sqrt(np.maximum(np.diag(J @ fit.covariance @ J.T), 0.0)))
+
+
+def _corners(model: FallOffModel, sigmas: Array, size: tuple[int, int]) -> tuple[Corner, ...]:
+    """Fall-off in the centres of the four corner pixels."""
+    names = ("upper left", "upper right", "lower left", "lower right")
+    x, y = _corner_places(size)
     apart = model.camera_constant is not None
     natural, artificial = model.natural(x, y), model.artificial(x, y)
     return tuple(
