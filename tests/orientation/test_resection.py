@@ -321,3 +321,22 @@ def test_the_direct_start_is_the_same_every_time() -> None:
     t = tangents_of(AERIAL, NoLens(), points.xy)
     a, b = resect_direct(t, X, 1e-4), resect_direct(t, X, 1e-4)
     assert (a.pose.center == b.pose.center).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_three_points_on_a_cylinder_with_the_camera_do_not_lead_far_from_the_stated_pose(seed: int) -> None:
+    """There noise leaves no closed solution near the truth; the only one left lay 90 m away."""
+    rng = np.random.default_rng(seed)
+    pose = Pose(at(0.0, 0.0, 300.0), rotation_opk(0.0, -0.1, 1.0))
+    a = np.array([0.3, 2.5, 4.7])
+    X = at(60.0, 0.0, 0.0) + np.column_stack([60.0 * np.cos(a), 60.0 * np.sin(a), [10.0, 22.0, 3.0]])
+    interior = Interior.digital((4000, 3000), (3200.0, 3200.0))
+    points = measured(FrameCamera(interior, NoLens(), pose), X, rng, 0.5, 0.02)
+    near = Pose(pose.center + np.array([2.0, 1.0, -3.0]), pose.R_ground_camera)
+    try:
+        found = resect(points, interior, NoLens(), near=near)
+    except GeometryError as error:
+        assert "do not determine" in str(error)
+    else:
+        off = np.abs(found.pose.center - pose.center)
+        assert (off < 5.0 * np.sqrt(np.diag(found.covariance)[:3])).all()

@@ -186,6 +186,11 @@ def _best(R: Array, centers: Array, points: tuple[Array, Array], scale: float, n
         elif found[0] < kept[same[0]][0]:
             kept[same[0]] = found
     fitting = [pose for _, fits, pose in kept if fits] if few and sure else []
+    if fitting and near is not None:
+        # Where the camera lies on the cylinder about three points, noise may leave no closed solution there.
+        there = polished_pose(near, t, X, np.ones(len(t), bool), 20)
+        if (_distances(there.R_ground_camera[None], there.center[None], t, X)[0] / (3.0 * scale) < _FITS).all():
+            fitting.append(there)
     if len(fitting) < 2:
         return min(kept, key=lambda item: item[0])[2]
     if near is None:
