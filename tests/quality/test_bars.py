@@ -159,3 +159,20 @@ def test_full_contrast_has_to_be_known():
         bar_curve([])
     with pytest.raises(InputError, match="lower one"):
         bar_curve([measure_bars(noisy(0.3, 10.0))], (5.0, 4.0))
+
+
+def test_standard_deviations_hold_the_error_of_the_object_s_contrast():
+    """Of noisy bars, the widest of which tell the contrast: 40 series, MTF and contrast transfer."""
+    known = [measure_bars(bars((60, 80), f, 5.0, SIGMA)) for f in (0.05, 0.1)]
+    truth = bar_curve(known)
+    errors, sigmas = [], []
+    for seed in range(40):
+        groups = [measure_bars(noisy(f, 5.0, 100 * k + seed, 12.0)) for k, f in enumerate((0.05, 0.1))]
+        curve, given = bar_curve(groups), bar_curve(groups, LEVELS)
+        for found, right in ((curve.mtf, truth.mtf), (curve.contrast, truth.contrast)):
+            errors.append(found.modulation[2] - right.modulation[2])
+            sigmas.append(found.sigma[2])
+        assert curve.mtf.sigma[2] > 1.1 * given.mtf.sigma[2]
+    deviation = np.sqrt(np.mean((np.array(errors) / sigmas).reshape(-1, 2) ** 2, axis=0))
+    print("errors in standard deviations:", deviation)
+    assert deviation == pytest.approx([1.0, 1.0], abs=0.3)

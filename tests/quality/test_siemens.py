@@ -132,3 +132,19 @@ def test_clipped_stars_and_unknown_contrast_are_refused():
     for wrong in ({"sectors": 2}, {"directions": 0}, {"highest": 3.0}, {"levels": (3.0, 1.0)}, {"radius": -1.0}):
         with pytest.raises(InputError):
             StarRules(**wrong)
+
+
+@pytest.mark.parametrize("sine", [False, True])
+def test_standard_deviations_hold_the_error_of_the_object_s_contrast(sine):
+    """The widest rings know their wave far better than the level of the widest sectors that it is compared with."""
+    shape, centre = (200, 200), (100.3, 98.8)
+    clean = star(shape, centre, 24, 0.6, sine=sine)
+    rows = np.random.default_rng(5)
+    seen = [measure_star(clean + rows.normal(0.0, 12.0, shape)) for _ in range(12)]
+    wide = (seen[0].mtf.frequency > 0.0) & (seen[0].mtf.frequency < 0.08)
+    count = np.count_nonzero(wide)
+    values = np.array([found.mtf.modulation[1 : count + 1] for found in seen])
+    sigmas = np.array([found.mtf.sigma[1 : count + 1] for found in seen])
+    ratio = values.std(axis=0, ddof=1) / sigmas.mean(axis=0)
+    print("scatter in standard deviations:", ratio)
+    assert 0.7 < np.sqrt(np.mean(ratio**2)) < 1.3

@@ -65,12 +65,16 @@ def bar_curve(groups: Sequence[BarContrast], levels: tuple[float, float] | None 
         raise InputError(f"two groups of bars have the frequency {frequency[close[0]]:.4g} cycles per pixel; keep one")
     low, high, source = _levels(ordered, levels)
     modulation = (high - low) / (high + low)
+    # An object's contrast that is measured itself is as uncertain as the widest bars, and all figures with it.
+    own = 0.0 if levels is not None else ordered[0].modulation_sigma / ordered[0].modulation
     contrast = np.array([group.modulation / modulation for group in ordered])
     contrast_sigma = np.array([group.modulation_sigma / modulation for group in ordered])
+    contrast_sigma[1:] = np.hypot(contrast_sigma[1:], contrast[1:] * own)
     duties, duty_sigma = _duties(ordered, low, high)
     share = np.array([_fundamental(duty, low, high) for duty in duties])
     transfer = np.array([group.fundamental for group in ordered]) / share
-    transfer_sigma = np.hypot(np.array([group.fundamental_sigma for group in ordered]) / share, transfer * duty_sigma)
+    transfer_sigma = np.array([group.fundamental_sigma for group in ordered]) / share
+    transfer_sigma = np.sqrt(transfer_sigma**2 + transfer**2 * (duty_sigma**2 + own**2))
     return BarCurve(
         ordered,
         low,

@@ -133,14 +133,14 @@ def measure_star(
     rings = [fit_ring(*pixels.between(r - w, r + w), r, sectors, whole=True) for r, w in _radii(inner, outer)]
     _refuse_weak(rings, white_noise(values), what)
     wave = rules.wave or _wave(rings)
-    low, high, source = _levels(pixels, rings, rules.levels, wave, sectors, outer, what)
+    low, high, uncertain, source = _levels(pixels, rings, rules.levels, wave, sectors, outer, what)
     full = (high - low) / 2.0 * (4.0 / pi if wave == "square" else 1.0) / ((high + low) / 2.0)
     directional = {}
     for k in range(rules.directions):
         parts = [_direction(pixels, r, w, k, rules.directions, sectors) for r, w in _radii(inner, outer, 1.25)]
         kept = [ring for ring in parts if ring is not None]
         if len(kept) >= 2:
-            directional[degrees(pi * k / rules.directions)] = _curve(kept, sectors, full)
+            directional[degrees(pi * k / rules.directions)] = _curve(kept, sectors, (full, uncertain))
     return StarMtf(
         pixels.centre,
         sigma,
@@ -150,7 +150,7 @@ def measure_star(
         high,
         source,
         (inner, outer),
-        _curve(rings, sectors, full),
+        _curve(rings, sectors, (full, uncertain)),
         directional,
     )
 
@@ -239,17 +239,20 @@ def _levels(
     sectors: int,
     outer: float,
     what: str,
-) -> tuple[float, float, str]:
-    """Light of wide dark and bright areas."""
+) -> tuple[float, float, float, str]:
+    """Light of wide dark and bright areas, and the relative standard deviation of their difference."""
     if levels is not None:
-        return levels[0], levels[1], "as given"
+        return levels[0], levels[1], 0.0, "as given"
     widest = rings[0]
     if wave == "sine":
         # Next to frequency 0 the transfer falls with the square of the frequency.
         squares = np.array([(sectors / (2.0 * pi * ring.radius)) ** 2 for ring in rings[:8]])
         share = np.array([ring.amplitude / ring.mean for ring in rings[:8]])
-        top = float(np.polyfit(squares, share, 1)[1]) * widest.mean
-        return widest.mean - top, widest.mean + top, "widest sectors, continued to frequency 0"
+        line = np.stack([np.ones_like(squares), squares], axis=1)
+        to_top = np.linalg.pinv(line)[0]
+        top = float(to_top @ share) * widest.mean
+        error = float(np.hypot.reduce(to_top * [ring.sigma / ring.mean for ring in rings[:8]])) * widest.mean
+        return widest.mean - top, widest.mean + top, error / top, "widest sectors, continued to frequency 0"
     values, angle = pixels.between(0.87 * outer, 0.99 * outer)
     turn = (sectors * angle - np.arctan2(widest.sine, widest.cosine)) / (2.0 * pi)
     found = []
@@ -266,14 +269,16 @@ def _levels(
             f"{what}: even the widest sectors, {2 * pi * outer / sectors:.1f} pixels a period, have no flat middle, so "
             "that the object's contrast is unknown; give the light of wide dark and bright areas"
         )
-    return low, high, f"middle of the widest sectors, {2 * pi * outer / sectors:.1f} pixels a period"
+    uncertain = float(np.hypot(low_sigma, high_sigma)) / (high - low)
+    return low, high, uncertain, f"middle of the widest sectors, {2 * pi * outer / sectors:.1f} pixels a period"
 
 
-def _curve(rings: list[Ring], sectors: int, full: float) -> MtfCurve:
-    """Rings as a curve; each ring's wave through its mean, against that of the object."""
+def _curve(rings: list[Ring], sectors: int, object_wave: tuple[float, float]) -> MtfCurve:
+    """Rings as a curve; each ring's wave through its mean, against that of the object and its relative error."""
+    full, uncertain = object_wave
     frequency = np.array([sectors / (2.0 * pi * ring.radius) for ring in rings])
+    modulation = np.array([ring.amplitude / ring.mean / full for ring in rings])
+    sigma = np.hypot([ring.sigma / ring.mean / full for ring in rings], modulation * uncertain)
     return MtfCurve(
-        np.concatenate([[0.0], frequency]),
-        np.concatenate([[1.0], [ring.amplitude / ring.mean / full for ring in rings]]),
-        np.concatenate([[0.0], [ring.sigma / ring.mean / full for ring in rings]]),
+        np.concatenate([[0.0], frequency]), np.concatenate([[1.0], modulation]), np.concatenate([[0.0], sigma])
     )
