@@ -329,7 +329,7 @@ def test_three_points_on_a_cylinder_with_the_camera_do_not_lead_far_from_the_sta
     rng = np.random.default_rng(seed)
     pose = Pose(at(0.0, 0.0, 300.0), rotation_opk(0.0, -0.1, 1.0))
     a = np.array([0.3, 2.5, 4.7])
-    X = at(60.0, 0.0, 0.0) + np.column_stack([60.0 * np.cos(a), 60.0 * np.sin(a), [10.0, 22.0, 3.0]])
+    X = at(60.0, 0.0, 0.0) + np.column_stack([60.0 * np.cos(a), 60.0 * np.sin(a), np.zeros(3)])
     interior = Interior.digital((4000, 3000), (3200.0, 3200.0))
     points = measured(FrameCamera(interior, NoLens(), pose), X, rng, 0.5, 0.02)
     near = Pose(pose.center + np.array([2.0, 1.0, -3.0]), pose.R_ground_camera)

@@ -8,6 +8,7 @@ from math import comb
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from photoplan.errors import GeometryError
@@ -188,7 +189,7 @@ def _best(R: Array, centers: Array, points: tuple[Array, Array], scale: float, n
     fitting = [pose for _, fits, pose in kept if fits] if few and sure else []
     if fitting and near is not None:
         # Where the camera lies on the cylinder about three points, noise may leave no closed solution there.
-        there = polished_pose(near, t, X, np.ones(len(t), bool), 20)
+        there = _settled(near, t, X, size)
         if (_distances(there.R_ground_camera[None], there.center[None], t, X)[0] / (3.0 * scale) < _FITS).all():
             fitting.append(there)
     if len(fitting) < 2:
@@ -199,6 +200,18 @@ def _best(R: Array, centers: Array, points: tuple[Array, Array], scale: float, n
             "or an approximate orientation, is needed"
         )
     return min(fitting, key=lambda pose: _apart(pose, near, size))
+
+
+def _settled(pose: Pose, t: Array, X: Array, size: float) -> Pose:
+    """The minimum next to a pose, also where the points hardly determine it (Levenberg and Marquardt's method)."""
+    unit = np.array([size] * 3 + [1.0] * 3)
+
+    def residuals(step: Array) -> Array:
+        there = moved(pose, step * unit)
+        r = reprojected(there.R_ground_camera[None], there.center[None], X)[0] - t
+        return np.where(np.isfinite(r), r, 1e3).ravel()
+
+    return moved(pose, least_squares(residuals, np.zeros(6), method="lm").x * unit)
 
 
 def _apart(a: Pose, b: Pose, size: float) -> float:
