@@ -132,6 +132,18 @@ def test_transfer_losses_lower_the_modulation():
         assert image[:, 50:].mean() == pytest.approx(100.0, rel=1e-2)
 
 
+@pytest.mark.parametrize("product", [0.01, 0.1, 0.3, 2.0])
+def test_charge_arrives_late_by_the_transfer_product(product):
+    """The mean of the shares e^(−nε) (nε)^k / k! is nε; what is not late stays where it is, border included."""
+    scene = np.full((3, 60), 10.0)
+    scene[1, 20] = scene[1, 59] = 1010.0
+    image = form_image(ImageModel(readout=Readout(transfer_product=product)), scene).values - 10.0
+    assert image[1, 20] == pytest.approx(1000 * np.exp(-product), rel=1e-5)
+    assert (image[1, :55] @ np.arange(55)) / image[1, :55].sum() == pytest.approx(20 + product, abs=1e-5)
+    assert image[1, 59] == pytest.approx(1000 * np.exp(-product), rel=1e-5)
+    assert np.allclose(image[[0, 2]], 0.0, atol=1e-4)
+
+
 def test_smear_is_the_mean_of_the_column():
     scene = np.zeros((10, 6))
     scene[4, 2] = 50.0

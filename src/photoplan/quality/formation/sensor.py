@@ -160,5 +160,5 @@ def moved_charge(electrons: _Array, readout: Readout) -> _Array:
         )
         padded = np.pad(electrons, ((0, 0), (late.size - 1, 0)), mode="edge")
         # Before the first column lie elements as the first one: a line has no dark border.
-        electrons = ndimage.convolve1d(padded, shares, axis=1, origin=-(late.size // 2))[:, : electrons.shape[1]]
+        electrons = ndimage.convolve1d(padded, shares, axis=1, origin=-(late.size // 2))[:, late.size - 1 :]
     return np.asarray(electrons)
