@@ -140,8 +140,8 @@ def test_facts_are_those_that_the_scan_was_made_with(
     assert facts.shear == pytest.approx(shear, abs=1e-9)
     assert facts.mirrored == mirrored
     if shear == 0.0:
-        # Of a mirrored scan, how the picture lay before left and right were exchanged.
-        lay = math.pi - turn if mirrored else turn
+        # A mirrored scan that is not turned has its x axis to the left.
+        lay = turn - math.pi if mirrored else turn
         assert math.remainder(facts.rotation - lay, math.tau) == pytest.approx(0.0, abs=1e-9)
 
 

@@ -63,15 +63,13 @@ def test_figures_are_those_that_the_scan_was_made_with(photoplan: Here, tmp_path
     assert (image["model"], image["redundancy"], image["mirrored"], image["note"]) == ("affine", 10, False, None)
 
 
-def test_a_scan_through_the_back_lies_as_it_did_before_left_and_right_were_exchanged(
-    photoplan: Here, tmp_path: Path
-) -> None:
-    """As `photoplan fiducials` counts: 0 and mirrored, not half a turn and exchanged up and down."""
+def test_a_scan_through_the_back_is_mirrored_and_not_upside_down(photoplan: Here, tmp_path: Path) -> None:
+    """As `photoplan fiducials` counts: left and right are exchanged, then the picture is turned."""
     back = {n: (FILM.size - 1 - x, y) for n, (x, y) in MARKS.items()}
     said = photoplan("interior", project(tmp_path, {"a": back}, "mirrored = true\n"), "--json")
     (image,) = json.loads(said.out)["images"]
     assert image["mirrored"]
-    assert image["rotation_deg"] == pytest.approx(0.7, abs=1e-4)
+    assert image["rotation_deg"] == pytest.approx(-0.7, abs=1e-4)
 
 
 def test_residuals_in_micrometres_and_pixels(photoplan: Here, tmp_path: Path) -> None:

@@ -36,11 +36,12 @@ class AffineFacts:
     def rotation(self) -> float:
         """How far the picture is turned in the scan, clockwise, −π to π: x and y axis in the mean.
 
-        0: x to the right, y up. Of a mirrored scan, before its left and right were exchanged, as
-        `photoplan fiducials` counts it.
+        0: x to the right, y up. Of a mirrored scan: x to the left, y up, since `photoplan fiducials` too exchanges left
+        and right first and turns then.
         """
-        direction = math.pi - self.direction_x if self.mirrored else self.direction_x
-        return _half_turn(direction - self.shear / 2)
+        if self.mirrored:
+            return _half_turn(self.direction_x + math.pi + self.shear / 2)
+        return _half_turn(self.direction_x - self.shear / 2)
 
 
 @dataclass(frozen=True)
