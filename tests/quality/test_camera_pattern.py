@@ -159,6 +159,29 @@ def test_pixels_that_do_not_count_are_no_defects():
     assert find_defects(mean, stack.level.temporal_variance, 4, ("hot", "dark"), 0.1).count > 1000
 
 
+@pytest.mark.parametrize("black", [0.0, -2.0, 2.0])
+def test_noise_that_is_cut_off_at_black_makes_no_hot_pixels(black):
+    noise, alarms = np.random.default_rng(6), 0
+    for _ in range(10):
+        offset = black + 2 * noise.standard_normal((64, 80))
+        offset[20, 30] += 60.0
+        frames = np.clip(np.rint(offset + 2.5 * noise.standard_normal((4, 64, 80))), 0, 255)
+        variance = float(frames.var(axis=0, ddof=1).mean())
+        found = find_defects(frames.mean(axis=0), variance, 4, ("hot",), cut=True)
+        assert (found.defects[0].row, found.defects[0].col) == (20, 30)
+        alarms += found.count - 1
+    assert alarms <= 1
+
+
+def test_threshold_of_flat_frames_is_that_which_counts():
+    image = 2000 + 20 * np.random.default_rng(1).standard_normal((64, 80))
+    image[10, 10] = 2150.0
+    image[40, 40] = 1750.0
+    found = find_defects(image, 400.0, 4, ("hot", "dark"), 0.1)
+    assert found.count == 1
+    assert found.threshold == pytest.approx(200, rel=0.01)
+
+
 def test_blinking_needs_frames_and_noise():
     with pytest.raises(InputError, match="four or more"):
         find_blinking(np.ones((20, 20)), 3)

@@ -14,6 +14,7 @@ from photoplan.products.characterise_data import SeriesData, Setting
 from photoplan.products.characterise_result import Figure, Outcome, Table, joined
 from photoplan.quality.camera.defects import Defect, DefectList, find_blinking, find_defects, find_lines, log_histogram
 from photoplan.quality.camera.frame_statistics import FrameStack
+from photoplan.quality.camera.photon_transfer import is_clipped_dark
 from photoplan.report.characterise_charts import Chart, Curve, Picture, shrunk
 
 __all__ = ["analyse", "missing"]
@@ -69,7 +70,8 @@ def _setting(data: SeriesData, setting: Setting, plane: Plane, how: tuple[tuple[
     stack = data.stacks(setting)[plane.name]
     level = stack.level
     mean = stack.mean if stack.counted is None else np.where(stack.counted, stack.mean, np.nan)
-    found = find_defects(mean, level.temporal_variance, level.frames, kinds, share, data.step)  # type: ignore[arg-type]
+    how_noisy, cut = (level.temporal_variance, level.frames), is_clipped_dark(level)
+    found = find_defects(mean, *how_noisy, kinds, share, data.step, cut)  # type: ignore[arg-type]
     lines = find_lines(mean, data.step)
     refused: dict[str, str] = {}
     lists = {"pixels": found, "lines": lines}

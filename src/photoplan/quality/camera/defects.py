@@ -52,7 +52,7 @@ class DefectList:
     count: int
     """All of them."""
     threshold: float
-    """Grey values."""
+    """Grey values; the median where it differs from place to place."""
     scatter: float
     """Standard deviation of what most pixels show, grey values."""
     deviation: NDArray[np.float64] | None
@@ -77,6 +77,7 @@ def find_defects(
     kinds: tuple[Kind, ...],
     share: float = 0.0,
     step: float = 1.0,
+    cut: bool = False,
 ) -> DefectList:
     """Pixels that differ from their surroundings.
 
@@ -94,6 +95,8 @@ def find_defects(
         A pixel must differ by this part of its surroundings' grey value, whatever the scatter.
     step : float
         Distance of neighbouring grey values.
+    cut : bool
+        Black is cut off, so that only brighter pixels show how they scatter.
 
     Raises
     ------
@@ -114,6 +117,9 @@ def find_defects(
     deviation = mean - ground
     rest = temporal_variance / frames if np.isfinite(temporal_variance) else 0.0
     scatter = _scatter(deviation, sqrt(step**2 / 12 / frames + max(rest, 0.0)))
+    if cut:
+        # From one to two standard deviations above the middle, which zeros and few hot pixels leave as they are.
+        scatter = max(scatter, float(np.diff(np.nanquantile(deviation, (0.8413, 0.9772)))[0]))
     # A mean of few frames has rounded values: one step of the grey values in one of them is no defect.
     threshold = max(_factor(int(np.isfinite(mean).sum())) * scatter, 1.5 * step / frames)
     limit = np.maximum(threshold, share * np.abs(ground))
@@ -129,7 +135,7 @@ def find_defects(
         Defect("hot" if deviation[r, c] > 0 else "dark", float(c), float(r), float(deviation[r, c]), float(q))
         for r, c, q in zip(rows[order], cols[order], ratio[order])
     )
-    return DefectList(listed, int(found.sum()), threshold, scatter, deviation)
+    return DefectList(listed, int(found.sum()), float(np.nanmedian(limit)), scatter, deviation)
 
 
 def find_blinking(variance: NDArray[np.float64], frames: int, step: float = 1.0) -> DefectList:
