@@ -161,6 +161,15 @@ def test_it_holds_everything_and_reaches_for_nothing() -> None:
     assert "95 % confidence ellipses" in words
 
 
+def test_gross_errors_of_control_do_not_set_the_scale_in_which_the_others_are_drawn() -> None:
+    given = facts()
+    wrong = replace(given.ground[2], residual=(2.0, -1.5, 2.5), rejected=(True, True, True))
+    changed = replace(given, ground=(*given.ground[:2], wrong, *given.ground[3:]))
+    plots = AdjustPlots()
+    assert plots.control(changed, check=False)[1] == plots.control(given, check=False)[1]
+    assert "What was taken out as a gross error has no arrow." in " ".join(Page(adjust_report(changed, plots)).words)
+
+
 def test_fault_11_hostile_names_are_shown_and_not_obeyed() -> None:
     document = adjust_report(facts(HOSTILE), AdjustPlots())
     page = Page(document)

@@ -75,7 +75,10 @@ class AdjustPlots:
             return png(fig)
 
     def control(self, facts: AdjustFacts, check: bool) -> tuple[bytes, str]:
-        """Residual vectors of control or check points with the 95 % ellipses of the adjusted points, and the scale."""
+        """Residual vectors of control or check points with the 95 % ellipses of the adjusted points, and the scale.
+
+        What was taken out has no arrow: its residual would set the scale, and the others could not be seen.
+        """
         some = [g for g in facts.ground if g.check == check and np.isfinite(g.residual).any()]
         with self._mpl.rc_context(STYLE):
             fig, axes = self._map(facts)
@@ -84,18 +87,20 @@ class AdjustPlots:
             left, right = axes.get_xlim()
             bottom, top = axes.get_ylim()
             axes.set_ylim(bottom - 0.08 * (top - bottom), top)
-            reach = max((float(np.nanmax(np.abs(g.residual))) for g in some), default=0.0)
-            spread = max((float(np.sqrt(np.nanmax(np.diag(g.covariance)))) for g in some), default=0.0)
+            kept = [np.where(g.rejected, np.nan, g.residual) for g in some]
+            reach = max((float(np.nan_to_num(np.abs(v)).max()) for v in kept), default=0.0)
+            spread = max((float(np.sqrt(np.nan_to_num(np.diag(g.covariance)[:2]).max())) for g in some), default=0.0)
             largest = max(reach, _ELLIPSE_95 * spread, 1e-6)
             scale = round_down(max(0.07 * (right - left) / largest, 1e-6))
-            for g in some:
+            for g, residual in zip(some, kept):
                 x, y = g.XYZ[:2] if np.isfinite(g.XYZ[:2]).all() else (np.nan, np.nan)
                 if not np.isfinite([x, y]).all():
                     continue
                 self._ellipse(axes, (x, y), g.covariance[:2, :2], scale)
-                dx, dy, dz = (scale * np.nan_to_num(v) for v in g.residual)
-                _arrow(axes, x, y, dx, dy, RED)
-                if np.isfinite(g.residual[2]):
+                dx, dy, dz = (scale * np.nan_to_num(v) for v in residual)
+                if np.isfinite(residual[:2]).any():
+                    _arrow(axes, x, y, dx, dy, RED)
+                if np.isfinite(residual[2]):
                     _arrow(axes, x, y, 0.0, dz, BLUE)
             self._ground(axes, [g for g in facts.ground if g.check == check], 9.0)
             handles = [
@@ -274,8 +279,22 @@ class AdjustPlots:
 
 
 def _arrow(axes: Any, x: float, y: float, dx: float, dy: float, colour: str) -> None:
-    style = {"arrowstyle": "-|>", "color": colour, "lw": 1.3, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 7}
-    axes.annotate("", (x + dx, y + dy), (x, y), arrowprops=style, zorder=5)
+    """An arrow whose head is smaller where it is short, so that its length can be seen."""
+    head = {"headwidth": 4.5, "headlength": 5.0, "headaxislength": 5.0, "minshaft": 1.5, "minlength": 0.3}
+    axes.quiver(
+        x,
+        y,
+        dx,
+        dy,
+        angles="xy",
+        scale_units="xy",
+        scale=1,
+        units="inches",
+        width=0.018,
+        color=colour,
+        zorder=5,
+        **head,
+    )
 
 
 def _key(mpl: Any, colour: str, label: str) -> Any:
@@ -283,7 +302,7 @@ def _key(mpl: Any, colour: str, label: str) -> Any:
 
 
 def _legend(fig: Any) -> None:
-    legend = fig.legend(loc="outside lower center", ncols=4)
+    legend = fig.legend(loc="outside lower center", ncols=3)
     for handle in legend.legend_handles:
         if hasattr(handle, "set_sizes"):
             handle.set_sizes([30])

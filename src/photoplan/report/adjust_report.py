@@ -173,12 +173,13 @@ def _gross(facts: AdjustFacts) -> list[str]:
 
 def _control(facts: AdjustFacts, plots: AdjustPlots) -> list[str]:
     picture, scale = plots.control(facts, check=False)
+    out = any(any(g.rejected) for g in facts.ground if not g.check)
     return [
         figure(
             picture,
             f"Residuals of control × {scale}",
             "Adjusted minus given coordinates, with the 95 % confidence ellipses of the adjusted points, in the same "
-            "scale.",
+            f"scale.{' What was taken out as a gross error has no arrow.' if out else ''}",
         ),
         ground_table([g for g in facts.ground if not g.check], normalised=True),
     ]
