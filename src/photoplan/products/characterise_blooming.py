@@ -79,9 +79,23 @@ def _plane(data: SeriesData, run: Run, plane: Plane, images: list[np.ndarray]) -
                 remark=remark,
                 **where,
             ),
-            Figure("blooming_rows_px", found.extent_rows, nan, "extent along columns", "px", remark=longest, **where),
             Figure(
-                "blooming_columns_px", found.extent_columns, nan, "extent along rows", "px", remark=longest, **where
+                "blooming_rows_px",
+                found.extent_rows * plane.step,
+                nan,
+                "extent along columns",
+                "px",
+                remark=longest,
+                **where,
+            ),
+            Figure(
+                "blooming_columns_px",
+                found.extent_columns * plane.step,
+                nan,
+                "extent along rows",
+                "px",
+                remark=longest,
+                **where,
             ),
         ]
     else:

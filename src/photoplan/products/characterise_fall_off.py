@@ -50,21 +50,21 @@ def analyse(data: SeriesData) -> Outcome:
         below = dark[plane.name]
         image -= below if isinstance(below, float) else _whole(data, setting, plane, below)
         settings = _settings(data, setting, plane, below if isinstance(below, float) else float(below.mean()))
-        parts.append(_fitted(image, settings, plane.name, setting))
+        parts.append(_fitted(image, settings, plane, setting))
     first = Outcome(notes=(f"from {len(setting.frames)} frames, {setting.label}; {note}",))
     return joined([first, *parts])
 
 
-def _fitted(image: Array, settings: FallOffSettings, plane: str, setting: Setting) -> Outcome:
+def _fitted(image: Array, settings: FallOffSettings, plane: Plane, setting: Setting) -> Outcome:
     """The fall-off; without its natural part where the light shows none and nobody asked for it."""
     try:
-        return _outcome(fit_fall_off(image, settings), settings, plane, setting)
+        return _outcome(fit_fall_off(image, settings), plane, setting)
     except InputError as error:
         if settings.natural != "estimated" or "natural" in setting.first.group.entry.values:
             raise
         rest = replace(settings, natural="none")
-        refused = Outcome(refused={f"natural part{f' ({plane})' if plane else ''}": str(error)})
-        return joined([_outcome(fit_fall_off(image, rest), rest, plane, setting), refused])
+        refused = Outcome(refused={f"natural part{f' ({plane.name})' if plane.name else ''}": str(error)})
+        return joined([_outcome(fit_fall_off(image, rest), plane, setting), refused])
 
 
 def _brightest(data: SeriesData) -> Setting:
@@ -134,7 +134,8 @@ def _settings(data: SeriesData, setting: Setting, plane: Plane, dark: float) -> 
     )
 
 
-def _outcome(found: FallOff, settings: FallOffSettings, plane: str, setting: Setting) -> Outcome:
+def _outcome(found: FallOff, of: Plane, setting: Setting) -> Outcome:
+    plane = of.name
     suffix = f"_{plane.replace(' ', '_')}" if plane else ""
     names = f"fall_off_model{suffix}.toml", f"fall_off_gain{suffix}.tif"
     group = FrameGroup(setting.first.group, setting.frames)
@@ -150,17 +151,19 @@ def _outcome(found: FallOff, settings: FallOffSettings, plane: str, setting: Set
         )
     terms = tuple((plane, t.n, t.m, t.coefficient, t.sigma) for t in found.terms)
     corners = tuple((plane, c.name, *_percent(c.total, c.sigma, c.natural, c.artificial)) for c in found.corners)
-    dirt = tuple((plane, d.x, d.y, d.width, d.height, 100 * d.depth) for d in found.dirt)
+    dirt = tuple(
+        (plane, *_place(of, d.x, d.y), d.width * of.step, d.height * of.step, 100 * d.depth) for d in found.dirt
+    )
     head = ("plane", "corner", "total_percent", "sigma", "natural_percent", "artificial_percent")
     return Outcome(
-        _figures(found, plane),
+        _figures(found, of),
         refused,
         {
             "corners": Table(head, corners, "Brightness lost in the corners"),
             "terms": Table(("plane", "n", "m", "coefficient", "sigma"), terms, "Terms r^n cos(m θ) of the polynomial"),
             "dirt": Table(("plane", "x", "y", "width", "height", "depth_percent"), dirt, "Dust and stains"),
         },
-        _plots(found, plane),
+        _plots(found, of),
         tuple(notes),
         {f"separability{suffix}": found.separability} if found.separability else {},
         {
@@ -170,12 +173,18 @@ def _outcome(found: FallOff, settings: FallOffSettings, plane: str, setting: Set
     )
 
 
+def _place(plane: Plane, x: float, y: float) -> tuple[float, float]:
+    """Column and row in the image of a place in the whole array of a plane."""
+    return plane.col + plane.step * x, plane.row + plane.step * y
+
+
 def _percent(*values: float | None) -> tuple[float | str, ...]:
     return tuple("" if v is None else 100.0 * v for v in values)
 
 
-def _figures(found: FallOff, plane: str) -> tuple[Figure, ...]:
-    nan = math.nan
+def _figures(found: FallOff, of: Plane) -> tuple[Figure, ...]:
+    """Lengths in pixels of the image, of which a colour has every second one."""
+    nan, plane, step = math.nan, of.name, of.step
 
     def figure(name: str, value: float, sigma: float, label: str, unit: str = "%", at: str = "") -> Figure:
         return Figure(name, value, sigma, label, unit, plane, at)
@@ -187,13 +196,11 @@ def _figures(found: FallOff, plane: str) -> tuple[Figure, ...]:
             figures.append(figure("natural_percent", 100 * c.natural, nan, "natural part cos⁴ω", at=c.name))
             figures.append(figure("artificial_percent", 100 * c.artificial, nan, "artificial part", at=c.name))
     if found.camera_constant is not None and found.sigma_camera_constant is not None:
-        s = found.sigma_camera_constant
-        figures.append(
-            figure("camera_constant_px", found.camera_constant, s, "camera constant from the fall-off", "px")
-        )
+        constant, s = step * found.camera_constant, step * found.sigma_camera_constant
+        figures.append(figure("camera_constant_px", constant, s, "camera constant from the fall-off", "px"))
     if found.sigma_principal_point is not None:
-        for axis, value, s in zip("xy", found.model.principal_point, found.sigma_principal_point):
-            figures.append(figure(f"principal_point_{axis}_px", value, s, f"principal point {axis}", "px"))
+        for axis, value, s in zip("xy", _place(of, *found.model.principal_point), found.sigma_principal_point):
+            figures.append(figure(f"principal_point_{axis}_px", value, step * s, f"principal point {axis}", "px"))
     figures += [
         figure("asymmetry_percent", 100 * found.asymmetry, nan, "largest difference of two corners"),
         figure("range_before_percent", 100 * found.range_before, nan, "brightest minus darkest before correction"),
@@ -204,11 +211,14 @@ def _figures(found: FallOff, plane: str) -> tuple[Figure, ...]:
     return tuple(figures)
 
 
-def _plots(found: FallOff, plane: str) -> tuple[Chart | Picture, ...]:
+def _plots(found: FallOff, plane: Plane) -> tuple[Chart | Picture, ...]:
     assert found.blocks is not None and found.residuals is not None
     blocks, model = found.blocks, found.model
-    of = f", {plane}" if plane else ""
-    extent = (-0.5, model.size[0] - 0.5, model.size[1] - 0.5, -0.5)
+    of = f", {plane.name}" if plane.name else ""
+    left, upper = _place(plane, -0.5, -0.5)
+    right, lower = _place(plane, model.size[0] - 0.5, model.size[1] - 0.5)
+    extent = (left, right, lower, upper)
+    dirt = tuple(_place(plane, d.x, d.y) for d in found.dirt[:30])
     relative = blocks.values / found.level
     return (
         Picture(
@@ -216,26 +226,26 @@ def _plots(found: FallOff, plane: str) -> tuple[Chart | Picture, ...]:
             "Mean of the flat frames in blocks, relative to the principal point (Behr 1989, fig. 4.9).",
             100 * relative,
             "%",
-            points=tuple((d.x, d.y) for d in found.dirt[:30]),
+            points=dirt,
             extent=extent,
         ),
-        _profile(found, of),
+        _profile(found, of, plane.step),
         Picture(
             f"After correction{of}",
             f"What the model leaves; {len(found.dirt)} places with dust or stains (circles) did not count.",
             100 * found.residuals,
             "% of the brightness",
-            points=tuple((d.x, d.y) for d in found.dirt[:30]),
+            points=dirt,
             extent=extent,
         ),
     )
 
 
-def _profile(found: FallOff, of: str) -> Chart:
+def _profile(found: FallOff, of: str, unit: int) -> Chart:
     """Brightness against the distance from the principal point: measured, and the parts of the model."""
     assert found.blocks is not None
     blocks, model = found.blocks, found.model
-    radius = np.hypot(blocks.x - model.principal_point[0], blocks.y - model.principal_point[1])
+    radius = unit * np.hypot(blocks.x - model.principal_point[0], blocks.y - model.principal_point[1])
     step = max(1, len(radius) // 1500)
     farthest = max(
         ((x, y) for x in (0.0, model.size[0] - 1.0) for y in (0.0, model.size[1] - 1.0)),
@@ -244,7 +254,7 @@ def _profile(found: FallOff, of: str) -> Chart:
     s = np.linspace(0.0, 1.0, 100)
     x = model.principal_point[0] + s * (farthest[0] - model.principal_point[0])
     y = model.principal_point[1] + s * (farthest[1] - model.principal_point[1])
-    r = s * math.dist(farthest, model.principal_point)
+    r = s * unit * math.dist(farthest, model.principal_point)
     curves = [
         Curve(radius[::step], 100 * blocks.known[::step] / found.level, "blocks", "points", colour=5),
         Curve(r, 100 * model.relative(x, y), "model to the farthest corner", "line", colour=0),

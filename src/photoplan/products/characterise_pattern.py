@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import isfinite, nan
 
 import numpy as np
@@ -60,7 +61,7 @@ def _plane(data: SeriesData, plane: Plane) -> Outcome:
     setting = _matching_dark(data, flat)
     if setting is not None:
         stack = data.stacks(setting)[plane.name]
-        outcomes.append(tried(prefix("DSNU", plane.name), lambda: _dsnu(stack, plane.name, setting.label)))
+        outcomes.append(tried(prefix("DSNU", plane.name), lambda: _dsnu(stack, plane, setting.label)))
         if not is_clipped_dark(stack.level) and outcomes[0].figures:
             dark = _variance(stack, filtered=False)
     if flat is None:
@@ -102,7 +103,7 @@ def _variance(stack: FrameStack, filtered: bool) -> PatternVariance:
     return pattern_variance(stack.mean, stack.level.temporal_variance, stack.level.frames, filtered=filtered)
 
 
-def _dsnu(stack: FrameStack, name: str, label: str) -> Outcome:
+def _dsnu(stack: FrameStack, plane: Plane, label: str) -> Outcome:
     if is_clipped_dark(stack.level):
         raise InputError(
             f"black is cut off: {100 * stack.level.zero_share:.3g} % of the samples are zero, which hides the pattern; "
@@ -110,7 +111,10 @@ def _dsnu(stack: FrameStack, name: str, label: str) -> Outcome:
         )
     found = _variance(stack, filtered=False)
     return joined(
-        [_parts(found, "dsnu", "DSNU", name, "DN", 1.0, label), _spectra(stack, name, f"dark {name}".strip())]
+        [
+            _parts(found, "dsnu", "DSNU", plane.name, "DN", 1.0, label),
+            _spectra(stack, plane, f"dark {plane.name}".strip()),
+        ]
     )
 
 
@@ -133,7 +137,7 @@ def _prnu(data: SeriesData, flat: Setting, plane: Plane, dark: PatternVariance |
     notes = () if dark is not None else (f"{prefix(name, 'PRNU')}: no dark pattern taken out",)
     whole = Outcome(tuple(figures), notes=notes)
     parts = _parts(even, "bright", "bright pattern", name, "%", 100 / signal, flat.label)
-    return joined([whole, parts, _spectra(stack, name, f"flat {name}".strip())])
+    return joined([whole, parts, _spectra(stack, plane, f"flat {name}".strip())])
 
 
 def _no_pattern(black: float) -> PatternVariance:
@@ -157,9 +161,10 @@ def _parts(found: PatternVariance, key: str, words: str, plane: str, unit: str, 
     return Outcome(tuple(figures), details={prefix(key, plane).replace(" ", "_"): found.to_dict() | {"setting": label}})
 
 
-def _spectra(stack: FrameStack, plane: str, title: str) -> Outcome:
-    """Spectrograms along rows and columns."""
-    along = {"rows": spectrogram(stack.mean, 1), "columns": spectrogram(stack.mean, 0)}
+def _spectra(stack: FrameStack, of: Plane, title: str) -> Outcome:
+    """Spectrograms along rows and columns, with frequencies in pixels of the image."""
+    plane = of.name
+    along = {way: _of_image(spectrogram(stack.mean, axis), of.step) for way, axis in (("rows", 1), ("columns", 0))}
     head = ("image", "along", "frequency_cycles_px", "amplitude_dn")
     rows = tuple((title, way, float(f), float(a)) for way, s in along.items() for f, a in zip(s.frequency, s.amplitude))
     figures = [
@@ -184,6 +189,11 @@ def _spectra(stack: FrameStack, plane: str, title: str) -> Outcome:
         log_y=True,
     )
     return Outcome(tuple(figures), tables={"spectrograms": Table(head, rows, "Spectrograms")}, plots=(chart,))
+
+
+def _of_image(s: Spectrogram, step: int) -> Spectrogram:
+    """With frequencies in cycles per pixel of the image, of which a colour has every second one."""
+    return replace(s, frequency=s.frequency / step, peak_frequency=s.peak_frequency / step)
 
 
 def _peak(s: Spectrogram) -> str:
