@@ -135,3 +135,40 @@ def test_times_with_decimals_in_names_and_values_up_to_1(
     for name, truth in (("change_dn", 200 * largest / 4095), ("time_constant_s", 3.0)):
         assert abs(found[name]["value"] - truth) < 3.5 * found[name]["sigma"], name
     assert found["settled_s"]["value"] == pytest.approx(3 * np.log(200 / 0.5), abs=0.5)
+
+
+def test_mask_of_drift_frames_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A stain in the middle changes; what lies around it does not."""
+    rng = np.random.default_rng(2)
+    mask = np.ones((40, 40), np.uint8)
+    mask[18:22, 18:22] = 0
+    for k in range(12):
+        grey = 1000 + 5 * rng.standard_normal((40, 40)) + 100 * k * (mask == 0)
+        with rasterio.open(tmp_path / f"drift_{10 * k}.tif", "w", "GTiff", 40, 40, 1, dtype="uint16") as file:
+            file.write(np.rint(grey).astype(np.uint16), 1)
+    with rasterio.open(tmp_path / "mask.tif", "w", "GTiff", 40, 40, 1, dtype="uint8") as file:
+        file.write(mask, 1)
+    entry = '[[frames]]\nkind = "drift"\nfiles = "drift_{time_s}.tif"\nmask = "mask.tif"\nvalues = { window = 20 }\n'
+    (tmp_path / "series.toml").write_text(entry)
+    said = Here(capsys)("characterise", tmp_path / "series.toml", "--only", "drift", "--json", "-q")
+    assert said.code == 0, said.err
+    found = {figure["name"]: figure["value"] for figure in json.loads(said.out)["analyses"][0]["figures"]}
+    assert found["mean_dn"] == pytest.approx(1000, abs=0.3)
+    assert found["pixel_noise_of_mean_dn"] == pytest.approx(5 / np.sqrt(400 - 16), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("entry", "why"),
+    [
+        ('kind = "stage"\nmask = "mask.tif"', "a mask does not count for kind stage"),
+        ('kind = "step"\nbrightest = 0.5', "brightest does not count for kind step"),
+        ('kind = "wedge"\nmask = "m.tif"\nsteps = [{ density = 0.1, roi = [0, 0, 9, 9] }]', "does not count for steps"),
+    ],
+)
+def test_masks_that_would_not_count_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], entry: str, why: str
+) -> None:
+    (tmp_path / "series.toml").write_text(f'[[frames]]\nfiles = "a_*.tif"\n{entry}\n')
+    said = Here(capsys)("characterise", tmp_path / "series.toml")
+    assert said.code == 3
+    assert why in said.err

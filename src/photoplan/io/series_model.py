@@ -185,6 +185,10 @@ class FramesEntry(Entry):
         for what, listed in (("edges", self.edges), ("targets", self.targets)):
             if len({each.name for each in listed}) < len(listed):
                 raise ValueError(f"two {what} have the same name")
+        if self.mask is not None and (self.kind in ("plumb", "target", "stage") or self.steps):
+            raise ValueError(f"a mask does not count for {'steps' if self.steps else f'kind {self.kind}'}; give rois")
+        if self.brightest is not None and (self.kind in ("plumb", "target", "stage", "drift", "step") or self.steps):
+            raise ValueError(f"brightest does not count for {'steps' if self.steps else f'kind {self.kind}'}")
         if self.steps and self.density is not None:
             raise ValueError("give either density (one patch fills the frame) or steps")
         return self

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.series_file import Frame, Group
-from photoplan.io.series_pixels import frame_pixels, split
+from photoplan.io.series_pixels import frame_pixels, plane_mask, split
 from photoplan.products.characterise_data import SeriesData
 
 __all__ = ["FrameGroup", "central_window", "frame_groups"]
@@ -60,12 +60,15 @@ class FrameGroup:
         return np.asarray(t - t[0])
 
     def pixels(self, data: SeriesData, window: Window | None = None) -> Iterator[dict[str, NDArray[Any]]]:
-        """Pixels of a window (the roi) of every frame, by plane."""
+        """Pixels of a window (the roi) of every frame, by plane; in a row those that a mask leaves."""
         window = self.group.window if window is None else window
+        inside = replace(self.group, window=window)
+        masks = {plane.name: plane_mask(inside, plane) for plane in data.planes}
         for frame in self.frames:
             image = frame_pixels(frame, window)
             data.watch(1)
-            yield {plane.name: split(image, plane, window) for plane in data.planes}
+            parts = {plane.name: split(image, plane, window) for plane in data.planes}
+            yield {name: part if (mask := masks[name]) is None else part[mask] for name, part in parts.items()}
 
     def number(self, key: str, default: float, low: float, high: float) -> float:
         """A number among the entry's values.
