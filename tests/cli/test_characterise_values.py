@@ -172,3 +172,26 @@ def test_masks_that_would_not_count_are_refused(
     said = Here(capsys)("characterise", tmp_path / "series.toml")
     assert said.code == 3
     assert why in said.err
+
+
+@pytest.mark.parametrize("dark", [True, False])
+def test_saturation_where_dark_frames_state_no_exposure_or_are_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], dark: bool
+) -> None:
+    """A black level of 200 DN is no response; grey values stop at 4095, which is the largest."""
+    rng = np.random.default_rng(7)
+    kinds = [(f"flat_{t}ms_{k}.tif", 60.0 * t) for t in (2, 4, 8, 16, 24, 32, 40, 50, 75, 90) for k in range(2)]
+    for name, signal in [*kinds, ("dark_0.tif", 0.0), ("dark_1.tif", 0.0)]:
+        grey = 200 + 0.5 * rng.poisson(2 * signal, (40, 48)) + 3 * rng.standard_normal((40, 48))
+        with rasterio.open(tmp_path / name, "w", "GTiff", 48, 40, 1, dtype="uint16") as file:
+            file.write(np.clip(np.rint(grey), 0, 4095).astype(np.uint16), 1)
+    series = '[camera]\nbits = 12\n[[frames]]\nkind = "flat"\nfiles = "flat_{exposure}ms_*.tif"\n'
+    series += '[[frames]]\nkind = "dark"\nfiles = "dark_*.tif"\n' if dark else ""
+    (tmp_path / "series.toml").write_text(series)
+    said = Here(capsys)("characterise", tmp_path / "series.toml", "--only", "saturation", "--json", "-q")
+    assert said.code == 0, said.err
+    report = json.loads(said.out)
+    assert report["notes"] == []
+    found = {figure["name"]: figure for figure in report["analyses"][0]["figures"]}
+    assert "between 50 and 75 ms: grey values stop" in found["saturation_dn"]["remark"]
+    assert found["saturation_exposure"]["value"] == pytest.approx((4095 - 200) / 60, rel=0.01)

@@ -19,6 +19,7 @@ __all__ = [
     "MOST_SATURATED",
     "Black",
     "Run",
+    "black_if_known",
     "black_of",
     "dark_levels",
     "exposure_runs",
@@ -110,6 +111,7 @@ def black_of(data: SeriesData, setting: Setting, plane: Plane) -> Black:
     saturated, do not count.
     """
     known: list[tuple[float, Level]] = []
+    of_any: Level | None = None
     clipped = False
     for dark in data.settings("dark"):
         if not of_one_temperature(dark, setting):
@@ -122,14 +124,25 @@ def black_of(data: SeriesData, setting: Setting, plane: Plane) -> Black:
             return Black(level.mean, _sigma(level), level, "dark frames of the same exposure")
         if dark.first.exposure_ms is not None:
             known.append((dark.first.exposure_ms, level))
+        else:
+            of_any = level
     if known and setting.first.exposure_ms is not None:
         known.sort(key=lambda item: item[0])
         mean = _between(setting.first.exposure_ms, [(exposure, level.mean) for exposure, level in known])
         sigma = max(_sigma(level) for _, level in known)
         return Black(mean, sigma, None, "from dark frames of other exposures")
+    if of_any is not None:
+        return Black(of_any.mean, _sigma(of_any), None, "from dark frames without a stated exposure")
     stated = data.series.camera.black_level_dn
     why = "black is cut off in the dark frames" if clipped else "no dark frames that fit"
     return Black(stated, 0.0, None, f"{why}: black level {stated:g} DN, as black_level_dn says")
+
+
+def black_if_known(data: SeriesData, setting: Setting, plane: Plane) -> float:
+    """Black of a setting; NaN: neither dark frames nor the series file tell it."""
+    black = black_of(data, setting, plane)
+    told = black.sigma > 0 or black.level is not None or black.rule.startswith("from dark frames")
+    return black.mean if told or "black_level_dn" in data.series.camera.model_fields_set else nan
 
 
 def _between(exposure: float, known: Sequence[tuple[float, float]]) -> float:

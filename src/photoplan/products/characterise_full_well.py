@@ -14,13 +14,15 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.io.series_pixels import Plane
-from photoplan.products.characterise_common import Run, black_of, exposure_runs
+from photoplan.products.characterise_common import Run, black_if_known, exposure_runs
 from photoplan.products.characterise_data import SeriesData
 from photoplan.quality.camera.saturation import FullWell, find_saturation, full_well
 
 __all__ = ["full_well_notes", "with_full_wells"]
 
 _LEAST = 4
+#: Share of samples at the largest grey value from which on that is what stops them.
+_MOSTLY = 0.5
 
 
 def with_full_wells(data: SeriesData) -> SeriesData:
@@ -52,13 +54,13 @@ def _find(data: SeriesData, run: Run, plane: Plane) -> FullWell | None:
         found = find_saturation(
             run.values,
             [level.mean for level in levels],
-            black_of(data, run.settings[0], plane).mean,
+            black_if_known(data, run.settings[0], plane),
             [level.saturated_share for level in levels],
             variance if np.isfinite(variance).all() else None,
         )
     except InputError:  # every level is cut off at the largest grey value: told by the analyses themselves
         return None
-    if found is None or found.rule == "clipping":
+    if found is None or found.rule == "clipping" or levels[-1].saturated_share >= _MOSTLY:
         return None
     stack = data.stacks(run.settings[-1])[plane.name]
     seen = stack.mean if stack.counted is None else stack.mean[stack.counted]

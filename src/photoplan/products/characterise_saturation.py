@@ -7,7 +7,7 @@ from math import isfinite, nan
 import numpy as np
 
 from photoplan.io.series_pixels import Plane
-from photoplan.products.characterise_common import MOST_SATURATED, Run, black_of, exposure_runs, prefix, tried
+from photoplan.products.characterise_common import MOST_SATURATED, Run, black_if_known, exposure_runs, prefix, tried
 from photoplan.products.characterise_data import SeriesData
 from photoplan.products.characterise_result import Figure, Outcome, joined
 from photoplan.quality.camera.frame_statistics import check_level
@@ -51,13 +51,12 @@ def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
     levels = [data.levels(setting)[plane.name] for setting in run.settings]
     for level in levels:
         check_level(level)
-    black = black_of(data, run.settings[0], plane)
     mean = np.array([level.mean for level in levels])
     variance = np.array([level.temporal_variance for level in levels])
     found = find_saturation(
         run.values,
         mean,
-        black.mean,
+        black_if_known(data, run.settings[0], plane),
         [level.saturated_share for level in levels],
         variance if np.isfinite(variance).all() else None,
     )

@@ -8,7 +8,7 @@ section 6.6).
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from math import inf, isfinite, nan, sqrt
+from math import inf, isfinite, nan, pi, sqrt
 from typing import Any
 
 import numpy as np
@@ -87,6 +87,8 @@ def find_saturation(
     exposure, mean : array, shape (n,)
         Exposure (increasing) and mean grey value.
     black : float
+        Grey value without light; NaN: not known, that of the line through the darker levels is taken.
+    black : float
         Grey value without light.
     saturated_share : array, shape (n,)
         Share of samples at the largest grey value. Where it stays below a half, a bright spot is saturated, and not the
@@ -102,6 +104,8 @@ def find_saturation(
     x, y, share = (np.asarray(v, float) for v in (exposure, mean, saturated_share))
     if x.size < 4 or (np.diff(x) <= 0).any():
         raise InputError(f"{x.size} levels; saturation needs four of increasing exposure")
+    if not isfinite(black):
+        black = _black_of_line(x[: max(3, x.size // 2)], y[: max(3, x.size // 2)])
     signal = y - black
     found = {
         "clipping": _first(share > _CLIPPED) if share[-1] >= _MOSTLY else None,
@@ -117,12 +121,20 @@ def find_saturation(
     first = known[rule]
     level = float(y[-1])
     response = float(np.median(signal[:first] / x[:first]))
-    spread = float(np.std(signal[:first] / x[:first])) / sqrt(first)
+    # Of a median, whose variance is π / 2 times that of a mean.
+    spread = float(np.std(signal[:first] / x[:first])) * sqrt(pi / 2 / max(first - 1, 1))
     at = (level - black) / response if response > 0 else inf
     # Clipped shares begin before the mean arrives: the crossing may lie a little outside of the two levels.
     inside = 0.8 * x[first - 1] <= at <= 1.2 * x[first]
     sigma = at * spread / response if inside and first > 1 else nan
     return Saturation(level, rule, float(x[first - 1]), float(x[first]), at if inside else nan, sigma)
+
+
+def _black_of_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
+    """Grey value at no exposure of the line of least relative deviations; not below 0, nor above the darkest level."""
+    below = np.maximum(y, 1e-300)
+    offset, _ = np.linalg.lstsq(np.column_stack([1 / below, x / below]), np.ones_like(x), rcond=None)[0]
+    return float(np.clip(offset, 0.0, max(0.0, float(y[0]))))
 
 
 def _first(signs: NDArray[np.bool_]) -> int | None:
