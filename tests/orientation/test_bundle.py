@@ -181,6 +181,15 @@ def test_a_block_that_only_control_holds_is_not_tilted_to_fit_wrong_control(seed
     assert np.sqrt(np.mean((errors_of(simulated, result) / sigma) ** 2)) < 1.5
 
 
+@pytest.mark.parametrize("seed", [3, 4])
+def test_points_of_two_rays_are_no_gross_errors_because_half_of_their_residuals_are_none(seed: int) -> None:
+    simulated = simulate(seed, strips=1, images=2, per_image=150, gnss=0.05, attitude=2e-4, tilt=0.01)
+    result = adjust_block(simulated.block)
+    assert int(result.rejected.sum()) <= 2
+    images = next(group for group in result.groups if group.name.startswith("image points"))
+    assert 0.85 < images.factor < 1.15
+
+
 def test_check_points_do_not_take_part() -> None:
     simulated = simulate(2, strips=3, images=6)
     check = np.zeros(9, bool)

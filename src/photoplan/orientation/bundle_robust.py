@@ -40,6 +40,8 @@ _HUBER = 5
 _HUBER_LIMIT, _FALL = 2.0, 3.0
 #: Control points from which it is asked with which of them most agree.
 _LEAST_CONTROL = 5
+#: Medians of the length of normally distributed errors, σ = 1, in one and in two coordinates.
+_MEDIAN_1D, _MEDIAN_2D = 0.6745, 1.1774
 #: Image points are not judged by less than this part of their stated standard deviation, however small residuals are.
 _BEST = 0.05
 #: An observation that was taken out comes back when its residual is below this part of the critical value.
@@ -137,7 +139,18 @@ def robust_scale(e: _Floats, kind: tuple[str, str]) -> float:
     e = e[np.isfinite(e)]
     if len(e) < 20:
         return 1.0
-    return max(1.4826 * float(np.median(np.abs(e))), _BEST if kind[1] == "px" else 1.0)
+    return max(float(np.median(np.abs(e))) / _MEDIAN_1D, _BEST if kind[1] == "px" else 1.0)
+
+
+def _joined(e: _Floats, kind: tuple[str, str]) -> _Floats:
+    """Whitened residuals of a group, each coordinate of an image point replaced by what its length makes of it.
+
+    Points of two rays have no residuals along the base, so that half of all coordinates would be small.
+    """
+    if kind[1] != "px":
+        return e
+    length: _Floats = np.linalg.norm(e.reshape(-1, 2), axis=1)
+    return np.repeat(length * (_MEDIAN_1D / _MEDIAN_2D), 2)
 
 
 def robust_weights(model: Model, e: _Floats, turn: int) -> _Floats:
@@ -152,7 +165,7 @@ def robust_weights(model: Model, e: _Floats, turn: int) -> _Floats:
     for k in range(len(kinds)):
         mine = np.flatnonzero(of == k)
         # Sizes of two or three coordinates are longer than single ones; the scale is that of the single ones.
-        s = size[mine] / (robust_scale(e[mine], kinds[k]) * stretch)
+        s = size[mine] / (robust_scale(_joined(e[mine], kinds[k]), kinds[k]) * stretch)
         weight[mine] = (
             _HUBER_LIMIT / np.maximum(s, _HUBER_LIMIT) if turn < _HUBER else 1.0 / (1 + (s / _FALL) ** 2) ** 2
         )
@@ -184,7 +197,7 @@ def first_taken_out(model: Model, state: State, active: Active, critical: float)
     kinds, of = kinds_of(model)
     for k in range(len(kinds)):
         mine = np.flatnonzero(of == k)
-        size[mine] /= robust_scale(e[mine], kinds[k]) * _stretch(model)
+        size[mine] /= robust_scale(_joined(e[mine], kinds[k]), kinds[k]) * _stretch(model)
     size[~np.isfinite(size)] = np.inf
     # Where residuals are small beside the errors this is too strict, so it takes twice as much here; data snooping does
     # the rest.
