@@ -59,6 +59,16 @@ def test_a_filter_is_measured_and_restores_other_images(scenes):
     assert after < 0.56 * before
 
 
+@pytest.mark.parametrize("level", [65535.0 + 110.0, -90.0])
+def test_full_skies_and_black_shadows_do_not_hide_the_noise(scenes, tmp_path, level):
+    """A part that is just full: its few pixels beside the end of the range are not the noise of the image."""
+    made, _ = scenes
+    flat = level + np.random.default_rng(3).normal(0.0, 50.0, (144, SIZE))
+    path = write(tmp_path / "sky.tif", np.concatenate([100.0 * made[0][0], flat])[None])
+    (part,) = design_restoration(DesignRequest((path,), most_edges=12, options=DesignOptions("regularised"))).parts
+    assert part.scene.noise * 65535 == pytest.approx(50.0, rel=0.15)
+
+
 def test_the_exact_inverse_where_the_condition_holds(scenes):
     _, files = scenes
     found = design_restoration(DesignRequest(files, most_edges=MOST))

@@ -29,6 +29,8 @@ __all__ = ["DesignRequest", "DesignedPart", "MeasuredFilter", "design_restoratio
 #: Windows of an image in which its contrast is looked for, in each direction, and their side.
 _WINDOWS = 5
 _SIDE = 256
+#: Share of the blocks of an image that must hold no saturated pixel, for the noise to be looked for in these alone.
+_CLEAN = 0.1
 
 
 @dataclass(frozen=True)
@@ -231,6 +233,7 @@ def _designed(
 def _scene(images: Sequence[LightImage], channel: int) -> SceneStatistics:
     """Noise and contrast of images, from windows over the whole of them, in their light."""
     blocks: list[NDArray[np.float64]] = []
+    clean: list[NDArray[np.float64]] = []
     squares, count = 0.0, 0
     for image in images:
         for window in _windows(image.size):
@@ -239,13 +242,16 @@ def _scene(images: Sequence[LightImage], channel: int) -> SceneStatistics:
             if picture.valid is not None:
                 grey[~picture.valid] = np.nan
             blocks.append(block_noise(grey))
+            clean.append(blocks[-1] if picture.saturated is None else block_noise(grey, ~picture.saturated))
             for difference in (np.diff(grey, axis=0), np.diff(grey, axis=1)):
                 known = difference[np.isfinite(difference)]
                 squares += float(known @ known)
                 count += known.size
     if count == 0 or squares == 0.0:
         raise InputError("the images have no contrast")
-    noise = image_noise(np.concatenate(blocks))
+    every, whole = np.concatenate(blocks), np.concatenate(clean)
+    # A full sky seems to have no noise, and its few pixels below the end seem to be all of it.
+    noise = image_noise(whole if whole.size >= _CLEAN * every.size else every)
     noise = noise if np.isfinite(noise) else 0.0
     # Differences of neighbours hold the noise of both.
     contrast = max(squares / count - 2.0 * noise**2, 1e-4 * squares / count)
@@ -268,9 +274,10 @@ def _where(part: DesignedPart, parts: Sequence[DesignedPart]) -> str:
     if len(parts) == 1:
         return ""
     exact = sum(one.design.method == "exact" for one in parts)
-    band = "" if part.band is None else f"band {part.band} "
-    place = "" if part.at is None else f"at column {part.at[0]:.0f}, row {part.at[1]:.0f}"
-    return f"{exact} of {len(parts)} parts exact, {len(parts) - exact} regularised; the noisiest, {band}{place}: "
+    band = [] if part.band is None else [f"band {part.band}"]
+    place = [] if part.at is None else [f"at column {part.at[0]:.0f}, row {part.at[1]:.0f}"]
+    which = " ".join(band + place)
+    return f"{exact} of {len(parts)} parts exact, {len(parts) - exact} regularised; the noisiest, {which}: "
 
 
 def _filter(request: DesignRequest, parts: Sequence[DesignedPart], size: tuple[int, int]) -> RestorationFilter:
