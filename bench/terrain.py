@@ -27,7 +27,7 @@ from prepare import CHECKOUT, WORK
 from programs import Missing
 from terrain_programs import Case, Surface, figures_of, photoplan, rst, tin
 
-from photoplan.io.terrain_files import read_measured
+from photoplan.io.terrain.files import read_measured
 
 HERE = Path(__file__).resolve().parent
 MIB = 2**20

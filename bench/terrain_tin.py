@@ -16,7 +16,7 @@ from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
 from photoplan.geometry.triangulation import constrained_faces
-from photoplan.io.terrain_files import read_measured
+from photoplan.io.terrain.files import read_measured
 from photoplan.surfaces.measured import MeasuredTerrain
 from photoplan.terrain.clean import clean
 

@@ -80,7 +80,7 @@ def run(capsys) -> Here:
 @pytest.fixture(scope="module")
 def told(folder, tmp_path_factory) -> dict:
     """Everything that the series allows, as JSON."""
-    from photoplan.products.characterise import CharacteriseRequest, characterise
+    from photoplan.products.characterise.run import CharacteriseRequest, characterise
 
     return json.loads(json.dumps(characterise(CharacteriseRequest(folder / "series.toml")).to_dict()))
 
@@ -302,9 +302,9 @@ def test_fault_08_frame_whose_pixels_are_damaged_stops_its_analysis_only(folder,
 
 
 def test_black_is_that_of_the_exposure_and_temperature(tmp_path):
-    from photoplan.io.series_file import read_series
-    from photoplan.products.characterise_common import black_of
-    from photoplan.products.characterise_data import SeriesData
+    from photoplan.io.series.file import read_series
+    from photoplan.products.characterise.common import black_of
+    from photoplan.products.characterise.data import SeriesData
 
     noise = np.random.default_rng(8)
     for kind, exposure, celsius, mean in (

@@ -15,7 +15,7 @@ from tools.command import Here, process, start, wait_for
 from tools.landxml import write_landxml
 
 from photoplan.io.lock import FileLock
-from photoplan.io.terrain_model_read import ModelReader
+from photoplan.io.terrain.model_read import ModelReader
 from photoplan.surfaces.hybrid import HybridSurface
 
 EAST, NORTH = 500_000.0, 5_300_000.0

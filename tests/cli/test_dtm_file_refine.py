@@ -10,8 +10,8 @@ import pytest
 from tools.command import Here
 from tools.small_model import LAYOUT, grid_unit, hills, parts, write_units_of
 
-from photoplan.io.terrain_model_read import ModelReader
-from photoplan.io.terrain_model_tables import GrossError
+from photoplan.io.terrain.model_read import ModelReader
+from photoplan.io.terrain.model_tables import GrossError
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.units import LineElement, UnitLayout
 
@@ -73,8 +73,8 @@ def test_fine_inside_coarse_outside_joined_between(
 def test_gross_errors_and_lines_of_the_model_that_counts(files: tuple[Path, Path, Path], tmp_path: Path) -> None:
     from dataclasses import replace
 
-    from photoplan.io.terrain_model_write import ModelWriter
-    from photoplan.products.dtm_refine import RefineRequest, dtm_refine
+    from photoplan.io.terrain.model_write import ModelWriter
+    from photoplan.products.dtm.refine import RefineRequest, dtm_refine
 
     inside, outside = (500_070.0, 5_299_950.0, 0.0), (500_010.0, 5_299_890.0, 0.0)
 

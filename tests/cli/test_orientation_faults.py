@@ -17,7 +17,7 @@ from tools.adjust_project import Make, write_project
 from tools.command import Here, Said, edit, process, start, wait_for
 
 import photoplan as photoplan_package
-from photoplan.products import adjust
+from photoplan.products.adjust import run as adjust
 
 pytest.importorskip("matplotlib")
 

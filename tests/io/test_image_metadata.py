@@ -18,8 +18,8 @@ from photoplan.geometry.crs import topocentric_poses
 from photoplan.geometry.earth_poses import enu_poses
 from photoplan.io.image_metadata import read_image_metadata
 from photoplan.io.observed_positions import read_observed_positions
-from photoplan.io.orientation_exif import rotation_from_gimbal
-from photoplan.io.orientation_file import read_orientation, read_orientation_block
+from photoplan.io.orientation.exif import rotation_from_gimbal
+from photoplan.io.orientation.file import read_orientation, read_orientation_block
 
 Entries = dict[int, tuple[int, Any]]
 ASCII, SHORT, LONG, RATIONAL, BYTE = 2, 3, 4, 5, 1

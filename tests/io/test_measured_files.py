@@ -18,7 +18,7 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import HeightSystemError, InputError, UsageError
-from photoplan.io.terrain_files import CodeClass, CodeTable, ReadOptions, read_measured
+from photoplan.io.terrain.files import CodeClass, CodeTable, ReadOptions, read_measured
 
 laspy = pytest.importorskip("laspy", reason="needs laspy")
 
@@ -220,7 +220,7 @@ def test_unclassified_las_is_taken_whole(tmp_path: Path) -> None:
 
 
 def test_classes_that_begin_late_do_not_bring_earlier_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("photoplan.io.terrain_las.CHUNK", 100)
+    monkeypatch.setattr("photoplan.io.terrain.las.CHUNK", 100)
     classes = np.zeros(1000, int)
     classes[550:] = 2
     measured = read_measured([las(tmp_path / "a.las", classes)])

@@ -10,7 +10,7 @@ import pytest
 from photoplan.errors import InputError
 from photoplan.geometry.rotation import rotation_from_angles
 from photoplan.io.observed_positions import read_observed_positions
-from photoplan.io.orientation_table import TableFormat
+from photoplan.io.orientation.table import TableFormat
 
 POSITIONS = "name,x,y,z\na.tif,1,2,3\nb.tif,4,5,6\n"
 FULL = (

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from tools.format_examples import assert_same, block_of, frame, pixels, round_trip
 
 from photoplan.errors import InputError
-from photoplan.io.orientation_colmap import read_points
-from photoplan.io.orientation_file import orientation_format, read_orientation_block
+from photoplan.io.orientation.colmap import read_points
+from photoplan.io.orientation.file import orientation_format, read_orientation_block
 
 CAMERAS = """# Camera list with one line of data per camera:
 #   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]

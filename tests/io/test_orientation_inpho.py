@@ -8,9 +8,9 @@ from tools.orientation_blocks import CAMERA, CENTERS, GROUND, NAMES, block, our_
 
 from photoplan.errors import InputError
 from photoplan.io.camera_model import BrownLens, FilmCamera, FrameCamera
-from photoplan.io.orientation_block import without_lenses
-from photoplan.io.orientation_file import orientation_format, read_orientation_block, write_orientation
-from photoplan.io.orientation_table import TableFormat
+from photoplan.io.orientation.block import without_lenses
+from photoplan.io.orientation.file import orientation_format, read_orientation_block, write_orientation
+from photoplan.io.orientation.table import TableFormat
 
 FROM_CAMERA = TableFormat(declared=frozenset({"direction"}))
 TO_CAMERA = TableFormat(direction="ground-to-camera")

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from tools.format_examples import assert_same, block_of, frame, pixels, round_trip, with_table
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io.orientation_exif import rotation_from_gimbal
-from photoplan.io.orientation_file import orientation_format, read_orientation_block, write_orientation
-from photoplan.io.orientation_metashape import read_cameras
+from photoplan.io.orientation.exif import rotation_from_gimbal
+from photoplan.io.orientation.file import orientation_format, read_orientation_block, write_orientation
+from photoplan.io.orientation.metashape import read_cameras
 
 LENS = {"f": 3705.5, "cx": 11.7, "cy": -27.7, "b1": 0.53, "b2": -0.31, "k1": -0.092, "k2": -0.076, "k3": 0.116}
 LENS |= {"k4": -0.076, "p1": -3.1e-4, "p2": 1.2e-4}

@@ -11,8 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from photoplan.errors import InputError
-from photoplan.io.orientation_file import read_orientation
-from photoplan.io.orientation_opensfm import rotation_from_axis_angle
+from photoplan.io.orientation.file import read_orientation
+from photoplan.io.orientation.opensfm import rotation_from_axis_angle
 
 LLA = {"latitude": 46.84, "longitude": -91.99, "altitude": 150.0}
 

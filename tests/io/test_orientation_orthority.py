@@ -16,7 +16,7 @@ import pytest
 from photoplan.cameras.frame import FrameCamera
 from photoplan.geometry.pose import Pose
 from photoplan.io.camera_file import read_cameras
-from photoplan.io.orientation_file import read_orientation
+from photoplan.io.orientation.file import read_orientation
 from photoplan.io.project_cameras import interior_of, lens_of
 from photoplan.io.project_model import Image
 

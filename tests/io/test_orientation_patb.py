@@ -8,13 +8,13 @@ import pytest
 from tools.orientation_blocks import CAMERA, block, our_pixels, pixels_of_matrix
 
 from photoplan.errors import InputError
-from photoplan.io.orientation_file import (
+from photoplan.io.orientation.file import (
     orientation_format,
     read_orientation,
     read_orientation_block,
     write_orientation,
 )
-from photoplan.io.orientation_table import TableFormat
+from photoplan.io.orientation.table import TableFormat
 
 FROM_CAMERA = TableFormat(declared=frozenset({"direction"}))
 TO_CAMERA = TableFormat(direction="ground-to-camera")

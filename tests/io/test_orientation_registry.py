@@ -5,10 +5,10 @@ import pytest
 from tools.orientation_blocks import CAMERA, block, our_pixels
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io import orientation_file
 from photoplan.io.camera_model import FilmCamera
-from photoplan.io.orientation_block import OrientationBlock, OrientationFormat
-from photoplan.io.orientation_file import (
+from photoplan.io.orientation import file as orientation_file
+from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
+from photoplan.io.orientation.file import (
     FORMATS,
     choose_format,
     orientation_format,
@@ -17,7 +17,7 @@ from photoplan.io.orientation_file import (
     write_orientation,
     written_formats,
 )
-from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat
+from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
 
 MARKS = {str(k): xy for k, xy in enumerate([(-106.0, -106.0), (106.0, -106.0), (106.0, 106.0)])}
 

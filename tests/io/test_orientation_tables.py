@@ -11,8 +11,8 @@ import pytest
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.rotation import ROTATION_ORDERS, angles_from_rotation, rotation_opk
-from photoplan.io.orientation_file import read_orientation
-from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat
+from photoplan.io.orientation.file import read_orientation
+from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
 
 HEAD = "filename,x,y,z,omega,phi,kappa\n"
 ROWS = "a.jpg,576661.8239,5188164.7692,207.2298,1.074164,-3.800570,-42.559458\nb.jpg,1,2,3,0.5,0.25,180\n"

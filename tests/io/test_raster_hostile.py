@@ -18,7 +18,7 @@ from photoplan.geometry.grid import Window
 from photoplan.io.checks import RasterLimits, check_plain_file
 from photoplan.io.raster import RasterReader
 from photoplan.io.raster_info import read_info
-from photoplan.io.terrain_reader import TerrainReader
+from photoplan.io.terrain.reader import TerrainReader
 from photoplan.io.tiff_layout import read_tiff_layout
 
 SIDE = 256

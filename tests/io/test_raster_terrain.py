@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io.block_cache import BlockCache
-from photoplan.io.terrain_reader import TerrainReader
+from photoplan.io.terrain.reader import TerrainReader
 
 
 def grid(path: Path, heights: np.ndarray, **profile: Any) -> Path:

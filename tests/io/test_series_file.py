@@ -10,11 +10,11 @@ import pytest
 from tools.camera_model import write_frame
 
 from photoplan.errors import InputError
-from photoplan.io.series_file import read_series
-from photoplan.io.series_model import StatisticsEntry
-from photoplan.io.series_names import find_files
-from photoplan.io.series_pixels import Plane, plane_mask, plane_pixels, series_planes
-from photoplan.io.series_statistics import read_statistics
+from photoplan.io.series.file import read_series
+from photoplan.io.series.model import StatisticsEntry
+from photoplan.io.series.names import find_files
+from photoplan.io.series.pixels import Plane, plane_mask, plane_pixels, series_planes
+from photoplan.io.series.statistics import read_statistics
 
 PIXELS = np.arange(48, dtype=np.uint8).reshape(6, 8)
 
@@ -297,8 +297,8 @@ def test_patterns_do_not_leave_plain_files(tmp_path: Path):
 
 
 def test_every_entry_is_explained_on_the_reference_page():
-    from photoplan.io.series_model import KINDS, SeriesEntry
-    from photoplan.io.series_names import FIELDS
+    from photoplan.io.series.model import KINDS, SeriesEntry
+    from photoplan.io.series.names import FIELDS
 
     schema = SeriesEntry.model_json_schema()
     entries = {name for table in schema["$defs"].values() for name in table.get("properties", {})}
@@ -310,7 +310,7 @@ def test_every_entry_is_explained_on_the_reference_page():
 
 
 def test_every_analysis_is_explained_on_the_reference_page():
-    from photoplan.products.characterise_registry import ANALYSES
+    from photoplan.products.characterise.registry import ANALYSES
 
     page = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "characterise.md").read_text("utf-8")
     assert not [analysis.name for analysis in ANALYSES if f"| `{analysis.name}` |" not in page]

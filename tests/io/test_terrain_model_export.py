@@ -11,8 +11,8 @@ from defusedxml import ElementTree
 from tools.small_model import EMPTY, LAYOUT, grid_unit, hills, lines, unit_at, wall_line
 
 from photoplan.errors import UsageError
-from photoplan.io.terrain_export import replacing, write_points, write_tin
-from photoplan.io.terrain_export_mesh import mesh_parts
+from photoplan.io.terrain.export import replacing, write_points, write_tin
+from photoplan.io.terrain.export_mesh import mesh_parts
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.memory_units import MemoryUnits
 from photoplan.surfaces.mesh_faces import build_faces
@@ -152,7 +152,7 @@ def test_points_are_each_post_once_and_the_lines(model: MemoryUnits, tmp_path: P
 
 def test_memory_is_that_of_two_rows_of_units() -> None:
     """A hundred rows of units: the table of shared vertices never holds more than two rows' edges."""
-    from photoplan.io import terrain_export_mesh as module
+    from photoplan.io.terrain import export_mesh as module
 
     layout = UnitLayout(0.0, 0.0, 8.0, 3, 100)
     source = MemoryUnits(layout, {(c, r): grid_unit(layout, c, r, 4) for c in range(3) for r in range(100)})

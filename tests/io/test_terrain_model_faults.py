@@ -19,11 +19,11 @@ import pytest
 from tools.small_model import LAYOUT, grid_unit, same_unit, unit_at, write_small
 
 from photoplan.errors import InputError, ResourceError, RunLocked, UsageError
-from photoplan.io import terrain_model_write
-from photoplan.io.terrain_model_blob import _UNIT, MOST_BYTES
-from photoplan.io.terrain_model_read import ModelReader, unit_checksum
-from photoplan.io.terrain_model_tables import HEADER, LINES, UNITS
-from photoplan.io.terrain_model_write import ModelWriter
+from photoplan.io.terrain import model_write as terrain_model_write
+from photoplan.io.terrain.model_blob import _UNIT, MOST_BYTES
+from photoplan.io.terrain.model_read import ModelReader, unit_checksum
+from photoplan.io.terrain.model_tables import HEADER, LINES, UNITS
+from photoplan.io.terrain.model_write import ModelWriter
 
 PLACES = [(c, r) for r in range(LAYOUT.rows) for c in range(LAYOUT.columns)]
 
@@ -32,7 +32,7 @@ import os, signal, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from tools import small_model
-from photoplan.io import terrain_model_write as module
+from photoplan.io.terrain import model_write as module
 
 moment = sys.argv[3]
 def die(*args, **kwargs):
@@ -98,7 +98,7 @@ import resource, signal, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from tools import small_model
-from photoplan.io.terrain_model_read import ModelReader
+from photoplan.io.terrain.model_read import ModelReader
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]), int(sys.argv[3])))
 from photoplan.errors import PhotoplanError
@@ -308,7 +308,7 @@ def spoilt_faces(name: str, value: Any) -> bytes:
     """The unit with the wall, with one array of its triangles spoilt, as bytes before compression."""
     from tools.small_model import LINED
 
-    from photoplan.io.terrain_model_blob import pack_unit
+    from photoplan.io.terrain.model_blob import pack_unit
 
     unit = unit_at(*LINED)
     assert unit is not None and unit.faces is not None

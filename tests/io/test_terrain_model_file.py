@@ -34,9 +34,9 @@ from tools.small_model import (
 )
 
 from photoplan.errors import InputError, PhotoplanError, UsageError
-from photoplan.io.terrain_model_blob import check_unit, inflate, pack_unit, unit_of
-from photoplan.io.terrain_model_read import ModelReader, is_terrain_model
-from photoplan.io.terrain_model_write import ModelWriter
+from photoplan.io.terrain.model_blob import check_unit, inflate, pack_unit, unit_of
+from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
+from photoplan.io.terrain.model_write import ModelWriter
 from photoplan.surfaces.units import Unit, UnitLayout
 
 PLACES = [(c, r) for r in range(LAYOUT.rows) for c in range(LAYOUT.columns)]

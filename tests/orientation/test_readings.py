@@ -18,8 +18,8 @@ from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import ROTATION_ORDERS, angles_from_rotation, rotation_from_angles
 from photoplan.io.ground_points import read_ground_points
 from photoplan.io.image_points import read_image_points
-from photoplan.io.orientation_file import read_orientation
-from photoplan.io.orientation_table import TableFormat
+from photoplan.io.orientation.file import read_orientation
+from photoplan.io.orientation.table import TableFormat
 from photoplan.orientation.readings import (
     CAMERA_AXES,
     DIRECTIONS,

@@ -18,12 +18,12 @@ from photoplan.io.image_points import read_image_points
 from photoplan.io.project import load_project
 from photoplan.io.project_model import ANGLE_UNITS
 from photoplan.orientation.block import AdjustSettings
-from photoplan.products import adjust
-from photoplan.products.adjust import OUTPUTS, AdjustReport, AdjustRequest, adjust_project
-from photoplan.products.adjust_block import adjust_prepared, map_result, prepare
-from photoplan.products.adjust_frame import angle_derivatives
-from photoplan.products.adjust_inputs import read_inputs
-from photoplan.products.adjust_start import started
+from photoplan.products.adjust import run as adjust
+from photoplan.products.adjust.block import adjust_prepared, map_result, prepare
+from photoplan.products.adjust.frame import angle_derivatives
+from photoplan.products.adjust.inputs import read_inputs
+from photoplan.products.adjust.run import OUTPUTS, AdjustReport, AdjustRequest, adjust_project
+from photoplan.products.adjust.start import started
 
 pytest.importorskip("matplotlib")
 

@@ -13,7 +13,7 @@ from photoplan.io.camera_model import Camera
 from photoplan.io.project_cameras import interior_of, lens_of
 from photoplan.io.project_model import Image
 from photoplan.orientation.block import AdjustedCamera, BlockCamera
-from photoplan.products.adjust_cameras import block_camera, calibrated, camera_entries
+from photoplan.products.adjust.cameras import block_camera, calibrated, camera_entries
 
 MARKS = {"a": [-100.0, -100.0], "b": [100.0, -100.0], "c": [100.0, 100.0], "d": [-100.0, 100.0]}
 FILM = {"type": "film", "size": [4000, 4000], "camera_constant_mm": 150.0, "fiducials_mm": MARKS}

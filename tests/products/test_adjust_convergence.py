@@ -11,7 +11,7 @@ from tools.adjust_project import MIDDLE, Make, write_project
 
 from photoplan.io.project import load_project
 from photoplan.io.project_edit import ProjectChanges, edit_project
-from photoplan.products.adjust import AdjustRequest, adjust_project
+from photoplan.products.adjust.run import AdjustRequest, adjust_project
 
 
 @pytest.mark.parametrize("turn", [0.5, 3.0])

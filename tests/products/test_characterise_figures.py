@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from photoplan.products.characterise_result import Figure
+from photoplan.products.characterise.result import Figure
 
 
 @pytest.mark.parametrize(

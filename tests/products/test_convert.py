@@ -11,8 +11,8 @@ from tools.orientation_blocks import ANGLES, CAMERA, CENTERS, GROUND, NAMES, blo
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles
 from photoplan.io.camera_model import FilmCamera
-from photoplan.io.orientation_file import FORMATS, orientation_format, read_orientation_block, write_orientation
-from photoplan.io.orientation_table import TableFormat
+from photoplan.io.orientation.file import FORMATS, orientation_format, read_orientation_block, write_orientation
+from photoplan.io.orientation.table import TableFormat
 from photoplan.orientation.readings import Reading
 from photoplan.products.convert import ConvertRequest, convert_orientation
 from photoplan.products.convert_readings import list_readings

@@ -19,7 +19,7 @@ from photoplan.errors import HeightSystemError, InputError, PhotoplanError, Usag
 from photoplan.geometry.crs import crs_step
 from photoplan.geometry.rotation import rotation_opk
 from photoplan.io.camera_model import FilmCamera, FrameCamera
-from photoplan.io.orientation_table import TableFormat
+from photoplan.io.orientation.table import TableFormat
 from photoplan.io.project import load_project
 from photoplan.products.init import InitRequest, init_project, make_project
 

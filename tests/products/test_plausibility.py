@@ -12,9 +12,9 @@ import pytest
 from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles, rotation_opk
 from photoplan.io.camera_file import read_cameras
 from photoplan.io.camera_model import FrameCamera
-from photoplan.io.orientation_file import read_orientation
+from photoplan.io.orientation.file import read_orientation
 from photoplan.io.project_model import Image, Orientation
-from photoplan.io.terrain_reader import TerrainReader
+from photoplan.io.terrain.reader import TerrainReader
 from photoplan.products.plausibility import Plausibility, View, assess, view_of
 from photoplan.products.readings import DECLARED, readings
 from photoplan.surfaces.raster import RasterSurface

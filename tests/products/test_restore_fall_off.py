@@ -14,8 +14,8 @@ from tools.command import Here
 from photoplan.geometry.grid import Window
 from photoplan.io.fall_off_file import FallOffEntry, TermEntry, fall_off_text
 from photoplan.io.raster import RasterReader
-from photoplan.products.characterise_fall_off import correction_text
-from photoplan.products.restore import RestoreReport, RestoreRequest, plan_restoration, restore_images
+from photoplan.products.characterise.fall_off import correction_text
+from photoplan.products.restore.run import RestoreReport, RestoreRequest, plan_restoration, restore_images
 from photoplan.quality.camera.fall_off import fit_fall_off
 from photoplan.quality.camera.fall_off_adjust import FallOffSettings
 from photoplan.quality.camera.fall_off_model import FallOffModel

@@ -16,11 +16,11 @@ from tools.command import Here
 
 from photoplan.errors import UsageError
 from photoplan.io.raster import RasterReader
-from photoplan.products.restore_design import DesignedPart, DesignRequest
-from photoplan.products.restore_details import compare
-from photoplan.products.restore_filter import FilterRequest, FoundFilter, requested_filter
-from photoplan.products.restore_page import _pictures, filter_facts
-from photoplan.products.restore_report import open_report
+from photoplan.products.restore.design import DesignedPart, DesignRequest
+from photoplan.products.restore.details import compare
+from photoplan.products.restore.filter import FilterRequest, FoundFilter, requested_filter
+from photoplan.products.restore.page import _pictures, filter_facts
+from photoplan.products.restore.report import open_report
 from photoplan.quality.restoration.design import DesignOptions, design_filter
 from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
 from photoplan.quality.restoration.regularised import SceneStatistics

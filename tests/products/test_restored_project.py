@@ -18,7 +18,7 @@ from photoplan.products.check import check_project
 from photoplan.products.execution import Run, execute
 from photoplan.products.filter_files import save_filter
 from photoplan.products.orthophoto import plan_orthophotos
-from photoplan.products.restore import RestoreRequest, restore_images
+from photoplan.products.restore.run import RestoreRequest, restore_images
 from photoplan.products.scene import input_files, open_scene
 from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
 

@@ -18,7 +18,7 @@ from photoplan.errors import HeightSystemError, InputError
 from photoplan.geometry.crs import crs_step
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.project import load_project
-from photoplan.io.terrain_model_read import ModelReader
+from photoplan.io.terrain.model_read import ModelReader
 from photoplan.products.check import check_project
 from photoplan.products.execution import Run, execute
 from photoplan.products.init import InitRequest, init_project

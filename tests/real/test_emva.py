@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from tools.command import Here
 
-from photoplan.io.series_model import StatisticsEntry
-from photoplan.io.series_statistics import read_statistics
+from photoplan.io.series.model import StatisticsEntry
+from photoplan.io.series.statistics import read_statistics
 from photoplan.quality.camera.emva import EmvaPoints, EmvaSheet, emva_sheet
 
 #: By `emva1288` 0.6.3.

@@ -12,8 +12,8 @@ from tools.photos import turned_by
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_from_angles
 from photoplan.io.project import load_project
-from photoplan.products.adjust_inputs import read_inputs
-from photoplan.products.adjust_start import started
+from photoplan.products.adjust.inputs import read_inputs
+from photoplan.products.adjust.start import started
 
 
 def test_exposures_with_positions_and_no_attitudes(shared: Path, tmp_path: Path) -> None:

@@ -17,8 +17,8 @@ from tools.build_terrain import surface_of, terrain, unit_of
 from tools.tin_volume import exact_volume, read_landxml_tin, tin_heights, tin_outline
 
 from photoplan.geometry.triangulation import constrained_faces
-from photoplan.io.terrain_files import read_measured
-from photoplan.io.terrain_options import ReadOptions
+from photoplan.io.terrain.files import read_measured
+from photoplan.io.terrain.options import ReadOptions
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, Tin
 from photoplan.terrain.build import Built, build, plan_build
 from photoplan.terrain.clean import clean

@@ -10,7 +10,8 @@ import pytest
 
 from photoplan.errors import ResourceError, UsageError
 from photoplan.kernels.collocation import correlation
-from photoplan.products import dtm_report, dtm_report_covariance
+from photoplan.products.dtm import report as dtm_report
+from photoplan.products.dtm import report_covariance as dtm_report_covariance
 from photoplan.report.build_report import build_report
 from photoplan.report.page import text
 from photoplan.report.plots import Plots

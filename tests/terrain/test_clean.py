@@ -358,7 +358,7 @@ def test_twenty_thousand_segments_take_a_second() -> None:
 
 
 def test_real_survey_is_clean(shared: Path) -> None:
-    from photoplan.io.terrain_files import read_measured
+    from photoplan.io.terrain.files import read_measured
 
     measured = read_measured([shared / "data" / "m3_road_survey" / "M3_Terrain.mm.xml"])
     out, found = clean(measured)

@@ -15,9 +15,9 @@ from photoplan.cameras.frame import FrameCamera
 from photoplan.geometry.pose import Pose
 from photoplan.io import camera_model as described
 from photoplan.io.camera_model import BrownLens, OpenCVFisheyeLens, OpenCVLens
-from photoplan.io.orientation_block import OrientationBlock
-from photoplan.io.orientation_file import read_orientation_block, write_orientation
-from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat
+from photoplan.io.orientation.block import OrientationBlock
+from photoplan.io.orientation.file import read_orientation_block, write_orientation
+from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.project_cameras import interior_of, lens_of
 from photoplan.io.project_model import Image
 

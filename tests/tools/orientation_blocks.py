@@ -7,8 +7,8 @@ import numpy as np
 from photoplan.cameras.frame import FrameCamera as PixelCamera
 from photoplan.geometry.pose import Pose
 from photoplan.io.camera_model import FrameCamera
-from photoplan.io.orientation_block import OrientationBlock
-from photoplan.io.orientation_table import OrientationTable, OrientedImage
+from photoplan.io.orientation.block import OrientationBlock
+from photoplan.io.orientation.table import OrientationTable, OrientedImage
 from photoplan.io.project_cameras import interior_of, lens_of
 from photoplan.io.project_model import Image
 

@@ -12,9 +12,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from photoplan.io.terrain_model_read import ModelReader
-from photoplan.io.terrain_model_tables import GrossError, ModelHeader, empty_figures
-from photoplan.io.terrain_model_write import ModelParts, ModelWriter
+from photoplan.io.terrain.model_read import ModelReader
+from photoplan.io.terrain.model_tables import GrossError, ModelHeader, empty_figures
+from photoplan.io.terrain.model_write import ModelParts, ModelWriter
 from photoplan.surfaces.mesh_faces import build_faces
 from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
 

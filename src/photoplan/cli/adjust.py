@@ -13,7 +13,7 @@ import click
 from photoplan.cli.options import json_option
 
 if TYPE_CHECKING:
-    from photoplan.products.adjust import AdjustReport
+    from photoplan.products.adjust.run import AdjustReport
 
 __all__ = ["command"]
 
@@ -42,7 +42,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     Measurements are the files that [observations] names. Orientations and calibrated cameras are written into the
     project file (the one before is kept as *.previous.toml), a report and the points into the output folder.
     """
-    from photoplan.products.adjust import AdjustRequest, adjust_project
+    from photoplan.products.adjust.run import AdjustRequest, adjust_project
 
     def talk(text: str) -> None:
         if not quiet:

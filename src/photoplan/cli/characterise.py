@@ -12,7 +12,7 @@ from photoplan.cli.failures import end_with_failures
 from photoplan.cli.options import json_option
 
 if TYPE_CHECKING:
-    from photoplan.products.characterise import AnalysisRun, CharacteriseReport
+    from photoplan.products.characterise.run import AnalysisRun, CharacteriseReport
 
 __all__ = ["command"]
 
@@ -33,7 +33,7 @@ def command(series: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     exposed. Every analysis that they allow is made; the others are listed with what is missing.
     """
     from photoplan.cli.progress import progress
-    from photoplan.products.characterise import CharacteriseRequest, characterise
+    from photoplan.products.characterise.run import CharacteriseRequest, characterise
 
     request = CharacteriseRequest(series, **options)
     report = characterise(request, lambda total: progress(total, quiet, "analyses"))

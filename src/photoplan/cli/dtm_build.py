@@ -11,7 +11,7 @@ import click
 from photoplan.cli.options import json_option
 
 if TYPE_CHECKING:
-    from photoplan.products.dtm_build import BuildReport, BuildRequest
+    from photoplan.products.dtm.build import BuildReport, BuildRequest
 
 __all__ = ["command"]
 
@@ -60,7 +60,7 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     from contextlib import ExitStack
 
     from photoplan.cli.progress import progress
-    from photoplan.products.dtm_build import describe_plan, dtm_build, load, plan_facts
+    from photoplan.products.dtm.build import describe_plan, dtm_build, load, plan_facts
     from photoplan.terrain.build import plan_build
 
     request = _request(options)
@@ -101,8 +101,8 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
 def _request(options: dict[str, Any]) -> BuildRequest:
     import psutil
 
-    from photoplan.io.terrain_files import CodeTable, ReadOptions, read_code_table
-    from photoplan.products.dtm_build import BuildRequest
+    from photoplan.io.terrain.files import CodeTable, ReadOptions, read_code_table
+    from photoplan.products.dtm.build import BuildRequest
     from photoplan.terrain.settings import BuildSettings
 
     codes = options.pop("codes")

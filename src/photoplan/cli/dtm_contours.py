@@ -46,7 +46,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     from contextlib import ExitStack
 
     from photoplan.cli.progress import progress
-    from photoplan.products.dtm_contours import ContourRequest, make_contours
+    from photoplan.products.dtm.contours import ContourRequest, make_contours
     from photoplan.terrain.contours import ContourOptions
 
     names = ("interval", "base", "index", "smooth", "simplify", "band", "shortest")

@@ -29,7 +29,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     Triangulations hold walls as vertical triangles (LandXML cannot); points are the posts and the lines' vertices.
     """
     from photoplan.cli.progress import progress
-    from photoplan.products.dtm_export import ExportRequest, dtm_export, export_steps
+    from photoplan.products.dtm.export import ExportRequest, dtm_export, export_steps
 
     request = ExportRequest(**options)
     with progress(0 if quiet else export_steps(request), quiet) as report:

@@ -32,7 +32,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     Pits are filled first; how much that was is printed.
     """
-    from photoplan.products.dtm_flow import BANDS, FlowRequest, dtm_flow
+    from photoplan.products.dtm.flow import BANDS, FlowRequest, dtm_flow
 
     found = dtm_flow(FlowRequest(**options))
     if as_json:

@@ -18,7 +18,7 @@ __all__ = ["command"]
 @json_option
 def command(model: Path, gross: bool, as_json: bool) -> None:
     """Show the figures of MODEL: units, lines, accuracy, gross errors. A raster is shown as by `photoplan info`."""
-    from photoplan.products.dtm_info import dtm_info
+    from photoplan.products.dtm.info import dtm_info
 
     found = dtm_info(model)
     if as_json:

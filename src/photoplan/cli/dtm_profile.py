@@ -33,8 +33,8 @@ def command(x: str | None, y: str | None, decimal_comma: bool, as_json: bool, qu
 
     There is a point wherever the surface bends: at grid lines, breaklines and edges of triangles; at a wall two.
     """
-    from photoplan.io.terrain_points import PointTableFormat
-    from photoplan.products.dtm_profile import ProfileRequest, dtm_profile
+    from photoplan.io.terrain.points import PointTableFormat
+    from photoplan.products.dtm.profile import ProfileRequest, dtm_profile
 
     request = ProfileRequest(form=PointTableFormat(x, y, None, decimal_comma), **options)
     found = dtm_profile(request)

@@ -33,7 +33,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     Inside a band along the polygons' border the difference of the two is blended in; outside nothing changes.
     """
-    from photoplan.products.dtm_refine import RefineRequest, dtm_refine
+    from photoplan.products.dtm.refine import RefineRequest, dtm_refine
 
     found = dtm_refine(RefineRequest(**options))
     if as_json:

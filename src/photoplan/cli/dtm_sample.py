@@ -45,8 +45,8 @@ def command(
     """
     from photoplan.geometry.crs import crs_label
     from photoplan.geometry.heights import height_label
-    from photoplan.io.terrain_points import PointTableFormat
-    from photoplan.products.dtm_sample import SampleRequest, dtm_sample
+    from photoplan.io.terrain.points import PointTableFormat
+    from photoplan.products.dtm.sample import SampleRequest, dtm_sample
 
     spelled = {"comma": ",", "semicolon": ";", "tab": "\t", "\\t": "\t", "space": " "}
     form = PointTableFormat(x, y, spelled.get(delimiter or "", delimiter), decimal_comma, not no_header)

@@ -12,7 +12,7 @@ import click
 from photoplan.cli.options import json_option
 
 if TYPE_CHECKING:
-    from photoplan.products.dtm_shading import ShadingFacts
+    from photoplan.products.dtm.shading import ShadingFacts
 
 __all__ = ["command", "light_options", "picture_options", "say", "take_light", "take_request"]
 
@@ -61,7 +61,7 @@ def take_light(options: dict[str, Any]) -> Any:
 
 def take_request(options: dict[str, Any]) -> Any:
     """The request, taken out of the options of a verb."""
-    from photoplan.products.dtm_shading import PictureRequest
+    from photoplan.products.dtm.shading import PictureRequest
 
     names = ("model", "output", "resolution", "bounds", "crs", "preview", "overwrite", "workers")
     return PictureRequest(**{name: options.pop(name) for name in names})
@@ -98,7 +98,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     Slopes are those of the model's surface at each pixel, so breaklines stay sharp.
     """
-    from photoplan.products.dtm_shading import make_picture, shade_picture
+    from photoplan.products.dtm.shading import make_picture, shade_picture
 
     picture, request = shade_picture(take_light(options)), take_request(options)
     say(lambda begin: make_picture(request, picture, begin), as_json, quiet)

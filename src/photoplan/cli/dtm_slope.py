@@ -21,7 +21,7 @@ def command(percent: bool, classes: str | None, aspect: bool, as_json: bool, qui
 
     Places without terrain are NaN, or class 0.
     """
-    from photoplan.products.dtm_shading import aspect_picture, make_picture, slope_picture
+    from photoplan.products.dtm.shading import aspect_picture, make_picture, slope_picture
 
     if aspect and (percent or classes):
         raise click.UsageError("--aspect goes with neither --percent nor --classes")

@@ -23,7 +23,7 @@ __all__ = ["command"]
 @light_options
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Colours by height: red, green, blue, with a mask where MODEL has no terrain."""
-    from photoplan.products.dtm_shading import make_picture, tint_picture
+    from photoplan.products.dtm.shading import make_picture, tint_picture
     from photoplan.terrain.shading_tints import RAMPS
 
     ramp, span, steps = options.pop("ramp"), options.pop("heights"), options.pop("classes")

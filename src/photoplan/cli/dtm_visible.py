@@ -38,7 +38,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     Places without terrain block nothing.
     """
     from photoplan.cli.progress import progress
-    from photoplan.products.dtm_visible import VisibleRequest, dtm_visible
+    from photoplan.products.dtm.visible import VisibleRequest, dtm_visible
 
     found = dtm_visible(VisibleRequest(**options), lambda observers: progress(observers, quiet))
     if as_json:

@@ -35,7 +35,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     Cut is where A lies above B. Where one of the models has no height nothing is counted; that area is printed.
     """
     from photoplan.cli.progress import progress
-    from photoplan.products.dtm_volume import VolumeRequest, dtm_volume
+    from photoplan.products.dtm.volume import VolumeRequest, dtm_volume
 
     found = dtm_volume(VolumeRequest(**options), lambda windows: progress(windows, quiet))
     if as_json:

@@ -51,8 +51,8 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any
         run_patterns(images, as_json, quiet, options)
         return
     from photoplan.cli.progress import progress
-    from photoplan.products.mtf import MtfRequest, measure_mtf
-    from photoplan.products.mtf_result import group_lines
+    from photoplan.products.mtf.result import group_lines
+    from photoplan.products.mtf.run import MtfRequest, measure_mtf
 
     talk = talking(quiet)
     request = MtfRequest(images, **edge_options(options))

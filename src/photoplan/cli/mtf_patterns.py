@@ -58,7 +58,7 @@ def run_patterns(images: tuple[Path, ...], as_json: bool, quiet: bool, options: 
     click.UsageError
         An option is for edges.
     """
-    from photoplan.products.mtf_patterns import PatternRequest, measure_patterns
+    from photoplan.products.mtf.patterns import PatternRequest, measure_patterns
 
     _refuse(_OF_EDGES, f"is for edges, not for --pattern {options['pattern']}")
 

@@ -40,7 +40,7 @@ def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def table_format(options: dict[str, Any]) -> Any:
     """TableFormat of `reading_options`, which are taken out of `options`."""
-    from photoplan.io.orientation_table import TableFormat
+    from photoplan.io.orientation.table import TableFormat
 
     names = ("angle_unit", "rotation", "direction")
     given = {name: value for name in names if (value := options.pop(name)) is not None}

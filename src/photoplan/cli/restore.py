@@ -13,8 +13,8 @@ from photoplan.cli.options import BYTES, json_option
 from photoplan.cli.restore_options import filter_options, filter_request
 
 if TYPE_CHECKING:
-    from photoplan.products.restore import RestoredImage, RestorePlan
-    from photoplan.products.restore_report import ReportFile
+    from photoplan.products.restore.report import ReportFile
+    from photoplan.products.restore.run import RestoredImage, RestorePlan
     from photoplan.products.restored_reader import RestoredReader
 
 __all__ = ["command"]
@@ -53,8 +53,8 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
     import psutil
 
     from photoplan.cli.progress import progress
-    from photoplan.products.restore import RestoreRequest, plan_restoration, restore_images
-    from photoplan.products.restore_filter import FILTER_NAME, keep_filter, requested_filter
+    from photoplan.products.restore.filter import FILTER_NAME, keep_filter, requested_filter
+    from photoplan.products.restore.run import RestoreRequest, plan_restoration, restore_images
 
     def talk(text: str) -> None:
         if not quiet:
@@ -97,7 +97,7 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
 
 def _page(options: dict[str, Any], inputs: list[Path | None]) -> ReportFile | None:
     """The report that the options ask for, which are taken out; refused before any work."""
-    from photoplan.products.restore_report import open_report
+    from photoplan.products.restore.report import open_report
 
     path: Path | None = options.pop("report")
     files = [each for each in (*inputs, options["chromatic"], options["fall_off"]) if isinstance(each, Path)]
@@ -106,8 +106,8 @@ def _page(options: dict[str, Any], inputs: list[Path | None]) -> ReportFile | No
 
 def _before(plan: RestorePlan) -> list[str]:
     """What a user should know before the filter is used."""
-    from photoplan.products.restore import filter_figures
-    from photoplan.products.restore_filter import NO_FILTER
+    from photoplan.products.restore.filter import NO_FILTER
+    from photoplan.products.restore.run import filter_figures
 
     figures = filter_figures(plan.filter)
     sums = ", ".join(f"{total:.4g}" for total in figures["sums"][:6])
@@ -137,7 +137,7 @@ def _corrections(reader: RestoredReader) -> list[str]:
 
 
 def _show(plan: RestorePlan, as_json: bool) -> None:
-    from photoplan.products.restore import filter_figures
+    from photoplan.products.restore.run import filter_figures
 
     rows: list[dict[str, Any]] = [
         {

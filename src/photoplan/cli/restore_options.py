@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
-    from photoplan.products.restore_filter import FilterRequest
+    from photoplan.products.restore.filter import FilterRequest
 
 __all__ = ["filter_options", "filter_request"]
 
@@ -45,8 +45,8 @@ def filter_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def filter_request(images: tuple[Path, ...], options: dict[str, Any]) -> FilterRequest:
     """What the options ask for; takes them out of `options`, but for those that others need too."""
-    from photoplan.products.restore_design import DesignRequest
-    from photoplan.products.restore_filter import FilterRequest
+    from photoplan.products.restore.design import DesignRequest
+    from photoplan.products.restore.filter import FilterRequest
     from photoplan.quality.restoration.design import DesignOptions
 
     file, aperture = options.pop("filter_file"), options.pop("aperture")

@@ -7,18 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from photoplan.errors import InputError
-from photoplan.io import (
-    camera_opencv,
-    camera_opensfm,
-    camera_pix4d,
-    camera_toml,
-    camera_yaml,
-    orientation_colmap,
-    orientation_metashape,
-    orientation_pix4d,
-)
+from photoplan.io import camera_opencv, camera_opensfm, camera_pix4d, camera_toml, camera_yaml
 from photoplan.io.camera_model import FilmCamera, FrameCamera
-from photoplan.io.orientation_table import TableFormat
+from photoplan.io.orientation import colmap as orientation_colmap
+from photoplan.io.orientation import metashape as orientation_metashape
+from photoplan.io.orientation import pix4d as orientation_pix4d
+from photoplan.io.orientation.table import TableFormat
 from photoplan.io.plain_files import read_head
 
 __all__ = ["CAMERA_FORMATS", "CameraFile", "read_cameras"]

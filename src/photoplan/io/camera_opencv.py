@@ -19,8 +19,8 @@ from photoplan.errors import InputError
 from photoplan.io.camera_model import FilmCamera, FrameCamera
 from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
 from photoplan.io.names import unique_stems
-from photoplan.io.orientation_block import Loss, OrientationBlock, OrientationFormat
-from photoplan.io.orientation_table import TableFormat
+from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat
+from photoplan.io.orientation.table import TableFormat
 from photoplan.io.plain_files import finite, parse_yaml, read_head, read_json, read_text
 
 __all__ = ["FORMAT", "is_opencv", "read", "render"]

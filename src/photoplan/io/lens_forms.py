@@ -14,7 +14,7 @@ from photoplan.cameras.lenses.none import NoLens
 from photoplan.cameras.lenses.opencv import OpenCV
 from photoplan.errors import InputError
 from photoplan.io.camera_model import FilmCamera, FrameCamera
-from photoplan.io.orientation_block import Loss, OrientationBlock
+from photoplan.io.orientation.block import Loss, OrientationBlock
 from photoplan.io.plain_files import build
 from photoplan.io.project_cameras import lens_of
 

@@ -22,9 +22,9 @@ from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.rotation import rotation_from_angles
 from photoplan.io.named_table import NamedTable, TableColumns, read_named_table
 from photoplan.io.names import match_key
-from photoplan.io.orientation_exif import map_positions, read_folder
-from photoplan.io.orientation_file import read_orientation
-from photoplan.io.orientation_table import TableFormat, angle_in_radians
+from photoplan.io.orientation.exif import map_positions, read_folder
+from photoplan.io.orientation.file import read_orientation
+from photoplan.io.orientation.table import TableFormat, angle_in_radians
 from photoplan.io.prj_file import crs_beside
 from photoplan.io.project_model import ANGLE_UNITS
 

@@ -1,6 +1,6 @@
 """A block of images as the bundle adjustment takes it, and what comes out: in one Cartesian system, metres.
 
-Maps are not Cartesian; `photoplan.products.adjust` carries a project's inputs here and the result back.
+Maps are not Cartesian; `photoplan.products.adjust.run` carries a project's inputs here and the result back.
 """
 
 from __future__ import annotations

@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import canonical_crs, require_projected_metres
 from photoplan.io.camera_file import read_cameras
-from photoplan.io.orientation_block import Loss, OrientationBlock, without_lenses
-from photoplan.io.orientation_file import (
+from photoplan.io.orientation.block import Loss, OrientationBlock, without_lenses
+from photoplan.io.orientation.file import (
     choose_format,
     orientation_format,
     read_orientation_block,
     write_orientation,
     written_formats,
 )
-from photoplan.io.orientation_table import Direction, OrientationTable, OrientedImage, TableFormat, degrees_of
+from photoplan.io.orientation.table import Direction, OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.product import check_output
 from photoplan.orientation.readings import turn_matrix
 from photoplan.products.init import placed
@@ -38,7 +38,7 @@ class ConvertRequest:
     orientation: Path
     """File, or folder of a format with several files; a project too."""
     target: str
-    """Format to write, of `photoplan.io.orientation_file.FORMATS`."""
+    """Format to write, of `photoplan.io.orientation.file.FORMATS`."""
     output: Path | None = None
     """None: beside the orientation, called after it and the format."""
     format: str | None = None

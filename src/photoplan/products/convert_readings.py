@@ -14,8 +14,8 @@ from photoplan.errors import InputError, UsageError
 from photoplan.io.camera_model import FilmCamera
 from photoplan.io.ground_points import read_ground_points
 from photoplan.io.image_points import named_as, read_image_points
-from photoplan.io.orientation_block import OrientationBlock
-from photoplan.io.orientation_file import orientation_format
+from photoplan.io.orientation.block import OrientationBlock
+from photoplan.io.orientation.file import orientation_format
 from photoplan.io.project_cameras import interior_of, lens_of
 from photoplan.io.project_model import Image
 from photoplan.orientation.readings import (

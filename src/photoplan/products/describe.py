@@ -13,7 +13,7 @@ from photoplan.io.plan_file import read_plan_tables
 from photoplan.io.project import load_project
 from photoplan.io.project_model import Terrain
 from photoplan.io.raster_info import RasterInfo, read_info
-from photoplan.io.terrain_model_read import ModelReader, is_terrain_model
+from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
 from photoplan.products.describe_filter import describe_filter
 from photoplan.products.describe_model import describe_model
 

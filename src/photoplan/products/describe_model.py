@@ -9,7 +9,7 @@ import numpy as np
 
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import height_label
-from photoplan.io.terrain_model_read import ModelReader
+from photoplan.io.terrain.model_read import ModelReader
 from photoplan.surfaces.units import LineElement, UnitFigures
 
 __all__ = ["describe_model", "model_figures"]

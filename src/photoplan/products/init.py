@@ -17,8 +17,8 @@ from photoplan.io.camera_file import CameraFile, read_cameras
 from photoplan.io.camera_model import FilmCamera, FrameCamera, Triple
 from photoplan.io.camera_opensfm import resized
 from photoplan.io.names import check_input_name, match_key, relative_path
-from photoplan.io.orientation_file import read_orientation
-from photoplan.io.orientation_table import OrientationTable, OrientedImage, TableFormat
+from photoplan.io.orientation.file import read_orientation
+from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.project import parse_project, write_project
 from photoplan.io.project_model import Image, Project, Terrain
 from photoplan.io.raster_info import RasterInfo, read_info
@@ -61,7 +61,7 @@ class InitRequest:
     camera: Path
     """File with cameras: TOML, YAML or JSON."""
     orientation: Path | None = None
-    """File with orientations, of any format of `photoplan.io.orientation_file`; None: the images are to be oriented."""
+    """File with orientations, of any format of `photoplan.io.orientation.file`; None: the images are to be oriented."""
     terrain: str | None = None
     """Raster of heights, or one height in metres; None: it is added to the project before products are made."""
     crs: str | None = None

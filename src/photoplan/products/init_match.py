@@ -10,7 +10,7 @@ from photoplan.errors import InputError
 from photoplan.io.camera_file import CameraFile
 from photoplan.io.camera_model import FilmCamera
 from photoplan.io.names import check_input_name, match_key
-from photoplan.io.orientation_table import OrientationTable, OrientedImage
+from photoplan.io.orientation.table import OrientationTable, OrientedImage
 
 __all__ = ["Unoriented", "camera_by_size", "camera_name", "image_files", "match_images", "some", "unoriented"]
 

@@ -22,10 +22,10 @@ from photoplan.geometry.crs import (
 )
 from photoplan.geometry.heights import check_height_system, declared_pair, height_label, height_step
 from photoplan.io.names import check_input_name, relative_path
-from photoplan.io.orientation_table import OrientationTable, degrees_of
+from photoplan.io.orientation.table import OrientationTable, degrees_of
 from photoplan.io.project_model import Terrain
 from photoplan.io.raster_info import read_info
-from photoplan.io.terrain_model_read import ModelReader, is_terrain_model
+from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
 
 __all__ = [
     "Systems",

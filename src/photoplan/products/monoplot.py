@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.rotation import rotation_from_angles
 from photoplan.io.named_table import write_named_table
-from photoplan.io.orientation_table import angle_in_radians
+from photoplan.io.orientation.table import angle_in_radians
 from photoplan.io.polygons import read_features, write_features
 from photoplan.io.product import check_output
 from photoplan.io.project import load_project

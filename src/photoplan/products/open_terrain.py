@@ -9,8 +9,8 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import CrsStep, crs_step, require_projected_metres, same_crs
-from photoplan.io.terrain_model_read import ModelReader, is_terrain_model
-from photoplan.io.terrain_reader import TerrainReader
+from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
+from photoplan.io.terrain.reader import TerrainReader
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.raster import RasterSurface
 

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from photoplan.geometry.rotation import rotation_from_angles
 from photoplan.io.camera_model import FilmCamera, FrameCamera
-from photoplan.io.orientation_table import angle_in_radians
+from photoplan.io.orientation.table import angle_in_radians
 from photoplan.io.project_cameras import interior_of, lens_of
 from photoplan.io.project_model import Image, Orientation
 from photoplan.products.readings import DECLARED, Reading, readings

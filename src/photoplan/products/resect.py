@@ -15,7 +15,7 @@ from photoplan.io.project import load_project
 from photoplan.io.project_edit import ProjectChanges, edit_project
 from photoplan.io.project_model import Project
 from photoplan.orientation.resection_model import ResectSettings
-from photoplan.products.adjust_inputs import AdjustInputs, read_inputs
+from photoplan.products.adjust.inputs import AdjustInputs, read_inputs
 from photoplan.products.resect_image import ResectedImage, control_rows, resect_image
 from photoplan.products.scene import input_files
 from photoplan.report.resect_report import ResectFacts, ResectPlots, resect_report

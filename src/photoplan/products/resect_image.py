@@ -20,9 +20,9 @@ from photoplan.io.project_model import ANGLE_UNITS, Image, Project
 from photoplan.orientation.block import AdjustedCamera
 from photoplan.orientation.resection import resect
 from photoplan.orientation.resection_model import MeasuredPoints, Resected, ResectSettings
-from photoplan.products.adjust_cameras import Calibrated, block_camera, calibrated, camera_entries
-from photoplan.products.adjust_frame import angle_derivatives, block_frame, nadir_heights
-from photoplan.products.adjust_inputs import AdjustInputs
+from photoplan.products.adjust.cameras import Calibrated, block_camera, calibrated, camera_entries
+from photoplan.products.adjust.frame import angle_derivatives, block_frame, nadir_heights
+from photoplan.products.adjust.inputs import AdjustInputs
 from photoplan.products.plain_values import plain
 from photoplan.products.scene import stated_pose
 

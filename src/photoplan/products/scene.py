@@ -20,7 +20,7 @@ from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_from_angles
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.names import resolve_input
-from photoplan.io.orientation_table import angle_in_radians
+from photoplan.io.orientation.table import angle_in_radians
 from photoplan.io.project import parse_project
 from photoplan.io.project_cameras import interior_of, lens_of
 from photoplan.io.project_model import Image, Project, Terrain

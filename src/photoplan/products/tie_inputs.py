@@ -14,7 +14,7 @@ from photoplan.cameras.build import oriented_camera
 from photoplan.errors import InputError
 from photoplan.io.names import match_key
 from photoplan.io.observed_positions import read_observed_positions
-from photoplan.io.orientation_table import TableFormat
+from photoplan.io.orientation.table import TableFormat
 from photoplan.io.plain_files import read_text
 from photoplan.io.project_cameras import interior_of, lens_of
 from photoplan.io.project_model import FilmCamera, Image, Project

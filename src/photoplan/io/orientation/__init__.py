@@ -1,0 +1,1 @@
+"""Orientations and cameras in everyone's files, one format in each."""

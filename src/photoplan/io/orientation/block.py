@@ -1,0 +1,216 @@
+"""Oriented images together with their cameras, and what a file format for them is.
+
+How a format is added: a module ``orientation_NAME.py`` defines `FORMAT`, an `OrientationFormat` of four functions, and
+`photoplan.io.orientation.file.FORMATS` gets a line. Nothing else changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.geometry.rotation import angles_from_rotation
+from photoplan.io.camera_model import FilmCamera, FrameCamera, NoLens
+from photoplan.io.orientation.table import Direction, OrientationTable, OrientedImage, TableFormat
+from photoplan.io.project_model import ANGLE_UNITS
+
+__all__ = [
+    "Loss",
+    "LossKind",
+    "OrientationBlock",
+    "OrientationFormat",
+    "common_losses",
+    "height_losses",
+    "require_cameras",
+    "require_map",
+    "without_lenses",
+]
+
+LossKind = Literal["lens", "camera", "film", "crs", "height_system", "other"]
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Something that a format cannot hold."""
+
+    kind: LossKind
+    """``lens``: a file with the camera but without its lens would be wrong; such a file is written only on demand.
+    Everything else is only told."""
+    text: str
+    """What is lost, and where to keep it; a sentence without a full stop."""
+
+
+@dataclass(frozen=True, eq=False)
+class OrientationBlock:
+    """Everything that is known of a block of oriented images; checked at birth."""
+
+    table: OrientationTable
+    """Poses and the names of the images and of their cameras."""
+    cameras: Mapping[str, FrameCamera | FilmCamera] = field(default_factory=dict)
+    """Descriptions by name; empty where the file holds none. With one camera, images need not name it."""
+    files: Mapping[str, str] = field(default_factory=dict)
+    """Image files by image name, as stated (relative to the orientation file, or absolute); not all are known."""
+    sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    """Width and height in pixels by image name, where the camera does not state them."""
+    matrix: Direction | None = None
+    """What rotation matrices do in a file that is written, where its format leaves that open; None: as is usual."""
+
+    def __post_init__(self) -> None:
+        names = {image.name for image in self.table.images}
+        for what, known in (("file", self.files), ("size", self.sizes)):
+            unknown = next((name for name in known if name not in names), None)
+            if unknown is not None:
+                raise InputError(f"{self.table.file}: {what} of image {unknown!r}, which is not in the block")
+        if not self.cameras:
+            return
+        for image in self.table.images:
+            self.camera_name(image)
+
+    def camera_name(self, image: OrientedImage) -> str:
+        """Name of an image's camera.
+
+        Raises
+        ------
+        InputError
+            The image names a camera that is not described, or none where there are several.
+        """
+        known = ", ".join(map(repr, self.cameras)) or "none"
+        if image.camera is None:
+            if len(self.cameras) == 1:
+                return next(iter(self.cameras))
+            raise InputError(f"{self.table.file}: image {image.name!r} names no camera; cameras are {known}")
+        if image.camera not in self.cameras:
+            raise InputError(
+                f"{self.table.file}: camera {image.camera!r} of image {image.name!r} is not described; "
+                f"cameras are {known}"
+            )
+        return image.camera
+
+    def camera(self, image: OrientedImage) -> FrameCamera | FilmCamera:
+        """Description of an image's camera; raises as `camera_name`."""
+        return self.cameras[self.camera_name(image)]
+
+    def size(self, image: OrientedImage) -> tuple[int, int] | None:
+        """Width and height of an image in pixels, None if they are not known."""
+        own = self.sizes.get(image.name)
+        return own if own is not None or not self.cameras else self.camera(image).size
+
+    def angles(self, order: str, unit: str) -> NDArray[np.float64]:
+        """Angles of all images, shape (n, 3), for camera-to-ground matrices: in the sequence of `order`, in `unit`."""
+        table = self.table
+        if (table.angle_unit, table.rotation, table.direction) == (unit, order, "camera-to-ground"):
+            # Numbers that are already so stay untouched.
+            return np.array([i.angles for i in table.images], np.float64)
+        scale = ANGLE_UNITS[unit] / (2 * np.pi)
+        angles = np.array([angles_from_rotation(R, order) for R in table.rotations], np.float64) * scale
+        # Rounded below the noise of the conversion; adding zero turns −0.0 into 0.0.
+        return np.asarray(np.round(angles, 12) + 0.0, np.float64)
+
+
+@dataclass(frozen=True)
+class OrientationFormat:
+    """A file format for orientations."""
+
+    name: str
+    """As `--format` and `--to` spell it."""
+    title: str
+    """As users know it."""
+    sniff: Callable[[Path, str], bool]
+    """Whether a file may be of this format: its path and its first 64 KiB as text (line ends are newlines, bytes that
+    are not UTF-8 are replaced; empty for a folder). If two formats claim one file, the user is asked; a format without
+    any mark of its own claims none and has to be stated. What no format claims is read as a table of text."""
+    read: Callable[[Path, TableFormat], OrientationBlock]
+    """What the file holds; `TableFormat` only where the format leaves conventions open. Raises InputError."""
+    render: Callable[[OrientationBlock, Path], Mapping[Path, str]] | None = None
+    """Text of all files to be written under a path that the user gave (a folder for formats of several files); writes
+    nothing itself. Raises InputError where something that the format needs is not known. None: read only."""
+    losses: Callable[[OrientationBlock], Iterable[Loss]] = lambda block: ()
+    """What of a block the format cannot hold."""
+    suffix: str = ".txt"
+    """Of a file that the user gives no name; empty for a folder."""
+    angles: bool = False
+    """Whether files hold three angles that could mean something else than they are taken for."""
+
+
+def require_map(block: OrientationBlock, path: Path) -> None:
+    """Refuse a block in a local tangential system, for formats that cannot state its origin.
+
+    Raises
+    ------
+    InputError
+        Positions and rotations refer to such a system.
+    """
+    if block.table.origin is not None:
+        raise InputError(
+            f"{path}: the orientations of {block.table.file} are in a local system that this format cannot state; "
+            "carry them into a map with --crs EPSG:nnnn"
+        )
+
+
+def require_cameras(block: OrientationBlock, path: Path, what: str) -> None:
+    """Refuse a block without cameras, for formats that describe them; `what` names the file in the message.
+
+    Raises
+    ------
+    InputError
+        There are none.
+    """
+    if not block.cameras:
+        raise InputError(f"{path}: {what} describes the cameras, and none is given; name the file that does")
+
+
+def without_lenses(block: OrientationBlock) -> OrientationBlock:
+    """The block with all lenses taken as free of distortion."""
+    cameras = {name: camera.model_copy(update={"lens": NoLens()}) for name, camera in block.cameras.items()}
+    return replace(block, cameras=cameras)
+
+
+def common_losses(
+    block: OrientationBlock,
+    *,
+    cameras: bool,
+    crs: bool = False,
+    height_system: bool = False,
+    film: bool = True,
+    lenses: tuple[str, ...] = (),
+) -> list[Loss]:
+    """Losses of a format that holds what is True.
+
+    Parameters
+    ----------
+    block : OrientationBlock
+    cameras, crs, height_system : bool
+        Whether the format holds cameras, a coordinate system, a height system.
+    film : bool
+        Whether a format with cameras can hold scanned film (marks and their measurement in each image).
+    lenses : tuple of str
+        Types of lenses (`photoplan.io.camera_model`) that a format with cameras holds without loss.
+    """
+    lost: list[Loss] = []
+    if block.cameras and not cameras:
+        names = ", ".join(map(repr, block.cameras))
+        lost.append(Loss("camera", f"no cameras ({names}): keep the file that describes them"))
+    if cameras:
+        for name, camera in block.cameras.items():
+            if isinstance(camera, FilmCamera) and not film:
+                lost.append(Loss("film", f"no fiducial marks (camera {name!r})"))
+            if camera.lens.type != "none" and camera.lens.type not in lenses:
+                lost.append(Loss("lens", f"no lens of type {camera.lens.type} (camera {name!r})"))
+    if block.table.crs is not None and not crs:
+        lost.append(Loss("crs", "no coordinate system: state it to whoever reads the file"))
+    if block.table.height_system is not None and not height_system:
+        lost.append(Loss("height_system", f"no height system ({block.table.height_system})"))
+    return lost
+
+
+def height_losses(table: OrientationTable) -> Iterable[Loss]:
+    """The loss of a format whose heights are understood as ellipsoidal."""
+    if table.crs is not None and table.height_system != "ellipsoidal":
+        stated = table.height_system or "not stated"
+        yield Loss("height_system", f"heights as ellipsoidal ones only (these are: {stated})")

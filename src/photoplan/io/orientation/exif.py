@@ -1,0 +1,137 @@
+"""Approximate orientations from what drones write into their images: position, and the attitude of the gimbal.
+
+The gimbal's axes are x along the viewing direction, y right, z down; R = R_z(yaw) R_y(pitch) R_x(roll) takes them to
+north, east, down (DJI Mavic 3E/3T User Manual, "Photo File": NED, rotation order ZYX). So pitch −90 looks straight down
+with the top of the image towards the yaw. The image lies on its sensor as the camera writes it, without EXIF's display
+rotation.
+
+Yaw is taken from true north. Positions become a tangential system (east, north, up), which later steps carry into the
+project's CRS with the convergence of meridians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.errors import InputError
+from photoplan.geometry.crs import crs_step
+from photoplan.geometry.earth_poses import enu_poses
+from photoplan.geometry.rotation import rotation_from_angles
+from photoplan.io.image_metadata import ImageMetadata, read_image_metadata
+from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
+from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat, degrees_of
+
+__all__ = ["FORMAT", "image_files", "map_positions", "read", "read_folder", "rotation_from_gimbal"]
+
+SUFFIXES = (".jpg", ".jpeg", ".tif", ".tiff")
+#: From north, east, down to east, north, up.
+_R_ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+#: Columns: camera x (right), y (up) and z (backwards) in the gimbal's axes forwards, right, down.
+_R_GIMBAL_CAMERA = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def rotation_from_gimbal(yaw_pitch_roll: ArrayLike) -> NDArray[np.float64]:
+    """R_enu_camera (3, 3): camera axes to east, north, up, of yaw, pitch and roll in degrees."""
+    # About z by yaw, then y by pitch, then x by roll: the order that is spelled kappa, phi, omega.
+    R_ned_gimbal = rotation_from_angles(np.radians(np.asarray(yaw_pitch_roll, float)), "kpo")
+    return np.asarray(_R_ENU_NED @ R_ned_gimbal @ _R_GIMBAL_CAMERA, np.float64)
+
+
+def image_files(path: Path) -> list[Path]:
+    """JPEG and TIFF images of a folder by name, or the one file.
+
+    Raises
+    ------
+    InputError
+        The folder has none.
+    """
+    if not path.is_dir():
+        return [path]
+    files = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file())
+    if not files:
+        raise InputError(f"{path}: the folder holds no image ({', '.join(SUFFIXES)})")
+    return files
+
+
+def read_folder(path: Path) -> tuple[ImageMetadata, ...]:
+    """Metadata of the images of a folder, or of one image, that state a position.
+
+    Raises
+    ------
+    InputError
+        None does, or a file is damaged.
+    """
+    stated = tuple(m for m in map(read_image_metadata, image_files(path)) if m.position is not None)
+    if not stated:
+        raise InputError(f"{path}: no image states a GPS position (latitude, longitude and altitude)")
+    datums = {m.datum.upper().replace(" ", "").replace("-", "") for m in stated if m.datum}
+    other = sorted(d for d in datums if not d.startswith("WGS84"))
+    if other:
+        raise InputError(f"{path}: positions refer to the datum {other[0]}; only WGS 84 is read from EXIF")
+    return stated
+
+
+def map_positions(images: Sequence[ImageMetadata], crs: str) -> NDArray[np.float64]:
+    """Positions in a projected CRS, shape (n, 3): map coordinates, and the height as the images state it.
+
+    Raises
+    ------
+    InputError
+        No exact transformation from WGS 84 is available, or a position has no place in the CRS.
+    """
+    places = np.array([m.position for m in images], float).reshape(-1, 3)
+    return np.column_stack([crs_step("EPSG:4326", crs)(places[:, [1, 0]]), places[:, 2]])
+
+
+def read(path: Path, form: TableFormat) -> OrientationBlock:
+    """Approximate orientations of a folder of drone images, or of one; `form` is not used.
+
+    Raises
+    ------
+    InputError
+        No image states position and attitude, or a file is damaged.
+    """
+    files = image_files(path)
+    stated = read_folder(path)
+    oriented = [m for m in stated if m.yaw_pitch_roll is not None and m.position is not None]
+    if not oriented:
+        raise InputError(
+            f"{path}: {len(stated)} images state a position and none an attitude (gimbal angles in XMP); give the "
+            "folder as positions in [observations] instead"
+        )
+    origin, enu, axes = enu_poses(np.array([m.position for m in oriented], float))
+    # One camera needs no name: that of the camera file may be any.
+    several = len({m.camera for m in oriented}) > 1
+    R = np.stack([rotation_from_gimbal(m.yaw_pitch_roll or (0, 0, 0)) for m in oriented])
+    angles = degrees_of(axes @ R).tolist()
+    images = tuple(
+        OrientedImage(m.file.name, (x, y, z), (a[0], a[1], a[2]), m.camera if several else None)
+        for m, (x, y, z), a in zip(oriented, enu.tolist(), angles)
+    )
+    lost = len(files) - len(oriented)
+    notes = [f"{path.name}: {lost} images state no position or attitude; left out"] if lost else []
+    turned = sum(m.display != 1 for m in oriented)
+    if turned:
+        notes.append(
+            f"{path.name}: EXIF turns {turned} images for display; angles are those of the pixels as stored, so images "
+            "that another program has turned need its angle"
+        )
+    notes.append(
+        "positions and gimbal angles of drones are approximate: metres, degrees, and heights in a system of their own"
+    )
+    sizes = {m.file.name: m.size for m in oriented if m.size is not None}
+    named = {m.file.name: m.file.name if path.is_dir() else str(m.file) for m in oriented}
+    return OrientationBlock(OrientationTable(path, images, origin=origin, notes=tuple(notes)), files=named, sizes=sizes)
+
+
+def _sniff(path: Path, head: str) -> bool:
+    if path.is_dir():
+        return any(p.suffix.lower() in SUFFIXES for p in path.iterdir())
+    return path.suffix.lower() in SUFFIXES
+
+
+FORMAT = OrientationFormat("exif", "positions and attitudes in drone images", _sniff, read)

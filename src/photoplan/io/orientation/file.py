@@ -1,0 +1,154 @@
+"""The registry of file formats for orientations: reading and writing files of any of them."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+
+from photoplan.errors import InputError, UsageError
+from photoplan.io.disk import disk_error, write_atomically
+from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
+from photoplan.io.orientation.table import OrientationTable, TableFormat
+from photoplan.io.plain_files import read_head
+
+__all__ = [
+    "FORMATS",
+    "choose_format",
+    "orientation_format",
+    "read_orientation",
+    "read_orientation_block",
+    "write_orientation",
+    "written_formats",
+]
+
+#: Module of every format, by name; each defines `FORMAT` (see `photoplan.io.orientation.block`).
+FORMATS: dict[str, str] = {
+    "csv": "photoplan.io.orientation.csv",
+    "toml": "photoplan.io.orientation.toml",
+    "opensfm": "photoplan.io.orientation.opensfm",
+    "patb": "photoplan.io.orientation.patb",
+    "bingo": "photoplan.io.orientation.bingo",
+    "bluh": "photoplan.io.orientation.bluh",
+    "inpho": "photoplan.io.orientation.inpho",
+    "metashape": "photoplan.io.orientation.metashape",
+    "pix4d": "photoplan.io.orientation.pix4d",
+    "opk": "photoplan.io.orientation.opk",
+    "exif": "photoplan.io.orientation.exif",
+    "odm": "photoplan.io.orientation.odm",
+    "colmap": "photoplan.io.orientation.colmap",
+    "opencv": "photoplan.io.camera_opencv",
+}
+
+#: Formats whose reader says what is wrong with a file that no format claims, by suffix; else it is a table of text.
+_BY_SUFFIX = {".toml": "toml", ".json": "opensfm"}
+
+
+def orientation_format(name: str) -> OrientationFormat:
+    """The format of a name.
+
+    Raises
+    ------
+    UsageError
+        There is none.
+    """
+    if name not in FORMATS:
+        raise UsageError(f"orientation format {name!r}; allowed are {', '.join(FORMATS)}")
+    found: OrientationFormat = import_module(FORMATS[name]).FORMAT
+    return found
+
+
+def choose_format(path: Path, form: TableFormat) -> OrientationFormat:
+    """The one format that a file is of, by its content.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, or it may be of several formats.
+    """
+    if form.columns is not None:
+        # Only a table has columns to be declared.
+        return orientation_format("csv")
+    head = "" if path.is_dir() else read_head(path)
+    claiming = [f for f in map(orientation_format, FORMATS) if f.sniff(path, head)]
+    if len(claiming) > 1:
+        kinds = ", ".join(f"{f.name} ({f.title})" for f in claiming)
+        raise InputError(f"{path}: its content does not tell which format it is: {kinds}; say it with --format")
+    return claiming[0] if claiming else orientation_format(_BY_SUFFIX.get(path.suffix.lower(), "csv"))
+
+
+def read_orientation_block(
+    path: str | Path, form: TableFormat | None = None, format: str | None = None
+) -> OrientationBlock:
+    """Oriented images of a file, with cameras where it holds them.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file, or the folder of a format that has several files.
+    form : TableFormat, optional
+        What a table of text does not say of itself: columns, angle unit, rotation.
+    format : str, optional
+        One of `FORMATS`; None: by the content.
+
+    Raises
+    ------
+    InputError
+        The file cannot be used, or it may be of several formats.
+    UsageError
+        The format is unknown.
+    """
+    path, form = Path(path), form or TableFormat()
+    return (choose_format(path, form) if format is None else orientation_format(format)).read(path, form)
+
+
+def read_orientation(path: str | Path, form: TableFormat | None = None, format: str | None = None) -> OrientationTable:
+    """Orientation table of a file; see `read_orientation_block`."""
+    return read_orientation_block(path, form, format).table
+
+
+def write_orientation(block: OrientationBlock, path: str | Path, format: str, *, overwrite: bool = False) -> list[Path]:
+    """Write a block in a format; each file appears complete or not at all.
+
+    Parameters
+    ----------
+    block : OrientationBlock
+    path : path
+        File, or folder of a format with several files.
+    format : str
+        One of `FORMATS`.
+    overwrite : bool
+        Replace files that exist.
+
+    Returns
+    -------
+    list of Path
+        The files.
+
+    Raises
+    ------
+    UsageError
+        The format is not written, or a file exists; nothing is written then.
+    InputError
+        Something is not known that the format needs.
+    ResourceError
+        The disk is full.
+    """
+    render = orientation_format(format).render
+    if render is None:
+        raise UsageError(f"orientation format {format} is read only; written are {', '.join(written_formats())}")
+    texts = render(block, Path(path))
+    present = [str(file) for file in texts if file.exists()]
+    if present and not overwrite:
+        raise UsageError(f"{', '.join(present)}: exists already; choose another output or say --overwrite")
+    for file, text in texts.items():
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise disk_error(file.parent, error) from None
+        write_atomically(file, text.encode())
+    return list(texts)
+
+
+def written_formats() -> list[str]:
+    """Names of the formats that can be written."""
+    return [name for name in FORMATS if orientation_format(name).render is not None]

@@ -1,0 +1,255 @@
+"""Agisoft Metashape's ``cameras.xml``: cameras and poses (File, Export, Export Cameras).
+
+As its manual (Metashape User Manual, Professional Edition 2.1, appendix "Camera models") and the API reference define
+it: a camera's ``transform`` is a row-major 4 × 4 matrix from the camera's axes (x right, y down, z forwards) to the
+chunk's own system; the ``transform`` of a component (of the chunk, in files before version 1.5) takes these by scale,
+rotation and translation to the world: geocentric coordinates of the datum of the ``reference`` CRS if that is
+geographic or projected, else the local system. Pixels: u = w/2 + cx + x′ f + x′ B1 + y′ B2, v = h/2 + cy + y′ f with
+(0.5, 0.5) as the centre of the upper-left pixel; x′, y′ from Brown's polynomial with k1–k4, p1, p2, y down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.geometry.crs import parse_crs, split_compound
+from photoplan.geometry.earth_poses import (
+    enu_axes,
+    geocentric_of_geodetic,
+    geodetic_of_geocentric,
+    is_local_crs,
+    is_wgs84_geographic,
+    map_poses,
+)
+from photoplan.io.camera_model import FilmCamera, FrameCamera
+from photoplan.io.lens_forms import AgisoftForm, frame_camera
+from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
+from photoplan.io.orientation.metashape_write import losses, render
+from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
+from photoplan.io.plain_files import finite
+from photoplan.io.xml_file import numbers, read_xml
+
+__all__ = ["FORMAT", "read", "read_cameras"]
+
+MAX_BYTES = 256 << 20
+_COEFFICIENTS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
+
+_Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class _Similarity:
+    """From the chunk's own system to the world: X = scale · R x + t."""
+
+    R: _Floats = field(default_factory=lambda: np.eye(3))
+    t: _Floats = field(default_factory=lambda: np.zeros(3))
+    scale: float = 1.0
+
+
+def read(path: Path, form: TableFormat) -> OrientationBlock:
+    """Oriented images and cameras of a ``cameras.xml``; `form` is not used.
+
+    Raises
+    ------
+    InputError
+        The file is no such XML or is damaged; the message names sensor or camera.
+    """
+    chunk = _chunk(path)
+    sensors = {s.get("id", ""): s for s in chunk.findall("./sensors/sensor")}
+    shared, by_component = _component_transforms(chunk, path)
+    notes: list[str] = []
+    oriented = [c for c in chunk.iterfind("./cameras//camera") if c.find("transform") is not None]
+    unaligned = sum(1 for _ in chunk.iterfind("./cameras//camera")) - len(oriented)
+    if not oriented:
+        raise InputError(f"{path}: no camera has a transform; align the photos and export again")
+    if unaligned > 0:
+        notes.append(f"{path.name}: {unaligned} cameras are not aligned; left out")
+    rolling = sum(c.find("rolling_shutter") is not None for c in oriented)
+    if rolling:
+        notes.append(f"{path.name}: {rolling} cameras state a rolling shutter; its motion is not applied")
+    names, centers, rotations = [], [], []
+    placed = [by_component.get(c.get("component_id", ""), shared) for c in oriented]
+    georeferenced = any(p is not None for p in placed)
+    kept = [c for c, p in zip(oriented, placed) if p is not None or not georeferenced]
+    if len(kept) < len(oriented):
+        notes.append(f"{path.name}: {len(oriented) - len(kept)} cameras of a component without position; left out")
+    for camera in kept:
+        world = by_component.get(camera.get("component_id", ""), shared) or _Similarity()
+        where = f"{path}: camera {camera.get('label')!r}"
+        R, t = _camera_pose(camera, where)
+        names.append((camera.get("label") or f"camera {camera.get('id')}", camera.get("sensor_id", "")))
+        centers.append(world.scale * world.R @ t + world.t)
+        rotations.append(world.R @ R @ FLIP)
+    cameras = {s: _sensor(sensors.get(s), s, path) for s in dict.fromkeys(s for _, s in names)}
+    placing = _place(chunk, np.array(centers), np.array(rotations), georeferenced, path)
+    angles = degrees_of(placing.rotations).tolist()
+    images = tuple(
+        OrientedImage(name, (x, y, z), (a[0], a[1], a[2]), cameras[s][0])
+        for (name, s), (x, y, z), a in zip(names, placing.centers.tolist(), angles)
+    )
+    heights = "ellipsoidal" if placing.crs is not None else None
+    table = OrientationTable(
+        path, images, crs=placing.crs, height_system=heights, origin=placing.origin, notes=(*notes, *placing.notes)
+    )
+    return OrientationBlock(table, _unique(cameras, path))
+
+
+def read_cameras(path: Path) -> dict[str, FrameCamera | FilmCamera]:
+    """The cameras alone: sensors with a calibration, by label.
+
+    Raises
+    ------
+    InputError
+        See `read`.
+    """
+    chunk = _chunk(path)
+    found = {s.get("id", ""): s for s in chunk.findall("./sensors/sensor") if s.find("calibration") is not None}
+    return _unique({key: _sensor(s, key, path) for key, s in found.items()}, path)
+
+
+def _chunk(path: Path) -> Element:
+    root = read_xml(path, MAX_BYTES)
+    chunks = [root] if root.tag == "chunk" else root.findall("./chunk")
+    if root.tag not in ("document", "chunk") or not chunks:
+        raise InputError(f"{path}: an XML document of <{root.tag[:50]}>; Metashape's <document> with a <chunk> is read")
+    if len(chunks) > 1:
+        raise InputError(f"{path}: holds {len(chunks)} chunks; export the cameras of one chunk")
+    return chunks[0]
+
+
+def _component_transforms(chunk: Element, path: Path) -> tuple[_Similarity | None, dict[str, _Similarity | None]]:
+    """Of the chunk, and of its components by their id; None: it has no position."""
+    shared = _similarity(chunk.find("./transform"), f"{path}: chunk")
+    found: dict[str, _Similarity | None] = {}
+    for component in chunk.findall("./components/component"):
+        own = component.find("./transform")
+        where = f"{path}: component {component.get('label')!r}"
+        found[component.get("id", "")] = shared if own is None else _similarity(own, where)
+    # Cameras of files with one component need not name it.
+    if len(found) == 1 and shared is None:
+        shared = next(iter(found.values()))
+    return shared, found
+
+
+def _similarity(element: Element | None, where: str) -> _Similarity | None:
+    if element is None or element.find("rotation") is None:
+        return None
+    R = np.array(numbers(element.find("rotation"), f"{where}: rotation", 9)).reshape(3, 3)
+    t = np.array(numbers(element.find("translation"), f"{where}: translation", 3))
+    scale = numbers(element.find("scale"), f"{where}: scale", 1)[0] if element.find("scale") is not None else 1.0
+    if scale <= 0:
+        raise InputError(f"{where}: scale {scale}; a positive number is needed")
+    return _Similarity(_rotation(R, where), t, scale)
+
+
+def _rotation(R: _Floats, where: str) -> _Floats:
+    """The rotation next to a printed one."""
+    U, _, Vt = np.linalg.svd(R)
+    nearest = U @ Vt
+    if np.linalg.det(nearest) < 0 or np.abs(nearest - R).max() > 1e-5:
+        raise InputError(f"{where}: its matrix is not a right-handed rotation; the file is damaged or of another kind")
+    return nearest
+
+
+def _camera_pose(camera: Element, where: str) -> tuple[_Floats, _Floats]:
+    M = np.array(numbers(camera.find("transform"), f"{where}: transform", 16)).reshape(4, 4)
+    if not np.allclose(M[3], [0.0, 0.0, 0.0, 1.0], rtol=0, atol=1e-9):
+        raise InputError(f"{where}: transform: the last row is {M[3].tolist()}; 0 0 0 1 is needed")
+    return _rotation(M[:3, :3], where), M[:3, 3]
+
+
+def _sensor(sensor: Element | None, key: str, path: Path) -> tuple[str, FrameCamera]:
+    if sensor is None:
+        raise InputError(f"{path}: sensor {key!r}, which a camera refers to, is not described")
+    label = sensor.get("label") or f"sensor {key}"
+    where = f"{path}: sensor {label!r}"
+    given = sensor.findall("./calibration")
+    if not given:
+        raise InputError(f"{where}: has no calibration; export the cameras after the photos were aligned")
+    calibration = next((c for c in given if c.get("class") == "adjusted"), given[-1])
+    kind = calibration.get("type") or sensor.get("type") or "frame"
+    if kind not in ("frame", "fisheye"):
+        raise InputError(f"{where}: type {kind!r} is not supported; allowed are frame and fisheye")
+    v = {c: numbers(calibration.find(c), f"{where}: {c}", 1)[0] for c in _COEFFICIENTS if _has(calibration, c)}
+    if "f" not in v:
+        raise InputError(f"{where}: its calibration states no focal length f")
+    if v.get("p3") or v.get("p4"):
+        raise InputError(f"{where}: p3 and p4 are not supported; fix them to 0, align and export again")
+    resolution = calibration.find("resolution")
+    resolution = sensor.find("resolution") if resolution is None else resolution
+    sides = ("width", "height")
+    try:
+        width, height = (int(resolution.get(s, "")) if resolution is not None else 0 for s in sides)
+    except ValueError:
+        width = height = 0
+    if width <= 0 or height <= 0:
+        raise InputError(f"{where}: its resolution (width and height in pixels) is not stated")
+    finite([width, height], where, 2)
+    c = {name: v.get(name, 0.0) for name in _COEFFICIENTS}
+    k, p, b = (c["k1"], c["k2"], c["k3"], c["k4"]), (c["p1"], c["p2"]), (c["b1"], c["b2"])
+    form = AgisoftForm((width, height), c["f"], (c["cx"], c["cy"]), k, p, b, kind == "fisheye")
+    return label, frame_camera(form, where)
+
+
+def _has(element: Element, name: str) -> bool:
+    return element.find(name) is not None
+
+
+def _unique(cameras: Mapping[str, tuple[str, FrameCamera]], path: Path) -> dict[str, FrameCamera | FilmCamera]:
+    by_name: dict[str, FrameCamera | FilmCamera] = {}
+    for key, (label, camera) in cameras.items():
+        if by_name.setdefault(label, camera) != camera:
+            raise InputError(
+                f"{path}: two sensors are called {label!r} (the second has the id {key}); rename one in Metashape"
+            )
+    return by_name
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """Poses in a system that photoplan knows."""
+
+    centers: _Floats
+    rotations: _Floats
+    crs: str | None = None
+    origin: tuple[float, float, float] | None = None
+    notes: tuple[str, ...] = ()
+
+
+def _place(chunk: Element, centers: _Floats, rotations: _Floats, georeferenced: bool, path: Path) -> _Placed:
+    """Poses of the world system, in the CRS that the file states."""
+    stated = (chunk.findtext("./reference") or "").strip()
+    if not georeferenced:
+        note = f"{path.name}: the chunk has no position, scale and rotation; coordinates are the program's own"
+        return _Placed(centers, rotations, notes=(note,))
+    if not stated or is_local_crs(stated):
+        return _Placed(centers, rotations, notes=(f"{path.name}: coordinates are in a local system",))
+    where = f"{path}: reference"
+    crs = parse_crs(stated, where)
+    if crs.is_geocentric or is_wgs84_geographic(split_compound(stated)[0], where):
+        lat, lon, h = geodetic_of_geocentric(centers.mean(axis=0))
+        axes = enu_axes(lat, lon)
+        enu = (centers - geocentric_of_geodetic((lat, lon, h))) @ axes.T
+        return _Placed(enu, axes @ rotations, origin=(lat, lon, h))
+    horizontal = split_compound(stated)[0]
+    if not parse_crs(horizontal, where).is_projected:
+        raise InputError(
+            f"{where}: {crs.name!r} is geographic on another datum than WGS 84; choose a projected CRS in Metashape "
+            "(Reference, Convert) and export again"
+        )
+    XYZ, axes = map_poses(horizontal, centers)
+    return _Placed(XYZ, np.swapaxes(axes, 1, 2) @ rotations, crs=horizontal)
+
+
+def _sniff(path: Path, head: str) -> bool:
+    return "<document" in head and "<chunk" in head and path.suffix.lower() == ".xml"
+
+
+FORMAT = OrientationFormat("metashape", "Metashape cameras.xml", _sniff, read, render, losses, suffix=".xml")

@@ -1,0 +1,249 @@
+"""Pix4D's exterior and interior orientations (folder ``1_initial/params`` of a project).
+
+``PROJECT_calibrated_external_camera_parameters.txt`` has one line per image, ``imageName X Y Z Omega Phi Kappa``:
+degrees, R = R_ω R_φ R_κ takes the camera's axes (x right, y up, z backwards) to those of the map (Pix4D knowledge base,
+"How are the Internal and External Camera Parameters defined?"; OPF specification, input cameras).
+``PROJECT_calibrated_camera_parameters.txt`` has ten lines per image with camera and pose in the form of computer
+vision, m = K [R | −R t] X with x right, y down, z forwards, positions relative to ``PROJECT_offset.xyz``.
+``PROJECT_wkt.prj`` states the CRS. Each of the two may be given; files of the project beside it are used too.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.geometry.crs import parse_crs, split_compound
+from photoplan.geometry.earth_poses import is_local_crs, legacy_wkt
+from photoplan.io import camera_pix4d
+from photoplan.io.camera_model import FilmCamera, FrameCamera
+from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
+from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat
+from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
+from photoplan.io.plain_files import finite, read_text
+
+__all__ = ["FORMAT", "read"]
+
+MAX_BYTES = 1 << 30
+_EXTERNAL = re.compile(r"\s*#?\s*imageName\s+X\s+Y\s+Z\s+Omega\s+Phi\s+Kappa\b", re.I)
+_FULL = re.compile(r"\s*fileName\s+imageWidth\s+imageHeight", re.I)
+_NAMES = ("_calibrated_external_camera_parameters.txt", "_calibrated_camera_parameters.txt")
+
+
+def read(path: Path, form: TableFormat) -> OrientationBlock:
+    """Oriented images, with cameras and CRS where files of the project state them; `form` is not used.
+
+    Raises
+    ------
+    InputError
+        The file is neither of the two, or a line is not of the format; the message names it.
+    """
+    lines = read_text(path, MAX_BYTES).split("\n")
+    if _FULL.match(lines[0]):
+        return _read_full(lines, path)
+    if not _EXTERNAL.match(lines[0]):
+        raise InputError(
+            f"{path}: begins neither with `imageName X Y Z Omega Phi Kappa` (calibrated_external_camera_parameters) "
+            "nor with `fileName imageWidth imageHeight` (calibrated_camera_parameters)"
+        )
+    images = [_external(line, number, path) for number, line in enumerate(lines, 1) if number > 1 and line.strip()]
+    cameras, of_image, notes = _cameras_beside(path, [i.name for i in images])
+    images = [OrientedImage(i.name, i.center, i.angles, of_image.get(i.name), i.line) for i in images]
+    return _block(path, images, cameras, notes)
+
+
+def _stem(path: Path) -> Path:
+    """Path up to the project's name."""
+    name = next((path.name.removesuffix(end) for end in _NAMES if path.name.endswith(end)), path.stem)
+    return path.with_name(name)
+
+
+def _block(
+    path: Path, images: list[OrientedImage], cameras: dict[str, FrameCamera | FilmCamera], notes: list[str]
+) -> OrientationBlock:
+    side = path.with_name(f"{_stem(path).name}_wkt.prj")
+    side = side if side.is_file() else path.with_suffix(".prj")
+    crs = heights = None
+    if side.is_file():
+        text = read_text(side, 100_000).strip()
+        if is_local_crs(text):
+            notes.append(f"{side.name}: coordinates are in a local system")
+        else:
+            parse_crs(text, str(side))
+            crs, heights = split_compound(text)
+    table = OrientationTable(
+        path,
+        tuple(images),
+        crs=crs,
+        crs_file=side if crs is not None else None,
+        height_system=heights,
+        notes=tuple(notes),
+    )
+    return OrientationBlock(table, cameras)
+
+
+def _external(line: str, number: int, path: Path) -> OrientedImage:
+    where = f"{path}:{number}"
+    # A name may hold spaces: the numbers are counted from the end.
+    words = line.rsplit(maxsplit=6)
+    try:
+        values = finite([float(w) for w in words[1:]], where, 6)
+    except ValueError:
+        raise InputError(f"{where}: {line[:80]!r}: a name, X, Y, Z, omega, phi and kappa are needed") from None
+    return OrientedImage(words[0].strip(), values[:3], values[3:], None, number)
+
+
+def _cameras_beside(
+    path: Path, names: list[str]
+) -> tuple[dict[str, FrameCamera | FilmCamera], dict[str, str | None], list[str]]:
+    """Cameras by name, the camera of every image, and notes."""
+    stem = _stem(path)
+    full = stem.with_name(stem.name + _NAMES[1])
+    if full.is_file():
+        block = _read_full(read_text(full, MAX_BYTES).split("\n"), full)
+        of_image = {i.name: i.camera for i in block.table.images}
+        if set(names) <= set(of_image):
+            return dict(block.cameras), of_image, [f"{path.name}: cameras from {full.name}"]
+    own = camera_pix4d.camera_files(stem)[0]
+    if own.is_file():
+        cameras = camera_pix4d.read(own)
+        if len(cameras) == 1:
+            return cameras, {}, [f"{path.name}: camera from {own.name}"]
+    return {}, {}, []
+
+
+def _read_full(lines: list[str], path: Path) -> OrientationBlock:
+    """The blocks of ten lines of a ``calibrated_camera_parameters.txt``."""
+    # Eight lines of description; blank lines are no part of the format.
+    rows = [(n, line) for n, line in enumerate(lines, 1) if line.strip()]
+    first = next((k for k, (_, line) in enumerate(rows) if line.strip().lower().startswith("camera model")), -1) + 1
+    rows = rows[first:] if first else rows[7:]
+    if not rows or len(rows) % 10:
+        last = rows[-1][0] if rows else 1
+        raise InputError(f"{path}:{last}: {len(rows)} lines follow the description; ten for each image are needed")
+    offset, notes = _offset(path)
+    cameras: dict[FrameCamera, str] = {}
+    images = []
+    for k in range(0, len(rows), 10):
+        name, camera, t, R_camera_world = _ten_lines(rows[k : k + 10], path)
+        label = cameras.setdefault(camera, f"camera {len(cameras)}")
+        x, y, z = (t + offset).tolist()
+        a = degrees_of((R_camera_world.T @ FLIP)[None])[0].tolist()
+        images.append(OrientedImage(name, (x, y, z), (a[0], a[1], a[2]), label, rows[k][0]))
+    return _block(path, images, {label: c for c, label in cameras.items()}, notes)
+
+
+def _offset(path: Path) -> tuple[NDArray[np.float64], list[str]]:
+    file = path.with_name(f"{_stem(path).name}_offset.xyz")
+    if not file.is_file():
+        return np.zeros(3), [f"{path.name}: positions are relative to {file.name}, which is not there"]
+    words = read_text(file, 10_000).split()
+    try:
+        return np.array(finite([float(w) for w in words], str(file), 3)), []
+    except ValueError:
+        raise InputError(f"{file}: {' '.join(words)[:80]!r}: three numbers are needed") from None
+
+
+def _ten_lines(
+    rows: list[tuple[int, str]], path: Path
+) -> tuple[str, FrameCamera, NDArray[np.float64], NDArray[np.float64]]:
+    """Name, camera, position and R_camera_world of an image."""
+    where = f"{path}:{rows[0][0]}"
+    words = rows[0][1].rsplit(maxsplit=2)
+    if len(words) != 3 or not (words[1].isdigit() and words[2].isdigit()):
+        raise InputError(f"{where}: {rows[0][1][:80]!r}: file name, width and height are needed")
+    K = np.array([_row(row, 3, path) for row in rows[1:4]])
+    radial, tangential = _row(rows[4], 3, path), _row(rows[5], 2, path)
+    t = np.array(_row(rows[6], 3, path))
+    R = np.array([_row(row, 3, path) for row in rows[7:10]])
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-5 or np.linalg.det(R) < 0:
+        raise InputError(f"{path}:{rows[7][0]}: image {words[0]!r}: its matrix is not a right-handed rotation")
+    if K[0, 1] != 0 or K[1, 0] != 0:
+        raise InputError(f"{path}:{rows[1][0]}: image {words[0]!r}: a sheared camera matrix is not supported")
+    form = OpenCVForm(
+        (int(words[1]), int(words[2])),
+        (float(K[0, 0]), float(K[1, 1])),
+        (float(K[0, 2]) - 0.5, float(K[1, 2]) - 0.5),
+        False,
+        (*radial, 0.0, 0.0, 0.0),
+        (tangential[0], tangential[1]),
+    )
+    U, _, Vt = np.linalg.svd(R)
+    return words[0], frame_camera(form, f"{where}: image {words[0]!r}"), t, U @ Vt
+
+
+def _row(row: tuple[int, str], count: int, path: Path) -> tuple[float, ...]:
+    where = f"{path}:{row[0]}"
+    try:
+        values: tuple[float, ...] = finite([float(w) for w in row[1].split()], where, count)
+    except ValueError:
+        raise InputError(f"{where}: {row[1][:80]!r}: {count} numbers are needed") from None
+    return values
+
+
+def _render(block: OrientationBlock, path: Path) -> dict[Path, str]:
+    stem = _stem(path)
+    external = path if path.suffix else stem.with_name(stem.name + _NAMES[0])
+    lines = ["imageName X Y Z Omega Phi Kappa"]
+    for image, angles in zip(block.table.images, block.angles("opk", "deg").tolist()):
+        lines.append(" ".join([image.name, *(repr(v) for v in (*image.center, *angles))]))
+    texts = {external: "\n".join([*lines, ""])}
+    if block.table.crs is not None:
+        texts[stem.with_name(f"{stem.name}_wkt.prj")] = legacy_wkt(block.table.crs) + "\n"
+    if block.cameras:
+        texts |= _render_full(block, stem)
+        if all(_square(camera) for camera in block.cameras.values()):
+            texts |= camera_pix4d.render(dict(block.cameras), stem)
+    return texts
+
+
+def _render_full(block: OrientationBlock, stem: Path) -> dict[Path, str]:
+    offset = np.floor(block.table.centers.mean(axis=0))
+    lines = ["fileName imageWidth imageHeight", "camera matrix K [3x3]", "radial distortion [3x1]"]
+    lines += ["tangential distortion [2x1]", "camera position t [3x1]", "camera rotation R [3x3]"]
+    lines += ["camera model m = K [R|-Rt] X", ""]
+    for image, R in zip(block.table.images, block.table.rotations):
+        form = opencv_form(block.camera(image))
+        if form is None or form.rational or form.fisheye:
+            name = block.camera_name(image)
+            raise InputError(f"{stem}: camera {name!r} has no form in Pix4D; write without its lens, or another format")
+        (fx, fy), (x, y) = form.focal, form.point
+        matrix = (FLIP @ R.T).tolist()
+        t = (np.array(image.center) - offset).tolist()
+        numbers = [(fx, 0.0, x + 0.5), (0.0, fy, y + 0.5), (0.0, 0.0, 1.0), form.k[:3], form.p, t, *matrix]
+        lines.append(f"{image.name} {form.size[0]} {form.size[1]}")
+        lines += [" ".join(repr(float(v)) for v in row) for row in numbers]
+    return {
+        stem.with_name(stem.name + _NAMES[1]): "\n".join([*lines, ""]),
+        stem.with_name(f"{stem.name}_offset.xyz"): " ".join(repr(v) for v in offset.tolist()) + "\n",
+    }
+
+
+def _square(camera: FrameCamera | FilmCamera) -> bool:
+    """Whether pixels are square, as in Pix4D."""
+    form = opencv_form(camera)
+    return form is None or abs(form.focal[0] - form.focal[1]) <= 1e-9 * form.focal[0]
+
+
+def _losses(block: OrientationBlock) -> Iterable[Loss]:
+    yield from opencv_losses(block, rational=False, fisheye=False)
+    for name, camera in block.cameras.items():
+        if not _square(camera):
+            yield Loss("other", f"square pixels only, and those of camera {name!r} are not: no .cam file")
+    if len(block.cameras) > 1:
+        yield Loss("other", "no names of cameras: they are numbered by their first image")
+    if block.table.height_system is not None:
+        yield Loss("height_system", f"no height system ({block.table.height_system})")
+
+
+def _sniff(path: Path, head: str) -> bool:
+    first = head.split("\n", 1)[0]
+    return bool(_EXTERNAL.match(first) or _FULL.match(first))
+
+
+FORMAT = OrientationFormat("pix4d", "Pix4D calibrated camera parameters", _sniff, read, _render, _losses)

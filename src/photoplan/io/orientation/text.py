@@ -1,0 +1,201 @@
+"""What the readers of classical orientation files share: words with line numbers, numbers with messages."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.io.orientation.block import OrientationBlock
+from photoplan.io.orientation.table import Direction, OrientationTable, OrientedImage, TableFormat, degrees_of
+from photoplan.io.plain_files import read_text
+from photoplan.io.project_model import ANGLE_UNITS
+
+__all__ = [
+    "DIRECTIONS",
+    "Words",
+    "angle_block",
+    "angle_lines",
+    "checked_rotation",
+    "number",
+    "numbers",
+    "one_word",
+    "pose_image",
+    "word_lines",
+]
+
+MAX_BYTES = 200_000_000
+#: Rotation matrices of files are rounded; what differs more from a rotation is none.
+ORTHOGONAL = 2e-4
+DIRECTIONS = {"camera-to-ground": "camera to ground", "ground-to-camera": "ground to camera"}
+
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eEdD][-+]?\d+)?", re.ASCII)
+
+
+@dataclass(frozen=True)
+class Words:
+    """A line of a file, split at white space."""
+
+    where: str
+    """File and line, for messages."""
+    line: int
+    words: tuple[str, ...]
+
+
+def word_lines(path: Path, max_bytes: int = MAX_BYTES) -> list[Words]:
+    """Lines of a text file that are not empty; raises InputError as `read_text`."""
+    lines = read_text(path, max_bytes).split("\n")
+    return [Words(f"{path}:{n}", n, tuple(text.split())) for n, text in enumerate(lines, 1) if text.strip()]
+
+
+def number(word: str, where: str, what: str) -> float:
+    """A finite number; ``1.5D+03`` of old programs is read too.
+
+    Raises
+    ------
+    InputError
+        It is something else; the message begins with `where` and names `what`.
+    """
+    if _NUMBER.fullmatch(word):
+        value = float(word.translate({ord("d"): "e", ord("D"): "e"}))
+        if math.isfinite(value):
+            return value
+    raise InputError(f"{where}: {what} = {word[:40]!r} is not a number")
+
+
+def numbers(words: Sequence[str], where: str, what: str, count: int) -> tuple[float, ...]:
+    """`count` numbers.
+
+    Parameters
+    ----------
+    words : sequence of str
+    where, what : str
+        File and line, and what the numbers are, for messages.
+    count : int
+
+    Raises
+    ------
+    InputError
+        There are more or fewer, or one is none.
+    """
+    if len(words) != count:
+        raise InputError(f"{where}: {what}: {len(words)} values; {count} numbers are needed")
+    return tuple(number(word, where, what) for word in words)
+
+
+def one_word(name: str, path: Path) -> str:
+    """A name as a format without quotes can hold it.
+
+    Raises
+    ------
+    InputError
+        It holds white space.
+    """
+    if not name or name.split() != [name]:
+        raise InputError(f"{path}: image {name!r} has a blank in its name, which this format cannot hold; rename it")
+    return name
+
+
+def checked_rotation(values: Sequence[float], where: str) -> NDArray[np.float64]:
+    """The rotation (3, 3) nearest to nine rounded numbers, row by row.
+
+    Raises
+    ------
+    InputError
+        They are no rotation.
+    """
+    M = np.array(values, float).reshape(3, 3)
+    if not np.allclose(M @ M.T, np.eye(3), atol=ORTHOGONAL) or np.linalg.det(M) < 0:
+        raise InputError(
+            f"{where}: the nine numbers are not a rotation matrix (rows of length 1, at right angles, right-handed)"
+        )
+    U, _, Vt = np.linalg.svd(M)
+    return np.asarray(U @ Vt, np.float64)
+
+
+def pose_image(
+    name: str, center: Sequence[float], R_ground_camera: NDArray[np.float64], line: int, camera: str | None = None
+) -> OrientedImage:
+    """An image whose rotation is given by a matrix, with ω, φ, κ in degrees.
+
+    Parameters
+    ----------
+    name : str
+    center : sequence of float
+        X, Y, Z, metres.
+    R_ground_camera : ndarray, shape (3, 3)
+    line : int
+        Of the file, for messages.
+    camera : str, optional
+        Name of its camera, where the file states it.
+    """
+    X, Y, Z = center
+    omega, phi, kappa = degrees_of(R_ground_camera[None])[0].tolist()
+    return OrientedImage(name, (X, Y, Z), (omega, phi, kappa), camera, line)
+
+
+def angle_block(
+    path: Path, form: TableFormat, rows: Sequence[tuple[Words, str, Sequence[str]]], own: tuple[str, str, Direction]
+) -> OrientationBlock:
+    """Block of lines with a name, X, Y, Z and φ, ω, κ in this order.
+
+    Parameters
+    ----------
+    path : Path
+    form : TableFormat
+        What the user declares against the format's own conventions.
+    rows : sequence of (Words, str, sequence of str)
+        Line, name and six numbers as text.
+    own : tuple
+        Angle unit, rotation and direction that the format defines.
+
+    Raises
+    ------
+    InputError
+        A number is missing or is none, or an angle is more than a full circle.
+    """
+    unit, rotation, direction = form.conventions(*own)
+    images = []
+    for line, name, words in rows:
+        X, Y, Z, phi, omega, kappa = numbers(words, line.where, f"image {name!r}: X, Y, Z, phi, omega, kappa", 6)
+        named = {"p": phi, "o": omega, "k": kappa}
+        for what, value in zip(("phi", "omega", "kappa"), named.values()):
+            if abs(value) > ANGLE_UNITS[unit] * (1 + 1e-9):
+                raise InputError(
+                    f"{line.where}: image {name!r}: {what} = {value:g} is more than a full circle in {unit}; declare "
+                    "the angle unit of the file with --angle-unit"
+                )
+        a, b, c = (named[letter] for letter in rotation)
+        images.append(OrientedImage(name, (X, Y, Z), (a, b, c), None, line.line))
+    note = f"{path.name}: angles read as {unit}, rotation {rotation}, {DIRECTIONS[direction]}"
+    return OrientationBlock(OrientationTable(path, tuple(images), unit, rotation, direction, notes=(note,)))
+
+
+def angle_lines(block: OrientationBlock, path: Path, width: int) -> list[str]:
+    """A line for each image: name, X, Y, Z in metres, and φ, ω, κ in gon, φ the primary rotation.
+
+    Parameters
+    ----------
+    block : OrientationBlock
+    path : Path
+        For the message.
+    width : int
+        Characters that names are filled up to.
+
+    Raises
+    ------
+    InputError
+        A name holds white space.
+    """
+    lines = []
+    for image, (phi, omega, kappa) in zip(block.table.images, block.angles("pok", "gon")):
+        X, Y, Z = image.center
+        name = one_word(image.name, path)
+        lines.append(f"{name:<{width}} {X:14.4f} {Y:14.4f} {Z:12.4f} {phi:14.8f} {omega:14.8f} {kappa:14.8f}")
+    return lines

@@ -1,0 +1,131 @@
+"""Pixels of a series' frames: planes of a Bayer pattern or bands, and the pixels that count."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.geometry.grid import Window
+from photoplan.io.raster import RasterReader
+from photoplan.io.series.file import Frame, Group, Series
+
+__all__ = ["Plane", "plane_mask", "plane_pixels", "series_planes"]
+
+#: Pixels of a frame that are held in memory at once.
+MAX_PIXELS = 400_000_000
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Pixels of one colour: every second row and column of a Bayer pattern, or a band."""
+
+    name: str
+    """``R``, ``G1`` (green in the rows of red), ``G2``, ``B``; ``band 2``; empty where there is one plane only."""
+    band: int
+    """From 0."""
+    row: int = 0
+    """First row and column that belong to it, counted from the image's corner."""
+    col: int = 0
+    step: int = 1
+
+    def first(self, window: Window) -> tuple[int, int]:
+        """Row and column of its first pixel inside a window, counted from the window's corner."""
+        return (self.row - window.row) % self.step, (self.col - window.col) % self.step
+
+    def to_image(self, window: Window, col: float, row: float) -> tuple[float, float]:
+        """(x, y) in the image of a position in the plane's array of that window."""
+        first_row, first_col = self.first(window)
+        return window.col + first_col + col * self.step, window.row + first_row + row * self.step
+
+
+def series_planes(series: Series) -> tuple[Plane, ...]:
+    """The planes of a series.
+
+    Raises
+    ------
+    InputError
+        A Bayer pattern is stated for images of several bands.
+    """
+    pattern = series.camera.bayer
+    if pattern is None:
+        if series.bands == 1:
+            return (Plane("", 0),)
+        return tuple(Plane(f"band {k + 1}", k) for k in range(series.bands))
+    if series.bands != 1:
+        raise InputError(
+            f"{series.path}: camera.bayer is {pattern}, but the frames have {series.bands} bands; a Bayer pattern "
+            "belongs to raw frames of one band: leave it out"
+        )
+    planes = []
+    for k, colour in enumerate(pattern):
+        row, col = divmod(k, 2)
+        name = colour if colour != "G" else "G1" if "R" in pattern[2 * row : 2 * row + 2] else "G2"
+        planes.append(Plane(name, 0, row, col, 2))
+    return tuple(sorted(planes, key=lambda plane: ("R", "G1", "G2", "B").index(plane.name)))
+
+
+def frame_pixels(frame: Frame, window: Window | None = None) -> NDArray[Any]:
+    """Pixels of a frame's window, all bands, shape (bands, h, w), in the type of the file.
+
+    Raises
+    ------
+    InputError
+        The file is damaged, has pixels without a value, or grey values that the stated bits cannot make.
+    """
+    window = frame.group.window if window is None else window
+    if window.size > MAX_PIXELS:
+        raise InputError(
+            f"{frame.group.label}: {window.width} × {window.height} pixels; at most {MAX_PIXELS:.2g} are held at once: "
+            "give a roi"
+        )
+    pixels, valid = RasterReader(frame.file).read(window)
+    if valid is not None:
+        raise InputError(
+            f"{frame.group.label}: {frame.file.name} has {int((~valid).sum())} pixels without a value (nodata, alpha "
+            "or NaN); raw frames have a value in every pixel"
+        )
+    largest = float(pixels.max())
+    if largest > frame.group.most_dn:
+        raise InputError(
+            f"{frame.group.label}: {frame.file.name} has the grey value {largest:.10g}, but camera.bits allow "
+            f"{frame.group.most_dn:.10g}; correct the bits (where they are the upper ones of the files' type, leave "
+            "them out)"
+        )
+    return pixels
+
+
+def plane_pixels(frame: Frame, plane: Plane, window: Window | None = None) -> NDArray[Any]:
+    """Pixels of one plane inside the frame's window, shape (h, w), in the type of the file."""
+    window = frame.group.window if window is None else window
+    return split(frame_pixels(frame, window), plane, window)
+
+
+def split(pixels: NDArray[Any], plane: Plane, window: Window) -> NDArray[Any]:
+    """The pixels of a plane out of all bands of a window."""
+    row, col = plane.first(window)
+    return pixels[plane.band, row :: plane.step, col :: plane.step]
+
+
+def plane_mask(group: Group, plane: Plane) -> NDArray[np.bool_] | None:
+    """Which pixels of a plane count by the group's mask, shape as `plane_pixels`; None: all of them.
+
+    Raises
+    ------
+    InputError
+        The mask leaves no pixel.
+    """
+    if group.mask is None:
+        return None
+    pixels, valid = RasterReader(group.mask).read(group.window)
+    counts = (pixels != 0).any(axis=0)
+    if valid is not None:
+        counts &= valid
+    row, col = plane.first(group.window)
+    found = counts[row :: plane.step, col :: plane.step]
+    if not found.any():
+        raise InputError(f"{group.label}: mask {group.mask.name} leaves no pixel")
+    return np.asarray(found)

@@ -1,0 +1,166 @@
+"""Reduced figures of a series: means and variances that were computed elsewhere."""
+
+from __future__ import annotations
+
+import ast
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from photoplan.errors import InputError
+from photoplan.io.plain_files import read_text
+from photoplan.io.series.model import StatisticsEntry
+from photoplan.io.series.names import condition
+from photoplan.io.series.table import read_columns
+
+__all__ = ["ReducedPoint", "read_statistics"]
+
+_MAX_BYTES = 50_000_000
+
+
+@dataclass(frozen=True)
+class ReducedPoint:
+    """Mean and temporal variance of the frames of one setting."""
+
+    kind: str
+    """``flat`` or ``dark``."""
+    mean: float
+    """Grey values."""
+    variance: float
+    """Temporal variance of a pixel, squared grey values."""
+    pixels: int
+    frames: int
+    exposure_ms: float | None = None
+    photons_per_pixel: float | None = None
+    temperature_c: float | None = None
+    wavelength_nm: float | None = None
+
+
+def read_statistics(path: Path, entry: StatisticsEntry) -> list[ReducedPoint]:
+    """Reduced figures of a file.
+
+    Raises
+    ------
+    InputError
+        The file is not of the stated format, or holds no figure.
+    """
+    points = _emva(path, entry) if entry.format == "emva1288" else _csv(path, entry)
+    if not points:
+        raise InputError(f"{path}: holds no reduced figure")
+    return points
+
+
+_NEEDED = ("kind", "mean", "variance")
+
+
+def _csv(path: Path, entry: StatisticsEntry) -> list[ReducedPoint]:
+    header, rows = read_columns(path)
+    missing = [name for name in _NEEDED if name not in header]
+    if missing:
+        raise InputError(f"{path}: columns {', '.join(header)} given; {', '.join(missing)} needed")
+    if entry.pixels is None and "pixels" not in header:
+        raise InputError(f"{path}: states no number of pixels; add a column pixels, or the entry pixels")
+    points = []
+    for line, fields in rows:
+        where = f"{path}:{line}"
+        texts = {key: text for key, text in zip(header, fields) if text}
+        kind = texts.pop("kind", "")
+        if kind not in ("flat", "dark"):
+            raise InputError(f"{where}: kind {kind!r}; allowed are flat and dark")
+        found = dict(condition(key, text, where) for key, text in texts.items())
+        for name in ("mean", "variance", "pixels", "frames"):
+            if name in found and (isinstance(found[name], str) or not math.isfinite(float(found[name]))):
+                raise InputError(f"{where}: {name} is {texts[name][:40]!r}; a number is needed")
+        if "mean" not in found or "variance" not in found:
+            raise InputError(f"{where}: mean or variance is empty")
+        points.append(_point(kind, found, entry, where))
+    return points
+
+
+def _point(kind: str, found: Mapping[str, Any], entry: StatisticsEntry, where: str) -> ReducedPoint:
+    variance, pixels = float(found["variance"]), float(found.get("pixels", entry.pixels or 0))
+    frames = float(found.get("frames", entry.frames))
+    if variance < 0 or not 2 <= pixels < 1e12 or not 2 <= frames <= 1e6:
+        raise InputError(
+            f"{where}: variance {variance:g}, {pixels:g} pixels, {frames:g} frames; a variance is not negative and "
+            "needs two pixels and two frames"
+        )
+    return ReducedPoint(
+        kind,
+        float(found["mean"]),
+        variance,
+        int(pixels),
+        int(frames),
+        found.get("exposure_ms"),
+        found.get("photons_per_pixel"),
+        found.get("temperature_c", entry.temperature_c),
+        found.get("wavelength_nm", entry.wavelength_nm),
+    )
+
+
+def _emva(path: Path, entry: StatisticsEntry) -> list[ReducedPoint]:
+    """Sums over two images and sums of squared differences, of the ``temporal`` part of such a dictionary.
+
+    With N pixels: mean = sum / (2 N), variance = pvar / (4 N); exposures are in nanoseconds. The spatial arrays, which
+    these files abbreviate, are left out.
+    """
+    text = read_text(path, _MAX_BYTES)
+    size = {name: re.search(rf"'{name}':\s*(\d{{1,7}})\b", text) for name in ("width", "height")}
+    width, height = size["width"], size["height"]
+    pixels = entry.pixels or (int(width[1]) * int(height[1]) if width and height else 0)
+    start = text.find("'temporal'")
+    if start < 0 or pixels < 2:
+        raise InputError(f"{path}: not a dictionary of the package emva1288 with 'temporal', 'width' and 'height'")
+    temporal = _dictionary(path, text, text.find("{", start))
+    points = []
+    for exposure, at in _items(path, temporal.get("bright")):
+        for photons, sums in _items(path, at):
+            points.append(_of_sums(path, "flat", exposure, sums, pixels, entry, photons))
+    for exposure, sums in _items(path, temporal.get("dark")):
+        points.append(_of_sums(path, "dark", exposure, sums, pixels, entry, None))
+    return points
+
+
+def _dictionary(path: Path, text: str, start: int) -> dict[Any, Any]:
+    """The literal that begins at `start`; nothing is executed."""
+    depth = 0
+    for match in re.compile(r"[{}]").finditer(text, max(start, 0)):
+        depth += 1 if match[0] == "{" else -1
+        if depth == 0 or depth > 8:
+            break
+    try:
+        found = ast.literal_eval(text[start : match.end()])
+    except (ValueError, SyntaxError, RecursionError, MemoryError, UnboundLocalError):
+        found = None
+    if not isinstance(found, dict):
+        raise InputError(f"{path}: the part 'temporal' is no plain dictionary")
+    return found
+
+
+def _items(path: Path, found: Any) -> list[tuple[float, Any]]:
+    if not isinstance(found, dict) or not all(isinstance(k, int | float) and math.isfinite(k) for k in found):
+        raise InputError(f"{path}: the part 'temporal' lacks exposures with their figures")
+    return sorted(found.items())
+
+
+def _of_sums(
+    path: Path, kind: str, exposure: float, sums: Any, pixels: int, entry: StatisticsEntry, photons: float | None
+) -> ReducedPoint:
+    values = [sums.get(name) if isinstance(sums, dict) else None for name in ("sum", "pvar")]
+    if not all(isinstance(v, int | float) and math.isfinite(v) and v >= 0 for v in values):
+        raise InputError(f"{path}: exposure {exposure:g}: 'sum' and 'pvar' must be numbers")
+    total, pvar = (float(v) for v in values if v is not None)
+    return ReducedPoint(
+        kind,
+        total / (2 * pixels),
+        pvar / (4 * pixels),
+        pixels,
+        2,
+        exposure * 1e-6,
+        photons,
+        entry.temperature_c,
+        entry.wavelength_nm,
+    )

@@ -1,0 +1,1 @@
+"""Terrain data in and out, one format in each file, and the file of a terrain model."""

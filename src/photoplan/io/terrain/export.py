@@ -1,0 +1,278 @@
+"""Terrain models for other programs: triangulations as OBJ, PLY or LandXML, points as XYZ or CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan import __version__
+from photoplan.errors import PhotoplanError
+from photoplan.io.disk import disk_error, sync_file, sync_folder
+from photoplan.io.lock import FileLock
+from photoplan.io.product import check_output
+from photoplan.io.terrain.export_mesh import MeshPart, mesh_parts
+from photoplan.surfaces.units import LineElement, Unit, UnitSource
+
+__all__ = ["TIN_SUFFIXES", "ExportFigures", "replacing", "write_points", "write_tin"]
+
+TIN_SUFFIXES = (".obj", ".ply", ".xml")
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class ExportFigures:
+    """What was written."""
+
+    vertices: int
+    faces: int = 0
+    walls: int = 0
+    """Vertical triangles at two-sided breaklines."""
+    line_points: int = 0
+
+
+@contextmanager
+def replacing(path: Path, inputs: Sequence[Path | str] = (), overwrite: bool = False) -> Iterator[Path]:
+    """A temporary name beside `path` to write to; it takes the name when the context ends well, else it is removed.
+
+    Raises
+    ------
+    UsageError
+        The output exists or is an input, or its folder cannot be written.
+    RunLocked
+        Another run is writing it.
+    ResourceError
+        The disk is full.
+    """
+    check_output(path, inputs, overwrite=overwrite)
+    part = path.with_name(f".{path.name}.part")
+    with FileLock(path.with_name(f".{path.name}.lock")):
+        check_output(path, inputs, overwrite=overwrite)
+        try:
+            try:
+                yield part
+                sync_file(part)
+                check_output(path, inputs, overwrite=overwrite)
+                part.replace(path)
+                sync_folder(path.parent)
+            finally:
+                for left in (part, part.with_name(part.name + ".faces")):
+                    left.unlink(missing_ok=True)
+        except PhotoplanError:
+            raise
+        except OSError as error:
+            raise disk_error(path, error) from error
+
+
+def write_tin(part: Path, kind: str, source: UnitSource, name: str, progress: Progress | None = None) -> ExportFigures:
+    """Write the triangulation of a model.
+
+    Parameters
+    ----------
+    part
+        Where to.
+    kind
+        `.obj`, `.ply` (binary, little-endian, double coordinates) or `.xml` (LandXML 1.2; without walls, which a
+        LandXML surface cannot hold).
+    source
+        The units.
+    name
+        Name of the surface in the file.
+    progress
+        Called with 1 and the number of triangles for each unit.
+    """
+    counts = [0, 0, 0]
+
+    def parts() -> Iterator[MeshPart]:
+        for item in mesh_parts(source):
+            counts[0] += len(item.vertices)
+            counts[1] += len(item.faces)
+            counts[2] += len(item.walls)
+            if progress is not None:
+                progress(1, len(item.faces))
+            yield item
+
+    {".obj": _write_obj, ".ply": _write_ply, ".xml": _write_landxml}[kind](part, parts(), name)
+    return ExportFigures(counts[0], counts[1], 0 if kind == ".xml" else counts[2])
+
+
+def _write_obj(path: Path, parts: Iterator[MeshPart], name: str) -> None:
+    with path.open("wb") as file:
+        file.write(
+            f"# photoplan {__version__}: terrain model, X east, Y north, Z up, metres\no {_word(name)}\n".encode()
+        )
+        for item in parts:
+            file.write(_text("v %.5f %.5f %.4f\n", item.vertices))
+            file.write(_text("f %d %d %d\n", np.concatenate([item.faces, item.walls]) + 1))
+
+
+def _write_ply(path: Path, parts: Iterator[MeshPart], name: str) -> None:
+    record = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
+    with ExitStack() as open_files:
+        file, faces = _two_files(open_files, path)
+        # The counts are known at the end: room is left for them.
+        file.write(_ply_header(0, 0, name))
+        vertices = triangles = 0
+        for item in parts:
+            file.write(item.vertices.astype("<f8").tobytes())
+            both = np.concatenate([item.faces, item.walls])
+            rows = np.empty(len(both), record)
+            rows["count"], rows["corners"] = 3, both
+            faces.write(rows.tobytes())
+            vertices, triangles = vertices + len(item.vertices), triangles + len(both)
+        faces.seek(0)
+        shutil.copyfileobj(faces, file, 1 << 20)
+        file.seek(0)
+        file.write(_ply_header(vertices, triangles, name))
+
+
+def _ply_header(vertices: int, faces: int, name: str) -> bytes:
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment photoplan {__version__}: {_word(name)}; X east, Y north, Z up, metres",
+        f"element vertex {vertices:012d}",
+        *(f"property double {axis}" for axis in "xyz"),
+        f"element face {faces:012d}",
+        "property list uchar int vertex_indices",
+        "end_header",
+    ]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _write_landxml(path: Path, parts: Iterator[MeshPart], name: str) -> None:
+    safe = _word(name).replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
+    with ExitStack() as open_files:
+        file, faces = _two_files(open_files, path)
+        file.write(
+            (
+                '<?xml version="1.0" encoding="UTF-8"?>\n<LandXML xmlns="http://www.landxml.org/schema/LandXML-1.2" '
+                'version="1.2">\n<Units><Metric linearUnit="meter" areaUnit="squareMeter" volumeUnit="cubicMeter" '
+                'temperatureUnit="celsius" pressureUnit="milliBars"/></Units>\n'
+                f'<Application name="photoplan" version="{__version__}"/>\n'
+                f'<Surfaces><Surface name="{safe}"><Definition surfType="TIN">\n<Pnts>\n'
+            ).encode()
+        )
+        count = 0
+        for item in parts:
+            # LandXML has north before east.
+            numbered = np.column_stack([count + 1 + np.arange(len(item.vertices)), item.vertices[:, [1, 0, 2]]])
+            file.write(_text('<P id="%d">%.5f %.5f %.4f</P>\n', numbered))
+            faces.write(_text("<F>%d %d %d</F>\n", item.faces + 1))
+            count += len(item.vertices)
+        file.write(b"</Pnts>\n<Faces>\n")
+        faces.seek(0)
+        shutil.copyfileobj(faces, file, 1 << 20)
+        file.write(b"</Faces>\n</Definition></Surface></Surfaces>\n</LandXML>\n")
+
+
+def _two_files(stack: ExitStack, path: Path) -> tuple[IO[bytes], IO[bytes]]:
+    """The file, and one beside it for what comes last."""
+    faces = path.with_name(path.name + ".faces")
+    return stack.enter_context(path.open("w+b")), stack.enter_context(faces.open("w+b"))
+
+
+def _text(form: str, rows: NDArray[np.float64] | NDArray[np.int64]) -> bytes:
+    return (form * len(rows) % tuple(rows.ravel().tolist())).encode()
+
+
+def _word(name: str) -> str:
+    return " ".join("".join(c if c.isprintable() else " " for c in name).split()) or "terrain"
+
+
+def write_points(
+    part: Path, kind: str, source: UnitSource, lines: Sequence[LineElement], progress: Progress | None = None
+) -> ExportFigures:
+    """Write the posts and the vertices of the lines as text.
+
+    Parameters
+    ----------
+    part
+        Where to.
+    kind
+        `.xyz` (X Y Z, no header), or `.csv` with header `x,y,z,sigma,kind,name,code,side`.
+    source
+        The units; a post on the edge of two units is written once.
+    lines
+        Line elements; a two-sided breakline gives its left and then its right heights.
+    progress
+        Called with 1 and the number of posts for each unit.
+    """
+    posts = points = 0
+    with part.open("wb") as file:
+        if kind == ".csv":
+            file.write(b"x,y,z,sigma,kind,name,code,side\n")
+        for rows in _posts(source):
+            form = "%.4f %.4f %.4f\n" if kind == ".xyz" else "%.4f,%.4f,%.4f,%.4f,post,,,\n"
+            file.write(_text(form, rows[:, :3] if kind == ".xyz" else rows))
+            posts += len(rows)
+            if progress is not None:
+                progress(1, len(rows))
+        for line in lines:
+            for side, z in (("left", line.xyz[:, 2]), ("right", line.right)):
+                if z is None or (side == "left" and not np.isfinite(z).any()):
+                    continue
+                there = np.isfinite(z)
+                rows = np.column_stack([line.xyz[:, :2], z, line.sigmas])[there]
+                points += len(rows)
+                if kind == ".xyz":
+                    file.write(_text("%.4f %.4f %.4f\n", rows[:, :3]))
+                else:
+                    ending = _csv_row([line.kind, line.name, line.code, side if line.right is not None else ""])
+                    file.write(_text("%.4f,%.4f,%.4f,%.4f," + ending.replace("%", "%%"), rows))
+    return ExportFigures(posts, line_points=points)
+
+
+def _csv_row(fields: list[str]) -> str:
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerow(fields)
+    return buffer.getvalue()
+
+
+def _posts(source: UnitSource) -> Iterator[NDArray[np.float64]]:
+    """X, Y, Z, sigma of the posts of each unit, shape (k, 4); a post that the unit before has is left out."""
+    layout = source.layout
+    above: dict[int, Unit] = {}
+    for row in range(layout.rows):
+        before: Unit | None = None
+        here: dict[int, Unit] = {}
+        for column in range(layout.columns):
+            unit = source.unit(column, row)
+            if unit is not None:
+                here[column] = unit
+                new = np.isfinite(unit.heights)
+                upper, corner = above.get(column), above.get(column - 1)
+                if before is not None:
+                    new[:, 0] &= ~_shared(before.heights[:, -1], unit.meshes)
+                if upper is not None:
+                    new[0] &= ~_shared(upper.heights[-1], unit.meshes)
+                if corner is not None and np.isfinite(corner.heights[-1, -1]):
+                    new[0, 0] = False
+                east = above.get(column + 1)
+                if east is not None and np.isfinite(east.heights[-1, 0]):
+                    new[0, -1] = False
+                yield _rows(unit, new)
+            before = unit
+        above = here
+
+
+def _shared(edge: NDArray[np.float32], meshes: int) -> NDArray[np.bool_]:
+    """Which of the posts along an edge the other unit has, whose posts along it are given."""
+    at = np.arange(meshes + 1) * (len(edge) - 1) / meshes
+    nearest = np.rint(at).astype(int)
+    return np.asarray((np.abs(at - nearest) < 1e-9) & np.isfinite(edge[nearest]))
+
+
+def _rows(unit: Unit, which: NDArray[np.bool_]) -> NDArray[np.float64]:
+    along = np.arange(unit.meshes + 1) * unit.width
+    X, Y = np.meshgrid(unit.left + along, unit.top - along)
+    heights = unit.heights.astype(float) + unit.datum
+    return np.column_stack([X[which], Y[which], heights[which], unit.sigmas[which]])

@@ -1,0 +1,178 @@
+"""Measured terrain from LAS and LAZ files (laspy, an optional package).
+
+Points of the wanted classes are mass points; points that the file flags as withheld are left out.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.crs import canonical_crs, parse_crs, split_compound
+from photoplan.io.terrain.options import ReadOptions
+from photoplan.surfaces.measured import MeasuredTerrain, PointGroup
+
+__all__ = ["read"]
+
+CHUNK = 1_000_000
+"""Points that are decoded at once."""
+GROUND = 2
+MAX_RATIO = 250.0
+"""Decoded bytes per stored byte of a LAZ file; real ones stay below 50."""
+RATIO_FROM = 1 << 30
+"""Decoded size in bytes from which `MAX_RATIO` is asked."""
+# Sizes of point records by their format (ASPRS LAS 1.4-R15, tables 7 to 17).
+_RECORD_SIZES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
+# GeoTIFF keys (OGC 19-008r4): model, geographic CRS, projected CRS, linear unit, vertical CRS, vertical unit.
+_GEOGRAPHIC, _PROJECTED, _UNIT, _VERTICAL, _VERTICAL_UNIT = 2048, 3072, 3076, 4096, 4099
+_METRE, _USER_DEFINED = 9001, 32767
+
+
+def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
+    """Mass points of a LAS or LAZ file.
+
+    Raises
+    ------
+    UsageError
+        laspy is not installed.
+    InputError
+        The file is damaged, promises more points than it can hold, or holds none of the wanted classes.
+    """
+    try:
+        import laspy  # type: ignore[import-untyped]  # noqa: PLC0415  # an optional package
+    except ImportError:
+        raise UsageError(f"{path}: LAS and LAZ need laspy; install it with `pip install 'photoplan[points]'`") from None
+    promised = _check_header(path)
+    try:
+        with laspy.open(path) as file:
+            header = file.header
+            scaling = np.array([header.scales, header.offsets], float)
+            if not (np.isfinite(scaling).all() and (scaling[0] != 0).all()):
+                raise InputError(f"{path}: scale {header.scales} and offset {header.offsets} of the header are damaged")
+            crs, heights = _crs(path, header)
+            xyz, records, notes = _points(path, file, options)
+    except (InputError, MemoryError):
+        raise
+    except BaseException as error:
+        # Damaged files come out of the decoders as many kinds of errors, panics of lazrs (no Exception) among them.
+        if isinstance(error, KeyboardInterrupt | SystemExit):
+            raise
+        raise InputError(
+            f"{path}: cannot be read ({' '.join(str(error).split())[:200] or type(error).__name__}); "
+            f"the header promises {promised} points: the file is damaged or cut off, get a fresh copy"
+        ) from None
+    group = PointGroup(path.name, "mass", xyz, records)
+    return MeasuredTerrain((group,), (), crs, heights, files=(path,), notes=tuple(notes))
+
+
+def _check_header(path: Path) -> int:
+    """Number of points, after the header's promises were compared with the size of the file."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(375)
+    if len(head) < 227 or head[:4] != b"LASF":
+        raise InputError(f"{path}: not a LAS file, or cut off in its header; get a fresh copy")
+    minor = head[25]
+    header_size, offset, vlrs, form, record, count = struct.unpack_from("<HIIBHI", head, 94)
+    if minor >= 4 and len(head) >= 255:
+        start, evlrs, count = struct.unpack_from("<QIQ", head, 235)
+        if evlrs and (start > size or evlrs > (size - start) // 60):
+            raise InputError(f"{path}: the header promises {evlrs} records behind the end of the file; it is cut off")
+    packed = bool(form & 0xC0)
+    form &= 0x3F
+    if form >= len(_RECORD_SIZES) or record < _RECORD_SIZES[form]:
+        raise InputError(f"{path}: point format {form} with {record} bytes a point; LAS knows formats 0 to 10")
+    if header_size > offset or offset > size or vlrs > (size - header_size) // 54:
+        raise InputError(
+            f"{path}: the header leads behind the end of the file ({size} bytes); it is damaged or cut off"
+        )
+    if count == 0:
+        raise InputError(f"{path}: holds no points")
+    decoded, stored = count * record, size - offset
+    if not packed and decoded > stored:
+        raise InputError(
+            f"{path}: the header promises {count} points ({decoded} bytes), the file has {stored} bytes for them; "
+            "it is damaged or cut off, get a fresh copy"
+        )
+    if packed and decoded > RATIO_FROM and decoded > MAX_RATIO * stored:
+        raise InputError(
+            f"{path}: promises {decoded / (1 << 30):.1f} GiB of points, {decoded / max(stored, 1):.0f} times what is "
+            f"stored (limit {MAX_RATIO:.0f}); a file that is trusted can be stored again without compression"
+        )
+    return int(count)
+
+
+def _points(path: Path, file: Any, options: ReadOptions) -> tuple[NDArray[np.float64], NDArray[np.int64], list[str]]:
+    """Coordinates and numbers of the wanted points, and notes."""
+    wanted = options.las_classes
+    kept: list[tuple[NDArray[np.float64], NDArray[np.int64]]] = []
+    counts: Counter[int] = Counter()
+    withheld, done, classified = 0, 0, wanted is not None
+    for chunk in file.chunk_iterator(CHUNK):
+        classes = np.asarray(chunk.classification)
+        use = ~np.asarray(chunk.withheld, bool)
+        withheld += int((~use).sum())
+        counts.update(dict(enumerate(np.bincount(classes[use], minlength=1).tolist())))
+        if not classified and (classes[use] > 1).any():
+            # Points read so far were of the classes "never classified" and "unclassified": none of them is ground.
+            classified = True
+            kept.clear()
+        if classified:
+            use &= np.isin(classes, (GROUND,) if wanted is None else wanted)
+        at = np.flatnonzero(use)
+        kept.append((np.stack([chunk.x[at], chunk.y[at], chunk.z[at]], axis=1), at + done + 1))
+        done += len(classes)
+    if done != file.header.point_count:
+        raise InputError(f"{path}: holds {done} of {file.header.point_count} promised points; it is cut off")
+    total = sum(len(k[1]) for k in kept)
+    present = ", ".join(f"{c} ({n} points)" for c, n in sorted(counts.items()) if n)
+    if not total:
+        asked = ", ".join(str(c) for c in ((GROUND,) if wanted is None else wanted))
+        raise InputError(f"{path}: no points of class {asked}; the file has classes {present}; choose with las_classes")
+    notes = []
+    if wanted is None:
+        what = f"points of class {GROUND} (ground) taken, {done - total} others left out"
+        notes.append(f"{path.name}: {what if classified else f'points are not classified, all {total} taken'}")
+    if withheld:
+        notes.append(f"{path.name}: {withheld} points are flagged as withheld and left out")
+    xyz = np.concatenate([np.asarray(k[0], np.float64) for k in kept])
+    return xyz, np.concatenate([k[1] for k in kept]).astype(np.int64), notes
+
+
+def _crs(path: Path, header: Any) -> tuple[str | None, str | None]:
+    """Horizontal CRS and height system of the file's WKT or GeoTIFF keys."""
+    vlrs = list(header.vlrs) + list(getattr(header, "evlrs", None) or [])
+    for vlr in vlrs:
+        text = getattr(vlr, "string", None)
+        if vlr.user_id.strip("\0 ") == "LASF_Projection" and vlr.record_id == 2112 and text and text.strip("\0 "):
+            parse_crs(text.strip("\0 "), f"{path}: CRS")
+            return split_compound(text.strip("\0 "))
+    for vlr in vlrs:
+        entries = getattr(vlr, "geo_keys", None)
+        if vlr.user_id.strip("\0 ") == "LASF_Projection" and entries:
+            return _of_geokeys(path, {k.id: k.value_offset for k in entries if k.tiff_tag_location == 0})
+    return None, None
+
+
+def _of_geokeys(path: Path, keys: dict[int, int]) -> tuple[str | None, str | None]:
+    units = {keys.get(_VERTICAL_UNIT, _METRE)} | ({keys[_UNIT]} if _UNIT in keys and _PROJECTED in keys else set())
+    if units - {_METRE, 0}:
+        raise InputError(
+            f"{path}: lengths are in a unit other than metres (EPSG unit {', '.join(map(str, sorted(units)))}); "
+            "convert the file to metres beforehand, for example with pdal or las2las"
+        )
+    code = keys.get(_PROJECTED) or keys.get(_GEOGRAPHIC)
+    if not code or code == _USER_DEFINED:
+        return None, None
+    text = f"EPSG:{code}"
+    parse_crs(text, f"{path}: CRS")
+    vertical = keys.get(_VERTICAL, 0)
+    if not 1024 <= vertical < _USER_DEFINED or not parse_crs(f"EPSG:{vertical}", f"{path}: heights").is_vertical:
+        return canonical_crs(text), None
+    return canonical_crs(text), canonical_crs(f"EPSG:{vertical}")

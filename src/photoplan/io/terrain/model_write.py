@@ -1,0 +1,354 @@
+"""Terrain models written unit by unit: crash-safe, continued after an interruption, complete under their name."""
+
+from __future__ import annotations
+
+import hashlib
+import sqlite3
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import astuple, dataclass, field, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import pyogrio.errors
+import shapely
+
+from photoplan import __version__
+from photoplan.errors import PhotoplanError, ResourceError, UsageError
+from photoplan.io.disk import disk_error, free_megabytes, sync_file, sync_folder
+from photoplan.io.gdal import GDAL_ERRORS, first_cause
+from photoplan.io.lock import FileLock
+from photoplan.io.product import check_output
+from photoplan.io.terrain.model_blob import check_unit, inflate, pack_line, pack_unit, unit_of
+from photoplan.io.terrain.model_layers import write_border, write_gross, write_heights, write_lines, write_units
+from photoplan.io.terrain.model_read import ModelReader, unit_checksum
+from photoplan.io.terrain.model_tables import (
+    FORMAT,
+    HEADER,
+    LINES,
+    UNITS,
+    GrossError,
+    ModelHeader,
+    check_layout,
+    header_to_json,
+)
+from photoplan.io.tile_log import TileLog
+from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
+
+__all__ = ["ModelParts", "ModelWriter"]
+
+_FIGURES = struct.Struct("<3q2d2q5dq")
+_STORED = struct.Struct("<Q2dQ")
+_SAMPLES = 12
+_GPKG_ERRORS = (
+    *GDAL_ERRORS,
+    pyogrio.errors.DataSourceError,
+    pyogrio.errors.DataLayerError,
+    pyogrio.errors.FeatureError,
+    sqlite3.Error,
+    MemoryError,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class ModelParts:
+    """What a model holds beside its units."""
+
+    header: ModelHeader
+    """Its layout must be the writer's; `made_by` and `identity` are set by the writer."""
+    lines: Sequence[LineElement] = ()
+    """Line elements, with their intersections with the grid."""
+    gross: Sequence[GrossError] = ()
+    """Measurements flagged as gross errors."""
+    domain: Any | None = None
+    """Where there is a surface: a polygon or multipolygon of Shapely in the model's CRS; None: not bounded."""
+
+
+@dataclass(eq=False)
+class ModelWriter:
+    """Collects computing units and makes a terrain model's file of them; a context manager.
+
+    Units go into a crash-safe log beside the file, so that the next run with the same `run_key` finds them in `done`.
+    `finish` assembles the GeoPackage under a temporary name, opens it again, compares it with the log, and only then
+    gives it its name. Leaving the context without `finish` keeps the log. `add` may be called from several threads.
+
+    Raises
+    ------
+    UsageError
+        On entry: the output exists or is an input, or its folder cannot be written. In `add`: a unit that is not of the
+        layout.
+    RunLocked
+        On entry, if another run is writing this model.
+    ResourceError
+        In `add` and `finish`, if the disk is full: no model under the name, no temporary files, units are kept.
+    """
+
+    path: Path
+    """The file, a `.gpkg`."""
+    layout: UnitLayout
+    """Where the units lie."""
+    run_key: str
+    """A digest of inputs, settings and version: another key starts afresh."""
+    overwrite: bool = False
+    """Replace a file that exists."""
+    inputs: Sequence[Path | str] = ()
+    """Files that must not be overwritten."""
+    _log: TileLog | None = field(default=None, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self.path = Path(self.path)
+        if self.path.suffix.lower() != ".gpkg":
+            raise UsageError(f"{self.path}: a terrain model is a GeoPackage; give it a name that ends with .gpkg")
+        check_layout(self.layout, str(self.path))
+        self._lock = FileLock(self.path.with_name(f".{self.path.name}.lock"))
+
+    def __enter__(self) -> ModelWriter:
+        check_output(self.path, self.inputs, overwrite=self.overwrite)
+        self._lock.acquire()
+        try:
+            # The run before may have finished between the check and the lock.
+            check_output(self.path, self.inputs, overwrite=self.overwrite)
+            self._remove_parts()
+            key = f"{self.run_key} {self.layout} {FORMAT} {__version__}"
+            self._log = TileLog(self.path.with_name(f".{self.path.name}.units"), key)
+        except BaseException:
+            self._lock.release()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._log is not None:
+            if self._log.finished:
+                self._log.close()
+            else:
+                self._log.remove()
+            self._log = None
+        self._lock.release()
+
+    def done(self) -> frozenset[tuple[int, int]]:
+        """Column and row of the units that need not be computed any more."""
+        columns = self.layout.columns
+        return frozenset((number % columns, number // columns) for number in self._open_log().finished)
+
+    def add(self, unit: Unit | None, figures: UnitFigures) -> None:
+        """Add a finished unit, or None with the figures of an empty one; at once safe on the disk."""
+        column, row = figures.column, figures.row
+        where = f"{self.path}: unit column {column} row {row}"
+        if not (0 <= column < self.layout.columns and 0 <= row < self.layout.rows):
+            raise UsageError(f"{where}: the layout has {self.layout.columns} × {self.layout.rows} units")
+        content = b""
+        if unit is not None:
+            left, top = self.layout.corner(column, row)
+            if max(abs(unit.left - left), abs(unit.top - top), abs(unit.side - self.layout.side)) > 1e-6:
+                raise UsageError(f"{where}: lies at {unit.left}, {unit.top}; its place in the layout is {left}, {top}")
+            check_unit(unit, where)
+            packed, size = pack_unit(unit)
+            span = _range_of(unit)
+            if span is not None:
+                content = _STORED.pack(size, *span, unit.meshes) + packed
+        payload = _FIGURES.pack(*astuple(figures)) + content
+        self._open_log().append(row * self.layout.columns + column, payload)
+
+    def figures(self) -> Iterator[UnitFigures]:
+        """Figures of all finished units, row by row."""
+        log = self._open_log()
+        for number in sorted(log.finished):
+            yield UnitFigures(*_FIGURES.unpack_from(log.read(number)))
+
+    def unit(self, column: int, row: int) -> Unit | None:
+        """A finished unit, or None if it is empty.
+
+        Raises
+        ------
+        KeyError
+            It is not finished.
+        """
+        number = row * self.layout.columns + column
+        stored = self._stored(number)
+        if stored is None:
+            return None
+        buffer = inflate(stored.packed, stored.size, f"{self.path}: unit column {column} row {row}")
+        return unit_of(buffer, self.layout, column, row)
+
+    def finish(self, parts: ModelParts, progress: Callable[[int], None] | None = None) -> ModelReader:
+        """Make the file, give it its name, and open it.
+
+        Parameters
+        ----------
+        parts
+            Header, lines, gross errors, border.
+        progress
+            Called with 1 for each strip of the raster of heights.
+
+        Raises
+        ------
+        PhotoplanError
+            Units are missing.
+        """
+        log = self._open_log()
+        missing = self.layout.columns * self.layout.rows - len(log.finished)
+        if missing:
+            raise PhotoplanError(f"{self.path}: {missing} units were not delivered; empty ones are added as None")
+        if parts.header.layout != self.layout:
+            raise UsageError(f"{self.path}: the header's layout is {parts.header.layout}, the units' {self.layout}")
+        part = self.path.with_name(f".{self.path.name}.part.gpkg")
+        try:
+            try:
+                identity = self._assemble(part, parts, progress)
+                self._check(part, identity)
+                sync_file(part)
+                # The last look before the name is taken: another program may have made the file meanwhile.
+                check_output(self.path, self.inputs, overwrite=self.overwrite)
+                part.replace(self.path)
+                sync_folder(self.path.parent)
+            finally:
+                self._remove_parts()
+        except OSError as error:
+            raise disk_error(self.path, error) from error
+        except _GPKG_ERRORS as error:
+            raise self._unwritten(first_cause(error)) from error
+        log.remove()
+        self._log = None
+        return ModelReader(self.path)
+
+    def _assemble(self, part: Path, parts: ModelParts, progress: Callable[[int], None] | None) -> str:
+        """Make the file under a temporary name; returns its identity."""
+        crs = parts.header.crs
+        write_units(part, self.layout, self.figures(), crs)
+        write_lines(part, parts.lines, crs)
+        write_gross(part, parts.gross, crs)
+        if parts.domain is not None:
+            write_border(part, parts.domain, crs)
+        meshes = self._base_meshes()
+        if meshes:
+            write_heights(part, self.layout, meshes, self.unit, crs, progress)
+        with closing(sqlite3.connect(part)) as db:
+            # The file is nothing until it is complete: no journal is needed, and it is synchronised once at the end.
+            db.execute("PRAGMA journal_mode = OFF")
+            db.execute("PRAGMA synchronous = OFF")
+            with db:
+                _make_tables(db)
+                digest = hashlib.sha256()
+                db.executemany(f"INSERT INTO {UNITS} VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", self._unit_rows(digest))
+                db.executemany(f"INSERT INTO {LINES} VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", _line_rows(parts.lines))
+                header = replace(parts.header, made_by=f"photoplan {__version__}", identity="")
+                digest.update(header_to_json(header).encode())
+                text = header_to_json(replace(header, identity=digest.hexdigest()))
+                domain = None if parts.domain is None else shapely.to_wkb(parts.domain)
+                db.execute(f"INSERT INTO {HEADER} VALUES (1, ?, ?, ?)", (FORMAT, text, domain))
+        return digest.hexdigest()
+
+    def _base_meshes(self) -> int:
+        """Meshes along a side that most units have; 0: all are empty."""
+        counts: Counter[int] = Counter()
+        for number in self._open_log().finished:
+            stored = self._stored(number)
+            if stored is not None:
+                counts[stored.meshes] += 1
+        return max(counts, key=lambda meshes: (counts[meshes], -meshes)) if counts else 0
+
+    def _unit_rows(self, digest: Any) -> Iterator[tuple[Any, ...]]:
+        """Rows of the table of units, in order."""
+        for number in sorted(self._open_log().finished):
+            stored = self._stored(number)
+            if stored is None:
+                continue
+            low, high, size = stored.low, stored.high, stored.size
+            checksum = unit_checksum(number, size, low, high, stored.packed)
+            digest.update(f"{number} {checksum} ".encode())
+            row, column = divmod(number, self.layout.columns)
+            yield number, column, row, stored.meshes, low, high, size, checksum, stored.packed
+
+    def _stored(self, number: int) -> _Stored | None:
+        content = self._open_log().read(number)[_FIGURES.size :]
+        if not content:
+            return None
+        size, low, high, meshes = _STORED.unpack_from(content)
+        return _Stored(size, low, high, meshes, content[_STORED.size :])
+
+    def _check(self, part: Path, identity: str) -> None:
+        """Open the assembled file and compare it with the log at some units."""
+        reader = ModelReader(part, cache_bytes=0)
+        places = list(reader.units())
+        good = reader.header.identity == identity
+        for column, row in places[:: max(1, -(-len(places) // _SAMPLES))]:
+            written, kept = reader.unit(column, row), self.unit(column, row)
+            good = good and written is not None and kept is not None
+            good = good and np.array_equal(written.heights, kept.heights, equal_nan=True)  # type: ignore[union-attr]
+        if not good:
+            raise self._unwritten("it does not hold what was written")
+
+    def _remove_parts(self) -> None:
+        """Remove what this model's runs may have left: SQLite and GDAL make files beside their output."""
+        name = f".{self.path.name}.part.gpkg"
+        for left in self.path.parent.iterdir() if self.path.parent.is_dir() else ():
+            if left.name.startswith(name):
+                left.unlink(missing_ok=True)
+
+    def _open_log(self) -> TileLog:
+        if self._log is None:
+            raise UsageError(f"{self.path}: the model is not open; use it in a `with` block, and finish it once")
+        return self._log
+
+    def _unwritten(self, cause: str) -> ResourceError:
+        return ResourceError(
+            f"{self.path}: could not be written ({cause}; {free_megabytes(self.path)} MB are free there); free some "
+            "space and run the same command again: finished units are kept"
+        )
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """A unit as it lies in the log."""
+
+    size: int
+    low: float
+    high: float
+    meshes: int
+    packed: bytes
+
+
+def _range_of(unit: Unit) -> tuple[float, float] | None:
+    """Lowest and highest height of posts and triangles; None if the unit has no surface at all."""
+    heights = unit.heights[np.isfinite(unit.heights)].astype(float) + unit.datum
+    if unit.faces is not None and len(unit.faces.corners):
+        Z = unit.faces.vertices[unit.faces.corners.ravel(), 2]
+        heights = np.append(heights, Z[np.isfinite(Z)])
+    return (float(heights.min()), float(heights.max())) if heights.size else None
+
+
+def _make_tables(db: sqlite3.Connection) -> None:
+    db.execute(
+        f"CREATE TABLE {HEADER} (id INTEGER PRIMARY KEY, format INTEGER NOT NULL, content TEXT NOT NULL, domain BLOB)"
+    )
+    db.execute(
+        f'CREATE TABLE {UNITS} (id INTEGER PRIMARY KEY, "column" INTEGER NOT NULL, "row" INTEGER NOT NULL, '
+        "meshes INTEGER NOT NULL, low DOUBLE NOT NULL, high DOUBLE NOT NULL, size INTEGER NOT NULL, "
+        "checksum INTEGER NOT NULL, content BLOB NOT NULL)"
+    )
+    db.execute(
+        f"CREATE TABLE {LINES} (id INTEGER PRIMARY KEY, name TEXT NOT NULL, code TEXT NOT NULL, xmin DOUBLE NOT NULL, "
+        "ymin DOUBLE NOT NULL, xmax DOUBLE NOT NULL, ymax DOUBLE NOT NULL, size INTEGER NOT NULL, "
+        "checksum INTEGER NOT NULL, content BLOB NOT NULL)"
+    )
+    # A GeoPackage names its tables, so that programs which look for them know that these are meant to be there.
+    for table, what in ((HEADER, "header"), (UNITS, "computing units"), (LINES, "line elements")):
+        db.execute(
+            "INSERT INTO gpkg_contents (table_name, data_type, identifier, description) VALUES (?, 'attributes', ?, ?)",
+            (table, table, f"{what} of the terrain model, for photoplan"),
+        )
+
+
+def _line_rows(lines: Sequence[LineElement]) -> Iterator[tuple[Any, ...]]:
+    for number, line in enumerate(lines, 1):
+        packed, size = pack_line(line)
+        xmin, ymin = (float(value) for value in line.xyz[:, :2].min(axis=0))
+        xmax, ymax = (float(value) for value in line.xyz[:, :2].max(axis=0))
+        yield number, line.name, line.code, xmin, ymin, xmax, ymax, size, zlib.crc32(packed), packed

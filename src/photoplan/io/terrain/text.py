@@ -1,0 +1,244 @@
+"""Measured terrain from text files: points, and lines as consecutive records.
+
+Columns are separated by spaces, commas, semicolons or tabs; see `ReadOptions.columns` for what they hold. Lines that
+are empty or begin with ``#`` are passed over. Records whose code is one of a line class make up lines: consecutive
+records of one line id (and code), or, where there is no column of line ids, of one code without an empty line between
+them. A breakline whose records have a second height (column ``z_right``) is two-sided: ``z`` is the height left of the
+line in its direction, ``z_right`` the height to its right; records without it have one height. Heights may be empty
+for border lines and holes. A file of the same name with the suffix ``.prj`` states the CRS.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.io.prj_file import crs_beside
+from photoplan.io.terrain.columns import Block, Layout, find_layout, parse_block
+from photoplan.io.terrain.groups import CodeIndex, PointColumns, class_of, is_line, make_groups
+from photoplan.io.terrain.options import CodeClass, ReadOptions
+from photoplan.surfaces.measured import LineKind, MeasuredLine, MeasuredTerrain
+
+__all__ = ["read"]
+
+BLOCK = 8 << 20
+"""Bytes that are parsed at once."""
+MAX_LINE = 1 << 20
+"""Bytes of one line at most."""
+
+
+@dataclass
+class _Columns:
+    """Columns of the file as they grow, block by block."""
+
+    xyz: list[NDArray[np.float64]] = field(default_factory=list)
+    records: list[NDArray[np.int64]] = field(default_factory=list)
+    codes: list[NDArray[np.int32]] = field(default_factory=list)
+    lines: list[NDArray[np.int32]] = field(default_factory=list)
+    sigma: list[NDArray[np.float64]] = field(default_factory=list)
+    right: list[NDArray[np.float64]] = field(default_factory=list)
+    names: list[NDArray[Any]] = field(default_factory=list)
+
+
+def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
+    """Points and lines of a text file.
+
+    Raises
+    ------
+    InputError
+        A line cannot be read as declared; the message names file and line.
+    """
+    layout: Layout | None = None
+    codes, ids, out = CodeIndex(), CodeIndex(), _Columns()
+    classes: list[CodeClass] = []
+
+    def look_up(code: str, line: int) -> CodeClass:
+        return class_of(code, options, "mass", f"{path}:{line}")
+
+    for first, lines in _blocks(path):
+        if layout is None:
+            layout = find_layout(path, lines, options)
+        block = None if layout is None else parse_block(path, layout, first, lines, look_up)
+        if block is not None:
+            _append(out, block, codes, ids)
+            _learn(classes, codes, block, look_up)
+    if layout is None or not out.xyz:
+        raise InputError(f"{path}: holds no line with data" + ("" if layout is None else ", only a header"))
+    return _terrain(path, layout, out, codes, ids, classes)
+
+
+def _blocks(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Number of the first line, and whole lines, of one part of the file after the other."""
+    number, rest = 1, b""
+    try:
+        with path.open("rb") as file:
+            while raw := file.read(BLOCK):
+                if number == 1 and not rest and raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+                    raise InputError(f"{path}: UTF-16 text; save the file as UTF-8")
+                raw = rest + raw
+                cut = max(raw.rfind(b"\n"), raw.rfind(b"\r", 0, -1)) + 1
+                if not cut and len(raw) > MAX_LINE:
+                    raise InputError(
+                        f"{path}:{number}: a line of more than {MAX_LINE} bytes; this is no table of points"
+                    )
+                rest = raw[cut:]
+                if cut:
+                    lines = _lines(path, number, raw[:cut])
+                    yield number, lines
+                    number += len(lines)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    if rest:
+        yield number, _lines(path, number, rest)
+
+
+def _lines(path: Path, number: int, raw: bytes) -> list[str]:
+    if number == 1:
+        raw = raw.removeprefix(b"\xef\xbb\xbf")
+    try:
+        text = raw.decode("utf-8")
+    except UnicodeDecodeError as error:
+        at = number + raw[: error.start].count(b"\n")
+        raise InputError(f"{path}:{at}: not UTF-8 (byte {raw[error.start]:#04x}); save the file as UTF-8") from None
+    if "\0" in text:
+        at = number + text[: text.index("\0")].count("\n")
+        raise InputError(f"{path}:{at}: holds a zero byte; this is not a text file")
+    if "\r" in text:
+        text = text.replace("\r\n", "\n").replace("\r", "\n")
+    lines = text.split("\n")
+    if not lines[-1]:
+        lines.pop()
+    return lines
+
+
+def _append(out: _Columns, block: Block, codes: CodeIndex, ids: CodeIndex) -> None:
+    out.xyz.append(block.xyz)
+    out.records.append(block.records)
+    count = len(block.xyz)
+    if block.code is not None:
+        out.codes.append(codes.numbers(block.code, count))
+    if block.line is not None:
+        out.lines.append(ids.numbers(block.line, count))
+    if block.sigma is not None:
+        out.sigma.append(block.sigma)
+    if block.right is not None:
+        out.right.append(block.right)
+    if block.name is not None:
+        out.names.append(np.array(block.name))
+
+
+def _learn(classes: list[CodeClass], codes: CodeIndex, block: Block, look_up: Callable[[str, int], CodeClass]) -> None:
+    """Classes of the codes that this block brought; unknown ones are named with their line."""
+    for code in codes.texts[len(classes) :]:
+        at = int(block.records[block.code.index(code)]) if block.code is not None and code in block.code else 0
+        classes.append(look_up(code, at))
+
+
+def _terrain(
+    path: Path, layout: Layout, out: _Columns, codes: CodeIndex, ids: CodeIndex, classes: list[CodeClass]
+) -> MeasuredTerrain:
+    def whole(parts: list[Any]) -> Any:
+        joined = np.concatenate(parts) if parts else None
+        parts.clear()  # the parts are not needed beside the whole
+        return joined
+
+    xyz, records, names = whole(out.xyz), whole(out.records), whole(out.names)
+    sigma, right = whole(out.sigma), whole(out.right)
+    number, line = whole(out.codes), whole(out.lines)
+    columns = PointColumns(xyz, records, number, sigma, names)
+    if number is None and line is None:
+        on_line = np.zeros(len(xyz), bool)
+    else:
+        by_class = np.array([is_line(c) for c in classes] or [False])
+        on_line = by_class[number] if number is not None else line > 0
+        if number is not None and line is not None:
+            on_line |= (line > 0) & (number == 0)
+    notes = list(layout.notes)
+    lines: list[MeasuredLine] = []
+    alone = np.empty(0, np.int64)
+    if on_line.any():
+        lines, alone = _make_lines(path, columns, on_line, line, right, (codes.texts, ids.texts), classes)
+        if len(alone):
+            some = ", ".join(str(r) for r in records[alone[:5]])
+            notes.append(
+                f"{path.name}: {len(alone)} lines have one record (line {some} of the file); read as mass points"
+            )
+    texts, kinds = codes.texts, list(classes)
+    if len(alone):
+        texts, kinds = [*texts, ""], [*kinds, CodeClass("mass")]
+        number = np.zeros(len(xyz), np.int32) if number is None else number
+        number[alone] = len(texts) - 1
+        on_line[alone] = False
+    columns = PointColumns(xyz, records, number, sigma, names)
+    if on_line.any():
+        columns = columns.take(~on_line)
+    groups = make_groups(path, columns, texts, kinds) if len(columns.xyz) else []
+    left_out = len(columns.xyz) - sum(len(g.xyz) for g in groups)
+    if left_out:
+        notes.append(f"{path.name}: {left_out} points left out, their codes say `ignore`")
+    stated = crs_beside(path)
+    crs, heights = (None, None) if stated is None else (stated.crs, stated.height_system)
+    return MeasuredTerrain(tuple(groups), tuple(lines), crs, heights, files=(path,), notes=tuple(notes))
+
+
+def _make_lines(
+    path: Path,
+    columns: PointColumns,
+    on_line: NDArray[np.bool_],
+    ids: NDArray[np.int32] | None,
+    right: NDArray[np.float64] | None,
+    texts: tuple[list[str], list[str]],
+    classes: list[CodeClass],
+) -> tuple[list[MeasuredLine], NDArray[np.int64]]:
+    """Lines, and the rows of those that would have one vertex; `texts` are codes and line ids by their numbers."""
+    codes, id_texts = texts
+    rows = np.flatnonzero(on_line)
+    code = np.zeros(len(columns.xyz), np.int32) if columns.codes is None else columns.codes
+    step = np.diff(rows) > 1
+    step |= np.diff(code[rows]) != 0
+    step |= (np.diff(ids[rows]) != 0) if ids is not None else (np.diff(columns.records[rows]) > 1)
+    starts = np.concatenate([[0], np.flatnonzero(step) + 1, [len(rows)]])
+    lines, alone = [], []
+    for a, b in zip(starts[:-1].tolist(), starts[1:].tolist()):
+        part = rows[a:b]
+        if b - a == 1:
+            alone.append(part[0])
+            continue
+        text = codes[code[part[0]]] if columns.codes is not None else ""
+        cls = classes[code[part[0]]] if columns.codes is not None else CodeClass("breakline")
+        own = id_texts[ids[part[0]]] if ids is not None else ""
+        kind: LineKind = cls.kind if is_line(cls) else "breakline"  # type: ignore[assignment]
+        name = f"{path.name}:{columns.records[part[0]]}" + "".join(f" {t}" for t in (text, own) if t)
+        lines.append(
+            MeasuredLine(
+                name,
+                kind,
+                columns.xyz[part],
+                _right_heights(right, columns.xyz, part, kind),
+                _line_sigma(columns.sigma, part, cls.sigma),
+                text,
+            )
+        )
+    return lines, np.array(alone, np.int64)
+
+
+def _right_heights(
+    right: NDArray[np.float64] | None, xyz: NDArray[np.float64], part: NDArray[np.int64], kind: str
+) -> NDArray[np.float64] | None:
+    """Heights right of a line; records without one have one height. None: no record has one."""
+    if right is None or kind != "breakline" or np.isnan(right[part]).all():
+        return None
+    return np.where(np.isnan(right[part]), xyz[part, 2], right[part])
+
+
+def _line_sigma(sigma: NDArray[np.float64] | None, part: NDArray[np.int64], default: float | None) -> float | None:
+    """One standard deviation for a line: the root mean square of its records'."""
+    if sigma is None or np.isnan(sigma[part]).all():
+        return default
+    return float(np.sqrt(np.nanmean(sigma[part] ** 2)))

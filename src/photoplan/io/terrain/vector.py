@@ -1,0 +1,355 @@
+"""Measured terrain from GeoPackage, Shapefile, GeoJSON and DXF: 3-D points, lines and polygons (by GDAL).
+
+The class of a feature is that of its code: the attribute `ReadOptions.attribute` (or ``kind``, ``class``, ``code``; in
+DXF the layer), else the name of the layer. Without one, points are mass points, lines breaklines and polygons borders
+with their holes. Attributes ``sigma`` and ``name`` are the standard deviation and the name. A breakline with the
+attribute ``z_right`` (one height for each vertex: a list of numbers, or a text with spaces between them; or one height
+for all) is two-sided. M values are not read.
+"""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+import warnings
+from collections import Counter
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyogrio.raw
+import shapely
+from numpy.typing import NDArray
+from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldError, GeometryError
+
+from photoplan.errors import InputError
+from photoplan.geometry.crs import canonical_crs, parse_crs, split_compound
+from photoplan.io.terrain.groups import CodeIndex, PointColumns, class_of, is_line, make_groups
+from photoplan.io.terrain.options import CodeClass, ReadOptions
+from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
+
+__all__ = ["read"]
+
+_CODES = ("kind", "class", "code")
+_NAMES = ("name", "id", "nr", "label")
+_POINT, _LINE, _RING, _POLYGON = 0, 1, 2, 3
+_DRAWING_METRES = ("0", "6")
+_ERRORS = (DataLayerError, DataSourceError, FeatureError, FieldError, GeometryError, shapely.GEOSException, ValueError)
+
+
+@dataclass(frozen=True, eq=False)
+class _Layer:
+    """Simple geometries of one layer and the attributes of each."""
+
+    name: str
+    geometry: NDArray[Any]
+    feature: NDArray[np.int64]
+    """Number of the feature of each geometry, from 1."""
+    codes: list[str]
+    sigma: NDArray[np.float64] | None
+    names: NDArray[Any] | None
+    right: NDArray[Any] | None
+
+
+def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
+    """Points and lines of the layers of a vector file.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, is not in metres, or a point or line that needs heights has none.
+    """
+    drawing = _is_drawing(path)
+    if drawing:
+        _check_drawing_units(path, options)
+    notes: list[str] = []
+    points: list[PointGroup] = []
+    lines: list[MeasuredLine] = []
+    crs: str | None = None
+    heights: str | None = None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for name in _layers(path, options, drawing):
+            layer, text = _layer(path, name, options, drawing, notes)
+            if layer is None:
+                continue
+            stated = _reference(path, text, layer, notes)
+            if crs is not None and stated[0] is not None and stated[0] != crs:
+                raise InputError(f"{path}: layers in {crs} and {stated[0]}; choose layers of one CRS")
+            crs, heights = (crs or stated[0]), (heights or stated[1])
+            more = _features(path, layer, options, notes)
+            points += more[0]
+            lines += more[1]
+    return MeasuredTerrain(tuple(points), tuple(lines), crs, heights, files=(path,), notes=tuple(notes))
+
+
+def _is_drawing(path: Path) -> bool:
+    with path.open("rb") as file:
+        head = file.read(22)
+    return head.startswith(b"AutoCAD Binary DXF") or not head.startswith(
+        (b"SQLite", b"\x00\x00\x27\x0a", b"{", b"\xef")
+    )
+
+
+def _check_drawing_units(path: Path, options: ReadOptions) -> None:
+    """Refuse drawings in units other than metres; a declared CRS says that the numbers are its metres."""
+    with path.open("rb") as file:
+        head = file.read(1 << 16).decode("latin-1")
+    found = re.search(r"\$INSUNITS\s+70\s+(\d+)", head)
+    if found and found[1] not in _DRAWING_METRES and options.crs is None:
+        unit = {"1": "inches", "2": "feet", "4": "millimetres", "5": "centimetres", "21": "US survey feet"}
+        raise InputError(
+            f"{path}: the drawing says its unit is {unit.get(found[1], f'number {found[1]}')} ($INSUNITS); metres are "
+            "needed: convert it, or declare the CRS if the coordinates are its metres nevertheless"
+        )
+
+
+def _layers(path: Path, options: ReadOptions, drawing: bool) -> list[str]:
+    if drawing:
+        return ["entities"]
+    views = _views(path)
+    try:
+        names = [str(name) for name, kind in pyogrio.list_layers(str(path)) if kind is not None]
+    except _ERRORS as error:
+        raise InputError(f"{path}: cannot be opened ({' '.join(str(error).split())[:300]}); get a fresh copy") from None
+    if options.layers is not None and len(names) > 1:
+        lost = [name for name in options.layers if name not in names]
+        chosen = [name for name in names if name in options.layers]
+        if not chosen:
+            raise InputError(f"{path}: holds no layer called {', '.join(lost)}; it has {', '.join(names)}")
+        names = chosen
+    if not names:
+        raise InputError(f"{path}: holds no layer with geometry")
+    if views & {name.casefold() for name in names}:
+        raise InputError(
+            f"{path}: layer {', '.join(n for n in names if n.casefold() in views)} is a view (a query, which may have "
+            "no end), not a table; store it as a table (ogr2ogr), or choose other layers"
+        )
+    return names
+
+
+def _views(path: Path) -> set[str]:
+    """Names of the views of a GeoPackage in small letters; nothing for other formats."""
+    with path.open("rb") as file:
+        if file.read(6) != b"SQLite":
+            return set()
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as db:
+            return {
+                str(name).casefold() for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'view'")
+            }
+    except sqlite3.Error as error:
+        raise InputError(f"{path}: cannot be opened ({error}); get a fresh copy") from None
+
+
+def _layer(
+    path: Path, name: str, options: ReadOptions, drawing: bool, notes: list[str]
+) -> tuple[_Layer | None, str | None]:
+    """One layer with its geometries taken apart, and its CRS."""
+    # Blocks of drawings are not unfolded: nested ones grow without bound. Their insertion points are points.
+    more = {"INLINE_BLOCKS": "NO"} if drawing else {}
+    try:
+        meta, _, wkb, data = pyogrio.raw.read(str(path), layer=name, **more)
+        geometry = shapely.from_wkb(wkb)
+    except _ERRORS as error:
+        raise InputError(f"{path}: layer {name}: cannot be read ({' '.join(str(error).split())[:300]})") from None
+    fields = {str(f).casefold(): values for f, values in zip(meta["fields"], data)}
+    use = ~(shapely.is_missing(geometry) | shapely.is_empty(geometry))
+    if drawing:
+        use &= _drawn(path, geometry, fields, options, notes)
+    if not use.all() and not drawing:
+        notes.append(f"{path.name}: layer {name}: {int((~use).sum())} features have no geometry")
+    at = np.flatnonzero(use)
+    parts, whose = shapely.get_parts(geometry[at], return_index=True)
+    while (shapely.get_type_id(parts) > _POLYGON).any():
+        parts, again = shapely.get_parts(parts, return_index=True)
+        whose = whose[again]
+    if not len(parts):
+        return None, None
+    row = at[whose]
+    attribute = "layer" if drawing and options.attribute is None else options.attribute
+    key = attribute.casefold() if attribute else next((c for c in _CODES if c in fields), "")
+    if attribute and key not in fields:
+        raise InputError(f"{path}: layer {name}: no attribute {attribute!r}; it has {', '.join(fields) or 'none'}")
+    codes = [_text(v) for v in fields[key][row]] if key else [""] * len(parts)
+    names = next((fields[n] for n in _NAMES if n in fields), None)
+    return (
+        _Layer(
+            name,
+            parts,
+            row + 1,
+            codes,
+            None if "sigma" not in fields else _sigma(path, fields["sigma"][row]),
+            None if names is None else np.array([_text(v) for v in names[row]]),
+            fields["z_right"][row] if "z_right" in fields else None,
+        ),
+        meta["crs"],
+    )
+
+
+def _drawn(
+    path: Path, geometry: NDArray[Any], fields: dict[str, Any], options: ReadOptions, notes: list[str]
+) -> NDArray[np.bool_]:
+    """Which entities of a drawing are measured points and lines: no texts, no faces and hatches."""
+    text = np.array([v is not None for v in fields.get("text", [None] * len(geometry))], bool)
+    faces = np.isin(shapely.get_type_id(geometry), (3, 6, 7, 15, 16, 17))
+    for what, which in (("texts", text), ("faces and hatches", faces)):
+        if which.any():
+            notes.append(f"{path.name}: {int(which.sum())} {what} left out")
+    use = ~(text | faces)
+    if options.layers is not None:
+        layers = fields["layer"]
+        use &= np.isin(layers.astype(str), options.layers)
+        if not use.any():
+            known = ", ".join(sorted(set(layers.astype(str))))
+            raise InputError(f"{path}: nothing on layers {', '.join(options.layers)}; it has {known}")
+    return use
+
+
+def _text(value: Any) -> str:
+    if value is None or (isinstance(value, float) and np.isnan(value)):
+        return ""
+    return (
+        str(int(value)) if isinstance(value, float | np.floating) and float(value).is_integer() else str(value).strip()
+    )
+
+
+def _sigma(path: Path, values: NDArray[Any]) -> NDArray[np.float64]:
+    try:
+        sigma = np.array([np.nan if v is None or v == "" else v for v in values], np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{path}: attribute sigma: not all values are numbers; metres are needed") from None
+    if (sigma < 0).any() or np.isinf(sigma).any():
+        raise InputError(f"{path}: attribute sigma: {sigma[(sigma < 0) | np.isinf(sigma)][0]}; zero or more is needed")
+    return sigma
+
+
+def _features(
+    path: Path, layer: _Layer, options: ReadOptions, notes: list[str]
+) -> tuple[list[PointGroup], list[MeasuredLine]]:
+    codes = CodeIndex()
+    number = codes.numbers(layer.codes, len(layer.codes))
+    # What an empty code means, the name of the layer says; the kind of geometry says it where that is no class either.
+    of_layer = options.codes.find(layer.name)
+    classes = [(_known(path, layer, code, options) if code else None) or of_layer for code in codes.texts]
+    kind = shapely.get_type_id(layer.geometry)
+    lines: list[MeasuredLine] = []
+    stray: list[tuple[int, NDArray[np.float64]]] = []
+    left_out: Counter[str] = Counter()
+    for at in np.flatnonzero(kind != _POINT).tolist():
+        cls = classes[number[at]] or CodeClass("border" if kind[at] == _POLYGON else "breakline")
+        if cls.kind == "ignore":
+            left_out[layer.codes[at] or layer.name] += 1
+        elif is_line(cls):
+            lines += _lines(path, layer, at, cls)
+        else:
+            stray.append((at, _heights(path, layer, at, shapely.get_coordinates(layer.geometry[at], include_z=True))))
+    is_point = np.flatnonzero(kind == _POINT)
+    of_point = [c if c is not None and not is_line(c) else CodeClass("mass") for c in classes]
+    xyz = shapely.get_coordinates(layer.geometry[is_point], include_z=True)
+    rows = np.concatenate([is_point, *(np.full(len(c), at) for at, c in stray)]).astype(np.int64)
+    xyz = np.concatenate([xyz, *(c for _, c in stray)])
+    used = np.array([c.kind != "ignore" for c in of_point])[number[rows]]
+    rows, xyz = rows[used], xyz[used]
+    flat = np.flatnonzero(np.isnan(xyz[:, 2]))
+    if len(flat):
+        raise InputError(_no_height(path, layer, int(rows[flat[0]]), len(flat)))
+    columns = PointColumns(
+        xyz,
+        layer.feature[rows],
+        number[rows],
+        None if layer.sigma is None else layer.sigma[rows],
+        None if layer.names is None else layer.names[rows],
+    )
+    if left_out or not used.all():
+        notes.append(
+            f"{path.name}: layer {layer.name}: {sum(left_out.values()) + int((~used).sum())} features left out"
+        )
+    return (make_groups(path, columns, codes.texts, of_point) if len(xyz) else []), lines
+
+
+def _known(path: Path, layer: _Layer, code: str, options: ReadOptions) -> CodeClass | None:
+    found = options.codes.find(code)
+    if found is None and options.codes.classes:
+        at = int(layer.feature[layer.codes.index(code)])
+        class_of(code, options, "mass", f"{path}: layer {layer.name}, feature {at}")
+    return found
+
+
+def _no_height(path: Path, layer: _Layer, at: int, count: int) -> str:
+    code = f" ({layer.codes[at]})" if layer.codes[at] else ""
+    more = f"; so have {count - 1} others" if count > 1 else ""
+    return (
+        f"{path}: layer {layer.name}, feature {layer.feature[at]}{code}: has no height{more}; give 3-D geometry, "
+        "choose other layers, or leave its code out (`ignore` in the table of codes)"
+    )
+
+
+def _heights(path: Path, layer: _Layer, at: int, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    if np.isnan(xyz[:, 2]).any():
+        raise InputError(_no_height(path, layer, at, 1))
+    return xyz
+
+
+def _lines(path: Path, layer: _Layer, at: int, cls: CodeClass) -> list[MeasuredLine]:
+    """Lines of one geometry: itself, or the rings of a polygon."""
+    shape, kind = layer.geometry[at], cls.kind
+    rings = [(shape, kind)]
+    if shapely.get_type_id(shape) == _POLYGON:
+        inner = "hole" if kind == "border" else kind
+        rings = [(shapely.get_exterior_ring(shape), kind), *((r, inner) for r in shape.interiors)]
+    own = f" {layer.names[at]}" if layer.names is not None and layer.names[at] else ""
+    code = layer.codes[at]
+    name = f"{path.name}: {layer.name} {layer.feature[at]}{own}" + (f" ({code})" if code else "")
+    sigma = cls.sigma if layer.sigma is None or np.isnan(layer.sigma[at]) else float(layer.sigma[at])
+    lines = []
+    for ring, own_kind in rings:
+        xyz = shapely.get_coordinates(ring, include_z=True)
+        if own_kind in ("breakline", "formline"):
+            _heights(path, layer, at, xyz)
+        right = _right(path, layer, at, len(xyz)) if own_kind == "breakline" else None
+        line_kind: Any = own_kind
+        lines.append(MeasuredLine(name, line_kind, xyz, right, sigma, code))
+    return lines
+
+
+def _right(path: Path, layer: _Layer, at: int, count: int) -> NDArray[np.float64] | None:
+    """Heights right of a line from the attribute z_right."""
+    value = None if layer.right is None else layer.right[at]
+    if value is None or (isinstance(value, str) and not value.strip()):
+        return None
+    try:
+        numbers = np.atleast_1d(
+            np.array(re.split(r"[;\s]+|,\s+", value.strip()) if isinstance(value, str) else value, float)
+        )
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    if np.isnan(numbers).all() and len(numbers):
+        return None
+    if len(numbers) == 1:
+        numbers = np.repeat(numbers, count)
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise InputError(
+            f"{path}: layer {layer.name}, feature {layer.feature[at]}: z_right = {str(value)[:60]!r}; "
+            f"{count} heights, one for each vertex, or one for all are needed"
+        )
+    return numbers
+
+
+def _reference(path: Path, text: str | None, layer: _Layer, notes: list[str]) -> tuple[str | None, str | None]:
+    """CRS and height system that a layer states."""
+    if text is None:
+        return None, None
+    crs = parse_crs(text, f"{path}: CRS")
+    if crs.name.casefold().startswith("undefined"):
+        return None, None
+    bounds = shapely.total_bounds(layer.geometry[:1000])
+    if path.suffix.casefold() in (".geojson", ".json") and crs.is_geographic and np.abs(bounds).max() > 360:
+        # GeoJSON without a CRS is WGS 84 by its standard; coordinates that are no degrees say otherwise.
+        notes.append(f"{path.name}: states no CRS, and its coordinates are no degrees")
+        return None, None
+    if crs.is_geographic:
+        return canonical_crs(text), None
+    return split_compound(text)

@@ -1,0 +1,1 @@
+"""`photoplan adjust`: bundle adjustment of a project."""

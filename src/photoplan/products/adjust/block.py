@@ -1,0 +1,241 @@
+"""From a project's measurements to a block, and from the adjusted block to map coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.observed import GroundPoints
+from photoplan.errors import InputError
+from photoplan.geometry.pose import Pose
+from photoplan.geometry.rotation import angles_from_rotation
+from photoplan.io.project_cameras import interior_of
+from photoplan.io.project_model import ANGLE_UNITS, Project
+from photoplan.orientation.block import Adjusted, AdjustSettings, Block, BlockCamera, BlockImage
+from photoplan.orientation.bundle import adjust_block
+from photoplan.products.adjust.cameras import Calibrated, Free, block_camera, calibrated
+from photoplan.products.adjust.frame import BlockFrame, angle_derivatives, block_frame, make_bend, nadir_heights
+from photoplan.products.adjust.inputs import AdjustInputs
+
+__all__ = ["MapResult", "Prepared", "adjust_prepared", "map_result", "prepare"]
+
+_Floats = NDArray[np.float64]
+Adjuster = Callable[[Block, AdjustSettings], Adjusted]
+
+#: How far a control point with an unknown coordinate may be from where it was thought, before its other coordinates
+#: are computed again for the new place: times the slope between the block's horizons, metres.
+_PLACE = 1e-3
+_ROUNDS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A block with what leads back from it."""
+
+    inputs: AdjustInputs
+    frame: BlockFrame
+    block: Block
+    near: _Floats
+    """About where each ground point lies in the map, (g, 3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapResult:
+    """An adjustment in map coordinates; standard deviations hold sigma0."""
+
+    prepared: Prepared
+    adjusted: Adjusted
+    poses: tuple[Pose, ...]
+    """Map poses, angles about the map's axes at each station, in the order of `adjusted.images`."""
+    angles: _Floats
+    """(n, 3), in the unit and order of the project."""
+    sigma_center: _Floats
+    """(n, 3), metres."""
+    sigma_angles: _Floats
+    """(n, 3), in the project's unit."""
+    XYZ: _Floats
+    """All adjusted points, (m, 3)."""
+    covariance: _Floats
+    """(m, 3, 3), m²."""
+    ground_residuals: _Floats
+    """Adjusted minus given, (g, 3), metres; NaN: not known or not adjusted."""
+    position_residuals: _Floats
+    """Computed minus observed, (p, 3), metres."""
+    cameras: tuple[Calibrated, ...]
+    """Those that had unknowns."""
+
+
+def prepare(inputs: AdjustInputs, starts: Mapping[str, Pose], free: Free) -> Prepared:
+    """The block of a project in its Cartesian system.
+
+    Parameters
+    ----------
+    inputs : AdjustInputs
+    starts : mapping
+        Map pose of every image.
+    free : Free
+        Parameters of cameras that are unknowns, with what is known of them beforehand.
+
+    Raises
+    ------
+    InputError
+        An interior orientation cannot be made (fiducial marks missing), or height systems cannot be joined.
+    UsageError
+        A parameter cannot be free.
+    """
+    project = inputs.project
+    centers = np.array([starts[image.name].center for image in inputs.images])
+    frame = block_frame(project, np.concatenate([centers, inputs.ground.XYZ]))
+    cameras: dict[str, BlockCamera] = {}
+    images = []
+    for image in inputs.images:
+        camera = project.cameras[image.camera]
+        interior = interior_of(camera, image)
+        if image.camera not in cameras:
+            cameras[image.camera] = block_camera(image.camera, camera, interior, free.get(image.camera))
+        pose = frame.pose(starts[image.name])
+        images.append(BlockImage(image.name, image.camera, interior.plane_to_pixel, pose))
+    unused = [name for name in free if name not in cameras]
+    if unused:
+        raise InputError(f"camera {unused[0]!r} is to be calibrated, but none of the images is of it")
+    near = _places(inputs, starts, images, cameras)
+    adjustment = project.adjustment
+    stations = {image.name: starts[image.name].center for image in inputs.images}
+    positions, attitudes = inputs.positions, inputs.attitudes
+    nadir = nadir_heights(project, centers[:, :2], _mean_height(inputs.ground))
+    block = Block(
+        cameras=cameras,
+        images=tuple(images),
+        observations=inputs.points,
+        ground=frame.ground(inputs.ground, near),
+        positions=None if positions is None else frame.positions(positions),
+        attitudes=None
+        if attitudes is None
+        else frame.attitudes(attitudes, np.array([stations[name] for name in attitudes.images])),
+        lever_arm=adjustment.lever_arm,
+        lever_arm_sigma=adjustment.lever_arm_sigma,
+        drift=adjustment.drift,
+        boresight=adjustment.boresight,
+        bend=make_bend(project, frame, tuple(images), cameras, nadir),
+    )
+    return Prepared(inputs, frame, block, near)
+
+
+def _mean_height(ground: GroundPoints) -> float:
+    known = ground.XYZ[np.isfinite(ground.XYZ[:, 2]), 2]
+    return float(known.mean()) if len(known) else 0.0
+
+
+def _places(
+    inputs: AdjustInputs, starts: Mapping[str, Pose], images: Sequence[BlockImage], cameras: Mapping[str, BlockCamera]
+) -> _Floats:
+    """About where each ground point lies: unknown heights are the mean of the known ones, unknown places are where the
+    ray of the first measurement reaches that height."""
+    ground, points = inputs.ground, inputs.points
+    near = np.array(ground.XYZ)
+    near[np.isnan(near[:, 2]), 2] = _mean_height(ground)
+    of = {image.name: image for image in images}
+    number = {name: k for k, name in enumerate(points.points)}
+    middle = np.mean([pose.center[:2] for pose in starts.values()], axis=0)
+    for k in np.flatnonzero(np.isnan(near[:, 0])):
+        near[k, :2] = middle
+        rows = np.flatnonzero(points.point == number.get(ground.names[k], -1))
+        if not len(rows):
+            continue
+        image = of[points.images[points.image[rows[0]]]]
+        camera, pose = cameras[image.camera], starts[image.name]
+        plane = image.plane_to_pixel.inverse(points.xy[rows[0]])
+        t = camera.lens.undistort((plane - np.array(camera.principal_point)) / camera.c)
+        d = pose.R_ground_camera @ np.array([t[0], t[1], -1.0])
+        if d[2] < 0:
+            near[k, :2] = pose.center[:2] + d[:2] / d[2] * (near[k, 2] - pose.center[2])
+    return near
+
+
+def adjust_prepared(
+    prepared: Prepared, settings: AdjustSettings, adjuster: Adjuster = adjust_block
+) -> tuple[Prepared, Adjusted]:
+    """Adjust, again where a control point with an unknown coordinate lies elsewhere than was thought."""
+    adjusted = adjuster(prepared.block, settings)
+    ground = prepared.inputs.ground
+    partial = ~np.isfinite(ground.XYZ).all(axis=1)
+    if prepared.frame.local is None or not partial.any():
+        return prepared, adjusted
+    row = {name: k for k, name in enumerate(adjusted.points)}
+    for _ in range(_ROUNDS):
+        near = prepared.near.copy()
+        for k in np.flatnonzero(partial):
+            if ground.names[k] in row:
+                near[k] = prepared.frame.map_points(adjusted.XYZ[row[ground.names[k]]])
+        moved = np.linalg.norm(near - prepared.near, axis=1)
+        J = prepared.frame.jacobian(near)
+        slope = np.maximum(np.abs(J[:, 2, :2]).max(axis=1), np.abs(J[:, :2, 2]).max(axis=1))
+        if not (moved * slope > _PLACE).any():
+            break
+        poses = dict(zip(adjusted.images, adjusted.poses))
+        images = tuple(replace(image, pose=poses.get(image.name, image.pose)) for image in prepared.block.images)
+        block = replace(prepared.block, images=images, ground=prepared.frame.ground(ground, near))
+        prepared = replace(prepared, block=block, near=near)
+        adjusted = adjuster(block, settings)
+        row = {name: k for k, name in enumerate(adjusted.points)}
+    return prepared, adjusted
+
+
+def map_result(prepared: Prepared, adjusted: Adjusted) -> MapResult:
+    """The adjusted block in map coordinates."""
+    frame, project = prepared.frame, prepared.inputs.project
+    poses = tuple(frame.map_pose(pose) for pose in adjusted.poses)
+    centers = np.array([pose.center for pose in poses]).reshape(-1, 3)
+    unit, order = project.orientation.angle_unit, project.orientation.rotation
+    to_unit = ANGLE_UNITS[unit] / (2 * np.pi)
+    angles = np.array([angles_from_rotation(pose.R_ground_camera, order) for pose in poses]).reshape(-1, 3) * to_unit
+    D = np.array([angle_derivatives(pose.R_ground_camera, order) for pose in poses]).reshape(-1, 3, 3)
+    of_angles = D @ adjusted.pose_covariance[:, 3:, 3:] @ np.swapaxes(D, 1, 2)
+    of_centers = frame.map_covariance(adjusted.pose_covariance[:, :3, :3], centers)
+    XYZ = frame.map_points(adjusted.XYZ)
+    return MapResult(
+        prepared,
+        adjusted,
+        poses,
+        angles,
+        _roots(of_centers),
+        _roots(of_angles) * to_unit,
+        XYZ,
+        frame.map_covariance(adjusted.point_covariance, XYZ),
+        _ground_residuals(prepared, adjusted, XYZ),
+        _position_residuals(prepared, adjusted),
+        _cameras(project, prepared.block, adjusted),
+    )
+
+
+def _roots(covariance: _Floats) -> _Floats:
+    return np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+
+
+def _ground_residuals(prepared: Prepared, adjusted: Adjusted, XYZ: _Floats) -> _Floats:
+    ground = prepared.inputs.ground
+    row = {name: k for k, name in enumerate(adjusted.points)}
+    out = np.full((len(ground), 3), np.nan)
+    for k, name in enumerate(ground.names):
+        if name in row:
+            out[k] = XYZ[row[name]] - ground.XYZ[k]
+    return out
+
+
+def _position_residuals(prepared: Prepared, adjusted: Adjusted) -> _Floats:
+    positions = prepared.inputs.positions
+    if positions is None or prepared.frame.local is None:
+        return np.asarray(adjusted.position_residuals)
+    back = np.linalg.inv(prepared.frame.jacobian(positions.XYZ))
+    return np.asarray((back @ adjusted.position_residuals[..., None])[..., 0])
+
+
+def _cameras(project: Project, block: Block, adjusted: Adjusted) -> tuple[Calibrated, ...]:
+    return tuple(
+        calibrated(project.cameras[found.name], block.cameras[found.name], found)
+        for found in adjusted.cameras
+        if found.free
+    )

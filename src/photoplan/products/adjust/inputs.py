@@ -1,0 +1,214 @@
+"""The measurements of a project, brought together under the project's names and with their accuracy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.observed import GroundPoints, ImagePoints, ObservedAttitudes, ObservedPositions
+from photoplan.errors import InputError
+from photoplan.io.gcp_list import is_gcp_list, read_gcp_list
+from photoplan.io.ground_points import read_ground_points
+from photoplan.io.image_points import named_as, read_image_points
+from photoplan.io.names import match_key
+from photoplan.io.observed_positions import PositionTable, read_observed_positions
+from photoplan.io.orientation.exif import image_files
+from photoplan.io.orientation.table import TableFormat, angle_in_radians
+from photoplan.io.project_cameras import image_size
+from photoplan.io.project_model import Image, Project
+from photoplan.products.init_match import some
+
+__all__ = ["AdjustInputs", "read_inputs"]
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustInputs:
+    """Everything that is measured, in map coordinates and the orientation's height system."""
+
+    project: Project
+    images: tuple[Image, ...]
+    """Those that are wanted."""
+    points: ImagePoints
+    """Measurements in these images, by the project's names, each with a standard deviation."""
+    ground: GroundPoints
+    table: PositionTable | None
+    """Observed positions as their file states them, by the project's names."""
+    positions: ObservedPositions | None
+    attitudes: ObservedAttitudes | None
+    files: tuple[Path, ...]
+    notes: tuple[str, ...]
+    """What a user should know of how the files were read."""
+
+
+def read_inputs(project: Project, names: Sequence[str]) -> AdjustInputs:
+    """Read all files that [observations] names.
+
+    Parameters
+    ----------
+    project : Project
+    names : sequence of str
+        The images that are wanted, by their names in the project.
+
+    Raises
+    ------
+    InputError
+        There are no image points, a file cannot be read, control has no stated accuracy, or no image of the files is
+        in the project.
+    """
+    observations = project.observations
+    if not observations.image_points and not any(is_gcp_list(project.resolve(f)) for f in observations.control):
+        raise InputError(
+            'the project names no image points; give image_points = ["points.csv"] in [observations], measured by '
+            "hand or by `photoplan tie`"
+        )
+    notes: list[str] = []
+    ground_parts, parts, files = _control(project)
+    for file in observations.image_points:
+        path = project.resolve(file)
+        if path not in files:
+            files.append(path)
+            parts.append((path, read_image_points(path)))
+    points = _image_points(project, parts, names, notes)
+    ground = _ground(project, ground_parts)
+    measured = set(points.points)
+    unmeasured = [n for n in ground.names if n not in measured]
+    if unmeasured:
+        notes.append(f"{len(unmeasured)} ground points are measured in no image: {some(unmeasured)}")
+        keep = np.array([n in measured for n in ground.names], bool)
+        names_kept = tuple(n for n in ground.names if n in measured)
+        ground = GroundPoints(names_kept, ground.XYZ[keep], ground.sigma[keep], ground.check[keep])
+    table = _positions(project, names, notes)
+    if table is not None:
+        files += image_files(table.path)
+    positions = None if table is None else table.positions(observations.sigma_position)
+    unit = project.orientation.angle_unit
+    sigma = None if observations.sigma_attitude is None else observations.sigma_attitude
+    radians = None if sigma is None else float(angle_in_radians(np.array(sigma), unit))
+    attitudes = None if table is None else table.attitudes(radians)
+    if table is not None and table.R_ground_camera is not None and attitudes is None:
+        notes.append(
+            f"{table.path.name}: attitudes are start values only; they become observations with sigma_attitude in "
+            "[observations]"
+        )
+    wanted = set(names)
+    images = tuple(image for image in project.images if image.name in wanted)
+    return AdjustInputs(project, images, points, ground, table, positions, attitudes, tuple(files), tuple(notes))
+
+
+def _control(project: Project) -> tuple[list[GroundPoints], list[tuple[Path, ImagePoints]], list[Path]]:
+    """Ground points of all files, and the measurements that come with a gcp_list.txt."""
+    grounds, points, files = [], [], []
+    for file in project.observations.control:
+        path = project.resolve(file)
+        files.append(path)
+        if is_gcp_list(path):
+            gcps = read_gcp_list(path, project.crs)
+            grounds.append(gcps.ground)
+            points.append((path, gcps.points))
+        else:
+            grounds.append(read_ground_points(path, crs=project.crs))
+    return grounds, points, files
+
+
+def _image_points(
+    project: Project, parts: list[tuple[Path, ImagePoints]], names: Sequence[str], notes: list[str]
+) -> ImagePoints:
+    every = [image.name for image in project.images]
+    renamed, unknown, total = [], [], 0
+    for path, part in parts:
+        own, lost = named_as(part, every)
+        total += len(part.images)
+        unknown += [n for n in lost if n not in unknown]
+        if len(lost) == len(part.images) and any(match_key(n) in {match_key(p) for p in part.points} for n in every):
+            raise InputError(
+                f"{path}: the column of points holds images; its header names the columns point and image in the wrong "
+                "order, or it has none and the order is image, point"
+            )
+        renamed.append(own)
+    try:
+        merged = ImagePoints.merged(renamed).of_images(names)
+    except InputError as error:
+        raise InputError(f"{', '.join(path.name for path, _ in parts)}: {error}") from None
+    if not len(merged):
+        raise InputError(
+            f"{', '.join(str(path) for path, _ in parts)}: none of the images is in the project: measured are "
+            f"{some(unknown)}; the project has {some(every)}"
+        )
+    _refuse_outside(project, merged)
+    if unknown:
+        notes.append(f"{len(unknown)} images of the measurements are not in the project: {some(unknown)}")
+    return _with_sigma(merged, project.observations.sigma_image)
+
+
+def _refuse_outside(project: Project, points: ImagePoints) -> None:
+    """Measurements outside their image, by more than half a pixel beyond its border: of another size, or exchanged."""
+    sizes = np.array([image_size(project.cameras[i.camera], i) for i in map(project.image, points.images)])
+    width_height = sizes[points.image]
+    outside = np.flatnonzero(((points.xy < -1.0) | (points.xy > width_height)).any(axis=1))
+    if len(outside):
+        k = int(outside[0])
+        width, height = width_height[k]
+        x, y = points.xy[k]
+        raise InputError(
+            f"{points.label(k)}: column {x:g}, row {y:g} lies outside the image of {width} × {height} pixels "
+            f"({len(outside)} of {len(points)} measurements do); were they measured in images of another size, or are "
+            "x and y exchanged?"
+        )
+
+
+def _with_sigma(points: ImagePoints, sigma: float) -> ImagePoints:
+    full = np.where(np.isnan(points.sigma), sigma, points.sigma)
+    return ImagePoints(points.images, points.points, points.image, points.point, points.xy, full)
+
+
+def _ground(project: Project, parts: list[GroundPoints]) -> GroundPoints:
+    names = tuple(name for part in parts for name in part.names)
+    none = np.empty((0, 3))
+    XYZ = np.concatenate([none, *(p.XYZ for p in parts)])
+    sigma = np.concatenate([none, *(p.sigma for p in parts)])
+    check = np.concatenate([np.empty(0, bool), *(p.check for p in parts)])
+    if project.observations.sigma_control is not None:
+        plane, height = project.observations.sigma_control
+        sigma = np.where(np.isnan(sigma), [plane, plane, height], sigma)
+    lost = np.isnan(sigma) & np.isfinite(XYZ) & ~check[:, None]
+    if lost.any():
+        name = names[int(np.flatnonzero(lost.any(axis=1))[0])]
+        raise InputError(
+            f"control point {name!r}: its accuracy is not stated; give sigma_control = [horizontal, height] in metres "
+            "in [observations], or columns sigma_xy and sigma_z with the points (0: held fixed)"
+        )
+    return GroundPoints(names, XYZ, sigma, check)
+
+
+def _positions(project: Project, names: Sequence[str], notes: list[str]) -> PositionTable | None:
+    if project.observations.positions is None:
+        return None
+    orientation = project.orientation
+    form = TableFormat(angle_unit=orientation.angle_unit, rotation=orientation.rotation)
+    table = read_observed_positions(project.resolve(project.observations.positions), form, crs=project.crs)
+    known = {match_key(name): name for name in names}
+    every = {match_key(image.name) for image in project.images}
+    keep = [k for k, name in enumerate(table.images) if match_key(name) in known]
+    unknown = [name for name in table.images if match_key(name) not in every]
+    if not keep:
+        raise InputError(
+            f"{table.path}: none of its images is in the project: it has {some(list(table.images))}; the project has "
+            f"{some(list(known.values()))}"
+        )
+    if unknown:
+        notes.append(f"{table.path.name}: {len(unknown)} positions are of images that are not in the project")
+    at: NDArray[np.int64] = np.array(keep, np.int64)
+    return PositionTable(
+        table.path,
+        tuple(known[match_key(table.images[k])] for k in keep),
+        table.XYZ[at],
+        table.sigma[at],
+        None if table.R_ground_camera is None else table.R_ground_camera[at],
+        table.sigma_angle[at],
+        tuple(table.strip[k] for k in keep),
+        table.time[at],
+    )

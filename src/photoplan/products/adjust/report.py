@@ -1,0 +1,368 @@
+"""From an adjusted block to what its report, its JSON and its layers say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.geometry.crs import crs_label
+from photoplan.geometry.heights import height_label
+from photoplan.io.adjusted_points import PointLayer
+from photoplan.io.project_model import ANGLE_UNITS
+from photoplan.orientation.block import AdjustSettings
+from photoplan.products.adjust.block import MapResult
+from photoplan.products.adjust.field import residual_fields
+from photoplan.products.init_match import some
+from photoplan.report.adjust_facts import (
+    AdjustFacts,
+    CalibrationFacts,
+    GroundFacts,
+    GroupFacts,
+    ImageFacts,
+    MeasurementFacts,
+    StripFacts,
+)
+from photoplan.report.check_points import CheckAccuracy, check_accuracy
+
+__all__ = ["build_facts", "point_layers"]
+
+_Floats = NDArray[np.float64]
+Triple = tuple[float, float, float]
+#: Kept measurements that are named.
+_WORST = 15
+#: Redundancy from which a group's variance factor says something, and from which ratio on it is told.
+_SOUND, _CONTRADICTED = 30.0, 1.4
+
+
+def build_facts(title: str, result: MapResult, settings: AdjustSettings, seconds: float) -> AdjustFacts:
+    """What the report shows.
+
+    Parameters
+    ----------
+    title : str
+    result : MapResult
+    settings : AdjustSettings
+        How it was adjusted.
+    seconds : float
+        How long that took.
+    """
+    prepared, adjusted = result.prepared, result.adjusted
+    inputs, project = prepared.inputs, prepared.inputs.project
+    used = np.isfinite(adjusted.residuals).all(axis=1) & ~adjusted.rejected
+    ground = ground_facts(result)
+    names = {g.name for g in ground}
+    tie = np.array([name not in names for name in adjusted.points], bool)
+    sigma = np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2))
+    system = project.orientation.height_system
+    residuals = adjusted.residuals[used]
+    return AdjustFacts(
+        title=title,
+        crs=f"{crs_label(project.crs)} · heights {height_label(system)} · earth curvature "
+        f"{project.orientation.earth_curvature}",
+        sigma0=adjusted.sigma0,
+        redundancy=adjusted.redundancy,
+        unknowns=adjusted.unknowns,
+        iterations=adjusted.iterations,
+        seconds=seconds,
+        rms_pixels=float(np.sqrt((residuals**2).mean())) if len(residuals) else float("nan"),
+        measurements=int(used.sum()),
+        rejected=int(adjusted.rejected.sum() + adjusted.ground_rejected.sum() + adjusted.position_rejected.sum()),
+        points=len(adjusted.points),
+        mean_rays=float(adjusted.rays.mean()) if len(adjusted.rays) else float("nan"),
+        angle_unit=project.orientation.angle_unit,
+        groups=tuple(GroupFacts(g.name, g.count, g.redundancy, g.rms, g.unit, g.factor) for g in adjusted.groups),
+        images=_images(result, used),
+        ground=ground,
+        check=_check(ground),
+        cameras=_cameras(result),
+        strips=_strips(result),
+        lever_arm=None
+        if inputs.positions is None
+        else (_triple(adjusted.lever_arm), _triple(adjusted.lever_arm_sigma)),
+        boresight=_boresight(result),
+        gross=_gross(result),
+        worst=_worst(result, used),
+        left_out=adjusted.left_out,
+        normalised=adjusted.normalised[used].ravel(),
+        critical=settings.critical,
+        robust=settings.robust,
+        tie_XY=result.XYZ[tie, :2],
+        point_sigma=_triple(np.sqrt(np.mean(sigma[tie] ** 2, axis=0)) if tie.any() else np.full(3, np.nan)),
+        fields=residual_fields(result, used),
+        notes=(*inputs.notes, *_advice(result, used)),
+        inputs=_inputs(inputs.files),
+        settings=_settings(result, settings, seconds),
+    )
+
+
+def _advice(result: MapResult, used: NDArray[np.bool_]) -> list[str]:
+    """What to look at: stated accuracies that the observations contradict, images that hang on nothing but GNSS."""
+    points, adjusted = result.prepared.inputs.points, result.adjusted
+    out = []
+    for group in adjusted.groups:
+        if (
+            group.redundancy < _SOUND
+            or not np.isfinite(group.factor)
+            or 1 / _CONTRADICTED < group.factor < _CONTRADICTED
+        ):
+            continue
+        how = "small" if group.factor > 1 else "large"
+        ratio = max(group.factor, 1 / group.factor) if group.factor > 0 else np.inf
+        advice = ""
+        if group.unit == "px" and group.factor > 0:
+            advice = f"; {float(np.median(points.sigma)) * group.factor:.2g} px would fit"
+        out.append(f"{group.name}: the stated standard deviation is {ratio:.1f} times too {how}{advice}")
+    out += _control_out(result)
+    out += [
+        f"image errors of camera {c.camera} are alike over up to {c.reach:.0f} px: for its orientations "
+        f"{c.effect:.1f} measurements count as one"
+        for c in adjusted.correlations
+    ]
+    seen = {points.images[k] for k in np.unique(points.image[used])}
+    alone = [name for name in adjusted.images if name not in seen]
+    if alone:
+        out.append(f"{len(alone)} images have no measured point; their orientation is the observed one: {some(alone)}")
+    return out
+
+
+def _control_out(result: MapResult) -> list[str]:
+    """Control of which as much is taken out as is left: then the wrong half may have been kept."""
+    adjusted, ground = result.adjusted, result.prepared.inputs.ground
+    known = np.isfinite(adjusted.ground_residuals) & ~ground.check[:, None]
+    out = []
+    for name, axes in (("horizontal control coordinates", slice(0, 2)), ("control heights", slice(2, 3))):
+        total, lost = int(known[:, axes].sum()), int((adjusted.ground_rejected & known)[:, axes].sum())
+        if lost and 2 * lost >= total:
+            out.append(
+                f"{lost} of {total} {name} are taken out as gross errors: nothing tells whether they are wrong or "
+                "those that are left; measure more control"
+            )
+    return out
+
+
+def _check(ground: Sequence[GroundFacts]) -> CheckAccuracy | None:
+    check = [g for g in ground if g.check and np.isfinite(g.residual).any()]
+    if not check:
+        return None
+    return check_accuracy(np.array([g.residual for g in check]), np.array([g.stated for g in check]))
+
+
+def _cameras(result: MapResult) -> tuple[CalibrationFacts, ...]:
+    return tuple(
+        CalibrationFacts(c.name, c.parameters, c.units, c.before, c.after, c.sigma, c.correlation)
+        for c in result.cameras
+    )
+
+
+def _triple(values: _Floats) -> Triple:
+    a, b, c = (float(v) for v in values)
+    return a, b, c
+
+
+def _images(result: MapResult, used: NDArray[np.bool_]) -> tuple[ImageFacts, ...]:
+    adjusted, points = result.adjusted, result.prepared.inputs.points
+    positions = result.prepared.inputs.positions
+    strip = {} if positions is None else dict(zip(positions.images, positions.strip))
+    number = {name: k for k, name in enumerate(points.images)}
+    order = np.argsort(points.image, kind="stable")
+    starts = np.searchsorted(points.image[order], np.arange(len(points.images) + 1))
+    out = []
+    for k, name in enumerate(adjusted.images):
+        at = number.get(name)
+        rows = np.empty(0, np.int64) if at is None else order[starts[at] : starts[at + 1]]
+        mine = rows[used[rows]]
+        r, w = adjusted.residuals[mine], np.abs(adjusted.normalised[mine])
+        none = not len(mine)
+        out.append(
+            ImageFacts(
+                name,
+                strip.get(name, ""),
+                len(mine),
+                int(adjusted.rejected[rows].sum()),
+                (float("nan"),) * 2 if none else (float(r[:, 0].mean()), float(r[:, 1].mean())),
+                (float("nan"),) * 2 if none else (_rms(r[:, 0]), _rms(r[:, 1])),
+                float(np.nanmax(w)) if np.isfinite(w).any() else float("nan"),
+                _triple(result.poses[k].center),
+                _triple(result.sigma_center[k]),
+                _triple(result.sigma_angles[k]),
+            )
+        )
+    return tuple(out)
+
+
+def _rms(values: _Floats) -> float:
+    return float(np.sqrt((values**2).mean())) if values.size else float("nan")
+
+
+def ground_facts(result: MapResult) -> tuple[GroundFacts, ...]:
+    """Control and check points, in the order of their files."""
+    ground, adjusted = result.prepared.inputs.ground, result.adjusted
+    row = {name: k for k, name in enumerate(adjusted.points)}
+    unknown = ~np.isfinite(ground.XYZ)
+    normalised = np.where(unknown, np.nan, adjusted.ground_normalised)
+    out = []
+    for k, name in enumerate(ground.names):
+        at = row.get(name)
+        a, b, c = (bool(v) for v in adjusted.ground_rejected[k])
+        out.append(
+            GroundFacts(
+                name,
+                bool(ground.check[k]),
+                0 if at is None else int(adjusted.rays[at]),
+                _triple(ground.XYZ[k]),
+                _triple(result.ground_residuals[k]),
+                _triple(ground.sigma[k]),
+                _triple(normalised[k]),
+                (a, b, c),
+                np.full((3, 3), np.nan) if at is None else result.covariance[at],
+            )
+        )
+    return tuple(out)
+
+
+def _strips(result: MapResult) -> tuple[StripFacts, ...]:
+    positions = result.prepared.inputs.positions
+    if positions is None:
+        return ()
+    adjusted = result.adjusted
+    frame = result.prepared.frame
+    drift = {strip.name: strip for strip in adjusted.strips}
+    out = []
+    names = np.array(positions.strip, object)
+    for name in dict.fromkeys(positions.strip):
+        mine = names == name
+        good = mine & ~adjusted.position_rejected & np.isfinite(result.position_residuals).all(axis=1)
+        r = result.position_residuals[good]
+        found = drift.get(name)
+        back = np.linalg.inv(frame.jacobian(positions.XYZ[mine].mean(axis=0)))
+        nothing = np.full(3, np.nan)
+        known = found is not None and bool(np.isfinite(found.sigma[:3]).any())
+        out.append(
+            StripFacts(
+                str(name),
+                int(mine.sum()),
+                int(adjusted.position_rejected[mine].sum()),
+                _triple(r.mean(axis=0) if len(r) else nothing),
+                _triple(np.sqrt((r**2).mean(axis=0)) if len(r) else nothing),
+                _triple(back @ found.shift if known and found is not None else nothing),
+                _triple(back @ found.rate if known and found is not None else nothing),
+                _triple(found.sigma[:3] if found is not None else nothing),
+            )
+        )
+    return tuple(out)
+
+
+def _boresight(result: MapResult) -> tuple[Triple, Triple] | None:
+    project, adjusted = result.prepared.inputs.project, result.adjusted
+    if not project.adjustment.boresight or result.prepared.inputs.attitudes is None:
+        return None
+    factor = ANGLE_UNITS[project.orientation.angle_unit] / (2 * np.pi)
+    return _triple(adjusted.boresight * factor), _triple(adjusted.boresight_sigma * factor)
+
+
+def _gross(result: MapResult) -> tuple[MeasurementFacts, ...]:
+    """All gross errors, the largest first."""
+    adjusted, inputs = result.adjusted, result.prepared.inputs
+    out = [_measurement(result, int(k), True) for k in np.flatnonzero(adjusted.rejected)]
+    for k, axis in zip(*np.nonzero(adjusted.ground_rejected)):
+        d = result.ground_residuals[k, axis]
+        what = f"control point {inputs.ground.names[k]!r}, {'XYZ'[axis]}"
+        text = f"{d:+.3f} m" if np.isfinite(d) else "too few of its image points are left"
+        out.append(MeasurementFacts(what, text, float(adjusted.ground_normalised[k, axis]), True))
+    if inputs.positions is not None:
+        for k in np.flatnonzero(adjusted.position_rejected):
+            d = result.position_residuals[k]
+            size = np.abs(d) / inputs.positions.sigma[k]
+            what = f"observed position of image {inputs.positions.images[k]!r}"
+            out.append(MeasurementFacts(what, " ".join(f"{v:+.3f}" for v in d) + " m", float(size.max()), True))
+    return tuple(sorted(out, key=lambda m: -abs(m.normalised) if np.isfinite(m.normalised) else 0.0))
+
+
+def _worst(result: MapResult, used: NDArray[np.bool_]) -> tuple[MeasurementFacts, ...]:
+    w = np.abs(result.adjusted.normalised).max(axis=1)
+    w[~used | ~np.isfinite(w)] = -1.0
+    order = np.argsort(-w)[:_WORST]
+    return tuple(_measurement(result, int(k), False) for k in order if w[k] > 0)
+
+
+def _measurement(result: MapResult, k: int, rejected: bool) -> MeasurementFacts:
+    adjusted = result.adjusted
+    dx, dy = adjusted.residuals[k]
+    normalised = adjusted.normalised[k]
+    axis = int(np.argmax(np.abs(np.nan_to_num(normalised))))
+    text = f"{dx:+.2f} {dy:+.2f} px" if np.isfinite([dx, dy]).all() else "without it, one image sees the point"
+    return MeasurementFacts(result.prepared.inputs.points.label(k), text, float(normalised[axis]), rejected)
+
+
+def _inputs(files: Sequence[Path]) -> tuple[tuple[str, str], ...]:
+    return tuple((path.name, str(path)) for path in files)
+
+
+def _settings(result: MapResult, settings: AdjustSettings, seconds: float) -> tuple[tuple[str, str], ...]:
+    adjustment, observations = (getattr(result.prepared.inputs.project, n) for n in ("adjustment", "observations"))
+    free = "; ".join(f"{c.name}: {', '.join(c.parameters)}" for c in result.cameras) or "none"
+    stated = {
+        "sigma_image": f"{observations.sigma_image:g} px, where the measurements state none",
+        "sigma_control": observations.sigma_control,
+        "sigma_position": observations.sigma_position,
+        "sigma_attitude": observations.sigma_attitude,
+    }
+    return (
+        ("gross errors", f"beyond {settings.critical:g} standard deviations" if settings.robust else "not sought"),
+        ("calibrated parameters", free),
+        *((key, str(value)) for key, value in stated.items() if value is not None),
+        ("lever arm", f"{adjustment.lever_arm} m ± {adjustment.lever_arm_sigma:g} m"),
+        ("drift", adjustment.drift),
+        ("variance components", "estimated and used" if settings.variance_components else "not used"),
+        ("correlation of image errors", "regarded" if settings.correlation else "not regarded"),
+        ("time", f"{seconds:.1f} s"),
+    )
+
+
+def point_layers(result: MapResult, facts: AdjustFacts) -> list[PointLayer]:
+    """Layers of the GeoPackage: adjusted points, projection centres, and residuals of control and check points."""
+    adjusted = result.adjusted
+    role = {g.name: "check" if g.check else "control" for g in facts.ground}
+    sigma = np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2))
+    points = PointLayer(
+        "points",
+        result.XYZ,
+        {
+            "name": np.array(adjusted.points, object),
+            "role": np.array([role.get(name, "tie") for name in adjusted.points], object),
+            "images": np.asarray(adjusted.rays, np.int32),
+            **_xyz("sigma", sigma),
+        },
+    )
+    images = facts.images
+    centers = PointLayer(
+        "projection_centres",
+        np.array([image.center for image in images]).reshape(-1, 3),
+        {
+            "name": np.array([image.name for image in images], object),
+            "strip": np.array([image.strip for image in images], object),
+            "points": np.array([image.measurements for image in images], np.int32),
+            "rms_px": np.array([np.hypot(*image.rms) for image in images]),
+            **_xyz("sigma", np.array([image.sigma_center for image in images])),
+        },
+    )
+    shown = [g for g in facts.ground if np.isfinite(g.XYZ).all() and np.isfinite(g.residual).all()]
+    control = PointLayer(
+        "ground_residuals",
+        np.array([g.XYZ for g in shown]).reshape(-1, 3),
+        {
+            "name": np.array([g.name for g in shown], object),
+            "role": np.array([role[g.name] for g in shown], object),
+            **_xyz("residual", np.array([g.residual for g in shown]).reshape(-1, 3)),
+            **_xyz("normalised", np.array([g.normalised for g in shown]).reshape(-1, 3)),
+            "rejected": np.array([any(g.rejected) for g in shown], bool),
+        },
+    )
+    return [points, centers, control]
+
+
+def _xyz(name: str, values: _Floats) -> dict[str, _Floats]:
+    return {f"{name}_{axis}": np.ascontiguousarray(values[:, k], float) for k, axis in enumerate("xyz")}

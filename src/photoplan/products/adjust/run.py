@@ -1,0 +1,234 @@
+"""Bundle adjustment of a project: its measurements in, its orientations and cameras changed, a report beside it."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from photoplan.errors import UsageError
+from photoplan.io.adjusted_points import write_point_layers, write_residuals
+from photoplan.io.disk import disk_error, write_atomically
+from photoplan.io.product import check_output
+from photoplan.io.project import load_project
+from photoplan.io.project_edit import ProjectChanges, edit_project
+from photoplan.io.project_model import Project
+from photoplan.orientation.block import AdjustSettings
+from photoplan.orientation.bundle import adjust_block
+from photoplan.products.adjust.block import (
+    MapResult,
+    Prepared,
+    adjust_prepared,
+    map_result,
+    prepare,
+)
+from photoplan.products.adjust.cameras import Free, camera_entries, parse_calibrate
+from photoplan.products.adjust.inputs import AdjustInputs, read_inputs
+from photoplan.products.adjust.json import facts_json
+from photoplan.products.adjust.report import build_facts, point_layers
+from photoplan.products.adjust.start import started
+from photoplan.products.scene import input_files
+from photoplan.report.adjust_facts import AdjustFacts
+from photoplan.report.adjust_plots import AdjustPlots
+from photoplan.report.adjust_report import adjust_report
+
+__all__ = ["OUTPUTS", "AdjustReport", "AdjustRequest", "adjust_project"]
+
+#: Files of the output folder.
+OUTPUTS = ("report.html", "report.json", "points.gpkg", "image_points.csv")
+Talk = Callable[[str], None]
+Progress = Callable[[int, float], None]
+
+
+@dataclass(frozen=True)
+class AdjustRequest:
+    """What is asked."""
+
+    project: Path
+    calibrate: tuple[str, ...] = ()
+    """``CAMERA=c,x0,y0,k1`` each; empty: as [adjustment] states."""
+    images: tuple[str, ...] = ()
+    """Names or patterns; empty: all."""
+    robust: bool = True
+    critical: float = 4.0
+    variance_components: bool = True
+    """Whether each group of observations gets the accuracy that its residuals show."""
+    correlation: bool = True
+    """Whether errors of neighbouring image points may be alike."""
+    output: Path | None = None
+    """Folder; None: ``adjustment`` beside the project file."""
+    dry_run: bool = False
+    """Adjust and tell, but write nothing."""
+    overwrite: bool = False
+
+    @property
+    def folder(self) -> Path:
+        """Where reports go."""
+        return self.output if self.output is not None else self.project.resolve().parent / "adjustment"
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustReport:
+    """What came out."""
+
+    written: tuple[Path, ...]
+    """Empty after a dry run."""
+    facts: AdjustFacts
+    orientations: int
+    """Images whose orientation was written into the project."""
+    data: dict[str, Any]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`: those of ``report.json``, with the files."""
+        return {"files": [str(path) for path in self.written], **self.data}
+
+
+def adjust_project(
+    request: AdjustRequest, talk: Talk = lambda text: None, progress: Progress = lambda number, rms: None
+) -> AdjustReport:
+    """Adjust the block of a project and write the result into it.
+
+    Parameters
+    ----------
+    request : AdjustRequest
+    talk : callable
+        Told what is used, before the adjustment.
+    progress : callable
+        Told after each iteration: its number and the root mean square of the weighted residuals.
+
+    Raises
+    ------
+    UsageError
+        An output exists or is an input, matplotlib is not installed, or an option makes no sense.
+    InputError
+        The project or its measurements cannot be used.
+    GeometryError
+        The observations do not determine what is asked; the parameters are named.
+    ResourceError
+        The disk is full.
+    """
+    if not (math.isfinite(request.critical) and request.critical > 0):
+        raise UsageError(f"--critical {request.critical:g}; a positive number of standard deviations is needed")
+    project = load_project(request.project)
+    free = _free(project, request.calibrate)
+    names = project.select(request.images or None)
+    plots = None if request.dry_run else _prepare_outputs(request, project)
+    inputs = read_inputs(project, names)
+    if plots is not None:
+        _refuse_inputs(request, inputs.files)
+    begun = time.perf_counter()
+    inputs, starts = started(inputs)
+    prepared = prepare(inputs, starts, free)
+    talk(_used(prepared))
+    settings = AdjustSettings(
+        request.robust, request.critical, request.variance_components, correlation=request.correlation
+    )
+    prepared, adjusted = adjust_prepared(prepared, settings, partial(adjust_block, progress=progress))
+    result = map_result(prepared, adjusted)
+    title = f"Bundle adjustment of {request.project.resolve().parent.name}"
+    facts = build_facts(title, result, settings, time.perf_counter() - begun)
+    data = facts_json(facts, result)
+    if plots is None:
+        return AdjustReport((), facts, 0, data)
+    return _write(request, result, facts, data, plots)
+
+
+def _free(project: Project, options: Sequence[str]) -> Free:
+    if options:
+        return parse_calibrate(options, list(project.cameras))
+    known = project.adjustment.prior_sigma
+    stated = project.adjustment.calibrate.items()
+    return {name: {p: known.get(name, {}).get(p) for p in parameters} for name, parameters in stated if parameters}
+
+
+def _prepare_outputs(request: AdjustRequest, project: Project) -> AdjustPlots:
+    """What draws the report; outputs that exist are refused before any work."""
+    if request.folder.exists() and not request.folder.is_dir():
+        raise UsageError(f"{request.folder}: is no folder; reports go into a folder")
+    there = next(
+        folder for folder in (request.folder.absolute(), *request.folder.absolute().parents) if folder.exists()
+    )
+    if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
+        raise UsageError(f"{request.folder}: cannot be made, as {there} cannot be written into; give another --output")
+    _refuse_inputs(request, [request.project, *input_files(project)])
+    return AdjustPlots()
+
+
+def _refuse_inputs(request: AdjustRequest, inputs: Sequence[Path]) -> None:
+    for name in OUTPUTS:
+        check_output(request.folder / name, inputs, overwrite=request.overwrite)
+
+
+def _used(prepared: Prepared) -> str:
+    inputs: AdjustInputs = prepared.inputs
+    control = int((~inputs.ground.check).sum())
+    positions = 0 if inputs.positions is None else len(inputs.positions.images)
+    attitudes = 0 if inputs.attitudes is None else len(inputs.attitudes.images)
+    free = [f"{name}: {', '.join(camera.free)}" for name, camera in prepared.block.cameras.items() if camera.free]
+    return (
+        f"{len(inputs.images)} images · {len(inputs.points)} measurements of {len(inputs.points.points)} points · "
+        f"{control} control, {len(inputs.ground) - control} check points · {positions} positions, {attitudes} attitudes"
+        + (f" · calibrated {'; '.join(free)}" if free else "")
+    )
+
+
+def _write(
+    request: AdjustRequest, result: MapResult, facts: AdjustFacts, data: dict[str, Any], plots: AdjustPlots
+) -> AdjustReport:
+    folder, adjusted = request.folder, result.adjusted
+    html = adjust_report(facts, plots).encode("utf-8", errors="replace")
+    changes = _changes(result)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise disk_error(folder, error) from error
+    write_point_layers(folder / "points.gpkg", point_layers(result, facts), result.prepared.frame.crs)
+    write_residuals(
+        folder / "image_points.csv",
+        result.prepared.inputs.points,
+        adjusted.residuals,
+        adjusted.normalised,
+        adjusted.redundancies,
+        adjusted.rejected,
+    )
+    text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
+    write_atomically(folder / "report.json", text.encode())
+    write_atomically(folder / "report.html", html)
+    edit_project(request.project, changes)
+    return AdjustReport(tuple(folder / name for name in OUTPUTS), facts, len(adjusted.images), data)
+
+
+def _changes(result: MapResult) -> ProjectChanges:
+    """Entries of the project file: orientations with standard deviations, and calibrated cameras."""
+    project, block = result.prepared.inputs.project, result.prepared.block
+    images: dict[str, dict[str, Any]] = {}
+    for k, name in enumerate(result.adjusted.images):
+        images[name] = {
+            "center": _rounded(result.poses[k].center, 5),
+            "angles": _rounded(result.angles[k], 10),
+            "sigma_center": _figures(result.sigma_center[k]),
+            "sigma_angles": _figures(result.sigma_angles[k]),
+        }
+    cameras = {
+        found.name: camera_entries(project.cameras[found.name], block.cameras[found.name], found)
+        for found in result.adjusted.cameras
+        if found.free
+    }
+    return ProjectChanges(images=images, cameras=cameras)
+
+
+def _rounded(values: np.ndarray, digits: int) -> list[float]:
+    return [round(float(v), digits) + 0.0 for v in values]
+
+
+def _figures(values: np.ndarray) -> list[float] | None:
+    """Three figures of each; None where one is not known."""
+    return [float(f"{v:.3g}") for v in values] if np.isfinite(values).all() else None

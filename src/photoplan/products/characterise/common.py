@@ -1,0 +1,195 @@
+"""What several analyses of a camera share: series of settings, black levels, words for reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import inf, isfinite, nan
+
+import numpy as np
+
+from photoplan.errors import InputError
+from photoplan.io.series.pixels import Plane
+from photoplan.products.characterise.data import SeriesData, Setting
+from photoplan.products.characterise.result import Outcome
+from photoplan.quality.camera.frame_statistics import Level
+from photoplan.quality.camera.photon_transfer import is_clipped_dark
+
+__all__ = [
+    "MOST_SATURATED",
+    "Black",
+    "Run",
+    "black_if_known",
+    "black_of",
+    "dark_levels",
+    "exposure_runs",
+    "of_one_temperature",
+    "prefix",
+    "saturation_of",
+    "tried",
+]
+
+#: Share of saturated samples up to which a mean grey value is one.
+MOST_SATURATED = 1e-2
+#: Conditions that may be the abscissa of a run, with what axes say.
+_ABSCISSAS = (
+    ("exposure_ms", "exposure ms", "ms"),
+    ("photons_per_pixel", "photons per pixel", "photon"),
+    ("illumination", "illumination", "step"),
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    """Settings that differ in one condition only, by its growing value."""
+
+    settings: tuple[Setting, ...]
+    name: str
+    """Of the condition, such as ``exposure_ms``."""
+    axis: str
+    unit: str
+    label: str
+    """What they have in common, such as ``500 nm``."""
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """The condition, increasing."""
+        return tuple(float(getattr(setting.first, self.name)) for setting in self.settings)
+
+
+def exposure_runs(data: SeriesData, kinds: Sequence[str], least: int) -> list[Run]:
+    """Runs of at least so many settings of different exposure, photons or illumination (the first that differs)."""
+    found: dict[tuple[object, ...], list[Setting]] = {}
+    for setting in data.settings(*kinds):
+        first = setting.first
+        key = (first.group.index, first.kind, first.wavelength_nm, first.temperature_c, first.density)
+        found.setdefault(key, []).append(setting)
+    runs = []
+    for settings in found.values():
+        run = _run(settings)
+        if run is not None and len(run.settings) >= least:
+            runs.append(run)
+    return runs
+
+
+def _run(settings: Sequence[Setting]) -> Run | None:
+    for name, axis, unit in _ABSCISSAS:
+        values = [getattr(setting.first, name) for setting in settings]
+        if None in values or len(set(values)) < 2 or len(set(values)) < len(values):
+            continue
+        ordered = tuple(sorted(settings, key=lambda s: float(getattr(s.first, name))))
+        return Run(ordered, name, axis, unit, _common(ordered))
+    return None
+
+
+def _common(settings: Sequence[Setting]) -> str:
+    first = settings[0].first
+    words = [first.group.entry.name] if first.group.entry.name else []
+    for name, unit in (("wavelength_nm", "nm"), ("temperature_c", "°C"), ("density", "density")):
+        value = getattr(first, name)
+        if value is not None:
+            words.append(f"{value:g} {unit}")
+    return " ".join(words)
+
+
+@dataclass(frozen=True)
+class Black:
+    """Grey value without light."""
+
+    mean: float
+    sigma: float
+    level: Level | None
+    """Of the dark frames it comes from; None: it was stated."""
+    rule: str
+    """Where it comes from, for notes."""
+
+
+def black_of(data: SeriesData, setting: Setting, plane: Plane) -> Black:
+    """Black of a setting: dark frames of its exposure, else by lines through the nearest others, else what is stated.
+
+    Dark frames of another temperature (by more than half a degree), and those that are cut off at black or
+    saturated, do not count.
+    """
+    known: list[tuple[float, Level]] = []
+    of_any: Level | None = None
+    clipped = False
+    for dark in data.settings("dark"):
+        if not of_one_temperature(dark, setting):
+            continue
+        level = data.levels(dark)[plane.name]
+        clipped = clipped or is_clipped_dark(level)
+        if is_clipped_dark(level) or level.saturated_share > MOST_SATURATED:
+            continue
+        if dark.first.exposure_ms == setting.first.exposure_ms:
+            return Black(level.mean, _sigma(level), level, "dark frames of the same exposure")
+        if dark.first.exposure_ms is not None:
+            known.append((dark.first.exposure_ms, level))
+        else:
+            of_any = level
+    if known and setting.first.exposure_ms is not None:
+        known.sort(key=lambda item: item[0])
+        mean = _between(setting.first.exposure_ms, [(exposure, level.mean) for exposure, level in known])
+        sigma = max(_sigma(level) for _, level in known)
+        return Black(mean, sigma, None, "from dark frames of other exposures")
+    if of_any is not None:
+        return Black(of_any.mean, _sigma(of_any), None, "from dark frames without a stated exposure")
+    stated = data.series.camera.black_level_dn
+    why = "black is cut off in the dark frames" if clipped else "no dark frames that fit"
+    return Black(stated, 0.0, None, f"{why}: black level {stated:g} DN, as black_level_dn says")
+
+
+def black_if_known(data: SeriesData, setting: Setting, plane: Plane) -> float:
+    """Black of a setting; NaN: neither dark frames nor the series file tell it."""
+    black = black_of(data, setting, plane)
+    told = black.sigma > 0 or black.level is not None or black.rule.startswith("from dark frames")
+    return black.mean if told or "black_level_dn" in data.series.camera.model_fields_set else nan
+
+
+def _between(exposure: float, known: Sequence[tuple[float, float]]) -> float:
+    """Value at an exposure by the line through the two nearest of the sorted points; that of a single one."""
+    if len(known) == 1:
+        return known[0][1]
+    right = min(max(int(np.searchsorted([x for x, _ in known], exposure)), 1), len(known) - 1)
+    (x0, y0), (x1, y1) = known[right - 1], known[right]
+    return y0 + (y1 - y0) * (exposure - x0) / (x1 - x0)
+
+
+def _sigma(level: Level) -> float:
+    return level.mean_sigma if isfinite(level.mean_sigma) else 0.0
+
+
+def of_one_temperature(dark: Setting, setting: Setting) -> bool:
+    """Whether dark frames fit to a setting: where both state a temperature, to half a degree."""
+    a, b = dark.first.temperature_c, setting.first.temperature_c
+    return a is None or b is None or abs(a - b) <= 0.5
+
+
+def dark_levels(data: SeriesData, plane: Plane, like: Setting) -> tuple[list[Level], list[float]]:
+    """Levels of the dark settings with two frames or more, the shortest exposure first, and their exposures.
+
+    Of those that have the temperature of a setting, or of the coolest where it states none.
+    """
+    settings = [s for s in data.settings("dark") if len(s.frames) >= 2 and of_one_temperature(s, like)]
+    coolest = min((s.first.temperature_c for s in settings if s.first.temperature_c is not None), default=0.0)
+    settings = [s for s in settings if (s.first.temperature_c or coolest) <= coolest + 0.5]
+    settings.sort(key=lambda s: s.first.exposure_ms or 0.0)
+    return [data.levels(s)[plane.name] for s in settings], [s.first.exposure_ms or 0.0 for s in settings]
+
+
+def saturation_of(data: SeriesData, plane: Plane, levels: Sequence[Level]) -> float:
+    """Grey value at which grey values stop: that of the series, or the largest that was seen of a clipped level."""
+    stated = data.saturation_dn(plane.name)
+    return stated if stated < inf else max((level.largest for level in levels), default=nan)
+
+
+def prefix(*parts: str) -> str:
+    """Parts that say something, as the key of a refusal."""
+    return " ".join(part for part in parts if part)
+
+
+def tried(what: str, make: Callable[[], Outcome]) -> Outcome:
+    """The outcome, or the refusal of `what` with its reason where the data do not allow it."""
+    try:
+        return make()
+    except InputError as error:
+        return Outcome(refused={what: str(error)})

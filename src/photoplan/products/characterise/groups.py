@@ -1,0 +1,142 @@
+"""Frames of a series by entry and time, for analyses that follow something from frame to frame."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.geometry.grid import Window
+from photoplan.io.series.file import Frame, Group
+from photoplan.io.series.pixels import frame_pixels, plane_mask, split
+from photoplan.products.characterise.data import SeriesData
+
+__all__ = ["FrameGroup", "central_window", "frame_groups"]
+
+
+@dataclass(frozen=True)
+class FrameGroup:
+    """The frames of one ``[[frames]]`` entry, in the order of their names (numbers in them by value).
+
+    Whether a point in a name is that of a decimal, the times decide.
+    """
+
+    group: Group
+    frames: tuple[Frame, ...]
+
+    @property
+    def label(self) -> str:
+        """Its name, else its number among the entries."""
+        return self.group.entry.name or f"entry {self.group.index + 1}"
+
+    def times(self) -> NDArray[np.float64]:
+        """Time of each frame, seconds since the first.
+
+        Raises
+        ------
+        InputError
+            A frame has no time, or one that does not come after the frame before.
+        """
+        for frame in self.frames:
+            if frame.time_s is None:
+                raise InputError(
+                    f"{self.group.label}: {frame.file.name} has no time; give a field {{time_s}} in the name, a table "
+                    'with a column time_s, or time_from = "exif"'
+                )
+        t = np.array([frame.time_s for frame in self.frames], float)
+        back = np.flatnonzero(np.diff(t) <= 0.0)
+        if back.size:
+            k = int(back[0])
+            raise InputError(
+                f"{self.group.label}: {self.frames[k + 1].file.name} has the time {t[k + 1]:.10g} s, which does not "
+                f"come after {t[k]:.10g} s of {self.frames[k].file.name} before it; correct the times"
+            )
+        return np.asarray(t - t[0])
+
+    def pixels(self, data: SeriesData, window: Window | None = None) -> Iterator[dict[str, NDArray[Any]]]:
+        """Pixels of a window (the roi) of every frame, by plane; in a row those that a mask leaves."""
+        window = self.group.window if window is None else window
+        inside = replace(self.group, window=window)
+        masks = {plane.name: plane_mask(inside, plane) for plane in data.planes}
+        for frame in self.frames:
+            image = frame_pixels(frame, window)
+            data.watch(1)
+            parts = {plane.name: split(image, plane, window) for plane in data.planes}
+            yield {name: part if (mask := masks[name]) is None else part[mask] for name, part in parts.items()}
+
+    def number(self, key: str, default: float, low: float, high: float) -> float:
+        """A number among the entry's values.
+
+        Raises
+        ------
+        InputError
+            It is no number, or outside of what is allowed.
+        """
+        value = self.group.entry.values.get(key, default)
+        if isinstance(value, str) or not low <= value <= high:
+            raise InputError(
+                f"{self.group.label}: values.{key} is {value!r}; a number from {low:g} to {high:g} is needed"
+            )
+        return float(value)
+
+    def word(self, key: str, allowed: tuple[str, ...]) -> str:
+        """A word among the entry's values; the first allowed one where it has none.
+
+        Raises
+        ------
+        InputError
+            It is another word.
+        """
+        value = self.group.entry.values.get(key, allowed[0])
+        if value not in allowed:
+            raise InputError(f"{self.group.label}: values.{key} is {value!r}; allowed are {', '.join(allowed)}")
+        return str(value)
+
+    def has(self, key: str) -> bool:
+        """Whether the entry states a value."""
+        return key in self.group.entry.values
+
+
+def frame_groups(data: SeriesData, kind: str) -> tuple[FrameGroup, ...]:
+    """Entries with frames of a kind, in the order of the file."""
+    found: dict[int, list[Frame]] = {}
+    for frame in data.series.of(kind):
+        found.setdefault(frame.group.index, []).append(frame)
+    return tuple(FrameGroup(frames[0].group, _ordered(frames)) for frames in found.values())
+
+
+def _ordered(frames: list[Frame]) -> tuple[Frame, ...]:
+    whole, decimal = (tuple(sorted(frames, key=lambda f: _natural(f, n))) for n in (r"([0-9]+)", r"([0-9]*\.?[0-9]+)"))
+    return decimal if _grows(decimal) and not _grows(whole) else whole
+
+
+def _grows(frames: tuple[Frame, ...]) -> bool:
+    times = [frame.time_s for frame in frames if frame.time_s is not None]
+    return len(times) == len(frames) and all(a < b for a, b in pairwise(times))
+
+
+def _natural(frame: Frame, number: str) -> tuple[tuple[int, str | float], ...]:
+    parts = re.split(number, frame.file.name)
+    return tuple((1, float(p[:15])) if re.fullmatch(number, p) else (0, p) for p in parts)
+
+
+def central_window(window: Window, side: int, where: str) -> Window:
+    """A square in the middle of a window.
+
+    Raises
+    ------
+    InputError
+        The window is smaller.
+    """
+    if side > min(window.width, window.height):
+        raise InputError(
+            f"{where}: a window of {side} × {side} pixels in an area of {window.width} × {window.height}; state "
+            "a smaller values.window"
+        )
+    return Window(window.col + (window.width - side) // 2, window.row + (window.height - side) // 2, side, side)

@@ -1,0 +1,126 @@
+"""The analyses of a camera: what each needs, and the function that does it. Adding one is a line here and a module.
+
+The module of an analysis holds two functions::
+
+    def missing(data: SeriesData) -> str | None     # None: it can run; else what the series lacks, one sentence
+    def analyse(data: SeriesData) -> Outcome        # figures with sigmas, tables, plots, refusals
+
+`analyse` raises `InputError` where nothing can be known; it refuses single figures in `Outcome.refused`.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import cast
+
+from photoplan.products.characterise.data import SeriesData
+from photoplan.products.characterise.result import Outcome
+
+__all__ = ["ANALYSES", "Analysis"]
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """One analysis."""
+
+    name: str
+    """As in `--only`."""
+    title: str
+    needs: str
+    """Which frames it needs, for the documentation and `--dry-run`."""
+    module: str
+    """Holds `missing` and `analyse`; imported when it is asked."""
+
+    def missing(self, data: SeriesData) -> str | None:
+        """What the series lacks for it; None: nothing."""
+        return cast(Callable[[SeriesData], str | None], self._function("missing"))(data)
+
+    def analyse(self, data: SeriesData) -> Outcome:
+        """Run it."""
+        return cast(Callable[[SeriesData], Outcome], self._function("analyse"))(data)
+
+    def _function(self, name: str) -> object:
+        return getattr(importlib.import_module(f"photoplan.products.characterise.{self.module}"), name)
+
+
+#: In the order of the report.
+ANALYSES: tuple[Analysis, ...] = (
+    Analysis(
+        "photon_transfer",
+        "Photon transfer",
+        "flat frames, two or more at each of three or more brightnesses (dark frames improve it)",
+        "transfer",
+    ),
+    Analysis(
+        "noise",
+        "Noise against grey value",
+        "two or more frames of a scene that stands still, at each brightness",
+        "noise",
+    ),
+    Analysis(
+        "dark_signal",
+        "Dark signal",
+        "dark frames at three or more exposures (at two or more temperatures: the doubling temperature)",
+        "dark",
+    ),
+    Analysis(
+        "linearity",
+        "Linearity",
+        "flat or scene frames at three or more exposures or illuminations",
+        "linearity",
+    ),
+    Analysis("wedge", "Grey wedge", "wedge frames with three or more densities", "wedge"),
+    Analysis(
+        "saturation",
+        "Saturation",
+        "flat or scene frames at four or more exposures or illuminations, the longest of them saturated",
+        "saturation",
+    ),
+    Analysis(
+        "blooming",
+        "Blooming",
+        "scene frames of a bright object at four or more exposures, from unsaturated to saturated",
+        "blooming",
+    ),
+    Analysis(
+        "fixed_pattern",
+        "Fixed pattern",
+        "two or more dark frames (DSNU) and two or more flat frames (PRNU) at one setting",
+        "pattern",
+    ),
+    Analysis("defects", "Defect elements", "dark or flat frames, two or more at a setting", "defects"),
+    Analysis(
+        "emva1288",
+        "EMVA 1288 release 4",
+        "flat frames or reduced figures with photons per pixel, and dark ones at the same exposures",
+        "emva",
+    ),
+    Analysis("fall_off", "Light fall-off", "flat frames (dark frames at their exposure improve it)", "fall_off"),
+    Analysis("drift", "Brightness drift", "drift frames with times, ten or more", "drift"),
+    Analysis(
+        "gain_control",
+        "Automatic gain control",
+        "step frames with times: one entry per transition, eight or more frames after it",
+        "gain",
+    ),
+    Analysis(
+        "line_jitter",
+        "Line jitter",
+        "plumb frames: a straight vertical edge (two parallel ones, a horizontal one as control)",
+        "jitter",
+    ),
+    Analysis(
+        "warm_up",
+        "Warm-up drift",
+        "target frames with times, or a table of positions; two targets for scale",
+        "warm_up",
+    ),
+    Analysis(
+        "stage",
+        "Stage calibration",
+        "stage frames with stage coordinates, or a table of positions; four points or more",
+        "stage",
+    ),
+)

@@ -1,0 +1,266 @@
+"""`photoplan characterise`: everything about a camera that a series of images allows to know."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from photoplan.errors import InputError, ResourceError, UsageError
+from photoplan.io.disk import write_atomically
+from photoplan.io.named_table import write_named_table
+from photoplan.io.product import check_output
+from photoplan.io.series.file import Series, read_series
+from photoplan.io.whole_image import write_whole_image
+from photoplan.products.characterise.data import SeriesData
+from photoplan.products.characterise.full_well import full_well_notes, with_full_wells
+from photoplan.products.characterise.registry import ANALYSES, Analysis
+from photoplan.products.characterise.result import Figure, Outcome, Table
+from photoplan.products.characterise.steps import step_notes, with_grey_step
+from photoplan.products.plain_values import plain
+from photoplan.report.characterise_charts import ChartDrawer
+from photoplan.report.characterise_page import AnalysisPart, SeriesFacts, characterise_page
+
+__all__ = ["AnalysisRun", "CharacteriseReport", "CharacteriseRequest", "characterise"]
+
+
+@dataclass(frozen=True)
+class CharacteriseRequest:
+    """What is asked."""
+
+    series: Path
+    only: tuple[str, ...] = ()
+    """Names of analyses; all that the series allows if empty."""
+    report: Path | None = None
+    """HTML."""
+    csv: Path | None = None
+    """Folder for the tables."""
+    overwrite: bool = False
+    dry_run: bool = False
+    """Say which analyses would run; read no pixel."""
+
+
+@dataclass(frozen=True, eq=False)
+class AnalysisRun:
+    """What became of one analysis."""
+
+    analysis: Analysis
+    outcome: Outcome | None = None
+    missing: str | None = None
+    """What the series lacks for it."""
+    failed: str | None = None
+    """Why it stopped."""
+
+    @property
+    def state(self) -> str:
+        """``done``, ``missing``, ``failed``, or ``possible`` in a dry run."""
+        if self.missing is not None:
+            return "missing"
+        return "failed" if self.failed is not None else "possible" if self.outcome is None else "done"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        found: dict[str, Any] = {"name": self.analysis.name, "title": self.analysis.title, "state": self.state}
+        found |= {"reason": self.missing or self.failed} if self.missing or self.failed else {}
+        if self.outcome is not None:
+            found |= self.outcome.to_dict()
+            found["tables"] = {
+                name: {"head": list(table.head), "rows": plain(table.rows)}
+                for name, table in self.outcome.tables.items()
+            }
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class CharacteriseReport:
+    """What came out."""
+
+    series: Series
+    runs: tuple[AnalysisRun, ...]
+    written: tuple[Path, ...]
+    """Report, tables and what goes with them."""
+    notes: tuple[str, ...] = ()
+    """What concerns all analyses."""
+
+    @property
+    def failed(self) -> dict[str, str]:
+        """Analyses that stopped, with the reason."""
+        return {run.analysis.name: f"{run.analysis.name}: {run.failed}" for run in self.runs if run.failed is not None}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        series = self.series
+        return {
+            "series": str(series.path),
+            "camera": series.camera.model_dump(exclude_none=True),
+            "frames": len(series.frames),
+            "size": None if series.size is None else list(series.size),
+            "saturation_dn": plain(series.saturation_dn),
+            "notes": list(self.notes),
+            "analyses": [run.to_dict() for run in self.runs],
+            "written": [str(path) for path in self.written],
+        }
+
+
+def _unwatched(total: int) -> AbstractContextManager[Callable[[int, int], None]]:
+    return nullcontext(lambda parts, pixels: None)
+
+
+def characterise(
+    request: CharacteriseRequest,
+    begin: Callable[[int], AbstractContextManager[Callable[[int, int], None]]] = _unwatched,
+) -> CharacteriseReport:
+    """Run the analyses that a series allows; one that fails does not stop the others.
+
+    Parameters
+    ----------
+    request : CharacteriseRequest
+    begin : callable
+        Gets the number of analyses; what it returns is entered, and called with (1, 0) after each.
+
+    Raises
+    ------
+    UsageError
+        An analysis is unknown, or an output exists or cannot be drawn because matplotlib is missing.
+    InputError
+        The series cannot be used, or lacks what an analysis that was named needs.
+    """
+    chosen = _chosen(request.only)
+    series = read_series(request.series)
+    drawer = _check_outputs(request, series)
+    data = SeriesData(series)
+    runs = [AnalysisRun(analysis, missing=analysis.missing(data)) for analysis in chosen]
+    _refuse_missing(request, runs)
+    if request.dry_run:
+        return CharacteriseReport(series, tuple(runs), ())
+    with begin(sum(run.missing is None for run in runs)) as advance:
+        data = with_full_wells(with_grey_step(data))
+        series = data.series
+        for k, run in enumerate(runs):
+            if run.missing is None:
+                runs[k] = _run(run.analysis, data)
+                advance(1, 0)
+    notes = (*step_notes(data), *full_well_notes(data))
+    written = _write_tables(request, series, runs)
+    if request.report is not None and drawer is not None:
+        text = characterise_page(_facts(data, notes), [_part(run) for run in runs], drawer)
+        request.report.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(request.report, text.encode("utf-8"))
+        written = [request.report, *written]
+    return CharacteriseReport(series, tuple(runs), tuple(written), notes)
+
+
+def _chosen(only: Sequence[str]) -> list[Analysis]:
+    known = {analysis.name: analysis for analysis in ANALYSES}
+    unknown = [name for name in only if name not in known]
+    if unknown:
+        raise UsageError(f"--only {unknown[0]}: no such analysis; known are {', '.join(known)}")
+    return [analysis for analysis in ANALYSES if not only or analysis.name in only]
+
+
+def _refuse_missing(request: CharacteriseRequest, runs: Sequence[AnalysisRun]) -> None:
+    """Analyses that were named must be possible, and one at least of all."""
+    lacking = [run for run in runs if run.missing is not None]
+    if request.dry_run or not (request.only or len(lacking) == len(runs)):
+        return
+    if lacking:
+        listed = "\n".join(f"  {run.analysis.name}: {run.missing}" for run in lacking)
+        which = "an analysis that was named" if request.only else "any analysis"
+        raise InputError(f"{request.series}: the series lacks what {which} needs:\n{listed}")
+
+
+def _run(analysis: Analysis, data: SeriesData) -> AnalysisRun:
+    try:
+        return AnalysisRun(analysis, analysis.analyse(data))
+    except ResourceError:
+        raise
+    except InputError as error:
+        return AnalysisRun(analysis, failed=str(error))
+
+
+def _check_outputs(request: CharacteriseRequest, series: Series) -> ChartDrawer | None:
+    """Refuse outputs that exist or are inputs, before any work."""
+    if request.csv is not None:
+        folder = request.csv
+        if folder.exists() and not folder.is_dir():
+            raise UsageError(f"{folder}: is no folder; --csv takes one")
+        if folder.is_dir() and any(folder.glob("*.csv")) and not request.overwrite:
+            raise UsageError(f"{folder}: holds tables; give --overwrite to replace them, or another --csv")
+        for path in folder.glob("*.csv"):
+            if path.resolve() in {p.resolve() for p in series.inputs}:
+                raise UsageError(f"{path}: is an input of the series; give another --csv")
+    if request.report is None:
+        return None
+    check_output(request.report, list(series.inputs), overwrite=request.overwrite)
+    return ChartDrawer()
+
+
+def _write_tables(request: CharacteriseRequest, series: Series, runs: Sequence[AnalysisRun]) -> list[Path]:
+    if request.csv is None:
+        return []
+    done = [run for run in runs if run.outcome is not None]
+    figures = [(run.analysis.name, figure) for run in done if run.outcome for figure in run.outcome.figures]
+    tables = {"figures": _figure_table(figures)}
+    for run in done:
+        assert run.outcome is not None
+        tables |= {f"{run.analysis.name}_{name}": table for name, table in run.outcome.tables.items()}
+    written = []
+    for name, table in tables.items():
+        path = request.csv / f"{name}.csv"
+        write_named_table(path, table.head, table.rows)
+        written.append(path)
+    return written + _write_files(request, series, done)
+
+
+def _write_files(request: CharacteriseRequest, series: Series, done: Sequence[AnalysisRun]) -> list[Path]:
+    assert request.csv is not None
+    written = []
+    for run in done:
+        assert run.outcome is not None
+        for name, content in run.outcome.files.items():
+            path = request.csv / name
+            check_output(path, list(series.inputs), overwrite=request.overwrite)
+            if isinstance(content, bytes):
+                write_atomically(path, content)
+            else:
+                write_whole_image(path, content)
+            written.append(path)
+    return written
+
+
+def _figure_table(figures: Sequence[tuple[str, Figure]]) -> Table:
+    head = ("analysis", "name", "plane", "at", "value", "sigma", "unit", "remark")
+    rows = [(name, f.name, f.plane, f.at, plain(f.value), plain(f.sigma), f.unit, f.remark) for name, f in figures]
+    return Table(head, tuple(tuple("" if v is None else v for v in row) for row in rows))
+
+
+def _facts(data: SeriesData, notes: tuple[str, ...]) -> SeriesFacts:
+    series, camera = data.series, data.series.camera
+    wells = [data.wells.get(plane.name) for plane in data.planes]
+    levels = [series.saturation_dn if well is None else well.level_dn for well in wells]
+    kinds = dict.fromkeys(frame.kind for frame in series.frames)
+    return SeriesFacts(
+        name=camera.name or series.path.stem,
+        file=series.path.name,
+        frames=", ".join(f"{len(series.of(kind))} {kind}" for kind in kinds)
+        or f"{len(series.reduced)} reduced figures",
+        size="" if series.size is None else f"{series.size[0]} × {series.size[1]} px, {series.dtype}",
+        saturation=", ".join(dict.fromkeys(f"{full:.4g}" for full in levels)),
+        notes=notes,
+    )
+
+
+def _part(run: AnalysisRun) -> AnalysisPart:
+    outcome = run.outcome or Outcome()
+    return AnalysisPart(
+        run.analysis.title,
+        run.state,
+        run.missing or run.failed or "",
+        tuple((f.label, " ".join(filter(None, [f.plane, f.at])), *f.texts, f.remark) for f in outcome.figures),
+        tuple(f"{what}: {why}" for what, why in outcome.refused.items()),
+        tuple((table.caption or name, table.head, table.rows) for name, table in outcome.tables.items()),
+        outcome.plots,
+        outcome.notes,
+    )

@@ -1,0 +1,172 @@
+"""Analysis `stage`: the camera calibrated by a stage that moves a target over its field."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.products.characterise.data import SeriesData
+from photoplan.products.characterise.groups import FrameGroup, frame_groups
+from photoplan.products.characterise.result import Figure, Outcome, Table, joined
+from photoplan.products.characterise.targets import locate_targets
+from photoplan.quality.camera.stage import LEAST_POINTS, StageCalibration, b4_lines, stage_calibration
+from photoplan.report.characterise_charts import Chart, Curve
+from photoplan.report.drawing import round_down
+
+__all__ = ["analyse", "missing"]
+
+_GON = 200.0 / math.pi
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    label: str
+    unit: str
+    names: tuple[str, ...]
+    stage: Array
+    measured: Array
+    notes: tuple[str, ...] = ()
+
+
+def missing(data: SeriesData) -> str | None:
+    """What the series lacks."""
+    if any(p.entry.kind == "stage" for p in data.series.positions) or len(data.series.of("stage")) >= LEAST_POINTS:
+        return None
+    return f"{LEAST_POINTS} or more stage frames with stage_x and stage_y, or a table of positions of kind stage"
+
+
+def analyse(data: SeriesData) -> Outcome:
+    """Affine transformation between stage and image, for every target and table."""
+    points = [p for group in frame_groups(data, "stage") for p in _of_frames(data, group)]
+    points += [
+        _Points(
+            table.label,
+            table.entry.unit,
+            tuple(line.name for line in table.lines),
+            np.array([line.stage for line in table.lines], float).reshape(-1, 2),
+            np.array([(line.x, line.y) for line in table.lines], float),
+        )
+        for table in data.series.positions
+        if table.entry.kind == "stage"
+    ]
+    parts = []
+    for k, each in enumerate(points, 1):
+        try:
+            found = stage_calibration(each.names, each.stage, each.measured)
+        except InputError as error:
+            raise type(error)(f"{each.label}: {error}") from None
+        parts.append(_outcome(found, each, k))
+    return joined(parts)
+
+
+def _of_frames(data: SeriesData, group: FrameGroup) -> list[_Points]:
+    stage = []
+    for frame in group.frames:
+        values = [frame.values.get(key) for key in ("stage_x", "stage_y")]
+        if not all(isinstance(v, float | int) and math.isfinite(v) for v in values):
+            raise InputError(
+                f"{group.group.label}: {frame.file.name} lacks stage_x or stage_y; give a table with columns file, "
+                "stage_x and stage_y, or fields of these names in the pattern"
+            )
+        stage.append([float(v) for v in values if v is not None])
+    unit = str(group.group.entry.values.get("unit", "um"))[:20]
+    out = []
+    for name, places in locate_targets(data, group).items():
+        seen = [k for k, p in enumerate(places) if not p.why]
+        lost = [f"{p.frame.file.name}: {p.why}" for p in places if p.why]
+        label = group.label if len(group.group.entry.targets) < 2 else f"{group.label}, {name}"
+        out.append(
+            _Points(
+                label,
+                unit,
+                tuple(group.frames[k].file.stem for k in seen),
+                np.array(stage)[seen],
+                np.array([(places[k].x, places[k].y) for k in seen]),
+                tuple(f"{label}: not found in {text}" for text in lost),
+            )
+        )
+    return out
+
+
+def _outcome(found: StageCalibration, given: _Points, number: int) -> Outcome:
+    at, unit, f = given.label, given.unit, found.facts
+    n = len(found.names) - len(found.gross)
+
+    def figure(name: str, value: float, sigma: float, label: str, unit: str) -> Figure:
+        return Figure(name, value, sigma, label, unit, "", at)
+
+    figures = []
+    for axis, scale, size, sigma in zip("xy", f.scale, f.pixel_size, found.sigma_pixel_size):
+        figures.append(figure(f"scale_{axis}", scale, scale * sigma / size, f"scale factor in {axis}", f"px/{unit}"))
+        figures.append(figure(f"pixel_size_{axis}", size, sigma, f"pixel size in {axis}", unit))
+    for axis, value, sigma in zip("xy", (f.direction_x, f.direction_y), found.sigma_direction):
+        figures.append(
+            figure(f"rotation_{axis}_gon", value * _GON, sigma * _GON, f"rotation of the {axis} axis", "gon")
+        )
+    figures.append(figure("shear_gon", f.shear * _GON, found.sigma_shear * _GON, "shear", "gon"))
+    for axis, value in zip("xy", found.sigma):
+        figures.append(
+            figure(f"mean_error_{axis}_px", value, value / math.sqrt(2 * (n - 3)), f"mean error {axis}", "px")
+        )
+    figures.append(figure("m0_px", found.sigma0, found.sigma0 / math.sqrt(2 * found.redundancy), "M0", "px"))
+    matrices: list[tuple[str | float | int, ...]] = [
+        (at, way, *(float(getattr(t, f"a{k}")) for k in range(1, 7)))
+        for way, t in (("stage to image", found.to_image), ("image to stage", found.to_stage))
+    ]
+    points = tuple(_row(found, at, k) for k in range(len(found.names)))
+    head = ("series", "point", "stage_x", "stage_y", "x_px", "y_px", "residual_x_px", "residual_y_px", "remark")
+    return Outcome(
+        tuple(figures),
+        tables={
+            "matrices": Table(
+                ("series", "way", "a1", "a2", "a3", "b1", "b2", "b3"), tuple(matrices), "Affine matrices"
+            ),
+            "points": Table(head, points, "Points, residuals measured minus transformed"),
+        },
+        plots=(_chart(found, at),),
+        notes=(*given.notes, *_notes(found, at)),
+        files={f"stage_calibration_{number}.txt": ("\n".join(b4_lines(found, unit)) + "\n").encode()},
+    )
+
+
+def _row(found: StageCalibration, at: str, k: int) -> tuple[str | float | int, ...]:
+    """A point with its residuals."""
+    name = found.names[k]
+    numbers = (float(v) for v in (*found.stage[k], *found.measured[k], *found.residuals[k]))
+    return (at, name, *numbers, "gross error" if name in found.gross else "")
+
+
+def _notes(found: StageCalibration, at: str) -> list[str]:
+    notes = [f"{at}: gross errors left out: {', '.join(found.gross)}"] if found.gross else []
+    if found.facts.mirrored:
+        notes.append(f"{at}: the image is mirrored against the stage")
+    if found.systematic is not None and found.systematic < 0.001:
+        notes.append(
+            f"{at}: the residuals are systematic (second-order terms, chance of none {found.systematic:.1g}): "
+            "distortion, or a stage that is not straight"
+        )
+    return notes
+
+
+def _chart(found: StageCalibration, at: str) -> Chart:
+    """Residual vectors (Behr 1989, figs. B.2 and B.3), enlarged."""
+    x, y = found.measured.T
+    largest = float(np.linalg.norm(found.residuals, axis=1).max()) or 1.0
+    factor = round_down(0.1 * float(np.ptp(found.measured)) / largest)
+    ends = found.measured + factor * found.residuals
+    gap = np.full(len(x), np.nan)
+    lines = np.column_stack([x, ends[:, 0], gap]).ravel(), np.column_stack([y, ends[:, 1], gap]).ravel()
+    return Chart(
+        f"Residuals, {at}",
+        f"Measured minus transformed, enlarged {factor:g} times; mean errors {found.sigma[0]:.2f} and "
+        f"{found.sigma[1]:.2f} px (Behr 1989, figs. B.2 and B.3).",
+        "column px",
+        "row px (upwards in the figure)",
+        (Curve(x, y, "points", "points"), Curve(*lines, f"residuals × {factor:g}", "line")),
+    )

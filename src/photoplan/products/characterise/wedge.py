@@ -1,0 +1,129 @@
+"""Grey wedge of a series: characteristic curve for each illumination (Behr 1989, fig. 4.12)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isfinite, sqrt
+
+import numpy as np
+
+from photoplan.errors import InputError
+from photoplan.geometry.grid import Window
+from photoplan.io.series.file import Frame
+from photoplan.io.series.pixels import Plane, plane_pixels
+from photoplan.products.characterise.common import black_of, prefix, saturation_of, tried
+from photoplan.products.characterise.data import SeriesData, Setting
+from photoplan.products.characterise.result import Figure, Outcome, Table, joined
+from photoplan.quality.camera.frame_statistics import Level, StackSums
+from photoplan.quality.camera.grey_wedge import GreyWedge, grey_wedge
+from photoplan.report.characterise_charts import Chart, Curve
+
+__all__ = ["analyse", "missing"]
+
+_LEAST = 3
+
+
+@dataclass(frozen=True)
+class _Patch:
+    density: float
+    level: Level
+    setting: Setting
+
+
+def missing(data: SeriesData) -> str | None:
+    """What the series lacks."""
+    frames = data.series.of("wedge")
+    densities = {frame.density for frame in frames} - {None}
+    densities |= {step.density for frame in frames for step in frame.group.entry.steps}
+    if len(densities) >= _LEAST:
+        return None
+    return (
+        f"wedge frames with {len(densities)} densities; a grey wedge needs {_LEAST}: give density, or steps with rois"
+    )
+
+
+def analyse(data: SeriesData) -> Outcome:
+    """Characteristic curve of every plane and illumination."""
+    outcomes = []
+    for plane in data.planes:
+        patches: dict[str, list[_Patch]] = {}
+        for setting in data.settings("wedge"):
+            patches.setdefault(_label(setting.first), []).extend(_patches(data, setting, plane))
+        for label, of_label in patches.items():
+            key = prefix("grey wedge", plane.name, label)
+            outcomes.append(tried(key, lambda p=of_label, n=plane, a=label: _curve(data, p, n, a)))  # type: ignore[misc]
+    return joined(outcomes)
+
+
+def _label(frame: Frame) -> str:
+    words = [frame.group.entry.name or ""]
+    words += [] if frame.illumination is None else [f"illumination {frame.illumination:g}"]
+    words += [] if frame.exposure_ms is None else [f"{frame.exposure_ms:g} ms"]
+    return prefix(*words)
+
+
+def _patches(data: SeriesData, setting: Setting, plane: Plane) -> list[_Patch]:
+    """Statistics of each patch of the frames of one setting."""
+    entry = setting.first.group.entry
+    if not entry.steps:
+        if setting.first.density is None:
+            raise InputError(
+                f"{setting.first.group.label}: {setting.first.file.name} states no density; give it or steps"
+            )
+        return [_Patch(setting.first.density, data.levels(setting)[plane.name], setting)]
+    found = []
+    size = data.series.size or (0, 0)
+    for step in entry.steps:
+        window = Window(*step.roi)
+        if window.stop[0] > size[0] or window.stop[1] > size[1]:
+            raise InputError(f"{setting.first.group.label}: step of density {step.density:g}: its roi leaves the image")
+        sums = StackSums(data.saturation_dn(plane.name))
+        for frame in setting.frames:
+            sums.add(plane_pixels(frame, plane, window))
+        found.append(_Patch(step.density, sums.stack().level, setting))
+    return found
+
+
+def _curve(data: SeriesData, patches: list[_Patch], plane: Plane, label: str) -> Outcome:
+    blacks = [black_of(data, patch.setting, plane) for patch in patches]
+    signal = [patch.level.mean - black.mean for patch, black in zip(patches, blacks)]
+    sigma = [
+        patch.level.mean_sigma
+        if isfinite(patch.level.mean_sigma)
+        else sqrt(max(patch.level.spatial_variance, data.step**2 / 12) / patch.level.pixels)
+        for patch in patches
+    ]
+    full = saturation_of(data, plane, [patch.level for patch in patches]) - blacks[0].mean
+    found = grey_wedge([patch.density for patch in patches], signal, sigma, full)
+    where = {"plane": plane.name, "at": label}
+    nan = float("nan")
+    figures = (
+        Figure("gamma", found.gamma, found.gamma_sigma, "gamma of the characteristic curve", "", **where),
+        Figure("wedge_error_percent", found.error_percent, nan, "largest deviation from proportionality", "%", **where),
+        Figure("used_range_percent", found.used_range_percent, nan, "part of the grey scale used", "%", **where),
+    )
+    rows = tuple(
+        (plane.name, label, float(d), float(t), float(y), int(u))
+        for d, t, y, u in zip(found.density, found.transmission, found.signal, found.used)
+    )
+    head = ("plane", "at", "density", "transmission", "signal_dn", "used")
+    return Outcome(
+        figures,
+        tables={"patches": Table(head, rows, "Patches of the wedge")},
+        plots=(_plot(found, prefix("Grey wedge", plane.name, label)),),
+        details={prefix("wedge", plane.name, label).replace(" ", "_"): found.to_dict()},
+    )
+
+
+def _plot(found: GreyWedge, title: str) -> Chart:
+    grid = np.linspace(found.density.min(), found.density.max(), 60)
+    return Chart(
+        title,
+        f"Grey value over density; the dashed curve is a proportional sensor, gamma is {found.gamma:.3g}.",
+        "density",
+        "signal DN",
+        (
+            Curve(found.density, found.signal, "measured", "line and points"),
+            Curve(grid, found.slope * 10.0**-grid, "proportional", "dashed"),
+        ),
+    )

@@ -1,0 +1,1 @@
+"""`photoplan dtm`: terrain models built, shown and used."""

@@ -1,0 +1,297 @@
+"""From files of measured terrain to a terrain model: read, clean, plan, predict, write, report."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+from photoplan import __version__
+from photoplan.errors import InputError, ResourceError, UsageError
+from photoplan.geometry.crs import crs_label
+from photoplan.geometry.heights import check_height_system, height_label
+from photoplan.io.product import check_output
+from photoplan.io.run_record import peak_memory_bytes, record_path, versions, write_run_record
+from photoplan.io.terrain.files import read_measured
+from photoplan.io.terrain.model_tables import GrossError, ModelHeader, empty_figures, input_facts
+from photoplan.io.terrain.model_write import ModelParts, ModelWriter
+from photoplan.io.terrain.options import ReadOptions
+from photoplan.surfaces.measured import MeasuredTerrain
+from photoplan.terrain.build import BuildPlan, Built, Steps, build, plan_build
+from photoplan.terrain.clean import Finding, clean
+from photoplan.terrain.settings import BuildSettings
+
+__all__ = ["BuildReport", "BuildRequest", "describe_plan", "dtm_build", "load", "plan_facts"]
+
+#: Bytes that a build needs for each point, measured; more than the machine has is refused before any work.
+_BYTES_PER_POINT = 700
+
+
+@dataclass(frozen=True)
+class BuildRequest:
+    """What is asked."""
+
+    inputs: tuple[Path, ...]
+    output: Path
+    options: ReadOptions = field(default_factory=ReadOptions)
+    """How the files are read."""
+    settings: BuildSettings = field(default_factory=BuildSettings)
+    height_system: str | None = None
+    """Declared height system; None: what the files state."""
+    workers: int = 1
+    report: bool | None = None
+    """Whether a page with plots is written beside the model; None: if matplotlib is there."""
+    overwrite: bool = False
+
+
+@dataclass(frozen=True)
+class BuildReport:
+    """What came out."""
+
+    path: Path
+    figures: dict[str, Any]
+    """Figures of the whole model, plain values."""
+    gross: tuple[GrossError, ...]
+    findings: tuple[Finding, ...]
+    notes: tuple[str, ...]
+    page: Path | None
+    """The report, or None."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        return {
+            "model": str(self.path),
+            **self.figures,
+            "gross_errors": [
+                {"name": g.name, "xyz": list(g.xyz), "residual": g.residual, "normalised": g.normalised}
+                for g in self.gross
+            ],
+            "findings": [{"kind": f.kind, "text": f.text, "X": f.X, "Y": f.Y} for f in self.findings],
+            "notes": list(self.notes),
+            "report": None if self.page is None else str(self.page),
+        }
+
+
+def load(request: BuildRequest) -> tuple[MeasuredTerrain, tuple[Finding, ...], str, str | None]:
+    """Clean measurements, what cleaning found, their CRS and their height system.
+
+    Raises
+    ------
+    InputError
+        A file cannot be used, or the CRS is not known.
+    HeightSystemError
+        The declared height system is none, or contradicts the files.
+    """
+    raw = read_measured(request.inputs, request.options)
+    if raw.crs is None:
+        names = ", ".join(path.name for path in request.inputs)
+        raise InputError(f"{names}: no CRS; state it with --crs EPSG:nnnn, it is not guessed")
+    system = _height_system(raw, request.height_system)
+    _check_memory(raw)
+    measured, findings = clean(raw, sigmas=request.settings.filters or None)
+    return measured, findings, raw.crs, system
+
+
+def dtm_build(
+    request: BuildRequest, steps: Steps | None = None, talk: Callable[[str], None] = lambda text: None
+) -> BuildReport:
+    """Build a terrain model and write it, with its run record and its report.
+
+    Raises
+    ------
+    UsageError
+        The output exists or is an input.
+    InputError
+        A file cannot be used; the measurements do not determine a surface (`GeometryError`).
+    ResourceError
+        The disk is full, or the points need more memory than there is.
+    """
+    started = time.perf_counter()
+    if request.output.suffix.lower() != ".gpkg":
+        raise UsageError(f"{request.output}: a terrain model is a GeoPackage; give it a name that ends with .gpkg")
+    if not request.output.resolve().parent.is_dir():
+        raise UsageError(f"{request.output}: no such folder; make it first")
+    check_output(request.output, request.inputs, overwrite=request.overwrite)
+    _check_report(request)
+    measured, findings, crs, system = load(request)
+    plan = plan_build(measured, request.settings)
+    talk(describe_plan(plan, measured, crs, system))
+    facts = [input_facts(path) for path in request.inputs]
+    key = _key(request, facts, plan, crs, system)
+    with ModelWriter(request.output, plan.layout, key, request.overwrite, request.inputs) as writer:
+        built = build(plan, request.workers, steps)
+        gross = tuple(_gross(built, measured))
+        done = writer.done()
+        for of_unit in built.figures:
+            place = of_unit.column, of_unit.row
+            if place not in done:
+                unit = built.units.get(place)
+                writer.add(unit, of_unit if unit is not None else empty_figures(*place))
+        totals = _totals(built, measured, findings, len(gross))
+        header = ModelHeader(
+            crs, system, plan.layout, request.settings.to_dict(), tuple(facts), built.fit.whole.name, totals
+        )
+        writer.finish(ModelParts(header, built.lines, gross, plan.polygon))
+    seconds = time.perf_counter() - started
+    figures = {**totals, "crs": crs_label(crs), "height_system": system, "seconds": round(seconds, 3)}
+    page = _page(request, built, measured, findings, seconds, talk)
+    report = BuildReport(request.output, figures, gross, findings, measured.notes, page)
+    record = {"product": request.output.name, "kind": "terrain model", **report.to_dict()}
+    del record["findings"]
+    record |= {"inputs": facts, "settings": request.settings.to_dict(), "versions": versions()}
+    record |= {"finding_counts": dict(Counter(f.kind for f in findings)), "peak_memory_bytes": peak_memory_bytes()}
+    write_run_record(record_path(request.output), record)
+    return report
+
+
+def describe_plan(plan: BuildPlan, measured: MeasuredTerrain, crs: str, system: str | None) -> str:
+    """One line on what will be computed."""
+    layout = plan.layout
+    kinds = Counter(line.kind for line in measured.lines)
+    lines = ", ".join(_many(count, kind) for kind, count in kinds.items()) or "no lines"
+    return (
+        f"{measured.count} points, {lines} · spacing {plan.seen.spacing:.3g} m · grid {plan.width:g} m, "
+        f"{layout.columns} × {layout.rows} units of {layout.side:g} m · gaps over {2 * plan.reach:.3g} m stay open · "
+        f"{crs_label(crs)}, heights {height_label(system)}"
+    )
+
+
+def plan_facts(
+    plan: BuildPlan, measured: MeasuredTerrain, findings: Sequence[Finding], crs: str, system: str | None
+) -> dict[str, Any]:
+    """What will be computed, as plain values for `--json`."""
+    return {
+        "points": measured.count,
+        "lines": dict(Counter(line.kind for line in measured.lines)),
+        "spacing": round(plan.seen.spacing, 4),
+        "grid_width": plan.width,
+        "units": [plan.layout.columns, plan.layout.rows],
+        "unit_side": plan.layout.side,
+        "bounds": list(plan.layout.bounds),
+        "widest_gap": 2 * plan.reach,
+        "crs": crs_label(crs),
+        "height_system": system,
+        "findings": [{"kind": f.kind, "text": f.text, "X": f.X, "Y": f.Y} for f in findings],
+    }
+
+
+def _many(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
+def _height_system(measured: MeasuredTerrain, declared: str | None) -> str | None:
+    if declared is None:
+        return measured.height_system
+    wanted = check_height_system(declared)
+    if wanted == "same":
+        raise UsageError("height system same; a model needs a name: ellipsoidal or EPSG:nnnn of a vertical CRS")
+    if measured.height_system is not None and check_height_system(measured.height_system) != wanted:
+        raise UsageError(
+            f"height system {declared} was declared, but the files state {height_label(measured.height_system)}"
+        )
+    return wanted
+
+
+def _check_memory(measured: MeasuredTerrain) -> None:
+    vertices = sum(len(line.xyz) for line in measured.lines)
+    needed = (measured.count + vertices) * _BYTES_PER_POINT
+    free = psutil.virtual_memory().available
+    if needed > free:
+        raise ResourceError(
+            f"{measured.count} points need about {needed >> 20} MiB, {free >> 20} MiB are free; build parts of the "
+            "area and join them with `photoplan dtm refine`, or thin the points"
+        )
+
+
+def _key(request: BuildRequest, facts: Sequence[dict[str, Any]], plan: BuildPlan, crs: str, system: str | None) -> str:
+    text = json.dumps(
+        [facts, request.settings.to_dict(), repr(request.options), repr(plan.layout), crs, system, __version__],
+        sort_keys=True,
+        default=str,
+    )
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _gross(built: Built, measured: MeasuredTerrain) -> list[GrossError]:
+    """The flagged points with their names, the worst first."""
+    seen, residuals = built.fit.seen, built.fit.residuals
+    found = []
+    for k in built.fit.gross:
+        group = measured.points[seen.group[k]]
+        place = int(seen.record[k])
+        X, Y, Z = group.xyz[place].tolist()
+        residual, redundancy, normalised = residuals[k].tolist()
+        # The filtered surface still leans towards the point: without it, it would lie this far away.
+        away = residual / redundancy
+        found.append(GrossError(group.label(place), group.kind, (X, Y, Z), away, redundancy, normalised))
+    return sorted(found, key=lambda g: -abs(g.normalised))
+
+
+def _totals(built: Built, measured: MeasuredTerrain, findings: Sequence[Finding], gross: int) -> dict[str, Any]:
+    whole, fit = built.fit.whole, built.fit
+    there = [f for f in built.figures if (f.column, f.row) in built.units]
+    z = fit.residuals[fit.noise[: fit.seen.points] >= 0, 2]
+    z = z[np.isfinite(z)]
+    widths = Counter(round(u.width, 6) for u in built.units.values())
+    return {
+        "points": measured.count,
+        "lines": dict(Counter(line.kind for line in measured.lines)),
+        "spacing": round(fit.seen.spacing, 4),
+        "units": len(there),
+        "grid_widths": {f"{width:g}": count for width, count in sorted(widths.items())},
+        "covariance": whole.name,
+        "variance": whole.variance,
+        "length": whole.length,
+        "noise": whole.noise,
+        "sigma": float(np.sqrt(np.nanmean([f.sigma**2 for f in there]))) if there else None,
+        "spread": float(z.std()) if len(z) else None,
+        "gross": gross,
+        "findings": len(findings),
+    }
+
+
+def _check_report(request: BuildRequest) -> None:
+    """Refuse a report that cannot be written before any work is done."""
+    page = _page_path(request.output)
+    if request.report is not False and page.exists() and not request.overwrite:
+        raise UsageError(f"{page} exists; give --overwrite to replace it, or --no-report")
+    if request.report and not _can_plot():
+        raise UsageError("the report needs matplotlib: pip install 'photoplan[report]', or give --no-report")
+
+
+def _page_path(output: Path) -> Path:
+    return output.with_name(f"{output.stem}.report.html")
+
+
+def _can_plot() -> bool:
+    return find_spec("matplotlib") is not None
+
+
+def _page(
+    request: BuildRequest,
+    built: Built,
+    measured: MeasuredTerrain,
+    findings: Sequence[Finding],
+    seconds: float,
+    talk: Callable[[str], None],
+) -> Path | None:
+    if request.report is False:
+        return None
+    if not _can_plot():
+        talk("no report: it needs matplotlib (pip install 'photoplan[report]')")
+        return None
+    # matplotlib takes a second to import, and is optional.
+    from photoplan.products.dtm.report import write_report  # noqa: PLC0415
+
+    page = _page_path(request.output)
+    write_report(page, built, measured, findings, request.inputs, seconds)
+    return page

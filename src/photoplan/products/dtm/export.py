@@ -1,0 +1,158 @@
+"""A terrain model in the formats of other programs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.geometry.heights import crs_with_heights
+from photoplan.io.grid_writer import GridOptions, write_grid
+from photoplan.io.product import check_output
+from photoplan.io.terrain.export import TIN_SUFFIXES, replacing, write_points, write_tin
+from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
+from photoplan.products.open_terrain import OpenTerrain, open_terrain
+from photoplan.surfaces.hybrid import HybridSurface
+from photoplan.targets.map import MapTarget
+
+__all__ = ["EXPORTS", "ExportReport", "ExportRequest", "dtm_export", "export_steps"]
+
+RASTERS = (".tif", ".tiff")
+POINTS = (".xyz", ".csv")
+EXPORTS = (*RASTERS, *TIN_SUFFIXES, *POINTS)
+"""Suffixes that are written."""
+_TILE = 512
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class ExportRequest:
+    """What is asked."""
+
+    model: Path
+    output: Path
+    """Its suffix says what is written: see `EXPORTS`."""
+    resolution: float | None = None
+    """Of a raster, metres; None: the finest grid width, pixels centred on the posts."""
+    bounds: tuple[float, float, float, float] | None = None
+    """Part of a raster, xmin, ymin, xmax, ymax; None: all."""
+    sigma: Path | None = None
+    """Where to write the raster of standard deviations."""
+    crs: str | None = None
+    """Of a terrain file that does not state its own."""
+    overwrite: bool = False
+
+
+@dataclass(frozen=True)
+class ExportReport:
+    """What was written."""
+
+    paths: tuple[Path, ...]
+    figures: dict[str, Any]
+    """Counts, or size and resolution of the raster."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        return {"files": [str(path) for path in self.paths], **self.figures}
+
+
+def dtm_export(request: ExportRequest, progress: Progress | None = None) -> ExportReport:
+    """Write a terrain model in another format; `progress` is called with tiles or units, and pixels or triangles.
+
+    Raises
+    ------
+    UsageError
+        The suffix is not known, the output exists or is an input, or options do not fit the format.
+    InputError
+        The file is no terrain model, or bounds lie outside of it.
+    ResourceError
+        The disk is full.
+    """
+    kind = _kind(request)
+    for path in filter(None, (request.output, request.sigma)):
+        check_output(path, [request.model], overwrite=request.overwrite)
+    if request.sigma is not None and request.sigma.resolve() == request.output.resolve():
+        raise UsageError(f"{request.sigma}: heights and standard deviations need a file each")
+    terrain = open_terrain(request.model, request.crs)
+    if kind in RASTERS:
+        return _export_raster(request, terrain, progress)
+    if terrain.model is None:
+        raise UsageError(f"{request.model}: a raster has no triangles or lines; export it as .tif, or with gdal2xyz")
+    reader = terrain.model
+    with replacing(request.output, [request.model], request.overwrite) as part:
+        if kind in POINTS:
+            figures = write_points(part, kind, reader, reader.lines(), progress)
+            counts = {"posts": figures.vertices, "line_points": figures.line_points}
+        else:
+            figures = write_tin(part, kind, reader, request.model.stem, progress)
+            counts = {"vertices": figures.vertices, "triangles": figures.faces, "wall_triangles": figures.walls}
+    return ExportReport((request.output,), counts)
+
+
+def export_steps(request: ExportRequest) -> int:
+    """How often `progress` will be called with 1, for a bar."""
+    if _kind(request) not in RASTERS:
+        return sum(1 for _ in ModelReader(request.model, 0).units()) if is_terrain_model(request.model) else 1
+    grid = _grid(request, open_terrain(request.model, request.crs))
+    tiles = -(-grid.width // _TILE) * -(-grid.height // _TILE)
+    return tiles if request.sigma is None else 2 * tiles
+
+
+def _kind(request: ExportRequest) -> str:
+    kind = request.output.suffix.lower()
+    if kind not in EXPORTS:
+        raise UsageError(f"{request.output}: {kind or 'no suffix'}; by the suffix is written: {', '.join(EXPORTS)}")
+    raster_only = (request.resolution, request.bounds, request.sigma)
+    if kind not in RASTERS and any(option is not None for option in raster_only):
+        raise UsageError(f"{request.output}: resolution, bounds and sigma belong to a raster (.tif)")
+    return kind
+
+
+def _grid(request: ExportRequest, terrain: OpenTerrain) -> MapGrid:
+    crs = crs_with_heights(terrain.crs, terrain.height_system)
+    bounds = request.bounds or terrain.bounds
+    low, high = np.maximum(bounds[:2], terrain.bounds[:2]), np.minimum(bounds[2:], terrain.bounds[2:])
+    if not (low < high).all():
+        raise InputError(f"{terrain.path}: covers {_text(terrain.bounds)}, the bounds are {_text(bounds)}")
+    if request.resolution is not None or request.bounds is not None:
+        return MapGrid.covering((*bounds[:2], *bounds[2:]), request.resolution or terrain.resolution, crs)
+    width = terrain.resolution
+    xmin, ymin, xmax, ymax = terrain.bounds
+    # Pixels of a raster are its own; those of a model lie centred on its posts, the outer ones included.
+    edge = width / 2 if terrain.model is not None else 0.0
+    columns, rows = (round((b - a + 2 * edge) / width) for a, b in ((xmin, xmax), (ymin, ymax)))
+    return MapGrid(xmin - edge, ymax + edge, width, columns, rows, crs)
+
+
+def _export_raster(request: ExportRequest, terrain: OpenTerrain, progress: Progress | None) -> ExportReport:
+    grid, surface = _grid(request, terrain), terrain.surface
+    target = MapTarget(grid)
+    options = GridOptions(tile=_TILE, overwrite=request.overwrite, inputs=[request.model], progress=progress)
+
+    def heights(window: Window) -> NDArray[np.float32]:
+        return surface.relief(target, window)[None]
+
+    def sigmas(window: Window) -> NDArray[np.float32]:
+        assert isinstance(surface, HybridSurface)
+        return surface.relief_with_sigma(target, window)[1][None]
+
+    if request.sigma is not None and not isinstance(surface, HybridSurface):
+        raise UsageError(f"{request.model}: a raster of heights has no standard deviations; leave --sigma out")
+    facts = write_grid(request.output, grid, np.float32, 1, "auto", heights, options)
+    paths = [request.output]
+    if request.sigma is not None:
+        write_grid(request.sigma, grid, np.float32, 1, "auto", sigmas, options)
+        paths.append(request.sigma)
+    size = {"columns": grid.width, "rows": grid.height, "resolution": grid.resolution}
+    return ExportReport(tuple(paths), {**size, "share_with_height": facts.valid_share})
+
+
+def _text(bounds: tuple[float, float, float, float]) -> str:
+    return " ".join(f"{v:.10g}" for v in bounds)

@@ -1,0 +1,266 @@
+"""Rasters and polygons of catchments and flow lengths."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError, ResourceError, UsageError
+from photoplan.geometry.crs import crs_label, same_crs
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.io.grid_writer import GridOptions, write_grid
+from photoplan.io.polygons import label_polygons, read_features, write_features
+from photoplan.io.product import check_output
+from photoplan.io.xy_table import read_xy_table
+from photoplan.products.dtm.visible import ROLES, own_grid, read_grid
+from photoplan.products.open_terrain import OpenTerrain, open_terrain
+from photoplan.terrain.flow import CELL_BYTES, Flow, FlowMethod, flow_of, snapped
+
+__all__ = ["BANDS", "FlowReport", "FlowRequest", "OutletRow", "dtm_flow"]
+
+TILE = 512
+BANDS = ("upstream area m²", "flow length m", "longest way here m", "direction", "catchment", "depth of filling m")
+"""What the bands of the raster hold; NaN without terrain."""
+
+
+@dataclass(frozen=True)
+class FlowRequest:
+    """What is asked."""
+
+    model: Path
+    output: Path
+    resolution: float | None = None
+    """Side of a cell, metres; None: the model's mesh width."""
+    outlets: Path | None = None
+    """Points whose catchments are wanted; None: catchments are those of the cells where water leaves the model."""
+    snap: float = 0.0
+    """Outlets move to the largest upstream area within this distance, metres."""
+    catchments: Path | None = None
+    """Where to write the catchments as polygons (GeoPackage)."""
+    method: FlowMethod = "d8"
+    memory: int = 2 << 30
+    """Bytes that the grid may take."""
+    workers: int | None = None
+    crs: str | None = None
+    overwrite: bool = False
+
+
+@dataclass(frozen=True)
+class OutletRow:
+    """Figures of one outlet."""
+
+    name: str
+    X: float
+    Y: float
+    """Middle of the outlet's cell."""
+    area: float
+    """Area whose water comes by, m²."""
+    own: float
+    """The same without the catchments of outlets above, m²."""
+    longest: float
+    """Length of the longest way to it, metres."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        return {
+            "outlet": self.name,
+            "x": self.X,
+            "y": self.Y,
+            "upstream_area": self.area,
+            "own_area": self.own,
+            "longest_way": self.longest,
+        }
+
+
+@dataclass(frozen=True)
+class FlowReport:
+    """What came out."""
+
+    path: Path
+    catchments: Path | None
+    resolution: float
+    area: float
+    """Area with terrain, m²."""
+    outflow: float
+    """Sum of the areas of all cells where water leaves, m²: the same, or something is lost."""
+    pits: float
+    """Area that was raised by filling, m²."""
+    pit_volume: float
+    """Volume of the filling, m³."""
+    rows: tuple[OutletRow, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        return {
+            "path": str(self.path),
+            "catchments": self.catchments and str(self.catchments),
+            "bands": list(BANDS),
+            "resolution": self.resolution,
+            "area": self.area,
+            "outflow_area": self.outflow,
+            "filled_area": self.pits,
+            "filled_volume": self.pit_volume,
+            "outlets": [row.to_dict() for row in self.rows],
+        }
+
+
+def dtm_flow(request: FlowRequest) -> FlowReport:
+    """Compute and write flow over a model.
+
+    Raises
+    ------
+    UsageError
+        An output exists or is an input, or an option makes no sense.
+    InputError
+        The model or the outlets cannot be used.
+    ResourceError
+        The grid does not fit the memory.
+    """
+    inputs = [request.model, *([request.outlets] if request.outlets else [])]
+    for path in (request.output, request.catchments):
+        if path is not None:
+            check_output(path, inputs, overwrite=request.overwrite)
+    if request.catchments is not None and request.catchments.suffix.lower() != ".gpkg":
+        raise UsageError(f"{request.catchments}: polygons are written as GeoPackage; give a name that ends with .gpkg")
+    if not (math.isfinite(request.snap) and request.snap >= 0):
+        raise UsageError(f"snap {request.snap} m; zero or a positive number of metres is needed")
+    terrain = open_terrain(request.model, request.crs)
+    points = [] if request.outlets is None else _points(request.outlets, terrain)
+    grid = _grid(request, terrain)
+    heights = read_grid(terrain, grid)
+    cells = _cells(request, grid, heights, points)
+    flow = flow_of(heights, grid.resolution, cells, request.method)
+    rows = [_row(flow, grid, number, name, cell) for number, ((name, _, _), cell) in enumerate(zip(points, cells), 1)]
+    depth = flow.filled - heights
+    _write(request, grid, flow, depth, inputs)
+    if request.catchments is not None:
+        _write_catchments(request.catchments, grid, flow, rows, terrain.crs)
+    pixel = grid.resolution**2
+    return FlowReport(
+        request.output,
+        request.catchments,
+        grid.resolution,
+        float(np.isfinite(heights).sum()) * pixel,
+        float(flow.area[flow.leaves].sum()),
+        float((depth > 0).sum()) * pixel,
+        float(np.nansum(depth, dtype=float)) * pixel,
+        tuple(rows),
+    )
+
+
+def _points(path: Path, terrain: OpenTerrain) -> list[tuple[str, float, float]]:
+    """Name, X and Y of the outlets."""
+    if path.suffix.lower() in (".csv", ".txt", ".tsv", ".xyz", ".dat"):
+        table = read_xy_table(path, ROLES)
+        names = table.texts("name") or [f"line {line}" for line in table.lines]
+        return [(name, float(x), float(y)) for name, (x, y) in zip(names, table.xy)]
+    read = read_features(path, "Point")
+    if read.crs is not None and not same_crs(read.crs, terrain.crs):
+        raise InputError(
+            f"{path}: outlets in {crs_label(read.crs)}, the model is in {crs_label(terrain.crs)}; reproject them"
+        )
+    at = [shapely.get_coordinates(item.geometry)[0] for item in read.items]
+    return [(item.name, float(x), float(y)) for item, (x, y) in zip(read.items, at)]
+
+
+def _grid(request: FlowRequest, terrain: OpenTerrain) -> MapGrid:
+    if request.resolution is None:
+        grid = own_grid(terrain, terrain.bounds[:2], terrain.bounds[2:])
+    else:
+        grid = MapGrid.covering(terrain.bounds, request.resolution, terrain.crs)
+    need = grid.width * grid.height * CELL_BYTES
+    if need > request.memory:
+        raise ResourceError(
+            f"{grid.width} × {grid.height} cells take {need / 2**30:.1f} GiB, allowed are "
+            f"{request.memory / 2**30:.1f}: water knows no tiles; give a coarser --resolution or more --memory"
+        )
+    return grid
+
+
+def _cells(
+    request: FlowRequest, grid: MapGrid, heights: NDArray[np.float32], points: Sequence[tuple[str, float, float]]
+) -> list[tuple[int, int]]:
+    """Row and column of every outlet, moved to the flow where that is wanted."""
+    if not points:
+        return []
+    area = flow_of(heights, grid.resolution).area if request.snap > 0 else np.where(np.isnan(heights), np.nan, 1.0)
+    cells = []
+    for name, x, y in points:
+        column, row = grid.to_pixel((x, y))
+        try:
+            cells.append(snapped(area, float(row), float(column), request.snap / grid.resolution))
+        except InputError:
+            raise InputError(
+                f"{request.outlets}: outlet {name} at {x:.10g} {y:.10g} has no terrain within {request.snap:g} m; "
+                "move it, or give a larger --snap"
+            ) from None
+        other = cells.index(cells[-1])
+        if other < len(cells) - 1:
+            raise InputError(
+                f"{request.outlets}: outlets {points[other][0]} and {name} come to lie in one cell; leave one out, or "
+                "give a smaller --snap or --resolution"
+            )
+    return cells
+
+
+def _row(flow: Flow, grid: MapGrid, number: int, name: str, cell: tuple[int, int]) -> OutletRow:
+    X, Y = grid.to_map((cell[1], cell[0]))
+    own = float((flow.catchment == number).sum()) * grid.resolution**2
+    return OutletRow(name, float(X), float(Y), float(flow.area[cell]), own, float(flow.longest[cell]))
+
+
+def _write(request: FlowRequest, grid: MapGrid, flow: Flow, depth: NDArray[np.float32], inputs: Sequence[Path]) -> None:
+    def tile(window: Window) -> NDArray[np.float32]:
+        right, bottom = window.stop
+        part = slice(window.row, bottom), slice(window.col, right)
+        none = np.isnan(depth[part])
+        bands: list[NDArray[Any]] = [
+            flow.area[part],
+            flow.length[part],
+            flow.longest[part],
+            np.where(none, np.nan, flow.direction[part]),
+            np.where(none, np.nan, flow.catchment[part]),
+            depth[part],
+        ]
+        return np.stack(bands).astype(np.float32)
+
+    options = GridOptions(
+        tile=TILE,
+        workers=request.workers,
+        overwrite=request.overwrite,
+        inputs=inputs,
+        resampling="nearest",
+        tags={"BANDS": "; ".join(BANDS)},
+    )
+    write_grid(request.output, grid, np.float32, len(BANDS), "auto", tile, options)
+
+
+def _write_catchments(path: Path, grid: MapGrid, flow: Flow, rows: Sequence[OutletRow], crs: str) -> None:
+    found = label_polygons(flow.catchment, grid)
+    numbers = np.array([*found], np.int32)
+    if rows:
+        names = [rows[number - 1].name for number in numbers]
+        upstream, longest = (
+            np.array([getattr(rows[n - 1], key) for n in numbers], float) for key in ("area", "longest")
+        )
+    else:
+        row, column = np.nonzero(flow.leaves)
+        order = np.argsort(flow.catchment[row, column])
+        names = [str(number) for number in numbers]
+        upstream, longest = (a[row, column][order].astype(float) for a in (flow.area, flow.longest))
+    own = shapely.area(np.array([*found.values()], object)) if found else np.empty(0)
+    columns = {
+        "number": numbers,
+        "name": np.array(names, object),
+        "own_area": own,
+        "upstream_area": upstream,
+        "longest_way": longest,
+    }
+    write_features(path, "MultiPolygon", [*found.values()], columns, crs, "catchments")

@@ -1,0 +1,183 @@
+"""Profiles over lines of a file, as a table and as a picture."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.crs import crs_label, same_crs
+from photoplan.io.polygons import read_features
+from photoplan.io.product import check_output
+from photoplan.io.terrain.export import replacing
+from photoplan.io.terrain.points import PointTable, PointTableFormat
+from photoplan.products.dtm.profile_plot import ProfilePlot
+from photoplan.products.open_terrain import OpenTerrain, open_terrain
+from photoplan.surfaces.hybrid import HybridSurface
+from photoplan.surfaces.profile import profile
+
+__all__ = ["Profile", "ProfileRequest", "dtm_profile", "profiles_of"]
+
+TABLES = (".csv", ".txt")
+MOST_POINTS = 1_000_000
+"""Points of the lines at most."""
+_LINE_NAMES = ("line", "line_id", "profile")
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """The surface over one line; straight between its points."""
+
+    name: str
+    distance: NDArray[np.float64]
+    """Along the line, ascending, metres; twice the same at a wall."""
+    xy: NDArray[np.float64]
+    heights: NDArray[np.float64]
+    """Metres; NaN at the first and last point where there is no surface."""
+    sigmas: NDArray[np.float64]
+    """Standard deviations of the heights, metres; NaN: unknown."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Figures as plain values."""
+        there = np.isfinite(self.heights)
+        known = self.heights[there]
+        return {
+            "line": self.name,
+            "length": float(self.distance[-1]),
+            "points": len(self.distance),
+            "low": float(known.min()) if known.size else None,
+            "high": float(known.max()) if known.size else None,
+        }
+
+
+@dataclass(frozen=True)
+class ProfileRequest:
+    """What is asked."""
+
+    model: Path
+    lines: Path
+    """A vector file of lines, or a CSV of points along them."""
+    outputs: tuple[Path, ...]
+    """`.csv`, and `.png` for a picture."""
+    form: PointTableFormat = field(default_factory=PointTableFormat)
+    line_column: str | None = None
+    """Column of a CSV that tells lines apart; None: `line`, `line_id` or `profile`, else all points are one line."""
+    tolerance: float = 0.001
+    """Largest distance in height from the surface, metres."""
+    crs: str | None = None
+    """Of a terrain file that does not state its own."""
+    overwrite: bool = False
+
+
+def dtm_profile(request: ProfileRequest) -> list[Profile]:
+    """Compute the profiles and write them.
+
+    Raises
+    ------
+    UsageError
+        An output exists, is an input, or is of no known kind; a picture is asked for and matplotlib is missing.
+    InputError
+        The terrain or the lines cannot be used, or they are in different CRSs.
+    """
+    inputs = [request.model, request.lines]
+    for path in request.outputs:
+        if path.suffix.lower() not in (*TABLES, ".png"):
+            raise UsageError(f"{path}: {path.suffix or 'no suffix'}; profiles are written as .csv and .png")
+        check_output(path, inputs, overwrite=request.overwrite)
+    if len({path.resolve() for path in request.outputs}) < len(request.outputs):
+        raise UsageError(f"{request.outputs[0]}: is given twice as an output")
+    plot = ProfilePlot() if any(path.suffix.lower() == ".png" for path in request.outputs) else None
+    terrain = open_terrain(request.model, request.crs)
+    found = profiles_of(terrain, _lines(request, terrain), request.tolerance)
+    for path in request.outputs:
+        with replacing(path, inputs, request.overwrite) as part:
+            if plot is not None and path.suffix.lower() == ".png":
+                plot.draw(part, found)
+            else:
+                _write_table(part, found)
+    return found
+
+
+def profiles_of(
+    terrain: OpenTerrain, lines: Sequence[tuple[str, NDArray[np.float64]]], tolerance: float = 0.001
+) -> list[Profile]:
+    """Profiles over lines (name, vertices (n, 2)) in the terrain's CRS."""
+    found = []
+    for name, vertices in lines:
+        try:
+            distance, X, Y, Z = profile(terrain.surface, vertices, tolerance)
+        except UsageError as error:
+            raise UsageError(f"line {name!r}: {error}") from None
+        xy = np.column_stack([X, Y])
+        surface = terrain.surface
+        sigmas = surface.sigmas(xy) if isinstance(surface, HybridSurface) else np.full(len(xy), np.nan)
+        found.append(Profile(name, distance, xy, Z, np.where(np.isnan(Z), np.nan, sigmas)))
+    return found
+
+
+def _lines(request: ProfileRequest, terrain: OpenTerrain) -> list[tuple[str, NDArray[np.float64]]]:
+    """Name and vertices of each line."""
+    if request.lines.suffix.lower() in (*TABLES, ".xyz"):
+        return _lines_of_table(request)
+    features = read_features(request.lines, "LineString")
+    if features.crs is not None and not same_crs(features.crs, terrain.crs):
+        raise InputError(
+            f"{request.lines}: lines in {crs_label(features.crs)}, the model is in {crs_label(terrain.crs)}; reproject "
+            "the lines"
+        )
+    lines = []
+    for item in features.items:
+        parts = shapely.get_parts(item.geometry)
+        for number, part in enumerate(parts, 1):
+            name = item.name if len(parts) == 1 else f"{item.name}.{number}"
+            lines.append((name, shapely.get_coordinates(part)))
+    return lines
+
+
+def _lines_of_table(request: ProfileRequest) -> list[tuple[str, NDArray[np.float64]]]:
+    table = PointTable(request.lines, request.form)
+    column = _line_column(request, table)
+    names: list[str] = []
+    points = []
+    for part in table.parts(100_000):
+        names += ["1" if column is None else row[column] for row in part.rows]
+        points.append(part.xy)
+        if len(names) > MOST_POINTS:
+            raise InputError(f"{request.lines}: more than {MOST_POINTS} points; give fewer lines at a time")
+    xy = np.concatenate(points)
+    groups: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        groups.setdefault(name, []).append(i)
+    short = [name for name, which in groups.items() if len(np.unique(xy[which], axis=0)) < 2]
+    if short:
+        raise InputError(f"{request.lines}: line {short[0]!r} has fewer than two different points")
+    return [(name, xy[which]) for name, which in groups.items()]
+
+
+def _line_column(request: ProfileRequest, table: PointTable) -> int | None:
+    lower = [name.casefold() for name in table.names]
+    if request.line_column is None:
+        wanted = next((name for name in _LINE_NAMES if name in lower), None)
+        return None if wanted is None else lower.index(wanted)
+    if request.line_column.casefold() not in lower:
+        raise InputError(
+            f"{request.lines}: no column {request.line_column!r}; the columns are {', '.join(table.names)[:200]}"
+        )
+    return lower.index(request.line_column.casefold())
+
+
+def _write_table(part: Path, profiles: Sequence[Profile]) -> None:
+    with part.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["line", "distance", "x", "y", "height", "sigma"])
+        for p in profiles:
+            for d, (x, y), z, s in zip(p.distance, p.xy, p.heights, p.sigmas):
+                height, sigma = (f"{v:.4f}" if np.isfinite(v) else "" for v in (z, s))
+                writer.writerow([p.name, f"{d:.4f}", f"{x:.4f}", f"{y:.4f}", height, sigma])

@@ -1,0 +1,234 @@
+"""A finer terrain model takes the place of a coarse one inside polygons."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from photoplan import __version__
+from photoplan.errors import HeightSystemError, InputError, UsageError
+from photoplan.geometry.crs import crs_label, same_crs
+from photoplan.geometry.heights import check_height_system, height_label
+from photoplan.io.polygons import read_features
+from photoplan.io.product import check_output
+from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
+from photoplan.io.terrain.model_tables import ModelHeader, empty_figures, input_facts
+from photoplan.io.terrain.model_write import ModelParts, ModelWriter
+from photoplan.surfaces.memory_units import unit_range
+from photoplan.surfaces.refined_units import LinedUnits, refine_units
+from photoplan.surfaces.units import LineElement, Unit, UnitFigures
+
+__all__ = ["RefineReport", "RefineRequest", "dtm_refine"]
+
+
+@dataclass(frozen=True)
+class RefineRequest:
+    """What is asked."""
+
+    coarse: Path
+    fine: Path
+    polygons: Path
+    output: Path
+    transition: float
+    """Width of the band inside the polygons in which the two are joined, metres."""
+    width: float | None = None
+    """Largest grid width inside the polygons, metres; None: the fine model's finest."""
+    height_system: str | None = None
+    """`same` declares that both models have one height system."""
+    overwrite: bool = False
+
+
+@dataclass(frozen=True)
+class RefineReport:
+    """What came out."""
+
+    path: Path
+    units: int
+    """Units of the model that have a surface."""
+    changed: int
+    """Those that differ from the coarse model's."""
+    lines: int
+    largest: float
+    """Largest change of a post that both have, metres; NaN: there is none."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        largest = self.largest if math.isfinite(self.largest) else None
+        counts = {"units": self.units, "changed": self.changed, "lines": self.lines}
+        return {"model": str(self.path), **counts, "largest_change": largest}
+
+
+def dtm_refine(request: RefineRequest, progress: Callable[[int, int], None] | None = None) -> RefineReport:
+    """Write the coarse model with the fine one inside the polygons.
+
+    Raises
+    ------
+    UsageError
+        The output exists or is an input, or an input is a raster.
+    HeightSystemError
+        Height systems differ, or are not stated.
+    InputError
+        A file cannot be used, CRSs differ, or the polygons touch no unit.
+    """
+    inputs = [request.coarse, request.fine, request.polygons]
+    check_output(request.output, inputs, overwrite=request.overwrite)
+    coarse, fine = (_model(path) for path in (request.coarse, request.fine))
+    if not same_crs(coarse.header.crs, fine.header.crs):
+        raise InputError(
+            f"{coarse.path} is in {crs_label(coarse.header.crs)}, {fine.path} in {crs_label(fine.header.crs)}; build "
+            "both in one CRS"
+        )
+    system = _one_system(coarse, fine, request.height_system)
+    polygons = _polygons(request, coarse)
+    width = request.width if request.width is not None else fine.finest
+    with ModelWriter(request.output, coarse.layout, _key(request, coarse, fine), request.overwrite, inputs) as writer:
+        units, lines = refine_units(
+            LinedUnits(coarse, coarse.lines(), coarse.domain()),
+            LinedUnits(fine, fine.lines(polygons.bounds), fine.domain()),
+            polygons,
+            request.transition,
+            width,
+        )
+        if not units:
+            raise InputError(f"{request.polygons}: the polygons touch no unit of {coarse.path}")
+        _add(writer, coarse, units, lines, progress)
+        reader = writer.finish(_parts(request, coarse, fine, system, polygons, width, lines))
+    there = int(np.isfinite(reader.ranges[..., 0]).sum())
+    return RefineReport(request.output, there, len(units), len(lines), _largest(coarse, units))
+
+
+def _model(path: Path) -> ModelReader:
+    if path.is_file() and path.suffix.lower() != ".gpkg" and not is_terrain_model(path):
+        raise UsageError(f"{path}: only models of `photoplan dtm build` are refined; a raster has no units")
+    return ModelReader(path)
+
+
+def _one_system(coarse: ModelReader, fine: ModelReader, declared: str | None) -> str | None:
+    """The height system of both models."""
+    if declared not in (None, "same"):
+        raise UsageError(f"height system {declared!r}; `same` declares that both models have one")
+    stated = [reader.header.height_system for reader in (coarse, fine)]
+    named = [check_height_system(system) for system in stated if system is not None]
+    if len(named) == 2 and named[0] != named[1]:
+        raise HeightSystemError(
+            f"{coarse.path}: heights {height_label(named[0])}, {fine.path}: {height_label(named[1])}; build both in one"
+        )
+    if len(named) < 2 and declared is None:
+        without = " and ".join(str(r.path) for r, s in zip((coarse, fine), stated) if s is None)
+        raise HeightSystemError(f"{without}: no height system stated; if both have the same, say --height-system same")
+    return named[0] if named else None
+
+
+def _polygons(request: RefineRequest, coarse: ModelReader) -> Any:
+    read = read_features(request.polygons, "Polygon")
+    if read.crs is not None and not same_crs(read.crs, coarse.header.crs):
+        raise InputError(
+            f"{request.polygons}: polygons in {crs_label(read.crs)}, the models are in "
+            f"{crs_label(coarse.header.crs)}; reproject them"
+        )
+    return shapely.union_all([shapely.force_2d(item.geometry) for item in read.items])
+
+
+def _key(request: RefineRequest, coarse: ModelReader, fine: ModelReader) -> str:
+    facts = (
+        coarse.header.identity,
+        fine.header.identity,
+        input_facts(request.polygons)["sha256_sampled"],
+        request.transition,
+        request.width,
+        request.height_system,
+        __version__,
+    )
+    return hashlib.sha256(repr(facts).encode()).hexdigest()
+
+
+def _add(
+    writer: ModelWriter,
+    coarse: ModelReader,
+    units: dict[tuple[int, int], Unit],
+    lines: tuple[LineElement, ...],
+    progress: Callable[[int, int], None] | None,
+) -> None:
+    """All units into the new model."""
+    done = writer.done()
+    known = {(f.column, f.row): f for f in coarse.figures()}
+    boxes = shapely.STRtree([shapely.LineString(line.xyz[:, :2]) for line in lines])
+    layout = coarse.layout
+    for row in range(layout.rows):
+        for column in range(layout.columns):
+            at = column, row
+            if at not in done:
+                old, new = coarse.unit(column, row), units.get(at)
+                figures = known.get(at, empty_figures(column, row))
+                writer.add(new or old, figures if new is None else _figures(new, old, figures, boxes))
+            if progress is not None:
+                progress(1, 1)
+
+
+def _figures(unit: Unit, old: Unit | None, before: UnitFigures, lines: shapely.STRtree) -> UnitFigures:
+    """Figures of a new unit: where it joins two models, what was estimated for one of them does not hold for it."""
+    low, high = unit_range(unit)
+    known = unit.sigmas[np.isfinite(unit.sigmas)].astype(float)
+    sigma = float(np.sqrt((known**2).mean())) if known.size else math.nan
+    box = shapely.box(unit.left, unit.top - unit.side, unit.left + unit.side, unit.top)
+    count = len(lines.query(box, predicate="intersects"))
+    after = replace(before, meshes=unit.meshes, low=low, high=high, lines=count, sigma=sigma)
+    if old is not None and np.array_equal(unit.heights, old.heights, equal_nan=True):
+        # Only its triangles are new: finer posts adjoin.
+        return after
+    nan = math.nan
+    return replace(after, variance=nan, length=nan, noise=nan, spread=nan)
+
+
+def _parts(
+    request: RefineRequest,
+    coarse: ModelReader,
+    fine: ModelReader,
+    system: str | None,
+    polygons: Any,
+    width: float,
+    lines: tuple[LineElement, ...],
+) -> ModelParts:
+    """All but the units."""
+    settings = {"transition": request.transition, "width": width}
+    header = ModelHeader(
+        coarse.header.crs,
+        system,
+        coarse.layout,
+        settings={"refined": settings, "coarse": coarse.header.settings, "fine": fine.header.settings},
+        inputs=tuple(input_facts(path) for path in (request.coarse, request.fine, request.polygons)),
+        family=coarse.header.family,
+    )
+    shapely.prepare(polygons)
+    gross = [g for g in coarse.gross() if not shapely.intersects_xy(polygons, *g.xyz[:2])]
+    gross += [g for g in fine.gross() if shapely.intersects_xy(polygons, *g.xyz[:2])]
+    outer, inner = coarse.domain(), fine.domain()
+    domain = None
+    if outer is not None or inner is not None:
+        # Inside the polygons the fine model's border counts, outside the coarse one's.
+        outer = shapely.box(*coarse.layout.bounds) if outer is None else outer
+        domain = outer.difference(polygons).union(polygons if inner is None else polygons.intersection(inner))
+        areas = [p for p in shapely.get_parts(domain) if p.geom_type == "Polygon" and p.area > 0]
+        domain = shapely.multipolygons(areas)
+    return ModelParts(header, lines, gross, domain)
+
+
+def _largest(coarse: ModelReader, units: dict[tuple[int, int], Unit]) -> float:
+    """Largest change of a post that both models have."""
+    largest = math.nan
+    for (column, row), unit in units.items():
+        old = coarse.unit(column, row)
+        if old is None or unit.meshes % old.meshes:
+            continue
+        step = unit.meshes // old.meshes
+        change = (unit.heights[::step, ::step] + unit.datum) - (old.heights + old.datum)
+        if np.isfinite(change).any():
+            largest = max(float(np.nanmax(np.abs(change))), largest if math.isfinite(largest) else 0.0)
+    return largest

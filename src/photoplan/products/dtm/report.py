@@ -1,0 +1,298 @@
+"""The report of a terrain model that was just built: what is known in memory, brought into plain values."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.geometry.crs import crs_label
+from photoplan.geometry.grid import MapGrid
+from photoplan.io.disk import write_atomically
+from photoplan.products.dtm.report_covariance import covariance_facts
+from photoplan.report.build_report import BuildFacts, FilterEffect, GrossError, Note, ReportMap, build_report
+from photoplan.report.plots import Plots
+from photoplan.surfaces.hybrid import HybridSurface
+from photoplan.surfaces.measured import MeasuredTerrain
+from photoplan.surfaces.memory_units import MemoryUnits
+from photoplan.targets.map import MapTarget
+from photoplan.terrain.build import Built
+from photoplan.terrain.clean import Finding
+
+__all__ = ["build_facts", "check_report", "write_report"]
+
+T = TypeVar("T", bound=np.generic)
+#: Longer side of the map, pixels.
+_SIDE = 900
+#: Points of a class that are looked at, and normalised residuals that are kept.
+_SAMPLE, _RESIDUALS = 100_000, 1_000_000
+#: Vertices of all lines in the map at most.
+_VERTICES = 400_000
+
+_WORDS = {
+    "mass": "mass points",
+    "spot": "spot heights",
+    "breakline": "breaklines",
+    "formline": "form lines",
+    "border": "border lines",
+    "hole": "holes",
+}
+
+
+def check_report() -> Plots:
+    """What draws the report; asked for before a model is built, so that a missing library is known at once.
+
+    Raises
+    ------
+    UsageError
+        matplotlib is not installed.
+    """
+    return Plots()
+
+
+def write_report(
+    path: Path,
+    built: Built,
+    measured: MeasuredTerrain,
+    findings: Sequence[Finding],
+    inputs: Sequence[Path],
+    seconds: float,
+) -> None:
+    """Write the report of a model as one HTML file, complete or not at all.
+
+    Parameters
+    ----------
+    path : Path
+    built : Built
+    measured : MeasuredTerrain
+        The clean measurements that the model was built from.
+    findings : sequence of Finding
+        What cleaning found.
+    inputs : sequence of Path
+        The files that were read.
+    seconds : float
+        What the model took.
+
+    Raises
+    ------
+    UsageError
+        matplotlib is not installed, or the folder cannot be written.
+    ResourceError
+        The disk is full.
+    """
+    plots = check_report()
+    title = path.name.removesuffix(".html").removesuffix(".report")
+    facts = build_facts(title, built, measured, findings, inputs, seconds)
+    write_atomically(path, build_report(facts, plots).encode("utf-8", errors="replace"))
+
+
+def build_facts(
+    title: str,
+    built: Built,
+    measured: MeasuredTerrain,
+    findings: Sequence[Finding],
+    inputs: Sequence[Path],
+    seconds: float,
+) -> BuildFacts:
+    """What the report shows, from samples where there is much: the same for the same model."""
+    fit, figures = built.fit, built.figures
+    surface = HybridSurface(MemoryUnits(built.plan.layout, built.units))
+    z = fit.residuals[:, 2]
+    used = z[(fit.noise[: fit.seen.points] >= 0) & np.isfinite(z)]
+    full = [f for f in figures if f.meshes > 0]
+    posts = np.array([(f.meshes + 1) ** 2 for f in full], float)
+    sigmas = np.array([f.sigma for f in full])
+    known = np.isfinite(sigmas)
+    sigma = float(np.sqrt(np.average(sigmas[known] ** 2, weights=posts[known]))) if known.any() else np.nan
+    widths = Counter(built.plan.layout.side / f.meshes for f in full)
+    return BuildFacts(
+        title=title,
+        crs=_systems(measured),
+        counts=_counts(measured),
+        units=len(full),
+        empty=len(figures) - len(full),
+        widths=tuple(sorted(widths.items())),
+        family=fit.whole.name,
+        variance=fit.whole.variance,
+        length=fit.whole.length,
+        noise=fit.whole.noise,
+        sigma=sigma,
+        spread=float(used.std()) if len(used) >= 20 else np.nan,
+        seconds=seconds,
+        map=_map(built, surface),
+        normalised=_thin(used, _RESIDUALS),
+        covariance=covariance_facts(fit),
+        effects=_effects(built, measured, surface),
+        gross=_gross(built, measured, surface),
+        notes=(
+            *(Note("while reading", note) for note in measured.notes),
+            *(Note(f.kind, f.text, f.X, f.Y) for f in findings),
+        ),
+        settings=_settings(built),
+        inputs=tuple((path.name, _size(path)) for path in inputs),
+        limit=built.plan.settings.gross,
+    )
+
+
+def _systems(measured: MeasuredTerrain) -> str:
+    plan = "CRS not stated" if measured.crs is None else crs_label(measured.crs)
+    return f"{plan}; heights: {measured.height_system or 'system not stated'}"
+
+
+def _counts(measured: MeasuredTerrain) -> tuple[tuple[str, int], ...]:
+    points: Counter[str] = Counter()
+    for group in measured.points:
+        points[group.kind] += len(group.xyz)
+    lines = Counter(line.kind for line in measured.lines)
+    return tuple((word, points.get(kind, 0) + lines.get(kind, 0)) for kind, word in _WORDS.items())  # type: ignore[call-overload]
+
+
+def _map(built: Built, surface: HybridSurface) -> ReportMap:
+    """The model on the pixels of a map that just holds its units."""
+    layout = built.plan.layout
+    rows, columns = zip(*((row, column) for column, row in built.units)) if built.units else ((0,), (0,))
+    left, top = layout.corner(min(columns), min(rows))
+    right, bottom = layout.corner(max(columns) + 1, max(rows) + 1)
+    resolution = max(right - left, top - bottom) / _SIDE
+    target = MapTarget(MapGrid.covering((left, bottom, right, top), resolution, ""))
+    grid = target.grid
+    heights = np.full((grid.height, grid.width), np.nan, np.float32)
+    sigmas = heights.copy()
+    for part in grid.window.tiles(256):
+        inside = np.s_[part.row : part.stop[1], part.col : part.stop[0]]
+        heights[inside], sigmas[inside] = surface.relief_with_sigma(target, part)
+    known = np.isfinite(heights)
+    if known.any():
+        # Units reach further than the model: the map ends where it does.
+        row, column = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+        kept = np.s_[row[0] : row[-1] + 1, column[0] : column[-1] + 1]
+        heights, sigmas = heights[kept], sigmas[kept]
+        left, top = grid.left + column[0] * resolution, grid.top - row[0] * resolution
+    return ReportMap(left, top, resolution, heights, sigmas, _lines(built, resolution))
+
+
+def _lines(built: Built, resolution: float) -> tuple[tuple[str, NDArray[np.float64]], ...]:
+    """Lines for the map; where there are very many vertices, every so-manieth."""
+    vertices = sum(len(line.xyz) for line in built.lines)
+    step = max(1, -(-vertices // _VERTICES))
+    drawn = []
+    for line in built.lines:
+        xy = line.xyz[:, :2]
+        if step > 1 and np.ptp(xy, axis=0).max() < resolution:
+            continue
+        drawn.append((line.kind, np.vstack([xy[:-1:step], xy[-1:]])))
+    return tuple(drawn)
+
+
+def _thin(values: NDArray[T], most: int) -> NDArray[T]:
+    """Evenly taken members, at most so many."""
+    return values[:: max(1, -(-len(values) // most))]
+
+
+def _effects(built: Built, measured: MeasuredTerrain, surface: HybridSurface) -> tuple[FilterEffect, ...]:
+    """Measured minus filtered heights, by class."""
+    fit, seen = built.fit, built.fit.seen
+    kinds = np.array([group.kind for group in measured.points])[seen.group] if seen.points else np.empty(0, str)
+    sigma = np.sqrt(np.maximum(fit.noise, 0.0))
+    found = []
+    for kind in ("mass", "spot"):
+        some = np.flatnonzero((kinds == kind) & (fit.noise[: seen.points] >= 0))
+        if not len(some):
+            continue
+        shown = _thin(some, _SAMPLE)
+        xyz = seen.xyz[shown] + seen.origin
+        d = xyz[:, 2] - surface.heights(xyz[:, :2])
+        found.append(FilterEffect(_WORDS[kind], len(some), _one(sigma[some]), xyz[:, :2], d))
+    return (*found, *_line_effects(built))
+
+
+def _line_effects(built: Built) -> list[FilterEffect]:
+    """The same for vertices of lines that have heights."""
+    lines = built.plan.seen.lines
+    origin = built.plan.seen.origin
+    parts: dict[str, list[tuple[NDArray[np.float64], NDArray[np.float64]]]] = {}
+    for k, element in enumerate(built.lines):
+        part = slice(lines.start[k], lines.start[k + 1])
+        xyz = lines.xyz[part] + origin
+        if not np.isfinite(xyz[:, 2]).all():
+            continue
+        # The element has further vertices on the grid's edges; along the line, both have one course.
+        filtered = np.interp(_along(xyz), _along(element.xyz), element.xyz[:, 2])
+        parts.setdefault(element.kind, []).append((xyz[:, :2], xyz[:, 2] - filtered))
+    found = []
+    known = _line_sigma(built)
+    for kind in parts:
+        xy, d = (np.concatenate(values) for values in zip(*parts[kind]))
+        step = max(1, -(-len(d) // _SAMPLE))
+        name = f"vertices of {_WORDS[kind]}"
+        found.append(FilterEffect(name, len(d), known.get(kind, np.nan), xy[::step], d[::step]))
+    return found
+
+
+def _line_sigma(built: Built) -> dict[str, float]:
+    """Filter value of each class of lines, where it is one for all."""
+    lines, settings = built.plan.seen.lines.lines, built.plan.settings
+    found: dict[str, float] = {}
+    for kind in {line.kind for line in lines}:
+        given = {
+            line.sigma if line.sigma is not None else settings.filters.get(kind) for line in lines if line.kind == kind
+        }
+        only = next(iter(given))
+        found[kind] = float(only) if len(given) == 1 and only is not None else np.nan
+    return found
+
+
+def _along(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance along a line up to each vertex, as a part of the whole."""
+    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xyz[:, :2], axis=0).T))])
+    return length / max(float(length[-1]), 1e-12)
+
+
+def _one(sigma: NDArray[np.float64]) -> float:
+    """The value, if all have the same; NaN otherwise."""
+    return float(sigma[0]) if len(sigma) and np.ptp(sigma) <= 1e-9 * sigma[0] else np.nan
+
+
+def _gross(built: Built, measured: MeasuredTerrain, surface: HybridSurface) -> tuple[GrossError, ...]:
+    fit, seen = built.fit, built.fit.seen
+    some = fit.gross
+    if not len(some):
+        return ()
+    xyz = seen.xyz[some] + seen.origin
+    difference = xyz[:, 2] - surface.heights(xyz[:, :2])
+    names = [measured.points[seen.group[k]].label(int(seen.record[k])) for k in some.tolist()]
+    normalised = fit.residuals[some, 2]
+    return tuple(
+        GrossError(name, float(X), float(Y), float(Z), float(d), float(z))
+        for name, (X, Y, Z), d, z in zip(names, xyz, difference, normalised)
+    )
+
+
+def _size(path: Path) -> str:
+    """Size and folder of a file."""
+    try:
+        size = f"{path.stat().st_size / 1e6:.3g} MB, in "
+    except OSError:
+        size = "in "
+    return f"{size}{path.absolute().parent}"
+
+
+def _settings(built: Built) -> tuple[tuple[str, str], ...]:
+    plan, settings = built.plan, built.plan.settings
+    given = settings.filters
+    own = "" if settings.grid_width else " (from the spacing of the points)"
+    adapt = "a quarter of each unit's standard deviation" if settings.adapt is None else f"{settings.adapt:g} m"
+    return (
+        ("finest grid width", f"{plan.width:g} m{own}"),
+        ("computing units", f"{settings.unit_meshes} finest meshes, {plan.layout.side:g} m along a side"),
+        ("grids widened within", "no, all have the finest width" if settings.adapt == 0 else adapt),
+        ("covariance family", f"{settings.family}" + (" (the likeliest)" if settings.family == "auto" else "")),
+        ("filter values", ", ".join(f"{_WORDS[k]} {v:g} m" for k, v in given.items()) or "estimated from the data"),
+        ("gross errors", f"beyond {settings.gross:g} standard deviations" if settings.gross else "not sought"),
+        ("gaps bridged up to", f"{2 * plan.reach:.4g} m"),
+        ("spacing of the points", f"{plan.seen.spacing:.3g} m"),
+    )

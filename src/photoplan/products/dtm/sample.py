@@ -1,0 +1,136 @@
+"""Heights and their standard deviations at points of a table."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import UsageError
+from photoplan.io.product import check_output
+from photoplan.io.terrain.export import replacing
+from photoplan.io.terrain.points import PointTable, PointTableFormat
+from photoplan.products.open_terrain import OpenTerrain, open_terrain
+from photoplan.surfaces.hybrid import HybridSurface
+
+__all__ = ["SampleReport", "SampleRequest", "dtm_sample"]
+
+PART = 100_000
+"""Points that are in memory at once."""
+COLUMNS = ("height", "sigma")
+
+
+@dataclass(frozen=True)
+class SampleRequest:
+    """What is asked."""
+
+    model: Path
+    points: Path
+    output: Path
+    form: PointTableFormat = field(default_factory=PointTableFormat)
+    points_crs: str | None = None
+    """CRS of the points; None: the model's."""
+    crs: str | None = None
+    """Of a terrain file that does not state its own."""
+    digits: int = 4
+    """Decimals of the heights."""
+    names: tuple[str, str] = COLUMNS
+    """Names of the new columns."""
+    overwrite: bool = False
+
+
+@dataclass(frozen=True)
+class SampleReport:
+    """What came out."""
+
+    path: Path
+    points: int
+    outside: int
+    """Points where there is no model: their columns are empty."""
+    low: float
+    high: float
+    sigma: float
+    """Root mean square of the standard deviations, metres; NaN: unknown."""
+    crs: str
+    height_system: str | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        figures = {"low": self.low, "high": self.high, "sigma": self.sigma}
+        return {
+            "file": str(self.path),
+            "points": self.points,
+            "outside": self.outside,
+            **{name: value if np.isfinite(value) else None for name, value in figures.items()},
+            "crs": self.crs,
+            "height_system": self.height_system,
+        }
+
+
+def dtm_sample(request: SampleRequest, progress: Callable[[int, int], None] | None = None) -> SampleReport:
+    """Write the points' table with two more columns, part by part.
+
+    Raises
+    ------
+    UsageError
+        The output exists or is an input; a column has the name of a new one.
+    InputError
+        The terrain or the table cannot be used; a line that cannot be read is named.
+    """
+    inputs = [request.model, request.points]
+    check_output(request.output, inputs, overwrite=request.overwrite)
+    terrain = open_terrain(request.model, request.crs)
+    if request.points_crs is not None:
+        terrain, _ = terrain.in_crs(request.points_crs)
+    table = PointTable(request.points, request.form)
+    taken = [name for name in request.names if name in table.names]
+    if taken:
+        raise UsageError(f"{request.points}: has a column {taken[0]} already; name the new ones: --names HEIGHT SIGMA")
+    count = outside = known = 0
+    low, high, squares = np.inf, -np.inf, 0.0
+    delimiter = table.delimiter
+    with (
+        replacing(request.output, inputs, request.overwrite) as part,
+        part.open("w", encoding="utf-8", newline="") as file,
+    ):
+        writer = csv.writer(file, delimiter=delimiter, lineterminator="\n")
+        if request.form.header:
+            writer.writerow([*table.names, *request.names])
+        for points in table.parts(PART):
+            heights, sigmas = _values(terrain, points.xy)
+            texts = [_texts(values, request, delimiter) for values in (heights, sigmas)]
+            writer.writerows([*row, h, s] for row, h, s in zip(points.rows, *texts))
+            there = np.isfinite(heights)
+            count, outside = count + len(heights), outside + int((~there).sum())
+            if there.any():
+                low, high = min(low, float(heights[there].min())), max(high, float(heights[there].max()))
+            good = sigmas[np.isfinite(sigmas)]
+            known, squares = known + len(good), squares + float((good**2).sum())
+            if progress is not None:
+                progress(1, len(heights))
+    sigma = float(np.sqrt(squares / known)) if known else np.nan
+    if outside == count:
+        low = high = np.nan
+    return SampleReport(request.output, count, outside, low, high, sigma, terrain.crs, terrain.height_system)
+
+
+def _values(terrain: OpenTerrain, XY: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    heights = terrain.surface.heights(XY)
+    if not isinstance(terrain.surface, HybridSurface):
+        return heights, np.full(len(XY), np.nan)
+    return heights, terrain.surface.sigmas(XY)
+
+
+def _texts(values: NDArray[np.float64], request: SampleRequest, delimiter: str) -> list[str]:
+    """Numbers as the table writes them; empty (between spaces: nan) where there is none."""
+    form = f"%.{request.digits}f"
+    texts = ["" if value != value else form % value for value in values.tolist()]
+    # A field of spaces between spaces would vanish.
+    if delimiter == " ":
+        texts = [text or "nan" for text in texts]
+    return [text.replace(".", ",") for text in texts] if request.form.decimal_comma else texts

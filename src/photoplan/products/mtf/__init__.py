@@ -1,0 +1,1 @@
+"""`photoplan mtf`: sharpness at edges and test patterns."""

@@ -1,0 +1,1 @@
+"""`photoplan restore`: filters measured, designed and applied."""

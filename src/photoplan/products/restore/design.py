@@ -1,0 +1,299 @@
+"""The restoration filter of images, measured in the images themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.grid import Window
+from photoplan.products.linearisation import linearisation_of
+from photoplan.products.mtf.image import LightImage
+from photoplan.products.mtf.result import ImageMtf, MtfReport
+from photoplan.products.mtf.run import MtfRequest, measure_mtf
+from photoplan.quality.edges.response import EdgeMeasurement
+from photoplan.quality.edges.sharpness import LEAST_EDGES, sharpness_of
+from photoplan.quality.restoration.design import Design, DesignOptions, Sharpness, design_filter
+from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
+from photoplan.quality.restoration.image_noise import block_noise, image_noise
+from photoplan.quality.restoration.regularised import SceneStatistics
+
+__all__ = ["DesignRequest", "DesignedPart", "MeasuredFilter", "design_restoration"]
+
+#: Windows of an image in which its contrast is looked for, in each direction, and their side.
+_WINDOWS = 5
+_SIDE = 256
+#: Share of the blocks of an image that must hold no saturated pixel, for the noise to be looked for in these alone.
+_CLEAN = 0.1
+
+
+@dataclass(frozen=True)
+class DesignRequest:
+    """What is asked."""
+
+    images: tuple[Path, ...]
+    linearisation: str | None = None
+    """``linear``, ``srgb`` or a file with a table: the light that the filter holds for; None: linear, with a warning
+    for images of 8 bits."""
+    per_band: bool = False
+    """A filter for each band instead of one for all, from the luminance."""
+    cells: int = 1
+    """Parts of the field in each direction that get filters of their own, where they have edges enough."""
+    most_edges: int = 200
+    """Edges of an image that are measured."""
+    least_length: float | None = None
+    """Of an edge, pixels; None: 20."""
+    options: DesignOptions = field(default_factory=DesignOptions)
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.cells <= 15:
+            raise UsageError(f"a field of {self.cells} × {self.cells} parts; allowed are 1 to 15")
+
+
+@dataclass(frozen=True, eq=False)
+class DesignedPart:
+    """The filter of one band in one part of the field."""
+
+    band: int | None
+    """None: all bands."""
+    at: tuple[float, float] | None
+    """Column and row of the middle of the part; None: the whole field."""
+    edges: int
+    """Edges it was measured with."""
+    sharpness: tuple[Sharpness, Sharpness]
+    """Along rows and along columns."""
+    missing: tuple[str, ...]
+    """``x`` or ``y`` where no edges show the sharpness along rows or columns and that of the other stands for it."""
+    scene: SceneStatistics
+    design: Design
+
+    def facts(self) -> dict[str, Any]:
+        """Figures for the filter's file."""
+        return {
+            "band": self.band,
+            "at": None if self.at is None else list(self.at),
+            "edges": self.edges,
+            "noise": self.scene.noise,
+            "contrast": self.scene.contrast,
+            "mtf50_x": round(self.sharpness[0].modulation().mtf50, 4),
+            "mtf50_y": round(self.sharpness[1].modulation().mtf50, 4),
+            "spread_x": [round(float(v), 5) for v in self.sharpness[0].spread.side()],
+            "spread_y": [round(float(v), 5) for v in self.sharpness[1].spread.side()],
+            "condition_x": str(self.design.condition_x),
+            "condition_y": str(self.design.condition_y),
+            "noise_gain": round(self.design.noise_gain, 3),
+            "method": self.design.method,
+            "rule": self.design.reason,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredFilter:
+    """A filter and what it was measured with."""
+
+    filter: RestorationFilter
+    parts: tuple[DesignedPart, ...]
+    mtf: MtfReport
+    notes: tuple[str, ...]
+    """What a user should know: edge enhancement, parts of the field without edges."""
+
+
+def _unwatched(total: int) -> AbstractContextManager[Callable[[int, int], None]]:
+    return nullcontext(lambda tiles, pixels: None)
+
+
+def design_restoration(
+    request: DesignRequest,
+    begin: Callable[[int], AbstractContextManager[Callable[[int, int], None]]] = _unwatched,
+    talk: Callable[[str], None] = lambda text: None,
+) -> MeasuredFilter:
+    """Measure the sharpness of images at their edges, all together, and design the filter that restores them.
+
+    Parameters
+    ----------
+    request : DesignRequest
+    begin : callable
+        Gets the number of tiles; what it returns is entered, and called with (tiles, pixels) as they are done.
+    talk : callable
+        Called with what a user should know while it goes on.
+
+    Raises
+    ------
+    UsageError
+        Images of different size or bands: they cannot have one filter.
+    InputError
+        No image can be used, the edges are too few, or an exact inverse is asked for that does not exist.
+    """
+    band = "all" if request.per_band else None
+    asked = MtfRequest(
+        request.images,
+        linearisation=request.linearisation,
+        band=band,
+        most_edges=request.most_edges,
+        least_length=request.least_length,
+        grid=1,
+    )
+    mtf = measure_mtf(asked, begin, talk)
+    if not mtf.images:
+        raise InputError("no image can be measured: " + "; ".join(mtf.failed.values()))
+    size = _common_size(mtf.images)
+    light = linearisation_of(request.linearisation or "linear")
+    opened = [LightImage.open(image.file, light) for image in mtf.images]
+    parts: list[DesignedPart] = []
+    notes = [f"not measured: {why}" for why in mtf.failed.values()]
+    for channel in _channels(mtf.images, request.per_band):
+        scene = _scene(opened, channel)
+        edges = [e.measured for image in mtf.images for e in image.edges if e.channel == channel]
+        parts += _parts(request, (channel if request.per_band else None, size), edges, scene, notes)
+    if mtf.enhancement is not None and mtf.enhancement.enhanced:
+        notes.append(mtf.enhancement.warning)
+    return MeasuredFilter(_filter(request, parts, size), tuple(parts), mtf, tuple(notes))
+
+
+def _common_size(images: Sequence[ImageMtf]) -> tuple[int, int]:
+    sizes = {image.size for image in images}
+    if len(sizes) > 1:
+        listed = ", ".join(f"{w} × {h}" for w, h in sorted(sizes))
+        raise UsageError(
+            f"the images are of different size ({listed}); measure a filter for those of each camera alone"
+        )
+    return sizes.pop()
+
+
+def _channels(images: Sequence[ImageMtf], per_band: bool) -> list[int]:
+    """Channels that get a filter of their own."""
+    channels = sorted({edge.channel for image in images for edge in image.edges})
+    return [c for c in channels if c > 0] if per_band else channels[:1]
+
+
+def _parts(
+    request: DesignRequest,
+    where: tuple[int | None, tuple[int, int]],
+    edges: Sequence[EdgeMeasurement],
+    scene: SceneStatistics,
+    notes: list[str],
+) -> list[DesignedPart]:
+    """The filters of a band: for the whole field, or for each part of it that has edges enough."""
+    band, size = where
+    whole = _designed(request, (band, None), edges, scene)
+    for axis in whole.missing:
+        lacking, other = ("rows", "columns") if axis == "x" else ("columns", "rows")
+        notes.append(f"too few edges show the sharpness along {lacking}; that along {other} stands for it")
+    if request.cells == 1:
+        return [whole]
+    n, found = request.cells, []
+    poor = 0
+    for row in range(n):
+        for col in range(n):
+            at = ((col + 0.5) * size[0] / n - 0.5, (row + 0.5) * size[1] / n - 0.5)
+            here = [edge for edge in edges if _cell(edge, size, n) == (col, row)]
+            part = _designed(request, (band, at), here, scene, whole)
+            poor += part.edges == 0
+            found.append(part)
+    if poor:
+        name = "" if band is None else f"band {band}: "
+        notes.append(
+            f"{name}{poor} of {n * n} parts of the field have fewer than {LEAST_EDGES} edges along rows and along "
+            "columns; they get the filter of the whole field"
+        )
+    return found
+
+
+def _cell(edge: EdgeMeasurement, size: tuple[int, int], n: int) -> tuple[int, int]:
+    """Column and row of the part of the field that an edge lies in."""
+    return int((edge.col + 0.5) * n / size[0]), int((edge.row + 0.5) * n / size[1])
+
+
+def _designed(
+    request: DesignRequest,
+    place: tuple[int | None, tuple[float, float] | None],
+    edges: Sequence[EdgeMeasurement],
+    scene: SceneStatistics,
+    whole: DesignedPart | None = None,
+) -> DesignedPart:
+    """The filter of edges; what a part of the field does not show is taken from the whole."""
+    try:
+        x, y, missing = sharpness_of(edges)
+    except InputError:
+        if whole is None:
+            raise
+        return DesignedPart(*place, 0, whole.sharpness, whole.missing, whole.scene, whole.design)
+    if whole is not None:
+        x = whole.sharpness[0] if "x" in missing else x
+        y = whole.sharpness[1] if "y" in missing else y
+    return DesignedPart(*place, len(edges), (x, y), missing, scene, design_filter(x, y, scene, request.options))
+
+
+def _scene(images: Sequence[LightImage], channel: int) -> SceneStatistics:
+    """Noise and contrast of images, from windows over the whole of them, in their light."""
+    blocks: list[NDArray[np.float64]] = []
+    clean: list[NDArray[np.float64]] = []
+    squares, count = 0.0, 0
+    for image in images:
+        for window in _windows(image.size):
+            picture = image.picture(window, channel)
+            grey = picture.grey.astype(np.float64)
+            if picture.valid is not None:
+                grey[~picture.valid] = np.nan
+            blocks.append(block_noise(grey))
+            clean.append(blocks[-1] if picture.saturated is None else block_noise(grey, ~picture.saturated))
+            for difference in (np.diff(grey, axis=0), np.diff(grey, axis=1)):
+                known = difference[np.isfinite(difference)]
+                squares += float(known @ known)
+                count += known.size
+    if count == 0 or squares == 0.0:
+        raise InputError("the images have no contrast")
+    every, whole = np.concatenate(blocks), np.concatenate(clean)
+    # A full sky seems to have no noise, and its few pixels below the end seem to be all of it.
+    noise = image_noise(whole if whole.size >= _CLEAN * every.size else every)
+    noise = noise if np.isfinite(noise) else 0.0
+    # Differences of neighbours hold the noise of both.
+    contrast = max(squares / count - 2.0 * noise**2, 1e-4 * squares / count)
+    return SceneStatistics(noise, float(np.sqrt(contrast)))
+
+
+def _windows(size: tuple[int, int]) -> list[Window]:
+    """Windows spread over an image."""
+    side = min(_SIDE, size[0]), min(_SIDE, size[1])
+    places = [
+        (round(j * (size[0] - side[0]) / (_WINDOWS - 1)), round(i * (size[1] - side[1]) / (_WINDOWS - 1)))
+        for i in range(_WINDOWS)
+        for j in range(_WINDOWS)
+    ]
+    return [Window(*place, *side) for place in sorted(set(places))]
+
+
+def _where(part: DesignedPart, parts: Sequence[DesignedPart]) -> str:
+    """Which of several parts is spoken of, and how many are restored how; empty for a single one."""
+    if len(parts) == 1:
+        return ""
+    exact = sum(one.design.method == "exact" for one in parts)
+    band = [] if part.band is None else [f"band {part.band}"]
+    place = [] if part.at is None else [f"at column {part.at[0]:.0f}, row {part.at[1]:.0f}"]
+    which = " ".join(band + place)
+    return f"{exact} of {len(parts)} parts exact, {len(parts) - exact} regularised; the noisiest, {which}: "
+
+
+def _filter(request: DesignRequest, parts: Sequence[DesignedPart], size: tuple[int, int]) -> RestorationFilter:
+    kernels = tuple(FilterKernel(part.design.kernel, part.at, part.band) for part in parts)
+    # Of several parts the one that restoration costs most tells of the condition.
+    worst = max(parts, key=lambda part: part.design.noise_gain)
+    names = ", ".join(path.name for path in request.images[:3])
+    more = f" and {len(request.images) - 3} more" if len(request.images) > 3 else ""
+    facts: dict[str, Any] = {
+        "condition": _where(worst, parts)
+        + f"along rows: {worst.design.condition_x}; along columns: {worst.design.condition_y}",
+        "rule": _where(worst, parts) + worst.design.reason,
+        "rotation": f"{request.options.rotation}: weights off the axes follow from those on them",
+        "linearisation": request.linearisation or "linear",
+        "noise_gain": round(max(part.design.noise_gain for part in parts), 3),
+        "parts": [{k: v for k, v in part.facts().items() if v is not None} for part in parts],
+    }
+    placed = any(part.at is not None for part in parts)
+    return RestorationFilter(kernels, size if placed else None, f"measured at edges of {names}{more}", facts)

@@ -1,0 +1,138 @@
+"""The filter of a restoration: of a file, for the aperture of a scanner, or measured in the images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, cast
+
+import numpy as np
+
+from photoplan.errors import UsageError
+from photoplan.io.filter_file import filter_text
+from photoplan.products.filter_files import entries_of, load_filter, save_filter
+from photoplan.products.restore.design import DesignRequest, MeasuredFilter, design_restoration
+from photoplan.quality.restoration.aperture import aperture_filter
+from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
+
+__all__ = ["FilterRequest", "FoundFilter", "keep_filter", "requested_filter"]
+
+#: File that a measured filter is written to, in the folder of the results.
+FILTER_NAME = "restoration_filter.toml"
+#: Description of the filter that leaves images as they are.
+NO_FILTER = "none"
+
+
+@dataclass(frozen=True)
+class FilterRequest:
+    """Where a filter comes from: one of these."""
+
+    file: Path | None = None
+    aperture: str | None = None
+    """``square`` or ``round``, with ``:RATIO`` of aperture by step where that is not 1."""
+    design: DesignRequest | None = None
+    none: bool = False
+    """No filter: the image is corrected otherwise alone."""
+
+    def __post_init__(self) -> None:
+        if sum(source is not None for source in (self.file, self.aperture, self.design)) + self.none != 1:
+            raise UsageError("give a filter file, the aperture of a scanner, or images to measure; one of them")
+
+
+@dataclass(frozen=True, eq=False)
+class FoundFilter:
+    """A filter and where it comes from."""
+
+    filter: RestorationFilter
+    origin: str
+    """In words: "the file …"; empty: there is no filter."""
+    measured: MeasuredFilter | None = None
+    """What was measured, where it was."""
+
+
+def requested_filter(
+    request: FilterRequest,
+    begin: Callable[[int], AbstractContextManager[Callable[[int, int], None]]],
+    talk: Callable[[str], None] = lambda text: None,
+) -> FoundFilter:
+    """The filter that is asked for.
+
+    Parameters
+    ----------
+    request : FilterRequest
+    begin : callable
+        Gets the number of tiles of a measurement; what it returns is entered, and called with (tiles, pixels).
+    talk : callable
+        Called with what was found, line by line.
+
+    Raises
+    ------
+    UsageError
+        The aperture is not understood, or the images cannot have one filter.
+    InputError
+        The file is no filter, the aperture cannot be undone, or the images do not determine a filter.
+    """
+    if request.none:
+        return FoundFilter(RestorationFilter((FilterKernel(np.ones((1, 1))),), description=NO_FILTER), "")
+    if request.file is not None:
+        return FoundFilter(load_filter(request.file), f"the file {request.file}")
+    if request.aperture is not None:
+        return FoundFilter(_for_aperture(request.aperture), f"the aperture of a scanner, {request.aperture}")
+    assert request.design is not None
+    found = design_restoration(request.design, begin, talk)
+    for line in _lines(found):
+        talk(line)
+    return FoundFilter(found.filter, "edges of the images", found)
+
+
+def keep_filter(path: Path, filter_: RestorationFilter, *, overwrite: bool = False) -> Path:
+    """Write a filter beside its results, unless the file holds the very same one already.
+
+    Raises
+    ------
+    UsageError
+        The file exists with another content and `overwrite` is False, or its folder cannot be written.
+    """
+    try:
+        if path.read_text(encoding="utf-8") == filter_text(entries_of(filter_)):
+            return path
+    except (OSError, UnicodeDecodeError):
+        pass
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{path.parent}: cannot be made ({error.strerror})") from None
+    return save_filter(path, filter_, overwrite=overwrite)
+
+
+def _for_aperture(text: str) -> RestorationFilter:
+    shape, _, stated = text.partition(":")
+    try:
+        ratio = float(stated) if stated else 1.0
+    except ValueError:
+        ratio = float("nan")
+    if shape not in ("square", "round") or ratio != ratio:
+        raise UsageError(
+            f"--aperture {text}; it is square or round, with :RATIO of aperture by step, such as round:1.2"
+        )
+    kernel = FilterKernel(aperture_filter(cast(Literal["square", "round"], shape), ratio))
+    facts = {"rule": f"inverse of the transfer function of a {shape} aperture of {ratio:g} steps (Ecker 1991, eq. 4.5)"}
+    return RestorationFilter((kernel,), description=f"{shape} aperture, {ratio:g} steps", facts=facts)
+
+
+def _lines(found: MeasuredFilter) -> list[str]:
+    """What was measured, for people."""
+    lines = []
+    for part in found.parts[:9]:
+        name = "all bands" if part.band is None else f"band {part.band}"
+        where = "" if part.at is None else f" at column {part.at[0]:.0f}, row {part.at[1]:.0f}"
+        sides = ["  ".join(f"{v:.3f}" for v in one.spread.side()[:4]) for one in part.sharpness]
+        lines.append(
+            f"{name}{where}: {part.edges} edges; spread function along rows {sides[0]}, along columns {sides[1]}; "
+            f"{part.design.method}, noise grows {part.design.noise_gain:.1f} times"
+        )
+    if len(found.parts) > 9:
+        lines.append(f"… and {len(found.parts) - 9} more parts; the filter file has them all")
+    return lines + list(found.notes)

@@ -1,0 +1,290 @@
+"""Images restored with a filter: planned, executed by tiles, recorded."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from photoplan import __version__
+from photoplan.errors import InputError, PhotoplanError, ResourceError, RunLocked, UsageError
+from photoplan.io.filter_file import filter_text
+from photoplan.io.fingerprint import fingerprint
+from photoplan.io.image_form import ImageForm, form_of
+from photoplan.io.names import unique_stems
+from photoplan.io.product import check_output
+from photoplan.io.raster import RasterReader
+from photoplan.io.run_record import record_path
+from photoplan.io.storage import Nodata
+from photoplan.products.aligned_reader import AlignedReader
+from photoplan.products.chromatic import load_chromatic, measured_once, model_figures
+from photoplan.products.fall_off_reader import FallOffFile, FallOffReader, load_fall_off
+from photoplan.products.filter_files import entries_of, load_filter
+from photoplan.products.linearisation import linearisation_of
+from photoplan.products.restore.execute import Job, RestoredImage, earlier_result, memory_of_a_tile, restore_one
+from photoplan.products.restore.request import RestoreRequest
+from photoplan.products.restored_reader import RestoredReader, Source, kept_nodata, restored_reader
+from photoplan.quality.colour.model import ChromaticModel
+from photoplan.quality.linearise import Linearisation
+from photoplan.quality.restoration.filters import RestorationFilter
+
+__all__ = [
+    "RestorePlan",
+    "RestoreReport",
+    "RestoreRequest",
+    "RestoredImage",
+    "filter_figures",
+    "plan_restoration",
+    "restore_images",
+]
+
+#: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
+BASE_MEMORY = 416 * 2**20
+
+Begin = Callable[[int], AbstractContextManager[Callable[[int, int], None]]]
+
+
+@dataclass(frozen=True, eq=False)
+class RestoreReport:
+    """What became of all images."""
+
+    images: tuple[RestoredImage, ...]
+    failed: dict[str, str]
+    """Why an image could not be restored, by its name."""
+    filter: RestorationFilter
+    folder: Path
+    report: Path | None = None
+    """The report with plots, where one was written."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        return {
+            "filter": filter_figures(self.filter),
+            "images": [image.to_dict() for image in self.images],
+            "failed": dict(self.failed),
+            "folder": str(self.folder),
+            "report": None if self.report is None else str(self.report),
+        }
+
+
+def filter_figures(filter_: RestorationFilter) -> dict[str, Any]:
+    """Size, noise gain and making of a filter as plain values."""
+    columns, rows = filter_.margin
+    return {
+        "description": filter_.description,
+        "size": [2 * columns + 1, 2 * rows + 1],
+        "kernels": len(filter_.kernels),
+        "noise_gain": filter_.noise_gain,
+        "sums": sorted({round(kernel.total, 6) for kernel in filter_.kernels}),
+        "facts": dict(entries_of(filter_).facts),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class Corrections:
+    """What is corrected before the filter: light fall-off, then lateral chromatic aberration."""
+
+    fall_off: FallOffFile | None
+    chromatic: ChromaticModel | Literal["measure"] | None
+    light: Linearisation
+
+    @classmethod
+    def of(cls, request: RestoreRequest, light: Linearisation) -> Corrections:
+        """Those that are asked for, their files read."""
+        fall_off = None if request.fall_off is None else load_fall_off(request.fall_off)
+        model = load_chromatic(request.chromatic) if isinstance(request.chromatic, Path) else request.chromatic
+        return cls(fall_off, model, light)
+
+    def source(self, path: Path) -> Source:
+        """The pixels of an image, corrected."""
+        raw = RasterReader(path)
+        lit = raw if self.fall_off is None else FallOffReader(raw, self.fall_off, self.light)
+        if self.chromatic is None:
+            return lit
+        return AlignedReader(lit, measured_once(path) if self.chromatic == "measure" else self.chromatic)
+
+
+@dataclass(frozen=True, eq=False)
+class RestorePlan:
+    """All images that can be restored, before any pixel is."""
+
+    request: RestoreRequest
+    filter: RestorationFilter
+    jobs: tuple[Job, ...]
+    failed: dict[str, str]
+    in_flight: int
+
+    @property
+    def tiles(self) -> int:
+        """Tiles of all images."""
+        return sum(job.tiles for job in self.jobs)
+
+
+def plan_restoration(request: RestoreRequest) -> RestorePlan:
+    """Open the filter and all images, and see where the results go; nothing is written.
+
+    Raises
+    ------
+    UsageError
+        An image is given twice, a result exists or would replace an input, or `memory` is too small for a tile.
+    InputError
+        The filter or the table of the linearisation cannot be used.
+    """
+    given = request.filter
+    filter_ = load_filter(given) if isinstance(given, Path) else given
+    text = filter_text(entries_of(filter_))
+    light = linearisation_of(request.linearisation)
+    corrections = Corrections.of(request, light)
+    files = [path.resolve() for path in request.images]
+    twice = [path for path in files if files.count(path) > 1]
+    if twice:
+        raise UsageError(f"image {twice[0]} is given twice")
+    stems = unique_stems(path.name for path in request.images)
+    inputs = [*request.images, *([given] if isinstance(given, Path) else [])]
+    inputs += [path for path in (request.chromatic, request.fall_off) if isinstance(path, Path)]
+    inputs += [] if request.linearisation in ("linear", "srgb") else [Path(request.linearisation)]
+    jobs, failed = [], {}
+    for path in request.images:
+        try:
+            source = corrections.source(path)
+            out = np.dtype(source.info.dtype if request.dtype == "same" else request.dtype)
+            _check_bands(path, source.bands, request.bands)
+            chosen = _only(filter_, request.bands, source.bands)
+            reader = restored_reader(source, chosen, light, out)
+            target = request.folder / f"{stems[path.name]}_restored.tif"
+            jobs.append(_job(request, reader, target, text, tuple(inputs)))
+        except InputError as error:
+            failed[path.name] = str(error)
+    for job in jobs:
+        _check_outputs(job, request)
+    return RestorePlan(request, filter_, tuple(jobs), failed, _in_flight(request, jobs))
+
+
+def _check_bands(path: Path, count: int, wanted: Iterable[int]) -> None:
+    for band in wanted:
+        if not 1 <= band <= count:
+            raise InputError(f"{path}: band {band} is asked for; the image has {count}")
+
+
+def _only(filter_: RestorationFilter, bands: tuple[int, ...], count: int) -> RestorationFilter:
+    """The filter for some bands alone."""
+    if not bands:
+        return filter_
+    kernels = [replace(kernel, band=band) for band in sorted(set(bands)) for kernel in filter_.for_band(band)]
+    if not kernels:
+        raise InputError(f"the filter has no kernel for band {', '.join(map(str, bands))}")
+    return RestorationFilter(tuple(kernels), filter_.image_size, filter_.description, filter_.facts)
+
+
+def _job(request: RestoreRequest, reader: RestoredReader, target: Path, text: str, inputs: tuple[Path, ...]) -> Job:
+    info = reader.info
+    digest = fingerprint(info.path).digest
+    facts = [__version__, digest, text, request.settings["bands"], str(reader.dtype), request.linearisation]
+    if reader.aligned is not None:
+        facts.append(model_figures(reader.aligned.model))
+    if reader.lit is not None:
+        facts += ["light fall-off", reader.lit.fall_off.digest]
+    light = reader.restorer.linearisation
+    if light.grey is not None and light.light is not None:
+        facts += [light.grey.tolist(), light.light.tolist()]
+    key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+    nodata: Nodata = kept_nodata(info, reader.dtype)
+    if request.compress == "jpeg" and (reader.dtype != np.uint8 or reader.bands not in (1, 3)):
+        raise InputError(
+            f"{info.path}: {reader.bands} bands of {reader.dtype}; compression jpeg takes one or three of uint8"
+        )
+    form: ImageForm = form_of(info)
+    return Job(reader, target, form, key, nodata, digest, inputs)
+
+
+def _check_outputs(job: Job, request: RestoreRequest) -> None:
+    """Refuse results that exist, but for those of this very run when it was interrupted."""
+    mine = earlier_result(job, request.settings) is not None
+    outputs = [job.target, record_path(job.target), *([job.picture] if request.quicklook else [])]
+    outputs += [job.chromatic_file] if request.chromatic == "measure" else []
+    for path in outputs:
+        check_output(path, job.inputs, overwrite=request.overwrite or mine)
+
+
+def _in_flight(request: RestoreRequest, jobs: list[Job]) -> int:
+    wanted = request.workers if request.workers == 1 else 2 * request.workers
+    if request.memory is None or not jobs:
+        return wanted
+    each = max(memory_of_a_tile(job.reader) for job in jobs)
+    fits = (request.memory - BASE_MEMORY) // each
+    if fits < 1:
+        raise UsageError(
+            f"--memory {request.memory / 2**20:.0f} MiB; at least {(BASE_MEMORY + each) / 2**20:.0f} MiB are needed "
+            "for one tile"
+        )
+    return int(min(wanted, fits))
+
+
+def _unwatched(total: int) -> AbstractContextManager[Callable[[int, int], None]]:
+    return nullcontext(lambda tiles, pixels: None)
+
+
+def restore_images(
+    request: RestoreRequest,
+    begin: Begin = _unwatched,
+    talk: Callable[[str], None] = lambda text: None,
+    finished: Callable[[RestoredImage], None] = lambda image: None,
+) -> RestoreReport:
+    """Restore all images; one that cannot be used does not stop the others.
+
+    Parameters
+    ----------
+    request : RestoreRequest
+    begin : callable
+        Gets the number of tiles; what it returns is entered, and called with (tiles, pixels) that are finished.
+    talk : callable
+        Called with a sentence that a user may want to read while it goes on.
+    finished : callable
+        Called with each image as soon as it is written.
+
+    Raises
+    ------
+    UsageError, InputError
+        See `plan_restoration`; nothing is done then.
+    ResourceError
+        Disk or memory ran out; the same request goes on where it stopped.
+    """
+    plan = plan_restoration(request)
+    settings = request.settings
+    kept = {job.target: earlier_result(job, settings) for job in plan.jobs} if not request.overwrite else {}
+    if plan.jobs and all(kept.get(job.target) for job in plan.jobs):
+        first = plan.jobs[0].target
+        raise UsageError(f"{first}: exists already; choose another output or say --overwrite")
+    _make_folder(request.folder)
+    results, failed = [], dict(plan.failed)
+    with begin(plan.tiles) as advance:
+        for job in plan.jobs:
+            name = job.reader.info.path.name
+            found = kept.get(job.target)
+            if found is not None:
+                talk(f"{name}: is restored already")
+                advance(job.tiles, 0)
+            else:
+                try:
+                    found = restore_one(job, request, plan.in_flight, advance, talk)
+                except (ResourceError, RunLocked):
+                    raise
+                except PhotoplanError as error:
+                    failed[name] = str(error)
+                    continue
+            results.append(found)
+            finished(found)
+    return RestoreReport(tuple(results), failed, plan.filter, request.folder)
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder}: no such folder, and it cannot be made ({error.strerror})") from None
