@@ -145,6 +145,15 @@ def test_fault_14_degrees_read_as_gon_and_radians() -> None:
     assert "--angle-unit deg" in fails(assess(views(opk, centers, unit="rad"), hills))
 
 
+def test_fault_14_the_declared_unit_is_the_one_that_is_named() -> None:
+    opk, centers = strips()
+    text = fails(assess(views((opk + 180) % 360 - 180, centers, np.radians, unit="gon"), hills))
+    assert "radians that were declared as gon; declare --angle-unit rad" in text
+    opk, centers = strips(heading=150)
+    text = fails(assess(views(opk, centers, lambda a: a / 0.9, unit="rad"), hills))
+    assert "gon that were declared as radians; declare --angle-unit gon" in text
+
+
 def test_fault_14_radians_read_as_degrees() -> None:
     opk, centers = strips()
     text = fails(assess(views((opk + 180) % 360 - 180, centers, np.radians), hills))
@@ -226,26 +235,30 @@ def test_every_reading_has_a_sentence_and_the_declared_one_none() -> None:
 
 
 @pytest.mark.parametrize(
-    ("written", "says"),
+    ("written", "unit", "says"),
     [
-        (lambda a: a, None),
-        (np.radians, "--angle-unit rad"),
-        (lambda a: a + np.array([180.0, 0, 0]), "turned by 180°"),
-        (np.degrees, "--angle-unit deg"),
+        (lambda a: a, "deg", None),
+        (np.radians, "deg", "--angle-unit rad"),
+        (lambda a: a + np.array([180.0, 0, 0]), "deg", "turned by 180°"),
+        (np.degrees, "deg", "--angle-unit deg"),
+        (lambda a: a, "rad", "degrees that were declared as radians; declare --angle-unit deg"),
     ],
 )
-def test_fault_14_on_the_real_drone_block(block: Path, written: Callable[[np.ndarray], Any], says: str | None) -> None:
+def test_fault_14_on_the_real_drone_block(
+    block: Path, written: Callable[[np.ndarray], Any], unit: str, says: str | None
+) -> None:
     """The terrain ends inside this block, so a fifth of its images look past it."""
     camera = next(iter(read_cameras(block / "int.yaml").cameras.values()))
     reader = TerrainReader(block / "dsm.tif")
     assert reader.info.to_map is not None
     x0, xx, _, y0, _, yy = reader.info.to_map
     surface = RasterSurface(reader, (x0, y0), (xx, -yy))
+    declared = Orientation.model_validate({"angle_unit": unit})
     made = []
     for line in read_orientation(block / "ext.csv").images:
         angles = tuple(float(v) for v in written(np.array(line.angles)))
         image = Image(name=line.name, file="x.jpg", camera="c", center=line.center, angles=angles)
-        made.append(view_of(image, camera, Orientation(), line.center))
+        made.append(view_of(image, camera, declared, line.center))
     result = assess(made, surface.heights)
     if says is None:
         assert result.implausible == ()

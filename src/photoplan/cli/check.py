@@ -32,6 +32,8 @@ def command(project: Path, images: tuple[str, ...], as_json: bool) -> None:
         click.echo(str(found))
     if found.implausible or found.alternative is not None:
         faults = f"{len(found.implausible)} of {len(found.images)} images are implausible"
+        if not found.implausible:
+            faults = "another reading of the orientation fits better"
         first = f": {found.implausible[0]}" if found.implausible else ""
         remedy = found.alternative or "no other reading of the angles fits; look at heights, axes and image names"
         raise GeometryError(f"{project}: {faults}{first}\n{remedy}")

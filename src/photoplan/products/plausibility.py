@@ -18,7 +18,7 @@ from photoplan.io.camera_model import FilmCamera, FrameCamera
 from photoplan.io.orientation.table import angle_in_radians
 from photoplan.io.project_cameras import interior_of, lens_of
 from photoplan.io.project_model import Image, Orientation
-from photoplan.products.readings import DECLARED, Reading, readings
+from photoplan.products.readings import CIRCLE, DECLARED, Reading, readings
 
 __all__ = ["ImagePlausibility", "Plausibility", "View", "assess", "view_of"]
 
@@ -56,6 +56,8 @@ class View:
     """Ideal directions (n, 2) of points spread over the image, x right, y up; the first is the image's middle."""
     pixel: float
     """Angle of a pixel in the middle, radians."""
+    unit: str = "deg"
+    """Unit of the angles in the project."""
 
     @property
     def R_ground_camera(self) -> NDArray[np.float64]:
@@ -206,7 +208,7 @@ def _alternative(views: list[View], images: tuple[ImagePlausibility, ...], heigh
     if not evidence.doubtful:
         return None
     ranked: list[tuple[tuple[float, ...], Reading, list[ImagePlausibility]]] = []
-    for reading in readings(sample[0].order):
+    for reading in readings(sample[0].order, sample[0].unit):
         # What one change explains needs no second, except where only the second makes the images upright.
         if ranked and reading.changes > ranked[0][1].changes and (ranked[0][0][0] < 0 or len(sample) < ENOUGH):
             break
@@ -240,7 +242,7 @@ class _Evidence:
     offset: float
     """Mean angle between image axes and flight lines, degrees, modulo 90."""
     largest: float
-    """Largest declared angle as a number of degrees."""
+    """Largest declared angle, parts of a full circle."""
     count: int
 
     @classmethod
@@ -255,7 +257,7 @@ class _Evidence:
             max(tilts),
             alike,
             offset,
-            float(np.degrees(max(np.abs(v.angles).max() for v in views))),
+            float(max(np.abs(v.angles).max() for v in views) / (2 * np.pi)),
             len(views),
         )
 
@@ -287,16 +289,19 @@ class _Evidence:
             return self.alike > 0.97 and abs(self.offset) < 5
         # All images lie alike, but askew. Only readings that people really mix up count then, since a heading that was
         # kept askew to the lines on purpose looks the same.
-        usual = reading in (Reading(unit="rad"), Reading(transposed=True))
+        usual = reading.changes == 1 and (reading.unit == "rad" or reading.transposed)
         return usual and self.alike > 0.9 and abs(self.offset) < 8
 
 
 def _possible(reading: Reading, largest: float) -> bool:
-    """Whether the largest declared angle, as a number of degrees, can be what the reading takes it for."""
+    """Whether the largest declared angle, in parts of a full circle, can be what the reading takes it for."""
     if reading.unit == "rad":
-        return largest < 2 * np.pi
-    # Angles divided by 57 are upright whatever they were: only more than a full circle lets one think of that.
-    return reading.unit != "rad to deg" or largest > 360.0
+        return largest * CIRCLE[reading.declared] < CIRCLE["rad"]
+    if reading.unit is None or reading.declared != "rad":
+        return True
+    # Angles divided by 57 are upright whatever they were: only more than a full circle lets one think of that, and only
+    # more than 360 of gon.
+    return largest > 1.0 and (reading.unit == "gon") == (largest * CIRCLE["rad"] > CIRCLE["deg"])
 
 
 def _sample(views: list[View], images: tuple[ImagePlausibility, ...]) -> list[int]:
@@ -360,4 +365,6 @@ def view_of(image: Image, camera: FrameCamera | FilmCamera, orientation: Orienta
     pixel = float(np.linalg.norm(t[1] - t[2]))
     angles = angle_in_radians(np.array(image.pose_numbers[1]), orientation.angle_unit)
     points = np.delete(t, [1, 2], axis=0)
-    return View(image.name, np.asarray(center, float), angles, orientation.rotation, points, pixel)
+    return View(
+        image.name, np.asarray(center, float), angles, orientation.rotation, points, pixel, orientation.angle_unit
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,15 +12,15 @@ from photoplan.geometry.rotation import ROTATION_ORDERS, rotation_from_angles
 
 __all__ = ["DECLARED", "Reading", "readings"]
 
-#: Factor from the declared unit to the true one, and what that means.
-UNITS = {
-    "gon": (0.9, "gon that were declared as degrees; declare --angle-unit gon"),
-    "rad": (180.0 / np.pi, "radians that were declared as degrees; declare --angle-unit rad"),
-    "gon to deg": (1 / 0.9, "degrees that were declared as gon; declare --angle-unit deg"),
-    "rad to deg": (
-        np.pi / 180.0,
-        "degrees that were declared as radians; declare --angle-unit deg",
-    ),
+#: Parts of a full circle of each unit, and what it is called.
+CIRCLE = {"deg": 360.0, "gon": 400.0, "rad": 2 * np.pi}
+NAMES = {"deg": "degrees", "gon": "gon", "rad": "radians"}
+#: True and declared units that are thought of, by the project's. `photoplan init` writes tables of gon and radians in
+#: degrees, so what was declared there may have been any.
+_UNITS = {
+    "deg": (("gon", "deg"), ("rad", "deg"), ("deg", "gon"), ("deg", "rad")),
+    "gon": (("rad", "gon"), ("deg", "gon")),
+    "rad": (("gon", "rad"), ("deg", "rad")),
 }
 
 
@@ -28,7 +29,7 @@ class Reading:
     """One way to read three angles and a projection centre."""
 
     unit: str | None = None
-    """Key of `UNITS`; None: as declared."""
+    """Unit that the numbers are in, a key of `CIRCLE`; None: as declared."""
     order: str | None = None
     """Rotation order; None: as declared."""
     transposed: bool = False
@@ -39,6 +40,8 @@ class Reading:
     """The ground's axes are Y south, Z down."""
     swapped: bool = False
     """X and Y of the projection centre are exchanged."""
+    declared: str = "deg"
+    """Unit that is declared."""
 
     @property
     def changes(self) -> int:
@@ -59,7 +62,10 @@ class Reading:
         """What the user would have to declare or repair."""
         parts = []
         if self.unit is not None:
-            parts.append(f"the angles look like {UNITS[self.unit][1]}")
+            parts.append(
+                f"the angles look like {NAMES[self.unit]} that were declared as {NAMES[self.declared]}; "
+                f"declare --angle-unit {self.unit}"
+            )
         if self.order is not None:
             parts.append(f"the rotation order looks like {self.order}; declare --rotation {self.order}")
         if self.transposed:
@@ -77,7 +83,7 @@ class Reading:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Projection centre (3,) and R_ground_camera (3, 3) of declared numbers (radians) under this reading."""
         if self.unit is not None:
-            angles = angles * UNITS[self.unit][0]
+            angles = angles * (CIRCLE[self.declared] / CIRCLE[self.unit])
         if self.order is not None:
             # An angle keeps its axis; only the sequence of rotations changes.
             named = dict(zip(order, angles))
@@ -95,16 +101,16 @@ class Reading:
 DECLARED = Reading()
 
 
-def readings(order: str) -> list[Reading]:
-    """All readings with one change, then those with two; `order` is the declared one."""
+def readings(order: str, unit: str = "deg") -> list[Reading]:
+    """All readings with one change, then those with two; `order` and `unit` are those of the project."""
     others = [o for o in ROTATION_ORDERS if o != order]
-    units = list(UNITS)
-    one = [Reading(unit=u) for u in units]
+    units = [partial(Reading, unit=true, declared=stated) for true, stated in _UNITS[unit]]
+    one = [made() for made in units]
     one += [Reading(transposed=True), Reading(camera_flipped=True), Reading(ground_flipped=True), Reading(swapped=True)]
     one += [Reading(order=o) for o in others]
-    two = [Reading(unit=u, order=o) for u in units for o in others]
-    two += [Reading(unit=u, transposed=True) for u in units]
-    two += [Reading(unit=u, camera_flipped=True) for u in units] + [Reading(unit=u, ground_flipped=True) for u in units]
+    two = [made(order=o) for made in units for o in others]
+    two += [made(transposed=True) for made in units]
+    two += [made(camera_flipped=True) for made in units] + [made(ground_flipped=True) for made in units]
     two += [Reading(order=o, transposed=True) for o in others]
     two += [Reading(order=o, camera_flipped=True) for o in others]
     two += [Reading(transposed=True, camera_flipped=True), Reading(transposed=True, ground_flipped=True)]
