@@ -120,3 +120,23 @@ def test_images_without_orientation_are_told(photoplan: Here, block: Path, near:
 def test_wrong_use(photoplan: Here, block: Path, near: Path, options: list[object], message: str) -> None:
     said = photoplan(*words(block, near, *options))
     assert said.code == 2 and message in said.err, said
+
+
+def test_orthophotos_of_two_resolutions_are_refused(photoplan: Here, block: Path, near: Path, tmp_path: Path) -> None:
+    """Patches of the second one were compared at the first one's scale: none was ever found."""
+    coarse = tmp_path / "coarse.tif"
+    with rasterio.open(block / "ref_ortho_from_cloud.tif") as source:
+        pixels, profile = source.read()[:, ::2, ::2], source.profile
+    profile |= {"transform": profile["transform"] @ rasterio.Affine.scale(2)}
+    with rasterio.open(coarse, "w", **profile | {"width": pixels.shape[2], "height": pixels.shape[1]}) as out:
+        out.write(pixels)
+    said = photoplan(*words(block, near, "--ortho", coarse))
+    assert said.code == 3 and "pixels of 0.4 m, those of" in said.err and "are 0.2 m" in said.err
+    assert not near.with_name("control.csv").exists()
+
+
+def test_what_no_patch_can_reach(photoplan: Here, block: Path, near: Path) -> None:
+    said = photoplan(*words(block, near, "--correlation", 2))
+    assert said.code == 2 and "--correlation 2" in said.err
+    said = photoplan(*words(block, near, "--correlation", 0.9999, "--images", IMAGES[0], "--grid", 3))
+    assert said.code == 3 and "no patch of the orthophoto was found in an image: " in said.err and " unlike" in said.err

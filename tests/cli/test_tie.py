@@ -44,6 +44,7 @@ def test_table_project_and_picture(photoplan: Here, project: Path) -> None:
     assert lines[0] == str(output) and lines[1] == str(output.with_suffix(".png"))
     assert output.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"
     assert "3 tried (pairs with common ground" in said.out and "loops" in said.out
+    text_sigma = float(said.out.split("standard deviation ")[1].split()[0])
     points = read_image_points(output)
     assert set(points.images) == set(NEAR) and len(points.points) > 60
     assert load_project(project).observations.image_points == ("a.csv",)
@@ -53,6 +54,7 @@ def test_table_project_and_picture(photoplan: Here, project: Path) -> None:
     found = json.loads(said.out)
     assert said.err == ""
     assert found["points"] == len(points.points) and found["pairs"] == {"tried": 3, "verified": 3}
+    assert text_sigma == pytest.approx(found["sigma"], rel=0.05)  # 0.01 px was printed of 0.006
     assert found["unconnected"] == [] and found["loops"]["factor"] >= 1
     assert load_project(project).observations.image_points == ("a.csv",)
 

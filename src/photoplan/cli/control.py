@@ -65,7 +65,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     plane, height, image = found.sigma
     click.echo(
         f"{found.points} control points of {found.patches} patches at {found.resolution:g} m; standard deviations "
-        f"{plane:.2f} m, height {height:.2f} m, image {image:.2f} px (medians)"
+        f"{plane:.2g} m, height {height:.2g} m, image {image:.2g} px (medians)"
     )
     width = max(5, *(len(i.name) for i in found.images))
     click.echo(f"{'image':{width}}  tried found  kept  shift px          residual px")

@@ -67,7 +67,7 @@ def _print(found: TieReport) -> None:
         ("images", f"{len(found.images)}, features at scale 1/{found.factor}"),
         ("pairs", f"{found.pairs} tried ({found.chosen}), {found.verified} verified"),
         ("tracks", f"{found.tracks} found, {found.ambiguous} ambiguous ones dropped"),
-        ("tie points", f"{found.points}, standard deviation {found.sigma:.2f} px (median)"),
+        ("tie points", f"{found.points}, standard deviation {found.sigma:.2g} px (median)"),
         ("  in images", ", ".join(f"{rays}: {count}" for rays, count in found.rays.items())),
     ]
     if found.refined is not None and found.loops is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,7 +36,7 @@ class ControlRequest:
 
     project: Path
     ortho: tuple[Path, ...]
-    """Orthophotos in the project's CRS; the first one that has a value counts."""
+    """Orthophotos in the project's CRS, of one resolution; the first one that has a value counts."""
     height_sigma: float
     """Standard deviation of the heights, metres."""
     heights: Path | None = None
@@ -144,6 +145,10 @@ def propose_control(request: ControlRequest, stage: Stage = unwatched) -> Contro
     ground, points = _tables(patches, covariances, images)
     if not len(points):
         found = sum(i.matched for i in images)
+        if not found:
+            reasons = sum((Counter(i.reasons) for i in images), Counter[str]())
+            listed = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common()) or "none is in an image"
+            raise GeometryError(f"no patch of the orthophoto was found in an image: {listed}")
         raise GeometryError(
             f"{found} of {sum(i.tried for i in images)} patches were found, but they do not agree on an orientation of "
             "any image; give a larger --search, another --correlation, or an orthophoto of a similar date"
@@ -178,6 +183,8 @@ def _check(request: ControlRequest, project: Project) -> tuple[Path, Path]:
     ):
         if not (np.isfinite(value) and value >= low):
             raise UsageError(f"{what} {value:g}; {low:g} or more is needed")
+    if not -1 <= request.correlation < 1:
+        raise UsageError(f"--correlation {request.correlation:g}; a number below 1 is needed, such as 0.7")
     if request.ortho_sigma is not None and not request.ortho_sigma > 0:
         raise UsageError(f"--ortho-sigma {request.ortho_sigma:g}; a positive number of metres is needed")
     output = request.output or request.project.resolve().parent / "control.csv"
@@ -193,7 +200,7 @@ def _check(request: ControlRequest, project: Project) -> tuple[Path, Path]:
 
 
 def _open_ortho(request: ControlRequest, project: Project) -> Ortho:
-    readers = []
+    readers: list[RasterReader] = []
     for path in request.ortho:
         reader = RasterReader(Path(path))
         info = reader.info
@@ -207,6 +214,12 @@ def _open_ortho(request: ControlRequest, project: Project) -> Ortho:
         _, xx, xy, _, yx, yy = info.to_map
         if xy or yx or xx <= 0 or abs(xx + yy) > 1e-6 * xx:
             raise InputError(f"{path}: pixels are not square, or the raster is not north-up; use gdalwarp first")
+        if readers and abs(xx / Ortho((readers[0],)).resolution - 1) > 1e-4:
+            first = f"{request.ortho[0]} are {Ortho((readers[0],)).resolution:g} m"
+            raise InputError(
+                f"{path}: pixels of {xx:g} m, those of {first}; orthophotos of one run need "
+                "the same: use gdalwarp -tr, or a run for each with an --output of its own"
+            )
         readers.append(reader)
     return Ortho(tuple(readers))
 
