@@ -80,6 +80,14 @@ class TestBuilt:
         (wrong,) = facts["gross_errors"]
         assert f"(record {len(ground()) // 3 + 1})" in wrong["name"] and wrong["residual"] == pytest.approx(2, abs=0.3)
 
+    def test_level_ground_is_as_noisy_as_its_points(self, photoplan: Here, tmp_path: Path) -> None:
+        xy = scattered(40.0, 700, 3)
+        level = np.column_stack([xy, 250 + np.random.default_rng(4).normal(0, 0.05, len(xy))])
+        points, model = write_text(tmp_path / "lake.csv", level + SHIFT), tmp_path / "m.gpkg"
+        said = photoplan("dtm", "build", points, "-o", model, "--crs", "EPSG:32633", "--json", "-q", "--no-report")
+        assert said.code == 0, said.err
+        assert json.loads(said.out)["noise"] == pytest.approx(0.05, rel=0.12)
+
     def test_dry_run_writes_nothing(self, photoplan: Here, survey: Path, tmp_path: Path) -> None:
         before = sorted(tmp_path.iterdir())
         said = photoplan("dtm", "build", survey, "-o", tmp_path / "m.gpkg", "--dry-run")

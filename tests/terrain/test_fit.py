@@ -55,6 +55,15 @@ def test_parameters_of_random_fields_are_recovered(family: str, length: float, n
     assert (np.abs(relative - 1) < 0.2).all(), relative
 
 
+def test_on_level_ground_the_whole_spread_of_the_heights_is_noise() -> None:
+    """A lake, an airfield: no signal at all. The noise is not bounded by the median of the deviations."""
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        place = rng.uniform(0, 250, (1000, 2)) + 1000
+        found = estimated(np.column_stack([place, 100 + rng.normal(0, 0.05, 1000)]), "auto")
+        assert found.noise == pytest.approx(0.05, rel=0.15)
+
+
 def test_the_smoothest_and_the_roughest_family_are_told_apart() -> None:
     for family in ("gaussian", "exponential"):
         assert estimated(sample(family, 4.0, 3, 0.02, 3000), "auto").name == family

@@ -33,6 +33,8 @@ _WIDE = 4
 _EXPECTED = np.array([0.5, 0.35, 0.3])
 #: Bounds of the half-value distance in spacings of the points.
 _SHORTEST, _LONGEST = 0.5, 30.0
+#: Bound of the noise's variance, in squares of the median deviation of the heights from their mean.
+_MOST_NOISE = 10.0
 #: Data further than this from their block's plane, in robust standard deviations, do not count in the estimation.
 _OUTLIER = 6.0
 
@@ -210,7 +212,8 @@ def _start(
     size = float(np.median(np.abs(blocks.b[..., 0]))) or 1.0
     variance = size**2 + 1e-8
     low = np.log([1e-8 * variance, _SHORTEST * seen.spacing, 1e-8 * variance])
-    high = np.log([1e4 * variance, _LONGEST * seen.spacing, variance])
+    # On level ground the whole variance is noise: 2.2 times the square of the median deviation, and more by chance.
+    high = np.log([1e4 * variance, _LONGEST * seen.spacing, _MOST_NOISE * variance])
     first = np.log([0.3 * variance, 4 * seen.spacing, 0.01 * variance])
     given = settings.filters.get("mass")
     if given is not None:
