@@ -13,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
-from photoplan.geometry.rotation import rotation_from_angles
+from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles
 from photoplan.io.named_table import write_named_table
 from photoplan.io.orientation.table import angle_in_radians
 from photoplan.io.polygons import read_features, write_features
@@ -136,7 +136,7 @@ def monoplot_file(request: MonoplotRequest) -> MonoplotReport:
         sigma,
         request.sigma_position,
         tuple(float(a) for a in angle_in_radians(np.array(request.sigma_angles), unit)),  # type: ignore[arg-type]
-        _axes(pose.opk),
+        _axes(pose.R_ground_camera, project.orientation.rotation),
     )
     height_range = scene.surface.height_range(scene.terrain_bounds)
     found = monoplot(scene.camera, given.xy, scene.surface, height_range, errors, mesh)
@@ -168,12 +168,17 @@ def _mesh_and_sigma(
     return terrain.resolution, surface.sigmas if isinstance(surface, HybridSurface) else None
 
 
-def _axes(opk: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Axes in ground space about which small changes of ω, φ and κ turn the camera: R = R_ω R_φ R_κ."""
-    omega, phi, _ = opk
-    about_omega = rotation_from_angles(np.array([omega, 0.0, 0.0]))
-    both = rotation_from_angles(np.array([omega, phi, 0.0]))
-    return np.stack([np.array([1.0, 0.0, 0.0]), about_omega[:, 1], both[:, 2]])
+def _axes(R_ground_camera: NDArray[np.float64], order: str) -> NDArray[np.float64]:
+    """Axes in ground space about which small changes of ω, φ and κ turn the camera, by the project's rotation order.
+
+    Each turns about its own axis, which the rotations before it in the order have moved.
+    """
+    angles = angles_from_rotation(R_ground_camera, order)
+    axes = np.empty((3, 3))
+    for k, letter in enumerate(order):
+        before = rotation_from_angles(np.where(np.arange(3) < k, angles, 0.0), order)
+        axes["opk".index(letter)] = before[:, "opk".index(letter)]
+    return axes
 
 
 def _read(request: MonoplotRequest) -> _Given:
