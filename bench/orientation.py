@@ -35,7 +35,7 @@ SIMULATED = """
 import sys
 sys.path.insert(0, sys.argv[1])
 from tools.sim_block import simulate
-from photoplan.orientation.bundle import adjust_block
+from photoplan.orientation.bundle.adjust import adjust_block
 strips, images, points = map(int, sys.argv[2:5])
 block = simulate(1, strips=strips, images=images, per_image=points, gnss=0.05, gross=0.02, control=25).block
 if sys.argv[5] == "adjust":

@@ -12,9 +12,9 @@ import yaml
 from pyproj import Transformer
 from rpc import fit_rpc
 
-from photoplan.io.project import load_project
-from photoplan.products.init import InitRequest, init_project
-from photoplan.products.scene import open_scene
+from photoplan.io.project.file import load_project
+from photoplan.products.init.run import InitRequest, init_project
+from photoplan.project.scene import open_scene
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 WORK = CHECKOUT / "bench" / "_work"

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from photoplan.geometry.triangulation import constrained_faces
 from photoplan.io.terrain.files import read_measured
 from photoplan.surfaces.measured import MeasuredTerrain
-from photoplan.terrain.clean import clean
+from photoplan.terrain.clean.run import clean
 
 
 def network(measured: MeasuredTerrain) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

@@ -10,8 +10,8 @@ from pydantic import TypeAdapter
 
 from photoplan.cameras.mark_pattern import MarkPattern
 from photoplan.io.mark_model import Mark
-from photoplan.orientation.mark_template import render
-from photoplan.products.camera_marks import mark_pattern
+from photoplan.orientation.marks.template import render
+from photoplan.project.camera_marks import mark_pattern
 
 MARKS = {
     "cross": {"type": "cross", "arm": 1.0, "width": 0.12, "free": 0.2},

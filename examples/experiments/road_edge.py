@@ -35,7 +35,7 @@ from photoplan.surfaces.memory_units import MemoryUnits
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.build import Built, build, plan_build
-from photoplan.terrain.clean import clean
+from photoplan.terrain.clean.run import clean
 from photoplan.terrain.settings import BuildSettings
 
 CENTRE, RADIUS = np.array([70.0, -85.0]), 150.0

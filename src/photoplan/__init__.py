@@ -20,11 +20,11 @@ from typing import Any
 __version__ = "0.1.0"
 
 _HOME = {
-    "load_project": "photoplan.io.project",
-    "plan_orthophotos": "photoplan.products.orthophoto",
-    "execute": "photoplan.products.execution",
-    "render": "photoplan.products.orthophoto",
-    "read_plan": "photoplan.products.plan_file",
+    "load_project": "photoplan.io.project.file",
+    "plan_orthophotos": "photoplan.products.orthophoto.plan",
+    "execute": "photoplan.products.orthophoto.execution",
+    "render": "photoplan.products.orthophoto.plan",
+    "read_plan": "photoplan.products.orthophoto.plan_file",
 }
 
 __all__ = ["__version__", *_HOME]

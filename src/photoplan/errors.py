@@ -16,17 +16,6 @@ A message says what was given, what is allowed, which file, point or image, and 
 
 from __future__ import annotations
 
-__all__ = [
-    "GeometryError",
-    "HeightSystemError",
-    "InputError",
-    "PhotoplanError",
-    "ResourceError",
-    "RunLocked",
-    "TilesFailed",
-    "UsageError",
-]
-
 
 class PhotoplanError(Exception):
     """Base of every error that photoplan raises on purpose; `exit_code` is what the command line returns."""

@@ -14,8 +14,8 @@ from tools.real_projects import drone_project
 
 from photoplan.io.ground_points import read_ground_points
 from photoplan.io.image_points import read_image_points
-from photoplan.io.project import load_project
-from photoplan.io.project_edit import ProjectChanges, edit_project
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
 
 IMAGES = ("DJI_0025", "DJI_0026", "DJI_0027")
 

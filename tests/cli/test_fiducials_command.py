@@ -12,8 +12,8 @@ import rasterio
 from tools.command import Here
 from tools.mark_scans import ARM, CORNERS, FREE, LINE, RADIUS, Simulated, simulate
 
-from photoplan.io.project import load_project
-from photoplan.io.project_cameras import fiducial_fit
+from photoplan.io.project.cameras import fiducial_fit
+from photoplan.io.project.file import load_project
 
 MARKS = (
     f'marks = {{ type = "ring_cross", diameter = {2 * RADIUS + LINE}, width = {LINE}, arm = {ARM}, '

@@ -13,7 +13,7 @@ import rasterio
 from tools.command import Here
 from tools.film_scan import Film, Scan
 
-from photoplan.io.project import load_project
+from photoplan.io.project.file import load_project
 
 FILM = Film((0.0, 0.0, 1500.0))
 MARKS = Scan(FILM, np.zeros((1, 1), np.uint8)).marks

@@ -363,8 +363,8 @@ def rendered(block: Path) -> list[str]:
     from photoplan.cameras.base import project as project_points
     from photoplan.cameras.build import oriented_camera
     from photoplan.geometry.pose import Pose
-    from photoplan.io.project import load_project
-    from photoplan.io.project_cameras import interior_of, lens_of
+    from photoplan.io.project.cameras import interior_of, lens_of
+    from photoplan.io.project.file import load_project
 
     project = load_project(block / "project.toml")
     image = project.image("a2")

@@ -19,8 +19,8 @@ from photoplan.cli.resect import command
 from photoplan.errors import GeometryError, InputError, TilesFailed, UsageError
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_from_angles
-from photoplan.io.project import load_project
-from photoplan.products.scene import open_scene
+from photoplan.io.project.file import load_project
+from photoplan.project.scene import open_scene
 
 SIZE, C = (4000, 3000), 3200.0
 LENS = Brown(k1=-0.05)

@@ -13,7 +13,7 @@ from tools.command import Here
 
 from photoplan.io.simulation_file import SimulationFile, read_simulation
 from photoplan.io.whole_image import write_whole_image
-from photoplan.products.simulate_model import model_of
+from photoplan.products.simulate.model import model_of
 from photoplan.quality.formation.model import ImageModel, form_image
 from photoplan.quality.formation.scenes import PatternScene
 

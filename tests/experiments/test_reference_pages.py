@@ -11,7 +11,7 @@ import pytest
 
 from photoplan.cli.dtm import VERBS as DTM_VERBS
 from photoplan.cli.main import VERBS
-from photoplan.io.project import project_schema
+from photoplan.io.project.file import project_schema
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError
-from photoplan.io.camera_file import read_cameras
-from photoplan.io.camera_model import FilmCamera, FrameCamera, NoLens, OpenCVFisheyeLens, OpenCVLens
-from photoplan.io.camera_opensfm import resized
+from photoplan.io.camera.file import read_cameras
+from photoplan.io.camera.model import FilmCamera, FrameCamera, NoLens, OpenCVFisheyeLens, OpenCVLens
+from photoplan.io.camera.opensfm import resized
 
 
 def write(folder: Path, name: str, content: str | object) -> Path:

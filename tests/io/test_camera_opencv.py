@@ -11,12 +11,12 @@ import pytest
 from tools.format_examples import assert_same_cameras, block_of, frame
 
 from photoplan.errors import InputError
-from photoplan.io.camera_file import read_cameras
-from photoplan.io.camera_opencv import render
+from photoplan.io.camera.file import read_cameras
+from photoplan.io.camera.opencv import render
 from photoplan.io.orientation.block import OrientationBlock
 from photoplan.io.orientation.file import read_orientation, write_orientation
-from photoplan.io.project_cameras import interior_of, lens_of
-from photoplan.io.project_model import Image
+from photoplan.io.project.cameras import interior_of, lens_of
+from photoplan.io.project.model import Image
 
 YAML = """%YAML:1.0
 ---

@@ -11,10 +11,10 @@ import pytest
 
 from photoplan.cameras.interior import Interior
 from photoplan.errors import InputError
-from photoplan.io.camera_file import read_cameras
-from photoplan.io.camera_model import FilmCamera
-from photoplan.io.camera_usgs import distance_differences
-from photoplan.io.project_cameras import lens_of
+from photoplan.io.camera.file import read_cameras
+from photoplan.io.camera.model import FilmCamera
+from photoplan.io.camera.usgs import distance_differences
+from photoplan.io.project.cameras import lens_of
 
 TEMPLATE = Path(__file__).resolve().parents[2] / "docs" / "templates" / "usgs-camera.toml"
 PRINTED = {"1-2": 311.128, "3-4": 311.116, "5-6": 224.002, "7-8": 223.996}

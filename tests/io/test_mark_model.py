@@ -13,11 +13,11 @@ from pydantic import TypeAdapter, ValidationError
 
 from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
 from photoplan.errors import InputError
-from photoplan.io.camera_file import read_cameras
-from photoplan.io.camera_model import FilmCamera
+from photoplan.io.camera.file import read_cameras
+from photoplan.io.camera.model import FilmCamera
 from photoplan.io.mark_model import Mark
-from photoplan.io.project_write import camera_lines
-from photoplan.products.camera_marks import mark_pattern, mark_patterns
+from photoplan.io.project.write import camera_lines
+from photoplan.project.camera_marks import mark_pattern, mark_patterns
 
 KINDS: list[dict[str, Any]] = [
     {"type": "cross", "arm": 1.0, "width": 0.1, "free": 0.2, "rotation": 45.0},

@@ -18,7 +18,8 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import HeightSystemError, InputError, UsageError
-from photoplan.io.terrain.files import CodeClass, CodeTable, ReadOptions, read_measured
+from photoplan.io.terrain.files import read_measured
+from photoplan.io.terrain.options import CodeClass, CodeTable, ReadOptions
 
 laspy = pytest.importorskip("laspy", reason="needs laspy")
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io.terrain.files import CodeClass, CodeTable, ReadOptions, read_code_table, read_measured
+from photoplan.io.terrain.files import read_measured
+from photoplan.io.terrain.options import CodeClass, CodeTable, ReadOptions, read_code_table
 from photoplan.surfaces.measured import MeasuredTerrain
 
 Write = Callable[..., Path]

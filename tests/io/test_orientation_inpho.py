@@ -7,7 +7,7 @@ import pytest
 from tools.orientation_blocks import CAMERA, CENTERS, GROUND, NAMES, block, our_pixels, pixels_of_matrix
 
 from photoplan.errors import InputError
-from photoplan.io.camera_model import BrownLens, FilmCamera, FrameCamera
+from photoplan.io.camera.model import BrownLens, FilmCamera, FrameCamera
 from photoplan.io.orientation.block import without_lenses
 from photoplan.io.orientation.file import orientation_format, read_orientation_block, write_orientation
 from photoplan.io.orientation.table import TableFormat

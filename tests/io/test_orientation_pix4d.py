@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from tools.format_examples import assert_same, block_of, frame, pixels, round_trip
 
 from photoplan.errors import InputError
-from photoplan.io.camera_file import read_cameras
+from photoplan.io.camera.file import read_cameras
 from photoplan.io.orientation.block import without_lenses
 from photoplan.io.orientation.file import orientation_format, read_orientation_block
 

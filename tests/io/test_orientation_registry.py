@@ -5,7 +5,7 @@ import pytest
 from tools.orientation_blocks import CAMERA, block, our_pixels
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io.camera_model import FilmCamera
+from photoplan.io.camera.model import FilmCamera
 from photoplan.io.orientation import file as orientation_file
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation.file import (

@@ -10,9 +10,9 @@ import pytest
 from photoplan.cameras.frame import FrameCamera as ComputingCamera
 from photoplan.errors import InputError
 from photoplan.geometry.pose import Pose
-from photoplan.io.camera_model import BrownLens, FilmCamera, FrameCamera, OpenCVLens, RadialTableLens
-from photoplan.io.project_cameras import fiducial_fit, image_size, interior_of, lens_of
-from photoplan.io.project_model import Image
+from photoplan.io.camera.model import BrownLens, FilmCamera, FrameCamera, OpenCVLens, RadialTableLens
+from photoplan.io.project.cameras import fiducial_fit, image_size, interior_of, lens_of
+from photoplan.io.project.model import Image
 
 IMAGE = Image(name="a", file="a.tif", camera="c", center=(0, 0, 0), angles=(0, 0, 0))
 # Ecker 1991, §8.1; rows counted upwards there, so the film counts as mirrored.

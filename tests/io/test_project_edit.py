@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io.project import load_project
-from photoplan.io.project_edit import ProjectChanges, edit_project
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
 
 WRITTEN = """# The block of 1987.
 format = 1

@@ -11,14 +11,14 @@ from tools.sim_block import FOCAL, Simulated, simulate
 from photoplan.cameras.lenses.brown import Brown
 from photoplan.cameras.lenses.opencv import OpenCV
 from photoplan.cameras.plane import Bilinear2D
-from photoplan.orientation.active import Active
-from photoplan.orientation.block import PARAMETERS, Adjusted, AdjustSettings, BlockCamera
-from photoplan.orientation.bundle import adjust_block
-from photoplan.orientation.bundle_model import build_model
-from photoplan.orientation.bundle_robust import weights_of
-from photoplan.orientation.bundle_rows import linearise, residuals_of, whitened
-from photoplan.orientation.bundle_select import select, start_points
-from photoplan.orientation.bundle_state import rotation_vector, start_state
+from photoplan.orientation.bundle.active import Active
+from photoplan.orientation.bundle.adjust import adjust_block
+from photoplan.orientation.bundle.block import PARAMETERS, Adjusted, AdjustSettings, BlockCamera
+from photoplan.orientation.bundle.model import build_model
+from photoplan.orientation.bundle.robust import weights_of
+from photoplan.orientation.bundle.rows import linearise, residuals_of, whitened
+from photoplan.orientation.bundle.select import select, start_points
+from photoplan.orientation.bundle.state import rotation_vector, start_state
 
 FILM = ("c", "x0", "y0")
 PLAIN = AdjustSettings(robust=False, variance_components=False)
@@ -286,7 +286,7 @@ def test_lever_arm_drift_and_boresight_are_recovered() -> None:
     simulated = simulate(4, strips=4, images=8, per_image=40, gnss=0.03, attitude=2e-4, cross=True, control=16)
     block = simulated.block
     lever, turn = np.array([0.4, -0.3, 1.2]), np.array([0.004, -0.002, 0.006])
-    from photoplan.orientation.bundle_state import small_rotations
+    from photoplan.orientation.bundle.state import small_rotations
 
     R = np.array([p.R_ground_camera for p in simulated.poses])
     strips = np.array([int(s[1:]) for s in block.positions.strip])

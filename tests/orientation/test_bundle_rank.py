@@ -10,7 +10,7 @@ from tools.sim_block import simulate
 
 from photoplan.cameras.lenses.radial_table import RadialTable
 from photoplan.errors import GeometryError, UsageError
-from photoplan.orientation.bundle import adjust_block
+from photoplan.orientation.bundle.adjust import adjust_block
 
 
 def test_fault_16_a_block_without_control_has_no_datum() -> None:

@@ -11,12 +11,12 @@ from scipy import ndimage
 
 from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
 from photoplan.errors import InputError
-from photoplan.orientation import mark_catalogue as free
-from photoplan.orientation import mark_silhouettes as frame
-from photoplan.orientation.mark_alone import find_mark
-from photoplan.orientation.mark_edges import fit_edges, pattern_edges
-from photoplan.orientation.mark_locate import locate_mark
-from photoplan.orientation.mark_template import coverage, render
+from photoplan.orientation.marks import catalogue as free
+from photoplan.orientation.marks import silhouettes as frame
+from photoplan.orientation.marks.alone import find_mark
+from photoplan.orientation.marks.edges import fit_edges, pattern_edges
+from photoplan.orientation.marks.locate import locate_mark
+from photoplan.orientation.marks.template import coverage, render
 
 SNR = 20.0
 SCALE = 40.0

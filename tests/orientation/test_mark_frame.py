@@ -12,10 +12,10 @@ from scipy import ndimage
 from tools.mark_scans import ArrayScan
 
 from photoplan.io import mark_model
-from photoplan.orientation.fiducials import FiducialSearch, find_fiducials
-from photoplan.orientation.mark_layout import MarkLayout
-from photoplan.orientation.mark_template import coverage
-from photoplan.products.camera_marks import mark_pattern
+from photoplan.orientation.marks.fiducials import FiducialSearch, find_fiducials
+from photoplan.orientation.marks.layout import MarkLayout
+from photoplan.orientation.marks.template import coverage
+from photoplan.project.camera_marks import mark_pattern
 
 MARKS = tomllib.loads((Path(__file__).parents[1] / "real" / "usgs_marks" / "marks.toml").read_text())
 PLACES = {"T": (0.01, 40.0), "B": (-0.01, -40.01), "L": (-40.0, 0.02), "R": (40.01, 0.0)}

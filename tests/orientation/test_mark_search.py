@@ -11,8 +11,8 @@ from tools.mark_scans import CORNERS, ArrayScan, Simulated, ring_cross_pattern, 
 
 from photoplan.cameras.mark_pattern import MarkPart, MarkPattern
 from photoplan.errors import InputError
-from photoplan.orientation.fiducials import FiducialResult, FiducialSearch, find_fiducials
-from photoplan.orientation.mark_layout import TURNS, MarkLayout, fit_placement
+from photoplan.orientation.marks.fiducials import FiducialResult, FiducialSearch, find_fiducials
+from photoplan.orientation.marks.layout import TURNS, MarkLayout, fit_placement
 
 PATTERN = ring_cross_pattern()
 LAYOUT = MarkLayout.of(CORNERS, dict.fromkeys(CORNERS, PATTERN))

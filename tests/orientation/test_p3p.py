@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from photoplan.geometry.rotation import rotation_opk
-from photoplan.orientation.p3p import bearings, three_point_poses
+from photoplan.orientation.resection.p3p import bearings, three_point_poses
 
 
 def scenes(rng: np.random.Generator, n: int, tilt: float, flat: bool) -> tuple[np.ndarray, ...]:

@@ -19,10 +19,10 @@ from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.errors import GeometryError, UsageError
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_opk
-from photoplan.orientation.block import AdjustSettings, Block, BlockCamera, BlockImage
-from photoplan.orientation.bundle import adjust_block
-from photoplan.orientation.direct import resect_direct
-from photoplan.orientation.resection import ResectSettings, resect, tangents_of
+from photoplan.orientation.bundle.adjust import adjust_block
+from photoplan.orientation.bundle.block import AdjustSettings, Block, BlockCamera, BlockImage
+from photoplan.orientation.resection.adjust import ResectSettings, resect, tangents_of
+from photoplan.orientation.resection.direct import resect_direct
 
 UNKNOWN_C = ResectSettings(camera_constant_known=False)
 

@@ -13,9 +13,9 @@ from photoplan.cameras.observed import GroundPoints, ImagePoints, ObservedPositi
 from photoplan.errors import GeometryError
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_opk
-from photoplan.orientation.block import BlockCamera
-from photoplan.orientation.similarity import fit_similarity, robust_similarity
-from photoplan.orientation.start import Started, StartImage, start_block
+from photoplan.orientation.bundle.block import BlockCamera
+from photoplan.orientation.start.block import Started, StartImage, start_block
+from photoplan.orientation.start.similarity import fit_similarity, robust_similarity
 
 LENS = Brown(k1=-0.02, k2=0.01)
 CAMERA = {"RC30": BlockCamera(AERIAL.c, AERIAL.principal_point, LENS)}

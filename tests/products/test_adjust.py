@@ -15,9 +15,9 @@ from tools.adjust_project import CAMERA, FILM, Made, Make, misses, write_project
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles
 from photoplan.io.image_points import read_image_points
-from photoplan.io.project import load_project
-from photoplan.io.project_model import ANGLE_UNITS
-from photoplan.orientation.block import AdjustSettings
+from photoplan.io.project.file import load_project
+from photoplan.io.project.model import ANGLE_UNITS
+from photoplan.orientation.bundle.block import AdjustSettings
 from photoplan.products.adjust import run as adjust
 from photoplan.products.adjust.block import adjust_prepared, map_result, prepare
 from photoplan.products.adjust.frame import angle_derivatives

@@ -9,10 +9,10 @@ import pytest
 from pydantic import TypeAdapter
 
 from photoplan.cameras.interior import Interior
-from photoplan.io.camera_model import Camera
-from photoplan.io.project_cameras import interior_of, lens_of
-from photoplan.io.project_model import Image
-from photoplan.orientation.block import AdjustedCamera, BlockCamera
+from photoplan.io.camera.model import Camera
+from photoplan.io.project.cameras import interior_of, lens_of
+from photoplan.io.project.model import Image
+from photoplan.orientation.bundle.block import AdjustedCamera, BlockCamera
 from photoplan.products.adjust.cameras import block_camera, calibrated, camera_entries
 
 MARKS = {"a": [-100.0, -100.0], "b": [100.0, -100.0], "c": [100.0, 100.0], "d": [-100.0, 100.0]}

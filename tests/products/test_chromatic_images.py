@@ -11,7 +11,6 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
 from photoplan.io.whole_image import write_whole_image
-from photoplan.products.aligned_reader import AlignedReader
 from photoplan.products.chromatic import (
     ChromaticRequest,
     correct_chromatic,
@@ -21,6 +20,7 @@ from photoplan.products.chromatic import (
     model_lines,
     save_chromatic,
 )
+from photoplan.project.aligned_reader import AlignedReader
 from photoplan.quality.colour.model import BandModel, ChromaticModel
 from photoplan.quality.formation.model import ImageModel, form_image
 from photoplan.quality.formation.optics_parts import Lateral, Spread

@@ -10,12 +10,12 @@ from tools.orientation_blocks import ANGLES, CAMERA, CENTERS, GROUND, NAMES, blo
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles
-from photoplan.io.camera_model import FilmCamera
+from photoplan.io.camera.model import FilmCamera
 from photoplan.io.orientation.file import FORMATS, orientation_format, read_orientation_block, write_orientation
 from photoplan.io.orientation.table import TableFormat
 from photoplan.orientation.readings import Reading
-from photoplan.products.convert import ConvertRequest, convert_orientation
-from photoplan.products.convert_readings import list_readings
+from photoplan.products.convert.readings import list_readings
+from photoplan.products.convert.run import ConvertRequest, convert_orientation
 
 MINE = ("csv", "toml", "patb", "bingo", "bluh", "inpho")
 FROM_CAMERA = TableFormat(declared=frozenset({"direction"}))
@@ -92,7 +92,7 @@ def test_a_lens_is_never_lost_in_silence(block, tmp_path):
 
 
 def test_a_whole_project_is_converted_with_its_camera_and_image_files(tmp_path, block):
-    from photoplan.products.init import InitRequest, init_project
+    from photoplan.products.init.run import InitRequest, init_project
 
     images = str(block / "images" / "*.jpg")
     request = InitRequest(

@@ -16,12 +16,13 @@ from tools.small_block import CRS, NAMES, SIZE, Block, make_project, texture, wr
 from photoplan.engine.executors import run_tiles
 from photoplan.errors import InputError, ResourceError, TilesFailed, UsageError
 from photoplan.io.product import ProductFile
-from photoplan.io.project import load_project
-from photoplan.products import execution, scene
-from photoplan.products.execution import BASE_MEMORY, Run, execute
-from photoplan.products.orthophoto import OrthoPlan, plan_orthophotos
-from photoplan.products.results import ProductResult
-from photoplan.products.scene import open_scene
+from photoplan.io.project.file import load_project
+from photoplan.products.orthophoto import execution
+from photoplan.products.orthophoto.execution import BASE_MEMORY, Run, execute
+from photoplan.products.orthophoto.plan import OrthoPlan, plan_orthophotos
+from photoplan.products.orthophoto.results import ProductResult
+from photoplan.project import scene
+from photoplan.project.scene import open_scene
 
 QUIET = Run(quicklook=False)
 

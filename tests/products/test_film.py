@@ -10,9 +10,9 @@ import rasterio
 from tools.real_projects import drone_project
 
 from photoplan.errors import InputError
-from photoplan.io.project import load_project, parse_project
-from photoplan.io.project_model import Project
-from photoplan.products.orthophoto import plan_orthophotos, render
+from photoplan.io.project.file import load_project, parse_project
+from photoplan.io.project.model import Project
+from photoplan.products.orthophoto.plan import plan_orthophotos, render
 
 CAMERA = "DJI FC300S half-res"
 BOUNDS = (576690.0, 5188125.0, 576745.0, 5188175.0)

@@ -18,10 +18,10 @@ from photoplan.cli.init import command
 from photoplan.errors import HeightSystemError, InputError, PhotoplanError, UsageError
 from photoplan.geometry.crs import crs_step
 from photoplan.geometry.rotation import rotation_opk
-from photoplan.io.camera_model import FilmCamera, FrameCamera
+from photoplan.io.camera.model import FilmCamera, FrameCamera
 from photoplan.io.orientation.table import TableFormat
-from photoplan.io.project import load_project
-from photoplan.products.init import InitRequest, init_project, make_project
+from photoplan.io.project.file import load_project
+from photoplan.products.init.run import InitRequest, init_project, make_project
 
 HEAD = "name,x,y,z,omega,phi,kappa\n"
 YAML = "cam:\n  type: pinhole\n  im_size: [40, 30]\n  focal_len: 50\n  sensor_size: [40, 30]\n"

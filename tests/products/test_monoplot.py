@@ -25,9 +25,9 @@ from photoplan.cli.main import run
 from photoplan.errors import UsageError
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_from_angles
-from photoplan.io.project import load_project
+from photoplan.io.project.file import load_project
 from photoplan.products.monoplot import MonoplotRequest, monoplot_file
-from photoplan.products.scene import open_scene
+from photoplan.project.scene import open_scene
 from photoplan.surfaces.level import LevelSurface
 from photoplan.terrain.monoplot import GroundPoints, MonoplotErrors, monoplot
 

@@ -12,11 +12,11 @@ from tools.small_block import FOCAL, NAMES, SIZE, X0, Y0, YAML, Z0, Block, make_
 
 from photoplan.cameras.base import project
 from photoplan.errors import GeometryError, UsageError
-from photoplan.io.project import load_project
+from photoplan.io.project.file import load_project
 from photoplan.plan.coverage import cover
-from photoplan.products.execution import Run, execute
-from photoplan.products.orthophoto import mean_gsd, plan_orthophotos, render, two_figures
-from photoplan.products.scene import open_scene
+from photoplan.products.orthophoto.execution import Run, execute
+from photoplan.products.orthophoto.plan import mean_gsd, plan_orthophotos, render, two_figures
+from photoplan.project.scene import open_scene
 from photoplan.surfaces.intersect import intersect
 
 QUIET = Run(quicklook=False)

@@ -14,10 +14,10 @@ import shapely
 from tools.small_block import CRS, NAMES, Block, make_project, texture, write_image, write_terrain
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io.project import load_project
-from photoplan.products.execution import Run, execute
-from photoplan.products.orthophoto import OrthoPlan, plan_orthophotos
-from photoplan.products.plan_file import compile_figures, read_plan, write_plan
+from photoplan.io.project.file import load_project
+from photoplan.products.orthophoto.execution import Run, execute
+from photoplan.products.orthophoto.plan import OrthoPlan, plan_orthophotos
+from photoplan.products.orthophoto.plan_file import compile_figures, read_plan, write_plan
 
 QUIET = Run(quicklook=False)
 SETTINGS = {"resolution": 1.0, "tile": 128, "kernel": "lanczos3", "tolerance": 0.01}

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles, rotation_opk
-from photoplan.io.camera_file import read_cameras
-from photoplan.io.camera_model import FrameCamera
+from photoplan.io.camera.file import read_cameras
+from photoplan.io.camera.model import FrameCamera
 from photoplan.io.orientation.file import read_orientation
-from photoplan.io.project_model import Image, Orientation
+from photoplan.io.project.model import Image, Orientation
 from photoplan.io.terrain.reader import TerrainReader
-from photoplan.products.plausibility import Plausibility, View, assess, view_of
-from photoplan.products.readings import DECLARED, readings
+from photoplan.products.check.plausibility import Plausibility, View, assess, view_of
+from photoplan.products.check.readings import DECLARED, readings
 from photoplan.surfaces.raster import RasterSurface
 
 EAST = np.array([1100.0, 0, 0])

@@ -12,7 +12,7 @@ from tools.pinhole import Pinhole
 from photoplan.cameras.base import project
 from photoplan.geometry.grid import Window
 from photoplan.geometry.pose import Pose
-from photoplan.products.reach import FAR, reach
+from photoplan.project.reach import FAR, reach
 from photoplan.surfaces.level import LevelSurface
 from photoplan.surfaces.raster import RasterSurface
 

@@ -11,15 +11,15 @@ import rasterio
 from tools.small_block import Block, texture, write_image
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io.project import load_project
-from photoplan.io.project_write import project_text
-from photoplan.products import scene as scenes
-from photoplan.products.check import check_project
-from photoplan.products.execution import Run, execute
-from photoplan.products.filter_files import save_filter
-from photoplan.products.orthophoto import plan_orthophotos
+from photoplan.io.project.file import load_project
+from photoplan.io.project.write import project_text
+from photoplan.products.check.run import check_project
+from photoplan.products.orthophoto.execution import Run, execute
+from photoplan.products.orthophoto.plan import plan_orthophotos
 from photoplan.products.restore.run import RestoreRequest, restore_images
-from photoplan.products.scene import input_files, open_scene
+from photoplan.project import scene as scenes
+from photoplan.project.filter_files import save_filter
+from photoplan.project.scene import input_files, open_scene
 from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
 
 

@@ -12,7 +12,7 @@ from tools.small_block import write_image
 from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
 from photoplan.products.restore.run import RestoreRequest, restore_images
-from photoplan.products.restored_reader import restored_reader
+from photoplan.project.restored_reader import restored_reader
 from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
 
 SIZE = (700, 560)

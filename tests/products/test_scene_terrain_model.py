@@ -17,13 +17,13 @@ from tools.small_model import grid_unit, write_units_of
 from photoplan.errors import HeightSystemError, InputError
 from photoplan.geometry.crs import crs_step
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.io.project import load_project
+from photoplan.io.project.file import load_project
 from photoplan.io.terrain.model_read import ModelReader
-from photoplan.products.check import check_project
-from photoplan.products.execution import Run, execute
-from photoplan.products.init import InitRequest, init_project
-from photoplan.products.orthophoto import plan_orthophotos
-from photoplan.products.scene import ground_of, open_scene
+from photoplan.products.check.run import check_project
+from photoplan.products.init.run import InitRequest, init_project
+from photoplan.products.orthophoto.execution import Run, execute
+from photoplan.products.orthophoto.plan import plan_orthophotos
+from photoplan.project.scene import ground_of, open_scene
 from photoplan.surfaces.units import Unit, UnitLayout
 from photoplan.targets.map import MapTarget
 

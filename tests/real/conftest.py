@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from tools.real_projects import dmc_project, drone_project
 
-from photoplan.io.project import load_project
-from photoplan.products.execution import Run, execute
-from photoplan.products.orthophoto import plan_orthophotos
+from photoplan.io.project.file import load_project
+from photoplan.products.orthophoto.execution import Run, execute
+from photoplan.products.orthophoto.plan import plan_orthophotos
 
 
 def make_orthos(project_folder: Path, images: Sequence[str] | None, resolution: float) -> list[Path]:

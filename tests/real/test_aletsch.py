@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from photoplan.cli.resect import command
-from photoplan.io.project import load_project
+from photoplan.io.project.file import load_project
 
 PROJECT = """crs = "EPSG:21781"
 

@@ -15,7 +15,7 @@ from tools.ign_block import Published, ign_project, published
 
 from photoplan.geometry.rotation import rotation_opk
 from photoplan.io.image_points import read_image_points
-from photoplan.io.project import load_project
+from photoplan.io.project.file import load_project
 
 GIB = 2**30
 

@@ -11,7 +11,7 @@ from tools.photos import turned_by
 
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_from_angles
-from photoplan.io.project import load_project
+from photoplan.io.project.file import load_project
 from photoplan.products.adjust.inputs import read_inputs
 from photoplan.products.adjust.start import started
 

@@ -21,7 +21,7 @@ from photoplan.io.terrain.files import read_measured
 from photoplan.io.terrain.options import ReadOptions
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, Tin
 from photoplan.terrain.build import Built, build, plan_build
-from photoplan.terrain.clean import clean
+from photoplan.terrain.clean.run import clean
 from photoplan.terrain.settings import BuildSettings
 
 NEAR = 2.0

@@ -10,7 +10,7 @@ from tools.proposed import residuals, spoilt
 from tools.real_projects import dmc_project
 
 from photoplan.io.ground_points import read_ground_points
-from photoplan.products.control import ControlRequest, propose_control
+from photoplan.products.control.run import ControlRequest, propose_control
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from photoplan.report.adjust_facts import (
+from photoplan.report.adjust.facts import (
     AdjustFacts,
     CalibrationFacts,
     GroundFacts,
@@ -19,8 +19,8 @@ from photoplan.report.adjust_facts import (
     ResidualField,
     StripFacts,
 )
-from photoplan.report.adjust_plots import AdjustPlots
-from photoplan.report.adjust_report import adjust_report
+from photoplan.report.adjust.plots import AdjustPlots
+from photoplan.report.adjust.report import adjust_report
 from photoplan.report.check_points import check_accuracy
 
 pytest.importorskip("matplotlib")

@@ -17,7 +17,7 @@ from photoplan.report.page import text
 from photoplan.report.plots import Plots
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
 from photoplan.terrain.build import build, plan_build
-from photoplan.terrain.clean import Finding, clean
+from photoplan.terrain.clean.run import Finding, clean
 from photoplan.terrain.settings import FAMILIES, BuildSettings
 
 pytest.importorskip("matplotlib")

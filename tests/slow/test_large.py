@@ -14,10 +14,10 @@ from tools.real_projects import drone_project
 from photoplan.engine.execute import render
 from photoplan.engine.twin import strict_positions, strict_scales, twin_resample
 from photoplan.geometry.grid import Window
-from photoplan.io.project import load_project
-from photoplan.products.init import InitRequest, init_project
-from photoplan.products.orthophoto import plan_orthophotos
-from photoplan.products.scene import open_scene
+from photoplan.io.project.file import load_project
+from photoplan.products.init.run import InitRequest, init_project
+from photoplan.products.orthophoto.plan import plan_orthophotos
+from photoplan.project.scene import open_scene
 
 pytestmark = pytest.mark.slow
 

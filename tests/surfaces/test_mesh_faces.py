@@ -13,7 +13,9 @@ from tools.hybrid_models import line, model, plain_unit, random_lines, rough
 
 from photoplan.errors import GeometryError, InputError
 from photoplan.surfaces.hybrid import HybridSurface
-from photoplan.surfaces.mesh_faces import build_faces, on_grid, thin
+from photoplan.surfaces.mesh.faces import build_faces
+from photoplan.surfaces.mesh.lines import on_grid
+from photoplan.surfaces.mesh.thin import thin
 from photoplan.surfaces.units import UnitLayout
 
 LAYOUT = UnitLayout(500_000.3, 5_300_000.7, 12.34, 2, 2)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.triangulation import constrained_faces
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
-from photoplan.terrain.clean import Finding, clean, domain_of
+from photoplan.terrain.clean.run import Finding, clean, domain_of
 
 EAST, NORTH = 21_530_000.0, 6_782_000.0
 SHIFT = np.array([EAST, NORTH, 0.0])
@@ -327,7 +327,7 @@ def test_fault_19_any_lines_can_be_triangulated_after_cleaning(case: tuple[Measu
 
 
 def test_work_that_does_not_end_is_ended_by_joining_vertices(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("photoplan.terrain.clean_nodes.ROUNDS", 1)
+    monkeypatch.setattr("photoplan.terrain.clean.nodes.ROUNDS", 1)
     rng = np.random.default_rng(7)
     lines = [line(np.column_stack([rng.uniform(0, 0.02, (3, 2)), np.zeros(3)]), name=str(i)) for i in range(40)]
     out, found = cleaned(*lines)

@@ -13,9 +13,9 @@ from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.geometry.triangulation import constrained_faces
 from photoplan.surfaces.units import MeshFaces
-from photoplan.terrain import contours
-from photoplan.terrain.contours import ContourLine, ContourOptions, trace_contours
-from photoplan.terrain.contours_parts import SurfacePart, grid_parts
+from photoplan.terrain.contours import run as contours
+from photoplan.terrain.contours.parts import SurfacePart, grid_parts
+from photoplan.terrain.contours.run import ContourLine, ContourOptions, trace_contours
 
 CORNER = (512_000.0, 5_200_000.0)
 

@@ -10,9 +10,9 @@ import shapely
 from tools.hybrid_models import model, random_lines
 
 from photoplan.surfaces.units import UnitLayout
-from photoplan.terrain.contours import ContourLine, ContourOptions, trace_contours
-from photoplan.terrain.contours_labels import Labeller, decimals_of
-from photoplan.terrain.contours_parts import unit_parts
+from photoplan.terrain.contours.labels import Labeller, decimals_of
+from photoplan.terrain.contours.parts import unit_parts
+from photoplan.terrain.contours.run import ContourLine, ContourOptions, trace_contours
 
 LAYOUT = UnitLayout(512_000.0, 5_200_060.0, 20.0, 3, 3)
 WIDTHS = np.array([[4, 8, 4], [8, 16, 8], [4, 4, 8]])

@@ -17,7 +17,8 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.targets.map import MapTarget
-from photoplan.terrain import shading, shading_tints
+from photoplan.terrain.shading import run as shading
+from photoplan.terrain.shading import tints as shading_tints
 
 GRID = MapGrid(1000.0, 2000.0, 0.5, 60, 50, "EPSG:32633")
 

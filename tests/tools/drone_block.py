@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.base import project as project_points
 from photoplan.geometry.rotation import rotation_from_angles
-from photoplan.io.project import load_project
-from photoplan.products.scene import open_scene
+from photoplan.io.project.file import load_project
+from photoplan.project.scene import open_scene
 
 #: The strip that was flown the other way: its images were turned by 180° when they were reduced, its gimbal was not.
 TURNED = range(24, 30)

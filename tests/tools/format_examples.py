@@ -13,13 +13,13 @@ from photoplan.cameras.base import Camera, project
 from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.frame import FrameCamera
 from photoplan.geometry.pose import Pose
-from photoplan.io import camera_model as described
-from photoplan.io.camera_model import BrownLens, OpenCVFisheyeLens, OpenCVLens
+from photoplan.io.camera import model as described
+from photoplan.io.camera.model import BrownLens, OpenCVFisheyeLens, OpenCVLens
 from photoplan.io.orientation.block import OrientationBlock
 from photoplan.io.orientation.file import read_orientation_block, write_orientation
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
-from photoplan.io.project_cameras import interior_of, lens_of
-from photoplan.io.project_model import Image
+from photoplan.io.project.cameras import interior_of, lens_of
+from photoplan.io.project.model import Image
 
 LENSES: dict[str, Any] = {
     "none": described.NoLens(),

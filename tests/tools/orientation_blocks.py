@@ -6,11 +6,11 @@ import numpy as np
 
 from photoplan.cameras.frame import FrameCamera as PixelCamera
 from photoplan.geometry.pose import Pose
-from photoplan.io.camera_model import FrameCamera
+from photoplan.io.camera.model import FrameCamera
 from photoplan.io.orientation.block import OrientationBlock
 from photoplan.io.orientation.table import OrientationTable, OrientedImage
-from photoplan.io.project_cameras import interior_of, lens_of
-from photoplan.io.project_model import Image
+from photoplan.io.project.cameras import interior_of, lens_of
+from photoplan.io.project.model import Image
 
 CAMERA = FrameCamera(
     size=(13824, 7680), camera_constant_mm=120.01, pixel_size_um=12.0, principal_point_mm=(0.024, -0.036)

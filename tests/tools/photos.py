@@ -12,7 +12,7 @@ from photoplan.cameras.lenses.base import Lens
 from photoplan.cameras.lenses.none import NoLens
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_opk
-from photoplan.orientation.resection import MeasuredPoints
+from photoplan.orientation.resection.adjust import MeasuredPoints
 
 #: A wide-angle aerial camera: 153 mm, 230 mm format scanned with 20 µm.
 AERIAL = Interior.metric((11500, 11500), 153.0, 0.02)

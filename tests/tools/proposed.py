@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from photoplan.cameras.base import project as into_image
 from photoplan.io.ground_points import read_ground_points
 from photoplan.io.image_points import read_image_points
-from photoplan.io.project import load_project
-from photoplan.io.project_edit import ProjectChanges, edit_project
-from photoplan.products.scene import open_scene
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
+from photoplan.project.scene import open_scene
 
 __all__ = ["residuals", "spoilt"]
 

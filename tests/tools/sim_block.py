@@ -13,8 +13,8 @@ from photoplan.cameras.lenses.brown import Brown
 from photoplan.cameras.observed import GroundPoints, ImagePoints, ObservedAttitudes, ObservedPositions
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_opk
-from photoplan.orientation.block import Block, BlockCamera, BlockImage
-from photoplan.orientation.bundle_state import small_rotations
+from photoplan.orientation.bundle.block import Block, BlockCamera, BlockImage
+from photoplan.orientation.bundle.state import small_rotations
 
 SIZE = (4000, 3000)
 FOCAL = 3600.0

@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.cameras.plane import Affine2D, Bilinear2D
 from photoplan.errors import InputError
 
-__all__ = ["AffineFacts", "Shrinkage", "affine_facts", "film_shrinkage", "residuals_on_film"]
-
 
 @dataclass(frozen=True)
 class AffineFacts:

@@ -7,8 +7,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Camera", "project"]
-
 
 class Camera(Protocol):
     """A mapping from ground to image, smooth wherever the point lies in front.

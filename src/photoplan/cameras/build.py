@@ -14,8 +14,6 @@ from photoplan.errors import UsageError
 from photoplan.geometry.local import LocalFrame, earth_radius
 from photoplan.geometry.pose import Pose
 
-__all__ = ["EARTH_CURVATURE", "MEAN_RADIUS", "oriented_camera"]
-
 #: How earth curvature may be regarded.
 EARTH_CURVATURE = ("none", "correction", "strict")
 #: Earth radius where no CRS tells a better one, metres (Ecker 1991, table 4.2).

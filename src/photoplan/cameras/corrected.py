@@ -11,8 +11,6 @@ from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.warped import Warp, WarpedCamera
 from photoplan.errors import InputError
 
-__all__ = ["CurvatureCorrection", "corrected_camera"]
-
 
 @dataclass(frozen=True)
 class CurvatureCorrection:

@@ -9,8 +9,6 @@ from photoplan.cameras.warped import Warp, WarpedCamera
 from photoplan.geometry.local import LocalFrame, earth_radius
 from photoplan.geometry.pose import Pose
 
-__all__ = ["curved_camera", "local_pose"]
-
 
 def local_pose(pose: Pose, local: LocalFrame) -> Pose:
     """Pose in the local system of a pose whose angles refer to the map's axes at the station.

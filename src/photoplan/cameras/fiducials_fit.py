@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from photoplan.cameras.plane import Affine2D, Bilinear2D
 from photoplan.errors import GeometryError, InputError
 
-__all__ = ["MODELS", "FiducialFit", "Marks", "fit_affine", "fit_bilinear", "fit_marks", "fit_similarity"]
-
 #: Marks as name → (x, y), or as rows (name, x, y) of a file, in which a name may by mistake occur twice.
 Marks = Mapping[str, tuple[float, float]] | Iterable[tuple[str, float, float]]
 

@@ -15,8 +15,6 @@ from photoplan.cameras.plane import Affine2D
 from photoplan.errors import UsageError
 from photoplan.geometry.pose import Pose
 
-__all__ = ["FrameCamera"]
-
 
 @dataclass(frozen=True, eq=False)
 class FrameCamera:

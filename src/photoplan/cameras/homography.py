@@ -9,8 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import GeometryError, InputError
 
-__all__ = ["Homography"]
-
 
 @dataclass(frozen=True, eq=False)
 class Homography:

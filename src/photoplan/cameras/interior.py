@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from photoplan.cameras.plane import Affine2D, Bilinear2D
 from photoplan.errors import InputError
 
-__all__ = ["Interior"]
-
 
 @dataclass(frozen=True)
 class Interior:

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 
-__all__ = ["MarkExample", "MarkPart", "MarkPattern"]
-
 
 @dataclass(frozen=True, eq=False)
 class MarkPart:

@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
 
-__all__ = ["GroundPoints", "ImagePoints", "ObservedAttitudes", "ObservedPositions"]
-
 
 @dataclass(frozen=True, eq=False)
 class ImagePoints:

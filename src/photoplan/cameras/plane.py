@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import GeometryError, InputError, UsageError
 
-__all__ = ["Affine2D", "Bilinear2D"]
-
 
 @dataclass(frozen=True)
 class Affine2D:

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Refraction", "refractivity"]
-
 # ICAO standard atmosphere: temperature falls by 6.5 K/km from 288.15 K to 11 km and stays; density follows from
 # hydrostatic equilibrium. Refractivity n − 1 is proportional to density.
 _LAPSE = 0.0065 / 288.15

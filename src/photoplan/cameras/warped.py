@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.cameras.frame import FrameCamera
 from photoplan.errors import UsageError
 
-__all__ = ["Warp", "WarpedCamera"]
-
 _ITERATIONS = 20
 
 

@@ -15,8 +15,6 @@ from photoplan.cli.options import json_option
 if TYPE_CHECKING:
     from photoplan.products.adjust.run import AdjustReport
 
-__all__ = ["command"]
-
 #: Gross errors and notes that are named; the rest is in the report.
 _SHOWN = 20
 

@@ -14,8 +14,6 @@ from photoplan.cli.options import json_option
 if TYPE_CHECKING:
     from photoplan.products.characterise.run import AnalysisRun, CharacteriseReport
 
-__all__ = ["command"]
-
 
 @click.command("characterise")
 @click.argument("series", type=click.Path(path_type=Path), metavar="SERIES")

@@ -9,8 +9,6 @@ import click
 
 from photoplan.cli.options import json_option
 
-__all__ = ["command"]
-
 
 @click.command("check")
 @click.argument("project", type=click.Path(path_type=Path))
@@ -22,8 +20,8 @@ def command(project: Path, images: tuple[str, ...], as_json: bool) -> None:
     Ends with exit code 3 if orientations are implausible or another reading fits better; that is named.
     """
     from photoplan.errors import GeometryError
-    from photoplan.io.project import load_project
-    from photoplan.products.check import check_project
+    from photoplan.io.project.file import load_project
+    from photoplan.products.check.run import check_project
 
     found = check_project(load_project(project), images or None)
     if as_json:

@@ -11,8 +11,6 @@ import click
 
 from photoplan.cli.options import json_option
 
-__all__ = ["command"]
-
 
 @click.command("control")
 @click.argument("project", type=click.Path(path_type=Path))
@@ -49,7 +47,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     import psutil
 
     from photoplan.cli.progress import progress
-    from photoplan.products.control import ControlRequest, propose_control
+    from photoplan.products.control.run import ControlRequest, propose_control
 
     options["workers"] = options["workers"] or psutil.cpu_count() or 1
     request = ControlRequest(**options)

@@ -11,8 +11,6 @@ import click
 from photoplan.cli.options import json_option
 from photoplan.cli.orientation_options import DIRECTIONS, reading_options, table_format
 
-__all__ = ["command"]
-
 
 @click.command("convert")
 @click.argument("orientation", type=click.Path(path_type=Path))
@@ -58,7 +56,7 @@ def command(
 
     What the other format cannot hold is said on stderr. A lens that it does not know is refused unless --drop-lens.
     """
-    from photoplan.products.convert import ConvertRequest
+    from photoplan.products.convert.run import ConvertRequest
 
     form = table_format(options)
     options["turned"] = int(options["turned"])
@@ -76,7 +74,7 @@ def command(
 
 
 def _convert(request: Any, as_json: bool, quiet: bool) -> None:
-    from photoplan.products.convert import convert_orientation
+    from photoplan.products.convert.run import convert_orientation
 
     done = convert_orientation(request)
     if as_json:
@@ -93,7 +91,7 @@ def _convert(request: Any, as_json: bool, quiet: bool) -> None:
 
 
 def _list(request: Any, image_points: Path, control: Path, as_json: bool, quiet: bool) -> None:
-    from photoplan.products.convert_readings import list_readings
+    from photoplan.products.convert.readings import list_readings
 
     found = list_readings(request, image_points, control)
     if as_json:

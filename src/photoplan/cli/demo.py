@@ -7,8 +7,6 @@ from pathlib import Path
 
 import click
 
-__all__ = ["command"]
-
 
 @click.command("demo")
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False), default=Path("photoplan-demo"))
@@ -22,10 +20,10 @@ def command(folder: Path, resolution: float, quiet: bool) -> None:
     import shutil
 
     from photoplan.cli import running
-    from photoplan.io.project import load_project
-    from photoplan.products.check import check_project
-    from photoplan.products.init import InitRequest, init_project
-    from photoplan.products.orthophoto import plan_orthophotos
+    from photoplan.io.project.file import load_project
+    from photoplan.products.check.run import check_project
+    from photoplan.products.init.run import InitRequest, init_project
+    from photoplan.products.orthophoto.plan import plan_orthophotos
 
     how = running.How.from_options(
         {"workers": None, "executor": "threads", "memory": None, "overwrite": True, "no_quicklook": False}

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from photoplan.cli.lazy import LazyGroup
 
-__all__ = ["command"]
-
 #: Verb and its one-line help; the command is `photoplan.cli.dtm_<verb>:command`.
 VERBS = {
     "build": "Predict a terrain model from points and lines.",

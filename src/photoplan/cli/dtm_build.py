@@ -13,8 +13,6 @@ from photoplan.cli.options import json_option
 if TYPE_CHECKING:
     from photoplan.products.dtm.build import BuildReport, BuildRequest
 
-__all__ = ["command"]
-
 _PATH = click.Path(path_type=Path)
 _POSITIVE = click.FloatRange(0, min_open=True)
 #: Findings and gross errors that are shown; all are in the report, in the model and in --json.
@@ -101,7 +99,7 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
 def _request(options: dict[str, Any]) -> BuildRequest:
     import psutil
 
-    from photoplan.io.terrain.files import CodeTable, ReadOptions, read_code_table
+    from photoplan.io.terrain.options import CodeTable, ReadOptions, read_code_table
     from photoplan.products.dtm.build import BuildRequest
     from photoplan.terrain.settings import BuildSettings
 

@@ -10,8 +10,6 @@ import click
 
 from photoplan.cli.options import json_option
 
-__all__ = ["command"]
-
 _PATH = click.Path(path_type=Path)
 _POSITIVE = click.FloatRange(0, min_open=True)
 
@@ -47,7 +45,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     from photoplan.cli.progress import progress
     from photoplan.products.dtm.contours import ContourRequest, make_contours
-    from photoplan.terrain.contours import ContourOptions
+    from photoplan.terrain.contours.run import ContourOptions
 
     names = ("interval", "base", "index", "smooth", "simplify", "band", "shortest")
     chosen = ContourOptions(**{name: options.pop(name) for name in names})

@@ -10,8 +10,6 @@ import click
 
 from photoplan.cli.options import BYTES, json_option
 
-__all__ = ["command"]
-
 
 @click.command("flow")
 @click.argument("model", type=click.Path(path_type=Path))

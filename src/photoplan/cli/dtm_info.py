@@ -9,8 +9,6 @@ import click
 
 from photoplan.cli.options import json_option
 
-__all__ = ["command"]
-
 
 @click.command("info")
 @click.argument("model", type=click.Path(path_type=Path))

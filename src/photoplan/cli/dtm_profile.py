@@ -10,8 +10,6 @@ import click
 
 from photoplan.cli.options import json_option
 
-__all__ = ["command"]
-
 
 @click.command("profile")
 @click.argument("model", type=click.Path(path_type=Path))

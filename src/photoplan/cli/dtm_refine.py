@@ -10,8 +10,6 @@ import click
 
 from photoplan.cli.options import json_option
 
-__all__ = ["command"]
-
 _PATH = click.Path(path_type=Path)
 
 

@@ -14,8 +14,6 @@ from photoplan.cli.options import json_option
 if TYPE_CHECKING:
     from photoplan.products.dtm.shading import ShadingFacts
 
-__all__ = ["command", "light_options", "picture_options", "say", "take_light", "take_request"]
-
 
 def picture_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Model, grid, output and run of every picture of a terrain."""
@@ -53,7 +51,7 @@ def light_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def take_light(options: dict[str, Any]) -> Any:
     """The light, taken out of the options of a verb."""
-    from photoplan.terrain.shading import Light
+    from photoplan.terrain.shading.run import Light
 
     names = ("azimuth", "altitude", "exaggeration", "multidirectional")
     return Light(**{name: options.pop(name) for name in names})

@@ -8,8 +8,6 @@ import click
 
 from photoplan.cli.dtm_shade import picture_options, say, take_request
 
-__all__ = ["command"]
-
 
 @click.command("slope")
 @picture_options

@@ -8,8 +8,6 @@ import click
 
 from photoplan.cli.dtm_shade import light_options, picture_options, say, take_light, take_request
 
-__all__ = ["command"]
-
 
 @click.command("tint")
 @picture_options
@@ -24,7 +22,7 @@ __all__ = ["command"]
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Colours by height: red, green, blue, with a mask where MODEL has no terrain."""
     from photoplan.products.dtm.shading import make_picture, tint_picture
-    from photoplan.terrain.shading_tints import RAMPS
+    from photoplan.terrain.shading.tints import RAMPS
 
     ramp, span, steps = options.pop("ramp"), options.pop("heights"), options.pop("classes")
     classed, shade, strength = options.pop("classed"), options.pop("shade"), options.pop("strength")

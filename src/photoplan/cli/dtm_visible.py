@@ -11,8 +11,6 @@ import click
 
 from photoplan.cli.options import BYTES, json_option
 
-__all__ = ["command"]
-
 
 @click.command("visible")
 @click.argument("model", type=click.Path(path_type=Path))

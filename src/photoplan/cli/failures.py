@@ -6,8 +6,6 @@ from collections.abc import Mapping
 
 from photoplan.errors import InputError, TilesFailed
 
-__all__ = ["end_with_failures"]
-
 
 def end_with_failures(failed: Mapping[str, str], done: int, what: str = "images failed") -> None:
     """Name the images that failed, if any did.

@@ -11,8 +11,6 @@ import click
 from photoplan.cli.failures import end_with_failures
 from photoplan.cli.options import json_option
 
-__all__ = ["command"]
-
 _ANSWER = {"auto": None, "yes": True, "no": False}
 
 
@@ -43,7 +41,7 @@ def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any)
     marks. An image that fails does not stop the others; they are listed at the end (exit code 4).
     """
     from photoplan.cli.progress import progress
-    from photoplan.products.fiducials import FiducialsRequest, locate_fiducials
+    from photoplan.products.fiducials.run import FiducialsRequest, locate_fiducials
 
     request = FiducialsRequest(scans, **_values(options))
     report = locate_fiducials(request, lambda total: progress(total, quiet, "images"))

@@ -9,8 +9,6 @@ import click
 
 from photoplan.cli.options import json_option
 
-__all__ = ["command"]
-
 
 @click.command("info")
 @click.argument("file", type=click.Path(path_type=Path))
@@ -19,10 +17,10 @@ __all__ = ["command"]
 @json_option
 def command(file: Path, plot: Path | None, overwrite: bool, as_json: bool) -> None:
     """Show what FILE holds: a raster, a terrain model, a project, a plan, a run record or a restoration filter."""
-    from photoplan.products.describe import describe
+    from photoplan.products.describe.run import describe
 
     if plot is not None:
-        from photoplan.products.describe_filter import draw_filter
+        from photoplan.products.describe.filter import draw_filter
 
         draw_filter(file, plot, overwrite=overwrite)
     facts = describe(file)

@@ -11,8 +11,6 @@ import click
 from photoplan.cli.options import json_option
 from photoplan.cli.orientation_options import reading_options, table_format
 
-__all__ = ["command"]
-
 _FILE = click.Path(path_type=Path)
 
 
@@ -55,7 +53,7 @@ def command(
     Prints the path of the project file on stdout. Height systems must be stated by the files or declared. Without
     --orientation the images are to be oriented (tie, resect, adjust), and --crs is needed.
     """
-    from photoplan.products.init import InitRequest, init_project
+    from photoplan.products.init.run import InitRequest, init_project
 
     form = table_format(options)
     talk = (lambda line: None) if quiet else (lambda line: click.echo(line, err=True))

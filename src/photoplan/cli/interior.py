@@ -11,8 +11,6 @@ import click
 from photoplan.cli.failures import end_with_failures
 from photoplan.cli.options import json_option
 
-__all__ = ["command"]
-
 
 @click.command("interior")
 @click.argument("project", type=click.Path(path_type=Path))

@@ -12,8 +12,6 @@ import threading
 import time
 from types import FrameType
 
-__all__ = ["CODE", "catch_interrupts", "stop_children"]
-
 CODE = 130
 """Exit code of an interrupted run."""
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)

@@ -14,8 +14,6 @@ from photoplan.cli.interrupt import CODE, catch_interrupts, stop_children
 from photoplan.cli.lazy import LazyGroup
 from photoplan.errors import PhotoplanError, ResourceError
 
-__all__ = ["main", "run"]
-
 #: Verb and its one-line help, in the order of a job; the command is `photoplan.cli.<verb>:command`.
 VERBS = {
     "init": "Write a project file from the files you have.",

@@ -12,8 +12,6 @@ from photoplan.cli.mtf_output import say_files, say_images, talking
 from photoplan.cli.mtf_patterns import edge_options, pattern_options, run_patterns
 from photoplan.cli.options import json_option
 
-__all__ = ["command"]
-
 
 @click.command("mtf")
 @click.argument("images", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="IMAGE…")

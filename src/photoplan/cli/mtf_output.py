@@ -9,8 +9,6 @@ from typing import Any, Protocol
 
 import click
 
-__all__ = ["say_files", "say_images", "talking"]
-
 
 class _Image(Protocol):
     @property

@@ -11,8 +11,6 @@ import click
 from photoplan.cli.failures import end_with_failures
 from photoplan.cli.mtf_output import say_files, say_images, talking
 
-__all__ = ["edge_options", "pattern_options", "run_patterns"]
-
 #: Options that speak of edges only, and those that speak of patterns only.
 _OF_EDGES = {"lab", "flight", "grid", "most_edges", "least_length", "least_snr", "half_width"}
 _OF_PATTERNS = {"sectors", "group", "levels", "coltman"}

@@ -8,8 +8,6 @@ from typing import Any
 
 import click
 
-__all__ = ["BYTES", "executing", "json_option"]
-
 _UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 
 

@@ -7,8 +7,6 @@ from typing import Any
 
 import click
 
-__all__ = ["DIRECTIONS", "reading_options", "table_format"]
-
 _DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 DIRECTIONS = ["camera-to-ground", "ground-to-camera"]
 

@@ -9,8 +9,6 @@ import click
 
 from photoplan.cli.options import executing
 
-__all__ = ["command"]
-
 
 @click.command("ortho")
 @click.argument("project", type=click.Path(path_type=Path))
@@ -40,8 +38,8 @@ def command(
     The same command continues a run that was interrupted.
     """
     from photoplan.cli import running
-    from photoplan.io.project import load_project
-    from photoplan.products.orthophoto import plan_orthophotos
+    from photoplan.io.project.file import load_project
+    from photoplan.products.orthophoto.plan import plan_orthophotos
 
     how = running.How.from_options(options)
     loaded = load_project(project)

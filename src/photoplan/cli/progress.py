@@ -8,8 +8,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-__all__ = ["Report", "progress"]
-
 
 class Report(Protocol):
     """What a run calls when tiles are finished."""

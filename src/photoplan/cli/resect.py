@@ -12,10 +12,8 @@ from photoplan.cli.failures import end_with_failures
 from photoplan.cli.options import json_option
 
 if TYPE_CHECKING:
-    from photoplan.products.resect import ResectResult
-    from photoplan.products.resect_image import ResectedImage
-
-__all__ = ["command"]
+    from photoplan.products.resect.image import ResectedImage
+    from photoplan.products.resect.run import ResectResult
 
 _DIGITS = {"deg": 4, "gon": 4, "rad": 6}
 _FILE = click.Path(path_type=Path)
@@ -45,7 +43,7 @@ def command(as_json: bool, quiet: bool, free: str | None, **options: Any) -> Non
     they are listed at the end (exit code 4).
     """
     from photoplan.cli.progress import progress
-    from photoplan.products.resect import ResectRequest, resect_project
+    from photoplan.products.resect.run import ResectRequest, resect_project
 
     parameters = tuple(dict.fromkeys(p.strip() for p in (free or "").split(",") if p.strip()))
     request = ResectRequest(free=parameters, **options)

@@ -15,9 +15,7 @@ from photoplan.cli.restore_options import filter_options, filter_request
 if TYPE_CHECKING:
     from photoplan.products.restore.report import ReportFile
     from photoplan.products.restore.run import RestoredImage, RestorePlan
-    from photoplan.products.restored_reader import RestoredReader
-
-__all__ = ["command"]
+    from photoplan.project.restored_reader import RestoredReader
 
 
 @click.command("restore")
@@ -129,7 +127,7 @@ def _before(plan: RestorePlan) -> list[str]:
 def _corrections(reader: RestoredReader) -> list[str]:
     """What is corrected in an image before the filter."""
     from photoplan.products.chromatic import model_lines
-    from photoplan.products.fall_off_reader import fall_off_line
+    from photoplan.project.fall_off_reader import fall_off_line
 
     lines = [] if reader.lit is None else [fall_off_line(reader.lit.fall_off)]
     lines += [] if reader.aligned is None else model_lines(reader.aligned.model)

@@ -11,8 +11,6 @@ import click
 if TYPE_CHECKING:
     from photoplan.products.restore.filter import FilterRequest
 
-__all__ = ["filter_options", "filter_request"]
-
 _OPTIONS = (
     click.option("--filter", "filter_file", type=click.Path(path_type=Path), metavar="FILE|none",
                  help="TOML, or one kernel as rows of numbers; none: no filter [measured at edges of the images]."),

@@ -9,8 +9,6 @@ import click
 
 from photoplan.cli.options import executing
 
-__all__ = ["command"]
-
 
 @click.command("run")
 @click.argument("plan", type=click.Path(path_type=Path))
@@ -22,7 +20,7 @@ def command(plan: Path, output: Path | None, **options: Any) -> None:
     Inputs that have changed since it was written are refused.
     """
     from photoplan.cli import running
-    from photoplan.products.plan_file import read_plan
+    from photoplan.products.orthophoto.plan_file import read_plan
 
     how = running.How.from_options(options)
     loaded, folder = read_plan(plan)

@@ -13,10 +13,8 @@ import psutil
 
 from photoplan.cli.progress import progress
 from photoplan.errors import TilesFailed
-from photoplan.products.execution import ProductResult, Run, execute
-from photoplan.products.orthophoto import OrthoPlan
-
-__all__ = ["How", "execute_and_report"]
+from photoplan.products.orthophoto.execution import ProductResult, Run, execute
+from photoplan.products.orthophoto.plan import OrthoPlan
 
 
 @dataclass(frozen=True)

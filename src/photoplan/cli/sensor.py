@@ -10,8 +10,6 @@ import click
 
 from photoplan.cli.options import json_option
 
-__all__ = ["command"]
-
 
 @click.command("sensor")
 @click.argument("file", type=click.Path(path_type=Path), metavar="FILE")
@@ -23,7 +21,7 @@ __all__ = ["command"]
 @click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Resolution, bandwidth, charge transfer and noise of the sensor that FILE (TOML) describes."""
-    from photoplan.products.sensor import SensorRequest, describe_sensor
+    from photoplan.products.sensor.run import SensorRequest, describe_sensor
 
     found = describe_sensor(SensorRequest(**options))
     if as_json:

@@ -9,10 +9,8 @@ import click
 
 from photoplan.cli.progress import progress
 from photoplan.cli.running import How
-from photoplan.products.orthophoto import OrthoPlan
-from photoplan.products.plan_file import PlanFigures, check_plan_path, compile_figures, write_plan
-
-__all__ = ["show_plan"]
+from photoplan.products.orthophoto.plan import OrthoPlan
+from photoplan.products.orthophoto.plan_file import PlanFigures, check_plan_path, compile_figures, write_plan
 
 
 def show_plan(plan: OrthoPlan, folder: Path, plan_file: Path | None, how: How) -> None:

@@ -10,8 +10,6 @@ import click
 
 from photoplan.cli.options import json_option
 
-__all__ = ["command"]
-
 
 @click.command("simulate")
 @click.argument("scene", metavar="SCENE")
@@ -42,7 +40,7 @@ def command(scene: str, as_json: bool, quiet: bool, **options: Any) -> None:
     discs:PITCH,DIAMETER.
     """
     from photoplan.cli.progress import progress
-    from photoplan.products.simulate import SimulateRequest, simulate
+    from photoplan.products.simulate.run import SimulateRequest, simulate
 
     report = simulate(SimulateRequest(scene, **options), lambda total: progress(total, quiet, "images"))
     if as_json:

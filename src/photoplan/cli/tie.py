@@ -11,9 +11,7 @@ import click
 from photoplan.cli.options import json_option
 
 if TYPE_CHECKING:
-    from photoplan.products.tie import TieReport
-
-__all__ = ["command"]
+    from photoplan.products.tie.run import TieReport
 
 
 @click.command("tie")
@@ -41,7 +39,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     import psutil
 
     from photoplan.cli.progress import progress
-    from photoplan.products.tie import TieRequest, find_ties
+    from photoplan.products.tie.run import TieRequest, find_ties
 
     options["refine"] = not options.pop("no_refine")
     options["use_orientation"] = not options.pop("ignore_orientation")

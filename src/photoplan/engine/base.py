@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from photoplan.geometry.grid import Window
 
-__all__ = ["Reader"]
-
 
 class Reader(Protocol):
     """A source image that is read by windows; safe to call from several threads."""

@@ -15,8 +15,6 @@ from photoplan.kernels.rectify import rectify_tile
 from photoplan.plan.product import CompiledTile, ProductPlan, compile_tile
 from photoplan.surfaces.base import Surface
 
-__all__ = ["Pixels", "execute_tile", "render"]
-
 #: A window of the source larger than this (bytes as read) is not read at once; its tile is executed in parts.
 MOST_SOURCE_BYTES = 48 * 2**20
 #: A tile of this side is not cut further, however much of the source it needs.

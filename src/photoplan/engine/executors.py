@@ -28,8 +28,6 @@ from typing import Any
 
 from photoplan.errors import PhotoplanError, UsageError
 
-__all__ = ["Outcome", "SerialExecutor", "Workers", "executor_factory", "run_tiles"]
-
 #: How often a tile is tried again after its worker died or an unforeseen error.
 RETRIES = 2
 

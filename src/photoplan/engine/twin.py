@@ -17,8 +17,6 @@ from photoplan.geometry.grid import Window
 from photoplan.surfaces.base import Surface
 from photoplan.targets.base import Target
 
-__all__ = ["strict_positions", "strict_scales", "twin_resample"]
-
 
 def strict_positions(
     target: Target, window: Window, camera: Camera, surface: Surface

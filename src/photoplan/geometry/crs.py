@@ -22,19 +22,6 @@ from pyproj.transformer import TransformerGroup
 
 from photoplan.errors import InputError
 
-__all__ = [
-    "CrsStep",
-    "canonical_crs",
-    "crs_label",
-    "crs_step",
-    "grid_rotation",
-    "parse_crs",
-    "require_projected_metres",
-    "same_crs",
-    "split_compound",
-    "topocentric_poses",
-]
-
 
 @lru_cache(maxsize=256)
 def parse_crs(text: str, where: str = "CRS") -> CRS:

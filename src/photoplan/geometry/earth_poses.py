@@ -13,19 +13,6 @@ from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_label, crs_step, parse_crs, require_projected_metres, topocentric_poses
 from photoplan.geometry.local import LocalFrame
 
-__all__ = [
-    "enu_axes",
-    "enu_poses",
-    "geocentric_of_geodetic",
-    "geocentric_poses",
-    "geodetic_of_geocentric",
-    "is_local_crs",
-    "is_wgs84_geographic",
-    "legacy_wkt",
-    "map_poses",
-    "topocentric_of_map",
-]
-
 _Floats = NDArray[np.float64]
 
 

@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import UsageError
 
-__all__ = ["MapGrid", "Window"]
-
 
 @dataclass(frozen=True, order=True)
 class Window:

@@ -20,8 +20,6 @@ from pyproj.transformer import TransformerGroup
 from photoplan.errors import HeightSystemError, InputError
 from photoplan.geometry.crs import area_of, canonical_crs, crs_label, missing_grids, parse_crs
 
-__all__ = ["HeightStep", "check_height_system", "crs_with_heights", "declared_pair", "height_label", "height_step"]
-
 OPTIONS = (
     "ellipsoidal, EPSG:nnnn (a vertical CRS, such as EPSG:5773 for EGM96), or same (both inputs are in one system)"
 )

@@ -13,8 +13,6 @@ from pyproj import Transformer
 from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_label, require_projected_metres
 
-__all__ = ["LocalFrame", "altered_height", "earth_radius", "unaltered_height"]
-
 #: Half the distance over which the mapping's derivative is taken, metres: the mapping is so smooth (its third
 #: derivative is of the order 1/R²) that truncation and rounding both stay below 1e-10.
 _REACH = 100.0

@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.rotation import opk_from_rotation, rotation_from_angles
 
-__all__ = ["Pose"]
-
 
 @dataclass(frozen=True, eq=False)
 class Pose:

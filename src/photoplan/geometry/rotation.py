@@ -7,8 +7,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import UsageError
 
-__all__ = ["ROTATION_ORDERS", "angles_from_rotation", "opk_from_rotation", "rotation_from_angles", "rotation_opk"]
-
 #: Orders of the three angles; the first letter is the primary rotation (about the fixed axis).
 ROTATION_ORDERS = ("opk", "pok", "kpo", "kop", "okp", "pko")
 

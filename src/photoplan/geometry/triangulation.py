@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from photoplan.errors import GeometryError
 
-__all__ = ["constrained_faces"]
-
 
 def constrained_faces(xy: NDArray[np.float64], edges: NDArray[np.int64]) -> NDArray[np.int32]:
     """Triangles over all points (their convex hull is filled) that hold every edge.

@@ -15,8 +15,6 @@ from photoplan.cameras.observed import ImagePoints
 from photoplan.io.geopackage import VectorLayer, write_geopackage
 from photoplan.io.named_table import write_named_table
 
-__all__ = ["PointLayer", "write_point_layers", "write_residuals"]
-
 
 @dataclass(frozen=True, eq=False)
 class PointLayer:

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from photoplan.io.disk import write_atomically
 
-__all__ = ["array_key", "load_arrays", "store_arrays"]
-
 _KEY = "key"
 
 

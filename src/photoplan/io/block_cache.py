@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from photoplan.errors import UsageError
 
-__all__ = ["BlockCache"]
-
 
 class BlockCache:
     """Arrays by key, at most `limit` bytes of them; safe to use from several threads.

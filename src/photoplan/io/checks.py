@@ -14,17 +14,6 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 
-__all__ = [
-    "DRIVER_NAMES",
-    "IMAGE_LIMITS",
-    "TERRAIN_LIMITS",
-    "RasterLimits",
-    "check_declared_size",
-    "check_plain_file",
-    "check_sidecars",
-    "raster_driver",
-]
-
 _GIB = 1 << 30
 
 DRIVER_NAMES = {

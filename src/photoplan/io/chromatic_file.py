@@ -9,12 +9,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, Strict
 
-from photoplan.io.camera_model import Entry, Number, Pair, Pixels
+from photoplan.io.camera.model import Entry, Number, Pair, Pixels
 from photoplan.io.disk import write_atomically
-from photoplan.io.project_write import toml_value
+from photoplan.io.project.write import toml_value
 from photoplan.io.toml_entries import read_entries
-
-__all__ = ["ChromaticBand", "ChromaticFile", "read_chromatic", "write_chromatic"]
 
 _MAX_BYTES = 1_000_000
 _Band = Annotated[int, Strict(), Field(ge=1, le=1000)]

@@ -14,8 +14,6 @@ from photoplan.errors import PhotoplanError, UsageError
 from photoplan.io.gdal import gdal_settings, warnings_of_gdal
 from photoplan.io.storage import COMPRESSIONS
 
-__all__ = ["CogOptions", "write_cog"]
-
 RESAMPLINGS = ("average", "mode", "nearest")
 
 

@@ -20,8 +20,6 @@ from photoplan.io.disk import disk_error, sync_file, sync_folder
 from photoplan.io.lock import FileLock
 from photoplan.io.product import check_output
 
-__all__ = ["FORMATS", "ContourRow", "LabelRow", "contour_files", "write_contours"]
-
 #: Ending of the name and the driver that writes it.
 FORMATS = {".gpkg": "GPKG", ".shp": "ESRI Shapefile", ".geojson": "GeoJSON", ".json": "GeoJSON", ".dxf": "DXF"}
 #: Vertices of the lines that are handed over at once.

@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 from photoplan.geometry.grid import Window
 from photoplan.io.disk import disk_error, write_all
 
-__all__ = ["SEQUENTIAL", "DecodedPicture", "decoded_picture"]
-
 SEQUENTIAL = ("JPEG", "PNG")
 """Formats that are decoded from the top."""
 _KEPT = 2

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from photoplan.geometry.grid import Window
 from photoplan.io.tiff_layout import TiffLayout, read_tiff_layout
 
-__all__ = ["damaged_block"]
-
 #: Codes of the two DEFLATE compressions of TIFF.
 _DEFLATE = (8, 32946)
 #: Bytes that are decoded at once while a block is checked.

@@ -9,8 +9,6 @@ from pathlib import Path
 
 from photoplan.errors import PhotoplanError, ResourceError, UsageError
 
-__all__ = ["disk_error", "free_megabytes", "sync_file", "sync_folder", "write_all", "write_atomically"]
-
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.ENOMEM}
 
 

@@ -13,8 +13,6 @@ from typing import BinaryIO
 
 from photoplan.errors import InputError
 
-__all__ = ["ExifValue", "read_exif"]
-
 ExifValue = str | tuple[float, ...]
 
 #: Entries of a directory, bytes of a value and segments of a JPEG header at most; real ones are far smaller.

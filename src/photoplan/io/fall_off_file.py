@@ -7,11 +7,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, Strict
 
-from photoplan.io.camera_model import Entry, Number, Positive
-from photoplan.io.project_write import toml_value
+from photoplan.io.camera.model import Entry, Number, Positive
+from photoplan.io.project.write import toml_value
 from photoplan.io.toml_entries import read_entries
-
-__all__ = ["FallOffEntry", "fall_off_text", "read_fall_off_entry"]
 
 _MAX_BYTES = 1_000_000
 _Side = Annotated[int, Strict(), Field(gt=0, le=10_000_000)]

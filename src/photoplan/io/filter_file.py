@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.plain_files import finite, read_text
-from photoplan.io.project_write import toml_key, toml_value
+from photoplan.io.project.write import toml_key, toml_value
 from photoplan.io.toml_file import read_toml
-
-__all__ = ["FilterEntries", "KernelEntry", "filter_text", "is_filter", "plain_fact", "read_filter_file"]
 
 #: Entry `kind` of a filter file, by which it is told from a project.
 FILTER_KIND = "restoration filter"

@@ -9,8 +9,6 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 
-__all__ = ["Fingerprint", "fingerprint", "unchanged"]
-
 _BLOCK = 64 << 10
 _BLOCKS = 64
 

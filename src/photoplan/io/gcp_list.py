@@ -25,8 +25,6 @@ from photoplan.io.names import match_key
 from photoplan.io.plain_files import read_text
 from photoplan.io.text_columns import NUMBER
 
-__all__ = ["GcpList", "is_gcp_list", "read_gcp_list", "write_gcp_list"]
-
 MAX_BYTES = 100_000_000
 _UTM = re.compile(r"WGS\s*84\s+UTM\s+(\d{1,2})\s*([NS])", re.I)
 

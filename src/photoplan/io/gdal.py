@@ -18,17 +18,6 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from photoplan.errors import InputError
 
-__all__ = [
-    "GDAL_ERRORS",
-    "close_handles",
-    "first_cause",
-    "gdal_settings",
-    "handle",
-    "not_georeferenced",
-    "open_raster",
-    "warnings_of_gdal",
-]
-
 CACHE_BYTES = 32 << 20
 """GDAL's block cache of the whole process; its default of a twentieth of the memory is not bounded enough."""
 GDAL_ERRORS = (RasterioError, CPLE_BaseError)

@@ -17,8 +17,6 @@ from pyogrio.errors import DataSourceError
 from photoplan.errors import UsageError
 from photoplan.io.disk import disk_error, sync_file, sync_folder
 
-__all__ = ["VectorLayer", "write_geopackage"]
-
 
 @dataclass(frozen=True, eq=False)
 class VectorLayer:

@@ -19,8 +19,6 @@ from photoplan.io.disk import free_megabytes
 from photoplan.io.product import ProductFacts, ProductFile, check_output
 from photoplan.io.storage import Nodata
 
-__all__ = ["GridOptions", "GridTile", "GridTiles", "write_grid"]
-
 GridTile = NDArray[Any] | tuple[NDArray[Any], NDArray[np.bool_]] | None
 """Values (bands, h, w); or values and validity (h, w), True = valid; or None: nothing is valid."""
 GridTiles = Callable[[Window], GridTile]

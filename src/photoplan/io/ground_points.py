@@ -26,8 +26,6 @@ from photoplan.io.checks import check_plain_file
 from photoplan.io.named_table import TableColumns, read_named_table, write_named_table
 from photoplan.io.prj_file import crs_beside
 
-__all__ = ["read_ground_points", "write_ground_points"]
-
 _ROLES = {
     "name": ("name", "point", "id", "label", "gcp", "point_id", "marker"),
     "x": ("x", "x0", "e", "east", "easting", "x_m"),

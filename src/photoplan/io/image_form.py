@@ -12,8 +12,6 @@ from photoplan.io.gdal import GDAL_ERRORS, gdal_settings, open_raster
 from photoplan.io.raster_info import RasterInfo
 from photoplan.io.scan_pitch import read_pitch
 
-__all__ = ["ImageForm", "dress", "form_of"]
-
 #: Metadata that are not true of a copy, or are written by its maker.
 _NOT_KEPT = ("AREA_OR_POINT", "PHOTOPLAN_", "TIFFTAG_SOFTWARE", "TIFFTAG_MINSAMPLEVALUE", "TIFFTAG_MAXSAMPLEVALUE",
              "OVR_RESAMPLING_ALG", "LAYOUT", "STATISTICS_")  # fmt: skip

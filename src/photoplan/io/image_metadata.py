@@ -23,8 +23,6 @@ from photoplan.errors import InputError
 from photoplan.io.exif import ExifValue, read_exif
 from photoplan.io.xml_file import parse_xml
 
-__all__ = ["ImageMetadata", "read_image_metadata"]
-
 _DJI = "dji.com/drone-dji"
 _CAMERA = "pix4d.com/camera"
 _MM_PER_UNIT = {2.0: 25.4, 3.0: 10.0, 4.0: 1.0, 5.0: 0.001}

@@ -16,8 +16,6 @@ from photoplan.errors import InputError
 from photoplan.io.named_table import NamedTable, TableColumns, read_named_table, write_named_table
 from photoplan.io.names import match_key
 
-__all__ = ["named_as", "read_image_points", "write_image_points"]
-
 _ROLES = {
     "point": ("point", "name", "point_id", "id", "gcp", "track"),
     "image": ("image", "photo", "file", "filename", "image_name", "cliche"),

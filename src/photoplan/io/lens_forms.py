@@ -13,12 +13,10 @@ from photoplan.cameras.lenses.fisheye import Fisheye
 from photoplan.cameras.lenses.none import NoLens
 from photoplan.cameras.lenses.opencv import OpenCV
 from photoplan.errors import InputError
-from photoplan.io.camera_model import FilmCamera, FrameCamera
+from photoplan.io.camera.model import FilmCamera, FrameCamera
 from photoplan.io.orientation.block import Loss, OrientationBlock
 from photoplan.io.plain_files import build
-from photoplan.io.project_cameras import lens_of
-
-__all__ = ["AgisoftForm", "OpenCVForm", "agisoft_form", "frame_camera", "opencv_form", "opencv_losses"]
+from photoplan.io.project.cameras import lens_of
 
 
 @dataclass(frozen=True)

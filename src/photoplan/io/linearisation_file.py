@@ -12,8 +12,6 @@ from photoplan.errors import InputError
 from photoplan.io.plain_files import read_text
 from photoplan.io.text_columns import NUMBER, has_decimal_comma
 
-__all__ = ["read_linearisation_table"]
-
 #: A table of 65536 lines of four long numbers.
 MAX_BYTES = 8_000_000
 _MOST_COLUMNS = 4

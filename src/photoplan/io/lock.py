@@ -15,8 +15,6 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
     import msvcrt
 
-__all__ = ["FileLock"]
-
 
 class FileLock:
     """An exclusive lock on a file beside the product; a context manager.

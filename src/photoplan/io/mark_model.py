@@ -1,6 +1,6 @@
 """Descriptions of what fiducial marks look like, as checked and frozen entries of a film camera.
 
-`photoplan.products.camera_marks` turns them into the patterns that are sought in scans. Lengths are millimetres on the
+`photoplan.project.camera_marks` turns them into the patterns that are sought in scans. Lengths are millimetres on the
 film, angles degrees anticlockwise; x is right and y up about the mark's reference point.
 """
 
@@ -9,26 +9,6 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Strict, Tag, model_validator
-
-__all__ = [
-    "Arc",
-    "Block",
-    "Cross",
-    "Curve",
-    "Dot",
-    "DotCross",
-    "EachMark",
-    "Example",
-    "Mark",
-    "Marks",
-    "Notch",
-    "Part",
-    "Polygon",
-    "Ring",
-    "RingCross",
-    "Silhouette",
-    "Triangle",
-]
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Length = Annotated[float, Strict(), Field(gt=0, le=1000, allow_inf_nan=False)]
@@ -57,7 +37,7 @@ class _Free(_Entry):
 
 
 class Cross(_Free):
-    """Four arms; see `photoplan.orientation.mark_catalogue` for every number of this and the following marks."""
+    """Four arms; see `photoplan.orientation.marks.catalogue` for every number of this and the following marks."""
 
     type: Literal["cross"]
     arm: Length

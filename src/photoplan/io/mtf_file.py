@@ -13,8 +13,6 @@ from photoplan.errors import InputError
 from photoplan.io.named_table import TableColumns, read_named_table
 from photoplan.io.plain_files import read_head
 
-__all__ = ["MtfTable", "read_mtf_table"]
-
 _FREQUENCY = {
     "px": ("cycles_per_px", "cycles_per_pixel", "cycles/px", "cycles/pixel", "cy/px", "lp/px"),
     "mm": ("cycles_per_mm", "cycles/mm", "cy/mm", "lp_per_mm", "lp/mm"),

@@ -30,8 +30,6 @@ from photoplan.io.text_columns import (
     split_line,
 )
 
-__all__ = ["NamedTable", "TableColumns", "read_named_table", "write_named_table"]
-
 MAX_BYTES = 1_000_000_000
 _NOTHING = ("nan", "inf", "infinity", "null", "none", "na", "n/a")
 

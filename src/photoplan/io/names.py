@@ -11,8 +11,6 @@ from pathlib import Path
 
 from photoplan.errors import InputError, UsageError
 
-__all__ = ["check_input_name", "inside", "match_key", "relative_path", "resolve_input", "safe_stem", "unique_stems"]
-
 #: Bytes of a stem at most; file systems allow 255 for a name, and products add a few suffixes.
 MAX_BYTES = 120
 

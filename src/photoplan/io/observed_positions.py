@@ -26,9 +26,7 @@ from photoplan.io.orientation.exif import map_positions, read_folder
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.orientation.table import TableFormat, angle_in_radians
 from photoplan.io.prj_file import crs_beside
-from photoplan.io.project_model import ANGLE_UNITS
-
-__all__ = ["PositionTable", "read_observed_positions"]
+from photoplan.io.project.model import ANGLE_UNITS
 
 _ROLES = {
     "name": ("name", "nom", "image", "image_name", "filename", "file", "photo", "label", "id"),

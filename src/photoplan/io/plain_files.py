@@ -12,9 +12,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from photoplan.errors import InputError
-from photoplan.io.project_errors import explain
-
-__all__ = ["build", "finite", "parse_yaml", "read_head", "read_json", "read_text", "read_yaml"]
+from photoplan.io.project.errors import explain
 
 #: Levels of nesting that any of our formats could need.
 MAX_DEPTH = 32

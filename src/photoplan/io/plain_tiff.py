@@ -21,8 +21,6 @@ from photoplan.errors import PhotoplanError
 from photoplan.io.gdal import gdal_settings, not_georeferenced
 from photoplan.io.tiff_layout import TiffArray, read_tiff_layout
 
-__all__ = ["write_plain_tiff"]
-
 _CHUNK = 8 << 20
 _NO_KERNEL_COPY = {errno.EXDEV, errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.EPERM}
 

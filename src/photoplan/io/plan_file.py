@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 
-__all__ = ["PlanTables", "read_plan_tables", "write_plan_tables"]
-
 FORMAT = 1
 _HEADER = "photoplan_plan"
 

@@ -7,8 +7,6 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 
-__all__ = ["check_png_complete"]
-
 
 def check_png_complete(path: Path) -> None:
     """Follow the chunks to the end chunk; the decoder itself would deliver a cut-off picture without a word.

@@ -21,8 +21,6 @@ from photoplan.geometry.grid import MapGrid
 from photoplan.io.checks import check_plain_file
 from photoplan.io.geopackage import VectorLayer, write_geopackage
 
-__all__ = ["Feature", "Features", "label_polygons", "read_features", "write_features"]
-
 _MAGIC = {b"SQLite format 3\0": "GeoPackage", b"\x00\x00\x27\x0a": "Shapefile", b"fgb": "FlatGeobuf"}
 _KINDS = {
     "Polygon": ("Polygon", "MultiPolygon"),

@@ -8,8 +8,6 @@ from pathlib import Path
 from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.io.plain_files import read_text
 
-__all__ = ["StatedCrs", "crs_beside"]
-
 _MAX_BYTES = 100_000
 
 

@@ -26,8 +26,6 @@ from photoplan.io.product_check import check_product
 from photoplan.io.storage import PRODUCT_TYPES, BlockCoder, Nodata, nodata_for
 from photoplan.io.tile_log import TileLog
 
-__all__ = ["ProductFacts", "ProductFile", "check_output"]
-
 _SAMPLES = 12
 _BIG = 3_900_000_000
 

@@ -16,8 +16,6 @@ from photoplan.geometry.grid import Window
 from photoplan.io.gdal import gdal_settings, open_raster
 from photoplan.io.tiff_layout import read_tiff_layouts
 
-__all__ = ["check_product"]
-
 _SIDE = 16
 _LOSSY = 16.0
 """Difference in grey values of means over 16 × 16 pixels up to which a tile compressed with losses counts as the one

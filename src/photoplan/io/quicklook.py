@@ -18,8 +18,6 @@ from photoplan.io.checks import check_plain_file, raster_driver
 from photoplan.io.disk import write_atomically
 from photoplan.io.gdal import GDAL_ERRORS, first_cause, gdal_settings, not_georeferenced, open_raster
 
-__all__ = ["write_overview", "write_quicklook"]
-
 _PERCENT = 2.0, 98.0
 
 

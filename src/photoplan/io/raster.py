@@ -23,8 +23,6 @@ from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.tiff_layout import read_tiff_layout
 from photoplan.io.validity import MissingBlocks, finite, not_nodata
 
-__all__ = ["IMAGE_TYPES", "RasterReader", "read_pixels"]
-
 IMAGE_TYPES = ("uint8", "uint16", "int16", "float32")
 """Types of the pixels of source images."""
 

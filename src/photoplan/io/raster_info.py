@@ -21,8 +21,6 @@ from photoplan.io.gdal import gdal_settings, open_raster, warnings_of_gdal
 from photoplan.io.png_chunks import check_png_complete
 from photoplan.io.tiff_layout import TiffLayout, read_tiff_layout
 
-__all__ = ["RasterInfo", "read_info"]
-
 _METRES = {"m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0}
 _METRES |= dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048)
 _METRES |= dict.fromkeys(("us survey foot", "us-ft", "ftus", "ft_us", "foot_us"), 1200.0 / 3937.0)

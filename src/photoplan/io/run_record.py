@@ -24,8 +24,6 @@ try:
 except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
-__all__ = ["peak_memory_bytes", "record_path", "versions", "write_run_record"]
-
 _PACKAGES = ("photoplan", "numpy", "numba", "scipy", "rasterio", "pyproj", "pyogrio", "shapely")
 
 

@@ -12,8 +12,6 @@ from photoplan.errors import UsageError
 from photoplan.io.gdal import open_raster
 from photoplan.io.raster_info import read_info
 
-__all__ = ["parse_pitch", "read_pitch"]
-
 _INCH = 25.4
 #: Millimetres that a resolution tag counts pixels in: 2 is the inch, 3 the centimetre (TIFF 6.0, EXIF 2.3).
 _UNITS = {"2": _INCH, "3": 10.0}

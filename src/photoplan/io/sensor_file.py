@@ -8,10 +8,8 @@ from typing import Annotated, Self
 from pydantic import Field, Strict, model_validator
 
 from photoplan.errors import InputError
-from photoplan.io.camera_model import Entry, Name, Number
+from photoplan.io.camera.model import Entry, Name, Number
 from photoplan.io.toml_entries import read_entries
-
-__all__ = ["SensorDescription", "read_sensor"]
 
 _MAX_BYTES = 1_000_000
 #: Nothing that is described is larger, or smaller than its reciprocal; it keeps every figure finite.

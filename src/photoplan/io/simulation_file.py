@@ -11,10 +11,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, Strict
 
-from photoplan.io.camera_model import Entry, Number, Pair
+from photoplan.io.camera.model import Entry, Number, Pair
 from photoplan.io.toml_entries import read_entries
-
-__all__ = ["SimulationFile", "read_simulation"]
 
 #: A description with a table of defects for every element of a large sensor stays below.
 _MAX_BYTES = 20_000_000

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from photoplan.errors import UsageError
 from photoplan.kernels.blocks import fill_block
 
-__all__ = ["COMPRESSIONS", "PRODUCT_TYPES", "BlockCoder", "Nodata", "nodata_for"]
-
 COMPRESSIONS = ("none", "deflate", "zstd", "lzw", "jpeg")
 PRODUCT_TYPES = ("uint8", "uint16", "int16", "float32")
 Nodata = float | Literal["auto", "mask"]

@@ -9,8 +9,6 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 
-__all__ = ["DELIMITERS", "NUMBER", "decimal", "find_delimiter", "has_decimal_comma", "number_of_columns", "split_line"]
-
 #: In the order in which they are tried.
 DELIMITERS = (";", "\t", ",", " ")
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)

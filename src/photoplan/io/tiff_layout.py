@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 
-__all__ = ["TiffArray", "TiffLayout", "read_tiff_layout", "read_tiff_layouts"]
-
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
 _CODES = {1: "u1", 3: "u2", 4: "u4", 13: "u4", 16: "u8", 18: "u8"}
 _MAX_TAGS = 4096

@@ -21,8 +21,6 @@ from typing import BinaryIO
 from photoplan.errors import PhotoplanError
 from photoplan.io.disk import disk_error, write_all
 
-__all__ = ["TileLog"]
-
 _MAGIC = b"PPTILES2"
 _START = struct.Struct("<8s32sI")
 _RECORD = struct.Struct("<4sQQQQI")

@@ -8,10 +8,8 @@ from typing import TypeVar
 from pydantic import BaseModel, ValidationError
 
 from photoplan.errors import InputError
-from photoplan.io.project_errors import explain
+from photoplan.io.project.errors import explain
 from photoplan.io.toml_file import MAX_BYTES, read_toml
-
-__all__ = ["read_entries"]
 
 _Model = TypeVar("_Model", bound=BaseModel)
 

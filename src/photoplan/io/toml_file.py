@@ -9,8 +9,6 @@ from typing import Any
 from photoplan.errors import InputError
 from photoplan.io.plain_files import read_text
 
-__all__ = ["read_toml"]
-
 #: A project of 100,000 images stays far below; anything larger is not a project file.
 MAX_BYTES = 200_000_000
 

@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 
 from photoplan.geometry.grid import Window
 
-__all__ = ["MissingBlocks", "finite", "not_nodata"]
-
 
 def not_nodata(pixels: NDArray[Any], nodata: float | None) -> NDArray[np.bool_] | None:
     """Where not all bands of `pixels` (bands, h, w) equal `nodata`; None if that is everywhere.

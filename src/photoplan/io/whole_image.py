@@ -16,8 +16,6 @@ from photoplan.errors import PhotoplanError, UsageError
 from photoplan.io.disk import disk_error, sync_file, sync_folder
 from photoplan.io.gdal import GDAL_ERRORS, gdal_settings
 
-__all__ = ["write_whole_image"]
-
 _TYPES = ("uint8", "uint16", "int16", "float32")
 
 

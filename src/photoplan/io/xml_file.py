@@ -11,8 +11,6 @@ from defusedxml.ElementTree import fromstring  # type: ignore[import-untyped]
 from photoplan.errors import InputError
 from photoplan.io.plain_files import MAX_DEPTH, finite, read_text
 
-__all__ = ["numbers", "parse_xml", "read_xml"]
-
 
 def read_xml(path: Path, max_bytes: int) -> Element:
     """Root of an XML file.

@@ -15,8 +15,6 @@ from photoplan.errors import InputError
 from photoplan.io.plain_files import read_text
 from photoplan.io.text_columns import DELIMITERS, NUMBER
 
-__all__ = ["XYTable", "read_xy_table"]
-
 MAX_BYTES = 1_000_000_000
 
 

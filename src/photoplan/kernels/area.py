@@ -13,8 +13,6 @@ from photoplan.kernels.place import ALL, AVERAGE
 from photoplan.kernels.sampling import add_block, block_pixels
 from photoplan.kernels.weights import TABLE_STEPS
 
-__all__ = ["average_runs"]
-
 # Weights stand in the middle of zeros, so that blocks of pixels may reach beyond them.
 _BEFORE = 8
 

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from photoplan.kernels.jit import inner, kernel
 from photoplan.kernels.place import ALL, BORDER
 
-__all__ = ["LEAST_WEIGHT", "border_runs", "store"]
-
 LEAST_WEIGHT = 0.5 - 1e-6
 """A pixel is valid if the weights of its valid taps add up to this: a half, up to rounding."""
 

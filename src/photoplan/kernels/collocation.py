@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 
-__all__ = ["EXPONENTIAL", "GAUSSIAN", "MATERN", "correlation", "factorise", "solve_transposed"]
-
 GAUSSIAN, MATERN, EXPONENTIAL = 0, 1, 2
 """Families of covariance functions, from the smoothest surface to the roughest."""
 

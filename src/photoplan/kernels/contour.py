@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 
-__all__ = ["count_segments", "cross_edges", "fill_segments", "link_segments"]
-
 #: A crossing keeps away from the edge's ends by this difference of height, metres, at most by a quarter of all …
 APART = 5e-7
 #: … and where it may move, by this part of the edge.

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 
-__all__ = ["smooth_line", "thin_line"]
-
 # A step towards the mean of the neighbours, and a part of it back, so that small rings shrink less.
 _INWARD, _OUTWARD = 0.5, -0.2
 # Below this sine the edge runs so nearly along the line that their intersection says nothing.

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 
-__all__ = ["CHUNK", "EVEN_TAPS", "GENERAL_TAPS", "convolve_even", "convolve_general", "round_clipped"]
-
 #: Columns are computed in multiples of this number: sixteen lanes, four at once.
 CHUNK = 64
 #: Columns of weights that are unrolled together; a tag of that length selects the compiled code.

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 
-__all__ = ["correlate"]
-
 _FLAT = 1e-10
 
 

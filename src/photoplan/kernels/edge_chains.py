@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import kernel
 
-__all__ = ["grow", "ridge"]
-
 
 @kernel
 def ridge(gx: NDArray[np.float32], gy: NDArray[np.float32], least: float, offset: NDArray[np.float32]) -> int:

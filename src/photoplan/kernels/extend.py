@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import kernel
 
-__all__ = ["extend_oddly"]
-
 
 @kernel
 def extend_oddly(

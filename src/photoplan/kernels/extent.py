@@ -6,8 +6,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["height_ranges"]
-
 
 @njit(nogil=True, cache=True)
 def height_ranges(relief: NDArray[np.float32], rects: NDArray[np.int32]) -> NDArray[np.float64]:

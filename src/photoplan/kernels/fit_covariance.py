@@ -11,8 +11,6 @@ from photoplan.kernels.collocation import correlation, factorise, solve_transpos
 from photoplan.kernels.jit import kernel
 from photoplan.kernels.patch_system import left_out, misfit
 
-__all__ = ["block_score", "minimise"]
-
 _JITTER = 1e-8
 
 

@@ -15,17 +15,6 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 
-__all__ = [
-    "accumulate",
-    "accumulate_split",
-    "directions",
-    "downstream",
-    "flood",
-    "label",
-    "steepest",
-    "upstream_length",
-]
-
 #: Neighbours from east, counter-clockwise; direction d of a cell is its position here.
 COLUMN = np.array([1, 1, 0, -1, -1, -1, 0, 1], np.int64)
 ROW = np.array([0, -1, -1, -1, 0, 1, 1, 1], np.int64)

@@ -12,8 +12,6 @@ from photoplan.kernels.place import ALL, INTERIOR
 from photoplan.kernels.position import RUN
 from photoplan.kernels.sampling import gather
 
-__all__ = ["gather_runs"]
-
 
 @inner
 def _write(

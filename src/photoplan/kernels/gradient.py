@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 
-__all__ = ["gradients", "illumination"]
-
 
 @inner
 def _slope(before: float, middle: float, after: float, step: float) -> float:

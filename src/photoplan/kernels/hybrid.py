@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from photoplan.kernels.jit import inner, kernel
 from photoplan.kernels.sample_grid import _bilinear, _post
 
-__all__ = ["sample_hybrid", "scan_faces"]
-
 _ON_FACE = 1e-7
 _ON_LINE = 1e-6
 Frame = tuple[float, float, float, int]

@@ -10,8 +10,6 @@ from typing import Any
 
 from numba import config, njit, typeof
 
-__all__ = ["COMPILED", "inner", "is_ready", "kernel"]
-
 COMPILED: bool = not config.DISABLE_JIT
 """False when `NUMBA_DISABLE_JIT=1`: everything then runs as plain Python, slowly, with the same results."""
 

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import kernel
 
-__all__ = ["pack", "solid_patches"]
-
 
 def pack(source: NDArray[Any], valid: NDArray[Any] | None = None) -> NDArray[Any]:
     """Planar pixels as groups of bands.

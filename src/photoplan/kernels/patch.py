@@ -11,8 +11,6 @@ from photoplan.kernels.collocation import correlation, solve_transposed
 from photoplan.kernels.jit import inner, kernel
 from photoplan.kernels.patch_system import system, trend, usable
 
-__all__ = ["predict"]
-
 # Models of a patch with less weight than this are left out.
 _LEAST = 0.02
 

@@ -18,9 +18,6 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 
-__all__ = ["CONVERGED", "CORRELATION", "COVARIANCE", "LEFT", "RESULTS", "SIGMA0", "SINGULAR", "UNSETTLED"]
-__all__ += ["match_patches", "sample_spline", "spline_coefficients"]
-
 #: What became of a patch: settled; not enough of it lies in the window; the normal matrix is singular (no texture,
 #: or texture along one direction); the iteration has not settled or went farther than allowed.
 CONVERGED, LEFT, SINGULAR, UNSETTLED = 0, 1, 2, 3

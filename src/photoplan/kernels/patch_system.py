@@ -11,8 +11,6 @@ from photoplan.kernels.collocation import correlation, factorise, solve_transpos
 from photoplan.kernels.jit import inner, kernel
 from photoplan.kernels.sides import clip_lines, sides_of
 
-__all__ = ["left_out", "misfit", "system", "trend", "usable"]
-
 # Squared normalised differences count with their logarithm beyond this: no covariance function is to bend towards a
 # blunder.
 _KNEE = 16.0

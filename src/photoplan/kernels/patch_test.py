@@ -11,8 +11,6 @@ from photoplan.kernels.collocation import solve_transposed
 from photoplan.kernels.jit import kernel
 from photoplan.kernels.patch_system import left_out, misfit, system, usable
 
-__all__ = ["score_models", "test_points"]
-
 # Points count with a normal weight of this many half sides of the leaf: far ones are other patches' matter.
 _FOCUS = 1.5
 

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from photoplan.kernels.jit import inner, kernel
 from photoplan.kernels.position import RUN, locate_run
 
-__all__ = ["ALL", "AVERAGE", "BORDER", "EMPTY", "INTERIOR", "NOTHING", "SOME", "empty_block", "place_runs"]
-
 EMPTY, INTERIOR, BORDER, AVERAGE = 0, 1, 2, 3
 """Kinds of pixels: outside or without relief; all taps inside and valid; some not; averaged over a wider kernel."""
 

@@ -14,18 +14,6 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 
-__all__ = [
-    "RUN",
-    "locate_run",
-    "middle_of_run",
-    "positions",
-    "row_weights",
-    "run_coefficients",
-    "shift_to",
-    "single",
-    "tile_runs",
-]
-
 RUN = 256
 """Columns of a rectangle that share one set of coefficients."""
 

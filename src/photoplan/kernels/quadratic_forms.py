@@ -9,8 +9,6 @@ import numpy as np
 from photoplan.kernels.jit import kernel
 from photoplan.kernels.selected_inverse import lookup
 
-__all__ = ["SparseRows", "gathered", "point_variances", "row_variances"]
-
 
 class SparseRows(NamedTuple):
     """Rows of a sparse matrix (CSR)."""

@@ -24,8 +24,6 @@ from photoplan.kernels.position import RUN, tile_runs
 from photoplan.kernels.scale import largest_scales, stretch_runs
 from photoplan.kernels.weights import KERNELS, STRETCH_FROM, weight_table
 
-__all__ = ["AnchorArrays", "is_compiled", "rectify_packed", "rectify_tile"]
-
 AnchorArrays = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]
 """rects (m, 4), box_start (m + 1,), box_heights (n, 2), corners (n, 8, 3): the fields of `photoplan.plan.Anchors`."""
 

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 
-__all__ = ["sample_lattice", "sample_points"]
-
 _ON_POST = 1e-6
 # Lattices coarser than this many posts skip most of a row; there is then nothing to gain from whole rows.
 _SPARSE = 2.0

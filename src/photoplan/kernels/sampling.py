@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import COMPILED, inner
 
-__all__ = ["add_block", "block_pixels", "gather"]
-
 _F32 = ir.FloatType()
 _I32 = ir.IntType(32)
 _FUSE = ("contract", "nsz")

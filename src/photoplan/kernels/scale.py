@@ -12,8 +12,6 @@ from photoplan.kernels.place import ALL, AVERAGE, EMPTY, INTERIOR, NOTHING, SOME
 from photoplan.kernels.position import RUN, middle_of_run, row_weights, run_coefficients, shift_to, single
 from photoplan.kernels.weights import STRETCH_FROM, STRETCH_FULL
 
-__all__ = ["largest_scales", "stretch_runs"]
-
 
 @kernel
 def largest_scales(

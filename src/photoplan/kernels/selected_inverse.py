@@ -8,8 +8,6 @@ import numpy as np
 
 from photoplan.kernels.jit import inner, kernel
 
-__all__ = ["SelectedInverse", "aligned", "fill_pattern", "lookup", "selected_inverse"]
-
 
 @kernel
 def fill_pattern(pointer, rows):

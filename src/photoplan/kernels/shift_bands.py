@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import kernel
 
-__all__ = ["limits_of", "no_mask", "shift_band"]
-
 
 @kernel
 def shift_band(source, valid, offset, moved, rule, out, out_valid):

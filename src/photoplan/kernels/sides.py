@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import kernel
 
-__all__ = ["clip_lines", "sides_of"]
-
 
 @kernel
 def sides_of(xy: NDArray[Any], vertices: NDArray[Any], start: NDArray[Any], pieces: int, result: NDArray[Any]) -> None:

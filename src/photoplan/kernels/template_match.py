@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 
-__all__ = ["sample_template"]
-
 
 @inner
 def _cubic(t, w, d):

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 
-__all__ = ["height_pyramid", "sight_rows"]
-
 _NUDGE = 1e-7
 """Part of a mesh by which a position on a grid line is moved on to find the mesh that comes next."""
 

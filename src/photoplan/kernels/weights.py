@@ -16,8 +16,6 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["DEFAULT_KERNEL", "KERNELS", "Kernel", "stretch", "weight_function", "weight_table"]
-
 LANCZOS_DEGREE = 12
 TABLE_STEPS = 2048
 STRETCH_FROM = 1.1

@@ -11,8 +11,6 @@ from scipy import fft, ndimage
 from photoplan.cameras.base import Camera, project
 from photoplan.kernels.patch_match import CONVERGED, CORRELATION, RESULTS, match_patches, spline_coefficients
 
-__all__ = ["Agreement", "FoundPatch", "agree", "best_place", "correlate", "find_patch"]
-
 Array = NDArray[np.float64]
 
 #: Part of a patch that must have values.

@@ -17,8 +17,6 @@ from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.matching.grey import GreyImage, to_bytes
 
-__all__ = ["FeatureSettings", "Features", "extract_features", "opencv"]
-
 #: A descriptor's numbers are kept as bytes, this many to one: their squares sum up to its square.
 DESCRIPTOR_UNIT = 512.0
 #: Parts that are worked on are not smaller than this, reduced pixels.

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from photoplan.geometry.grid import Window
 
-__all__ = ["Grey", "GreyImage", "Pixels", "ReducedImage", "patches_at", "to_bytes"]
-
 #: Pixels are read in squares of this side.
 TILE = 2048
 _LUMINANCE = (0.299, 0.587, 0.114)

@@ -18,8 +18,6 @@ from photoplan.matching.grey import Grey
 from photoplan.matching.refine import Map, Matched, RefineSettings, disc, local_affines, match_between
 from photoplan.matching.tracks import Tracks
 
-__all__ = ["Loops", "close_loops", "latin_weights"]
-
 #: Side of the squares that are dealt out, pixels. Noise of neighbouring pixels is alike: with squares of 4 pixels, a
 #: third of the effect of grain two pixels wide was missed, with 6 a seventh; larger ones leave too few for a patch.
 SQUARE = 6

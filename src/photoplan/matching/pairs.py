@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from photoplan.matching.features import DESCRIPTOR_UNIT, Features
 
-__all__ = ["Guide", "all_pairs", "match_features", "pairs_by_distance", "pairs_by_footprints", "pairs_by_likeness"]
-
 Pair = tuple[int, int]
 
 #: Rows of the table of similarities that are in memory at once.

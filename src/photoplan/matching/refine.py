@@ -14,17 +14,6 @@ from photoplan.kernels.patch_match import CONVERGED, CORRELATION, RESULTS, match
 from photoplan.matching.grey import Grey, patches_at
 from photoplan.matching.tracks import Tracks
 
-__all__ = [
-    "Matched",
-    "RefineSettings",
-    "Refined",
-    "disc",
-    "local_affines",
-    "match_between",
-    "reference_points",
-    "refine_tracks",
-]
-
 #: Neighbours whose features tell how two images are turned and scaled against each other at a place.
 _NEIGHBOURS = 15
 #: Patches that are matched at once.

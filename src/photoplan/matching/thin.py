@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from photoplan.matching.tracks import Tracks
 
-__all__ = ["thin_tracks"]
-
 #: Cells along each side of an image.
 CELLS = 5
 #: Tracks that every sixth of an overlap (its von Gruber positions) keeps, where it has so many.

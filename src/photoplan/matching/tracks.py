@@ -14,8 +14,6 @@ from scipy.sparse.csgraph import connected_components
 from photoplan.matching.features import Features
 from photoplan.matching.verify import PairMatches
 
-__all__ = ["Tracks", "TracksFound", "build_tracks", "connected_parts"]
-
 #: Features of one image closer than this are one point (pixels of the full image, at full scale).
 SAME_PLACE = 1.5
 

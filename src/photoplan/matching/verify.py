@@ -12,8 +12,6 @@ from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
 from photoplan.matching.features import opencv
 
-__all__ = ["Calibration", "PairMatches", "VerifySettings", "verify_pair"]
-
 
 @dataclass(frozen=True)
 class Calibration:

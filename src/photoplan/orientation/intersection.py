@@ -10,9 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import UsageError
 from photoplan.geometry.pose import Pose
-from photoplan.orientation.p3p import bearings
-
-__all__ = ["REASONS", "Intersected", "Rays", "intersect"]
+from photoplan.orientation.resection.p3p import bearings
 
 Array = NDArray[np.float64]
 

@@ -21,8 +21,6 @@ from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.rotation import ROTATION_ORDERS, rotation_from_angles
 
-__all__ = ["FittedReading", "Reading", "Sights", "StatedPoses", "fitting", "judge_readings", "sights_of", "turn_matrix"]
-
 #: Angle units: radians per unit.
 UNITS = {"deg": np.pi / 180, "gon": np.pi / 200, "rad": 1.0}
 DIRECTIONS = ("camera-to-ground", "ground-to-camera")

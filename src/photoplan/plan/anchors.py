@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from photoplan.geometry.grid import Window
 
-__all__ = ["Anchors"]
-
 
 @dataclass(frozen=True, eq=False)
 class Anchors:

@@ -16,8 +16,6 @@ from photoplan.kernels.extent import height_ranges
 from photoplan.plan.anchors import Anchors
 from photoplan.targets.base import Target
 
-__all__ = ["AnchorRule", "compile_anchors", "initial_cell"]
-
 #: A rectangle that still reaches behind the camera at this side is left out, pixels.
 SMALLEST_BEHIND = 4
 #: More layers than this over one rectangle do not pay; the residual that is left is reported.

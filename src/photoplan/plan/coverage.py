@@ -12,8 +12,6 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.surfaces.base import Surface
 from photoplan.surfaces.intersect import intersect
 
-__all__ = ["Coverage", "cover", "covered_tiles", "image_border"]
-
 #: Points per side of the lattice on which coverage is sampled.
 LATTICE = 192
 #: A tile this far beside the image is not compiled, pixels.

@@ -14,8 +14,6 @@ from photoplan.plan.compile import AnchorRule, compile_anchors
 from photoplan.surfaces.base import Surface
 from photoplan.targets.base import Target
 
-__all__ = ["CompiledTile", "ProductPlan", "Tile", "compile_tile"]
-
 
 @dataclass(frozen=True, order=True)
 class Tile:

@@ -13,23 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import UsageError
 
-__all__ = [
-    "OrientationEffect",
-    "admissible_height_error",
-    "admissible_shift",
-    "curvature_displacement",
-    "displacement_by_height",
-    "displacement_by_kappa",
-    "displacement_by_shift",
-    "displacement_by_tilt",
-    "megabytes",
-    "on_map",
-    "orientation_effect",
-    "resolution_on_ground",
-    "sampling_interval",
-    "scan_bytes",
-]
-
 #: Distance of an image corner from the principal point, 23 cm film format, metres (Ecker 1991, tables 4.2, 4.3).
 FILM_CORNER = 0.140
 #: Earth radius of Ecker 1991, table 4.2, metres.

@@ -2,7 +2,5 @@
 
 from typing import Literal
 
-__all__ = ["Compression", "Kernel"]
-
 Kernel = Literal["nearest", "bilinear", "bicubic", "bicubic-1", "lanczos3"]
 Compression = Literal["deflate", "zstd", "lzw", "jpeg", "none"]

@@ -15,24 +15,13 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io.chromatic_file import read_chromatic, write_chromatic
 from photoplan.io.raster import RasterReader
-from photoplan.products.aligned_reader import AlignedReader
+from photoplan.project.aligned_reader import AlignedReader
 from photoplan.quality.colour.disc_displacements import disc_displacements
 from photoplan.quality.colour.discs import DiscSettings, find_discs
 from photoplan.quality.colour.edge_displacements import edge_displacements
 from photoplan.quality.colour.model import BandModel, ChromaticModel, Displacements, fit_band
 from photoplan.quality.colour.patch_displacements import patch_displacements
 from photoplan.quality.edges.find import EdgePicture, find_edges
-
-__all__ = [
-    "ChromaticRequest",
-    "correct_chromatic",
-    "load_chromatic",
-    "measure_chromatic",
-    "measured_once",
-    "model_figures",
-    "model_lines",
-    "save_chromatic",
-]
 
 #: Side of the parts in which edges are sought, pixels; it bounds memory.
 _PART = 2048

@@ -14,19 +14,17 @@ from numpy.typing import NDArray
 from photoplan.cameras.affine_facts import AffineFacts, Shrinkage, affine_facts, film_shrinkage, residuals_on_film
 from photoplan.cameras.fiducials_fit import MODELS, FiducialFit
 from photoplan.errors import GeometryError, InputError, UsageError
-from photoplan.io.camera_model import FilmCamera
+from photoplan.io.camera.model import FilmCamera
 from photoplan.io.disk import write_atomically
 from photoplan.io.product import check_output
-from photoplan.io.project import load_project
-from photoplan.io.project_cameras import fiducial_fit
-from photoplan.io.project_edit import ProjectChanges, edit_project
-from photoplan.io.project_model import Image, Project
+from photoplan.io.project.cameras import fiducial_fit
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
+from photoplan.io.project.model import Image, Project
 from photoplan.io.scan_pitch import parse_pitch, read_pitch
 from photoplan.products.plain_values import plain
-from photoplan.products.scene import input_files
+from photoplan.project.scene import input_files
 from photoplan.report.interior import InteriorPlots, ResidualPanel, interior_report
-
-__all__ = ["ImageInterior", "InteriorRequest", "InteriorResult", "interior_orientations"]
 
 #: A film that seems to have changed by more was not scanned with the pitch that its file states.
 UNBELIEVABLE = 0.01

@@ -18,15 +18,13 @@ from photoplan.io.named_table import write_named_table
 from photoplan.io.orientation.table import angle_in_radians
 from photoplan.io.polygons import read_features, write_features
 from photoplan.io.product import check_output
-from photoplan.io.project import load_project
-from photoplan.io.project_model import Project
+from photoplan.io.project.file import load_project
+from photoplan.io.project.model import Project
 from photoplan.io.xy_table import read_xy_table
-from photoplan.products.open_terrain import open_terrain
-from photoplan.products.scene import Scene, input_files, open_scene, pose_of
+from photoplan.project.open_terrain import open_terrain
+from photoplan.project.scene import Scene, input_files, open_scene, pose_of
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.terrain.monoplot import REASONS, GroundPoints, MonoplotErrors, monoplot
-
-__all__ = ["MonoplotReport", "MonoplotRequest", "monoplot_file"]
 
 #: Flatter than this the ray grazes the terrain: small errors move the point far, and not linearly. Radians.
 GRAZING = math.radians(5.0)

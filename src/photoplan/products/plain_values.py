@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["plain"]
-
 
 def plain(value: Any) -> Any:
     """The same without arrays, tuples and NumPy's own numbers; None for NaN and infinity, which JSON does not know."""

@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["piled_ends"]
-
 #: Pixels that are looked at.
 _SAMPLE = 1 << 18
 #: Share of the pixels, and their number, from which on an end is a pile.

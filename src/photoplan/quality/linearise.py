@@ -15,8 +15,6 @@ from numpy.typing import DTypeLike, NDArray
 
 from photoplan.errors import InputError
 
-__all__ = ["Linearisation"]
-
 #: Longest table that is read: one line for each value of 16 bits.
 MOST_LINES = 65536
 

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 
-__all__ = ["MtfCurve"]
-
 
 @dataclass(frozen=True, eq=False)
 class MtfCurve:

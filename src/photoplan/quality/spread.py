@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 
-__all__ = ["GAUSSIAN_WIDTH", "SpreadFunction", "gaussian_modulation"]
-
 #: Full width at half maximum of a Gaussian with standard deviation 1.
 GAUSSIAN_WIDTH = 2.0 * sqrt(2.0 * log(2.0))
 

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from photoplan.report.page import Cell, figure, headline, page, section, table
 from photoplan.report.plots import LINE_WORDS, Plots
 
-__all__ = ["BuildFacts", "CovarianceFacts", "FilterEffect", "GrossError", "Note", "ReportMap", "build_report"]
-
 #: Rows of a list at most: more are counted.
 MOST_ROWS = 2000
 #: Notes of one kind that are spelled out.

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from photoplan.report.drawing import BLUE, GREEN, ORANGE, PURPLE, RED, SKY, SOFT, STYLE, load_matplotlib, png
 
-__all__ = ["Chart", "ChartDrawer", "Curve", "Picture", "shrunk"]
-
 COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
 _SIZE = (6.6, 3.6)
 #: Letters that fit side by side in a legend, and those that the sign of a curve takes.

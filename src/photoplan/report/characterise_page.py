@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from photoplan.report.characterise_charts import Chart, ChartDrawer, Picture
 from photoplan.report.page import Cell, figure, headline, page, section, table, text
 
-__all__ = ["AnalysisPart", "SeriesFacts", "characterise_page"]
-
 #: Rows of a table that are shown; all of them are in CSV.
 _ROWS = 25
 

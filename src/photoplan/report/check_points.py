@@ -13,8 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LEAST_CHECK_POINTS", "CheckAccuracy", "check_accuracy"]
-
 #: Check points that the standard asks for at least.
 LEAST_CHECK_POINTS = 30
 #: Mean error, as part of the RMSE, from which a systematic error should be looked for.

@@ -10,22 +10,6 @@ import numpy as np
 
 from photoplan.errors import UsageError
 
-__all__ = [
-    "BLUE",
-    "GREEN",
-    "INK",
-    "ORANGE",
-    "PURPLE",
-    "RED",
-    "SKY",
-    "SOFT",
-    "STYLE",
-    "axes_of",
-    "load_matplotlib",
-    "png",
-    "round_down",
-]
-
 #: Colours of Okabe and Ito.
 BLUE, RED, ORANGE, GREEN, PURPLE, SKY = "#0072B2", "#D55E00", "#E69F00", "#009E73", "#CC79A7", "#56B4E9"
 INK, SOFT = "#1c2730", "#5c6b77"

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, SOFT, STYLE, load_matplotlib, png
 
-__all__ = ["MOST_DRAWN", "FilterPlots", "KernelPicture", "frequency_response"]
-
 #: Kernels that are drawn; of more, the first ones are.
 MOST_DRAWN = 12
 _DIRECTIONS = (("row", BLUE, "-"), ("column", ORANGE, "--"), ("diagonal", GREEN, ":"))

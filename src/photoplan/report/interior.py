@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from photoplan.report.drawing import BLUE, INK, RED, SOFT, STYLE, load_matplotlib, png
 from photoplan.report.page import Cell, figure, headline, page, section, table
 
-__all__ = ["InteriorPlots", "ResidualPanel", "interior_report", "vector_scale"]
-
 #: In the units of the axes; heads in widths of their shafts.
 _VECTORS = {
     "angles": "xy",

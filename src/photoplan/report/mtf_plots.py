@@ -23,8 +23,6 @@ from photoplan.report.drawing import (
     png,
 )
 
-__all__ = ["CellFacts", "CurveFacts", "EdgeFacts", "MtfPlots", "ProfileFacts"]
-
 Array = NDArray[np.float64]
 
 _WIDTH = 7.2

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from photoplan.report.mtf_plots import CellFacts, CurveFacts, EdgeFacts, MtfPlots, ProfileFacts
 from photoplan.report.page import Cell, figure, headline, page, section, table, text
 
-__all__ = ["MtfImageFacts", "mtf_report"]
-
 Array = NDArray[np.float64]
 
 #: Images that get plots.

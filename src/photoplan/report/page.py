@@ -8,8 +8,6 @@ import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-__all__ = ["Cell", "figure", "headline", "page", "section", "table", "text"]
-
 _STYLE = """
 :root { --ink: #1c2730; --soft: #5c6b77; --rule: #d7dee3; --accent: #0b5c8c; --ground: #f6f8f9; }
 * { box-sizing: border-box; }

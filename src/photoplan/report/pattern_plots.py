@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SOFT, STYLE, axes_of, load_matplotlib, png
 from photoplan.report.page import Cell, figure, page, section, table, text
 
-__all__ = ["Curve", "Frame", "Mark", "PatternFacts", "PatternPlots", "PolarCurve", "pattern_page"]
-
 Array = NDArray[np.float64]
 
 _WIDTH = 6.2

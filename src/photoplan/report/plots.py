@@ -13,8 +13,6 @@ from photoplan.report.drawing import BLUE, INK, PURPLE, RED, SKY, SOFT, STYLE, l
 if TYPE_CHECKING:
     from photoplan.report.build_report import CovarianceFacts, FilterEffect, GrossError, ReportMap
 
-__all__ = ["LINE_WORDS", "Plots"]
-
 #: What lines of each kind are called.
 LINE_WORDS = {"breakline": "breaklines", "formline": "form lines", "border": "border lines", "hole": "holes"}
 

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from photoplan.report.drawing import BLUE, INK, RED, SOFT, STYLE, axes_of, load_matplotlib, png, round_down
 from photoplan.report.page import Cell, figure, headline, page, section, table, text
 
-__all__ = ["ResectFacts", "ResectPlots", "resect_report"]
-
 Array = NDArray[np.float64]
 
 _WIDTH = 6.2

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from photoplan.report.drawing import BLUE, INK, ORANGE, SOFT, STYLE, load_matplotlib, png
 from photoplan.report.filter_plots import FilterPlots, KernelPicture
 
-__all__ = ["AxisPicture", "EndsPicture", "FieldMap", "RestorePlots"]
-
 Array = NDArray[np.float64]
 
 _WIDTH = 9.0

@@ -12,8 +12,6 @@ from photoplan.report.filter_plots import MOST_DRAWN, KernelPicture
 from photoplan.report.page import Cell, figure, headline, page, section, table, text
 from photoplan.report.restore_plots import AxisPicture, EndsPicture, FieldMap, RestorePlots
 
-__all__ = ["STANDS_FOR", "FilterFacts", "PartFacts", "RestoredFacts", "restore_report"]
-
 #: Images that get pictures, and parts of the field that are listed.
 _PICTURED = 30
 _LISTED = 300

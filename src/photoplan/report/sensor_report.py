@@ -10,8 +10,6 @@ import numpy as np
 from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, PURPLE, RED, SOFT, STYLE, axes_of, load_matplotlib, png
 from photoplan.report.page import Cell, figure, page, section, table
 
-__all__ = ["SensorFacts", "SensorPlots", "sensor_report"]
-
 _WIDTH = 6.2
 _COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE)
 _TITLES = {

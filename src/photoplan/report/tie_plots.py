@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SKY, SOFT, STYLE, load_matplotlib, png
 
-__all__ = ["TieFacts", "TiePlots", "TieView", "spread_views"]
-
 #: Colours of points in two, three, four, and five or more images.
 RAY_COLOURS = {2: ORANGE, 3: SKY, 4: BLUE, 5: GREEN}
 _NAMES = 60

@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.geometry.grid import Window
 from photoplan.targets.base import Target
 
-__all__ = ["Surface"]
-
 
 class Surface(Protocol):
     """Where the object is: a depth h for every pixel of a target."""

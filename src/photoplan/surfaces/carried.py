@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from photoplan.geometry.grid import MapGrid, Window
 
-__all__ = ["carried_positions"]
-
 #: Positions are computed at every so-manieth pixel and interpolated between.
 STEP = 32
 

@@ -18,8 +18,6 @@ from photoplan.surfaces.units import MeshFaces, Unit, UnitSource
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
 
-__all__ = ["HybridSurface"]
-
 #: A point this close to a border of units, in sides of a unit, lies on it.
 ON_BORDER = 1e-9
 #: Between CRSs, positions are interpolated where that is good to this part of a pixel; else each pixel is transformed.

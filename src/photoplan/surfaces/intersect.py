@@ -13,8 +13,6 @@ from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.profile import profile
 from photoplan.surfaces.raster import RasterSurface
 
-__all__ = ["intersect", "intersect_strict"]
-
 
 def intersect(
     camera: Camera,

@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.geometry.grid import Window
 from photoplan.targets.base import Target
 
-__all__ = ["LevelSurface"]
-
 
 @dataclass(frozen=True)
 class LevelSurface:

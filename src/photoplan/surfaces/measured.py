@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 
-__all__ = ["LINE_KINDS", "POINT_KINDS", "LineKind", "MeasuredLine", "MeasuredTerrain", "PointGroup", "PointKind", "Tin"]
-
 PointKind = Literal["mass", "spot"]
 LineKind = Literal["breakline", "formline", "border", "hole"]
 POINT_KINDS: tuple[PointKind, ...] = get_args(PointKind)

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.surfaces.units import Unit, UnitLayout
 
-__all__ = ["MemoryUnits", "unit_range"]
-
 
 @dataclass(frozen=True, eq=False)
 class MemoryUnits:

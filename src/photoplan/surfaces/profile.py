@@ -9,11 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import UsageError
 from photoplan.surfaces.hybrid import HybridSurface
-from photoplan.surfaces.mesh_lines import SNAP, on_grid
+from photoplan.surfaces.mesh.lines import SNAP, on_grid
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.surfaces.units import LineElement, Unit, UnitLayout
-
-__all__ = ["profile"]
 
 #: Breaks of a profile nearer than this, metres, are one …
 SAME_PLACE = 1e-6

@@ -16,8 +16,6 @@ from photoplan.surfaces.carried import carried_positions
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
 
-__all__ = ["HeightGrid", "RasterSurface"]
-
 #: Between CRSs, positions are interpolated where that is good to this part of a mesh; else each pixel is transformed.
 POSITION_TOLERANCE = 0.01
 #: Posts that are read at once where single heights are asked for …

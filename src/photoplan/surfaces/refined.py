@@ -15,8 +15,6 @@ from photoplan.surfaces.base import Surface
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
 
-__all__ = ["RefinedSurface"]
-
 
 @dataclass(frozen=True, eq=False)
 class RefinedSurface:

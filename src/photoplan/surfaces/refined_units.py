@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.surfaces.hybrid import HybridSurface
-from photoplan.surfaces.mesh_faces import build_faces, on_grid
+from photoplan.surfaces.mesh.faces import build_faces
+from photoplan.surfaces.mesh.lines import on_grid
 from photoplan.surfaces.refined import RefinedSurface
 from photoplan.surfaces.units import LineElement, Unit, UnitLayout, UnitSource
-
-__all__ = ["LinedUnits", "clip_line", "refine_units"]
 
 #: Vertices of clipped lines nearer than this, metres, are one.
 SAME = 1e-6

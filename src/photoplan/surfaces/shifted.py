@@ -12,8 +12,6 @@ from photoplan.geometry.grid import Window
 from photoplan.surfaces.base import Surface
 from photoplan.targets.base import Target
 
-__all__ = ["ShiftedSurface"]
-
 
 @dataclass(frozen=True)
 class ShiftedSurface:

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.surfaces.measured import LineKind
 
-__all__ = ["LineElement", "MeshFaces", "Unit", "UnitFigures", "UnitLayout", "UnitSource"]
-
 
 @dataclass(frozen=True)
 class UnitLayout:

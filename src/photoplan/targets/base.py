@@ -9,8 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.geometry.grid import Window
 
-__all__ = ["Target"]
-
 
 class Target(Protocol):
     """The product's own coordinates: pixel (u, v) = (column, row) and depth h, and where they are on the ground."""

@@ -9,8 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.geometry.grid import MapGrid, Window
 
-__all__ = ["MapTarget"]
-
 
 @dataclass(frozen=True)
 class MapTarget:

@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.surfaces.measured import MeasuredTerrain
-from photoplan.surfaces.mesh_faces import build_faces, on_grid, thin
+from photoplan.surfaces.mesh.faces import build_faces
+from photoplan.surfaces.mesh.lines import on_grid
+from photoplan.surfaces.mesh.thin import thin
 from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
-from photoplan.terrain.clean_borders import domain_of
+from photoplan.terrain.clean.borders import domain_of
 from photoplan.terrain.domain import Domain
 from photoplan.terrain.fit import Fit, each, fit
 from photoplan.terrain.observations import Observations, observe
 from photoplan.terrain.predict import predict_lines, predict_unit
 from photoplan.terrain.settings import BuildSettings
-
-__all__ = ["BuildPlan", "Built", "Steps", "build", "plan_build"]
 
 #: Gaps are bridged up to twice this many spacings.
 _REACH = 10.0

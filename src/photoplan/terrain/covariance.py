@@ -14,8 +14,6 @@ from photoplan.terrain.neighbours import Neighbours
 from photoplan.terrain.observations import Observations
 from photoplan.terrain.settings import FAMILIES, BuildSettings
 
-__all__ = ["LADDER", "Covariance", "estimate_all", "estimate_unit", "ladder", "near_lines"]
-
 #: Distance between the two sides of a breakline in half-value distances, by family: what is left of the correlation
 #: is 6 %, 15 % and 18 %.
 GAPS = (2.0, 2.0, 2.5)

@@ -11,8 +11,6 @@ import shapely
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-__all__ = ["Domain"]
-
 #: A prepared polygon builds its index when it is first asked, and GEOS does not guard that against other threads.
 _ONE_AT_A_TIME = threading.Lock()
 

@@ -19,8 +19,6 @@ from photoplan.terrain.neighbours import Neighbours
 from photoplan.terrain.observations import Observations
 from photoplan.terrain.settings import BuildSettings
 
-__all__ = ["REACH", "Fit", "Progress", "each", "fit", "lines_of", "patches_at"]
-
 Progress = Callable[[int], None]
 T = TypeVar("T")
 

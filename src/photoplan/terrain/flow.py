@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError, UsageError
 from photoplan.kernels import flow as kernels
 
-__all__ = ["CELL_BYTES", "DIRECTIONS", "Flow", "FlowMethod", "flow_of", "snapped"]
-
 FlowMethod = Literal["d8", "dinf"]
 DIRECTIONS = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
 """Names of the directions 0 to 7."""

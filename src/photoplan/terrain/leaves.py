@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from photoplan.surfaces.units import UnitLayout
 
-__all__ = ["Leaves", "quadtree"]
-
 #: Points that a leaf holds at most.
 CAPACITY = 24
 #: A leaf is not smaller than this many meshes.

@@ -14,8 +14,6 @@ from photoplan.errors import UsageError
 from photoplan.surfaces.base import Surface
 from photoplan.surfaces.intersect import intersect
 
-__all__ = ["REASONS", "GroundPoints", "MonoplotErrors", "monoplot"]
-
 REASONS = {
     "": "met",
     "outside": "outside the image",

@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-__all__ = ["Neighbours"]
-
 #: How many of the nearest data are taken …
 POINTS, LINES = 72, 56
 #: … and, where these lie in a row, how many of every 8th and of every 64th.

@@ -13,8 +13,6 @@ from photoplan.errors import GeometryError
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain
 from photoplan.terrain.settings import SHARE, BuildSettings
 
-__all__ = ["Lines", "Observations", "observe", "spacing_of"]
-
 #: Points at which the spacing is measured.
 _SAMPLE = 20_000
 #: Copies of a breakline's points lie this part of the spacing beside it, one on each side.

@@ -11,8 +11,6 @@ from photoplan.surfaces.units import LineElement, Unit
 from photoplan.terrain.domain import Domain
 from photoplan.terrain.fit import REACH, Fit, Progress, each, lines_of, patches_at
 
-__all__ = ["heights_at", "predict_lines", "predict_unit"]
-
 
 def heights_at(
     fit: Fit, unit: int, xy: NDArray[np.float64]

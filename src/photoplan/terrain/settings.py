@@ -10,8 +10,6 @@ import numpy as np
 from photoplan.errors import UsageError
 from photoplan.surfaces.measured import LINE_KINDS, POINT_KINDS
 
-__all__ = ["FAMILIES", "BuildSettings", "Family"]
-
 Family = Literal["gaussian", "matern", "exponential"]
 FAMILIES: tuple[Family, ...] = get_args(Family)
 """Families of covariance functions; the place of each is its number in the kernels."""

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError, UsageError
 from photoplan.kernels.visibility import height_pyramid, sight_rows
 
-__all__ = ["Observer", "SightSettings", "curvature_drop", "horizon", "needed_heights"]
-
 #: Rows that one task of a thread computes.
 ROWS = 32
 

@@ -11,7 +11,7 @@ import signal
 import time
 from pathlib import Path
 
-from photoplan.products import execution
+from photoplan.products.orthophoto import execution
 
 _render = execution.render_tile
 

@@ -7,8 +7,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Lens"]
-
 
 class Lens(Protocol):
     """The deviation of a real lens from central projection.

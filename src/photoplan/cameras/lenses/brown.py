@@ -12,8 +12,6 @@ from photoplan.cameras.lenses.inverse import newton_inverse
 from photoplan.cameras.lenses.polynomial import decentred, decentred_jacobian
 from photoplan.errors import InputError
 
-__all__ = ["Brown"]
-
 
 @dataclass(frozen=True)
 class Brown:

@@ -15,8 +15,6 @@ from photoplan.cameras.lenses.base import Lens
 from photoplan.cameras.lenses.inverse import newton_inverse, solve2, upright
 from photoplan.errors import InputError
 
-__all__ = ["FieldLimited", "field_limited"]
-
 #: The field reaches this much beyond the farthest corner; less where the lens folds before that.
 _MARGINS = (1.05, 1.02, 1.005, 1.0)
 _STEPS = 24

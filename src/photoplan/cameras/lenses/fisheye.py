@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.cameras.lenses.radial import radial_jacobian
 from photoplan.errors import InputError
 
-__all__ = ["Fisheye"]
-
 _ITERATIONS = 60
 
 

@@ -7,8 +7,6 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["determinant", "newton_inverse", "solve2", "upright"]
-
 #: What is left of the residual at a point that counts as solved, relative to 1 + |t|.
 PRECISION = 1e-12
 _ITERATIONS = 60

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["decentred", "decentred_jacobian"]
-
 
 def decentred(t: NDArray[np.float64], factor: NDArray[np.float64], p1: float, p2: float) -> NDArray[np.float64]:
     """x·g + p1 (r² + 2x²) + 2 p2 x y and y·g + p2 (r² + 2y²) + 2 p1 x y, g = `factor` at t; shapes (..., 2)."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["radial_jacobian"]
-
 
 def radial_jacobian(
     t: NDArray[np.float64], r: NDArray[np.float64], across: NDArray[np.float64], along: NDArray[np.float64]

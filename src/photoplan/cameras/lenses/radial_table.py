@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.cameras.lenses.radial import radial_jacobian
 from photoplan.errors import InputError
 
-__all__ = ["RadialTable"]
-
 _ITERATIONS = 60
 
 

@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.cameras.lenses.base import Lens
 from photoplan.cameras.lenses.inverse import determinant
 
-__all__ = ["Reversed"]
-
 
 @dataclass(frozen=True)
 class Reversed:

@@ -16,8 +16,6 @@ from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFo
 from photoplan.io.orientation.table import Direction, TableFormat
 from photoplan.io.orientation.text import angle_block, angle_lines, word_lines
 
-__all__ = ["FORMAT", "read", "render"]
-
 #: Angle unit, rotation, direction.
 OWN: tuple[str, str, Direction] = ("gon", "pok", "camera-to-ground")
 KEYWORD = "ORIA"

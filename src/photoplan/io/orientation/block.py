@@ -16,21 +16,9 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.rotation import angles_from_rotation
-from photoplan.io.camera_model import FilmCamera, FrameCamera, NoLens
+from photoplan.io.camera.model import FilmCamera, FrameCamera, NoLens
 from photoplan.io.orientation.table import Direction, OrientationTable, OrientedImage, TableFormat
-from photoplan.io.project_model import ANGLE_UNITS
-
-__all__ = [
-    "Loss",
-    "LossKind",
-    "OrientationBlock",
-    "OrientationFormat",
-    "common_losses",
-    "height_losses",
-    "require_cameras",
-    "require_map",
-    "without_lenses",
-]
+from photoplan.io.project.model import ANGLE_UNITS
 
 LossKind = Literal["lens", "camera", "film", "crs", "height_system", "other"]
 
@@ -190,7 +178,7 @@ def common_losses(
     film : bool
         Whether a format with cameras can hold scanned film (marks and their measurement in each image).
     lenses : tuple of str
-        Types of lenses (`photoplan.io.camera_model`) that a format with cameras holds without loss.
+        Types of lenses (`photoplan.io.camera.model`) that a format with cameras holds without loss.
     """
     lost: list[Loss] = []
     if block.cameras and not cameras:

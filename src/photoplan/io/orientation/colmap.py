@@ -18,13 +18,11 @@ from scipy.spatial.transform import Rotation
 
 from photoplan.cameras.observed import ImagePoints
 from photoplan.errors import InputError
-from photoplan.io.camera_model import FilmCamera, FrameCamera
+from photoplan.io.camera.model import FilmCamera, FrameCamera
 from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, require_cameras
 from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.plain_files import finite, read_text
-
-__all__ = ["FORMAT", "ColmapPoints", "read", "read_cameras", "read_points"]
 
 MAX_BYTES = 2 << 30
 #: Parameters of every model: one or two focal lengths f, principal point c, coefficients of the lens.

@@ -15,10 +15,8 @@ from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, 
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.plain_files import read_text
 from photoplan.io.prj_file import crs_beside
-from photoplan.io.project_model import ANGLE_UNITS
+from photoplan.io.project.model import ANGLE_UNITS
 from photoplan.io.text_columns import NUMBER, decimal, find_delimiter, has_decimal_comma, split_line
-
-__all__ = ["FORMAT", "HEADERS", "read"]
 
 #: Header names (in small letters) of every role.
 HEADERS = {

@@ -25,8 +25,6 @@ from photoplan.io.image_metadata import ImageMetadata, read_image_metadata
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat, degrees_of
 
-__all__ = ["FORMAT", "image_files", "map_positions", "read", "read_folder", "rotation_from_gimbal"]
-
 SUFFIXES = (".jpg", ".jpeg", ".tif", ".tiff")
 #: From north, east, down to east, north, up.
 _R_ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])

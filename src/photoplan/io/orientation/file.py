@@ -11,16 +11,6 @@ from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation.table import OrientationTable, TableFormat
 from photoplan.io.plain_files import read_head
 
-__all__ = [
-    "FORMATS",
-    "choose_format",
-    "orientation_format",
-    "read_orientation",
-    "read_orientation_block",
-    "write_orientation",
-    "written_formats",
-]
-
 #: Module of every format, by name; each defines `FORMAT` (see `photoplan.io.orientation.block`).
 FORMATS: dict[str, str] = {
     "csv": "photoplan.io.orientation.csv",
@@ -36,7 +26,7 @@ FORMATS: dict[str, str] = {
     "exif": "photoplan.io.orientation.exif",
     "odm": "photoplan.io.orientation.odm",
     "colmap": "photoplan.io.orientation.colmap",
-    "opencv": "photoplan.io.camera_opencv",
+    "opencv": "photoplan.io.camera.opencv",
 }
 
 #: Formats whose reader says what is wrong with a file that no format claims, by suffix; else it is a table of text.

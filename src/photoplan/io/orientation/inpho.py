@@ -33,14 +33,12 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.geometry.rotation import rotation_opk
-from photoplan.io.camera_model import FilmCamera, FrameCamera
+from photoplan.io.camera.model import FilmCamera, FrameCamera
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation.inpho_write import losses, render
 from photoplan.io.orientation.table import Direction, OrientationTable, TableFormat
 from photoplan.io.orientation.text import DIRECTIONS, checked_rotation, number, numbers, pose_image
 from photoplan.io.plain_files import build, read_text
-
-__all__ = ["FORMAT", "read"]
 
 MAX_BYTES = 200_000_000
 #: Largest median difference of matrices and angles that settles what the matrices do: boresight angles and errors of

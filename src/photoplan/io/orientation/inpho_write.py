@@ -11,12 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from photoplan.errors import InputError
-from photoplan.io.camera_model import FilmCamera, FrameCamera
+from photoplan.io.camera.model import FilmCamera, FrameCamera
 from photoplan.io.orientation.block import Loss, OrientationBlock, common_losses, require_map
 from photoplan.io.orientation.table import Direction, OrientedImage
 from photoplan.io.orientation.text import DIRECTIONS
-
-__all__ = ["losses", "render"]
 
 DEFAULT: Direction = "ground-to-camera"
 #: Side of a pixel that is taken for a camera that is described in pixels, millimetres.

@@ -28,15 +28,13 @@ from photoplan.geometry.earth_poses import (
     is_wgs84_geographic,
     map_poses,
 )
-from photoplan.io.camera_model import FilmCamera, FrameCamera
+from photoplan.io.camera.model import FilmCamera, FrameCamera
 from photoplan.io.lens_forms import AgisoftForm, frame_camera
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation.metashape_write import losses, render
 from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.plain_files import finite
 from photoplan.io.xml_file import numbers, read_xml
-
-__all__ = ["FORMAT", "read", "read_cameras"]
 
 MAX_BYTES = 256 << 20
 _COEFFICIENTS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")

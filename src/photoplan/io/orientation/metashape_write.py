@@ -21,12 +21,10 @@ from photoplan.geometry.earth_poses import (
     geodetic_of_geocentric,
     legacy_wkt,
 )
-from photoplan.io.camera_model import FilmCamera, FrameCamera
+from photoplan.io.camera.model import FilmCamera, FrameCamera
 from photoplan.io.lens_forms import agisoft_form
 from photoplan.io.orientation.block import Loss, OrientationBlock, height_losses, require_cameras
 from photoplan.io.orientation.table import FLIP
-
-__all__ = ["losses", "render"]
 
 _LOCAL = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
 

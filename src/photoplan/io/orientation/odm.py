@@ -21,16 +21,14 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import canonical_crs, crs_label, crs_step
-from photoplan.io import camera_opensfm
-from photoplan.io.camera_model import FilmCamera, FrameCamera
+from photoplan.io.camera import opensfm as camera_opensfm
+from photoplan.io.camera.model import FilmCamera, FrameCamera
 from photoplan.io.lens_forms import opencv_form
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, common_losses
 from photoplan.io.orientation.opensfm import rotation_from_axis_angle
 from photoplan.io.orientation.opensfm_write import axis_angle
 from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.plain_files import finite, read_json
-
-__all__ = ["FORMAT", "read"]
 
 #: Longest distance of the two positions of an image, metres; the same numbers differ by rounding only.
 _AGREE = 0.05

@@ -16,13 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
-from photoplan.io.camera_opensfm import cameras_of
+from photoplan.io.camera.opensfm import cameras_of
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation.opensfm_write import losses, render
 from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.plain_files import finite, read_json
-
-__all__ = ["FORMAT", "read", "read_block", "rotation_from_axis_angle"]
 
 
 def rotation_from_axis_angle(vector: ArrayLike) -> NDArray[np.float64]:

@@ -14,12 +14,10 @@ from scipy.spatial.transform import Rotation
 from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_step
 from photoplan.geometry.earth_poses import topocentric_of_map
-from photoplan.io.camera_model import FilmCamera, FrameCamera
+from photoplan.io.camera.model import FilmCamera, FrameCamera
 from photoplan.io.lens_forms import opencv_form, opencv_losses
 from photoplan.io.orientation.block import Loss, OrientationBlock, height_losses, require_cameras
 from photoplan.io.orientation.table import FLIP, OrientationTable
-
-__all__ = ["axis_angle", "losses", "normalised_camera", "render"]
 
 
 def axis_angle(R_camera_world: NDArray[np.float64]) -> list[float]:

@@ -25,8 +25,6 @@ from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFo
 from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.plain_files import finite, read_text
 
-__all__ = ["FORMAT", "read"]
-
 MAX_BYTES = 256 << 20
 _HEADER = re.compile(r"#\s*PhotoID\W+X\W+Y\W+Z\W+Omega\W+Phi\W+Kappa", re.I)
 _SYSTEM = re.compile(r"#\s*CoordinateSystem\s*:?\s*(\S.*)", re.I)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from photoplan.errors import InputError
-from photoplan.io.camera_model import FilmCamera
+from photoplan.io.camera.model import FilmCamera
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, common_losses, require_map
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.orientation.text import (
@@ -27,8 +27,6 @@ from photoplan.io.orientation.text import (
     pose_image,
     word_lines,
 )
-
-__all__ = ["FORMAT", "read", "render"]
 
 #: Characters of an image name that PATB takes at most (Catalyst's guide on export to PATB).
 NAME = 15

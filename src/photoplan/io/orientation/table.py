@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.rotation import ROTATION_ORDERS, opk_from_rotation, rotation_from_angles
-from photoplan.io.project_model import ANGLE_UNITS
-
-__all__ = ["FLIP", "Direction", "OrientationTable", "OrientedImage", "TableFormat", "angle_in_radians", "degrees_of"]
+from photoplan.io.project.model import ANGLE_UNITS
 
 Direction = Literal["camera-to-ground", "ground-to-camera"]
 #: From camera axes x right, y down, z forwards to x right, y up, z backwards, and back.

@@ -15,20 +15,7 @@ from photoplan.errors import InputError
 from photoplan.io.orientation.block import OrientationBlock
 from photoplan.io.orientation.table import Direction, OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.plain_files import read_text
-from photoplan.io.project_model import ANGLE_UNITS
-
-__all__ = [
-    "DIRECTIONS",
-    "Words",
-    "angle_block",
-    "angle_lines",
-    "checked_rotation",
-    "number",
-    "numbers",
-    "one_word",
-    "pose_image",
-    "word_lines",
-]
+from photoplan.io.project.model import ANGLE_UNITS
 
 MAX_BYTES = 200_000_000
 #: Rotation matrices of files are rounded; what differs more from a rotation is none.

@@ -14,15 +14,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
-from photoplan.io.camera_model import Camera, Fiducials, Name, Pixels, Triple
+from photoplan.io.camera.model import Camera, Fiducials, Name, Pixels, Triple
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, require_map
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
-from photoplan.io.project_errors import explain
-from photoplan.io.project_model import Orientation
-from photoplan.io.project_write import camera_lines, toml_value
+from photoplan.io.project.errors import explain
+from photoplan.io.project.model import Orientation
+from photoplan.io.project.write import camera_lines, toml_value
 from photoplan.io.toml_file import read_toml
-
-__all__ = ["FORMAT", "read", "read_block", "render"]
 
 
 class _Line(BaseModel):

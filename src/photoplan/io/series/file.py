@@ -13,7 +13,7 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.io.camera_model import Entry
+from photoplan.io.camera.model import Entry
 from photoplan.io.names import resolve_input
 from photoplan.io.raster import RasterReader
 from photoplan.io.series.model import CONDITIONS, CameraFacts, FramesEntry, SeriesEntry
@@ -22,8 +22,6 @@ from photoplan.io.series.positions import MeasuredPositions, read_positions
 from photoplan.io.series.statistics import ReducedPoint, read_statistics
 from photoplan.io.series.table import read_conditions
 from photoplan.io.toml_entries import read_entries
-
-__all__ = ["Frame", "Group", "Series", "read_series"]
 
 #: A series of a hundred thousand frames is far below this.
 _MAX_BYTES = 20_000_000

@@ -6,20 +6,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, Strict, field_validator, model_validator
 
-from photoplan.io.camera_model import Entry, Name, Number, Positive
-
-__all__ = [
-    "CONDITIONS",
-    "KINDS",
-    "CameraFacts",
-    "EdgeEntry",
-    "FramesEntry",
-    "PositionsEntry",
-    "SeriesEntry",
-    "StatisticsEntry",
-    "StepEntry",
-    "TargetEntry",
-]
+from photoplan.io.camera.model import Entry, Name, Number, Positive
 
 #: Kinds of frames and what they show.
 KINDS = {

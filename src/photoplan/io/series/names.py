@@ -12,8 +12,6 @@ from photoplan.errors import InputError
 from photoplan.io.names import check_input_name, resolve_input
 from photoplan.io.text_columns import NUMBER
 
-__all__ = ["FIELDS", "Values", "condition", "find_files", "number_of_time"]
-
 Values = dict[str, float | str]
 
 #: Names of fields and columns that stand for a condition, with the factor to its unit.

@@ -13,8 +13,6 @@ from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
 from photoplan.io.series.file import Frame, Group, Series
 
-__all__ = ["Plane", "plane_mask", "plane_pixels", "series_planes"]
-
 #: Pixels of a frame that are held in memory at once.
 MAX_PIXELS = 400_000_000
 

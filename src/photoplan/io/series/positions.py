@@ -12,8 +12,6 @@ from photoplan.io.series.model import PositionsEntry
 from photoplan.io.series.names import number_of_time
 from photoplan.io.series.table import read_columns
 
-__all__ = ["MeasuredPosition", "MeasuredPositions", "read_positions"]
-
 _NEEDED = {"stage": ("x", "y", "stage_x", "stage_y"), "target": ("x", "y", "time_s")}
 _MOST = 100_000
 

@@ -16,8 +16,6 @@ from photoplan.io.series.model import StatisticsEntry
 from photoplan.io.series.names import condition
 from photoplan.io.series.table import read_columns
 
-__all__ = ["ReducedPoint", "read_statistics"]
-
 _MAX_BYTES = 50_000_000
 
 

@@ -12,8 +12,6 @@ from photoplan.geometry.grid import Window
 from photoplan.io.series.file import Frame, Series
 from photoplan.io.series.pixels import frame_pixels
 
-__all__ = ["grey_step", "largest_of_steps"]
-
 #: Frames that are looked at, and the side of the window in their middle.
 _FRAMES, _SIDE = 48, 128
 #: Different grey values from which on neighbouring ones occur among them.

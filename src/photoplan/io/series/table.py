@@ -9,8 +9,6 @@ from photoplan.io.plain_files import read_text
 from photoplan.io.series.names import Values, condition
 from photoplan.io.text_columns import DELIMITERS, decimal, split_line
 
-__all__ = ["read_columns", "read_conditions"]
-
 _MAX_BYTES = 100_000_000
 
 

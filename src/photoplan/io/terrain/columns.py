@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.io.terrain.options import CodeClass, ReadOptions
 
-__all__ = ["HEADERS", "Block", "Layout", "find_layout", "parse_block"]
-
 #: Header names (in small letters) of every role.
 HEADERS = {
     "x": ("x", "east", "easting", "e", "rechtswert"),

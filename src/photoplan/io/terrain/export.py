@@ -22,8 +22,6 @@ from photoplan.io.product import check_output
 from photoplan.io.terrain.export_mesh import MeshPart, mesh_parts
 from photoplan.surfaces.units import LineElement, Unit, UnitSource
 
-__all__ = ["TIN_SUFFIXES", "ExportFigures", "replacing", "write_points", "write_tin"]
-
 TIN_SUFFIXES = (".obj", ".ply", ".xml")
 Progress = Callable[[int, int], None]
 

@@ -18,8 +18,6 @@ from scipy.spatial import cKDTree
 
 from photoplan.surfaces.units import Unit, UnitSource
 
-__all__ = ["MeshPart", "mesh_parts", "unit_mesh"]
-
 _SAME = 2e-5
 """Vertices closer than this in the plane, metres, and …"""
 _SAME_HEIGHT = 5e-4

@@ -15,8 +15,6 @@ from photoplan.errors import InputError
 from photoplan.io.terrain.options import CodeClass, ReadOptions
 from photoplan.surfaces.measured import LINE_KINDS, POINT_KINDS, PointGroup
 
-__all__ = ["CodeIndex", "PointColumns", "class_of", "make_groups"]
-
 MAX_CODES = 1000
 """More codes than this in one file are names rather than classes: their points become one group for each class."""
 MAX_SIGMAS = 100

@@ -23,8 +23,6 @@ from photoplan.geometry.crs import canonical_crs, parse_crs
 from photoplan.io.terrain.options import CodeClass, ReadOptions
 from photoplan.surfaces.measured import LINE_KINDS, LineKind, MeasuredLine, MeasuredTerrain, PointGroup, Tin
 
-__all__ = ["read"]
-
 MAX_BYTES = 4 << 30
 MAX_DEPTH = 64
 """Levels of nesting; LandXML surfaces need ten."""

@@ -18,8 +18,6 @@ from photoplan.geometry.crs import canonical_crs, parse_crs, split_compound
 from photoplan.io.terrain.options import ReadOptions
 from photoplan.surfaces.measured import MeasuredTerrain, PointGroup
 
-__all__ = ["read"]
-
 CHUNK = 1_000_000
 """Points that are decoded at once."""
 GROUND = 2

@@ -19,8 +19,6 @@ from photoplan.errors import InputError
 from photoplan.surfaces.measured import LINE_KINDS
 from photoplan.surfaces.units import LineElement, MeshFaces, Unit, UnitLayout
 
-__all__ = ["MOST_BYTES", "MOST_MESHES", "check_unit", "inflate", "pack_line", "pack_unit", "unit_of", "unpack_line"]
-
 MOST_BYTES = 256 << 20
 """Bytes of one unit or line at most, before compression."""
 MOST_MESHES = 4096

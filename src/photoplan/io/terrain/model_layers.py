@@ -23,8 +23,6 @@ from photoplan.io.terrain.model_tables import GrossError
 from photoplan.kernels.sample_grid import sample_lattice
 from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
 
-__all__ = ["HEIGHTS_NODATA", "base_posts", "write_border", "write_gross", "write_heights", "write_lines", "write_units"]
-
 HEIGHTS_NODATA = -9999.0
 HEIGHTS_STEP = 1 / 1024
 """Heights of the raster are multiples of this, metres: they are for looking at, and compress by a third."""

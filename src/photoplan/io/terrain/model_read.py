@@ -33,8 +33,6 @@ from photoplan.io.terrain.model_tables import (
 from photoplan.io.unit_cache import UnitCache
 from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
 
-__all__ = ["ModelReader", "is_terrain_model", "unit_checksum"]
-
 _CHECKED = struct.Struct("<QQdd")
 _DAMAGED = (sqlite3.Error, UnicodeDecodeError)
 """What SQLite raises for a damaged file; its message may quote bytes that are no text."""

@@ -15,21 +15,6 @@ from photoplan.errors import InputError, UsageError
 from photoplan.io.fingerprint import fingerprint
 from photoplan.surfaces.units import UnitFigures, UnitLayout
 
-__all__ = [
-    "FORMAT",
-    "HEADER",
-    "LINES",
-    "MOST_UNITS",
-    "UNITS",
-    "GrossError",
-    "ModelHeader",
-    "check_layout",
-    "empty_figures",
-    "header_from_json",
-    "header_to_json",
-    "input_facts",
-]
-
 FORMAT = 1
 """Number of the layout; a file with another one is refused."""
 MOST_UNITS = 4_000_000

@@ -40,8 +40,6 @@ from photoplan.io.terrain.model_tables import (
 from photoplan.io.tile_log import TileLog
 from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
 
-__all__ = ["ModelParts", "ModelWriter"]
-
 _FIGURES = struct.Struct("<3q2d2q5dq")
 _STORED = struct.Struct("<Q2dQ")
 _SAMPLES = 12

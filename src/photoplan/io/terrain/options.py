@@ -15,8 +15,6 @@ from photoplan.io.plain_files import read_text
 from photoplan.io.toml_file import read_toml
 from photoplan.surfaces.measured import LINE_KINDS, POINT_KINDS
 
-__all__ = ["KINDS", "CodeClass", "CodeTable", "ReadOptions", "read_code_table"]
-
 KINDS: tuple[str, ...] = (*POINT_KINDS, *LINE_KINDS, "ignore")
 """Classes that a code may mean."""
 #: Words that mean a class wherever a code or the name of a layer stands (in small letters, signs left out).

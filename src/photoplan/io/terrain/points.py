@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 
-__all__ = ["PointPart", "PointTable", "PointTableFormat"]
-
 DELIMITERS = (",", ";", "\t", " ")
 _NAMES = {
     "x": ("x", "east", "easting", "e", "x_m", "rechtswert", "point_x", "longitude", "lon"),

@@ -18,8 +18,6 @@ from photoplan.io.raster import missing_blocks, read_pixels
 from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.validity import MissingBlocks
 
-__all__ = ["HIGHEST", "LOWEST", "TERRAIN_TYPES", "TerrainReader"]
-
 LOWEST, HIGHEST = -12_000.0, 9_000.0
 """Heights of the Earth, metres: below the deepest sea, above the highest mountain."""
 TERRAIN_TYPES = ("uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")

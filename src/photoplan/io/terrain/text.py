@@ -25,8 +25,6 @@ from photoplan.io.terrain.groups import CodeIndex, PointColumns, class_of, is_li
 from photoplan.io.terrain.options import CodeClass, ReadOptions
 from photoplan.surfaces.measured import LineKind, MeasuredLine, MeasuredTerrain
 
-__all__ = ["read"]
-
 BLOCK = 8 << 20
 """Bytes that are parsed at once."""
 MAX_LINE = 1 << 20

@@ -30,8 +30,6 @@ from photoplan.io.terrain.groups import CodeIndex, PointColumns, class_of, is_li
 from photoplan.io.terrain.options import CodeClass, ReadOptions
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
 
-__all__ = ["read"]
-
 _CODES = ("kind", "class", "code")
 _NAMES = ("name", "id", "nr", "label")
 _POINT, _LINE, _RING, _POLYGON = 0, 1, 2, 3

@@ -12,15 +12,13 @@ from photoplan.cameras.observed import GroundPoints
 from photoplan.errors import InputError
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import angles_from_rotation
-from photoplan.io.project_cameras import interior_of
-from photoplan.io.project_model import ANGLE_UNITS, Project
-from photoplan.orientation.block import Adjusted, AdjustSettings, Block, BlockCamera, BlockImage
-from photoplan.orientation.bundle import adjust_block
+from photoplan.io.project.cameras import interior_of
+from photoplan.io.project.model import ANGLE_UNITS, Project
+from photoplan.orientation.bundle.adjust import adjust_block
+from photoplan.orientation.bundle.block import Adjusted, AdjustSettings, Block, BlockCamera, BlockImage
 from photoplan.products.adjust.cameras import Calibrated, Free, block_camera, calibrated
 from photoplan.products.adjust.frame import BlockFrame, angle_derivatives, block_frame, make_bend, nadir_heights
 from photoplan.products.adjust.inputs import AdjustInputs
-
-__all__ = ["MapResult", "Prepared", "adjust_prepared", "map_result", "prepare"]
 
 _Floats = NDArray[np.float64]
 Adjuster = Callable[[Block, AdjustSettings], Adjusted]

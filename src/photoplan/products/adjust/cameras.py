@@ -17,11 +17,9 @@ from photoplan.cameras.lenses.none import NoLens
 from photoplan.cameras.lenses.opencv import OpenCV
 from photoplan.cameras.lenses.reversed import Reversed
 from photoplan.errors import UsageError
-from photoplan.io import camera_model as described
-from photoplan.io.project_cameras import lens_of
-from photoplan.orientation.block import PARAMETERS, AdjustedCamera, BlockCamera
-
-__all__ = ["Calibrated", "Free", "block_camera", "calibrated", "camera_entries", "parse_calibrate"]
+from photoplan.io.camera import model as described
+from photoplan.io.project.cameras import lens_of
+from photoplan.orientation.bundle.block import PARAMETERS, AdjustedCamera, BlockCamera
 
 Description = described.FrameCamera | described.FilmCamera
 
@@ -208,7 +206,7 @@ def camera_entries(camera: Description, start: BlockCamera, found: AdjustedCamer
 
 
 def _in_pixels(camera: Description) -> bool:
-    """Whether the interior orientation is computed in pixels; see `photoplan.io.project_cameras.interior_of`."""
+    """Whether the interior orientation is computed in pixels; see `photoplan.io.project.cameras.interior_of`."""
     if isinstance(camera, described.FilmCamera):
         return False
     return camera.camera_constant_mm is None or camera.principal_point_px is not None

@@ -5,12 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.io.project_cameras import image_size
-from photoplan.orientation.block import BlockImage
+from photoplan.io.project.cameras import image_size
+from photoplan.orientation.bundle.block import BlockImage
 from photoplan.products.adjust.block import MapResult
-from photoplan.report.adjust_facts import ResidualField
-
-__all__ = ["residual_fields"]
+from photoplan.report.adjust.facts import ResidualField
 
 _Floats = NDArray[np.float64]
 #: Measurements in a cell on average, and cells along the longer side at least and at most.

@@ -18,11 +18,9 @@ from photoplan.geometry.heights import OPTIONS, HeightStep, check_height_system,
 from photoplan.geometry.local import LocalFrame, earth_radius
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import angles_from_rotation
-from photoplan.io.project_model import Project
-from photoplan.orientation.block import Bend, BlockCamera, BlockImage
-from photoplan.products.scene import ground_of
-
-__all__ = ["BlockFrame", "angle_derivatives", "block_frame", "make_bend", "nadir_heights"]
+from photoplan.io.project.model import Project
+from photoplan.orientation.bundle.block import Bend, BlockCamera, BlockImage
+from photoplan.project.scene import ground_of
 
 _Floats = NDArray[np.float64]
 #: Step for the derivatives of angles, radians.

@@ -18,11 +18,9 @@ from photoplan.io.names import match_key
 from photoplan.io.observed_positions import PositionTable, read_observed_positions
 from photoplan.io.orientation.exif import image_files
 from photoplan.io.orientation.table import TableFormat, angle_in_radians
-from photoplan.io.project_cameras import image_size
-from photoplan.io.project_model import Image, Project
-from photoplan.products.init_match import some
-
-__all__ = ["AdjustInputs", "read_inputs"]
+from photoplan.io.project.cameras import image_size
+from photoplan.io.project.model import Image, Project
+from photoplan.products.init.match import some
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,7 @@ from photoplan.io.fingerprint import fingerprint
 from photoplan.io.run_record import versions
 from photoplan.products.adjust.block import MapResult
 from photoplan.products.plain_values import plain
-from photoplan.report.adjust_facts import AdjustFacts, GroundFacts, MeasurementFacts
-
-__all__ = ["facts_json"]
+from photoplan.report.adjust.facts import AdjustFacts, GroundFacts, MeasurementFacts
 
 
 def facts_json(facts: AdjustFacts, result: MapResult) -> dict[str, Any]:

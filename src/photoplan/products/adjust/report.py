@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import height_label
 from photoplan.io.adjusted_points import PointLayer
-from photoplan.io.project_model import ANGLE_UNITS
-from photoplan.orientation.block import AdjustSettings
+from photoplan.io.project.model import ANGLE_UNITS
+from photoplan.orientation.bundle.block import AdjustSettings
 from photoplan.products.adjust.block import MapResult
 from photoplan.products.adjust.field import residual_fields
-from photoplan.products.init_match import some
-from photoplan.report.adjust_facts import (
+from photoplan.products.init.match import some
+from photoplan.report.adjust.facts import (
     AdjustFacts,
     CalibrationFacts,
     GroundFacts,
@@ -26,8 +26,6 @@ from photoplan.report.adjust_facts import (
     StripFacts,
 )
 from photoplan.report.check_points import CheckAccuracy, check_accuracy
-
-__all__ = ["build_facts", "point_layers"]
 
 _Floats = NDArray[np.float64]
 Triple = tuple[float, float, float]

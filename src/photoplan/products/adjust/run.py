@@ -18,11 +18,11 @@ from photoplan.errors import UsageError
 from photoplan.io.adjusted_points import write_point_layers, write_residuals
 from photoplan.io.disk import disk_error, write_atomically
 from photoplan.io.product import check_output
-from photoplan.io.project import load_project
-from photoplan.io.project_edit import ProjectChanges, edit_project
-from photoplan.io.project_model import Project
-from photoplan.orientation.block import AdjustSettings
-from photoplan.orientation.bundle import adjust_block
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
+from photoplan.io.project.model import Project
+from photoplan.orientation.bundle.adjust import adjust_block
+from photoplan.orientation.bundle.block import AdjustSettings
 from photoplan.products.adjust.block import (
     MapResult,
     Prepared,
@@ -35,12 +35,10 @@ from photoplan.products.adjust.inputs import AdjustInputs, read_inputs
 from photoplan.products.adjust.json import facts_json
 from photoplan.products.adjust.report import build_facts, point_layers
 from photoplan.products.adjust.start import started
-from photoplan.products.scene import input_files
-from photoplan.report.adjust_facts import AdjustFacts
-from photoplan.report.adjust_plots import AdjustPlots
-from photoplan.report.adjust_report import adjust_report
-
-__all__ = ["OUTPUTS", "AdjustReport", "AdjustRequest", "adjust_project"]
+from photoplan.project.scene import input_files
+from photoplan.report.adjust.facts import AdjustFacts
+from photoplan.report.adjust.plots import AdjustPlots
+from photoplan.report.adjust.report import adjust_report
 
 #: Files of the output folder.
 OUTPUTS = ("report.html", "report.json", "points.gpkg", "image_points.csv")

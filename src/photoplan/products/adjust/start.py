@@ -9,16 +9,14 @@ import numpy as np
 
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.pose import Pose
-from photoplan.io.project_cameras import interior_of
-from photoplan.orientation.block import BlockCamera
-from photoplan.orientation.start import StartImage, start_block
+from photoplan.io.project.cameras import interior_of
+from photoplan.orientation.bundle.block import BlockCamera
+from photoplan.orientation.start.block import StartImage, start_block
 from photoplan.products.adjust.cameras import block_camera
 from photoplan.products.adjust.frame import block_frame
 from photoplan.products.adjust.inputs import AdjustInputs
-from photoplan.products.init_match import some
-from photoplan.products.scene import stated_pose
-
-__all__ = ["known_poses", "started"]
+from photoplan.products.init.match import some
+from photoplan.project.scene import stated_pose
 
 #: Farther from its image, no control point is believed, metres.
 _SIGHT = 50e3

@@ -14,8 +14,6 @@ from photoplan.products.characterise.result import Figure, Outcome, Table, joine
 from photoplan.quality.camera.blooming import Blooming, find_blooming
 from photoplan.report.characterise_charts import Chart, Curve
 
-__all__ = ["analyse", "missing"]
-
 _LEAST = 4
 #: Pixels of all mean images that are held at once.
 _MOST = 150_000_000

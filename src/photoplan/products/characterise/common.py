@@ -15,20 +15,6 @@ from photoplan.products.characterise.result import Outcome
 from photoplan.quality.camera.frame_statistics import Level
 from photoplan.quality.camera.photon_transfer import is_clipped_dark
 
-__all__ = [
-    "MOST_SATURATED",
-    "Black",
-    "Run",
-    "black_if_known",
-    "black_of",
-    "dark_levels",
-    "exposure_runs",
-    "of_one_temperature",
-    "prefix",
-    "saturation_of",
-    "tried",
-]
-
 #: Share of saturated samples up to which a mean grey value is one.
 MOST_SATURATED = 1e-2
 #: Conditions that may be the abscissa of a run, with what axes say.

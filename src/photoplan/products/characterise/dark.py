@@ -15,8 +15,6 @@ from photoplan.quality.camera.dark_signal import DarkCurrent, dark_current, doub
 from photoplan.quality.camera.frame_statistics import Level
 from photoplan.report.characterise_charts import Chart, Curve
 
-__all__ = ["analyse", "missing"]
-
 _LEAST = 3
 Currents = dict[float | None, DarkCurrent]
 

@@ -16,8 +16,6 @@ from photoplan.io.series.pixels import Plane, frame_pixels, plane_mask, series_p
 from photoplan.quality.camera.frame_statistics import FrameStack, Level, StackSums
 from photoplan.quality.camera.saturation import FullWell
 
-__all__ = ["SeriesData", "Setting"]
-
 #: What tells settings apart, and the units. Light is told by its photons; time is no setting.
 _CONDITIONS = (("kind", ""), *(each for each in CONDITIONS.items() if each[0] not in ("irradiance_uw_cm2", "time_s")))
 #: Share of saturated pixels up to which a frame may be the reference of `brightest`.

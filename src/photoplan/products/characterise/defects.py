@@ -17,8 +17,6 @@ from photoplan.quality.camera.frame_statistics import FrameStack
 from photoplan.quality.camera.photon_transfer import is_clipped_dark
 from photoplan.report.characterise_charts import Chart, Curve, Picture, shrunk
 
-__all__ = ["analyse", "missing"]
-
 #: Hot pixels whose growth with the exposure is followed, and whose places are drawn.
 _FOLLOWED = 40
 #: The strongest hot pixels of the longest exposure, among which the fastest are looked for.

@@ -14,8 +14,6 @@ from photoplan.products.characterise.result import Figure, Outcome, Table, joine
 from photoplan.quality.camera.brightness_drift import LEAST_MEASUREMENTS, BrightnessDrift, brightness_drift
 from photoplan.report.characterise_charts import Chart, Curve
 
-__all__ = ["analyse", "missing"]
-
 #: Side of the window in the middle of the image (Behr 1989, §4.2.4).
 WINDOW = 6
 

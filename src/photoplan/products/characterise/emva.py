@@ -22,8 +22,6 @@ from photoplan.quality.camera.frame_statistics import Level
 from photoplan.quality.camera.photon_transfer import is_clipped_dark
 from photoplan.report.characterise_charts import Chart, Curve
 
-__all__ = ["analyse", "missing"]
-
 _LEAST = 5
 #: Figures of other analyses that belong to the sheet: name there, name here, words, unit, and whether K divides them.
 _TAKEN = (

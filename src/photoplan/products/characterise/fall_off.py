@@ -22,8 +22,6 @@ from photoplan.quality.camera.fall_off_adjust import FallOffSettings
 from photoplan.quality.camera.fall_off_model import FallOffModel, gain_image
 from photoplan.report.characterise_charts import Chart, Curve, Picture
 
-__all__ = ["analyse", "correction_text", "missing"]
-
 _SATURATED = 1e-3
 #: Longer side of the gain image that is written.
 _GAIN_SIDE = 1024

@@ -18,8 +18,6 @@ from photoplan.products.characterise.common import Run, black_if_known, exposure
 from photoplan.products.characterise.data import SeriesData
 from photoplan.quality.camera.saturation import FullWell, find_saturation, full_well
 
-__all__ = ["full_well_notes", "with_full_wells"]
-
 _LEAST = 4
 #: Share of samples at the largest grey value from which on that is what stops them.
 _MOSTLY = 0.5

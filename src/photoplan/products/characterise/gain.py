@@ -15,8 +15,6 @@ from photoplan.quality.camera.approach import LEAST_VALUES
 from photoplan.quality.camera.gain_control import GainControl, compare_transitions, gain_control
 from photoplan.report.characterise_charts import Chart, Curve
 
-__all__ = ["analyse", "missing"]
-
 
 def missing(data: SeriesData) -> str | None:
     """What the series lacks."""

@@ -17,8 +17,6 @@ from photoplan.io.series.file import Frame, Group
 from photoplan.io.series.pixels import frame_pixels, plane_mask, split
 from photoplan.products.characterise.data import SeriesData
 
-__all__ = ["FrameGroup", "central_window", "frame_groups"]
-
 
 @dataclass(frozen=True)
 class FrameGroup:

@@ -18,8 +18,6 @@ from photoplan.products.characterise.result import Figure, Outcome, Table, joine
 from photoplan.quality.camera.line_jitter import grey_error
 from photoplan.quality.camera.parallel_edges import EdgePair, above_control, compare_edges
 
-__all__ = ["analyse", "missing"]
-
 _CHARTS = 4
 """Frames that are drawn."""
 

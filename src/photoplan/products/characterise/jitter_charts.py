@@ -9,8 +9,6 @@ import numpy as np
 from photoplan.products.characterise.jitter_edge import Edge
 from photoplan.report.characterise_charts import Chart, Curve
 
-__all__ = ["jitter_charts"]
-
 
 def jitter_charts(edges: Sequence[Edge]) -> list[Chart]:
     """Deviations of every edge of a frame, and their spectra."""

@@ -14,8 +14,6 @@ from photoplan.products.characterise.data import SeriesData
 from photoplan.quality.camera.line_jitter import LineJitter, line_jitter
 from photoplan.quality.camera.plumb_edge import EdgeLines, correlate_edge, fit_edge
 
-__all__ = ["Edge", "measured_edge"]
-
 
 @dataclass(frozen=True, eq=False)
 class Edge:

@@ -26,8 +26,6 @@ from photoplan.quality.camera.photon_transfer import is_clipped_dark
 from photoplan.quality.camera.saturation import find_saturation
 from photoplan.report.characterise_charts import Chart, Curve
 
-__all__ = ["analyse", "missing"]
-
 _KINDS = ("flat", "scene")
 _LEAST = 3
 

@@ -12,8 +12,6 @@ from photoplan.products.characterise.result import Figure, Outcome, Table, joine
 from photoplan.quality.camera.frame_statistics import Level
 from photoplan.report.characterise_charts import Chart, Curve
 
-__all__ = ["analyse", "missing"]
-
 #: What stands still: between frames of other kinds the scene or its brightness changes.
 _KINDS = ("dark", "flat", "scene", "wedge", "drift")
 

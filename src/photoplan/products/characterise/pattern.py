@@ -24,8 +24,6 @@ from photoplan.quality.camera.frame_statistics import FrameStack, check_level
 from photoplan.quality.camera.photon_transfer import is_clipped_dark
 from photoplan.report.characterise_charts import Chart, Curve
 
-__all__ = ["analyse", "missing"]
-
 #: Share of saturation that the standard asks of bright frames.
 _HALF = 0.5
 

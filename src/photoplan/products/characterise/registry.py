@@ -18,8 +18,6 @@ from typing import cast
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.result import Outcome
 
-__all__ = ["ANALYSES", "Analysis"]
-
 
 @dataclass(frozen=True)
 class Analysis:

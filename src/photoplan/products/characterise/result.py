@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from photoplan.products.plain_values import plain
 from photoplan.report.characterise_charts import Chart, Picture
 
-__all__ = ["Figure", "Outcome", "Table", "joined"]
-
 
 @dataclass(frozen=True)
 class Figure:

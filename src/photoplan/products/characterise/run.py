@@ -23,8 +23,6 @@ from photoplan.products.plain_values import plain
 from photoplan.report.characterise_charts import ChartDrawer
 from photoplan.report.characterise_page import AnalysisPart, SeriesFacts, characterise_page
 
-__all__ = ["AnalysisRun", "CharacteriseReport", "CharacteriseRequest", "characterise"]
-
 
 @dataclass(frozen=True)
 class CharacteriseRequest:

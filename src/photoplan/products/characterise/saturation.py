@@ -14,8 +14,6 @@ from photoplan.quality.camera.frame_statistics import check_level
 from photoplan.quality.camera.saturation import find_saturation
 from photoplan.report.characterise_charts import Chart, Curve
 
-__all__ = ["analyse", "missing"]
-
 _KINDS = ("flat", "scene")
 _LEAST = 4
 _WORDS = {

@@ -17,8 +17,6 @@ from photoplan.quality.camera.stage import LEAST_POINTS, StageCalibration, b4_li
 from photoplan.report.characterise_charts import Chart, Curve
 from photoplan.report.drawing import round_down
 
-__all__ = ["analyse", "missing"]
-
 _GON = 200.0 / math.pi
 
 Array = NDArray[np.float64]

@@ -7,8 +7,6 @@ from dataclasses import replace
 from photoplan.io.series.steps import grey_step, largest_of_steps
 from photoplan.products.characterise.data import SeriesData
 
-__all__ = ["step_notes", "with_grey_step"]
-
 
 def with_grey_step(data: SeriesData) -> SeriesData:
     """The same series with the distance of its grey values; reads a small part of some frames."""

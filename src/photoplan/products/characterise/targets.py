@@ -15,8 +15,6 @@ from photoplan.io.series.pixels import frame_pixels
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup
 
-__all__ = ["Located", "locate_targets", "targets_of"]
-
 #: Largest part of the frames in which a target may be lost.
 _MOST_LOST = 0.2
 _LARGEST = 25_000_000
@@ -65,7 +63,7 @@ def locate_targets(data: SeriesData, group: FrameGroup) -> dict[str, list[Locate
 
 
 def _locate(data: SeriesData, group: FrameGroup, frame: Frame, target: TargetEntry) -> Located:
-    from photoplan.orientation.mark_target import locate_target  # noqa: PLC0415 - slow to import, rarely needed
+    from photoplan.orientation.marks.target import locate_target  # noqa: PLC0415 - slow to import, rarely needed
 
     window = _window(data, group, target)
     # The first band; of a colour pattern the mean of each cell would move the target by less than its sigma.

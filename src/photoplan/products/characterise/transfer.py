@@ -13,8 +13,6 @@ from photoplan.quality.camera.frame_statistics import Level
 from photoplan.quality.camera.photon_transfer import PhotonTransfer, photon_transfer
 from photoplan.report.characterise_charts import Chart, Curve
 
-__all__ = ["analyse", "missing", "reduced_level"]
-
 _LEAST = 3
 
 

@@ -18,8 +18,6 @@ from photoplan.quality.camera.approach import LEAST_VALUES
 from photoplan.quality.camera.warm_up import Course, WarmUp, warm_up
 from photoplan.report.characterise_charts import Chart, Curve
 
-__all__ = ["analyse", "missing"]
-
 Array = NDArray[np.float64]
 
 #: Distance from the end, pixels, that counts as warm.

@@ -18,8 +18,6 @@ from photoplan.quality.camera.frame_statistics import Level, StackSums
 from photoplan.quality.camera.grey_wedge import GreyWedge, grey_wedge
 from photoplan.report.characterise_charts import Chart, Curve
 
-__all__ = ["analyse", "missing"]
-
 _LEAST = 3
 
 

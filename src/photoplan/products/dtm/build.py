@@ -27,10 +27,8 @@ from photoplan.io.terrain.model_write import ModelParts, ModelWriter
 from photoplan.io.terrain.options import ReadOptions
 from photoplan.surfaces.measured import MeasuredTerrain
 from photoplan.terrain.build import BuildPlan, Built, Steps, build, plan_build
-from photoplan.terrain.clean import Finding, clean
+from photoplan.terrain.clean.run import Finding, clean
 from photoplan.terrain.settings import BuildSettings
-
-__all__ = ["BuildReport", "BuildRequest", "describe_plan", "dtm_build", "load", "plan_facts"]
 
 #: Bytes that a build needs for each point, measured; more than the machine has is refused before any work.
 _BYTES_PER_POINT = 700

@@ -12,13 +12,11 @@ from photoplan.errors import GeometryError, UsageError
 from photoplan.io.contour_file import ContourRow, LabelRow, contour_files, write_contours
 from photoplan.io.product import check_output
 from photoplan.products.dtm.contours_picture import ContourPicture
-from photoplan.products.open_terrain import OpenTerrain, open_terrain
+from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.surfaces.raster import RasterSurface
-from photoplan.terrain.contours import ContourLine, ContourOptions, trace_contours
-from photoplan.terrain.contours_labels import Labeller, decimals_of
-from photoplan.terrain.contours_parts import SurfacePart, grid_parts, unit_parts
-
-__all__ = ["ContourFacts", "ContourRequest", "make_contours"]
+from photoplan.terrain.contours.labels import Labeller, decimals_of
+from photoplan.terrain.contours.parts import SurfacePart, grid_parts, unit_parts
+from photoplan.terrain.contours.run import ContourLine, ContourOptions, trace_contours
 
 #: Meshes along the side of a piece of a height grid.
 SIDE = 512

@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 
 from photoplan.io.disk import write_atomically
 from photoplan.report.drawing import load_matplotlib, png
-from photoplan.terrain.contours import ContourLine
-
-__all__ = ["ContourPicture"]
+from photoplan.terrain.contours.run import ContourLine
 
 #: Longer side, pixels; and vertices after which further lines are left out of the picture.
 SIDE, MOST = 1400, 2_000_000

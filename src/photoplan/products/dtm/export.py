@@ -17,11 +17,9 @@ from photoplan.io.grid_writer import GridOptions, write_grid
 from photoplan.io.product import check_output
 from photoplan.io.terrain.export import TIN_SUFFIXES, replacing, write_points, write_tin
 from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
-from photoplan.products.open_terrain import OpenTerrain, open_terrain
+from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.targets.map import MapTarget
-
-__all__ = ["EXPORTS", "ExportReport", "ExportRequest", "dtm_export", "export_steps"]
 
 RASTERS = (".tif", ".tiff")
 POINTS = (".xyz", ".csv")

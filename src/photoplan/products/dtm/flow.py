@@ -20,10 +20,8 @@ from photoplan.io.polygons import label_polygons, read_features, write_features
 from photoplan.io.product import check_output
 from photoplan.io.xy_table import read_xy_table
 from photoplan.products.dtm.visible import ROLES, own_grid, read_grid
-from photoplan.products.open_terrain import OpenTerrain, open_terrain
+from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.terrain.flow import CELL_BYTES, Flow, FlowMethod, flow_of, snapped
-
-__all__ = ["BANDS", "FlowReport", "FlowRequest", "OutletRow", "dtm_flow"]
 
 TILE = 512
 BANDS = ("upstream area m²", "flow length m", "longest way here m", "direction", "catchment", "depth of filling m")

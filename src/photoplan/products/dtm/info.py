@@ -8,10 +8,8 @@ from typing import Any
 
 from photoplan.errors import InputError
 from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
-from photoplan.products.describe import describe
-from photoplan.products.describe_model import describe_model, model_figures
-
-__all__ = ["TerrainFacts", "dtm_info"]
+from photoplan.products.describe.model import describe_model, model_figures
+from photoplan.products.describe.run import describe
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,9 @@ from photoplan.io.product import check_output
 from photoplan.io.terrain.export import replacing
 from photoplan.io.terrain.points import PointTable, PointTableFormat
 from photoplan.products.dtm.profile_plot import ProfilePlot
-from photoplan.products.open_terrain import OpenTerrain, open_terrain
+from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.profile import profile
-
-__all__ = ["Profile", "ProfileRequest", "dtm_profile", "profiles_of"]
 
 TABLES = (".csv", ".txt")
 MOST_POINTS = 1_000_000

@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 from photoplan.errors import UsageError
 from photoplan.report.drawing import load_matplotlib, png
 
-__all__ = ["ProfilePlot"]
-
 MOST = 12
 """Profiles of one picture at most."""
 _GROUND, _BAND = "#5b4a33", "#d9a441"
 
 
-class Drawn(Protocol):
+class _Drawn(Protocol):
     """What is drawn."""
 
     @property
@@ -44,7 +42,7 @@ class ProfilePlot:
     def __init__(self) -> None:
         self._mpl = load_matplotlib("a picture")
 
-    def draw(self, path: Path, profiles: Sequence[Drawn]) -> None:
+    def draw(self, path: Path, profiles: Sequence[_Drawn]) -> None:
         """Write a PNG: a panel for each profile, all in one scale.
 
         Raises
@@ -72,7 +70,7 @@ class ProfilePlot:
         path.write_bytes(png(figure, dpi=110))
 
 
-def _panel(panel: Any, item: Drawn, span: float, length: float) -> None:
+def _panel(panel: Any, item: _Drawn, span: float, length: float) -> None:
     d, z, s = item.distance, item.heights, item.sigmas
     if np.isfinite(s).any():
         panel.fill_between(d, z - 2 * s, z + 2 * s, color=_BAND, alpha=0.5, linewidth=0, label="± 2 σ")
@@ -88,7 +86,7 @@ def _panel(panel: Any, item: Drawn, span: float, length: float) -> None:
     panel.grid(alpha=0.3)
 
 
-def _range(item: Drawn) -> tuple[float, float]:
+def _range(item: _Drawn) -> tuple[float, float]:
     """Lowest and highest of all that is drawn, at least 0.1 m apart."""
     band = 2 * np.nan_to_num(item.sigmas)
     drawn = np.concatenate([item.heights - band, item.heights + band])

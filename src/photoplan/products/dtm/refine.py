@@ -25,8 +25,6 @@ from photoplan.surfaces.memory_units import unit_range
 from photoplan.surfaces.refined_units import LinedUnits, refine_units
 from photoplan.surfaces.units import LineElement, Unit, UnitFigures
 
-__all__ = ["RefineReport", "RefineRequest", "dtm_refine"]
-
 
 @dataclass(frozen=True)
 class RefineRequest:

@@ -21,9 +21,7 @@ from photoplan.surfaces.measured import MeasuredTerrain
 from photoplan.surfaces.memory_units import MemoryUnits
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.build import Built
-from photoplan.terrain.clean import Finding
-
-__all__ = ["build_facts", "check_report", "write_report"]
+from photoplan.terrain.clean.run import Finding
 
 T = TypeVar("T", bound=np.generic)
 #: Longer side of the map, pixels.

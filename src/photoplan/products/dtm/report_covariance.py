@@ -13,8 +13,6 @@ from photoplan.terrain.covariance import Covariance, near_lines
 from photoplan.terrain.fit import Fit
 from photoplan.terrain.settings import FAMILIES
 
-__all__ = ["correlation_at", "covariance_facts"]
-
 #: Neighbourhoods that are looked at, points of each, and classes of distance.
 _BLOCKS, _POINTS, _CLASSES = 160, 60, 14
 #: So many times as many neighbourhoods are tried, since breaklines part some.

@@ -15,10 +15,8 @@ from photoplan.errors import UsageError
 from photoplan.io.product import check_output
 from photoplan.io.terrain.export import replacing
 from photoplan.io.terrain.points import PointTable, PointTableFormat
-from photoplan.products.open_terrain import OpenTerrain, open_terrain
+from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.surfaces.hybrid import HybridSurface
-
-__all__ = ["SampleReport", "SampleRequest", "dtm_sample"]
 
 PART = 100_000
 """Points that are in memory at once."""

@@ -19,12 +19,10 @@ from photoplan.io.grid_writer import GridOptions, GridTile, write_grid
 from photoplan.io.product import ProductFacts, check_output
 from photoplan.io.quicklook import write_quicklook
 from photoplan.io.storage import Nodata
-from photoplan.products.open_terrain import OpenTerrain, open_terrain
-from photoplan.terrain import shading, shading_tints
-from photoplan.terrain.shading import Light, surface_slopes
-
-__all__ = ["Picture", "PictureRequest", "ShadingFacts", "aspect_picture", "make_picture", "shade_picture",
-           "slope_picture", "tint_picture"]  # fmt: skip
+from photoplan.project.open_terrain import OpenTerrain, open_terrain
+from photoplan.terrain.shading import run as shading
+from photoplan.terrain.shading import tints as shading_tints
+from photoplan.terrain.shading.run import Light, surface_slopes
 
 #: From flat to steep, for slope classes.
 SLOPE_COLOURS = ((255, 255, 212), (254, 217, 142), (254, 153, 41), (204, 76, 2), (120, 30, 10))

@@ -21,11 +21,9 @@ from photoplan.io.grid_writer import GridOptions, write_grid
 from photoplan.io.polygons import read_features
 from photoplan.io.product import check_output
 from photoplan.io.xy_table import read_xy_table
-from photoplan.products.open_terrain import OpenTerrain, open_terrain
+from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.visibility import Observer, SightSettings, horizon, needed_heights
-
-__all__ = ["VisibleReport", "VisibleRequest", "VisibleRow", "dtm_visible", "own_grid", "read_grid"]
 
 TILE = 512
 #: Bytes of one post while one observer is looked at: heights, those relative to the eye, pyramid, result.

@@ -18,14 +18,11 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.grid_writer import GridOptions, write_grid
 from photoplan.io.polygons import Feature, read_features
 from photoplan.io.product import check_output
-from photoplan.products.open_terrain import OpenTerrain, open_terrain
+from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.targets.map import MapTarget
-from photoplan.terrain.volume import TILE, Volume, VolumeSettings, volume_between
-from photoplan.terrain.volume_sigma import ErrorModel, VolumeSigma, volume_sigma
-
-__all__ = ["VolumeReport", "VolumeRequest", "VolumeRow", "dtm_volume"]
-
+from photoplan.terrain.volume.run import TILE, Volume, VolumeSettings, volume_between
+from photoplan.terrain.volume.sigma import ErrorModel, VolumeSigma, volume_sigma
 
 Report = Callable[[int, int], None]
 """Called with the number of windows just finished and of their cells."""

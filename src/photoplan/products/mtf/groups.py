@@ -20,8 +20,6 @@ from photoplan.quality.edges.groups import (
 )
 from photoplan.quality.edges.koelbl import EdgeSpread, spread_of_edge
 
-__all__ = ["ENOUGH", "group_edges"]
-
 #: Slanted edges from which on those along rows and columns do not count in a mean.
 ENOUGH = 3
 #: Shares of light that means are given for: Z, A, B and the next.

@@ -17,8 +17,6 @@ from photoplan.quality.edges.candidates import range_of
 from photoplan.quality.edges.find import EdgePicture
 from photoplan.quality.linearise import Linearisation
 
-__all__ = ["LUMINANCE", "LightImage"]
-
 #: Channel 0.
 LUMINANCE = 0
 _WEIGHTS = np.array([0.2126, 0.7152, 0.0722])

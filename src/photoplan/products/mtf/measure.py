@@ -22,8 +22,6 @@ from photoplan.quality.edges.enhancement import enhancement_of
 from photoplan.quality.edges.find import EdgeRegion, EdgeRules
 from photoplan.quality.edges.response import EdgeSettings, measure_edge
 
-__all__ = ["Measuring", "measure_image"]
-
 Advance = Callable[[int, int], None]
 
 #: Share of the pixels of an edge that may be saturated.

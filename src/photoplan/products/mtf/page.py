@@ -16,8 +16,6 @@ from photoplan.quality.spread import gaussian_modulation
 from photoplan.report.mtf_plots import CellFacts, CurveFacts, EdgeFacts, MtfPlots, ProfileFacts
 from photoplan.report.mtf_report import MtfImageFacts, mtf_report
 
-__all__ = ["mtf_page"]
-
 #: Longer side of the small copy of an image, pixels.
 _SMALL = 1100
 _FACTOR = 1.96

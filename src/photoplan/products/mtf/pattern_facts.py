@@ -16,8 +16,6 @@ from photoplan.quality.patterns.siemens import StarMtf
 from photoplan.quality.patterns.usaf import UsafBars, UsafResult
 from photoplan.report.pattern_plots import Curve, Frame, Mark, PatternFacts, PolarCurve
 
-__all__ = ["pattern_facts", "thinning"]
-
 #: Longest side of the picture, pixels.
 _SIDE = 900
 

@@ -17,8 +17,6 @@ from photoplan.quality.patterns.bar_curve import BarCurve, coltman_mtf
 from photoplan.quality.patterns.siemens import StarMtf
 from photoplan.quality.patterns.usaf import UsafBars, UsafResult
 
-__all__ = ["ImagePattern", "PatternReport", "PatternResult"]
-
 
 @dataclass(frozen=True, eq=False)
 class PatternResult:

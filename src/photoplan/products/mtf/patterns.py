@@ -14,11 +14,11 @@ from photoplan.errors import InputError, PhotoplanError, ResourceError, UsageErr
 from photoplan.geometry.grid import Window
 from photoplan.io.disk import write_atomically
 from photoplan.io.named_table import write_named_table
-from photoplan.products.linearisation import linearisation_of
 from photoplan.products.mtf.image import LUMINANCE, LightImage
 from photoplan.products.mtf.pattern_facts import pattern_facts, thinning
 from photoplan.products.mtf.pattern_result import ImagePattern, PatternReport, PatternResult
 from photoplan.products.mtf.request import ENCODED, check_files, unique_names
+from photoplan.project.linearisation import linearisation_of
 from photoplan.quality.linearise import Linearisation
 from photoplan.quality.patterns.bar_curve import bar_curve
 from photoplan.quality.patterns.bars import measure_bars
@@ -26,8 +26,6 @@ from photoplan.quality.patterns.pixels import clipped_pixels
 from photoplan.quality.patterns.siemens import StarRules, measure_star
 from photoplan.quality.patterns.usaf import UsafRules, measure_usaf
 from photoplan.report.pattern_plots import PatternPlots, pattern_page
-
-__all__ = ["PatternRequest", "measure_patterns"]
 
 Array = NDArray[np.float64]
 Roi = tuple[int, int, int, int]

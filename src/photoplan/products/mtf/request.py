@@ -8,8 +8,6 @@ from pathlib import Path
 from photoplan.errors import UsageError
 from photoplan.io.product import check_output
 
-__all__ = ["ENCODED", "check_files", "unique_names"]
-
 #: Said where nobody states how 8 bits are encoded.
 ENCODED = (
     "linearisation: linear (by default: grey values are taken as light). Images of 8 bits are usually encoded by a "

@@ -21,8 +21,6 @@ from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.restoration.filter_design import point_spread
 from photoplan.quality.spread import SpreadFunction
 
-__all__ = ["EdgeGroup", "ImageMtf", "LabComparison", "MeasuredEdge", "MtfReport", "group_lines", "rejected_words"]
-
 
 @dataclass(frozen=True, eq=False)
 class MeasuredEdge:

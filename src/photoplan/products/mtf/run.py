@@ -12,19 +12,17 @@ from photoplan.errors import PhotoplanError, ResourceError, UsageError
 from photoplan.io.disk import write_atomically
 from photoplan.io.mtf_file import read_mtf_table
 from photoplan.io.named_table import write_named_table
-from photoplan.products.linearisation import linearisation_of
 from photoplan.products.mtf.groups import group_edges
 from photoplan.products.mtf.image import LightImage
 from photoplan.products.mtf.measure import Measuring, measure_image
 from photoplan.products.mtf.page import mtf_page
 from photoplan.products.mtf.request import ENCODED, check_files, unique_names
 from photoplan.products.mtf.result import EdgeGroup, ImageMtf, MtfReport
+from photoplan.project.linearisation import linearisation_of
 from photoplan.quality.edges.enhancement import Enhancement, enhancement_of
 from photoplan.quality.edges.find import EdgeRules
 from photoplan.quality.linearise import Linearisation
 from photoplan.report.mtf_plots import MtfPlots
-
-__all__ = ["MtfRequest", "measure_mtf"]
 
 #: Cells of the field in each direction that a report can show.
 MOST_CELLS = 50

@@ -12,8 +12,6 @@ from photoplan.products.mtf.image import LightImage
 from photoplan.quality.edges.candidates import StraightEdge, find_lines
 from photoplan.quality.edges.find import EdgeRegion, EdgeRules, examine
 
-__all__ = ["Found", "join_lines", "parted", "search_edges", "select_spread", "tiles_of"]
-
 #: Side of a tile, pixels: its arrays take some 200 MB.
 TILE = 2048
 #: Longest line that is examined as one, pixels: bounds the window that is read for it, and how far lenses bend it.

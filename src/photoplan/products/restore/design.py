@@ -13,18 +13,16 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
-from photoplan.products.linearisation import linearisation_of
 from photoplan.products.mtf.image import LightImage
 from photoplan.products.mtf.result import ImageMtf, MtfReport
 from photoplan.products.mtf.run import MtfRequest, measure_mtf
+from photoplan.project.linearisation import linearisation_of
 from photoplan.quality.edges.response import EdgeMeasurement
 from photoplan.quality.edges.sharpness import LEAST_EDGES, sharpness_of
 from photoplan.quality.restoration.design import Design, DesignOptions, Sharpness, design_filter
 from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
 from photoplan.quality.restoration.image_noise import block_noise, image_noise
 from photoplan.quality.restoration.regularised import SceneStatistics
-
-__all__ = ["DesignRequest", "DesignedPart", "MeasuredFilter", "design_restoration"]
 
 #: Windows of an image in which its contrast is looked for, in each direction, and their side.
 _WINDOWS = 5

@@ -12,8 +12,6 @@ from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
 from photoplan.report.restore_plots import EndsPicture
 
-__all__ = ["Compared", "compare"]
-
 #: Side of a detail, pixels; and places in each direction at which details are looked at.
 SIDE = 160
 _PLACES = 20

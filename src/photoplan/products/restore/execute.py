@@ -24,9 +24,7 @@ from photoplan.io.storage import Nodata
 from photoplan.io.tile_log import TileLog
 from photoplan.products.chromatic import model_figures, save_chromatic
 from photoplan.products.restore.request import RestoreRequest
-from photoplan.products.restored_reader import PART, RestoredReader
-
-__all__ = ["Job", "RestoredImage", "earlier_result", "memory_of_a_tile", "restore_one"]
+from photoplan.project.restored_reader import PART, RestoredReader
 
 
 @dataclass(frozen=True, eq=False)

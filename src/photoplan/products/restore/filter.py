@@ -12,12 +12,10 @@ import numpy as np
 
 from photoplan.errors import UsageError
 from photoplan.io.filter_file import filter_text
-from photoplan.products.filter_files import entries_of, load_filter, save_filter
 from photoplan.products.restore.design import DesignRequest, MeasuredFilter, design_restoration
+from photoplan.project.filter_files import entries_of, load_filter, save_filter
 from photoplan.quality.restoration.aperture import aperture_filter
 from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
-
-__all__ = ["FilterRequest", "FoundFilter", "keep_filter", "requested_filter"]
 
 #: File that a measured filter is written to, in the folder of the results.
 FILTER_NAME = "restoration_filter.toml"

@@ -16,8 +16,6 @@ from photoplan.report.filter_plots import KernelPicture, frequency_response
 from photoplan.report.restore_plots import AxisPicture, FieldMap
 from photoplan.report.restore_report import STANDS_FOR, FilterFacts, PartFacts
 
-__all__ = ["filter_facts"]
-
 _FREQUENCY = np.linspace(0.0, 0.5, 101)
 _AXES = (("x", "rows", (1.0, 0.0)), ("y", "columns", (0.0, 1.0)))
 #: Bands whose field is drawn.

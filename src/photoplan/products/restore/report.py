@@ -11,17 +11,15 @@ from photoplan.io.disk import write_atomically
 from photoplan.io.product import check_output
 from photoplan.io.raster import RasterReader
 from photoplan.products.chromatic import model_figures
-from photoplan.products.fall_off_reader import fall_off_line
 from photoplan.products.restore.details import compare
 from photoplan.products.restore.execute import Job, RestoredImage
 from photoplan.products.restore.filter import FoundFilter
 from photoplan.products.restore.page import filter_facts
 from photoplan.products.restore.run import RestoreReport
+from photoplan.project.fall_off_reader import fall_off_line
 from photoplan.quality.colour.model import ChromaticModel
 from photoplan.report.restore_plots import RestorePlots
 from photoplan.report.restore_report import RestoredFacts, restore_report
-
-__all__ = ["ReportFile", "open_report"]
 
 
 @dataclass(frozen=True, eq=False)

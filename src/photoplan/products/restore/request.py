@@ -11,8 +11,6 @@ from photoplan.io.storage import COMPRESSIONS
 from photoplan.quality.colour.model import ChromaticModel
 from photoplan.quality.restoration.filters import RestorationFilter
 
-__all__ = ["RestoreRequest"]
-
 #: What `dtype` may be; grey values keep their scale in all of them.
 TYPES = ("same", "float32", "uint16")
 

@@ -22,27 +22,17 @@ from photoplan.io.product import check_output
 from photoplan.io.raster import RasterReader
 from photoplan.io.run_record import record_path
 from photoplan.io.storage import Nodata
-from photoplan.products.aligned_reader import AlignedReader
 from photoplan.products.chromatic import load_chromatic, measured_once, model_figures
-from photoplan.products.fall_off_reader import FallOffFile, FallOffReader, load_fall_off
-from photoplan.products.filter_files import entries_of, load_filter
-from photoplan.products.linearisation import linearisation_of
 from photoplan.products.restore.execute import Job, RestoredImage, earlier_result, memory_of_a_tile, restore_one
 from photoplan.products.restore.request import RestoreRequest
-from photoplan.products.restored_reader import RestoredReader, Source, kept_nodata, restored_reader
+from photoplan.project.aligned_reader import AlignedReader
+from photoplan.project.fall_off_reader import FallOffFile, FallOffReader, load_fall_off
+from photoplan.project.filter_files import entries_of, load_filter
+from photoplan.project.linearisation import linearisation_of
+from photoplan.project.restored_reader import RestoredReader, Source, kept_nodata, restored_reader
 from photoplan.quality.colour.model import ChromaticModel
 from photoplan.quality.linearise import Linearisation
 from photoplan.quality.restoration.filters import RestorationFilter
-
-__all__ = [
-    "RestorePlan",
-    "RestoreReport",
-    "RestoreRequest",
-    "RestoredImage",
-    "filter_figures",
-    "plan_restoration",
-    "restore_images",
-]
 
 #: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
 BASE_MEMORY = 416 * 2**20

@@ -11,8 +11,6 @@ from scipy import optimize, stats
 
 from photoplan.errors import InputError
 
-__all__ = ["LEAST_VALUES", "Approach", "check_times", "fit_approach"]
-
 Array = NDArray[np.float64]
 
 #: Values below which no exponential is fitted: its three unknowns need something that checks them.

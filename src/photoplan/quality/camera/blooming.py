@@ -19,8 +19,6 @@ from scipy import ndimage
 
 from photoplan.errors import InputError
 
-__all__ = ["Blooming", "find_blooming"]
-
 #: Pixels from the object up to which its neighbours lie. The nearest ones count, since charge fills them first; what
 #: they hold of the object's own light belongs to their response.
 _FAR = 4

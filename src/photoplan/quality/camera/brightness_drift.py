@@ -12,8 +12,6 @@ from scipy import stats
 from photoplan.errors import InputError
 from photoplan.quality.camera.approach import check_times
 
-__all__ = ["LEAST_MEASUREMENTS", "BrightnessDrift", "Variation", "brightness_drift"]
-
 Array = NDArray[np.float64]
 
 #: Measurements below which long and short term cannot be told apart.

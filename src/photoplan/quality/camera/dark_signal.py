@@ -18,8 +18,6 @@ from photoplan.quality.camera.frame_statistics import Level, check_level
 from photoplan.quality.camera.photon_transfer import is_clipped_dark
 from photoplan.quality.camera.straight_line import StraightLine, fit_line
 
-__all__ = ["DarkCurrent", "DoublingTemperature", "dark_current", "doubling_temperature"]
-
 
 @dataclass(frozen=True)
 class DarkCurrent:

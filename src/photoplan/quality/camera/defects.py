@@ -17,8 +17,6 @@ from scipy.stats import chi2, norm
 from photoplan.errors import InputError
 from photoplan.quality.camera.high_pass import background
 
-__all__ = ["Defect", "DefectList", "LogHistogram", "find_blinking", "find_defects", "find_lines", "log_histogram"]
-
 Kind = Literal["hot", "dark", "blinking", "row", "column"]
 #: False alarms that are expected in a whole image.
 _ALARMS = 0.01

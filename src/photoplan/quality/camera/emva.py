@@ -25,8 +25,6 @@ from photoplan.errors import InputError
 from photoplan.quality.camera.linearity import Linearity, linearity
 from photoplan.quality.camera.photon_transfer import LEAST_VARIANCE, QUANTISATION
 
-__all__ = ["EmvaPoints", "EmvaSheet", "emva_sheet"]
-
 #: Part of the signal at saturation up to which levels count, by the standard.
 _RANGE = 0.7
 

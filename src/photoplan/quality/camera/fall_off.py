@@ -22,8 +22,6 @@ from photoplan.quality.camera.fall_off_adjust import (
 from photoplan.quality.camera.fall_off_blocks import Blocks, to_blocks
 from photoplan.quality.camera.fall_off_model import FallOffModel, half_diagonal
 
-__all__ = ["Corner", "Dirt", "FallOff", "FallOffSettings", "Term", "fit_fall_off"]
-
 Array = NDArray[np.float64]
 
 #: Least part of what an unknown changes that no other one can do as well.

@@ -13,8 +13,6 @@ from photoplan.errors import GeometryError, InputError
 from photoplan.quality.camera.fall_off_blocks import Blocks, robust_weights
 from photoplan.quality.camera.fall_off_model import MOST_DEGREE, half_diagonal, surface_terms, term_values
 
-__all__ = ["FallOffSettings", "Fit", "adjust", "columns", "separability", "significant", "weakest"]
-
 Array = NDArray[np.float64]
 
 #: Standard deviations above which a term counts.

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Blocks", "robust_weights", "to_blocks"]
-
 Array = NDArray[np.float64]
 
 #: Blocks along the longer side.

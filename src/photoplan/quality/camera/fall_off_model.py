@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 
-__all__ = ["FallOffModel", "correct_fall_off", "gain_image", "largest_gain", "surface_terms", "term_values"]
-
 Array = NDArray[np.float64]
 
 _AT_ONCE = 1 << 21

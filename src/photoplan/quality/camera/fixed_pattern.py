@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.quality.camera.high_pass import LINE_SHARE, WHITE_SHARE, high_pass
 
-__all__ = ["PatternVariance", "Spectrogram", "pattern_variance", "prnu_percent", "signed_root", "spectrogram"]
-
 #: Side of an image from which rows and columns can be told from pixels.
 _LEAST_SIDE = 16
 

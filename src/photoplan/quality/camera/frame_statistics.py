@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 
-__all__ = ["LEAST_PIXELS", "FrameStack", "Level", "StackSums", "check_level"]
-
 #: Pixels below which no figure is derived.
 LEAST_PIXELS = 64
 

@@ -12,8 +12,6 @@ from scipy import stats
 from photoplan.errors import InputError
 from photoplan.quality.camera.approach import LEAST_VALUES, Approach, check_times, fit_approach
 
-__all__ = ["Asymmetry", "GainControl", "NoiseChange", "compare_transitions", "gain_control"]
-
 Array = NDArray[np.float64]
 
 #: Frames before the step below which nothing is said about the noise there.

@@ -15,8 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.errors import InputError
 from photoplan.quality.camera.straight_line import fit_line
 
-__all__ = ["GreyWedge", "grey_wedge"]
-
 
 @dataclass(frozen=True, eq=False)
 class GreyWedge:

@@ -14,8 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-__all__ = ["LINE_SHARE", "WHITE_SHARE", "background", "high_pass"]
-
 #: Sides of the boxes, pixels, and one row of the binomial filter, by the standard.
 _BOXES = (7, 11)
 _BINOMIAL = (0.25, 0.5, 0.25)

@@ -21,8 +21,6 @@ from photoplan.quality.camera.line_period import (
 )
 from photoplan.quality.camera.plumb_edge import LEAST_LINES
 
-__all__ = ["LineJitter", "Spike", "grey_error", "line_jitter", "position_error"]
-
 Array = NDArray[np.float64]
 
 #: Chance of a false alarm below which an oscillation, a curve or an offset of the fields is taken as real.

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Adjusted", "Harmonic", "Spectrum", "Waves", "adjust_periods", "false_alarm", "spectrum"]
-
 Array = NDArray[np.float64]
 
 #: Frequencies that are tried within the width of a spectral line, so that none is passed by.

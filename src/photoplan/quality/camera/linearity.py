@@ -16,8 +16,6 @@ from scipy.special import erfc
 
 from photoplan.errors import InputError
 
-__all__ = ["HIGH", "LOW", "Linearity", "linearity"]
-
 #: Parts of saturation between which levels count (EMVA 1288 release 4 linear).
 LOW, HIGH = 0.05, 0.95
 

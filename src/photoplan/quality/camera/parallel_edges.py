@@ -13,8 +13,6 @@ from photoplan.errors import InputError
 from photoplan.quality.camera.line_jitter import LineJitter
 from photoplan.quality.camera.plumb_edge import LEAST_LINES
 
-__all__ = ["AboveControl", "EdgePair", "above_control", "compare_edges"]
-
 Array = NDArray[np.float64]
 
 LEVEL = 0.01

@@ -20,8 +20,6 @@ from photoplan.errors import InputError
 from photoplan.quality.camera.frame_statistics import Level, check_level
 from photoplan.quality.camera.straight_line import StraightLine, fit_line
 
-__all__ = ["QUANTISATION", "PhotonTransfer", "is_clipped_dark", "photon_transfer"]
-
 #: Variance of rounding to whole grey values (Behr 1989, eq. 3.14); of other steps times their square.
 QUANTISATION = 1.0 / 12.0
 #: Below this variance rounding hides the noise (EMVA 1288 release 4 linear, eq. 53, 54).

@@ -11,8 +11,6 @@ from scipy import special
 
 from photoplan.errors import InputError
 
-__all__ = ["LEAST_LINES", "MOST_LINES", "PATTERN", "EdgeLines", "correlate_edge", "fit_edge"]
-
 Array = NDArray[np.float64]
 
 #: Lines below which a straight line and what leaves it cannot be told apart.

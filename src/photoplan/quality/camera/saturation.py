@@ -16,8 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
 
-__all__ = ["FullWell", "Saturation", "find_saturation", "full_well"]
-
 #: Share of samples at the largest grey value from which on a level is clipped.
 _CLIPPED = 0.01
 #: Share at the last level from which on it shows saturation, not a bright spot.

@@ -14,8 +14,6 @@ from photoplan.cameras.affine_facts import AffineFacts, affine_facts
 from photoplan.cameras.plane import Affine2D
 from photoplan.errors import GeometryError, InputError
 
-__all__ = ["LEAST_POINTS", "StageCalibration", "b4_lines", "stage_calibration"]
-
 Array = NDArray[np.float64]
 
 #: Points of a calibration: three determine an affine transformation, the fourth checks it. More than

@@ -11,8 +11,6 @@ from scipy.special import gammaincc
 
 from photoplan.errors import InputError
 
-__all__ = ["StraightLine", "fit_line"]
-
 #: Level of significance at which the scatter about the line is taken as larger than stated.
 _SIGNIFICANT = 0.01
 

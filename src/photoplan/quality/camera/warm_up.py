@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from photoplan.errors import GeometryError, InputError
 from photoplan.quality.camera.approach import LEAST_VALUES, Approach, check_times, fit_approach
 
-__all__ = ["Course", "Movement", "WarmUp", "warm_up"]
-
 Array = NDArray[np.float64]
 
 #: Parameters of each model, in the order of its unknowns after the shift.

@@ -11,8 +11,6 @@ from photoplan.errors import InputError
 from photoplan.quality.colour.discs import Disc
 from photoplan.quality.colour.model import Displacements
 
-__all__ = ["disc_displacements"]
-
 #: A centre is not known better than this, whatever its fit says: print, lens and mosaic are not perfect, pixels.
 _FLOOR = 0.002
 

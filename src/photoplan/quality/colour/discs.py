@@ -12,8 +12,6 @@ from scipy import ndimage, special
 
 from photoplan.errors import InputError
 
-__all__ = ["Disc", "DiscSettings", "find_discs"]
-
 _Array = NDArray[np.float64]
 #: Half the side of the part of an image that a disc is fitted in, in radii.
 _REACH = 1.7

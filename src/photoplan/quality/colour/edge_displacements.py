@@ -12,8 +12,6 @@ from photoplan.errors import InputError
 from photoplan.quality.colour.model import Displacements
 from photoplan.quality.edges.find import EdgeRegion
 
-__all__ = ["edge_displacements"]
-
 _Array = NDArray[np.float64]
 #: Steps of a fit at most.
 _ROUNDS = 30

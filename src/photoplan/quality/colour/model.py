@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from photoplan.errors import GeometryError, InputError
 
-__all__ = ["KINDS", "BandModel", "ChromaticModel", "Displacements", "Trial", "fit_band"]
-
 _Array = NDArray[np.float64]
 Term = tuple[int, int, float, float]
 """Powers i of u and j of v, and coefficients of the displacement along x and y."""

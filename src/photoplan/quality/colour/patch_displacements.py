@@ -9,8 +9,6 @@ from scipy import ndimage
 from photoplan.errors import InputError
 from photoplan.quality.colour.model import Displacements
 
-__all__ = ["patch_displacements"]
-
 _Array = NDArray[np.float64]
 #: Steps of a match at most.
 _ROUNDS = 15

@@ -13,8 +13,6 @@ from scipy.ndimage import binary_dilation, gaussian_filter1d
 
 from photoplan.kernels.edge_chains import grow, ridge
 
-__all__ = ["StraightEdge", "find_lines", "noise_of", "range_of"]
-
 Array = NDArray[np.float64]
 
 #: Standard deviation of the Gaussian before the gradient, pixels.

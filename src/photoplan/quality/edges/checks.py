@@ -15,19 +15,6 @@ from scipy.special import chdtrc
 
 from photoplan.errors import InputError
 
-__all__ = [
-    "EdgeSettings",
-    "Residuals",
-    "check_certainty",
-    "check_clipping",
-    "check_line",
-    "check_one_peak",
-    "check_region",
-    "check_sides",
-    "check_step",
-    "grain",
-]
-
 #: Side of the squares beside the edge whose means are tested for structure, pixels.
 CELL = 5
 #: Chance of error of the tests: a clean edge is refused once in so many.

@@ -13,8 +13,6 @@ from photoplan.quality.edges.profile import EdgeFit
 from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.spread import GAUSSIAN_WIDTH
 
-__all__ = ["EdgeFigures", "EdgeShape", "edge_figures"]
-
 #: Line spread function and edge profile are looked at this densely: lines for each standard deviation.
 DENSITY = 25
 #: Reach, in standard deviations of the trend, within which width, over- and undershoot are looked for.

@@ -18,8 +18,6 @@ import numpy as np
 from photoplan.errors import InputError
 from photoplan.quality.edges.groups import CombinedValue, combine
 
-__all__ = ["EnhancedEdge", "Enhancement", "enhancement_of"]
-
 #: Mean of over- and undershoot from which an image counts as enhanced, parts of the contrast. Diffraction and ideal
 #: optics leave none; noise and the interpolation of colours leave one or two hundredths.
 LEAST = 0.02

@@ -13,8 +13,6 @@ from photoplan.errors import InputError
 from photoplan.quality.edges.candidates import StraightEdge, find_lines, range_of
 from photoplan.quality.edges.strip import Blur, Strip, strip_along
 
-__all__ = ["REASONS", "EdgePicture", "EdgeRegion", "EdgeRules", "cut_region", "examine", "find_edges"]
-
 #: Why an edge is not measured, as messages say it.
 REASONS = {
     "curved": "curved",

@@ -15,17 +15,6 @@ from photoplan.errors import InputError
 from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.spread import gaussian_modulation
 
-__all__ = [
-    "CombinedValue",
-    "GaussianFit",
-    "combine",
-    "field_cell",
-    "fit_gaussian",
-    "mean_curve",
-    "quantiles",
-    "sigma_of_interval",
-]
-
 Array = NDArray[np.float64]
 
 #: Residuals beyond so many standard deviations count less.

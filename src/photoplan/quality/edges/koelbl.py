@@ -12,8 +12,6 @@ from photoplan.errors import InputError
 from photoplan.quality.edges.response import EdgeMeasurement
 from photoplan.quality.spread import SpreadFunction
 
-__all__ = ["EdgeSpread", "normalised_edge", "spread_from_edge", "spread_from_response", "spread_of_edge"]
-
 #: Pixels to each side that a spread function is asked for.
 _HALF = 5
 

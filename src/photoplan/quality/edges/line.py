@@ -12,8 +12,6 @@ from scipy.ndimage import gaussian_filter
 from photoplan.errors import InputError
 from photoplan.quality.edges.model import LEAST_BLUR, PixelEdge
 
-__all__ = ["EdgeLine", "EdgePixels", "find_line", "fit_line"]
-
 #: Standard deviation in pixels of the smoothing with which an edge is first found.
 SMOOTHING = 1.5
 #: Steps of the fit; each halves the error at least, so what has not settled by then is not one edge.

@@ -9,8 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-__all__ = ["PixelEdge"]
-
 #: A side of the pixel shorter than this, seen along the edge, is replaced by its variance (an error below 1e-13).
 SHORT_SIDE = 1e-3
 #: Narrowest Gaussian in pixels: keeps derivatives finite when a sharpened edge rises faster than one pixel allows.

@@ -30,8 +30,6 @@ from scipy.linalg import cho_factor, cho_solve, eigh
 
 from photoplan.quality.edges.model import LEAST_BLUR, PixelEdge
 
-__all__ = ["EdgeFit", "ProfileBasis", "fit_profile"]
-
 #: Distance between nodes of the signal in standard deviations of the trend; farther out they grow with the distance.
 NODE = 0.4
 #: Beyond this many standard deviations the nodes grow and the signal fades with the square of the distance.

@@ -26,8 +26,6 @@ from photoplan.quality.edges.model import PixelEdge
 from photoplan.quality.edges.profile import EdgeFit, ProfileBasis, fit_profile
 from photoplan.quality.mtf_curve import MtfCurve
 
-__all__ = ["EdgeMeasurement", "EdgeProfile", "EdgeSettings", "measure_edge"]
-
 #: Distance between the lines of the profile that is handed out, pixels.
 SPACING = 0.125
 #: Pixels beyond which those far from the edge are left out at once.

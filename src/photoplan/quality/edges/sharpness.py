@@ -15,8 +15,6 @@ from photoplan.quality.edges.response import EdgeMeasurement
 from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.restoration.design import Sharpness
 
-__all__ = ["LEAST_EDGES", "sharpness_of"]
-
 #: Edges that a direction needs.
 LEAST_EDGES = 3
 #: Pixels to each side that are asked of a spread function; less where edges are not seen as far.

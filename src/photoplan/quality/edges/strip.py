@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from photoplan.quality.edges.candidates import StraightEdge
 
-__all__ = ["SIDE", "Blur", "Sides", "Strip", "strip_along"]
-
 Array = NDArray[np.float64]
 
 #: Length of a block along the line, pixels.

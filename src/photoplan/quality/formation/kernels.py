@@ -16,8 +16,6 @@ from photoplan.errors import InputError
 from photoplan.quality.formation.optics_parts import Aperture, Spread
 from photoplan.quality.formation.shapes import disc_share
 
-__all__ = ["PixelKernel", "aperture_transfer", "pixel_kernel", "spread_transfer"]
-
 _Array = NDArray[np.float64]
 _Transfer = Callable[[_Array, _Array], NDArray[Any]]
 #: Modulation that counts as none.

@@ -34,8 +34,6 @@ from photoplan.quality.formation.sensor_parts import (
 )
 from photoplan.quality.formation.signal import enhanced, next_gain, quantised, toned
 
-__all__ = ["MOST_PIXELS", "FormedImage", "ImageModel", "form_image", "form_series"]
-
 _Array = NDArray[np.float64]
 #: Pixels × bands of an image that is formed: it is held in memory several times as float64.
 MOST_PIXELS = 40_000_000

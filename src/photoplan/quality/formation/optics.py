@@ -15,8 +15,6 @@ from photoplan.quality.formation.kernels import PixelKernel, pixel_kernel
 from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitter, Spread
 from photoplan.quality.formation.scenes import Scene
 
-__all__ = ["Optics", "falloff_factors", "line_displacements", "sample_scene"]
-
 _Array = NDArray[np.float64]
 _Spectrum = NDArray[np.complex128]
 #: Cells of a tile's side, without the margin of the spread function.

@@ -8,8 +8,6 @@ from typing import Literal
 
 from photoplan.errors import InputError
 
-__all__ = ["Aperture", "Falloff", "Lateral", "LineJitter", "Spread", "check_range"]
-
 #: Widths beyond this many pixels come from a wrong unit rather than from optics.
 MOST_WIDTH_PX = 200.0
 

@@ -13,8 +13,6 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.quality.formation.shapes import bar_share, disc_share, edge_share, sector_share, step_mean
 
-__all__ = ["PATTERNS", "ArrayScene", "PatternScene", "Scene", "parse_pattern"]
-
 #: Patterns by name: what their numbers mean, how many there may be, and those that are taken if none is given.
 PATTERNS: dict[str, tuple[str, tuple[float, ...]]] = {
     "flat": ("the bright level everywhere", ()),

@@ -12,8 +12,6 @@ from scipy import ndimage, special
 from photoplan.errors import InputError
 from photoplan.quality.formation.sensor_parts import DarkCurrent, Defect, FixedPattern, Readout, Well
 
-__all__ = ["Overflow", "Pattern", "add_shot_noise", "fixed_pattern", "moved_charge", "overflow"]
-
 _Array = NDArray[np.float64]
 #: Times that circular overflow spreads again where it meets full elements; what is left then goes along the columns.
 _ROUNDS = 60

@@ -8,20 +8,6 @@ from typing import Literal
 from photoplan.errors import InputError
 from photoplan.quality.formation.optics_parts import check_range
 
-__all__ = [
-    "AutomaticGain",
-    "DarkCurrent",
-    "Defect",
-    "Enhancement",
-    "Exposure",
-    "FixedPattern",
-    "Gain",
-    "Quantisation",
-    "Readout",
-    "Tone",
-    "Well",
-]
-
 
 @dataclass(frozen=True)
 class Exposure:

@@ -8,8 +8,6 @@ from math import cos, pi, radians, sin
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["bar_share", "disc_share", "edge_share", "sector_share", "step_mean"]
-
 _Array = NDArray[np.float64]
 #: A side seen at less than this share of the other counts as none; the share is then wrong by less than that.
 _THIN = 1e-7

@@ -10,8 +10,6 @@ from scipy import ndimage
 
 from photoplan.quality.formation.sensor_parts import AutomaticGain, Enhancement, Quantisation, Tone
 
-__all__ = ["enhanced", "next_gain", "quantised", "toned"]
-
 _Array = NDArray[np.float64]
 
 

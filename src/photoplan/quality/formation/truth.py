@@ -11,8 +11,6 @@ from photoplan.errors import InputError
 from photoplan.quality.formation.kernels import aperture_transfer, spread_transfer
 from photoplan.quality.formation.model import ImageModel
 
-__all__ = ["line_spread", "line_spread_width", "model_modulation", "model_mtf50", "model_transfer"]
-
 _Array = NDArray[np.float64]
 #: Cycles per pixel up to which a transfer function is summed; what is left there is refused.
 _MOST_FREQUENCY = 40.0

@@ -13,8 +13,6 @@ from photoplan.errors import InputError
 from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.patterns.bars import BarContrast, fundamental_of_square
 
-__all__ = ["BarCurve", "bar_curve", "coltman_factor", "coltman_mtf"]
-
 Array = NDArray[np.float64]
 
 #: Bars with less bend than this have a flat middle, where their levels are those of wide areas.

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.quality.patterns.pixels import least_squares
 
-__all__ = ["BarWave", "find_wave", "wave_columns"]
-
 Array = NDArray[np.float64]
 
 #: Harmonic waves of bars that are fitted beside the fundamental one.

@@ -16,8 +16,6 @@ from photoplan.errors import InputError
 from photoplan.quality.patterns.bar_wave import BarWave, find_wave, wave_columns
 from photoplan.quality.patterns.pixels import least_squares, pattern_window, white_noise
 
-__all__ = ["BarContrast", "fundamental_of_square", "measure_bars"]
-
 Array = NDArray[np.float64]
 
 #: Periods of the pattern that a window has to hold.

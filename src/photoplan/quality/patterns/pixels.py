@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 
-__all__ = ["clipped_pixels", "least_squares", "pattern_window", "white_noise"]
-
 Array = NDArray[np.float64]
 
 #: Share of clipped pixels from which on a pattern is refused.

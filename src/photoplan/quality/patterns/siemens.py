@@ -27,8 +27,6 @@ from photoplan.quality.patterns.star_fit import (
     rough_centre,
 )
 
-__all__ = ["StarMtf", "StarRules", "measure_star"]
-
 Array = NDArray[np.float64]
 
 #: Side of the largest window, pixels: all of its pixels are fitted at once.

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.quality.patterns.pixels import least_squares
 
-__all__ = ["SECTORS", "Ring", "StarPixels", "count_sectors", "find_centre", "fit_ring", "rough_centre"]
-
 Array = NDArray[np.float64]
 
 #: Numbers of sectors that a star may have.

@@ -19,8 +19,6 @@ from photoplan.quality.patterns.usaf_bars import ThreeBars, measure_three, place
 from photoplan.quality.patterns.usaf_find import UsafPlace, find_usaf
 from photoplan.quality.patterns.usaf_layout import UsafElement, usaf_frequency, usaf_layout
 
-__all__ = ["UsafBars", "UsafResult", "UsafRules", "measure_usaf"]
-
 Array = NDArray[np.float64]
 
 #: Side of the largest window, pixels.

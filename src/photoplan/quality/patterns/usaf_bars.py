@@ -14,8 +14,6 @@ from photoplan.quality.patterns.pixels import least_squares
 from photoplan.quality.patterns.usaf_find import UsafPlace
 from photoplan.quality.patterns.usaf_layout import HALF, UsafElement
 
-__all__ = ["ThreeBars", "measure_three", "place_pair"]
-
 Array = NDArray[np.float64]
 
 #: Half the part of the bars' length that is used, periods: their ends are blurred.

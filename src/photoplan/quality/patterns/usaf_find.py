@@ -12,8 +12,6 @@ from scipy import ndimage
 from photoplan.errors import InputError
 from photoplan.quality.patterns.usaf_layout import UsafElement, usaf_layout
 
-__all__ = ["UsafPlace", "find_usaf"]
-
 Array = NDArray[np.float64]
 
 #: Bars that are looked at, the largest first.

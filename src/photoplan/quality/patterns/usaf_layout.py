@@ -12,8 +12,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-__all__ = ["HALF", "UsafElement", "usaf_frequency", "usaf_layout"]
-
 #: Half the side of the square that three bars fill, periods.
 HALF = 1.25
 

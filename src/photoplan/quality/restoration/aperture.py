@@ -11,8 +11,6 @@ from scipy.special import j1
 
 from photoplan.errors import InputError
 
-__all__ = ["aperture_filter", "aperture_transfer"]
-
 #: Frequencies per axis over which the series of the inverse is summed.
 _GRID = 256
 #: Where less than this of a frequency is left, the aperture cannot be undone.

@@ -14,8 +14,6 @@ from photoplan.kernels.extend import extend_oddly
 from photoplan.quality.restoration.convolution import LEFT, RIGHT
 from photoplan.quality.restoration.scratch import Scratch
 
-__all__ = ["Margin"]
-
 
 @dataclass(frozen=True)
 class Margin:

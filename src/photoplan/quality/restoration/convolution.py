@@ -13,8 +13,6 @@ from photoplan.kernels.convolve import CHUNK, EVEN_TAPS, GENERAL_TAPS, convolve_
 from photoplan.kernels.jit import is_ready
 from photoplan.quality.restoration.filters import FilterKernel
 
-__all__ = ["LEFT", "RIGHT", "Convolution", "limits_of"]
-
 #: Columns of zeros that a source has before and behind its pixels, for vectors and unrolled loops.
 LEFT, RIGHT = max(EVEN_TAPS), CHUNK + max(GENERAL_TAPS)
 #: Part of a kernel's largest value by which mirrored values of a symmetric one may differ: the rounding of its making.

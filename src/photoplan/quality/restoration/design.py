@@ -17,8 +17,6 @@ from photoplan.quality.restoration.inverse import Condition, condition_of, exact
 from photoplan.quality.restoration.regularised import SceneStatistics, curve_transfer, regularised_filter
 from photoplan.quality.spread import GAUSSIAN_WIDTH, SpreadFunction
 
-__all__ = ["Design", "DesignOptions", "Sharpness", "design_filter"]
-
 #: Sizes that are tried until nothing that matters is cut off an exact inverse, pixels to each side.
 _HALVES = (5, 7, 10, 14, 20, 28)
 #: Share of an inverse that may be cut off.

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from photoplan.geometry.grid import Window
 
-__all__ = ["field_weights"]
-
 
 def field_weights(
     places: Sequence[tuple[float, float]], window: Window

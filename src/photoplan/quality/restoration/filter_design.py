@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.quality.spread import SpreadFunction
 
-__all__ = ["point_spread", "radial_filter", "separable_filter"]
-
 
 def radial_filter(
     inverse_x: NDArray[np.float64], inverse_y: NDArray[np.float64] | None = None, distance_digits: int | None = None

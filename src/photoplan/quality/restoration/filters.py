@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 
-__all__ = ["FilterKernel", "RestorationFilter"]
-
 #: Kernels wider than this are refused: they come from damaged files rather than from optics.
 MOST_WIDTH = 101
 

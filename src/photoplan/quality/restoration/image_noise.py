@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BLOCK", "block_noise", "image_noise"]
-
 #: Side of the blocks, pixels.
 BLOCK = 24
 #: Share of the blocks, the most even ones, that are taken to show noise alone.

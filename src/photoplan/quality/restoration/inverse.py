@@ -11,8 +11,6 @@ from scipy.linalg import svdvals, toeplitz
 from photoplan.errors import InputError
 from photoplan.quality.spread import SpreadFunction
 
-__all__ = ["Condition", "band_matrix", "condition_of", "exact_inverse", "spread_of_inverse"]
-
 #: Rows of the band matrix: its borders do not reach the middle any more (Kölbl 2006, §3, takes 20).
 BAND_ROWS = 61
 #: Frequencies at which transfer functions are examined.

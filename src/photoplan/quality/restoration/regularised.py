@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.quality.mtf_curve import MtfCurve
 
-__all__ = ["SceneStatistics", "Transfer", "curve_transfer", "regularised_filter"]
-
 Transfer = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 """Modulation at frequencies u along rows and v along columns, cycles per pixel; arrays that broadcast."""
 

@@ -18,8 +18,6 @@ from photoplan.quality.restoration.field_weights import field_weights
 from photoplan.quality.restoration.filters import RestorationFilter
 from photoplan.quality.restoration.scratch import Scratch
 
-__all__ = ["RestoredPixels", "Restorer", "light_of"]
-
 _SCRATCH = Scratch()
 
 

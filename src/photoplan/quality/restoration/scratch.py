@@ -10,8 +10,6 @@ import threading
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Scratch"]
-
 #: Values that are kept for the next tile; larger arrays are made and given back (64 MiB).
 MOST_KEPT = 1 << 24
 

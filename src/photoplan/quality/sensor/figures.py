@@ -13,21 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
 
-__all__ = [
-    "aperture_mtf",
-    "diffraction_cutoff",
-    "diffraction_mtf",
-    "element_um",
-    "jitter_grey",
-    "jitter_pixels",
-    "line_resolution",
-    "nyquist",
-    "pixel_um",
-    "quantisation_sigma",
-    "transfer_modulation",
-    "transfer_phase",
-]
-
 Array = NDArray[np.float64]
 
 

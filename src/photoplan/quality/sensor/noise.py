@@ -7,8 +7,6 @@ from math import log2, log10, sqrt
 
 from photoplan.errors import InputError
 
-__all__ = ["NoiseBudget", "amplifier_noise", "dark_at", "transfer_noise"]
-
 #: By how many kelvin the dark current doubles (Behr 1989, §3.6.4).
 DOUBLING_C = 10.0
 

@@ -6,17 +6,6 @@ from dataclasses import dataclass
 
 from photoplan.errors import InputError
 
-__all__ = [
-    "VideoNorm",
-    "bandwidth_hz",
-    "columns_of",
-    "lengthened",
-    "lines_from_viewing",
-    "points_of",
-    "sampling_hz",
-    "viewed_length",
-]
-
 
 def viewed_length(distance: float, angle_rad: float) -> float:
     """Length that is seen under a small angle from a distance, in its unit (Behr 1989, eq. 3.1 and 3.2)."""

@@ -1,0 +1,83 @@
+"""Camera descriptions from files of any known format."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from photoplan.errors import InputError
+from photoplan.io.camera import opencv as camera_opencv
+from photoplan.io.camera import opensfm as camera_opensfm
+from photoplan.io.camera import pix4d as camera_pix4d
+from photoplan.io.camera import toml as camera_toml
+from photoplan.io.camera import yaml as camera_yaml
+from photoplan.io.camera.model import FilmCamera, FrameCamera
+from photoplan.io.orientation import colmap as orientation_colmap
+from photoplan.io.orientation import metashape as orientation_metashape
+from photoplan.io.orientation import pix4d as orientation_pix4d
+from photoplan.io.orientation.table import TableFormat
+from photoplan.io.plain_files import read_head
+
+
+def _text(path: Path) -> dict[str, FrameCamera | FilmCamera]:
+    """Cameras of one of the formats whose files end in ``.txt``."""
+    head = read_head(path)
+    if head.lstrip().lower().startswith("filename imagewidth"):
+        return dict(orientation_pix4d.read(path, TableFormat()).cameras)
+    if "CAMERA_ID, MODEL" in head or path.name == "cameras.txt":
+        return orientation_colmap.read_cameras(path)
+    raise InputError(
+        f"{path}: no camera format; of text files, COLMAP's cameras.txt and Pix4D's calibrated_camera_parameters.txt "
+        "describe cameras"
+    )
+
+
+def _yaml(path: Path) -> dict[str, FrameCamera | FilmCamera]:
+    return camera_opencv.read(path) if camera_opencv.is_opencv(path) else camera_yaml.read(path)
+
+
+def _json(path: Path) -> dict[str, FrameCamera | FilmCamera]:
+    return camera_opencv.read(path) if camera_opencv.is_opencv(path) else camera_opensfm.read(path)
+
+
+#: Reader of every format, by file suffix.
+CAMERA_FORMATS: dict[str, Callable[[Path], dict[str, FrameCamera | FilmCamera]]] = {
+    ".toml": camera_toml.read,
+    ".yaml": _yaml,
+    ".yml": _yaml,
+    ".json": _json,
+    ".xml": orientation_metashape.read_cameras,
+    ".cam": camera_pix4d.read,
+    ".txt": _text,
+}
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """Cameras of a file."""
+
+    file: Path
+    cameras: dict[str, FrameCamera | FilmCamera]
+    """Descriptions by name."""
+    normalised: bool
+    """Whether the format relates everything to the image's size, so that a camera fits its images at any resolution."""
+
+
+def read_cameras(path: str | Path) -> CameraFile:
+    """Cameras of a file: own TOML, YAML (orthority's layout, OpenCV), JSON of OpenSfM and OpenDroneMap, Metashape's
+    ``cameras.xml``, Pix4D's ``.cam`` and ``calibrated_camera_parameters.txt``, COLMAP's ``cameras.txt``.
+
+    Raises
+    ------
+    InputError
+        The format is unknown, or the file cannot be used.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in CAMERA_FORMATS:
+        raise InputError(f"{path}: no camera format has the suffix {suffix!r}; allowed are {', '.join(CAMERA_FORMATS)}")
+    cameras = CAMERA_FORMATS[suffix](path)
+    if not cameras:
+        raise InputError(f"{path}: describes no camera")
+    return CameraFile(path, cameras, suffix == ".json" and not camera_opencv.is_opencv(path))

@@ -1,0 +1,114 @@
+"""Results written into a project file that exists: only the entries that change, comments and order stay."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import AoT, Table
+
+from photoplan.errors import InputError
+from photoplan.io.disk import write_atomically
+from photoplan.io.plain_files import read_text
+from photoplan.io.project.file import parse_project
+from photoplan.io.project.model import Project
+from photoplan.io.toml_file import MAX_BYTES
+
+
+@dataclass(frozen=True)
+class ProjectChanges:
+    """Entries to set, as plain values (numbers, strings, lists, tables); None removes an entry."""
+
+    images: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Entries of `[[images]]`, by the image's name."""
+    cameras: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Entries of `[cameras.NAME]`."""
+    tables: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Entries of other tables: observations, orientation …"""
+
+
+def edit_project(path: Path, changes: ProjectChanges) -> Project:
+    """Set entries of a project file; the file before is kept beside it as ``NAME.previous.toml``.
+
+    The changed file is checked before it replaces the old one, and appears complete or not at all.
+
+    Returns
+    -------
+    Project
+        The changed project.
+
+    Raises
+    ------
+    InputError
+        The file is no project, an image or camera is not in it, or a changed entry is not allowed.
+    ResourceError, UsageError
+        The disk is full, or the folder cannot be written to.
+    """
+    text = read_text(path, MAX_BYTES)
+    before = path.read_bytes()
+    line_end = "\r\n" if b"\r\n" in before else "\n"
+    try:
+        document = tomlkit.parse(text)
+    except TOMLKitError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from None
+    _set_images(document, changes.images, path)
+    for name, entries in changes.cameras.items():
+        cameras = _table(document.get("cameras", {}), f"{path}: cameras")
+        if name not in cameras:
+            raise InputError(f"{path}: camera {name!r} is not in the project")
+        _set(_table(cameras[name], f"{path}: cameras.{name}"), entries)
+    for name, entries in changes.tables.items():
+        if name not in document:
+            document.add(name, tomlkit.table())
+        _set(_table(document[name], f"{path}: {name}"), entries)
+    changed = document.as_string()
+    project = parse_project(document.unwrap(), path.resolve().parent, str(path), changed)
+    if changed != text:
+        write_atomically(path.with_suffix(".previous.toml"), before)
+        write_atomically(path, changed.replace("\n", line_end).encode())
+    return project
+
+
+def _set_images(document: tomlkit.TOMLDocument, images: Mapping[str, Mapping[str, Any]], path: Path) -> None:
+    listed = document.get("images", [])
+    if not isinstance(listed, AoT | list):
+        raise InputError(f"{path}: images must be written as [[images]]")
+    tables = {str(_table(t, f"{path}: images[{k}]").get("name")): t for k, t in enumerate(listed, 1)}
+    for name, entries in images.items():
+        if name not in tables:
+            raise InputError(f"{path}: image {name!r} is not in the project")
+        _set(tables[name], entries)
+
+
+def _table(value: Any, what: str) -> Any:
+    if not isinstance(value, Mapping):
+        raise InputError(f"{what}: a table is needed")
+    return value
+
+
+def _set(table: Table, entries: Mapping[str, Any]) -> None:
+    for key, value in entries.items():
+        if value is None:
+            table.pop(key, None)
+        elif key not in table or table[key] != _plain(value):
+            table[key] = _item(value)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {k: _plain(v) for k, v in value.items()}
+    return [_plain(v) for v in value] if isinstance(value, list | tuple) else value
+
+
+def _item(value: Any) -> Any:
+    """Tables and lists of a value stand in one line."""
+    if isinstance(value, Mapping):
+        inline = tomlkit.inline_table()
+        for key, entry in value.items():
+            inline[str(key)] = _item(entry)
+        return inline
+    return tomlkit.item(_plain(value))

@@ -1,0 +1,73 @@
+"""The project file: the one place for inputs, their CRS and their height systems."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from photoplan.errors import InputError
+from photoplan.geometry.crs import require_projected_metres
+from photoplan.geometry.heights import check_height_system
+from photoplan.io.disk import write_atomically
+from photoplan.io.project.errors import explain
+from photoplan.io.project.model import Project
+from photoplan.io.project.write import project_text
+from photoplan.io.toml_file import read_toml
+
+
+def load_project(path: str | Path) -> Project:
+    """Read and check a project file.
+
+    Inputs that it names are not opened here; their paths, the CRS and the height systems are checked.
+
+    Raises
+    ------
+    InputError
+        The file or an entry is wrong; the message names the entry and its line.
+    """
+    path = Path(path)
+    data, text = read_toml(path)
+    return parse_project(data, path.resolve().parent, str(path), text)
+
+
+def parse_project(data: dict[str, Any], folder: Path, source: str, text: str = "") -> Project:
+    """Project of the plain contents of a project file; `source` and `text` are for messages.
+
+    Raises
+    ------
+    InputError
+        An entry is wrong.
+    """
+    if "folder" in data:
+        raise InputError(f"{source}: unknown entry 'folder'")
+    try:
+        project = Project.model_validate({**data, "folder": folder})
+    except ValidationError as error:
+        raise InputError(explain(error, data, source, text)) from None
+    require_projected_metres(project.crs, f"{source}: crs")
+    terrain = None if project.terrain is None else project.terrain.height_system
+    for table, name in (("terrain", terrain), ("orientation", project.orientation.height_system)):
+        if name is not None:
+            check_height_system(name, f"{source}: [{table}] height_system")
+    return project
+
+
+def write_project(path: str | Path, project: Project) -> None:
+    """Write a project file with a comment for every entry; `load_project` gives an equal project again.
+
+    The file appears complete or not at all.
+
+    Raises
+    ------
+    ResourceError, UsageError
+        The disk is full, or the folder cannot be written to.
+    """
+    write_atomically(Path(path), project_text(project).encode())
+
+
+def project_schema() -> str:
+    """JSON Schema of the project file, as text."""
+    return json.dumps(Project.model_json_schema(), indent=2, ensure_ascii=False)

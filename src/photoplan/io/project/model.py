@@ -1,0 +1,321 @@
+"""What a project file says, as checked and frozen values. Files are read and written in `photoplan.io.project.file`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, Strict, field_validator, model_validator
+from pydantic.json_schema import SkipJsonSchema
+
+from photoplan.cameras.fiducials_fit import MODELS
+from photoplan.errors import InputError, UsageError
+from photoplan.io.camera.model import (
+    Camera,
+    Entry,
+    Fiducials,
+    FilmCamera,
+    FrameCamera,
+    Name,
+    Number,
+    Pixels,
+    Positive,
+    Restoration,
+    Restore,
+    Triple,
+)
+from photoplan.io.names import check_input_name, resolve_input, unique_stems
+
+#: Angle units and the size of one unit in radians' common measure, a full circle.
+ANGLE_UNITS = {"deg": 360.0, "gon": 400.0, "rad": 6.283185307179586}
+
+InputName = Annotated[str, Field(max_length=4000)]
+NotNegative = Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)]
+
+
+class Image(Entry):
+    """One oriented image."""
+
+    name: Name
+    """Products are called after it."""
+    file: InputName
+    camera: Name
+    center: Triple | None = None
+    """Projection centre X0, Y0, Z0 in the project's CRS and the orientation's height system, metres; None: the image
+    is not oriented yet."""
+    angles: Triple | None = None
+    """Three angles in the sequence and unit that [orientation] states."""
+    sigma_center: tuple[NotNegative, NotNegative, NotNegative] | None = None
+    """Standard deviations of the projection centre, metres, as `photoplan adjust` and `resect` found them."""
+    sigma_angles: tuple[NotNegative, NotNegative, NotNegative] | None = None
+    """Standard deviations of the angles, in their unit."""
+    fiducials: Fiducials | None = None
+    """Measured fiducial marks of a film scan: name = [column, row], pixels."""
+    size: tuple[Pixels, Pixels] | None = None
+    """Width and height of this scan, where the camera does not state them."""
+    restore: Restore | None = None
+    """Filter that it is restored with before anything is made of it; None: that of its camera, if there is one."""
+
+    @field_validator("file")
+    @classmethod
+    def _file(cls, text: str) -> str:
+        return _plain_file(text)
+
+    @model_validator(mode="after")
+    def _both(self) -> Self:
+        if (self.center is None) != (self.angles is None):
+            raise ValueError("center and angles go together: give both, or none for an image that is not oriented")
+        return self
+
+    @property
+    def pose_numbers(self) -> tuple[Triple, Triple]:
+        """Projection centre and angles as stated.
+
+        Raises
+        ------
+        InputError
+            The image is not oriented.
+        """
+        if self.center is None or self.angles is None:
+            raise InputError(
+                f"image {self.name!r} has no orientation; `photoplan resect` or `photoplan adjust` determines it"
+            )
+        return self.center, self.angles
+
+
+class Terrain(Entry):
+    """Where the ground is: a raster of heights, a terrain model, or one height everywhere."""
+
+    file: InputName | None = None
+    height: Number | None = None
+    crs: Name | None = None
+    """CRS of a file that does not state one, such as an ASCII grid."""
+    height_system: Name | None = None
+
+    @field_validator("file")
+    @classmethod
+    def _file(cls, text: str | None) -> str | None:
+        return None if text is None else _plain_file(text)
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        if (self.file is None) == (self.height is None):
+            raise ValueError("give either file (heights: a raster or a terrain model) or height (one everywhere)")
+        return self
+
+
+class Orientation(Entry):
+    """What the numbers of all [[images]] mean."""
+
+    height_system: Name | None = None
+    angle_unit: Literal["deg", "gon", "rad"] = "deg"
+    rotation: Literal["opk", "pok", "kpo", "kop", "okp", "pko"] = "opk"
+    earth_curvature: Literal["none", "correction", "strict"] = "none"
+    refraction: Annotated[bool, Strict()] = False
+
+
+class Observations(Entry):
+    """Files of measurements that determine orientations, and their accuracy where the files do not state it."""
+
+    image_points: tuple[InputName, ...] = ()
+    """Measured image points: point, image, column, row."""
+    control: tuple[InputName, ...] = ()
+    """Ground points, control and check."""
+    positions: InputName | None = None
+    """Table of observed projection centres, with or without attitudes."""
+    sigma_image: Positive = 0.5
+    """Standard deviation of an image coordinate, pixels."""
+    sigma_control: tuple[NotNegative, NotNegative] | None = None
+    """Standard deviation of control: each horizontal coordinate, height, metres."""
+    sigma_position: tuple[Positive, Positive] | None = None
+    """Standard deviation of observed positions: each horizontal coordinate, height, metres."""
+    sigma_attitude: Positive | None = None
+    """Standard deviation of observed attitudes, in the unit of [orientation]; None: attitudes are not observations."""
+
+    @field_validator("image_points", "control")
+    @classmethod
+    def _files(cls, files: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(_plain_file(text) for text in files)
+
+    @field_validator("positions")
+    @classmethod
+    def _positions(cls, text: str | None) -> str | None:
+        return None if text is None else _plain_file(text)
+
+
+Parameter = Literal["c", "x0", "y0", "k1", "k2", "k3", "p1", "p2", "b1", "b2"]
+
+
+class Adjustment(Entry):
+    """What `photoplan adjust` estimates besides orientations and points; options of the command override it."""
+
+    calibrate: dict[Name, tuple[Parameter, ...]] = Field(default_factory=dict)
+    """Parameters of each camera that are unknowns."""
+    prior_sigma: dict[Name, dict[Parameter, Positive]] = Field(default_factory=dict)
+    """Standard deviations with which parameters are known beforehand, by camera."""
+    lever_arm: Triple = (0.0, 0.0, 0.0)
+    """Antenna minus projection centre in camera axes (x right, y up, z towards the viewer), metres."""
+    lever_arm_sigma: NotNegative = 0.0
+    """Its standard deviation, metres; 0: it is held fixed."""
+    drift: Literal["none", "shift", "linear"] = "none"
+    """Drift of observed positions in each strip: none, a shift, or a shift and a change linear in time."""
+    boresight: Annotated[bool, Strict()] = False
+    """Whether three small rotations between the observed attitudes and the camera are unknowns."""
+
+
+class OrthoDefaults(Entry):
+    """Defaults of `photoplan ortho`; options of the command override them."""
+
+    resolution: Positive | None = None
+    bounds: tuple[Number, Number, Number, Number] | None = None
+    kernel: Name | None = None
+    tolerance: Positive | None = None
+    nodata: Number | Literal["auto", "mask"] | None = None
+    compress: Name | None = None
+    overviews: Annotated[bool, Strict()] | None = None
+
+    @field_validator("bounds")
+    @classmethod
+    def _bounds(cls, b: tuple[float, float, float, float] | None) -> tuple[float, float, float, float] | None:
+        if b is not None and (b[0] >= b[2] or b[1] >= b[3]):
+            raise ValueError(f"bounds {list(b)}; needed are [xmin, ymin, xmax, ymax] with xmin < xmax and ymin < ymax")
+        return b
+
+
+class Project(Entry):
+    """All inputs of a block of images, checked against each other."""
+
+    format: Literal[1] = 1
+    crs: Annotated[str, Field(min_length=1, max_length=20_000)]
+    terrain: Terrain | None = None
+    orientation: Orientation = Orientation()
+    observations: Observations = Observations()
+    adjustment: Adjustment = Adjustment()
+    cameras: dict[Name, Camera]
+    images: tuple[Image, ...]
+    ortho: OrthoDefaults = OrthoDefaults()
+    folder: SkipJsonSchema[Path] = Field(default=Path(), exclude=True)
+    """Folder of the project file, from which relative paths start; not an entry of the file."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if not self.images:
+            raise ValueError("no [[images]] entry; a project needs at least one image")
+        names: set[str] = set()
+        for number, image in enumerate(self.images, 1):
+            where = f"image {image.name!r} (entry {number})"
+            if image.name in names:
+                raise ValueError(f"{where}: the name is given twice")
+            names.add(image.name)
+            if image.camera not in self.cameras:
+                known = ", ".join(map(repr, self.cameras)) or "none"
+                raise ValueError(f"{where}: camera {image.camera!r} is not described; cameras are {known}")
+            _check_film(image, self.cameras[image.camera], where)
+        unknown = [name for name in self.adjustment.calibrate if name not in self.cameras]
+        if unknown:
+            raise ValueError(f"[adjustment] calibrate: camera {unknown[0]!r} is not described")
+        try:
+            unique_stems(i.name for i in self.images)
+        except InputError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+    @property
+    def ground(self) -> Terrain:
+        """The [terrain] entry.
+
+        Raises
+        ------
+        InputError
+            The project has none: it was made to determine orientations.
+        """
+        if self.terrain is None:
+            raise InputError("the project states no [terrain]; give file or height there")
+        return self.terrain
+
+    def resolve(self, file: str) -> Path:
+        """Absolute path of an entry `file`, relative ones from the project's folder."""
+        return resolve_input(self.folder, file)
+
+    def select(self, patterns: Sequence[str] | None = None) -> list[str]:
+        """Names of the images that match one of `patterns` (``*`` and ``?`` allowed), in the project's order.
+
+        Raises
+        ------
+        UsageError
+            A pattern matches no image.
+        """
+        names = [image.name for image in self.images]
+        if patterns is None:
+            return names
+        chosen: set[str] = set()
+        for pattern in patterns:
+            found = [n for n in names if n == pattern or fnmatchcase(n, pattern)]
+            if not found:
+                raise UsageError(
+                    f"image {pattern!r} is not in the project; "
+                    f"its {len(names)} images begin with {', '.join(names[:5])}"
+                )
+            chosen.update(found)
+        return [n for n in names if n in chosen]
+
+    def restoration(self, image: Image) -> Restoration | None:
+        """How an image of the project is restored: as it states itself, else as its camera does; None: not at all."""
+        return image.restore or self.cameras[image.camera].restore
+
+    def ortho_settings(self) -> dict[str, Any]:
+        """What the `[ortho]` table states, by the names of `photoplan.products.orthophoto.settings.OrthoSettings`."""
+        stated = self.ortho.model_dump(exclude_none=True)
+        if "nodata" in stated:
+            stated["nodata"] = str(stated["nodata"])
+        return stated
+
+    def image(self, name: str) -> Image:
+        """The image of this name.
+
+        Raises
+        ------
+        InputError
+            There is none.
+        """
+        for image in self.images:
+            if image.name == name:
+                return image
+        raise InputError(
+            f"image {name!r} is not in the project; its {len(self.images)} images begin with "
+            f"{', '.join(i.name for i in self.images[:5])}"
+        )
+
+
+def _plain_file(text: str) -> str:
+    try:
+        return check_input_name(text)
+    except InputError as error:
+        raise ValueError(str(error)) from None
+
+
+def _check_film(image: Image, camera: FrameCamera | FilmCamera, where: str) -> None:
+    """Marks of a film scan are the camera's, and enough or not yet measured; a digital image has none."""
+    if isinstance(camera, FrameCamera):
+        if image.fiducials is not None:
+            raise ValueError(f'{where}: fiducials are given, but camera {image.camera!r} is digital (type = "frame")')
+        return
+    if image.fiducials is None:
+        return
+    if image.size is None and camera.size is None:
+        raise ValueError(f"{where}: size = [width, height] of the scan is stated neither here nor for its camera")
+    unknown = [n for n in image.fiducials if n not in camera.fiducials_mm]
+    if unknown:
+        raise ValueError(
+            f"{where}: fiducial marks {', '.join(unknown)} are not among those of camera {image.camera!r}:"
+            f" {', '.join(camera.fiducials_mm)}"
+        )
+    needed = MODELS[camera.interior]
+    if len(image.fiducials) < needed:
+        missing = [n for n in camera.fiducials_mm if n not in image.fiducials]
+        raise ValueError(
+            f"{where}: {len(image.fiducials)} fiducial marks measured, {camera.interior} needs {needed}; "
+            f"missing {', '.join(missing)}"
+        )

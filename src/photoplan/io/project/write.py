@@ -1,0 +1,229 @@
+"""The text of a project file, with comments that explain its entries."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from pydantic import BaseModel
+
+from photoplan.io.camera.model import FilmCamera, FrameCamera
+from photoplan.io.project.model import (
+    Adjustment,
+    Image,
+    Observations,
+    Orientation,
+    OrthoDefaults,
+    Project,
+    Terrain,
+)
+
+
+def toml_key(name: str) -> str:
+    """A key as TOML wants it: bare where possible, else quoted."""
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else toml_value(name)
+
+
+def toml_value(value: Any) -> str:
+    """A value as TOML. Floats are written so that reading gives the same number again."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        # JSON's escapes are TOML's; DEL is the one character that JSON leaves bare and TOML forbids.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, int):
+        return str(value)
+    if isinstance(value, float):
+        return repr(value)
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{toml_key(k)} = {toml_value(v)}" for k, v in value.items()) + " }"
+    return "[" + ", ".join(toml_value(v) for v in value) + "]"
+
+
+def project_text(project: Project) -> str:
+    """The whole file as text."""
+    lines = [
+        "# Project of photoplan. Relative paths start at the folder of this file.",
+        "# Lengths are metres unless the name of an entry says otherwise. Pixel positions are [column, row];",
+        "# [0, 0] is the centre of the upper-left pixel.",
+        "format = 1",
+        "",
+        "# Horizontal CRS of everything in this file and of the products: projected, in metres.",
+        f"crs = {toml_value(project.crs)}",
+        "",
+        *(_terrain(project.terrain) if project.terrain is not None else ["# [terrain] is needed for products.", ""]),
+        *_orientation(project.orientation),
+        *_observations(project.observations),
+        *_adjustment(project.adjustment),
+        *_ortho(project.ortho),
+    ]
+    for name, camera in project.cameras.items():
+        lines += camera_lines(name, camera)
+    lines += [
+        "# One entry per image: `name` is what products are called after, `center` is X0, Y0, Z0 of the projection",
+        "# centre, `angles` are in the sequence and unit of [orientation].",
+    ]
+    for image in project.images:
+        lines += _image(image)
+    return "\n".join(lines) + "\n"
+
+
+def _entries(rows: Iterable[tuple[str, Any, str]]) -> list[str]:
+    """Lines `key = value  # comment`; entries without a value are shown commented out."""
+    lines = []
+    for key, value, comment in rows:
+        entry = f"# {key} =" if value is None else f"{toml_key(key)} = {toml_value(value)}"
+        lines.append(f"{entry}  # {comment}" if comment else entry)
+    return lines
+
+
+def _terrain(terrain: Terrain) -> list[str]:
+    return [
+        "[terrain]",
+        *_entries(
+            [
+                ("file", terrain.file, "heights: GeoTIFF, ASC, or a terrain model (.gpkg)"),
+                ("height", terrain.height, "or one height everywhere"),
+                ("crs", terrain.crs, "its CRS, where the file does not state one"),
+            ]
+        ),
+        '# Height system: "ellipsoidal", a vertical CRS such as "EPSG:5773", or "same" = that of the other input.',
+        *_entries([("height_system", terrain.height_system, "")]),
+        "",
+    ]
+
+
+def _orientation(orientation: Orientation) -> list[str]:
+    return [
+        "[orientation]",
+        *_entries(
+            [
+                ("height_system", orientation.height_system, "of every Z0 below"),
+                ("angle_unit", orientation.angle_unit, '"deg", "gon" or "rad"'),
+                ("rotation", orientation.rotation, "o = about X, p = about Y, k = about Z; the first is the primary"),
+                ("earth_curvature", orientation.earth_curvature, '"none", "correction" (of image points) or "strict"'),
+                ("refraction", orientation.refraction, "correct image points for a standard atmosphere"),
+            ]
+        ),
+        "",
+    ]
+
+
+def _given(section: BaseModel, comments: Mapping[str, str]) -> list[str]:
+    """Entries of a section that are stated, with their comments."""
+    values = section.model_dump(exclude_none=True)
+    return _entries((key, value, comments[key]) for key, value in values.items() if value != ())
+
+
+def _observations(observations: Observations) -> list[str]:
+    if observations == Observations():
+        return []
+    comments = {
+        "image_points": "measured image points: point, image, column, row",
+        "control": "ground points, control and check",
+        "positions": "table of observed projection centres, with or without attitudes",
+        "sigma_image": "standard deviation of an image coordinate, pixels",
+        "sigma_control": "[horizontal, height], metres, where the file does not state it",
+        "sigma_position": "[horizontal, height], metres",
+        "sigma_attitude": "in the unit of [orientation]; attitudes are observations only with it",
+    }
+    return [
+        "# Measurements from which `photoplan resect` and `photoplan adjust` determine orientations.",
+        "[observations]",
+        *_given(observations, comments),
+        "",
+    ]
+
+
+def _adjustment(adjustment: Adjustment) -> list[str]:
+    if adjustment == Adjustment():
+        return []
+    comments = {
+        "calibrate": "parameters of each camera that are unknowns: c, x0, y0, k1 …",
+        "prior_sigma": "standard deviations with which they are known beforehand",
+        "lever_arm": "antenna minus projection centre in camera axes, metres",
+        "lever_arm_sigma": "its standard deviation; 0: held fixed",
+        "drift": '"none", "shift" or "linear" for each strip',
+        "boresight": "whether rotations between observed attitudes and camera are unknowns",
+    }
+    return [
+        "# What `photoplan adjust` estimates besides orientations and points.",
+        "[adjustment]",
+        *_given(adjustment, comments),
+        "",
+    ]
+
+
+def _ortho(ortho: OrthoDefaults) -> list[str]:
+    return [
+        "# Defaults of `photoplan ortho`; options of the command override them.",
+        "[ortho]",
+        *_entries(
+            [
+                ("resolution", ortho.resolution, "side of a ground pixel; default: the images' mean, to two figures"),
+                ("bounds", ortho.bounds, "[xmin, ymin, xmax, ymax]; default: all that the images see"),
+                ("kernel", ortho.kernel, "interpolation of grey values"),
+                ("tolerance", ortho.tolerance, "largest error of a source position, pixels"),
+                ("nodata", ortho.nodata, 'a number, "mask" or "auto"'),
+                ("compress", ortho.compress, "compression of the products"),
+                ("overviews", ortho.overviews, "whether products hold overviews"),
+            ]
+        ),
+        "",
+    ]
+
+
+def camera_lines(name: str, camera: FrameCamera | FilmCamera) -> list[str]:
+    """The ``[cameras.NAME]`` table of a camera."""
+    return _frame(name, camera) if isinstance(camera, FrameCamera) else _film(name, camera)
+
+
+def _frame(name: str, camera: FrameCamera) -> list[str]:
+    rows: list[tuple[str, Any, str]] = [
+        ("type", camera.type, "digital frame camera"),
+        ("size", camera.size, "width and height, pixels"),
+        ("focal_px", camera.focal_px, "camera constant in pixels; [x, y] if they differ"),
+        ("camera_constant_mm", camera.camera_constant_mm, ""),
+        ("pixel_size_um", camera.pixel_size_um, ""),
+        ("sensor_size_mm", camera.sensor_size_mm, ""),
+        ("principal_point_px", camera.principal_point_px, "column, row"),
+        ("principal_point_mm", camera.principal_point_mm, "x right, y up, from the middle of the image"),
+        *_restore(camera),
+    ]
+    head = f"[cameras.{toml_key(name)}]"
+    return [head, *_entries(r for r in rows if r[1] is not None), *_lens(camera.lens), ""]
+
+
+def _film(name: str, camera: FilmCamera) -> list[str]:
+    rows: list[tuple[str, Any, str]] = [
+        ("type", camera.type, "scanned film; each image states its measured fiducial marks"),
+        ("camera_constant_mm", camera.camera_constant_mm, ""),
+        ("principal_point_mm", camera.principal_point_mm, "in the system of the fiducial marks, x right, y up"),
+        ("interior", camera.interior, '"similarity", "affine" or "bilinear": from the marks to the scan'),
+        ("mirrored", camera.mirrored, "true if the film was scanned through its back"),
+        ("size", camera.size, "width and height of the scans, pixels"),
+        ("fiducials_mm", camera.fiducials_mm, "calibrated marks: name = [x, y]"),
+        (
+            "marks",
+            camera.marks and camera.marks.model_dump(exclude_none=True, exclude_defaults=True),
+            "what the marks look like, mm",
+        ),
+        *_restore(camera),
+    ]
+    head = f"[cameras.{toml_key(name)}]"
+    return [head, *_entries(r for r in rows if r[1] is not None), *_lens(camera.lens), ""]
+
+
+def _restore(camera: FrameCamera | FilmCamera) -> list[tuple[str, Any, str]]:
+    return [("restore", camera.restore and camera.restore.model_dump(), "filter that its images are restored with")]
+
+
+def _lens(lens: BaseModel) -> list[str]:
+    return [f"lens = {toml_value(lens.model_dump(exclude_none=True))}"]
+
+
+def _image(image: Image) -> list[str]:
+    given = image.model_dump(exclude_none=True)
+    return ["", "[[images]]", *_entries((key, value, "") for key, value in given.items())]

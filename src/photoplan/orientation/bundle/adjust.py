@@ -1,0 +1,223 @@
+"""Bundle block adjustment: orientations, points and cameras from all observations at once, by least squares.
+
+The unknowns are exterior orientations, ground points and, where they are free, parameters of cameras, lever arm,
+boresight and drift. Points are eliminated (Schur complement), what remains is sparse and solved by SciPy. Gross errors
+are found in two ways: first by weights that fall with the residual, from whatever start; then by data snooping
+(Baarda 1968): each residual against its own standard deviation, the worst of each point first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import GeometryError
+from photoplan.orientation.bundle.active import Active
+from photoplan.orientation.bundle.block import Adjusted, AdjustSettings, Block, Correlation
+from photoplan.orientation.bundle.correlation import correlation_of, effects_of_rows
+from photoplan.orientation.bundle.model import Model, build_model
+from photoplan.orientation.bundle.normal import reduce_normals
+from photoplan.orientation.bundle.rank import check_rank
+from photoplan.orientation.bundle.result import Weighted, result_of
+from photoplan.orientation.bundle.robust import first_taken_out, robust_weights, snooped, softened, weights_of
+from photoplan.orientation.bundle.rows import linearise, residuals_of, whitened
+from photoplan.orientation.bundle.select import Selection, select, start_points
+from photoplan.orientation.bundle.solution import Solution, solution_of
+from photoplan.orientation.bundle.state import State, start_state
+
+#: Called after each iteration: its number, and the root mean square of the weighted residuals.
+Progress = Callable[[int, float], None]
+
+_Floats = NDArray[np.float64]
+
+#: Largest step at the end, in units of each unknown's own standard deviation (the others fixed).
+_CONVERGED = 1e-3
+_ROUNDING = 1e-6
+#: The same for the robust start, and its least number of iterations.
+_ROUGHLY, _LEAST = 0.5, 8
+#: Largest relative change of the sum of squares at the end.
+_SETTLED = 1e-9
+#: Rounds of data snooping, and of variance components.
+_ROUNDS, _COMPONENTS = 8, 6
+#: Whole steps that may make things worse for once: a block that turns as a whole cannot avoid it, since the step is
+#: straight and its way is not. What they led to counts only if it is better in the end.
+_PATIENCE = 4
+#: Damping (part of the diagonal) after a step that made things worse, and when to give up.
+_FIRST_DAMPING, _MOST_DAMPING = 1e-12, 1e6
+
+
+def adjust_block(block: Block, settings: AdjustSettings | None = None, progress: Progress | None = None) -> Adjusted:
+    """Adjust a block of images.
+
+    Parameters
+    ----------
+    block : Block
+        In a Cartesian system.
+    settings : AdjustSettings, optional
+    progress : callable, optional
+        Told after each iteration.
+
+    Raises
+    ------
+    GeometryError
+        The observations do not determine the unknowns; the message names them. Or no image has enough points, or the
+        iterations do not converge.
+    InputError, UsageError
+        A standard deviation is missing, or a parameter cannot be free.
+    """
+    settings = settings or AdjustSettings()
+    loop = _Loop(settings.iterations, progress or (lambda number, rms: None))
+    active = Active.all_of(block)
+    selection, XYZ, lost = _selected(block, active, frozenset())
+    model = build_model(block, selection.images, selection.measured, selection.points)
+    state = start_state(model, [block.images[k].pose for k in selection.images], XYZ)
+    _check(model, state, active)
+    if settings.robust:
+        state = loop.run(model, state, weights_of(model, active), robust=True)
+        active = first_taken_out(model, state, active, settings.critical)
+    for turn in range(_ROUNDS):
+        model, state, selection, lost = _rebuilt(block, model, state, active, lost)
+        state = loop.run(model, state, weights_of(model, active))
+        solution = solution_of(model, state, weights_of(model, active), settings.covariance)
+        if not settings.robust or turn == _ROUNDS - 1:
+            break
+        next_active = snooped(model, state, solution.judged(), active, settings.critical)
+        if next_active.equals(active):
+            break
+        active = next_active
+    weighted = _weighted(loop, solution, active, settings)
+    check_rank(model, weighted.solution.state, weighted.solution.reduced)
+    return result_of(block, selection, weighted, active, loop.count)
+
+
+def _weighted(loop: _Loop, solution: Solution, active: Active, settings: AdjustSettings) -> Weighted:
+    """The solution with the accuracies that residuals show: variance components, and correlated image points."""
+    model, state = solution.model, solution.state
+    correlations: tuple[Correlation, ...] = ()
+    if settings.correlation and settings.covariance:
+        k = len(model.image)
+        used = solution.weight[: 2 * k : 2] > 0
+        correlations = correlation_of(model, solution.normalised()[: 2 * k].reshape(-1, 2), used)
+    effects = effects_of_rows(model, correlations, len(solution.e)) if correlations else None
+    factors: _Floats | None = None
+    for _ in range(_COMPONENTS):
+        if settings.variance_components and settings.covariance:
+            factors = solution.trusted(solution.factors(factors))
+        elif effects is None:
+            break
+        weight = weights_of(model, active, factors)
+        state = loop.run(model, state, weight if effects is None else weight / effects)
+        solution = solution_of(model, state, weight, settings.covariance, effects)
+        if factors is None or np.allclose(solution.trusted(solution.factors(factors)), factors, rtol=0.02):
+            break
+    return Weighted(solution, solution.factors(factors), correlations)
+
+
+def _selected(block: Block, active: Active, lost: frozenset[str]) -> tuple[Selection, _Floats, frozenset[str]]:
+    """What takes part, start values of its points, and the points whose rays are parallel."""
+    while True:
+        selection = select(block, active, lost)
+        if not selection.images or not selection.points:
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in selection.left_out[:5])
+            raise GeometryError(
+                f"no image has enough measured points to be adjusted ({reasons or 'no measurements'}); are image "
+                "points and images of the same block?"
+            )
+        XYZ, parallel = start_points(block, selection)
+        if not parallel:
+            return selection, XYZ, lost
+        lost |= parallel
+
+
+def _check(model: Model, state: State, active: Active) -> None:
+    rows, _ = linearise(model, state, np.sqrt(weights_of(model, active)))
+    check_rank(model, state, reduce_normals(rows, len(model.point_names)))
+
+
+def _rebuilt(
+    block: Block, model: Model, state: State, active: Active, lost: frozenset[str]
+) -> tuple[Model, State, Selection, frozenset[str]]:
+    """The model without what was taken out; unknowns keep their values, points that come back are intersected.
+
+    Rays that are left may be parallel, so that points can be lost here too.
+    """
+    poses = dict(zip(model.image_names, state.poses()))
+    images = tuple(replace(b, pose=poses.get(b.name, b.pose)) for b in block.images)
+    selection, XYZ, lost = _selected(replace(block, images=images), active, lost)
+    made = build_model(block, selection.images, selection.measured, selection.points)
+    before = {name: k for k, name in enumerate(model.point_names)}
+    old = np.array([before.get(n, -1) for n in made.point_names], np.int64)
+    XYZ[old >= 0] = state.XYZ[old[old >= 0]]
+    return made, state.carried(model, made, [images[k].pose for k in selection.images], XYZ), selection, lost
+
+
+class _Loop:
+    """Iterations to the minimum; counts them over all rounds."""
+
+    def __init__(self, most: int, progress: Progress) -> None:
+        self.count = 0
+        self._most, self._progress = most, progress
+
+    def run(self, model: Model, state: State, base: _Floats, robust: bool = False) -> State:
+        """The state where the sum of squares with weights `base` (rows,) is least (Levenberg–Marquardt)."""
+        if robust:
+            base = base * softened(model, state)
+        damping, cost = 0.0, np.inf
+        patience, best, least = _PATIENCE, state, np.inf
+        for turn in range(self._most):
+            e = whitened(model, residuals_of(model, state))
+            weight = base * robust_weights(model, e * np.sqrt(base), turn) if robust else base
+            weight = np.where(np.isfinite(e), weight, 0.0)
+            before = _cost(e, weight)
+            if before <= least:
+                best, least = state, before
+            elif patience == 0 and not robust:
+                state, patience, damping = best, -1, _FIRST_DAMPING
+                continue
+            rows, _ = linearise(model, state, np.sqrt(weight))
+            while True:
+                reduced = reduce_normals(rows, len(model.point_names), damping)
+                step, points = reduced.solve()
+                moved = state.moved(model, step, points)
+                after = _cost(whitened(model, residuals_of(model, moved)), weight)
+                if after <= before * (1.0 + 1e-9) + 1e-12:
+                    break
+                if patience > 0 and damping == 0.0 and after < np.inf:
+                    patience -= 1
+                    break
+                damping = max(10.0 * damping, _FIRST_DAMPING)
+                if damping > _MOST_DAMPING:
+                    raise GeometryError(
+                        "the adjustment does not converge: no step makes the residuals smaller. Are start "
+                        "orientations, image points and control of the same block?"
+                    )
+            damping = 0.0 if damping <= _FIRST_DAMPING else damping / 10.0
+            state = moved
+            self.count += 1
+            self._progress(self.count, float(np.sqrt(after / max(1.0, float((weight > 0).sum())))))
+            largest = float(np.abs(step / reduced.scale).max()) if len(step) else 0.0
+            settled = abs(cost - after) <= _SETTLED * after or after < 1e-18 * len(e)
+            # A damped step is short for that reason alone, unless rounding is all that is left.
+            if not robust and ((damping == 0.0 and (largest < _CONVERGED or settled)) or largest < _ROUNDING):
+                return state
+            if robust and turn >= _LEAST and largest < _ROUGHLY:
+                return state
+            cost = after
+        if robust:
+            return state
+        raise GeometryError(
+            f"the adjustment has not converged after {self._most} iterations (largest step {largest:.2g} standard "
+            "deviations). Are the start orientations about right, and all free parameters determined? Images that have "
+            "no start orientation are oriented from control and tie points"
+        )
+
+
+def _cost(e: _Floats, weight: _Floats) -> float:
+    """Weighted sum of squares; infinite when a point that counts has come behind a camera."""
+    counted = weight > 0
+    if not np.isfinite(e[counted]).all():
+        return np.inf
+    return float((weight[counted] * e[counted] ** 2).sum())

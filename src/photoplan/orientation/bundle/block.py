@@ -1,0 +1,215 @@
+"""A block of images as the bundle adjustment takes it, and what comes out: in one Cartesian system, metres.
+
+Maps are not Cartesian; `photoplan.products.adjust.run` carries a project's inputs here and the result back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.lenses.base import Lens
+from photoplan.cameras.observed import GroundPoints, ImagePoints, ObservedAttitudes, ObservedPositions
+from photoplan.cameras.plane import Affine2D, Bilinear2D
+from photoplan.geometry.pose import Pose
+
+#: Parameters of a camera that can be unknowns, in the order of results: camera constant and principal point in the
+#: unit of the image plane, coefficients of the lens without unit (as in `photoplan.cameras.lenses.brown.Brown`).
+PARAMETERS = ("c", "x0", "y0", "k1", "k2", "k3", "p1", "p2", "b1", "b2")
+
+#: Shift of image points, (image indices (n,), poses of all images, ground points (n, 3)) → (n, 2) pixels, that is added
+#: to the central projection: earth curvature, refraction. It must be smooth and small; its derivatives are neglected.
+Bend = Callable[[NDArray[np.int64], "tuple[Pose, ...]", NDArray[np.float64]], NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class BlockCamera:
+    """A camera of the block."""
+
+    c: float
+    """Camera constant, in the unit of the image plane (millimetres, or pixels)."""
+    principal_point: tuple[float, float]
+    """x0, y0 in the image plane, same unit."""
+    lens: Lens
+    """`Brown`, `OpenCV` or `NoLens` where one of its coefficients is free; any where none is."""
+    free: tuple[str, ...] = ()
+    """Parameters that are unknowns, of `PARAMETERS`."""
+    prior_sigma: Mapping[str, float] = field(default_factory=dict)
+    """Standard deviations with which free parameters are known beforehand; without an entry: not at all."""
+
+
+@dataclass(frozen=True, eq=False)
+class BlockImage:
+    """An image of the block."""
+
+    name: str
+    camera: str
+    plane_to_pixel: Affine2D | Bilinear2D
+    """From the image plane (x right, y up) to pixels."""
+    pose: Pose
+    """Start value of the exterior orientation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Everything that is observed and that is known beforehand."""
+
+    cameras: Mapping[str, BlockCamera]
+    images: tuple[BlockImage, ...]
+    observations: ImagePoints
+    """With a standard deviation for every measurement; those in images that are not of the block are not used."""
+    ground: GroundPoints
+    """Control and check points; control with a standard deviation for every known coordinate."""
+    positions: ObservedPositions | None = None
+    attitudes: ObservedAttitudes | None = None
+    lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Antenna minus projection centre, in camera axes, metres."""
+    lever_arm_sigma: float = 0.0
+    """Its standard deviation; 0: held fixed."""
+    drift: str = "none"
+    """none, shift or linear: of observed positions in each strip."""
+    boresight: bool = False
+    """Whether three rotations between observed attitudes and camera are unknowns."""
+    start_points: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    """Start values of points, where they are known; others are intersected."""
+    bend: Bend | None = None
+
+
+@dataclass(frozen=True)
+class AdjustSettings:
+    """How the adjustment is done."""
+
+    robust: bool = True
+    """Whether observations that do not fit lose weight while iterating (Huber, then a redescending function)."""
+    critical: float = 4.0
+    """Normalised residual from which an observation is taken out as a gross error."""
+    variance_components: bool = True
+    """Whether the groups' standard deviations are estimated and used."""
+    correlation: bool = True
+    """Whether it is regarded that errors of neighbouring image points are alike, where their residuals show it."""
+    iterations: int = 40
+    """Most iterations."""
+    covariance: bool = True
+    """Whether covariances, redundancy numbers and normalised residuals are computed."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Observations of one kind with one variance factor."""
+
+    name: str
+    """As users call it: "image points, camera RC30", "control, height" …"""
+    count: int
+    """Observed numbers (not points)."""
+    redundancy: float
+    """Sum of the redundancy numbers; NaN where they were not computed."""
+    rms: float
+    """Root mean square of the residuals in the unit of the observations."""
+    unit: str
+    factor: float
+    """Standard deviation found divided by the one that was stated (root of vᵀPv / redundancy)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Correlation:
+    """Errors of image points that are alike over some distance, of the images of one camera."""
+
+    camera: str
+    effect: float
+    """Measurements that count as one for an orientation."""
+    reach: float
+    """Distance over which errors are alike, pixels."""
+    distance: NDArray[np.float64]
+    """Outer limits of classes of distance, (m,), pixels."""
+    rho: NDArray[np.float64]
+    """Correlation of residuals in each class, (m,); NaN: too few pairs."""
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustedCamera:
+    """Interior orientation after the adjustment."""
+
+    name: str
+    c: float
+    principal_point: tuple[float, float]
+    lens: Lens
+    free: tuple[str, ...]
+    """The parameters that were unknowns."""
+    covariance: NDArray[np.float64]
+    """Of those, shape (k, k), sigma0 included; NaN without covariance."""
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustedStrip:
+    """Drift of the observed positions of a strip: position = antenna + shift + rate · (time − epoch)."""
+
+    name: str
+    shift: NDArray[np.float64]
+    """(3,), metres."""
+    rate: NDArray[np.float64]
+    """(3,), metres per second; zero with shift only."""
+    epoch: float
+    sigma: NDArray[np.float64]
+    """Of shift and rate, (6,); NaN where it was no unknown."""
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """Result of a bundle adjustment. Covariances and standard deviations hold sigma0 already."""
+
+    images: tuple[str, ...]
+    poses: tuple[Pose, ...]
+    pose_covariance: NDArray[np.float64]
+    """(n, 6, 6): projection centre in metres, then small rotations about the camera's x, y, z axes in radians
+    (R ← R · exp[δ]×); NaN without covariance."""
+    cameras: tuple[AdjustedCamera, ...]
+    points: tuple[str, ...]
+    """All points that were adjusted: tie, control and check points."""
+    XYZ: NDArray[np.float64]
+    """(m, 3)."""
+    point_covariance: NDArray[np.float64]
+    """(m, 3, 3); NaN without covariance."""
+    rays: NDArray[np.int64]
+    """Measurements of each point that take part, (m,)."""
+    left_out: tuple[tuple[str, str], ...]
+    """Points and images that could not take part: name and reason."""
+    residuals: NDArray[np.float64]
+    """Computed minus measured position of every image measurement, (k, 2), pixels (column, row); NaN: not used."""
+    redundancies: NDArray[np.float64]
+    """Redundancy numbers of the measurements, (k, 2), 0 to 1; NaN: not used or not computed."""
+    normalised: NDArray[np.float64]
+    """Residuals divided by their standard deviations, (k, 2)."""
+    rejected: NDArray[np.bool_]
+    """Measurements that were taken out as gross errors, (k,); `residuals` and `normalised` then are those against the
+    result without them, NaN where their point or image had not enough left."""
+    ground_residuals: NDArray[np.float64]
+    """Adjusted minus given coordinates of every ground point, (g, 3), metres; NaN: not known or not seen."""
+    ground_normalised: NDArray[np.float64]
+    """Normalised residuals of control, (g, 3); NaN for check points."""
+    ground_rejected: NDArray[np.bool_]
+    """Control taken out as a gross error, coordinate by coordinate, (g, 3)."""
+    position_residuals: NDArray[np.float64]
+    """Computed minus observed positions, (n_positions, 3), metres."""
+    position_rejected: NDArray[np.bool_]
+    """(n_positions,)."""
+    attitude_residuals: NDArray[np.float64]
+    """Small rotations computed minus observed, (n_attitudes, 3), radians."""
+    lever_arm: NDArray[np.float64]
+    """(3,), metres."""
+    lever_arm_sigma: NDArray[np.float64]
+    """(3,); zero where held fixed."""
+    boresight: NDArray[np.float64]
+    """(3,), radians; zero where it was no unknown."""
+    boresight_sigma: NDArray[np.float64]
+    strips: tuple[AdjustedStrip, ...]
+    groups: tuple[Group, ...]
+    sigma0: float
+    """Standard deviation of unit weight: 1 where the stated standard deviations are right."""
+    redundancy: int
+    unknowns: int
+    iterations: int
+    correlations: tuple[Correlation, ...] = ()
+    """Of cameras whose image points have clearly correlated errors; orientations and their covariances regard it."""

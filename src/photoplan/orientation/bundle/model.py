@@ -1,0 +1,235 @@
+"""A block as arrays: what stays the same in all iterations of the bundle adjustment."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.lenses.brown import Brown
+from photoplan.cameras.lenses.none import NoLens
+from photoplan.cameras.lenses.opencv import OpenCV
+from photoplan.cameras.plane import Affine2D, Bilinear2D
+from photoplan.errors import InputError, UsageError
+from photoplan.orientation.bundle.block import PARAMETERS, Block, BlockCamera
+
+#: Standard deviation of coordinates that are held fixed, metres: small against anything that is measured, and large
+#: enough for the arithmetic.
+FIXED = 1e-5
+
+_Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Where the unknowns that are not points stand in the vector of unknowns: six of each image come first."""
+
+    images: int
+    cameras: dict[str, int]
+    """First column of each camera with free parameters."""
+    lever: int
+    """First of three columns; −1: no unknown."""
+    boresight: int
+    strips: dict[str, int]
+    """First column of each strip: three for its shift and, where drift is linear, three for its rate."""
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """The block's observations as arrays; points and images that cannot take part are already gone."""
+
+    block: Block
+    image_names: tuple[str, ...]
+    image_rows: _Index
+    """Number of each image in `block.images`, (n,)."""
+    camera_names: tuple[str, ...]
+    camera_of: _Index
+    """Camera of each image, (n,)."""
+    plane: NDArray[np.float64]
+    """Bilinear coefficients b1 … b8 from image plane to pixels of each image, (n, 8)."""
+    point_names: tuple[str, ...]
+    observation: _Index
+    """Number of each measurement in `block.observations`, (k,)."""
+    image: _Index
+    point: _Index
+    xy: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    ground: _Index
+    """Ground point of each control row, an index into `block.ground`, (c,)."""
+    ground_axis: _Index
+    """Coordinate of each control row: 0, 1, 2."""
+    ground_point: _Index
+    """Point of each control row, an index into `point_names`."""
+    ground_white: NDArray[np.float64]
+    """What the residuals of the three coordinates are multiplied with in a control row, (c, 3)."""
+    position: _Index
+    """Image of each observed position."""
+    position_row: _Index
+    """Its number in `block.positions`."""
+    strip_of: _Index
+    """Strip of each observed position, an index into `strip_names`."""
+    strip_names: tuple[str, ...]
+    tau: NDArray[np.float64]
+    """Time of each observed position since its strip's epoch."""
+    epochs: NDArray[np.float64]
+    attitude: _Index
+    attitude_row: _Index
+    columns: Columns
+
+    @property
+    def free(self) -> tuple[tuple[str, ...], ...]:
+        """Free parameters of each camera."""
+        return tuple(self.block.cameras[name].free for name in self.camera_names)
+
+
+def check_free(name: str, camera: BlockCamera) -> None:
+    """Refuse parameters that a camera's lens does not have.
+
+    Raises
+    ------
+    UsageError
+        A parameter is unknown, or the lens is not described by such coefficients.
+    """
+    unknown = [p for p in camera.free if p not in PARAMETERS]
+    if unknown:
+        raise UsageError(f"camera {name!r}: parameter {unknown[0]!r}; allowed are {', '.join(PARAMETERS)}")
+    coefficients = [p for p in camera.free if p not in ("c", "x0", "y0")]
+    if not coefficients:
+        return
+    if isinstance(camera.lens, OpenCV):
+        missing = [p for p in coefficients if p in ("b1", "b2")]
+        if missing:
+            raise UsageError(f"camera {name!r}: an OpenCV lens has no {', '.join(missing)}; a Brown lens has them")
+    elif not isinstance(camera.lens, Brown | NoLens):
+        raise UsageError(
+            f"camera {name!r}: {', '.join(coefficients)} cannot be free with its lens ({type(camera.lens).__name__}); "
+            "free c, x0, y0 only, or describe the lens by Brown's coefficients as distortion"
+        )
+
+
+def build_model(block: Block, images: list[int], measured: _Index, points: list[str]) -> Model:
+    """Arrays of a block.
+
+    Parameters
+    ----------
+    block : Block
+    images : list of int
+        Images that take part, indices into `block.images`.
+    measured : ndarray
+        Measurements that take part, indices into `block.observations`.
+    points : list of str
+        Points that take part.
+    """
+    seen = block.observations
+    chosen = [block.images[k] for k in images]
+    image_index = {b.name: k for k, b in enumerate(chosen)}
+    point_index = {name: k for k, name in enumerate(points)}
+    camera_names = tuple(dict.fromkeys(b.camera for b in chosen))
+    for name in camera_names:
+        check_free(name, block.cameras[name])
+    sigma = seen.sigma[measured]
+    if not np.isfinite(sigma).all():
+        raise InputError("image points without a standard deviation; every measurement needs one")
+    ground = _ground_rows(block, point_index)
+    position, position_row = _observed(block.positions.images if block.positions else (), image_index)
+    strips, strip_of, tau, epochs = _strips(block, position_row)
+    attitude, attitude_row = _observed(block.attitudes.images if block.attitudes else (), image_index)
+    return Model(
+        block=block,
+        image_names=tuple(image_index),
+        image_rows=np.array(images, np.int64),
+        camera_names=camera_names,
+        camera_of=np.array([camera_names.index(b.camera) for b in chosen], np.int64),
+        plane=np.array([_bilinear(b.plane_to_pixel) for b in chosen]).reshape(-1, 8),
+        point_names=tuple(points),
+        observation=measured,
+        image=np.array([image_index.get(n, -1) for n in seen.images], np.int64)[seen.image[measured]],
+        point=np.array([point_index.get(n, -1) for n in seen.points], np.int64)[seen.point[measured]],
+        xy=seen.xy[measured],
+        sigma=sigma,
+        ground=ground[0],
+        ground_axis=ground[1],
+        ground_point=ground[2],
+        ground_white=ground[3],
+        position=position,
+        position_row=position_row,
+        strip_of=strip_of,
+        strip_names=strips,
+        tau=tau,
+        epochs=epochs,
+        attitude=attitude,
+        attitude_row=attitude_row,
+        columns=_columns(block, len(chosen), camera_names, strips, len(attitude) > 0),
+    )
+
+
+def _bilinear(plane: Affine2D | Bilinear2D) -> tuple[float, ...]:
+    if isinstance(plane, Affine2D):
+        return (plane.a1, plane.a2, 0.0, plane.a3, plane.a4, plane.a5, 0.0, plane.a6)
+    return astuple(plane)
+
+
+def _observed(names: tuple[str, ...], image_index: dict[str, int]) -> tuple[_Index, _Index]:
+    rows = [k for k, name in enumerate(names) if name in image_index]
+    return np.array([image_index[names[k]] for k in rows], np.int64), np.array(rows, np.int64)
+
+
+def _strips(block: Block, rows: _Index) -> tuple[tuple[str, ...], _Index, NDArray[np.float64], NDArray[np.float64]]:
+    """Names of the strips, strip and time since its epoch of each observed position, and the epochs."""
+    if block.positions is None:
+        return (), np.empty(0, np.int64), np.empty(0), np.empty(0)
+    names = [block.positions.strip[k] for k in rows]
+    strips = tuple(dict.fromkeys(names))
+    of = np.array([strips.index(n) for n in names], np.int64)
+    time = block.positions.time[rows]
+    epochs = np.array([time[of == s].mean() for s in range(len(strips))])
+    return strips, of, time - epochs[of] if len(of) else np.empty(0), epochs
+
+
+def _ground_rows(block: Block, point_index: dict[str, int]) -> tuple[_Index, _Index, _Index, NDArray[np.float64]]:
+    """Control rows: ground point, coordinate, point, and the whitening of their residuals."""
+    ground = block.ground
+    rows: list[tuple[int, int, int]] = []
+    white: list[NDArray[np.float64]] = []
+    for k, name in enumerate(ground.names):
+        if ground.check[k] or name not in point_index:
+            continue
+        known = np.flatnonzero(np.isfinite(ground.XYZ[k]))
+        W = np.zeros((3, 3))
+        if ground.covariance is not None and np.isfinite(ground.covariance[k][np.ix_(known, known)]).all():
+            Q = ground.covariance[k][np.ix_(known, known)] + FIXED**2 * np.eye(len(known))
+            W[np.ix_(known, known)] = np.linalg.inv(np.linalg.cholesky(Q))
+        else:
+            sigma = np.maximum(ground.sigma[k][known], FIXED)
+            if not np.isfinite(sigma).all():
+                raise InputError(f"control point {name!r} has no standard deviation; state one for each coordinate")
+            W[known, known] = 1.0 / sigma
+        for axis in known:
+            rows.append((k, int(axis), point_index[name]))
+            white.append(W[axis])
+    table = np.array(rows, np.int64).reshape(-1, 3)
+    return table[:, 0], table[:, 1], table[:, 2], np.array(white).reshape(-1, 3)
+
+
+def _columns(block: Block, images: int, cameras: tuple[str, ...], strips: tuple[str, ...], attitudes: bool) -> Columns:
+    at = 6 * images
+    of_cameras: dict[str, int] = {}
+    for name in cameras:
+        if block.cameras[name].free:
+            of_cameras[name] = at
+            at += len(block.cameras[name].free)
+    lever = boresight = -1
+    if block.positions is not None and block.lever_arm_sigma > 0:
+        lever, at = at, at + 3
+    if attitudes and block.boresight:
+        boresight, at = at, at + 3
+    of_strips: dict[str, int] = {}
+    width = {"none": 0, "shift": 3, "linear": 6}.get(block.drift)
+    if width is None:
+        raise UsageError(f"drift {block.drift!r}; allowed are none, shift, linear")
+    for name in strips if width else ():
+        of_strips[name] = at
+        at += width
+    return Columns(images, of_cameras, lever, boresight, of_strips, at)

@@ -1,0 +1,164 @@
+"""Normal equations of the bundle adjustment: points eliminated, the rest solved by a sparse factorisation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import SuperLU, splu
+
+from photoplan.errors import GeometryError
+from photoplan.kernels.quadratic_forms import SparseRows, gathered, point_variances, row_variances
+from photoplan.kernels.selected_inverse import SelectedInverse, aligned, fill_pattern, selected_inverse
+from photoplan.orientation.bundle.rows import Rows
+
+_Floats = NDArray[np.float64]
+
+#: Part of a point's normal matrix that is added to its diagonal: far below rounding of any point that is determined.
+_RIDGE = 1e-13
+
+
+@dataclass(frozen=True, eq=False)
+class Reduced:
+    """Reduced normal equations S x = b of all unknowns but points (Schur complement)."""
+
+    rows: Rows
+    S: sparse.csc_matrix
+    """Scaled to a unit diagonal: S = D N D."""
+    scale: _Floats
+    """D."""
+    b: _Floats
+    V_inverse: _Floats
+    """(points, 3, 3)."""
+    N_pg: sparse.csr_matrix
+    n_p: _Floats
+    """(points, 3)."""
+
+    @cached_property
+    def factor(self) -> SuperLU:
+        """Factorisation without pivoting.
+
+        Raises
+        ------
+        GeometryError
+            The equations are exactly singular.
+        """
+        try:
+            return splu(self.S, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        except RuntimeError:
+            raise GeometryError(
+                "the normal equations are singular: the observations do not determine all unknowns"
+            ) from None
+
+    def solve(self) -> tuple[_Floats, _Floats]:
+        """Step of all unknowns but points, and of the points (m, 3)."""
+        x = self.scale * self.factor.solve(self.scale * -self.b)
+        back = (-self.n_p - (self.N_pg @ x).reshape(-1, 3))[:, :, None]
+        return x, (self.V_inverse @ back)[:, :, 0]
+
+
+def reduce_normals(rows: Rows, points: int, damping: float = 0.0) -> Reduced:
+    """Form the normal equations and eliminate the points.
+
+    Parameters
+    ----------
+    rows : Rows
+    points : int
+        Number of points.
+    damping : float
+        Part of the diagonal that is added to it (Levenberg–Marquardt).
+    """
+    at, P = _on_points(rows)
+    V = np.empty((points, 3, 3))
+    for k in range(3):
+        for n in range(k, 3):
+            V[:, k, n] = V[:, n, k] = np.bincount(at, P[:, k] * P[:, n], points)
+    e = rows.e[: len(at)]
+    n_p = np.stack([np.bincount(at, P[:, k] * e, points) for k in range(3)], axis=-1).astype(float)
+    # A point whose measurements have lost their weight (all but one ray, or all) must not make the equations singular:
+    # it then stays where it is.
+    trace = np.trace(V, axis1=1, axis2=2)[:, None]
+    V[:, range(3), range(3)] *= 1.0 + damping
+    V[:, range(3), range(3)] += _RIDGE * trace + (trace == 0.0)
+    # A point whose measurements have all lost their weight stays where it is.
+    with np.errstate(invalid="ignore"):
+        V[~(np.linalg.det(V) > 0.0)] = np.eye(3)
+    V_inverse = np.asarray(np.linalg.inv(V), np.float64)
+    N_gg = (rows.A_global.T @ rows.A_global).tocsc()
+    N_pg = (rows.A_points.T @ rows.A_global).tocsr()
+    blocks = sparse.bsr_matrix((V_inverse, np.arange(points), np.arange(points + 1)), (3 * points, 3 * points))
+    C = (blocks.tocsr() @ N_pg).tocsr()
+    S = (N_gg - N_pg.T @ C).tocsc()
+    b = rows.A_global.T @ rows.e - C.T @ n_p.ravel()
+    diagonal = S.diagonal()
+    if damping:
+        S = (S + sparse.diags(damping * N_gg.diagonal())).tocsc()
+        diagonal = S.diagonal()
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    D = sparse.diags(scale)
+    return Reduced(rows, (D @ S @ D).tocsc(), scale, np.asarray(b).ravel(), V_inverse, N_pg, n_p)
+
+
+def _on_points(rows: Rows) -> tuple[NDArray[np.int64], _Floats]:
+    """Point and coefficients (…, 3) of the rows that have a point; these come first."""
+    count = int((rows.point >= 0).sum())
+    return rows.point[:count], rows.A_points.data.reshape(-1, 3)
+
+
+class Inverse:
+    """Selected entries of the inverse of the reduced normal equations (cofactors, sigma0 = 1)."""
+
+    def __init__(self, reduced: Reduced) -> None:
+        factor = reduced.factor
+        if not np.array_equal(factor.perm_r, factor.perm_c):
+            raise GeometryError(
+                "the normal equations are not positive definite: the unknowns are not determined. Are start "
+                "orientations, positions, image points and control of the same block?"
+            )
+        order = factor.perm_c.astype(np.int64)
+        pattern = _pattern(reduced, order)
+        pointer, rows = fill_pattern(pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64))
+        L = factor.L.tocsc()
+        values = aligned(pointer, rows, L.indptr.astype(np.int64), L.indices.astype(np.int64), L.data)
+        diagonal, lower = selected_inverse(pointer, rows, values, factor.U.diagonal())
+        self._Q = SelectedInverse(pointer, rows, diagonal, lower, order)
+        self._reduced = reduced
+
+    def block(self, columns: NDArray[np.int64]) -> _Floats:
+        """Cofactors of unknowns that occur together in an equation (or belong to one image), shape (m, m)."""
+        scale = self._reduced.scale[columns]
+        dense = gathered(self._Q, columns)
+        return np.asarray(dense * scale[:, None] * scale[None, :])
+
+    def variances(self) -> tuple[_Floats, _Floats]:
+        """Cofactors of all points (m, 3, 3), and a Q aᵀ of all rows: 1 minus it is the redundancy number."""
+        rows, reduced = self._reduced.rows, self._reduced
+        at, P = _on_points(rows)
+        scaled = (rows.A_global @ sparse.diags(reduced.scale)).tocsr()
+        A = SparseRows(scaled.indptr.astype(np.int64), scaled.indices.astype(np.int64), scaled.data)
+        order = np.argsort(at, kind="stable").astype(np.int64)
+        pointer = np.searchsorted(at[order], np.arange(len(reduced.V_inverse) + 1)).astype(np.int64)
+        covariance, with_point = point_variances(self._Q, A, P, pointer, order, reduced.V_inverse)
+        others = np.arange(len(at), len(rows.e))
+        return covariance, np.concatenate([with_point, row_variances(self._Q, A, others)])
+
+
+def _pattern(reduced: Reduced, order: NDArray[np.int64]) -> sparse.csc_matrix:
+    """Strictly lower triangle, in the order of elimination, of everything that can occur in S.
+
+    Entries that happen to cancel belong to the pattern too, so it is made from ones.
+    """
+    A = reduced.rows.A_global
+    ones = sparse.csr_matrix((np.ones(len(A.data)), A.indices, A.indptr), A.shape)
+    N = reduced.N_pg
+    points = sparse.csr_matrix((np.ones(len(N.data)), N.indices, N.indptr), N.shape)
+    pattern = (ones.T @ ones + points.T @ points).tocoo()
+    row, column = order[pattern.row], order[pattern.col]
+    lower = row > column
+    shape = pattern.shape
+    out = sparse.csc_matrix((np.ones(int(lower.sum())), (row[lower], column[lower])), shape)
+    out.sort_indices()
+    return out

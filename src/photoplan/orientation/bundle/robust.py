@@ -1,0 +1,286 @@
+"""Observations that do not fit: their weights while iterating, and which are taken out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import GeometryError
+from photoplan.orientation.bundle.active import Active
+from photoplan.orientation.bundle.model import Model
+from photoplan.orientation.bundle.rows import residuals_of, residuals_of_all, whitened
+from photoplan.orientation.bundle.state import State
+from photoplan.orientation.start.similarity import robust_similarity
+
+_Floats = NDArray[np.float64]
+
+#: Kinds of rows: what a group of observations is called, and the unit of its residuals.
+Kinds = tuple[tuple[str, str], ...]
+
+#: Standard deviation of softened control in units of an image point's on the ground.
+_SOFT = 3.0
+#: Iterations with Huber's weights before gross errors may lose all influence.
+_HUBER = 5
+#: Where the weights begin to fall, in standard deviations.
+_HUBER_LIMIT, _FALL = 2.0, 3.0
+#: Control points from which it is asked with which of them most agree.
+_LEAST_CONTROL = 5
+#: Medians of the length of normally distributed errors, σ = 1, in one and in two coordinates.
+_MEDIAN_1D, _MEDIAN_2D = 0.6745, 1.1774
+#: Image points are not judged by less than this part of their stated standard deviation, however small residuals are.
+_BEST = 0.05
+#: An observation that was taken out comes back when its residual is below this part of the critical value.
+_BACK = 0.75
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """What data snooping looks at, of all rows."""
+
+    e: _Floats
+    """Residuals divided by the standard deviations that were stated."""
+    normalised: _Floats
+    """Residuals divided by their own standard deviations."""
+    weight: _Floats
+    scales: _Floats
+    """Of each group (`kinds_of`): standard deviation of its residuals in units of the stated ones."""
+
+
+def kinds_of(model: Model) -> tuple[Kinds, NDArray[np.int64]]:
+    """Groups of observations, and the group of each row; rows of what is known beforehand are not listed.
+
+    Control and check points are measured otherwise than tie points (by hand, say), so they are groups of their own.
+    """
+    kinds: list[tuple[str, str]] = [(f"image points, camera {name}", "px") for name in model.camera_names]
+    kinds += [(f"control and check points in images, camera {name}", "px") for name in model.camera_names]
+    of = [np.repeat(kinds_of_measurements(model)[model.observation], 2)]
+    at = len(kinds)
+    kinds += [("control, horizontal", "m"), ("control, height", "m")]
+    of.append(at + (model.ground_axis == 2))
+    block = model.block
+    if block.positions is not None:
+        at = len(kinds)
+        kinds += [("observed positions, horizontal", "m"), ("observed positions, height", "m")]
+        of.append(np.tile([at, at, at + 1], len(model.position)))
+    if block.attitudes is not None:
+        kinds.append(("observed attitudes", "rad"))
+        of.append(np.full(3 * len(model.attitude), len(kinds) - 1))
+    return tuple(kinds), np.concatenate(of).astype(np.int64)
+
+
+def kinds_of_measurements(model: Model) -> NDArray[np.int64]:
+    """Group of every measurement of the block, also of those that take no part; −1: its image takes none."""
+    seen = model.block.observations
+    cameras = {name: k for k, name in enumerate(model.camera_names)}
+    of_image = {b.name: cameras.get(b.camera, -1) for b in model.block.images}
+    camera = np.array([of_image.get(n, -1) for n in seen.images], np.int64)[seen.image]
+    names = set(model.block.ground.names)
+    surveyed = np.array([n in names for n in seen.points], bool)[seen.point]
+    return np.where(camera < 0, -1, camera + len(cameras) * surveyed)
+
+
+def weights_of(model: Model, active: Active, factors: _Floats | None = None) -> _Floats:
+    """Weights of all rows: 0 for what is taken out, 1 / factor² for its group's variance factor."""
+    _, of = kinds_of(model)
+    weight = np.ones(len(of))
+    if factors is not None:
+        weight = 1.0 / factors[of] ** 2
+    k, c, p = len(model.image), len(model.ground), len(model.position)
+    weight[2 * k : 2 * k + c] *= active.ground[model.ground, model.ground_axis]
+    if p:
+        weight[2 * k + c : 2 * k + c + 3 * p] *= np.repeat(active.position[model.position_row], 3)
+    return np.concatenate([weight, np.ones(_priors(model))])
+
+
+def softened(model: Model, state: State) -> _Floats:
+    """Weights that make control no better than what image points say of the ground, while gross errors are sought.
+
+    A wrong control point of high weight would otherwise draw its image points along, and these would look wrong.
+    """
+    out = np.ones(2 * len(model.image) + len(model.ground) + 3 * (len(model.position) + len(model.attitude)))
+    out = np.concatenate([out, np.ones(_priors(model))])
+    distance = np.linalg.norm(state.XYZ[model.point] - state.centers[model.image], axis=1)
+    pixel = np.sqrt(np.abs(model.plane[:, 0] * model.plane[:, 5] - model.plane[:, 1] * model.plane[:, 4]))
+    c = np.array([camera.c for camera in state.cameras])[model.camera_of] * pixel
+    blur = _SOFT * float(np.median(model.sigma.mean(axis=1) * distance / c[model.image]))
+    sigma = 1.0 / np.linalg.norm(model.ground_white, axis=1)
+    k = 2 * len(model.image)
+    out[k : k + len(model.ground)] = sigma**2 / (sigma**2 + blur**2)
+    return out
+
+
+def _priors(model: Model) -> int:
+    block = model.block
+    known = sum(p in block.cameras[n].prior_sigma for n in model.camera_names for p in block.cameras[n].free)
+    return known + (3 if model.columns.lever >= 0 else 0)
+
+
+def robust_scale(e: _Floats, kind: tuple[str, str]) -> float:
+    """Standard deviation of a group's whitened residuals, that one in five gross errors hardly moves.
+
+    Image points may be better than stated. Control, positions and attitudes may not: many of them are checked so little
+    that their residuals are small for that reason alone. Fewer than 20 residuals count as stated: 1.
+    """
+    e = e[np.isfinite(e)]
+    if len(e) < 20:
+        return 1.0
+    return max(float(np.median(np.abs(e))) / _MEDIAN_1D, _BEST if kind[1] == "px" else 1.0)
+
+
+def _joined(e: _Floats, kind: tuple[str, str]) -> _Floats:
+    """Whitened residuals of a group, each coordinate of an image point replaced by what its length makes of it.
+
+    Points of two rays have no residuals along the base, so that half of all coordinates would be small.
+    """
+    if kind[1] != "px":
+        return e
+    length: _Floats = np.linalg.norm(e.reshape(-1, 2), axis=1)
+    return np.repeat(length * (_MEDIAN_1D / _MEDIAN_2D), 2)
+
+
+def robust_weights(model: Model, e: _Floats, turn: int) -> _Floats:
+    """Weights that fall with the residual: Huber's at first, then Geman and McClure's.
+
+    Both coordinates of an image point, and all of an observed position, have one weight.
+    """
+    size = _sizes(model, e)
+    weight = np.ones(len(e))
+    kinds, of = kinds_of(model)
+    stretch = _stretch(model)
+    for k in range(len(kinds)):
+        mine = np.flatnonzero(of == k)
+        # Sizes of two or three coordinates are longer than single ones; the scale is that of the single ones.
+        s = size[mine] / (robust_scale(_joined(e[mine], kinds[k]), kinds[k]) * stretch)
+        weight[mine] = (
+            _HUBER_LIMIT / np.maximum(s, _HUBER_LIMIT) if turn < _HUBER else 1.0 / (1 + (s / _FALL) ** 2) ** 2
+        )
+    return np.nan_to_num(weight)
+
+
+def _stretch(model: Model) -> float:
+    """How much longer errors are than residuals, in the mean: unknowns take a part of the errors."""
+    rows = 2 * len(model.image) + len(model.ground) + 3 * (len(model.position) + len(model.attitude))
+    unknowns = model.columns.count + 3 * len(model.point_names)
+    return float(np.sqrt(rows / max(rows - unknowns, 0.05 * rows)))
+
+
+def _sizes(model: Model, e: _Floats) -> _Floats:
+    """Length of the whitened residual that each row is part of, in units of one coordinate's."""
+    size = np.abs(e)
+    k, c, p = len(model.image), len(model.ground), len(model.position)
+    pairs = e[: 2 * k].reshape(-1, 2)
+    size[: 2 * k] = np.repeat(np.sqrt((pairs**2).mean(axis=1)), 2)
+    threes = e[2 * k + c : 2 * k + c + 3 * p].reshape(-1, 3)
+    size[2 * k + c : 2 * k + c + 3 * p] = np.repeat(np.sqrt((threes**2).mean(axis=1)), 3)
+    return size
+
+
+def first_taken_out(model: Model, state: State, active: Active, critical: float) -> Active:
+    """Take out what does not fit the robust estimate at `state`."""
+    e = whitened(model, residuals_of(model, state)) * np.sqrt(softened(model, state))
+    size = np.abs(e)
+    kinds, of = kinds_of(model)
+    for k in range(len(kinds)):
+        mine = np.flatnonzero(of == k)
+        size[mine] /= robust_scale(_joined(e[mine], kinds[k]), kinds[k]) * _stretch(model)
+    size[~np.isfinite(size)] = np.inf
+    # Where residuals are small beside the errors this is too strict, so it takes twice as much here; data snooping does
+    # the rest.
+    bad = size[: len(of)] > 2.0 * critical
+    out = _without(model, active, bad)
+    if not len(model.position) and not np.array_equal(out.ground, active.ground):
+        out = replace(out, ground=_agreeing(model, state, active.ground, out.ground, 2.0 * critical))
+    return out
+
+
+def _agreeing(
+    model: Model, state: State, before: NDArray[np.bool_], after: NDArray[np.bool_], limit: float
+) -> NDArray[np.bool_]:
+    """Control with which most of it agrees: `after`, or what a similarity transformation of the block finds if more.
+
+    Nothing but control says where the block lies. Falling weights may tilt and shift it until it fits wrong control
+    as well, and then the right control is taken out.
+    """
+    ground = model.block.ground
+    full, point = [], []
+    for k in np.unique(model.ground):
+        rows = np.flatnonzero(model.ground == k)
+        if len(rows) == 3 and before[k].all():
+            full.append(int(k))
+            point.append(int(model.ground_point[rows[0]]))
+    if len(full) < _LEAST_CONTROL:
+        return after
+    k = slice(2 * len(model.image), 2 * len(model.image) + len(model.ground))
+    sigma = np.ones_like(ground.XYZ)
+    white = np.linalg.norm(model.ground_white, axis=1)
+    sigma[model.ground, model.ground_axis] = 1.0 / (white * np.sqrt(softened(model, state)[k]))
+    found, given = state.XYZ[point], ground.XYZ[full]
+    try:
+        moved, _ = robust_similarity(found, given, 0.5 * limit * float(np.median(sigma[full])))
+    except GeometryError:
+        return after
+    fits = np.abs(moved(found) - given) <= limit * sigma[full]
+    if _agreement(fits) <= _agreement(after[full]):
+        return after
+    ground_after = after.copy()
+    ground_after[full] = fits
+    return ground_after
+
+
+def _agreement(fits: NDArray[np.bool_]) -> tuple[int, int]:
+    """Points of which all coordinates (n, 3) fit, which tell more than coordinates do, and coordinates."""
+    return int(fits.all(axis=1).sum()), int(fits.sum())
+
+
+def _without(model: Model, active: Active, bad: NDArray[np.bool_]) -> Active:
+    """Take out the observations whose rows are bad."""
+    k, c, p = len(model.image), len(model.ground), len(model.position)
+    image, ground, position = active.image.copy(), active.ground.copy(), active.position.copy()
+    image[model.observation[bad[: 2 * k].reshape(-1, 2).any(axis=1)]] = False
+    rows = np.flatnonzero(bad[2 * k : 2 * k + c])
+    ground[model.ground[rows], model.ground_axis[rows]] = False
+    position[model.position_row[bad[2 * k + c : 2 * k + c + 3 * p].reshape(-1, 3).any(axis=1)]] = False
+    return Active(image, ground, position)
+
+
+def snooped(model: Model, state: State, judged: Judged, active: Active, critical: float) -> Active:
+    """Data snooping: the worst measurement of each point is taken out, and what fits again comes back.
+
+    Only the largest normalised residual of a point is judged at a time, since a gross error spreads over the
+    residuals of its point's other measurements.
+    """
+    _, of = kinds_of(model)
+    size = np.nan_to_num(np.abs(judged.normalised[: len(of)]))
+    size[judged.weight[: len(of)] == 0] = 0.0
+    k, c = len(model.image), len(model.ground)
+    bad = size > critical
+    point = np.concatenate([np.repeat(model.point, 2), model.ground_point])
+    worst = np.zeros(len(model.point_names))
+    np.maximum.at(worst, point, size[: 2 * k + c])
+    bad[: 2 * k + c] &= size[: 2 * k + c] >= worst[point]
+    out = _without(model, active, bad)
+    return _brought_back(model, state, judged, active, out, critical * _BACK)
+
+
+def _brought_back(model: Model, state: State, judged: Judged, before: Active, after: Active, limit: float) -> Active:
+    """Observations that were out before and fit now."""
+    block, scales = model.block, judged.scales
+    _, of = kinds_of(model)
+    residuals = residuals_of_all(model, state)
+    image = after.image.copy()
+    kind = kinds_of_measurements(model)
+    with np.errstate(invalid="ignore"):
+        size = np.abs(residuals / block.observations.sigma).max(axis=1) / scales[kind]
+    image |= ~before.image & (kind >= 0) & (np.nan_to_num(size, nan=np.inf) < limit)
+    ground, position = after.ground.copy(), after.position.copy()
+    rows = np.arange(2 * len(model.image), 2 * len(model.image) + len(model.ground))
+    fits = np.abs(judged.e[rows]) / scales[of[rows]] < limit
+    out = ~before.ground[model.ground, model.ground_axis]
+    ground[model.ground[fits & out], model.ground_axis[fits & out]] = True
+    if len(model.position):
+        rows = 2 * len(model.image) + len(model.ground) + np.arange(3 * len(model.position))
+        fits = (np.abs(judged.e[rows]) / scales[of[rows]]).reshape(-1, 3).max(axis=1) < limit
+        position[model.position_row[fits & ~before.position[model.position_row]]] = True
+    return Active(image, ground, position)

@@ -1,0 +1,299 @@
+"""Observation equations of the bundle adjustment: residuals and derivatives of every row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from photoplan.cameras.lenses.brown import Brown
+from photoplan.cameras.lenses.opencv import OpenCV
+from photoplan.orientation.bundle.model import Model
+from photoplan.orientation.bundle.state import CameraState, State, parameter, rotation_vector, skew
+
+_Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Computed minus observed, of every kind of observation."""
+
+    image: _Floats
+    """(k, 2), pixels; NaN: the point lies behind the camera."""
+    ground: _Floats
+    """(c,) whitened, in the order of the model's control rows."""
+    position: _Floats
+    """(p, 3), metres."""
+    attitude: _Floats
+    """(a, 3), radians."""
+    prior: _Floats
+    """(q,) whitened: parameters that are known beforehand."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Linearised equations: whitened residual + A_global · step + A_points · step of points."""
+
+    e: _Floats
+    """Whitened residuals, (rows,): image (x, y by turns), control, positions, attitudes, priors."""
+    A_global: sparse.csr_matrix
+    A_points: sparse.csr_matrix
+    point: NDArray[np.int64]
+    """Point of each row, −1: none."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Rays:
+    """Intermediate results of image points."""
+
+    p: _Floats
+    t: _Floats
+    real: _Floats
+    inner: _Floats
+    """∂ plane / ∂ t in units of the image plane, (k, 2, 2)."""
+    outer: _Floats
+    """∂ pixel / ∂ plane, (k, 2, 2)."""
+    px: _Floats
+
+
+def residuals_of(model: Model, state: State) -> Residuals:
+    """Residuals of all observations at a state."""
+    rays = _project(model, state, derivatives=False)
+    return _residuals(model, state, rays)
+
+
+def residuals_of_all(model: Model, state: State) -> _Floats:
+    """Computed minus measured position of every measurement of the block, (k, 2); NaN: image or point takes no part."""
+    seen = model.block.observations
+    images = {name: k for k, name in enumerate(model.image_names)}
+    points = {name: k for k, name in enumerate(model.point_names)}
+    image = np.array([images.get(n, -1) for n in seen.images], np.int64)[seen.image]
+    point = np.array([points.get(n, -1) for n in seen.points], np.int64)[seen.point]
+    there = np.flatnonzero((image >= 0) & (point >= 0))
+    every = replace(
+        model,
+        observation=there,
+        image=image[there],
+        point=point[there],
+        xy=seen.xy[there],
+        sigma=seen.sigma[there],
+    )
+    out = np.full((len(seen), 2), np.nan)
+    out[there] = residuals_of(every, state).image
+    return out
+
+
+def _residuals(model: Model, state: State, rays: _Rays) -> Residuals:
+    block = model.block
+    image = rays.px - model.xy
+    if block.bend is not None:
+        # The bend knows the images by their number in the block, of which some may not take part.
+        poses = [b.pose for b in block.images]
+        for row, pose in zip(model.image_rows, state.poses()):
+            poses[row] = pose
+        image = image + block.bend(model.image_rows[model.image], tuple(poses), state.XYZ[model.point])
+    off = state.XYZ[model.ground_point] - np.nan_to_num(block.ground.XYZ[model.ground])
+    ground = (model.ground_white * off).sum(axis=1)
+    position, attitude = np.empty((0, 3)), np.empty((0, 3))
+    if block.positions is not None:
+        antenna = state.centers[model.position] + state.rotations[model.position] @ state.lever
+        drift = state.shifts[model.strip_of] + state.rates[model.strip_of] * model.tau[:, None]
+        position = antenna + drift - block.positions.XYZ[model.position_row]
+    if block.attitudes is not None:
+        observed = block.attitudes.R_ground_camera[model.attitude_row]
+        turned = np.swapaxes(observed, 1, 2) @ state.rotations[model.attitude] @ state.boresight
+        attitude = rotation_vector(turned)
+    return Residuals(image, ground, position, attitude, _priors(model, state)[0])
+
+
+def linearise(model: Model, state: State, weight: _Floats) -> tuple[Rows, Residuals]:
+    """Equations at a state; `weight` (rows,) is the square root of each row's robust weight."""
+    rays = _project(model, state, derivatives=True)
+    found = _residuals(model, state, rays)
+    entries = _Entries()
+    on_points = _image_rows(model, state, rays, entries)
+    at = _direct_rows(model, state, found, entries)
+    prior, at_columns, prior_white = _priors(model, state)
+    entries.parts.append((prior_white, at + np.arange(len(prior)), at_columns))
+    k, c = 2 * len(model.image), len(model.ground)
+    point = np.full(at + len(prior), -1, np.int64)
+    point[:k] = np.repeat(model.point, 2)
+    point[k : k + c] = model.ground_point
+    e = whitened(model, found)
+    e = np.where(weight > 0, e, 0.0) * weight
+    A_global = _matrix(entries.parts, weight, (len(point), model.columns.count))
+    row = np.repeat(np.arange(k + c), 3)
+    column = (3 * point[: k + c, None] + np.arange(3)).ravel()
+    values = np.concatenate([on_points, model.ground_white]).ravel()
+    A_points = _matrix([(values, row, column)], weight, (len(point), 3 * len(model.point_names)))
+    return Rows(e, A_global, A_points, point), found
+
+
+class _Entries:
+    """Entries of a sparse matrix while it is filled: values, rows, columns."""
+
+    def __init__(self) -> None:
+        self.parts: list[tuple[_Floats, NDArray[np.int64], NDArray[np.int64]]] = []
+
+    def put(self, rows: NDArray[np.int64], first: NDArray[np.int64], values: _Floats) -> None:
+        """Blocks `values` (n, r, u) on rows (n, r); the u columns of each block begin at `first` (n,)."""
+        column = first[:, None, None] + np.arange(values.shape[2])
+        row, column = np.broadcast_arrays(rows[:, :, None], column)
+        self.parts.append((values.ravel(), row.ravel(), column.ravel()))
+
+
+def _image_rows(model: Model, state: State, rays: _Rays, entries: _Entries) -> _Floats:
+    """Rows of image points: entries of orientations and cameras; returned: the coefficients of the points, (2k, 3)."""
+    k = len(model.image)
+    white = 1.0 / model.sigma[:, :, None]
+    z = rays.p[:, 2]
+    by_p = np.zeros((k, 2, 3))
+    by_p[:, 0, 0] = by_p[:, 1, 1] = -1.0 / z
+    by_p[:, :, 2] = -rays.t / z[:, None]
+    by_p = rays.outer @ rays.inner @ by_p
+    by_X = by_p @ np.swapaxes(state.rotations[model.image], 1, 2)
+    rows = np.arange(2 * k).reshape(k, 2)
+    entries.put(rows, 6 * model.image, np.concatenate([-by_X, by_p @ skew(rays.p)], axis=2) * white)
+    for index, (name, free) in enumerate(zip(model.camera_names, model.free)):
+        mine = np.flatnonzero(model.camera_of[model.image] == index)
+        if free and len(mine):
+            J = _by_parameters(state.cameras[index], free, rays, mine) * white[mine]
+            entries.put(rows[mine], np.full(len(mine), model.columns.cameras[name]), J)
+    return (by_X * white).reshape(-1, 3)
+
+
+def _direct_rows(model: Model, state: State, found: Residuals, entries: _Entries) -> int:
+    """Rows of observed positions and attitudes; returned: the number of the row after them."""
+    block, columns = model.block, model.columns
+    at, n = 2 * len(model.image) + len(model.ground), len(model.position)
+    if block.positions is not None and n:
+        rows = at + np.arange(3 * n).reshape(n, 3)
+        white = 1.0 / block.positions.sigma[model.position_row][:, :, None]
+        R = state.rotations[model.position]
+        eye = np.broadcast_to(np.eye(3), R.shape)
+        entries.put(rows, 6 * model.position, np.concatenate([eye, -R @ skew(state.lever)], axis=2) * white)
+        if columns.lever >= 0:
+            entries.put(rows, np.full(n, columns.lever), R * white)
+        if columns.strips:
+            first = np.array([columns.strips[name] for name in model.strip_names], np.int64)[model.strip_of]
+            drift = eye if block.drift == "shift" else np.concatenate([eye, eye * model.tau[:, None, None]], axis=2)
+            entries.put(rows, first, drift * white)
+    at, n = at + 3 * n, len(model.attitude)
+    if block.attitudes is not None and n:
+        rows = at + np.arange(3 * n).reshape(n, 3)
+        white = 1.0 / block.attitudes.sigma[model.attitude_row][:, :, None]
+        # log(exp(e) exp(δ)) = e + (1 + [e]× / 2) δ + …, and a rotation before the boresight is turned by it.
+        by_turn = np.eye(3) + 0.5 * skew(found.attitude)
+        entries.put(rows, 6 * model.attitude + 3, by_turn @ state.boresight.T * white)
+        if columns.boresight >= 0:
+            entries.put(rows, np.full(n, columns.boresight), by_turn * white)
+    return at + 3 * n
+
+
+def whitened(model: Model, found: Residuals) -> _Floats:
+    """Residuals of all rows divided by their standard deviations, in the order of `Rows`."""
+    parts = [(found.image / model.sigma).ravel(), found.ground]
+    positions, attitudes = model.block.positions, model.block.attitudes
+    if positions is not None:
+        parts.append((found.position / positions.sigma[model.position_row]).ravel())
+    if attitudes is not None:
+        parts.append((found.attitude / attitudes.sigma[model.attitude_row]).ravel())
+    return np.concatenate([*parts, found.prior])
+
+
+def _matrix(
+    parts: list[tuple[_Floats, NDArray[np.int64], NDArray[np.int64]]], weight: _Floats, shape: tuple[int, int]
+) -> sparse.csr_matrix:
+    value, row, column = (np.concatenate(p) for p in zip(*parts))
+    # Points behind a camera have no derivatives, and no weight.
+    weighted = np.where(weight[row] > 0, value, 0.0) * weight[row]
+    return sparse.csr_matrix((weighted, (row, column)), shape)
+
+
+def _project(model: Model, state: State, derivatives: bool) -> _Rays:
+    """Image points of all measurements, with what their derivatives need."""
+    p = state.XYZ[model.point] - state.centers[model.image]
+    p = (p[:, None, :] @ state.rotations[model.image])[:, 0]
+    depth = np.where(p[:, 2] < 0, -p[:, 2], np.nan)
+    t = p[:, :2] / depth[:, None]
+    plane, real = np.empty_like(t), np.empty_like(t)
+    inner = np.empty((len(t), 2, 2)) if derivatives else np.empty((0, 2, 2))
+    of = model.camera_of[model.image]
+    for index, camera in enumerate(state.cameras):
+        mine = of == index
+        real[mine] = camera.lens.distort(t[mine])
+        plane[mine] = camera.c * real[mine] + (camera.x0, camera.y0)
+        if derivatives:
+            inner[mine] = camera.c * camera.lens.jacobian(t[mine])
+    b = model.plane[model.image]
+    x, y = plane[:, 0], plane[:, 1]
+    px = np.stack(
+        [
+            b[:, 0] * x + (b[:, 1] + b[:, 2] * x) * y + b[:, 3],
+            b[:, 4] * x + (b[:, 5] + b[:, 6] * x) * y + b[:, 7],
+        ],
+        axis=-1,
+    )
+    outer = np.empty((len(t), 2, 2))
+    outer[:, 0, 0], outer[:, 0, 1] = b[:, 0] + b[:, 2] * y, b[:, 1] + b[:, 2] * x
+    outer[:, 1, 0], outer[:, 1, 1] = b[:, 4] + b[:, 6] * y, b[:, 5] + b[:, 6] * x
+    return _Rays(p, t, real, inner, outer, px)
+
+
+def _by_parameters(camera: CameraState, free: tuple[str, ...], rays: _Rays, mine: NDArray[np.int64]) -> _Floats:
+    """∂ pixel / ∂ free parameters of a camera, (n, 2, k)."""
+    t = rays.t[mine]
+    J = np.zeros((len(mine), 2, len(free)))
+    for column, name in enumerate(free):
+        if name == "c":
+            J[:, :, column] = rays.real[mine]
+        elif name in ("x0", "y0"):
+            J[:, int(name == "y0"), column] = 1.0
+        else:
+            J[:, :, column] = camera.c * _by_coefficient(camera, name, t, rays.real[mine])
+    return rays.outer[mine] @ J
+
+
+def _by_coefficient(camera: CameraState, name: str, t: _Floats, real: _Floats) -> _Floats:
+    """∂ real tangent coordinates / ∂ a coefficient of the lens, (n, 2)."""
+    lens = camera.lens
+    x, y = t[:, 0], t[:, 1]
+    r2 = x * x + y * y
+    if name in ("b1", "b2"):
+        assert isinstance(lens, Brown)
+        # real x = xd (1 + b1) + yd b2, real y = yd.
+        yd = real[:, 1]
+        xd = (real[:, 0] - lens.b2 * yd) / (1.0 + lens.b1)
+        return np.stack([xd if name == "b1" else yd, np.zeros(len(t))], axis=-1)
+    if name in ("k1", "k2", "k3"):
+        d = t * (r2 ** int(name[1]))[:, None]
+        if isinstance(lens, OpenCV):
+            d /= (1.0 + r2 * (lens.k4 + r2 * (lens.k5 + r2 * lens.k6)))[:, None]
+    elif name == "p1":
+        d = np.stack([r2 + 2.0 * x * x, 2.0 * x * y], axis=-1)
+    else:
+        d = np.stack([2.0 * x * y, r2 + 2.0 * y * y], axis=-1)
+    if isinstance(lens, Brown):
+        d[:, 0] = d[:, 0] * (1.0 + lens.b1) + d[:, 1] * lens.b2
+    return d
+
+
+def _priors(model: Model, state: State) -> tuple[_Floats, NDArray[np.int64], _Floats]:
+    """Rows of what is known beforehand: whitened residual, column, 1 / standard deviation."""
+    rows: list[tuple[float, int, float]] = []
+    block, columns = model.block, model.columns
+    for name, now in zip(model.camera_names, state.cameras):
+        given = block.cameras[name]
+        before = CameraState(given.c, *given.principal_point, given.lens)
+        for k, what in enumerate(given.free):
+            sigma = given.prior_sigma.get(what)
+            if sigma is not None:
+                off = parameter(now, what) - parameter(before, what)
+                rows.append((off / sigma, columns.cameras[name] + k, 1.0 / sigma))
+    if columns.lever >= 0:
+        off_lever = (state.lever - block.lever_arm) / block.lever_arm_sigma
+        rows += [(float(off_lever[k]), columns.lever + k, 1.0 / block.lever_arm_sigma) for k in range(3)]
+    table = np.array(rows).reshape(-1, 3)
+    return table[:, 0], table[:, 1].astype(np.int64), table[:, 2]

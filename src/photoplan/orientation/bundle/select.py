@@ -1,0 +1,183 @@
+"""What can take part in a bundle adjustment, and where its points begin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.orientation.bundle.active import Active
+from photoplan.orientation.bundle.block import Block
+
+_Floats = NDArray[np.float64]
+_Index = NDArray[np.int64]
+
+#: Smallest eigenvalue of the intersection's normal matrix, as part of a ray's weight, below which rays count as
+#: parallel: an angle of 0.006° between two of them.
+_PARALLEL = 5e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Images, measurements and points that can take part."""
+
+    images: list[int]
+    """Indices into `block.images`."""
+    measured: _Index
+    """Indices into `block.observations`."""
+    points: list[str]
+    left_out: tuple[tuple[str, str], ...]
+    """Name and reason of what cannot."""
+
+
+def select(block: Block, active: Active, undetermined: frozenset[str] = frozenset()) -> Selection:
+    """Choose images and points with enough measurements.
+
+    Parameters
+    ----------
+    block : Block
+    active : Active
+        Observations that are not taken out as gross errors.
+    undetermined : frozenset of str
+        Points that are known to have parallel rays only.
+    """
+    seen = block.observations
+    index = {b.name: k for k, b in enumerate(block.images)}
+    image_of = np.array([index.get(n, -1) for n in seen.images], np.int64)[seen.image]
+    known = _known(block, active.ground)
+    keep = active.image & (image_of >= 0)
+    keep &= ~np.array([n in undetermined for n in seen.points], bool)[seen.point]
+    direct = _direct(block, active.position)
+    images_out: dict[str, str] = {}
+    while True:
+        rays = np.bincount(seen.point[keep], minlength=len(seen.points))
+        # One ray and a height determine a point too, but check nothing.
+        enough = (rays >= 2) | ((rays == 1) & (known == 3))
+        keep_points = keep & enough[seen.point]
+        per_image = np.bincount(image_of[keep_points], minlength=len(block.images))
+        poor = [k for k in range(len(block.images)) if per_image[k] < 3 and k not in direct]
+        poor = [k for k in poor if block.images[k].name not in images_out]
+        if not poor:
+            break
+        for k in poor:
+            images_out[block.images[k].name] = f"image with {per_image[k]} points that can be used; 3 are needed"
+        keep = keep_points & ~np.isin(image_of, poor)
+    used = np.flatnonzero(enough)
+    left = list(images_out.items())
+    left += [(n, "point whose rays are parallel") for n in seen.points if n in undetermined]
+    few = np.flatnonzero(~enough)
+    left += [(seen.points[k], _reason(int(rays[k]))) for k in few if seen.points[k] not in undetermined]
+    images = [k for k in range(len(block.images)) if block.images[k].name not in images_out]
+    return Selection(images, np.flatnonzero(keep_points), [seen.points[k] for k in used], tuple(left))
+
+
+def _reason(rays: int) -> str:
+    return "point seen in one image only" if rays == 1 else "point without measurements that can be used"
+
+
+def _known(block: Block, active: NDArray[np.bool_]) -> _Index:
+    """Control coordinates that take part, of each point of the observations."""
+    coordinates = {
+        name: int((np.isfinite(block.ground.XYZ[k]) & active[k]).sum())
+        for k, name in enumerate(block.ground.names)
+        if not block.ground.check[k]
+    }
+    return np.array([coordinates.get(n, 0) for n in block.observations.points], np.int64)
+
+
+def _direct(block: Block, active: NDArray[np.bool_]) -> set[int]:
+    """Images whose orientation is observed directly."""
+    if block.positions is None or block.attitudes is None:
+        return set()
+    both = {n for n, used in zip(block.positions.images, active) if used} & set(block.attitudes.images)
+    return {k for k, b in enumerate(block.images) if b.name in both}
+
+
+def start_points(block: Block, selection: Selection) -> tuple[_Floats, frozenset[str]]:
+    """Start values of the selected points (m, 3), and the points whose rays are parallel."""
+    seen = block.observations
+    chosen = [block.images[k] for k in selection.images]
+    image_index = {b.name: k for k, b in enumerate(chosen)}
+    point_index = {n: k for k, n in enumerate(selection.points)}
+    image = np.array([image_index.get(n, -1) for n in seen.images], np.int64)[seen.image[selection.measured]]
+    point = np.array([point_index.get(n, -1) for n in seen.points], np.int64)[seen.point[selection.measured]]
+    directions = np.empty((len(image), 3))
+    order = np.argsort(image, kind="stable")
+    ends = np.searchsorted(image[order], np.arange(len(chosen) + 1))
+    for k, b in enumerate(chosen):
+        mine = order[ends[k] : ends[k + 1]]
+        camera = block.cameras[b.camera]
+        plane = b.plane_to_pixel.inverse(seen.xy[selection.measured][mine])
+        t = camera.lens.undistort((plane - camera.principal_point) / camera.c)
+        d = np.column_stack([t, -np.ones(len(t))]) @ b.pose.R_ground_camera.T
+        directions[mine] = d / np.linalg.norm(d, axis=1, keepdims=True)
+    centers = np.array([b.pose.center for b in chosen])[image]
+    XYZ, determined = intersect(centers, directions, point, len(point_index))
+    for k, name in enumerate(block.ground.names):
+        if name in point_index and not block.ground.check[k]:
+            given = block.ground.XYZ[k]
+            at = point_index[name]
+            if np.isfinite(given).all():
+                XYZ[at], determined[at] = given, True
+            elif not determined[at]:
+                XYZ[at] = _on_ray(centers[point == at][0], directions[point == at][0], given)
+                determined[at] = np.isfinite(XYZ[at]).all()
+    for name, start in block.start_points.items():
+        if name in point_index:
+            XYZ[point_index[name]] = start
+            determined[point_index[name]] = True
+    return XYZ, frozenset(selection.points[k] for k in np.flatnonzero(~determined))
+
+
+def _on_ray(center: _Floats, direction: _Floats, given: _Floats) -> _Floats:
+    """Point of a ray at a known height; NaN without one."""
+    if not (np.isfinite(given[2]) and abs(direction[2]) > 1e-6):
+        return np.full(3, np.nan)
+    return np.asarray(center + direction * ((given[2] - center[2]) / direction[2]))
+
+
+def intersect(
+    centers: _Floats, directions: _Floats, point: _Index, count: int, rounds: int = 6
+) -> tuple[_Floats, NDArray[np.bool_]]:
+    """Points nearest to their rays, in the robust mean, and whether the rays determine them.
+
+    Parameters
+    ----------
+    centers, directions : ndarray, shape (k, 3)
+        Origins and unit directions of rays.
+    point : ndarray, shape (k,)
+        Point of each ray.
+    count : int
+        Number of points.
+    """
+    weight = np.ones(len(point))
+    good_rays = np.asarray(np.isfinite(directions).all(axis=1))
+    directions = np.where(good_rays[:, None], directions, 0.0)
+    projector = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    XYZ = np.full((count, 3), np.nan)
+    determined = np.zeros(count, bool)
+    for turn in range(rounds):
+        w = weight * good_rays
+        N = np.empty((count, 3, 3))
+        for i in range(3):
+            for j in range(3):
+                N[:, i, j] = np.bincount(point, w * projector[:, i, j], count)
+        from_center = (projector @ centers[:, :, None])[:, :, 0]
+        b = np.stack([np.bincount(point, w * from_center[:, i], count) for i in range(3)], axis=-1)
+        values = np.linalg.eigvalsh(N)
+        if turn == 0:
+            determined = np.asarray(values[:, 0] > _PARALLEL * np.maximum(values[:, 2], 1e-300))
+        solvable = values[:, 0] > 1e-14 * np.maximum(values[:, 2], 1e-300)
+        N[~solvable] = np.eye(3)
+        XYZ = np.where(solvable[:, None], np.linalg.solve(N, b[:, :, None])[:, :, 0], np.nan)
+        to = XYZ[point] - centers
+        distance = np.linalg.norm(to, axis=1)
+        across = np.linalg.norm((projector @ to[:, :, None])[:, :, 0], axis=1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            angle = np.where(distance > 0, across / distance, 0.0)
+        scale = max(float(np.nanmedian(angle[good_rays])) if good_rays.any() else 0.0, 1e-12)
+        # Far rays count less, as their error across is larger; gross errors hardly count.
+        weight = np.nan_to_num(1.0 / np.maximum(distance, 1e-9) ** 2 / (1.0 + (angle / (3.0 * scale)) ** 2) ** 2)
+    good: NDArray[np.bool_] = determined & np.isfinite(XYZ).all(axis=1)
+    return XYZ, good

@@ -1,0 +1,1 @@
+"""Fiducial marks and targets, found and measured in scans."""

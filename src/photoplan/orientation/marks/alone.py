@@ -1,0 +1,289 @@
+"""One mark alone in a window of a scan: found by correlation, placed by matching and by its edges, accepted or refused.
+
+`photoplan.orientation.marks.fiducials` finds all marks of a scan together, which settles scale, rotation and which is
+which. Here a single mark is sought whose scale and rotation are known to a few per cent and degrees only, as in a crop.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
+from photoplan.errors import InputError
+from photoplan.orientation.marks.edges import EdgeFit, fit_edges
+from photoplan.orientation.marks.locate import Location, correlation_surface, locate_mark
+from photoplan.orientation.marks.template import Template, render
+
+LEAST_ALONE = 0.7
+"""Correlation below which a place is no mark: no other mark confirms it, so that more is asked than of one of many."""
+
+_COARSE = 24
+"""Pixels that the smaller side of a mark has in the coarse search, about."""
+_SHARE = 0.6
+"""Share of a template that must lie on the window."""
+_AGREE = 1.5
+"""Pixels by which the place by edges may differ from that by correlation, beside three standard deviations."""
+_SECOND = 0.93
+"""Correlation of another place, as a share of the best, from which on it is not clear which is the mark."""
+_USED = 0.6
+"""Least share of the edge points that must be seen where they are expected."""
+_AROUND = 5
+"""Pixels about the place by edges in which correlation is to confirm it."""
+_BLUNT = 0.1
+"""Coarse correlations so near to the best do not decide between rotations."""
+_RMS = 1.5
+"""Largest root mean square distance of the edge points from the description, pixels."""
+_QUARTERS = 0.06
+"""How much better a quarter of an example may correlate elsewhere; those of marks of another shape do by more."""
+_NEAR = 8
+"""Pixels about a place in which the quarters are sought."""
+_SURE = 1.0
+"""Largest standard deviation of an accepted place, pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class AloneMark:
+    """Where a mark is, and whether to believe it."""
+
+    x: float
+    y: float
+    """Column and row of the reference point; NaN: nothing was found."""
+    sigma_x: float
+    sigma_y: float
+    """Standard deviations, pixels."""
+    correlation: float
+    """Highest correlation coefficient."""
+    second: float
+    """Highest correlation coefficient at another place, as a share of it."""
+    method: str
+    """`edges`, `matching`, `paraboloid` or `pixel`."""
+    refused: str
+    """Why the place is not to be used; empty: it is accepted."""
+    edges: EdgeFit | None
+    """Place by edges, of patterns."""
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the place is to be used."""
+        return not self.refused
+
+
+def find_mark(
+    image: NDArray[np.floating],
+    pattern: MarkPattern | MarkExample,
+    mm_to_pixel: NDArray[np.float64],
+    *,
+    negative: bool = False,
+    blur_px: float = 0.7,
+    rotations: tuple[float, ...] = (-1.5, 0.0, 1.5),
+    least_correlation: float = LEAST_ALONE,
+) -> AloneMark:
+    """A mark in a window.
+
+    The window is searched with coarse pixels and a few rotations, the best place with fine ones. Where image content
+    lies beside the mark (its description leaves parts of the ground out), its edges place it, and correlation confirms
+    that; else least-squares matching places it.
+
+    Parameters
+    ----------
+    image : ndarray, shape (h, w)
+        Grey values; NaN: not compared. The reference point may lie outside.
+    pattern : MarkPattern or MarkExample
+        What the mark looks like.
+    mm_to_pixel : (2, 2)
+        From millimetres (x right, y up) to columns and rows; scale to 3 %, rotation to 2°.
+    negative : bool
+        Whether dark and bright are exchanged.
+    blur_px : float
+        Standard deviation of the scan's blur, pixels.
+    rotations : tuple of float
+        Rotations beside that of the matrix that are tried, degrees.
+    least_correlation : float
+        Correlation below which the place is refused.
+
+    Raises
+    ------
+    InputError
+        The mark is larger than the window even in part.
+    """
+    grey = np.asarray(image, np.float32)
+    matrix = np.array(mm_to_pixel, np.float64)
+    turned = [_turn(angle) @ matrix for angle in rotations]
+    tries = [_coarse(grey, render(pattern, each, negative=negative, blur_px=blur_px)) for each in turned]
+    top = max((t[2] for t in tries if math.isfinite(t[2])), default=math.nan)
+    if math.isnan(top):
+        return _nothing("too little of the mark lies in the window")
+    likely = [(turn, t) for turn, t in zip(turned, tries, strict=True) if t[2] > top - _BLUNT]
+    found = [_by_edges(grey, pattern, turn, t, negative, blur_px) for turn, t in likely]
+    _, at, edges, turn = max(found, key=_merit)
+    if edges is not None:
+        # Correlation once more, now with the rotation and scale that the edges have.
+        turn, at = edges.scale * _turn(math.degrees(edges.rotation)) @ turn, (edges.x, edges.y)
+    part, origin = _around(grey, render(pattern, turn, blur_px=0.0), at, _AROUND)
+    fine = locate_mark(part, pattern, turn, negative=negative, blur_px=blur_px)
+    second = max(t[3] / t[2] for _, t in likely if t[2] == top)
+    place = (fine.x + origin[0], fine.y + origin[1])
+    judged = _judged(pattern, fine, place, edges, second, least_correlation)
+    if isinstance(pattern, MarkExample) and judged.accepted:
+        apart = min(_disagreement(grey, render(pattern, each, negative=negative), place) for each in turned)
+        if apart > _QUARTERS:
+            return replace(judged, refused=f"its quarters lie elsewhere: they correlate better there by {apart:.2f}")
+    return judged
+
+
+def _nothing(why: str) -> AloneMark:
+    nan = math.nan
+    return AloneMark(nan, nan, nan, nan, nan, nan, "pixel", why, None)
+
+
+_Found = tuple[float, tuple[float, float], EdgeFit | None, NDArray[np.float64]]
+
+
+def _by_edges(
+    grey: NDArray[np.float32],
+    pattern: MarkPattern | MarkExample,
+    matrix: NDArray[np.float64],
+    coarse: tuple[float, float, float, float, int],
+    negative: bool,
+    blur_px: float,
+) -> _Found:
+    """Correlation with finer pixels near a coarse place, where it is highest, the place by edges, and the matrix."""
+    x, y, _, _, factor = coarse
+    template = render(pattern, matrix, negative=negative, blur_px=blur_px)
+    part, origin = _around(grey, template, (x, y), 2 * factor + 2)
+    finer = max(1, factor // 3)
+    small, (ox, oy) = _shrunk_template(template, finer)
+    surface, _ = correlation_surface(_shrunk(part, finer), small, _SHARE)
+    if not np.isfinite(surface).any():
+        return -1.0, (x, y), None, matrix
+    row, column = np.unravel_index(int(np.nanargmax(surface)), surface.shape)
+    half = (finer - 1) / 2
+    at = ((column + ox) * finer + half + origin[0], (row + oy) * finer + half + origin[1])
+    edges = None
+    if isinstance(pattern, MarkPattern):
+        edges = fit_edges(grey, pattern, matrix, at, negative=negative, search_px=8.0)
+    return float(surface[row, column]), at, edges, matrix
+
+
+def _merit(found: _Found) -> float:
+    """Correlation, less where the edges are not seen."""
+    r, _, edges, _ = found
+    return r - 1.0 if edges is None else r + edges.used - min(edges.rms, 3.0) / 3.0
+
+
+def _judged(
+    pattern: MarkPattern | MarkExample,
+    fine: Location,
+    at: tuple[float, float],
+    edges: EdgeFit | None,
+    second: float,
+    least_correlation: float,
+) -> AloneMark:
+    """Which place stands, and whether it is to be used."""
+    by_edges = isinstance(pattern, MarkPattern) and math.isnan(pattern.background)
+    x, y, sx, sy, method = *at, fine.sigma_x, fine.sigma_y, fine.method
+    if by_edges and edges is not None:
+        x, y, sx, sy, method = edges.x, edges.y, edges.sigma_x, edges.sigma_y, "edges"
+    refused = ""
+    if not fine.correlation >= least_correlation:
+        refused = f"correlation {fine.correlation:.2f}; {least_correlation} is needed"
+    elif second > _SECOND:
+        refused = f"another place correlates nearly as well ({second:.0%})"
+    elif by_edges and edges is None:
+        refused = "its edges are not seen"
+    elif by_edges and edges is not None and edges.used < _USED:
+        refused = f"{edges.used:.0%} of its edges are seen; {_USED:.0%} are needed"
+    elif by_edges and edges is not None and edges.rms > _RMS:
+        refused = f"points lie {edges.rms:.1f} px (rms) beside the edges of its description; {_RMS} px are allowed"
+    elif by_edges and math.hypot(x - at[0], y - at[1]) > _AGREE + 3 * math.hypot(sx, sy):
+        refused = f"edges and correlation differ by {math.hypot(x - at[0], y - at[1]):.1f} px"
+    elif not max(sx, sy) <= _SURE:
+        refused = f"standard deviation of {max(sx, sy):.1f} px; {_SURE} px are allowed"
+    return AloneMark(float(x), float(y), float(sx), float(sy), fine.correlation, second, method, refused, edges)
+
+
+def _disagreement(grey: NDArray[np.float32], template: Template, at: tuple[float, float]) -> float:
+    """How much better the worst quarter of a template correlates somewhere near than at a place; 1: not seen there."""
+    part, origin = _around(grey, template, at, _NEAR)
+    column, row = (round(at[k] - origin[k] - template.reference[k]) for k in (0, 1))
+    i, j = np.indices(template.values.shape)
+    lower, right = i >= template.values.shape[0] // 2, j >= template.values.shape[1] // 2
+    worst = 0.0
+    for quarter in (lower & right, lower & ~right, ~lower & right, ~lower & ~right):
+        piece = Template(template.values, template.weights * quarter, template.reference)
+        surface, _ = correlation_surface(part, piece, _SHARE)
+        here = surface[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+        if np.isfinite(surface).any():  # a quarter without contrast, or outside, says nothing
+            worst = max(worst, float(np.nanmax(surface) - np.nanmax(here)) if np.isfinite(here).any() else 1.0)
+    return worst
+
+
+def _turn(degrees: float) -> NDArray[np.float64]:
+    """Rotation anticlockwise as seen in the scan, in columns and rows."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return np.array([[c, s], [-s, c]])
+
+
+def _coarse(grey: NDArray[np.float32], template: Template) -> tuple[float, float, float, float, int]:
+    """Place, its correlation, that of the best other place, and the factor of the pixels used; NaN: none."""
+    factor = max(1, round(min(template.values.shape) / _COARSE))
+    small, at = _shrunk_template(template, factor)
+    image = _shrunk(grey, factor)
+    rows, columns = small.values.shape
+    padded = np.pad(image, ((rows // 2, rows // 2), (columns // 2, columns // 2)), constant_values=np.nan)
+    if padded.shape[0] < rows or padded.shape[1] < columns:
+        return math.nan, math.nan, math.nan, math.nan, factor
+    surface, _ = correlation_surface(padded, small, _SHARE)
+    if not np.isfinite(surface).any():
+        return math.nan, math.nan, math.nan, math.nan, factor
+    row, column = np.unravel_index(int(np.nanargmax(surface)), surface.shape)
+    i, j = np.indices(surface.shape)
+    far = np.maximum(np.abs(i - row) / rows, np.abs(j - column) / columns) > 0.25
+    other = surface[far & np.isfinite(surface)]
+    second = float(other.max()) if other.size else -1.0
+    half = (factor - 1) / 2
+    x = (column - columns // 2 + at[0]) * factor + half
+    y = (row - rows // 2 + at[1]) * factor + half
+    return x, y, float(surface[row, column]), second, factor
+
+
+def _shrunk(grey: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
+    """Means of blocks; NaN where less than half of a block is valid."""
+    rows, columns = (n // factor * factor for n in grey.shape)
+    blocks = grey[:rows, :columns].reshape(rows // factor, factor, columns // factor, factor)
+    known = np.isfinite(blocks)
+    count = known.sum(axis=(1, 3))
+    total = np.where(known, blocks, 0.0).sum(axis=(1, 3))
+    return np.where(2 * count >= factor * factor, total / np.maximum(count, 1), np.nan).astype(np.float32)
+
+
+def _shrunk_template(template: Template, factor: int) -> tuple[Template, tuple[float, float]]:
+    """Weighted means of blocks, and where the reference point is in them."""
+    more = [-n % factor for n in template.values.shape]
+    values, weights = (np.pad(a, ((0, more[0]), (0, more[1]))) for a in (template.values, template.weights))
+    shape = (values.shape[0] // factor, factor, values.shape[1] // factor, factor)
+    total = weights.reshape(shape).sum(axis=(1, 3))
+    mean = (values * weights).reshape(shape).sum(axis=(1, 3)) / np.maximum(total, 1e-9)
+    half = (factor - 1) / 2
+    at = ((template.reference[0] - half) / factor, (template.reference[1] - half) / factor)
+    weight = np.where(total >= 0.25 * factor * factor, total / factor**2, 0.0)
+    return Template(mean.astype(np.float32), weight.astype(np.float32), at), at
+
+
+def _around(
+    grey: NDArray[np.float32], template: Template, at: tuple[float, float], margin: int
+) -> tuple[NDArray[np.float32], tuple[int, int]]:
+    """The part of a window that a template may cover, NaN outside the window; column and row of its first pixel."""
+    rows, columns = template.values.shape
+    col, row = (math.floor(at[k] - template.reference[k]) - margin for k in (0, 1))
+    part = np.full((rows + 2 * margin, columns + 2 * margin), np.nan, np.float32)
+    r0, c0 = max(row, 0), max(col, 0)
+    r1, c1 = min(row + part.shape[0], grey.shape[0]), min(col + part.shape[1], grey.shape[1])
+    if r1 <= r0 or c1 <= c0:
+        raise InputError("the mark lies outside the window")
+    part[r0 - row : r1 - row, c0 - col : c1 - col] = grey[r0:r1, c0:c1]
+    return part, (col, row)

@@ -1,0 +1,376 @@
+"""Fiducial marks of a scan: found, measured, and joined to the interior orientation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.fiducials_fit import FiducialFit, fit_affine
+from photoplan.errors import InputError
+from photoplan.orientation.marks.layout import TURNS, MarkLayout, Placement, Turn
+from photoplan.orientation.marks.locate import LEAST_CORRELATION, Location
+from photoplan.orientation.marks.measure import Measured, measure_marks
+from photoplan.orientation.marks.search import Scan, Search, pixel_sizes, search_placements
+
+TIE = 0.03
+"""Correlation per mark below which two ways of turning the scan fit equally well."""
+CLEARLY = 3.0
+"""How many times larger the residuals of a wrong turn must be."""
+FILM_MM = 0.005
+"""What film deforms beside an affine transformation, at least; millimetres."""
+DEFORMED_MM = 0.1
+"""Residuals in millimetres from which a mark may be a false one: office scanners leave 0.07."""
+RIVALS = 4
+"""Look-alikes that are named."""
+STATED_TOLERANCE = 0.03
+"""Part by which the resolution that a file states may be wrong."""
+
+
+@dataclass(frozen=True)
+class FiducialSearch:
+    """What is known of a scan; None: to be found out."""
+
+    pixel_mm: float | None = None
+    """Side of a pixel on the film, millimetres."""
+    rotation: int | None = None
+    """Degrees counter-clockwise by which the upright picture was turned: 0, 90, 180, 270."""
+    mirrored: bool | None = None
+    """Whether left and right are exchanged."""
+    usual_mirrored: bool = False
+    """What is taken where the marks fit both."""
+    negative: bool | None = None
+    """Whether dark and bright are exchanged against the patterns."""
+    least_correlation: float = LEAST_CORRELATION
+    """A place that correlates less is no mark."""
+
+    def __post_init__(self) -> None:
+        if self.rotation not in (None, 0, 90, 180, 270):
+            raise InputError(f"rotation of {self.rotation}°; allowed are 0, 90, 180 and 270")
+        if self.pixel_mm is not None and not (math.isfinite(self.pixel_mm) and self.pixel_mm > 0):
+            raise InputError(f"pixels of {self.pixel_mm} mm; a positive number is needed")
+        if not 0 < self.least_correlation < 1:
+            raise InputError(f"least correlation {self.least_correlation}; a number between 0 and 1 is needed")
+
+
+@dataclass(frozen=True, eq=False)
+class LocatedMark:
+    """A mark where it was found."""
+
+    name: str
+    x: float
+    y: float
+    """Column and row of its reference point, (0, 0) the centre of the upper-left pixel."""
+    sigma_x: float
+    sigma_y: float
+    """Standard deviations, pixels."""
+    correlation: float
+    """With the template, at the nearest whole pixel."""
+    method: str
+    """`matching` (least squares), `paraboloid`, or `edges` where image content lies beside the mark."""
+    paraboloid: tuple[float, float] | None
+    """Column and row by the paraboloid (Behr 1989, eq. 4.4)."""
+    matching: tuple[float, float] | None
+    """Column and row by least-squares matching; None: it did not converge."""
+
+
+@dataclass(frozen=True)
+class MissingMark:
+    """A mark that was not found."""
+
+    name: str
+    correlation: float
+    """The best near where the other marks say; NaN: that lies outside the scan."""
+    x: float
+    y: float
+    """Where the other marks say, column and row."""
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class FiducialResult:
+    """Marks of a scan and its interior orientation."""
+
+    marks: tuple[LocatedMark, ...]
+    missing: tuple[MissingMark, ...]
+    fit: FiducialFit
+    """Affine transformation from millimetres to pixels."""
+    residuals_um: NDArray[np.float64]
+    """Transformed minus measured position of each mark in `fit`, in the image plane (x right, y up), micrometres."""
+    turn: Turn
+    """How the upright picture was turned before it was scanned."""
+    negative: bool
+    blur_px: float
+    """Standard deviation of the scan's blur that fits best, pixels."""
+    placement: Placement
+    """The similarity that led to the marks."""
+    notes: tuple[str, ...]
+    """What a user should know, one sentence each."""
+
+    @property
+    def pixel_mm(self) -> float:
+        """Side of a pixel on the film, millimetres."""
+        t = self.fit.transformation.derivative(np.zeros(2))
+        return 1.0 / math.sqrt(abs(float(np.linalg.det(t))))
+
+    @property
+    def sigma0_um(self) -> float:
+        """Standard deviation of a coordinate from the residuals, micrometres; NaN with three marks."""
+        return self.fit.sigma0 * self.pixel_mm * 1000.0
+
+
+def find_fiducials(scan: Scan, layout: MarkLayout, known: FiducialSearch = FiducialSearch()) -> FiducialResult:
+    """All marks of a scan, without any approximate values.
+
+    Coarse pixels are searched for what correlates with the marks as they look in each possible turn and tone; the
+    similarity that joins the most and best candidates says where each mark must lie; there it is measured twice, the
+    second time with the mark drawn as the affine transformation and the blur of the first have it.
+
+    Raises
+    ------
+    InputError
+        Fewer than three marks are found; the message names the others.
+    GeometryError
+        The marks that were found lie on a line.
+    """
+    turns = tuple(t for t in TURNS if known.rotation in (None, t.rotation) and known.mirrored in (None, t.mirrored))
+    placements, notes = _search(scan, layout, known, turns)
+    if not placements:
+        raise InputError(_nothing(layout, scan, known))
+    ties = _ties(placements)
+    chosen = _usual(ties, known)
+    measured = measure_marks(scan, layout, chosen, known.least_correlation)
+    better = _better_turn(scan, layout, known, measured) if measured.missed else None
+    if better is not None:
+        notes.append(better)
+    if len(measured.found) < 3:
+        raise InputError(_too_few(layout, measured, better))
+    measured, dropped = _without_false(layout, measured, chosen.turn)
+    turn, fit, names, said = _decide(layout, measured, ties, chosen, known)
+    return _result(layout, measured, (turn, fit, names), (*notes, *said, *dropped))
+
+
+def _search(
+    scan: Scan, layout: MarkLayout, known: FiducialSearch, turns: tuple[Turn, ...]
+) -> tuple[list[Placement], list[str]]:
+    """Placements, best first; a resolution that is stated but does not fit is said and left."""
+    negatives = (False, True) if known.negative is None else (known.negative,)
+    notes: list[str] = []
+    if known.pixel_mm is not None:
+        found = search_placements(Search(scan, layout, turns, negatives, STATED_TOLERANCE), [known.pixel_mm])
+        if found and _convincing(found[0], layout):
+            return found, notes
+    wide = search_placements(Search(scan, layout, turns, negatives), pixel_sizes(layout, scan.size))
+    if known.pixel_mm is not None and not (wide and _convincing(wide[0], layout)):
+        return found or wide, []
+    if known.pixel_mm is not None and abs(math.log(wide[0].pixel_mm / known.pixel_mm)) > STATED_TOLERANCE:
+        notes.append(
+            f"pixels of {1000 * known.pixel_mm:.4g} µm, as stated, do not fit the marks; other sizes were tried"
+        )
+    return wide, notes
+
+
+def _convincing(placement: Placement, layout: MarkLayout) -> bool:
+    return len(placement.found) >= min(3, len(layout.names)) and placement.score >= 0.25 * len(placement.found)
+
+
+def _ties(placements: Sequence[Placement]) -> list[Placement]:
+    """Placements that fit as well as the best one."""
+    best = placements[0]
+    margin = TIE * len(best.found)
+    return [
+        p
+        for p in placements
+        if p.negative == best.negative and len(p.found) == len(best.found) and p.score >= best.score - margin
+    ]
+
+
+def _usual(ties: Sequence[Placement], known: FiducialSearch) -> Placement:
+    """Among equals the one that is not turned, and mirrored as usual with this camera."""
+    return min(ties, key=lambda p: (p.turn.mirrored != known.usual_mirrored, p.turn.rotation))
+
+
+def _decide(
+    layout: MarkLayout, measured: Measured, ties: Sequence[Placement], chosen: Placement, known: FiducialSearch
+) -> tuple[Turn, FiducialFit, dict[str, str], list[str]]:
+    """Turn, adjustment and new names of the marks; among equal turns the residuals decide, if they can."""
+    fits: list[tuple[float, Placement, FiducialFit, dict[str, str]]] = []
+    for p in ties:
+        names = _renamed(layout, measured, chosen, p)
+        if names is None:
+            continue
+        fit = fit_affine(_calibrated(layout), _places(measured, names), mirrored=p.turn.mirrored)
+        fits.append((fit.sigma0, p, fit, names))
+    if len(fits) == 1:
+        return fits[0][1].turn, fits[0][2], fits[0][3], []
+    fits.sort(key=lambda f: f[0])
+    left = fits
+    if fits[0][2].redundancy:
+        noise = max(fits[0][0], FILM_MM / chosen.pixel_mm, _typical_sigma(measured))
+        left = [f for f in fits if f[0] <= CLEARLY * noise]
+    told = ""
+    if len(left) < len(fits):
+        best, second = left[0], fits[len(left)]
+        told = f"by the calibrated values: sigma0 {best[0]:.2f} px, the next ({second[1].turn}) {second[0]:.2f} px"
+    if len(left) == 1:
+        return left[0][1].turn, left[0][2], left[0][3], [f"rotation {left[0][1].turn} is told {told}"]
+    usual = _usual([f[1] for f in left], known)
+    taken = next(f for f in left if f[1] is usual)
+    listed = ", ".join(str(f[1].turn) for f in sorted(left, key=lambda f: (f[1].turn.mirrored, f[1].turn.rotation)))
+    said = (
+        f"the marks fit every one of these rotations of the scan: {listed}; {usual.turn} is assumed. "
+        f"State --rotation and --mirrored if that is wrong{f' (others are excluded {told})' if told else ''}"
+    )
+    return taken[1].turn, taken[2], taken[3], [said]
+
+
+def _renamed(layout: MarkLayout, measured: Measured, chosen: Placement, other: Placement) -> dict[str, str] | None:
+    """Names under the chosen turn → names under another one; None if the places are not the same."""
+    gate = 0.05 * layout.extent / chosen.pixel_mm
+    renamed = {}
+    for name, at in measured.found.items():
+        off = np.hypot(*(other(layout.mm) - (at.x, at.y)).T)
+        k = int(off.argmin())
+        if off[k] > gate:
+            return None
+        renamed[name] = layout.names[k]
+    return renamed if len(set(renamed.values())) == len(renamed) else None
+
+
+def _calibrated(layout: MarkLayout) -> dict[str, tuple[float, float]]:
+    return {name: (float(x), float(y)) for name, (x, y) in zip(layout.names, layout.mm)}
+
+
+def _places(measured: Measured, names: Mapping[str, str]) -> dict[str, tuple[float, float]]:
+    return {names[name]: (at.x, at.y) for name, at in measured.found.items() if name in names}
+
+
+def _typical_sigma(measured: Measured) -> float:
+    return float(np.median([max(at.sigma_x, at.sigma_y) for at in measured.found.values()]))
+
+
+def _without_false(layout: MarkLayout, measured: Measured, turn: Turn) -> tuple[Measured, list[str]]:
+    """Leave out one mark that contradicts at least four others that agree; with four marks none can be told."""
+    notes: list[str] = []
+    names = list(measured.found)
+    while len(names) >= 5:
+        everything = _sigma0(layout, measured, names, turn)
+        left = [_sigma0(layout, measured, [n for n in names if n != name], turn) for name in names]
+        k = int(np.argmin(left))
+        pixel_mm = 1 / measured.px_per_mm
+        if everything * pixel_mm < 0.02 or left[k] > everything / 4:
+            break
+        notes.append(
+            f"mark {names[k]!r} is left out: with it sigma0 is {1000 * everything * pixel_mm:.0f} µm, "
+            f"without it {1000 * left[k] * pixel_mm:.0f} µm; something else was taken for it"
+        )
+        names.pop(k)
+    kept = {n: measured.found[n] for n in names}
+    false = {n: at for n, at in measured.found.items() if n not in kept}
+    missed = {**measured.missed, **{n: (at.correlation, "contradicts the other marks") for n, at in false.items()}}
+    return replace(measured, found=kept, missed=missed), notes
+
+
+def _sigma0(layout: MarkLayout, measured: Measured, names: Sequence[str], turn: Turn) -> float:
+    P = layout.mm[[layout.names.index(n) for n in names]]
+    p = np.array([(measured.found[n].x, measured.found[n].y) for n in names])
+    A = np.column_stack([P, np.ones(len(P))])
+    v = A @ np.linalg.lstsq(A, p, rcond=None)[0] - p
+    return math.sqrt(float((v**2).sum()) / (2 * len(P) - 6)) if len(P) > 3 else math.nan
+
+
+def _result(
+    layout: MarkLayout,
+    measured: Measured,
+    decided: tuple[Turn, FiducialFit, dict[str, str]],
+    notes: Sequence[str],
+) -> FiducialResult:
+    turn, fit, names = decided
+    marks = {names[old]: _located(names[old], at) for old, at in measured.found.items()}
+    to_mm = np.linalg.inv(fit.transformation.derivative(np.zeros(2)))
+    residuals = fit.residuals @ to_mm.T * 1000.0
+    missing = []
+    for name in fit.missing:
+        k = layout.names.index(name)
+        x, y = fit.transformation(layout.mm[k])
+        # The name that this corner had in the turn in which it was measured.
+        old = min(measured.missed, key=lambda n: math.dist(measured.expected[n], (x, y)))
+        missing.append(MissingMark(name, measured.missed[old][0], float(x), float(y), measured.missed[old][1]))
+    said = list(notes)
+    if fit.redundancy == 0:
+        said.append("three marks: the affine transformation has no redundancy, nothing checks them")
+    elif np.abs(residuals).max() > 1000 * DEFORMED_MM:
+        said.append(
+            f"residuals of {np.abs(residuals).max():.0f} µm are more than film deforms: the scanner is not true, or "
+            "one of the marks is something else (look at --pictures), or the calibration another camera's"
+        )
+    rivals = sorted(measured.placement.rivals, key=lambda rival: -rival[3])
+    if len(rivals) > RIVALS:
+        said.append(f"{len(rivals)} places look like marks and are none; the first are named")
+    for name, x, y, r in rivals[:RIVALS]:
+        said.append(
+            f"another place looks like mark {names.get(name, name)!r}: ({x:.0f}, {y:.0f}), correlation {r:.2f}; "
+            "it does not lie where the other marks say"
+        )
+    order = [marks[n] for n in layout.names if n in marks]
+    return FiducialResult(
+        tuple(order), tuple(missing), fit, residuals, turn, measured.placement.negative, measured.blur_px,
+        measured.placement, tuple(said),
+    )  # fmt: skip
+
+
+def _located(name: str, at: Location) -> LocatedMark:
+    return LocatedMark(
+        name,
+        at.x,
+        at.y,
+        at.sigma_x,
+        at.sigma_y,
+        at.correlation,
+        at.method,
+        None if at.peak is None else (at.peak.x, at.peak.y),
+        None if at.match is None else (at.match.x, at.match.y),
+    )
+
+
+def _nothing(layout: MarkLayout, scan: Scan, known: FiducialSearch) -> str:
+    width, height = scan.size
+    return (
+        f"none of the {len(layout.names)} fiducial marks found in the scan of {width} × {height} px; not found: "
+        f"{', '.join(layout.names)}. Check that the camera's marks look as described and that the scan shows them; "
+        "state its resolution with --scan-resolution"
+    )
+
+
+def _better_turn(scan: Scan, layout: MarkLayout, known: FiducialSearch, measured: Measured) -> str | None:
+    """What to say if the scan is turned in a way that was excluded, but fits more marks; None: it is not."""
+    excluded = tuple(
+        t for t in TURNS if known.rotation not in (None, t.rotation) or known.mirrored not in (None, t.mirrored)
+    )
+    if not excluded:
+        return None
+    search = Search(scan, layout, excluded, (measured.placement.negative,), STATED_TOLERANCE)
+    others = search_placements(search, [measured.placement.pixel_mm])
+    best = max(others, key=lambda p: (len(p.found), p.score), default=None)
+    if best is None or len(best.found) < 3 or len(best.found) <= len(measured.found) or not _convincing(best, layout):
+        return None
+    return (
+        f"turned by {measured.placement.turn}, as stated, the scan shows {len(measured.found)} of {len(layout.names)} "
+        f"marks; turned by {best.turn} it would show {len(best.found)}: check --rotation and --mirrored"
+    )
+
+
+def _too_few(layout: MarkLayout, measured: Measured, better: str | None) -> str:
+    lost = []
+    for name, (r, reason) in measured.missed.items():
+        x, y = measured.expected[name]
+        lost.append(f"{name!r} ({reason}{f', best correlation {r:.2f}' if math.isfinite(r) else ''}, {x:.0f} {y:.0f})")
+    found = ", ".join(f"{n!r} ({at.correlation:.2f})" for n, at in measured.found.items()) or "none"
+    hint = "" if better is None else f" ({better})"
+    return (
+        f"{len(measured.found)} of {len(layout.names)} fiducial marks found, three are needed. Found: {found}. "
+        f"Not found: {'; '.join(lost)}. Check that the camera's marks look as described{hint}, or measure by hand"
+    )

@@ -1,0 +1,1 @@
+"""Space resection of single images."""

@@ -1,0 +1,105 @@
+"""What a space resection is given and what comes out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.base import Camera
+from photoplan.cameras.interior import Interior
+from photoplan.cameras.lenses.base import Lens
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.pose import Pose
+
+Array = NDArray[np.float64]
+
+#: Parameters of the interior orientation that can be unknowns.
+FREE = ("c", "x0", "y0")
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPoints:
+    """Points of one image with their ground coordinates."""
+
+    names: tuple[str, ...]
+    xy: Array
+    """Measured column and row, (n, 2), pixels."""
+    sigma: Array
+    """Their standard deviations, (n, 2), pixels."""
+    XYZ: Array
+    """Ground coordinates, (n, 3), metres."""
+    covariance: Array
+    """Of those, (n, 3, 3), m²; zero: free of error."""
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        for name, shape in (("xy", (n, 2)), ("sigma", (n, 2)), ("XYZ", (n, 3)), ("covariance", (n, 3, 3))):
+            value = np.array(np.broadcast_to(np.asarray(getattr(self, name), float), shape))
+            bad = ~np.isfinite(value).all(axis=tuple(range(1, value.ndim)))
+            if bad.any():
+                raise InputError(f"point {self.names[int(bad.argmax())]!r}: its {name} is not finite")
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+        if not (self.sigma > 0).all():
+            raise InputError("standard deviations of image points must be positive")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+@dataclass(frozen=True)
+class ResectSettings:
+    """How a resection is done."""
+
+    free: tuple[str, ...] = ()
+    """Parameters of the interior orientation that are unknowns: c, x0, y0."""
+    camera_constant_known: bool = True
+    """False: c is an unknown, and the stated one is not even a start value."""
+    critical: float = 4.0
+    """Normalised residual, in units of sigma0, from which a point is taken out as a gross error."""
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.free if name not in FREE]
+        if unknown:
+            raise UsageError(f"free parameter {unknown[0]!r}; resection of one image allows {', '.join(FREE)}")
+        chosen = set(self.free) | (set() if self.camera_constant_known else {"c"})
+        object.__setattr__(self, "free", tuple(p for p in FREE if p in chosen))
+
+
+@dataclass(frozen=True, eq=False)
+class Resected:
+    """Result of a resection. Covariances hold sigma0 already."""
+
+    pose: Pose
+    interior: Interior
+    """As given, or with the parameters that were free."""
+    covariance: Array
+    """(6 + k, 6 + k): projection centre in metres, small rotations about the camera's x, y, z axes in radians
+    (R ← R · exp[δ]×), then the free parameters in the unit of the image plane."""
+    free: tuple[str, ...]
+    residuals: Array
+    """Computed minus measured position of every point, (n, 2), pixels (column, row); of rejected points too."""
+    redundancies: Array
+    """Redundancy numbers of the measurements, (n, 2); NaN for rejected points."""
+    normalised: Array
+    """Residuals divided by their standard deviations (those before the adjustment, without sigma0), (n, 2); NaN where
+    no other point controls the measurement."""
+    rejected: NDArray[np.bool_]
+    """Points taken out as gross errors, (n,)."""
+    sigma0: float
+    """Standard deviation of unit weight; 1 without redundancy."""
+    redundancy: int
+    notes: tuple[str, ...] = ()
+    """What a user should know: errors that cannot be located …"""
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals of one coordinate over the points that take part, pixels."""
+        return float(np.sqrt((self.residuals[~self.rejected] ** 2).mean()))
+
+
+#: The camera in ground coordinates that a pose makes: with earth curvature and refraction.
+CameraOf = Callable[[Interior, Lens, Pose], Camera]

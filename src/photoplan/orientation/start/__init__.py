@@ -1,0 +1,1 @@
+"""Orientation from nothing: relative orientation, models that grow, similarity."""

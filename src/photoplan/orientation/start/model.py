@@ -1,0 +1,188 @@
+"""Models that grow: images resected one after the other from points that oriented images intersect."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import GeometryError
+from photoplan.geometry.pose import Pose
+from photoplan.orientation.intersection import Rays, intersect
+from photoplan.orientation.resection.direct import polished_pose, reprojected, resect_direct
+from photoplan.orientation.start.net import Net
+from photoplan.orientation.start.relative import RelativeOrientation, relate
+
+Array = NDArray[np.float64]
+
+#: Known points that an image needs to be resected, and the part of them that must agree.
+_POINTS = 6
+_SHARE = 0.4
+#: Images with at least this part of the best image's points are added together.
+_TOGETHER = 0.7
+#: Pairs that are tried for the begin of a model.
+_PAIRS = 12
+#: Standard deviations of measurements are multiplied by this, as models are not adjusted while they grow.
+_SLACK = 4.0
+_SWEEPS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Poses and points in one system; both are filled while the model grows."""
+
+    poses: dict[int, Pose]
+    XYZ: Array
+    """(p, 3); NaN: not known."""
+
+
+def free_model(net: Net, images: Iterable[int]) -> Model | None:
+    """A model of its own of as many of `images` as hang together; None where no pair does."""
+    wanted = sorted(images)
+    pair = _best_pair(net, wanted)
+    if pair is None:
+        return None
+    first, second, found = pair
+    model = Model({first: Pose(np.zeros(3), np.eye(3)), second: found.pose}, np.full((len(net.points), 3), np.nan))
+    grown(net, model, wanted, 1.0, fixed=False)
+    return model
+
+
+def _best_pair(net: Net, images: list[int]) -> tuple[int, int, RelativeOrientation] | None:
+    """The pair with the most common points that meet under a good angle."""
+    shown = {k: set(net.point[net.of_image[k]].tolist()) for k in images}
+    pairs = [
+        (len(shown[a] & shown[b]), a, b) for i, a in enumerate(images) for b in images[i + 1 :] if shown[a] & shown[b]
+    ]
+    pairs.sort(key=lambda p: (-p[0], p[1], p[2]))
+    best: tuple[float, int, int, RelativeOrientation] | None = None
+    for count, a, b in pairs[:_PAIRS]:
+        if best is not None and count < 0.5 * pairs[0][0]:
+            break
+        try:
+            found = _related(net, a, b)
+        except GeometryError:
+            continue
+        # More than 30° between rays gains nothing.
+        worth = float(found.inliers.sum()) * min(found.angle, 0.52)
+        if best is None or worth > best[0]:
+            best = worth, a, b, found
+    return None if best is None else best[1:]
+
+
+def _related(net: Net, a: int, b: int) -> RelativeOrientation:
+    one, two = net.of_image[a], net.of_image[b]
+    _, i, j = np.intersect1d(net.point[one], net.point[two], return_indices=True)
+    one, two = one[i], two[j]
+    return relate(net.tangents[one], net.tangents[two], float(np.median(net.sigma[one])))
+
+
+def grown(net: Net, model: Model, images: Iterable[int], loose: float, fixed: bool = True) -> list[int]:
+    """Add images until none has enough known points; the numbers of those that were added.
+
+    Parameters
+    ----------
+    net, model
+        `model` is filled.
+    images : iterable of int
+        Images that may be added.
+    loose : float
+        Factor of the standard deviations that poses which are only approximate need.
+    fixed : bool
+        Whether control points keep their coordinates: the model is in the ground system.
+    """
+    waiting = [k for k in images if k not in model.poses]
+    added: list[int] = []
+    refused: dict[int, int] = {}
+    while True:
+        _intersected(net, model, loose, fixed)
+        known = np.isfinite(model.XYZ[:, 0])
+        counts = {k: int(known[net.point[net.of_image[k]]].sum()) for k in waiting}
+        able = {k: n for k, n in counts.items() if n >= _POINTS and n > refused.get(k, 0)}
+        if not able:
+            return added
+        enough = _TOGETHER * max(able.values())
+        new = []
+        for k in sorted(able, key=lambda k: (-able[k], k)):
+            if able[k] < enough:
+                break
+            pose = _resected(net, model, k, loose)
+            if pose is None:
+                refused[k] = able[k]
+                continue
+            model.poses[k] = pose
+            new.append(k)
+        waiting = [k for k in waiting if k not in model.poses]
+        added += new
+        for _ in range(_SWEEPS if new else 0):
+            _intersected(net, model, loose, fixed)
+            for k in new:
+                model.poses[k] = _polished(net, model, k, loose)
+
+
+def looseness(net: Net, model: Model) -> float:
+    """By how much the poses that the model has miss the measurements' standard deviation; at least 1."""
+    numbers = sorted(model.poses)
+    place = np.full(net.images, -1)
+    place[numbers] = np.arange(len(numbers))
+    rays = np.flatnonzero(place[net.image] >= 0)
+    if len(numbers) < 2 or not len(rays):
+        return 1.0
+    image, point, sigma = place[net.image[rays]], net.point[rays], np.repeat(net.sigma[rays, None], 2, axis=1)
+    poses = [model.poses[k] for k in numbers]
+    XYZ = intersect(poses, Rays(image, point, net.tangents[rays], sigma), len(net.points), critical=np.inf).XYZ
+    miss = np.full(len(rays), np.nan)
+    for k, pose in enumerate(poses):
+        mine = image == k
+        t = reprojected(pose.R_ground_camera[None], pose.center[None], XYZ[point[mine]])[0]
+        miss[mine] = np.linalg.norm(t - net.tangents[rays[mine]], axis=1) / net.sigma[rays[mine]]
+    miss = miss[np.isfinite(miss)]
+    # Residuals of two rays hold a quarter of the errors.
+    return float(np.clip(2.0 * np.median(miss) / _SLACK, 1.0, 200.0)) if len(miss) else 1.0
+
+
+def _intersected(net: Net, model: Model, loose: float, fixed: bool) -> None:
+    """Points of all oriented images, anew."""
+    numbers = sorted(model.poses)
+    place = np.full(net.images, -1)
+    place[numbers] = np.arange(len(numbers))
+    rays = np.flatnonzero(place[net.image] >= 0)
+    model.XYZ[:] = net.control if fixed else np.nan
+    if len(numbers) < 2:
+        return
+    sigma = np.repeat(net.sigma[rays, None], 2, axis=1) * (_SLACK * loose)
+    found = intersect(
+        [model.poses[k] for k in numbers],
+        Rays(place[net.image[rays]], net.point[rays], net.tangents[rays], sigma),
+        len(net.points),
+        min_angle=0.02,
+    )
+    free = ~np.isfinite(model.XYZ[:, 0])
+    model.XYZ[free] = found.XYZ[free]
+
+
+def _known(net: Net, model: Model, k: int) -> tuple[Array, Array, float]:
+    mine = net.of_image[k]
+    mine = mine[np.isfinite(model.XYZ[net.point[mine], 0])]
+    return net.tangents[mine], model.XYZ[net.point[mine]], float(np.median(net.sigma[mine]))
+
+
+def _resected(net: Net, model: Model, k: int, loose: float) -> Pose | None:
+    """Pose of an image; None where too few of its known points agree."""
+    t, X, sigma = _known(net, model, k)
+    try:
+        found = resect_direct(t, X, _SLACK * sigma)
+    except GeometryError:
+        return None
+    good = found.inliers.sum() >= max(_POINTS, _SHARE * len(t)) and found.scale <= 5.0 * _SLACK * loose * sigma
+    return found.pose if good else None
+
+
+def _polished(net: Net, model: Model, k: int, loose: float) -> Pose:
+    t, X, sigma = _known(net, model, k)
+    pose = model.poses[k]
+    r = np.linalg.norm(reprojected(pose.R_ground_camera[None], pose.center[None], X)[0] - t, axis=1)
+    near = r < 4.0 * _SLACK * loose * sigma
+    return polished_pose(pose, t, X, near) if near.sum() >= _POINTS else pose

@@ -1,0 +1,1 @@
+"""What to expect of a project, and whether its parts fit together."""

@@ -1,0 +1,368 @@
+"""Do orientation, terrain and camera fit together, and if not: which reading of the angles would?
+
+Only geometry is looked at: where an image looks, whether that is on the terrain, and how its axes lie to the flight
+lines. A wrong rotation order that only turns a small tilt into another direction cannot be seen this way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from photoplan.geometry.rotation import rotation_from_angles
+from photoplan.io.camera.model import FilmCamera, FrameCamera
+from photoplan.io.orientation.table import angle_in_radians
+from photoplan.io.project.cameras import interior_of, lens_of
+from photoplan.io.project.model import Image, Orientation
+from photoplan.products.check.readings import CIRCLE, DECLARED, Reading, readings
+
+Heights = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+#: Images that are looked at under other readings.
+SAMPLE = 12
+#: A reading is taken as better by its tilts only if all stay below this, and half of the declared ones are above the
+#: second; degrees. Between them lies everything that oblique images may be.
+UPRIGHT, OBLIQUE = 10.0, 20.0
+#: Images whose lines are looked at.
+LINES = 400
+#: Points on a side of the grid over an image.
+POINTS = 5
+#: Side of the area in which heights are asked for at once, metres.
+CELL = 1000.0
+#: Points that count as the image's middle.
+INNER = 10
+#: Images needed before tilts or flight lines say anything.
+ENOUGH = 3
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What the check needs to know of an image."""
+
+    name: str
+    center: NDArray[np.float64]
+    """Projection centre (3,) in the terrain's CRS and height system."""
+    angles: NDArray[np.float64]
+    """Three angles (3,) in radians, in the sequence of `order`."""
+    order: str
+    """Rotation order that is declared."""
+    tangents: NDArray[np.float64]
+    """Ideal directions (n, 2) of points spread over the image, x right, y up; the first is the image's middle."""
+    pixel: float
+    """Angle of a pixel in the middle, radians."""
+    unit: str = "deg"
+    """Unit of the angles in the project."""
+
+    @property
+    def R_ground_camera(self) -> NDArray[np.float64]:
+        """Rotation matrix as declared."""
+        return rotation_from_angles(self.angles, self.order)
+
+
+@dataclass(frozen=True)
+class ImagePlausibility:
+    """What follows from the orientation of one image."""
+
+    name: str
+    tilt: float
+    """Angle between optical axis and nadir, degrees."""
+    azimuth: float
+    """Direction in which the axis is tilted, degrees from north, clockwise."""
+    height_above_ground: float
+    """Height of the projection centre above the terrain below it, metres; NaN where there is none."""
+    gsd: float
+    """Side of the middle pixel across the line of sight on the ground, metres; NaN if it sees no ground."""
+    on_terrain: float
+    """Share of the image that sees the terrain."""
+    middle_on_terrain: bool
+    """Whether the middle of the image does."""
+    fault: str | None
+    """What cannot be right; None if the image is plausible."""
+
+
+@dataclass(frozen=True)
+class Plausibility:
+    """Result for a block of images."""
+
+    images: tuple[ImagePlausibility, ...]
+    alternative: str | None
+    """The reading of the orientation that would fit, as a sentence; None if the declared one fits or none does."""
+
+    @property
+    def implausible(self) -> tuple[ImagePlausibility, ...]:
+        """Images with a fault."""
+        return tuple(i for i in self.images if i.fault is not None)
+
+    def __str__(self) -> str:
+        lines = [f"{i.name}: {i.fault}" for i in self.implausible]
+        if self.alternative is not None:
+            lines.append(self.alternative)
+        return "\n".join(lines) or f"all {len(self.images)} images are plausible"
+
+
+def assess(views: Sequence[View], heights: Heights) -> Plausibility:
+    """Look at every image; where something cannot be right, try other readings of the whole block.
+
+    Parameters
+    ----------
+    views : sequence of View
+    heights : callable
+        Terrain heights at map points (n, 2), shape (n,); NaN where there is no terrain.
+
+    Returns
+    -------
+    Plausibility
+        Oblique images are plausible as long as they see the terrain.
+    """
+    images = tuple(_look(v, v.center, v.R_ground_camera, heights) for v in views)
+    alternative = _alternative(list(views), images, heights)
+    return Plausibility(images, alternative)
+
+
+def _look(view: View, center: NDArray[np.float64], R: NDArray[np.float64], heights: Heights) -> ImagePlausibility:
+    axis = -R[:, 2]
+    tilt = float(np.degrees(np.arccos(np.clip(-axis[2], -1, 1))))
+    azimuth = float(np.degrees(np.arctan2(axis[0], axis[1])) % 360) if tilt > 1e-9 else 0.0
+    below = float(heights(center[None, :2])[0])
+    points = _footprint(center, R, view.tangents, below, heights)
+    seen = np.isfinite(points[:, 2])
+    inner = np.argsort(np.linalg.norm(view.tangents - view.tangents[0], axis=1))[:INNER]
+    # A hole in the terrain under the very middle is not a sign of anything.
+    middle = bool(seen[0] or seen[inner].mean() > 0.5)
+    distance = float(np.linalg.norm(points[inner[seen[inner]][0]] - center)) if seen[inner].any() else np.nan
+    fault = None
+    if center[2] <= below:
+        fault = f"projection centre {below - center[2]:.1f} m below the terrain; are the height systems the same?"
+    elif not seen.any():
+        fault = f"sees nothing of the terrain (tilt {tilt:.1f}°)"
+    return ImagePlausibility(
+        view.name,
+        tilt,
+        azimuth,
+        float(center[2] - below),
+        distance * view.pixel,
+        float(seen.mean()),
+        middle,
+        fault,
+    )
+
+
+def _footprint(
+    center: NDArray[np.float64], R: NDArray[np.float64], tangents: NDArray[np.float64], below: float, heights: Heights
+) -> NDArray[np.float64]:
+    """Terrain points (n, 3) that the tangents see, to some metres; NaN where they see none."""
+    d = np.column_stack([tangents, -np.ones(len(tangents))]) @ R.T
+    d[~(d[:, 2] < 0)] = np.nan
+    level = np.full(len(d), below)
+    points = np.full((len(d), 3), np.nan)
+    if not np.isfinite(below):
+        # The camera does not stand over the terrain: begin with heights that the rays come by.
+        level[:] = _level_near(center, d, heights)
+    for _ in range(5):
+        with np.errstate(invalid="ignore"):
+            points = center + d * ((level - center[2]) / d[:, 2])[:, None]
+        there = np.isfinite(points[:, 0])
+        found = np.full(len(d), np.nan)
+        if there.any():
+            found[there] = _ground(heights, points[there, :2])
+        # A ray that has left the terrain stays on its last level, it may come back in the next step.
+        level = np.where(np.isfinite(found), found, level)
+    points[:, 2] = found
+    return points
+
+
+def _ground(heights: Heights, XY: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Heights at points that may lie far apart: asked for cell by cell, so that no large window is ever read."""
+    out = np.full(len(XY), np.nan)
+    cells, of = np.unique(np.floor(XY / CELL), axis=0, return_inverse=True)
+    for k in range(len(cells)):
+        mine = of.reshape(-1) == k
+        out[mine] = heights(XY[mine])
+    return out
+
+
+def _level_near(center: NDArray[np.float64], d: NDArray[np.float64], heights: Heights) -> float:
+    """A terrain height under the rays, for a camera that does not stand over the terrain; NaN if there is none."""
+    flat = d[np.isfinite(d[:, 2])]
+    if not len(flat):
+        return np.nan
+    reach = np.geomspace(10.0, 30_000.0, 20)
+    rays = flat[:: max(1, len(flat) // 5)]
+    points = center[:2] + reach[:, None, None] * (rays[:, :2] / np.abs(rays[:, 2:]))
+    found = _ground(heights, points.reshape(-1, 2))
+    good = np.isfinite(found)
+    return float(np.median(found[good])) if good.any() else np.nan
+
+
+def _alternative(views: list[View], images: tuple[ImagePlausibility, ...], heights: Heights) -> str | None:
+    """Sentence on the reading that fits where the declared one does not."""
+    chosen = _sample(views, images)
+    sample, declared = [views[k] for k in chosen], [images[k] for k in chosen]
+    evidence = _Evidence.of(views, declared, DECLARED)
+    if not evidence.doubtful:
+        return None
+    ranked: list[tuple[tuple[float, ...], Reading, list[ImagePlausibility]]] = []
+    for reading in readings(sample[0].order, sample[0].unit):
+        # What one change explains needs no second, except where only the second makes the images upright.
+        if ranked and reading.changes > ranked[0][1].changes and (ranked[0][0][0] < 0 or len(sample) < ENOUGH):
+            break
+        if not _possible(reading, evidence.largest):
+            continue
+        seen = [_look(v, *reading.apply(v.center, v.angles, v.order), heights) for v in sample]
+        other = _Evidence.of(views, seen, reading)
+        if other.better_than(evidence, reading):
+            upright = -float(other.steepest < UPRIGHT)
+            rank = (upright, reading.changes, -round(other.on_terrain, 2), -round(other.alike, 2))
+            ranked.append((rank, reading, seen))
+            ranked.sort(key=lambda r: r[0])
+    if not ranked:
+        return None
+    equal = [r.sentence for rank, r, _ in ranked if rank == ranked[0][0]]
+    return _sentence(" — or: ".join(equal[:3]), declared, ranked[0][2])
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """What a reading makes of a sample of images."""
+
+    faults: int
+    middles: float
+    """Share of images whose middle is on the terrain."""
+    on_terrain: float
+    median_tilt: float
+    steepest: float
+    alike: float
+    """How alike the image axes lie to the flight lines in all images, 0 to 1."""
+    offset: float
+    """Mean angle between image axes and flight lines, degrees, modulo 90."""
+    largest: float
+    """Largest declared angle, parts of a full circle."""
+    count: int
+
+    @classmethod
+    def of(cls, views: list[View], images: list[ImagePlausibility], reading: Reading) -> _Evidence:
+        tilts = [i.tilt for i in images]
+        alike, offset = _alignment(views, reading)
+        return cls(
+            sum(i.fault is not None for i in images),
+            float(np.mean([i.middle_on_terrain for i in images])),
+            float(np.mean([i.on_terrain for i in images])),
+            float(np.median(tilts)),
+            max(tilts),
+            alike,
+            offset,
+            float(max(np.abs(v.angles).max() for v in views) / (2 * np.pi)),
+            len(views),
+        )
+
+    @property
+    def tilted(self) -> bool:
+        return self.count >= ENOUGH and self.median_tilt > OBLIQUE
+
+    @property
+    def astray(self) -> bool:
+        """Image axes lie in no relation to the flight lines, in a block where that means something."""
+        return self.count >= 2 * ENOUGH and (self.alike < 0.85 or abs(self.offset) > 15)
+
+    @property
+    def doubtful(self) -> bool:
+        return bool(self.faults) or self.middles < 0.8 or self.tilted or self.astray
+
+    def better_than(self, declared: _Evidence, reading: Reading) -> bool:
+        """Whether this reading removes what is wrong with the declared one; what only looks different is not better."""
+        if self.faults or self.middles < declared.middles:
+            return False
+        # The terrain may end inside the block, so it is the gain that counts, not a share.
+        if self.on_terrain > declared.on_terrain + 0.2 and (declared.faults or self.middles > declared.middles + 0.2):
+            return True
+        if declared.tilted and self.steepest < UPRIGHT:
+            return True
+        if not declared.astray or self.count < 2 * ENOUGH:
+            return False
+        if declared.alike < 0.85:
+            return self.alike > 0.97 and abs(self.offset) < 5
+        # All images lie alike, but askew. Only readings that people really mix up count then, since a heading that was
+        # kept askew to the lines on purpose looks the same.
+        usual = reading.changes == 1 and (reading.unit == "rad" or reading.transposed)
+        return usual and self.alike > 0.9 and abs(self.offset) < 8
+
+
+def _possible(reading: Reading, largest: float) -> bool:
+    """Whether the largest declared angle, in parts of a full circle, can be what the reading takes it for."""
+    if reading.unit == "rad":
+        return largest * CIRCLE[reading.declared] < CIRCLE["rad"]
+    if reading.unit is None or reading.declared != "rad":
+        return True
+    # Angles divided by 57 are upright whatever they were: only more than a full circle lets one think of that, and only
+    # more than 360 of gon.
+    return largest > 1.0 and (reading.unit == "gon") == (largest * CIRCLE["rad"] > CIRCLE["deg"])
+
+
+def _sample(views: list[View], images: tuple[ImagePlausibility, ...]) -> list[int]:
+    """Images for other readings: faulty ones first, then spread over the block."""
+    faulty = [k for k, i in enumerate(images) if i.fault is not None or not i.middle_on_terrain]
+    spread = [int(k) for k in np.linspace(0, len(views) - 1, min(SAMPLE, len(views)))]
+    return list(dict.fromkeys(faulty[: SAMPLE // 2] + spread))[:SAMPLE]
+
+
+def _alignment(views: list[View], reading: Reading) -> tuple[float, float]:
+    """How the image axes lie to the flight lines: how alike in all images (0 to 1), and the mean difference (degrees).
+
+    The line through an image and its nearest neighbour is along or across a strip, so angles count modulo 90°.
+    """
+    posed = [reading.apply(v.center, v.angles, v.order) for v in views[:LINES]]
+    XY = np.array([center[:2] for center, _ in posed])
+    if len(XY) < 2:
+        return 1.0, 0.0
+    nearest = np.asarray(cKDTree(XY).query(XY, k=2)[1])[:, 1]
+    to = XY[nearest] - XY
+    line = np.arctan2(to[:, 1], to[:, 0])
+    kappa = np.array([np.arctan2(R[1, 0], R[0, 0]) for _, R in posed])
+    mean = np.mean(np.exp(4j * (kappa - line)))
+    return float(np.abs(mean)), float(np.degrees(np.angle(mean)) / 4)
+
+
+def _sentence(what: str, before: list[ImagePlausibility], after: list[ImagePlausibility]) -> str:
+    def tilts(images: list[ImagePlausibility]) -> str:
+        low, high = min(i.tilt for i in images), max(i.tilt for i in images)
+        return f"{low:.0f}–{high:.0f}°" if round(low) != round(high) else f"{low:.0f}°"
+
+    def middles(images: list[ImagePlausibility]) -> int:
+        return sum(i.middle_on_terrain for i in images)
+
+    return (
+        f"{what}: tilts are then {tilts(after)} instead of {tilts(before)}, and of {len(after)} images "
+        f"{middles(after)} look at the terrain instead of {middles(before)}"
+    )
+
+
+def view_of(image: Image, camera: FrameCamera | FilmCamera, orientation: Orientation, center: ArrayLike) -> View:
+    """View of a project's image.
+
+    Parameters
+    ----------
+    image : Image
+    camera : FrameCamera or FilmCamera
+        Description of its camera.
+    orientation : Orientation
+        What its angles mean.
+    center : array_like, shape (3,)
+        Projection centre in the terrain's height system.
+    """
+    interior, lens = interior_of(camera, image), lens_of(camera)
+    w, h = interior.size
+    part = np.linspace(0.0, 1.0, POINTS)
+    x, y = (g.ravel() for g in np.meshgrid(part * (w - 1), part * (h - 1)))
+    middle, half = np.array([(w - 1) / 2, (h - 1) / 2]), np.array([0.5, 0.0])
+    xy = np.concatenate([[middle, middle + half, middle - half], np.column_stack([x, y])])
+    t = lens.undistort(interior.tangent_to_pixel.inverse(xy))
+    pixel = float(np.linalg.norm(t[1] - t[2]))
+    angles = angle_in_radians(np.array(image.pose_numbers[1]), orientation.angle_unit)
+    points = np.delete(t, [1, 2], axis=0)
+    return View(
+        image.name, np.asarray(center, float), angles, orientation.rotation, points, pixel, orientation.angle_unit
+    )

@@ -1,0 +1,182 @@
+"""What to expect of a project, before a pixel is touched."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from photoplan.geometry.crs import crs_label
+from photoplan.io.project.model import Project
+from photoplan.plan.coverage import Coverage, cover
+from photoplan.products.check.plausibility import assess, view_of
+from photoplan.products.orthophoto.plan import mean_gsd, two_figures
+from photoplan.products.plain_values import plain
+from photoplan.project.scene import Scene, ground_of, open_scene, pose_of
+
+EARTH_RADIUS = 6_380_000.0
+#: Terrain displacements of curvature above this deserve a strict model, pixels.
+_CURVATURE_MATTERS = 0.3
+
+
+@dataclass(frozen=True)
+class ImageCheck:
+    """One image's line."""
+
+    image: str
+    tilt_deg: float
+    """Angle between optical axis and nadir, degrees."""
+    gsd: float
+    """Mean ground sampling distance, metres; NaN if it sees no terrain."""
+    footprint: tuple[float, float]
+    """Extent of the footprint in X and Y, metres; NaN if it sees no terrain."""
+    on_terrain: float
+    """Part of the image's border and middle whose rays meet the terrain, 0 to 1."""
+    relief_px: float
+    """Largest displacement in the image by an error of 1 m in height, pixels (Behr 1989, section 6.1.2)."""
+    admissible_height_error: float
+    """Height error that displaces the most sensitive point by one pixel, metres (Behr 1989, fig. 6.4)."""
+    curvature_px: float
+    """Largest displacement by the earth's curvature if it were ignored, pixels (Ecker 1991, eq. 4.17)."""
+    fault: str | None
+    """What cannot be right; None if the image is plausible."""
+    notes: tuple[str, ...]
+    """What a user should know of the file."""
+
+
+@dataclass(frozen=True)
+class ProjectCheck:
+    """All images of a project."""
+
+    images: tuple[ImageCheck, ...]
+    sensible_resolution: float
+    """Mean ground sampling distance of all images, to two figures, metres (Behr 1989, eq. 5.8)."""
+    heights: tuple[str, str, str]
+    """Height systems of terrain and orientation, and the one that is worked in."""
+    crs: str
+    alternative: str | None
+    """The reading of the orientation that would fit, where the declared one does not; None otherwise."""
+    advice: tuple[str, ...]
+    """Sentences that tell what would be better."""
+
+    @property
+    def implausible(self) -> tuple[str, ...]:
+        """Images with a fault, and what it is."""
+        return tuple(f"{i.image}: {i.fault}" for i in self.images if i.fault is not None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`; NaN becomes null."""
+        return {
+            "images": [plain(asdict(i)) for i in self.images],
+            "sensible_resolution": plain(self.sensible_resolution),
+            "height_systems": dict(zip(("terrain", "orientation", "working"), self.heights)),
+            "crs": self.crs,
+            "alternative": self.alternative,
+            "advice": list(self.advice),
+        }
+
+    def __str__(self) -> str:
+        width = max(5, *(len(i.image) for i in self.images))
+        lines = [
+            f"{crs_label(self.crs)} · heights: terrain {self.heights[0]}, orientation {self.heights[1]}",
+            f"{'image':<{width}}   tilt       GSD        footprint   on terrain   1 m height   admissible   curvature",
+        ]
+        for i in self.images:
+            size = f"{i.footprint[0]:.0f} × {i.footprint[1]:.0f} m"
+            lines.append(
+                f"{i.image:<{width}}  {i.tilt_deg:4.1f}°  {i.gsd:#7.3g} m  {size:>15}       {i.on_terrain:5.0%}   "
+                f"{i.relief_px:7.2f} px   {i.admissible_height_error:#8.3g} m   {i.curvature_px:6.2f} px"
+            )
+            lines += [f"{'':<{width}}  note: {note}" for note in i.notes]
+            lines += [f"{'':<{width}}  FAULT: {i.fault}"] if i.fault else []
+        closing = [f"sensible resolution {self.sensible_resolution:g} m"]
+        if not self.implausible and self.alternative is None:
+            closing.append("all plausible")
+        alternative = [] if self.alternative is None else [self.alternative]
+        return "\n".join([*lines, " · ".join(closing), *alternative, *self.advice])
+
+
+def check_project(project: Project, images: Sequence[str] | None = None) -> ProjectCheck:
+    """Open every input of a project, and compute what its images promise.
+
+    Parameters
+    ----------
+    project : Project
+    images : sequence of str, optional
+        Names or patterns; all images if it is None.
+
+    Raises
+    ------
+    PhotoplanError
+        The first input that cannot be used at all.
+    """
+    names = project.select(images)
+    ground = ground_of(project)
+    entries = [project.image(name) for name in names]
+    views = [
+        view_of(image, project.cameras[image.camera], project.orientation, pose_of(project, image, ground).center)
+        for image in entries
+    ]
+    plausible = assess(views, ground.surface.heights)
+    faults = {i.name: i.fault for i in plausible.images}
+    tilts = {i.name: i.tilt for i in plausible.images}
+    checks = [_check_image(open_scene(project, name), name, tilts[name], faults[name]) for name in names]
+    gsds = [c.gsd for c in checks if np.isfinite(c.gsd)]
+    return ProjectCheck(
+        tuple(checks),
+        two_figures(float(np.mean(gsds))) if gsds else float("nan"),
+        (*ground.height_systems, ground.working_system),
+        project.crs,
+        plausible.alternative,
+        _advice(project, checks),
+    )
+
+
+def _check_image(scene: Scene, name: str, tilt: float, fault: str | None) -> ImageCheck:
+    coverage = cover(scene.camera, scene.surface, scene.terrain_bounds)
+    nan = float("nan")
+    if coverage.bounds is None:
+        fault = fault or f"sees nothing of the terrain (tilt {tilt:.1f}°)"
+        return ImageCheck(name, tilt, nan, (nan, nan), coverage.on_surface, nan, nan, nan, fault, _notes(scene))
+    relief, curvature = _sensitivity(scene, coverage)
+    xmin, ymin, xmax, ymax = coverage.bounds
+    return ImageCheck(
+        name,
+        tilt,
+        mean_gsd(scene.camera, coverage),
+        (xmax - xmin, ymax - ymin),
+        coverage.on_surface,
+        relief,
+        1 / relief if relief > 0 else nan,
+        curvature,
+        fault,
+        _notes(scene),
+    )
+
+
+def _notes(scene: Scene) -> tuple[str, ...]:
+    return scene.notes
+
+
+def _sensitivity(scene: Scene, coverage: Coverage) -> tuple[float, float]:
+    """Largest displacement by 1 m of height, and by the earth's curvature, over the footprint; pixels."""
+    points = coverage.outline[np.isfinite(coverage.outline).all(axis=1)]
+    if not len(points):
+        return float("nan"), float("nan")
+    per_metre = np.linalg.norm(scene.camera.derivatives(points)[..., 2], axis=-1)
+    # Ecker 1991, eq. 4.17 with Z̄ = 0: the ground falls away from the tangential plane by d² / 2R.
+    drop = ((points[:, :2] - scene.camera.center[:2]) ** 2).sum(axis=1) / (2 * EARTH_RADIUS)
+    return float(np.nanmax(per_metre)), float(np.nanmax(per_metre * drop))
+
+
+def _advice(project: Project, checks: list[ImageCheck]) -> tuple[str, ...]:
+    lines = []
+    curvature = np.nanmax([c.curvature_px for c in checks] + [0.0])
+    if project.orientation.earth_curvature == "none" and curvature > _CURVATURE_MATTERS:
+        lines.append(
+            f"the earth's curvature displaces up to {curvature:.1f} px: if the orientation was computed with it, "
+            'set earth_curvature = "strict" in [orientation]'
+        )
+    return tuple(lines)

@@ -1,0 +1,1 @@
+"""Control points from an old orthophoto and a height model."""

@@ -1,0 +1,165 @@
+"""Patches of an orthophoto: where they lie, and how they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from photoplan.cameras.base import Camera
+from photoplan.errors import GeometryError, UsageError
+from photoplan.geometry.grid import Window
+from photoplan.io.raster import RasterReader
+from photoplan.matching.control import best_place
+from photoplan.matching.grey import GreyImage
+from photoplan.plan.coverage import image_border
+from photoplan.products.control.match import OrthoPatch
+from photoplan.project.scene import Scene
+from photoplan.surfaces.base import Surface
+
+#: Cells of the search at most, along each side.
+_LARGEST = 600
+
+
+@dataclass(frozen=True, eq=False)
+class Ortho:
+    """Orthophotos of one CRS."""
+
+    readers: tuple[RasterReader, ...]
+
+    @property
+    def resolution(self) -> float:
+        """Side of a pixel of the first one, metres."""
+        to_map = self.readers[0].info.to_map
+        assert to_map is not None
+        return to_map[1]
+
+    def read(
+        self, bounds: tuple[float, float, float, float], factor: int
+    ) -> tuple[NDArray[np.float32], tuple[float, float], float] | None:
+        """Grey values of means of pixels inside map bounds, the map place of the first one's middle, and their side.
+
+        From the first orthophoto that has values there; None if none has.
+        """
+        xmin, ymin, xmax, ymax = bounds
+        for reader in self.readers:
+            to_map = reader.info.to_map
+            assert to_map is not None
+            x0, step, _, y0, _, _ = to_map
+            side = factor * step
+            left, top = x0 - step / 2, y0 + step / 2
+            first = np.array([np.ceil((xmin - left) / side), np.ceil((top - ymax) / side)]).astype(int)
+            last = np.array([np.floor((xmax - left) / side), np.floor((top - ymin) / side)]).astype(int)
+            low, high = np.maximum(first, 0), np.minimum(last, np.array(reader.size) // factor)
+            if (high <= low).any():
+                continue
+            window = Window(int(low[0]), int(low[1]), *(int(v) for v in high - low))
+            values = GreyImage(reader).reduced(window, factor)
+            if np.isfinite(values).any():
+                return values, (left + (low[0] + 0.5) * side, top - (low[1] + 0.5) * side), side
+        return None
+
+
+def choose_patches(
+    ortho: Ortho, scenes: Sequence[Scene], grid: int, radius: int, search: float
+) -> tuple[tuple[float, int, int, float], list[OrthoPatch]]:
+    """Patches spread over what the images see: one in every square of the map, where its texture is best.
+
+    Squares are the `grid`-th part of a footprint. Patches are of the coarser resolution of orthophoto and photos.
+
+    Returns
+    -------
+    settings : (float, int, int, float)
+        Resolution (metres), radius (cells), search (cells), search (metres).
+    patches : list of OrthoPatch
+
+    Raises
+    ------
+    GeometryError
+        No image sees the ground.
+    UsageError
+        The search has too many cells.
+    """
+    seen = [_seen(scene) for scene in scenes]
+    areas = [s for s in seen if s is not None]
+    if not areas:
+        raise GeometryError("none of the images looks at the ground; look at heights and orientation")
+    gsd = float(np.median([np.sqrt(area.area / np.prod(size)) for area, size in areas]))
+    factor = max(1, round(gsd / ortho.resolution))
+    resolution = factor * ortho.resolution
+    cells = int(np.ceil(search / resolution))
+    if cells > _LARGEST:
+        raise UsageError(
+            f"--search {search:g} m are {cells} pixels of {resolution:g} m; at most {_LARGEST} are searched; give "
+            f"{_LARGEST * resolution:g} m or less, or a coarser orthophoto"
+        )
+    step = max(float(np.median([np.sqrt(area.area) for area, _ in areas])) / grid, resolution)
+    union = shapely.unary_union([area for area, _ in areas])
+    settings = (resolution, radius, cells, search)
+    return settings, _in_squares(ortho, union, scenes[0].ground.surface, (step, resolution, radius, factor))
+
+
+def _seen(scene: Scene) -> tuple[shapely.Geometry, tuple[int, int]] | None:
+    """Footprint on the level of the ground below."""
+    camera: Camera = scene.camera
+    level = float(scene.surface.heights(camera.center[:2]))
+    if not np.isfinite(level):
+        low, high = scene.surface.height_range(scene.terrain_bounds)
+        level = (low + high) / 2
+    if not np.isfinite(level):
+        return None
+    origin, direction = camera.rays(image_border(camera.size), level)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = (level - origin[:, 2]) / direction[:, 2]
+        foot = origin[:, :2] + t[:, None] * direction[:, :2]
+    foot = foot[np.isfinite(foot).all(axis=1) & (direction[:, 2] < 0) & (t > 0)]
+    area = shapely.convex_hull(shapely.MultiPoint(foot)).intersection(shapely.box(*scene.terrain_bounds))
+    return (area, camera.size) if area.area > 0 else None
+
+
+def _in_squares(
+    ortho: Ortho, union: shapely.Geometry, surface: Surface, sizes: tuple[float, float, int, int]
+) -> list[OrthoPatch]:
+    step, resolution, radius, factor = sizes
+    xmin, ymin, xmax, ymax = union.bounds
+    margin = (radius + 1) * resolution
+    found = []
+    for y in np.arange(ymin, ymax, step):
+        for x in np.arange(xmin, xmax, step):
+            if not union.intersects(shapely.box(x, y, x + step, y + step)):
+                continue
+            part = ortho.read((x - margin, y - margin, x + step + margin, y + step + margin), factor)
+            if part is None or min(part[0].shape) <= 2 * radius + 2:
+                continue
+            values, (left, top), side = part
+            place = best_place(values, radius, radius)
+            if place is None:
+                continue
+            col, row = place
+            patch = values[row - radius : row + radius + 1, col - radius : col + radius + 1].astype(float)
+            made = _patch(patch, (left + col * side, top - row * side), surface, side)
+            if made is not None:
+                found.append(made)
+    return found
+
+
+def _patch(values: NDArray[np.float64], at: tuple[float, float], surface: Surface, side: float) -> OrthoPatch | None:
+    """A patch with the plane through its ground; None where its middle has no height."""
+    radius = len(values) // 2
+    v, u = np.mgrid[-radius : radius + 1, -radius : radius + 1] * side
+    XY = np.stack([at[0] + u, at[1] - v], axis=-1)
+    Z = surface.heights(XY)
+    if not np.isfinite(Z[radius, radius]):
+        return None
+    known = np.isfinite(Z)
+    A = np.stack([np.ones(known.sum()), u[known], -v[known]], axis=1)
+    plane = np.array([np.median(Z[known]), 0.0, 0.0])
+    for _ in range(5):
+        off = np.abs(Z[known] - A @ plane)
+        weight = 1.0 / np.maximum(off, 0.05 * side)
+        plane = np.linalg.lstsq(A * np.sqrt(weight)[:, None], Z[known] * np.sqrt(weight), rcond=None)[0]
+    rough = float(np.sqrt(np.mean((Z[known] - A @ plane) ** 2)))
+    return OrthoPatch(values, (at[0], at[1], float(plane[0])), (float(plane[1]), float(plane[2])), rough)

@@ -1,0 +1,275 @@
+"""Control proposed for photos from an orthophoto and heights."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.observed import GroundPoints, ImagePoints
+from photoplan.errors import GeometryError, InputError, UsageError
+from photoplan.geometry.crs import crs_label, same_crs
+from photoplan.io.ground_points import write_ground_points
+from photoplan.io.image_points import write_image_points
+from photoplan.io.product import check_output
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
+from photoplan.io.project.model import Project, Terrain
+from photoplan.io.raster import RasterReader
+from photoplan.products.control.match import ImageControl, OrthoPatch, Settings, control_of_image
+from photoplan.products.control.patches import Ortho, choose_patches
+from photoplan.products.tie.work import Stage, threads, unwatched
+from photoplan.project.scene import input_files, open_scene
+
+
+@dataclass(frozen=True)
+class ControlRequest:
+    """What is asked."""
+
+    project: Path
+    ortho: tuple[Path, ...]
+    """Orthophotos in the project's CRS, of one resolution; the first one that has a value counts."""
+    height_sigma: float
+    """Standard deviation of the heights, metres."""
+    heights: Path | None = None
+    """Heights; None: the project's terrain."""
+    height_system: str | None = None
+    """Of `heights`, where the file does not state it."""
+    ortho_sigma: float | None = None
+    """Standard deviation of X and of Y in the orthophoto, metres; None: one of its pixels."""
+    images: tuple[str, ...] = ()
+    grid: int = 8
+    """Patches along each side of an image."""
+    search: float = 30.0
+    """How far off the approximate orientation may put a point, metres on the ground."""
+    radius: int = 15
+    """Of a patch, pixels of the coarser of orthophoto and photo."""
+    correlation: float = 0.7
+    output: Path | None = None
+    workers: int = 1
+    overwrite: bool = False
+    dry_run: bool = False
+
+
+@dataclass(frozen=True)
+class ControlReport:
+    """What was found."""
+
+    output: Path | None
+    """Table of ground points; None after a dry run."""
+    image_points: Path | None
+    patches: int
+    """Patches chosen in the orthophoto."""
+    resolution: float
+    """In which they were matched, metres."""
+    points: int
+    images: tuple[ImageControl, ...]
+    sigma: tuple[float, float, float]
+    """Standard deviations of the ground points: horizontal, height (metres, medians), image (pixels, median)."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        return {
+            "output": None if self.output is None else str(self.output),
+            "image_points": None if self.image_points is None else str(self.image_points),
+            "patches": self.patches,
+            "resolution": self.resolution,
+            "points": self.points,
+            "sigma": dict(zip(("plane", "height", "image"), (_number(s) for s in self.sigma))),
+            "images": [
+                {
+                    "image": i.name,
+                    "tried": i.tried,
+                    "matched": i.matched,
+                    "kept": len(i.points),
+                    "shift": [_number(v) for v in i.shift],
+                    "rms": _number(i.rms),
+                    "factor": i.factor,
+                    "reasons": i.reasons,
+                }
+                for i in self.images
+            ],
+        }
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def propose_control(request: ControlRequest, stage: Stage = unwatched) -> ControlReport:
+    """Match patches of an orthophoto in the photos of a project.
+
+    Raises
+    ------
+    UsageError
+        An output exists, or a number makes no sense.
+    InputError
+        An input cannot be used, or no image is oriented.
+    GeometryError
+        Nothing fits.
+    """
+    project = _with_heights(load_project(request.project), request)
+    output, image_output = _check(request, project)
+    names = [n for n in project.select(request.images or None) if project.image(n).center is not None]
+    if not names:
+        raise InputError(
+            f"{request.project}: none of the images has an approximate orientation; give center and angles, or find "
+            "some by `photoplan tie` and `photoplan adjust` with observed positions"
+        )
+    scenes = [open_scene(project, name) for name in names]
+    ortho = _open_ortho(request, project)
+    sizes, patches = choose_patches(ortho, scenes, request.grid, request.radius, request.search)
+    settings = Settings(*sizes, request.correlation)
+    if request.dry_run or not patches:
+        if not patches:
+            raise GeometryError("the orthophoto has no textured place with heights that one of the images could see")
+        return ControlReport(None, None, len(patches), settings.resolution, 0, (), (np.nan,) * 3)
+    covariances = _ground_covariances(patches, request, ortho)
+
+    def work(k: int) -> ImageControl:
+        return control_of_image(names[k], scenes[k], patches, covariances, settings)
+
+    images = []
+    with threads(request.workers) as run, stage("images", len(names)) as done:
+        for result in run(work, range(len(names))):
+            images.append(result)
+            done(1, 0)
+    ground, points = _tables(patches, covariances, images)
+    if not len(points):
+        found = sum(i.matched for i in images)
+        if not found:
+            reasons = sum((Counter(i.reasons) for i in images), Counter[str]())
+            listed = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common()) or "none is in an image"
+            raise GeometryError(f"no patch of the orthophoto was found in an image: {listed}")
+        raise GeometryError(
+            f"{found} of {sum(i.tried for i in images)} patches were found, but they do not agree on an orientation of "
+            "any image; give a larger --search, another --correlation, or an orthophoto of a similar date"
+        )
+    write_ground_points(output, ground)
+    write_image_points(image_output, points)
+    _enter(request.project, output, image_output)
+    sigma = (*_medians(ground.sigma[:, [0, 2]]), float(np.median(points.sigma)))
+    return ControlReport(output, image_output, len(patches), settings.resolution, len(ground), tuple(images), sigma)
+
+
+def _medians(values: NDArray[np.float64]) -> tuple[float, float]:
+    a, b = np.median(values, axis=0)
+    return float(a), float(b)
+
+
+def _with_heights(project: Project, request: ControlRequest) -> Project:
+    if request.heights is None:
+        return project
+    system = request.height_system or (None if project.terrain is None else project.terrain.height_system)
+    path = os.fspath(Path(request.heights).resolve())
+    return project.model_copy(update={"terrain": Terrain(file=path, height_system=system)})
+
+
+def _check(request: ControlRequest, project: Project) -> tuple[Path, Path]:
+    """Outputs, and everything that can be refused before any work."""
+    for what, value, low in (
+        ("--grid", request.grid, 1),
+        ("--search", request.search, 0.0),
+        ("--radius", request.radius, 5),
+        ("--height-sigma", request.height_sigma, 0.0),
+    ):
+        if not (np.isfinite(value) and value >= low):
+            raise UsageError(f"{what} {value:g}; {low:g} or more is needed")
+    if not -1 <= request.correlation < 1:
+        raise UsageError(f"--correlation {request.correlation:g}; a number below 1 is needed, such as 0.7")
+    if request.ortho_sigma is not None and not request.ortho_sigma > 0:
+        raise UsageError(f"--ortho-sigma {request.ortho_sigma:g}; a positive number of metres is needed")
+    output = request.output or request.project.resolve().parent / "control.csv"
+    image_output = output.with_name(f"{output.stem}_points{output.suffix or '.csv'}")
+    if not request.dry_run:
+        inputs = [request.project, *request.ortho]
+        # Tables of an older run of this command may be replaced, those of other measurements may not.
+        for path, own in ((output, project.observations.control), (image_output, project.observations.image_points)):
+            older = [project.resolve(file) for file in own]
+            others = [file for file in input_files(project) if file not in older]
+            check_output(path, [*inputs, *others], overwrite=request.overwrite)
+    return output, image_output
+
+
+def _open_ortho(request: ControlRequest, project: Project) -> Ortho:
+    readers: list[RasterReader] = []
+    for path in request.ortho:
+        reader = RasterReader(Path(path))
+        info = reader.info
+        if info.to_map is None or info.crs is None:
+            raise InputError(f"{path}: an orthophoto with its place on the map and its CRS is needed")
+        if not same_crs(info.crs, project.crs):
+            raise InputError(
+                f"{path}: in {crs_label(info.crs)}, the project is in {crs_label(project.crs)}; transform it with "
+                "gdalwarp -t_srs"
+            )
+        _, xx, xy, _, yx, yy = info.to_map
+        if xy or yx or xx <= 0 or abs(xx + yy) > 1e-6 * xx:
+            raise InputError(f"{path}: pixels are not square, or the raster is not north-up; use gdalwarp first")
+        if readers and abs(xx / Ortho((readers[0],)).resolution - 1) > 1e-4:
+            first = f"{request.ortho[0]} are {Ortho((readers[0],)).resolution:g} m"
+            raise InputError(
+                f"{path}: pixels of {xx:g} m, those of {first}; orthophotos of one run need "
+                "the same: use gdalwarp -tr, or a run for each with an --output of its own"
+            )
+        readers.append(reader)
+    return Ortho(tuple(readers))
+
+
+def _ground_covariances(patches: Sequence[OrthoPatch], request: ControlRequest, ortho: Ortho) -> NDArray[np.float64]:
+    """(n, 3, 3): an error of the place changes the height that is read there, by the slope of the ground."""
+    plane = request.ortho_sigma or ortho.resolution
+    slopes = np.array([p.slope for p in patches])
+    A = np.zeros((len(patches), 3, 2))
+    A[:, 0, 0] = A[:, 1, 1] = 1.0
+    A[:, 2] = slopes
+    covariance = plane**2 * (A @ A.transpose(0, 2, 1))
+    covariance[:, 2, 2] += request.height_sigma**2
+    return np.asarray(covariance)
+
+
+def _tables(
+    patches: Sequence[OrthoPatch], covariances: NDArray[np.float64], images: Sequence[ImageControl]
+) -> tuple[GroundPoints, ImagePoints]:
+    used = np.unique(np.concatenate([np.empty(0, np.int64), *(i.points for i in images)]))
+    digits = max(3, len(str(len(patches))))
+    names = tuple(f"C{k + 1:0{digits}d}" for k in used)
+    XYZ = np.array([patches[k].XYZ for k in used]).reshape(-1, 3)
+    C = covariances[used]
+    sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
+    ground = GroundPoints(names, XYZ, sigma, np.zeros(len(used), bool), C)
+    seen = [i for i in images if len(i.points)]
+    none = np.empty(0, np.int64)
+    points = ImagePoints(
+        tuple(i.name for i in seen),
+        names,
+        np.concatenate([none, *(np.full(len(i.points), k, np.int64) for k, i in enumerate(seen))]),
+        np.searchsorted(used, np.concatenate([none, *(i.points for i in seen)])).astype(np.int64),
+        np.concatenate([np.empty((0, 2)), *(i.xy for i in seen)]),
+        np.concatenate([np.empty((0, 2)), *(i.sigma for i in seen)]),
+    )
+    return ground, points
+
+
+def _enter(path: Path, output: Path, image_output: Path) -> None:
+    """Add both tables to [observations]."""
+    project = load_project(path)
+    folder = path.resolve().parent
+    entries: dict[str, Any] = {}
+    for role, listed, file in (
+        ("control", project.observations.control, output),
+        ("image_points", project.observations.image_points, image_output),
+    ):
+        whole = file.resolve()
+        if any(project.resolve(f) == whole for f in listed):
+            continue
+        written = whole.relative_to(folder).as_posix() if whole.is_relative_to(folder) else os.fspath(whole)
+        entries[role] = [*listed, written]
+    if entries:
+        edit_project(path, ProjectChanges(tables={"observations": entries}))

@@ -1,0 +1,1 @@
+"""Orientations from one format into another."""

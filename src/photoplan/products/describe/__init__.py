@@ -1,0 +1,1 @@
+"""What a file is: images, terrain models, filters, cameras."""

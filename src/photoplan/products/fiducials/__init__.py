@@ -1,0 +1,1 @@
+"""Fiducial marks of the scans of a project."""

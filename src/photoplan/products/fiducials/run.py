@@ -1,0 +1,224 @@
+"""Fiducial marks of scans: found, reported, drawn, and written into a project."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+from photoplan.errors import InputError, PhotoplanError, ResourceError, UsageError
+from photoplan.io.camera.file import read_cameras
+from photoplan.io.camera.model import FilmCamera, FrameCamera
+from photoplan.io.names import unique_stems
+from photoplan.io.product import check_output
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
+from photoplan.io.project.model import Project
+from photoplan.io.scan_pitch import parse_pitch
+from photoplan.orientation.marks.fiducials import FiducialSearch, find_fiducials
+from photoplan.orientation.marks.layout import MarkLayout
+from photoplan.orientation.marks.locate import LEAST_CORRELATION
+from photoplan.products.fiducials.picture import MarksPicture
+from photoplan.products.fiducials.result import FiducialsReport, ImageFiducials
+from photoplan.project.camera_marks import mark_patterns
+from photoplan.project.scan_image import ScanImage, stated_pixel_mm
+
+
+@dataclass(frozen=True)
+class FiducialsRequest:
+    """What is asked."""
+
+    images: tuple[Path, ...]
+    """Scans, or one project file."""
+    camera: Path | None = None
+    """File that describes their camera; a project describes its own."""
+    camera_name: str | None = None
+    """Which of its cameras, where it describes several."""
+    select: tuple[str, ...] = ()
+    """Names or patterns of a project's images; all film images if empty."""
+    scan_resolution: str | None = None
+    """Of the scans, such as ``1200dpi`` or ``21um``; None: as the files state it, else found."""
+    rotation: int | None = None
+    mirrored: bool | None = None
+    negative: bool | None = None
+    band: int | None = None
+    least_correlation: float = LEAST_CORRELATION
+    pictures: Path | None = None
+    """Folder that receives a picture of the marks of each image."""
+    overwrite: bool = False
+    dry_run: bool = False
+    """Do not write into the project."""
+
+
+@dataclass(frozen=True)
+class _Job:
+    name: str
+    file: Path
+    camera_name: str
+    camera: FilmCamera
+    layout: MarkLayout
+
+
+def _unwatched(total: int) -> AbstractContextManager[Callable[[int, int], None]]:
+    return nullcontext(lambda images, pixels: None)
+
+
+def locate_fiducials(
+    request: FiducialsRequest,
+    begin: Callable[[int], AbstractContextManager[Callable[[int, int], None]]] = _unwatched,
+) -> FiducialsReport:
+    """Find the fiducial marks of all images; one that fails does not stop the others.
+
+    Parameters
+    ----------
+    request : FiducialsRequest
+        What is asked.
+    begin : callable
+        Gets the number of images; what it returns is entered, and called with (1, 0) after each image.
+
+    Raises
+    ------
+    UsageError
+        Options contradict each other, or a picture exists or cannot be drawn because matplotlib is missing.
+    InputError
+        Camera or project cannot be used.
+    """
+    project = _project(request)
+    jobs = _jobs(request, project)
+    pictures = _pictures(request, jobs)
+    drawer = MarksPicture() if pictures else None
+    pixel_mm = sum(parse_pitch(request.scan_resolution)) / 2 if request.scan_resolution else None
+    results: list[ImageFiducials] = []
+    failed: dict[str, str] = {}
+    with begin(len(jobs)) as advance:
+        for job in jobs:
+            try:
+                results.append(_locate(request, job, pixel_mm, drawer, pictures, project is not None))
+            except ResourceError:
+                raise
+            except PhotoplanError as error:
+                failed[job.name] = str(error)
+            advance(1, 0)
+    written = None
+    if project is not None and results and not request.dry_run:
+        written = request.images[0]
+        edit_project(written, ProjectChanges(images={r.name: _entries(project, r) for r in results}))
+    return FiducialsReport(tuple(results), failed, written)
+
+
+def _project(request: FiducialsRequest) -> Project | None:
+    """The project that is given in place of images."""
+    if len(request.images) == 1 and request.images[0].suffix.lower() == ".toml":
+        if request.camera is not None or request.camera_name is not None:
+            raise UsageError("a project describes its cameras itself; leave out --camera and --camera-name")
+        return load_project(request.images[0])
+    if not request.images:
+        raise UsageError("no image is given; give scans and --camera FILE, or a project file")
+    if request.select:
+        raise UsageError("--images chooses among the images of a project; here the images are given themselves")
+    if request.camera is None:
+        raise UsageError("--camera FILE is needed: it describes the fiducial marks; or give a project file")
+    return None
+
+
+def _jobs(request: FiducialsRequest, project: Project | None) -> list[_Job]:
+    if project is None:
+        assert request.camera is not None
+        name, camera = _film_camera(request.camera, request.camera_name)
+        layout = _layout(camera, name, request.camera.resolve().parent)
+        files = [str(path) for path in request.images]
+        twice = sorted({f for f in files if files.count(f) > 1})
+        if twice:
+            raise UsageError(f"image {twice[0]} is given twice")
+        return [_Job(path.name, path, name, camera, layout) for path in request.images]
+    jobs = []
+    layouts: dict[str, MarkLayout] = {}
+    for name in project.select(request.select or None):
+        image = project.image(name)
+        described = project.cameras[image.camera]
+        if not isinstance(described, FilmCamera):
+            if request.select:
+                raise UsageError(f"image {name!r}: its camera {image.camera!r} is digital and has no fiducial marks")
+            continue
+        if image.camera not in layouts:
+            layouts[image.camera] = _layout(described, image.camera, project.folder)
+        jobs.append(_Job(name, project.resolve(image.file), image.camera, described, layouts[image.camera]))
+    if not jobs:
+        raise InputError(f"{request.images[0]}: none of its images was taken with a film camera")
+    return jobs
+
+
+def _film_camera(path: Path, wanted: str | None) -> tuple[str, FilmCamera]:
+    cameras: Mapping[str, FilmCamera | FrameCamera] = read_cameras(path).cameras
+    film = {name: camera for name, camera in cameras.items() if isinstance(camera, FilmCamera)}
+    listed = ", ".join(map(repr, film)) or "none"
+    if wanted is not None:
+        if wanted not in film:
+            raise UsageError(f"{path}: has no film camera {wanted!r}; its film cameras are {listed}")
+        return wanted, film[wanted]
+    if len(film) != 1:
+        raise UsageError(f"{path}: describes {len(film)} film cameras ({listed}); choose one with --camera-name")
+    return next(iter(film.items()))
+
+
+def _layout(camera: FilmCamera, name: str, folder: Path) -> MarkLayout:
+    try:
+        return MarkLayout.of(camera.fiducials_mm, mark_patterns(camera, folder))
+    except InputError as error:
+        raise InputError(f"camera {name!r}: {error}") from None
+
+
+def _pictures(request: FiducialsRequest, jobs: Sequence[_Job]) -> dict[str, Path]:
+    """Where each image's picture goes; refused before any work if it exists."""
+    if request.pictures is None:
+        return {}
+    stems = unique_stems(job.name for job in jobs)
+    paths = {name: request.pictures / f"{stem}.fiducials.png" for name, stem in stems.items()}
+    inputs = [*request.images, *(job.file for job in jobs)]
+    for path in paths.values():
+        check_output(path, inputs, overwrite=request.overwrite)
+    return paths
+
+
+def _locate(
+    request: FiducialsRequest,
+    job: _Job,
+    pixel_mm: float | None,
+    drawer: MarksPicture | None,
+    pictures: Mapping[str, Path],
+    in_project: bool,
+) -> ImageFiducials:
+    scan = ScanImage(job.file, request.band)
+    known = FiducialSearch(
+        pixel_mm if pixel_mm is not None else stated_pixel_mm(job.file),
+        request.rotation,
+        request.mirrored,
+        job.camera.mirrored,
+        request.negative,
+        request.least_correlation,
+    )
+    try:
+        found = find_fiducials(scan, job.layout, known)
+    except InputError as error:
+        raise type(error)(f"{job.file}: {error}") from None
+    if in_project and found.turn.mirrored != job.camera.mirrored:
+        raise InputError(
+            f"{job.file}: the scan is {'' if found.turn.mirrored else 'not '}mirrored, but its camera "
+            f"{job.camera_name!r} states mirrored = {str(job.camera.mirrored).lower()}; correct that entry, or give "
+            "scans of the other kind a camera of their own"
+        )
+    picture = pictures.get(job.name)
+    if drawer is not None and picture is not None:
+        drawer.draw(picture, scan, job.layout, found, job.name)
+    return ImageFiducials(job.name, job.file, job.camera_name, scan.size, scan.rule, found, picture)
+
+
+def _entries(project: Project, result: ImageFiducials) -> dict[str, object]:
+    """What is written for an image."""
+    image = project.image(result.name)
+    marks = {m.name: [round(m.x, 4), round(m.y, 4)] for m in result.found.marks}
+    entries: dict[str, object] = {"fiducials": marks}
+    if image.size is None and project.cameras[image.camera].size is None:
+        entries["size"] = list(result.size)
+    return entries

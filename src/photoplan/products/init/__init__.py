@@ -1,0 +1,1 @@
+"""A project file from the files that users have."""

@@ -1,0 +1,282 @@
+"""A project from the files that users have: images, camera, orientation, terrain."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.crs import crs_label
+from photoplan.geometry.heights import height_label
+from photoplan.io.camera.file import CameraFile, read_cameras
+from photoplan.io.camera.model import FilmCamera, FrameCamera, Triple
+from photoplan.io.camera.opensfm import resized
+from photoplan.io.names import check_input_name, match_key, relative_path
+from photoplan.io.orientation.file import read_orientation
+from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
+from photoplan.io.project.file import parse_project, write_project
+from photoplan.io.project.model import Image, Project, Terrain
+from photoplan.io.raster_info import RasterInfo, read_info
+from photoplan.products.init.match import (
+    Unoriented,
+    camera_by_size,
+    camera_name,
+    image_files,
+    match_images,
+    some,
+    unoriented,
+)
+from photoplan.products.init.systems import (
+    check_joined,
+    height_systems,
+    placed,
+    project_crs,
+    terrain_entry,
+)
+
+LENS_NAMES = {
+    "none": "no distortion",
+    "brown": "Brown lens",
+    "opencv": "OpenCV lens",
+    "opencv_fisheye": "OpenCV fisheye lens",
+    "radial_table": "radial table",
+}
+
+
+@dataclass(frozen=True)
+class InitRequest:
+    """What `photoplan init` is given; relative paths start at the current folder."""
+
+    folder: Path
+    """Folder of the project; `project.toml` is written into it."""
+    images: tuple[str, ...]
+    """Files, or patterns with ``*``, ``?`` and ``**``."""
+    camera: Path
+    """File with cameras: TOML, YAML or JSON."""
+    orientation: Path | None = None
+    """File with orientations, of any format of `photoplan.io.orientation.file`; None: the images are to be oriented."""
+    terrain: str | None = None
+    """Raster of heights, or one height in metres; None: it is added to the project before products are made."""
+    crs: str | None = None
+    """Projected CRS of the project; None: that of the orientation. Needed without one."""
+    height_system: str | None = None
+    """Declares whatever the files do not state: ellipsoidal, EPSG:nnnn, same."""
+    terrain_crs: str | None = None
+    """CRS of a terrain file that states none, such as an ASCII grid."""
+    terrain_height_system: str | None = None
+    """Declares the terrain's, also against what its file states."""
+    orientation_height_system: str | None = None
+    """Declares the orientation's, also against what its file states."""
+    form: TableFormat = field(default_factory=TableFormat)
+    """What the orientation file does not say of itself."""
+    format: str | None = None
+    """Format of the orientation file; None: by its content."""
+    earth_curvature: str = "none"
+    """none, correction or strict."""
+    refraction: bool = False
+    """Whether image points are corrected for refraction."""
+    image_points: tuple[Path, ...] = ()
+    """Files of measured image points, for [observations]."""
+    control: tuple[Path, ...] = ()
+    """Files of ground points, for [observations]."""
+    positions: Path | None = None
+    """Table of observed projection centres, for [observations]."""
+    overwrite: bool = False
+    """Whether an existing project file is replaced."""
+
+    @property
+    def path(self) -> Path:
+        """The project file."""
+        return self.folder / "project.toml"
+
+
+@dataclass(frozen=True)
+class InitResult:
+    """A project that was made, and what did not fit together."""
+
+    path: Path
+    """The project file."""
+    project: Project
+    without_orientation: tuple[str, ...]
+    """Image files that no line of the orientation names; they are left out."""
+    without_image: tuple[str, ...]
+    """Names of the orientation that no image file has; they are left out."""
+
+
+def init_project(request: InitRequest, talk: Callable[[str], None] = lambda line: None) -> InitResult:
+    """Make a project of the given files and write `project.toml`.
+
+    Parameters
+    ----------
+    request : InitRequest
+    talk : callable
+        Takes lines for the user: what was found and what was left out.
+
+    Raises
+    ------
+    UsageError
+        The project file exists.
+    InputError
+        A file cannot be used, or the files do not fit together.
+    HeightSystemError
+        Height systems are not declared, or the grid that joins them is missing.
+    """
+    if request.path.exists() and not request.overwrite:
+        raise UsageError(f"{request.path} exists; give --overwrite to replace it, or another folder")
+    result = make_project(request, talk)
+    try:
+        request.folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{request.folder}: the folder cannot be made ({error.strerror or error})") from None
+    write_project(result.path, result.project)
+    return result
+
+
+def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line: None) -> InitResult:
+    """The project of the given files, without writing anything; see `init_project`."""
+    files = image_files(request.images)
+    cameras = read_cameras(request.camera)
+    table = None
+    if request.orientation is not None:
+        table = read_orientation(request.orientation, request.form, request.format)
+    pairs, lonely_files, lonely_names = match_images(files, table) if table else (unoriented(files), [], [])
+    infos = {file: read_info(file) for file, _ in pairs}
+    terrain, terrain_info = terrain_entry(request)
+    crs, origin_of_crs = project_crs(request, table, terrain_info)
+    used = _cameras(pairs, cameras, infos, table.file if table else None)
+    for line in _summary(used, pairs, f"{crs_label(crs)} ({origin_of_crs})", (lonely_files, lonely_names), table):
+        talk(line)
+    systems = height_systems(request, table, terrain_info)
+    of_terrain = f"terrain {height_label(systems[0])}, " if terrain is not None else ""
+    of_others = "orientation" if table else "control"
+    talk(f"  height systems: {of_terrain}{of_others} {height_label(systems[1])}")
+    poses: dict[str, tuple[Triple, Triple]] = {}
+    if table is not None:
+        centers, angles = placed(table, crs, systems[1])
+        check_joined(systems, crs, centers)
+        poses = {i.name: (_triple(c), _triple(a)) for i, c, a in zip(table.images, centers, angles)}
+    images = []
+    for file, oriented in pairs:
+        camera, described = used[oriented.name]
+        center, turned = poses.get(oriented.name, (None, None))
+        size = infos[file].size if isinstance(described, FilmCamera) and described.size is None else None
+        images.append(
+            Image(
+                name=match_key(file.name),
+                file=relative_path(file, request.folder),
+                camera=camera,
+                center=center,
+                angles=turned,
+                fiducials=oriented.fiducials,
+                size=size,
+            )
+        )
+    project = _checked(request, terrain, systems, crs, dict(used.values()), images)
+    return InitResult(request.path, project, tuple(f.name for f in lonely_files), tuple(lonely_names))
+
+
+def _triple(values: NDArray[np.float64]) -> Triple:
+    return float(values[0]), float(values[1]), float(values[2])
+
+
+def _cameras(
+    pairs: list[tuple[Path, OrientedImage | Unoriented]],
+    cameras: CameraFile,
+    infos: dict[Path, RasterInfo],
+    table: Path | None,
+) -> dict[str, tuple[str, FrameCamera | FilmCamera]]:
+    """Camera (name and description) of every image name; sizes agree with the files'."""
+    used: dict[str, tuple[str, FrameCamera | FilmCamera]] = {}
+    sizes: dict[str, tuple[tuple[int, int], Path]] = {}
+    for file, image in pairs:
+        size = infos[file].size
+        if table is None or isinstance(image, Unoriented):
+            name = camera_by_size(file, size, cameras)
+        else:
+            name = camera_name(image, cameras, table)
+        camera = cameras.cameras[name]
+        if isinstance(camera, FrameCamera):
+            before = sizes.setdefault(name, (size, file))
+            if cameras.normalised and size == before[0]:
+                camera = resized(camera, size, f"{file}: camera {name!r}")
+        if camera.size is not None and camera.size != size:
+            raise InputError(
+                f"{file}: {size[0]} × {size[1]} px, but camera {name!r} of {cameras.file} has "
+                f"{camera.size[0]} × {camera.size[1]} px; give the camera of these images, or images of full size"
+            )
+        used[image.name] = (name, camera)
+    return used
+
+
+def _checked(
+    request: InitRequest,
+    terrain: Terrain | None,
+    systems: tuple[str | None, str],
+    crs: str,
+    cameras: dict[str, FrameCamera | FilmCamera],
+    images: list[Image],
+) -> Project:
+    """The project, checked as if it had been read."""
+    orientation = {
+        "height_system": systems[1],
+        "earth_curvature": request.earth_curvature,
+        "refraction": request.refraction,
+    }
+    if request.orientation is None:
+        # Angles will be written so; those of a file are turned into ω, φ, κ in degrees.
+        orientation |= {"angle_unit": request.form.angle_unit, "rotation": request.form.rotation}
+    contents: dict[str, Any] = {
+        "crs": crs,
+        "orientation": orientation,
+        "observations": _observations(request),
+        "cameras": {name: c.model_dump(exclude_none=True) for name, c in cameras.items()},
+        "images": [i.model_dump(exclude_none=True) for i in images],
+    }
+    if terrain is not None:
+        contents["terrain"] = {**terrain.model_dump(exclude_none=True), "height_system": systems[0]}
+    return parse_project(contents, request.folder.absolute().resolve(), "project")
+
+
+def _observations(request: InitRequest) -> dict[str, Any]:
+    """Entries of [observations]; the files have to be there."""
+    entries: dict[str, Any] = {}
+    for key, files in (("image_points", request.image_points), ("control", request.control)):
+        if files:
+            entries[key] = [_present(file, request.folder) for file in files]
+    if request.positions is not None:
+        entries["positions"] = _present(request.positions, request.folder, or_folder=True)
+    return entries
+
+
+def _present(file: Path, folder: Path, *, or_folder: bool = False) -> str:
+    """Path from the project; positions may be a folder, of images that state them."""
+    check_input_name(str(file))
+    if not (file.is_file() or (or_folder and file.is_dir())):
+        raise InputError(f"{file}: no such file; give the measurements that exist, or add them to the project later")
+    return relative_path(file.absolute(), folder)
+
+
+def _summary(
+    used: dict[str, tuple[str, FrameCamera | FilmCamera]],
+    pairs: Sequence[tuple[Path, OrientedImage | Unoriented]],
+    crs: str,
+    lonely: tuple[list[Path], list[str]],
+    table: OrientationTable | None,
+) -> list[str]:
+    """What was found, in a few lines."""
+    parts = [f"{len(pairs)} images" + ("" if table else " without orientation")]
+    for name, camera in dict(used.values()).items():
+        size = f", {camera.size[0]} × {camera.size[1]} px" if camera.size is not None else ""
+        film = "film, " if isinstance(camera, FilmCamera) else ""
+        parts.append(f'camera "{name}"{size}, {film}{LENS_NAMES[camera.lens.type]}')
+    lines = ["  " + " · ".join([*parts, crs])]
+    if lonely[0]:
+        lines.append(f"  left out, no orientation: {some([f.name for f in lonely[0]])}")
+    if lonely[1]:
+        lines.append(f"  left out, no image file: {some(lonely[1])}")
+    return lines + ([f"  {note}" for note in table.notes] if table else [])

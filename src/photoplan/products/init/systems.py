@@ -1,0 +1,223 @@
+"""CRS and height systems of a project that is made, and its terrain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import HeightSystemError, InputError, UsageError
+from photoplan.geometry.crs import (
+    canonical_crs,
+    crs_label,
+    crs_step,
+    grid_rotation,
+    parse_crs,
+    require_projected_metres,
+    same_crs,
+    topocentric_poses,
+)
+from photoplan.geometry.heights import check_height_system, declared_pair, height_label, height_step
+from photoplan.io.names import check_input_name, relative_path
+from photoplan.io.orientation.table import OrientationTable, degrees_of
+from photoplan.io.project.model import Terrain
+from photoplan.io.raster_info import read_info
+from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
+
+
+class Systems(Protocol):
+    """What is declared; `photoplan.products.init.run.InitRequest` tells of each."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the project."""
+        ...
+
+    @property
+    def terrain(self) -> str | None:
+        """Raster of heights, or one height."""
+        ...
+
+    @property
+    def crs(self) -> str | None:
+        """CRS of the project."""
+        ...
+
+    @property
+    def height_system(self) -> str | None:
+        """Of whatever does not state one."""
+        ...
+
+    @property
+    def terrain_crs(self) -> str | None:
+        """CRS of a terrain file that states none."""
+        ...
+
+    @property
+    def terrain_height_system(self) -> str | None:
+        """The terrain's alone."""
+        ...
+
+    @property
+    def orientation_height_system(self) -> str | None:
+        """The orientation's alone."""
+        ...
+
+
+@dataclass(frozen=True)
+class TerrainFacts:
+    """What a terrain file states of its systems."""
+
+    path: Path
+    crs: str | None
+    vertical_crs: str | None
+
+
+def _terrain_facts(file: Path) -> TerrainFacts:
+    if is_terrain_model(file):
+        header = ModelReader(file).header
+        return TerrainFacts(file, header.crs, header.height_system)
+    info = read_info(file)
+    return TerrainFacts(info.path, info.crs, info.vertical_crs)
+
+
+def terrain_entry(request: Systems) -> tuple[Terrain | None, TerrainFacts | None]:
+    """The terrain entry (height system still open) and the facts of its file.
+
+    Raises
+    ------
+    InputError
+        The file cannot be used, or its CRS is not known.
+    """
+    if request.terrain is None:
+        return None, None
+    text = request.terrain.strip()
+    try:
+        return Terrain(height=float(text)), None
+    except ValueError:
+        pass
+    check_input_name(text)
+    file = Path(text)
+    info = _terrain_facts(file)
+    if info.crs is None and request.terrain_crs is None:
+        raise InputError(f"terrain {file}: states no CRS; say the one it is in: --terrain-crs EPSG:nnnn")
+    stated = info.crs or request.terrain_crs
+    parse_crs(stated or "", f"terrain {file}")
+    if info.crs is not None and request.terrain_crs is not None and not same_crs(info.crs, request.terrain_crs):
+        raise InputError(
+            f"terrain {file}: states {crs_label(info.crs)}, not {request.terrain_crs}; leave --terrain-crs out"
+        )
+    crs = None if info.crs is not None else request.terrain_crs
+    return Terrain(file=relative_path(file.absolute(), request.folder), crs=crs), replace(info, crs=stated)
+
+
+def project_crs(request: Systems, table: OrientationTable | None, terrain: TerrainFacts | None) -> tuple[str, str]:
+    """The project's CRS and where it comes from.
+
+    Raises
+    ------
+    InputError
+        It is not stated, or not projected in metres.
+    """
+    if request.crs is not None:
+        crs, source = request.crs, "as given"
+    elif table is None:
+        raise InputError(
+            "without an orientation nothing states the CRS of the project; declare that of the control points with "
+            "--crs EPSG:nnnn"
+        )
+    elif table.crs is not None:
+        crs, source = table.crs, f"from {(table.crs_file or table.file).name}"
+    elif table.origin is not None and terrain is not None and terrain.crs is not None:
+        crs, source = _horizontal(terrain.crs), f"from {terrain.path.name}"
+    else:
+        raise InputError(f"{table.file}: does not state the CRS of its coordinates; declare it with --crs EPSG:nnnn")
+    require_projected_metres(crs, f"CRS ({source})")
+    return canonical_crs(crs), source
+
+
+def _horizontal(text: str) -> str:
+    crs = parse_crs(text)
+    return str((crs.sub_crs_list[0] if crs.is_compound else crs).to_wkt())
+
+
+def height_systems(
+    request: Systems, table: OrientationTable | None, terrain: TerrainFacts | None
+) -> tuple[str | None, str]:
+    """Height systems of terrain and orientation (with that of control): as declared, else as the files state.
+
+    Raises
+    ------
+    HeightSystemError
+        One of them is not known.
+    UsageError
+        Declared is another one than both files state.
+    """
+    stated_terrain = terrain.vertical_crs if terrain is not None else None
+    stated_table = table.height_system if table is not None else None
+    stated = [
+        request.terrain_height_system or stated_terrain or request.height_system,
+        request.orientation_height_system or stated_table or request.height_system,
+    ]
+    if request.height_system is not None:
+        declared = check_height_system(request.height_system, "--height-system")
+        of_files = [s for s in (stated_terrain, stated_table) if s is not None]
+        if len(of_files) == 2 and declared not in [check_height_system(s) for s in of_files]:
+            raise UsageError(
+                f"--height-system {request.height_system}: both files state theirs "
+                f"({height_label(stated[0])}; {height_label(stated[1])}); to overrule a file use "
+                "--terrain-height-system or --orientation-height-system"
+            )
+    terrain_system, orientation_system = stated
+    if request.terrain is not None:
+        return declared_pair(terrain_system, orientation_system)
+    if orientation_system is None:
+        raise HeightSystemError(
+            "height system of control points and orientation not stated → declare it with --height-system: "
+            "ellipsoidal, EPSG:nnnn (a vertical CRS, such as EPSG:5773 for EGM96), or same (as that of all heights)"
+        )
+    return None, check_height_system(orientation_system, "orientation")
+
+
+def placed(table: OrientationTable, crs: str, system: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Projection centres (n, 3) and ω, φ, κ in degrees (n, 3) in the project's CRS.
+
+    Raises
+    ------
+    InputError
+        The positions are in a CRS to whose axes angles cannot refer.
+    HeightSystemError
+        The unit of the heights is not stated.
+    """
+    if table.origin is not None:
+        centers, axes = topocentric_poses(table.origin, crs, table.centers)
+        return centers, degrees_of(axes @ table.rotations)
+    if table.crs is None or same_crs(table.crs, crs):
+        return table.centers, table.opk_degrees()
+    source = parse_crs(table.crs)
+    if not source.is_projected:
+        raise InputError(
+            f"{table.file}: positions are in {crs_label(table.crs)}, which is not projected, so angles have no axes "
+            "to refer to; transform the orientation into a projected CRS beforehand"
+        )
+    if source.axis_info[0].unit_conversion_factor != 1.0 and system in ("same", "ellipsoidal"):
+        raise HeightSystemError(
+            f"{table.file}: {crs_label(table.crs)} is in {source.axis_info[0].unit_name}, and the unit of Z is not "
+            "stated; declare the vertical CRS with --orientation-height-system EPSG:nnnn"
+        )
+    XY = table.centers[:, :2]
+    bounds = (XY[:, 0].min(), XY[:, 1].min(), XY[:, 0].max(), XY[:, 1].max())
+    step = crs_step(table.crs, crs, bounds)
+    centers = np.column_stack([step(XY), table.centers[:, 2]])
+    return centers, degrees_of(grid_rotation(step, XY) @ table.rotations)
+
+
+def check_joined(systems: tuple[str | None, str], crs: str, centers: NDArray[np.float64]) -> None:
+    """Fail now, not in every later command, if the height systems cannot be joined here."""
+    if systems[0] is None:
+        return
+    bounds = (centers[:, 0].min(), centers[:, 1].min(), centers[:, 0].max(), centers[:, 1].max())
+    height_step(systems[1], systems[0], crs, bounds)(centers)

@@ -1,0 +1,1 @@
+"""Orthophotos: planned, looked at, executed."""

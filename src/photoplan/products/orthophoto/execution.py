@@ -1,0 +1,323 @@
+"""Execute a plan: tiles to workers, pixels to files, a record beside each product."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from photoplan import __version__
+from photoplan.engine.execute import MOST_SOURCE_BYTES, Pixels
+from photoplan.engine.executors import Outcome, Workers, executor_factory, run_tiles
+from photoplan.errors import TilesFailed, UsageError
+from photoplan.io.product import ProductFile
+from photoplan.io.quicklook import write_overview
+from photoplan.io.run_record import peak_memory_bytes, record_path, versions, write_run_record
+from photoplan.kernels.rectify import is_compiled
+from photoplan.plan.anchors import Anchors
+from photoplan.plan.product import ProductPlan, Tile, compile_tile
+from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, render_tile
+from photoplan.products.orthophoto.results import ProductResult, finished_products, product_path
+from photoplan.project.restored_reader import RestoredReader
+from photoplan.project.scene import Scene, SceneAddress, input_files, open_scene
+
+#: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
+BASE_MEMORY = 320 * 2**20
+
+
+@dataclass(frozen=True)
+class Run:
+    """How a plan is executed; none of it changes a pixel."""
+
+    workers: int = 1
+    """Threads or processes."""
+    executor: str = "threads"
+    """``threads``, ``processes`` or a Dask scheduler's address."""
+    memory: int | None = None
+    """Bytes the run should stay under; None: no bound but the tiles in flight."""
+    overwrite: bool = False
+    """Whether finished products may be replaced."""
+    quicklook: bool = True
+    """Whether to write `overview.png`."""
+    progress: Callable[[int, int], None] = lambda tiles, pixels: None
+    """Called with the number of tiles just finished and of their pixels."""
+    talk: Callable[[str], None] = lambda text: None
+    """Called with a sentence that a user may want to read while it goes on."""
+    report: Callable[[ProductResult], None] = lambda result: None
+    """Called with each product's result as soon as it is known, also if some of its tiles failed."""
+
+    @property
+    def in_flight(self) -> int:
+        """Tiles that may be under way at once.
+
+        Raises
+        ------
+        UsageError
+            `memory` does not suffice for one tile.
+        """
+        wanted = self.workers if self.workers == 1 else 2 * self.workers
+        if self.memory is None:
+            return wanted
+        # A tile holds its source window as read and as packed for the kernel, relief, anchors and result.
+        per_tile = 3 * MOST_SOURCE_BYTES
+        fits = (self.memory - BASE_MEMORY) // per_tile
+        if fits < 1:
+            least = (BASE_MEMORY + per_tile) / 2**20
+            raise UsageError(
+                f"--memory {self.memory / 2**20:.0f} MiB; at least {least:.0f} MiB are needed for one tile"
+            )
+        return int(min(wanted, fits))
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What a worker is told once: small, and pickles."""
+
+    scene: SceneAddress
+    product: ProductPlan
+    kernel: str
+
+
+def _work(job: _Job, tile: Tile) -> Pixels:
+    return render_tile(job.product, job.kernel, job.scene.open(), tile)
+
+
+def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list[ProductResult]:
+    """Make all products of a plan.
+
+    Parameters
+    ----------
+    plan : OrthoPlan
+    output : path
+        Folder for `NAME_ortho.tif`, its run record, and the overview picture; made if it does not exist.
+    run : Run, optional
+        Workers, memory, overwriting, progress.
+
+    Returns
+    -------
+    list of ProductResult
+        In the plan's order.
+
+    Raises
+    ------
+    UsageError
+        A product exists and `run.overwrite` is False, or would replace any of the project's inputs; nothing is done
+        then.
+    RunLocked
+        Another run is writing the same product.
+    InputError
+        An input is missing, damaged, or has changed since it was planned.
+    TilesFailed
+        Some tiles failed again and again; their products are not written, all others are.
+    ResourceError
+        Disk or memory ran out.
+    """
+    run = run or Run()
+    folder = Path(output)
+    in_flight, make = run.in_flight, executor_factory(run.executor, run.workers)
+    picture = folder / "overview.png"
+    _refuse_inputs(plan, [*(product_path(folder, p) for p in plan.products), *([picture] if run.quicklook else [])])
+    kept = finished_products(plan, folder, run.overwrite)
+    _make_folder(folder)
+    if kept:
+        run.talk(f"{len(kept)} of {len(plan.products)} products are finished already")
+    results = []
+    with Workers(make) as workers:
+        for product in plan.products:
+            results.append(
+                kept.get(product.plan.name) or _make(plan, product, folder, run, partial(_tiles, workers, in_flight))
+            )
+            run.report(results[-1])
+    if run.quicklook:
+        write_overview([r.path for r in results if not r.failed], picture)
+    failed = [f"{r.path.name}: tiles {', '.join(map(str, r.failed))} ({r.reason})" for r in results if r.failed]
+    if failed:
+        raise TilesFailed(
+            "finished, but these products lack tiles and were not written; the same command tries the tiles again:\n  "
+            + "\n  ".join(failed)
+        )
+    return results
+
+
+def _refuse_inputs(plan: OrthoPlan, outputs: list[Path]) -> None:
+    """No output may be an input of the project, whichever product it belongs to and by whatever link."""
+    inputs = {_identity(file) for file in input_files(plan.project)}
+    for path in outputs:
+        if _identity(path) in inputs:
+            raise UsageError(f"{path}: the output is an input of the project; choose another --output")
+
+
+def _identity(path: Path) -> object:
+    """What two names of one file have in common."""
+    try:
+        state = path.stat()
+        return state.st_dev, state.st_ino
+    except OSError:
+        return path.resolve()
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder}: no such folder, and it cannot be made ({error.strerror})") from None
+
+
+def _tiles(workers: Workers, in_flight: int, job: _Job, tiles: list[Tile]) -> Iterator[Outcome]:
+    return run_tiles(tiles, partial(_work, job), workers, in_flight)
+
+
+def _make(
+    plan: OrthoPlan,
+    product: OrthoProduct,
+    folder: Path,
+    run: Run,
+    compute: Callable[[_Job, list[Tile]], Iterator[Outcome]],
+) -> ProductResult:
+    started = time.perf_counter()
+    settings, scene = plan.settings, open_scene(plan.project, product.plan.image)
+    for note in scene.notes:
+        run.talk(f"note: {note}")
+    if not is_compiled(scene.reader.dtype, scene.reader.bands, settings.kernel):
+        run.talk("compiling the resampling kernels for this kind of image, once (up to a minute)")
+    job = _Job(scene.address, replace(product.plan, tiles=()), settings.kernel)
+    tally = _Tally()
+    with ProductFile(
+        product_path(folder, product),
+        product.grid,
+        scene.reader.bands,
+        scene.reader.dtype,
+        run_key=product.key,
+        nodata=settings.nodata_value,
+        compress=settings.compress,
+        overviews=settings.overviews,
+        tile=settings.tile,
+        overwrite=run.overwrite,
+        inputs=scene.files,
+        threads=run.workers,
+    ) as file:
+        _collect(file, product.plan, scene, partial(compute, job), run, tally)
+        facts = None if tally.failed else file.complete(_tags(plan, product))
+    result = ProductResult(
+        product_path(folder, product),
+        product.plan.image,
+        time.perf_counter() - started,
+        0.0 if facts is None else facts.valid_share,
+        tally.residual,
+        tally.cells,
+        product.plan.tile_count,
+        tally.resumed,
+        tuple(sorted(tally.failed)),
+        next(iter(tally.reasons), ""),
+    )
+    if facts is not None:
+        record = _record(plan, product, scene, run, result)
+        write_run_record(
+            record_path(result.path), {**record, "values_moved_off_nodata": facts.moved_values, "bytes": facts.bytes}
+        )
+    return result
+
+
+def _collect(
+    file: ProductFile,
+    product: ProductPlan,
+    scene: Scene,
+    compute: Callable[[list[Tile]], Iterator[Outcome]],
+    run: Run,
+    tally: _Tally,
+) -> None:
+    """Bring every tile of a product into its file: those of an earlier run are there, the others are computed."""
+    finished = file.finished
+    for tile in product.tiles:
+        if tile.index in finished:
+            tally.again(compile_tile(product, tile.window, scene.camera, scene.surface).anchors)
+    if tally.resumed:
+        run.talk(f"{product.name}: {tally.resumed} of {len(product.tiles)} tiles are finished already")
+        run.progress(tally.resumed, 0)
+    # Tiles that the plan leaves out hold nothing of the image.
+    for index in set(range(product.tile_count)) - {tile.index for tile in product.tiles} - finished:
+        file.append_empty(index)
+    for outcome in compute([tile for tile in product.tiles if tile.index not in finished]):
+        done: Tile = outcome.task
+        if outcome.error is not None:
+            tally.failed.append(done.index)
+            tally.reasons.append(f"tile {done.index}: {outcome.error}")
+        else:
+            pixels: Pixels = outcome.result
+            if pixels.values is None:
+                file.append_empty(done.index)
+            else:
+                file.append(done.index, pixels.values, pixels.valid)
+            tally.add(pixels)
+        run.progress(1, done.window.size)
+
+
+@dataclass
+class _Tally:
+    residual: float = 0.0
+    cells: int = 0
+    resumed: int = 0
+    failed: list[int] = field(default_factory=list)
+    reasons: list[str] = field(default_factory=list)
+
+    def add(self, pixels: Pixels) -> None:
+        self.residual = max(self.residual, pixels.residual)
+        self.cells += pixels.cells
+
+    def again(self, anchors: Anchors | None) -> None:
+        """Count a tile that an earlier run has finished."""
+        self.resumed += 1
+        if anchors is not None:
+            self.residual = max(self.residual, anchors.residual)
+            self.cells += len(anchors.corners)
+
+
+def _tags(plan: OrthoPlan, product: OrthoProduct) -> dict[str, str]:
+    """What the file itself says of its origin."""
+    return {
+        "PHOTOPLAN_VERSION": __version__,
+        "PHOTOPLAN_IMAGE": product.plan.image,
+        "PHOTOPLAN_KERNEL": plan.settings.kernel,
+        "PHOTOPLAN_KEY": product.key,
+    }
+
+
+def _record(plan: OrthoPlan, product: OrthoProduct, scene: Scene, run: Run, result: ProductResult) -> dict[str, Any]:
+    """The run record: what a person needs to answer for the product, and to make it again."""
+    center = scene.camera.center
+    return {
+        "product": result.to_dict(),
+        "key": product.key,
+        "inputs": [
+            {"path": path, "sampled_sha256": digest, "size": Path(path).stat().st_size}
+            for path, digest in scene.address.digests
+        ],
+        "project": json.loads(scene.address.text),
+        "settings": plan.settings.to_dict(),
+        "grid": {
+            "crs": product.grid.crs,
+            "bounds": product.grid.bounds,
+            "resolution": product.grid.resolution,
+            "width": product.grid.width,
+            "height": product.grid.height,
+        },
+        "heights": {
+            "terrain": scene.ground.height_systems[0],
+            "orientation": scene.ground.height_systems[1],
+            "working": scene.ground.working_system,
+        },
+        "crs_operations": [
+            {"operation": step.operation, "accuracy_m": step.accuracy} for step in scene.ground.operations
+        ],
+        "restored": scene.reader.describe() if isinstance(scene.reader, RestoredReader) else None,
+        "projection_centre": [float(c) for c in center],
+        "gsd_m": product.gsd,
+        "first_cell_px": product.plan.rule.cell,
+        "run": {"workers": run.workers, "executor": run.executor, "memory": run.memory},
+        "versions": versions(),
+        "peak_memory_bytes": peak_memory_bytes(),
+    }

@@ -1,0 +1,301 @@
+"""Orthophotos: read a project, compile a plan, look at it, execute it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan import __version__
+from photoplan.cameras.base import Camera
+from photoplan.engine.execute import Pixels
+from photoplan.engine.execute import render as render_window
+from photoplan.errors import GeometryError, UsageError
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.io.names import safe_stem
+from photoplan.io.project.model import Project
+from photoplan.io.storage import nodata_for
+from photoplan.kernels.weights import KERNELS
+from photoplan.plan.compile import AnchorRule, initial_cell
+from photoplan.plan.coverage import Coverage, cover, covered_tiles, image_border
+from photoplan.plan.product import ProductPlan, Tile
+from photoplan.products.orthophoto.settings import OrthoSettings
+from photoplan.project.reach import some_height
+from photoplan.project.scene import Scene, open_scene
+from photoplan.targets.map import MapTarget
+
+#: Tiles of a product: their list is kept in memory.
+MOST_TILES = 1_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class OrthoProduct:
+    """One orthophoto before its pixels."""
+
+    plan: ProductPlan
+    """Grid, tiles and anchors' rule."""
+    coverage: Coverage
+    """Footprint of the image on the terrain."""
+    gsd: float
+    """Mean ground sampling distance of the image, metres."""
+    key: str
+    """Hash of all that decides the pixels: inputs, orientation, settings, version."""
+
+    @property
+    def grid(self) -> MapGrid:
+        """Map grid of the product."""
+        assert isinstance(self.plan.target, MapTarget)
+        return self.plan.target.grid
+
+
+@dataclass(frozen=True, eq=False)
+class OrthoPlan:
+    """Orthophotos of a project, ready to be looked at, written and executed."""
+
+    project: Project
+    settings: OrthoSettings
+    products: tuple[OrthoProduct, ...]
+    blind: tuple[str, ...] = ()
+    """A line for each image that was asked for and sees nothing of the terrain inside the bounds."""
+
+    def __getitem__(self, name: str) -> OrthoProduct:
+        for product in self.products:
+            if name in (product.plan.name, product.plan.image):
+                return product
+        raise KeyError(f"{name}; the plan has {', '.join(p.plan.image for p in self.products)}")
+
+    def __str__(self) -> str:
+        tiles = sum(len(p.plan.tiles) for p in self.products)
+        lines = [f"{len(self.products)} orthophotos, {tiles} tiles, kernel {self.settings.kernel}"]
+        for p in self.products:
+            lines.append(
+                f"  {p.plan.name}: {p.grid.width} × {p.grid.height} px of {p.grid.resolution:g} m, "
+                f"{len(p.plan.tiles)} of {p.plan.tile_count} tiles, GSD {p.gsd:.3g} m"
+            )
+        return "\n".join(lines)
+
+
+def plan_orthophotos(
+    project: Project, images: Sequence[str] | None = None, settings: OrthoSettings | None = None, **changes: Any
+) -> OrthoPlan:
+    """Plan an orthophoto for each image; no pixel is touched.
+
+    Parameters
+    ----------
+    project : Project
+    images : sequence of str, optional
+        Names of images (patterns with ``*`` and ``?`` allowed); all images if it is None.
+    settings : OrthoSettings, optional
+        The project's own if it is None.
+    **changes
+        Single settings by name, for example ``resolution=0.1``.
+
+    Raises
+    ------
+    InputError
+        An input cannot be used.
+    GeometryError
+        No image sees the terrain (the extents of both are printed).
+    UsageError
+        An unknown image or setting, or bounds that hold nothing.
+    """
+    chosen = settings or project_settings(project)
+    if changes:
+        chosen = OrthoSettings.from_dict({**chosen.to_dict(), **changes})
+    looks = []
+    blind: list[str] = []
+    for name in project.select(images):
+        scene = open_scene(project, name)
+        coverage = cover(scene.camera, scene.surface, scene.terrain_bounds)
+        if coverage.bounds is None:
+            blind.append(_sees_no_terrain(scene, name))
+        else:
+            looks.append((name, scene, coverage, mean_gsd(scene.camera, coverage)))
+    resolution = chosen.resolution or (two_figures(float(np.mean([look[3] for look in looks]))) if looks else 1.0)
+    products = []
+    for name, scene, coverage, gsd in looks:
+        plan = _plan_one(project, scene, name, coverage, replace(chosen, resolution=resolution))
+        if plan is None:
+            blind.append(f"{name}: sees {_extent(coverage.bounds)}; the bounds are {_extent(chosen.bounds)}")
+        else:
+            products.append(OrthoProduct(plan, coverage, gsd, _key(scene, plan, chosen)))
+    if not products:
+        where = "the terrain" if chosen.bounds is None else "terrain inside the bounds"
+        raise GeometryError(f"no image sees {where} (xmin ymin xmax ymax in metres):\n  " + "\n  ".join(blind))
+    _refuse_equal_names(products)
+    return OrthoPlan(project, replace(chosen, resolution=resolution), tuple(products), tuple(blind))
+
+
+def project_settings(project: Project) -> OrthoSettings:
+    """The settings of the project's `[ortho]` table; what it does not state has its default."""
+    return OrthoSettings.from_dict({k: v for k, v in project.ortho_settings().items() if v is not None})
+
+
+def _plan_one(
+    project: Project, scene: Scene, name: str, coverage: Coverage, settings: OrthoSettings
+) -> ProductPlan | None:
+    bounds = settings.bounds or coverage.bounds
+    assert bounds is not None and settings.resolution is not None
+    grid = MapGrid.covering(bounds, settings.resolution, project.crs)
+    _check_storable(scene, name, grid, settings)
+    target = MapTarget(grid)
+    windows = list(grid.window.tiles(settings.tile))
+    keep = covered_tiles(scene.camera, scene.surface, grid, windows)
+    tiles = tuple(Tile(i, window) for i, window in enumerate(windows) if keep[i])
+    if not tiles:
+        return None
+    rule = AnchorRule(settings.tolerance, max(1, math.ceil(KERNELS[settings.kernel].taps / 2)), settings.tile)
+    seen = coverage.outline[np.isfinite(coverage.outline).all(axis=1)]
+    if len(seen):
+        x, y, z = seen.mean(axis=0)
+        rule = replace(rule, cell=initial_cell(scene.camera, target, grid.to_pixel((x, y)), z, settings.tile, rule))
+    return ProductPlan(f"{safe_stem(name)}_ortho", name, target, settings.tile, rule, tiles)
+
+
+def _check_storable(scene: Scene, name: str, grid: MapGrid, settings: OrthoSettings) -> None:
+    """Refuse a product that cannot be written, before any is."""
+    tiles = -(-grid.width // settings.tile) * -(-grid.height // settings.tile)
+    if tiles > MOST_TILES:
+        raise UsageError(
+            f"{name}: resolution {settings.resolution:g} m gives {grid.width:.3g} × {grid.height:.3g} pixels in "
+            f"{tiles:.3g} tiles, more than {MOST_TILES}; choose a larger --resolution or --tile, or smaller --bounds"
+        )
+    nodata_for(scene.reader.dtype, settings.nodata_value, settings.compress)
+    if settings.compress == "jpeg" and (scene.reader.dtype != np.uint8 or scene.reader.bands not in (1, 3)):
+        raise UsageError(
+            f"{name}: {scene.reader.bands} bands of {scene.reader.dtype}; compression jpeg takes one or three of uint8"
+        )
+
+
+def _key(scene: Scene, plan: ProductPlan, settings: OrthoSettings) -> str:
+    """Hash of what decides a product's pixels: another key means that finished tiles are of no use."""
+    assert isinstance(plan.target, MapTarget)
+    grid = plan.target.grid
+    facts = {
+        "version": __version__,
+        "scene": scene.facts,
+        "grid": [grid.left, grid.top, grid.resolution, grid.width, grid.height, grid.crs],
+        "rule": [plan.rule.tolerance, plan.rule.radius, plan.rule.cell, plan.tile_side],
+        "kernel": settings.kernel,
+        "nodata": settings.nodata,
+    }
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+
+def mean_gsd(camera: Camera, coverage: Coverage) -> float:
+    """Mean ground sampling distance of an image over its footprint, metres.
+
+    At each footprint point it is the square root of the ground area of one image pixel on level ground.
+    """
+    points = coverage.outline[np.isfinite(coverage.outline).all(axis=1)]
+    if not len(points):
+        xmin, ymin, xmax, ymax = coverage.bounds or (0, 0, 0, 0)
+        return math.sqrt((xmax - xmin) * (ymax - ymin) / (camera.size[0] * camera.size[1]))
+    points = np.concatenate([points, points.mean(axis=0, keepdims=True)])
+    area = np.abs(np.linalg.det(camera.derivatives(points)[..., :2]))
+    return float(np.nanmean(1 / np.sqrt(area)))
+
+
+def two_figures(value: float) -> float:
+    """A positive number rounded to two significant figures."""
+    digits = 1 - math.floor(math.log10(value))
+    return round(value, digits)
+
+
+def _sees_no_terrain(scene: Scene, name: str) -> str:
+    """Extents of both the terrain and what the image looks at, on a level that the terrain has."""
+    x, y, z = scene.camera.center
+    center = f"{name}: projection centre {x:.0f} {y:.0f} {z:.0f}"
+    bounds = scene.ground.bounds
+    if bounds is None:
+        return f"{center} sees nothing of the level terrain; is it above it, and do height systems and angles fit?"
+    level = some_height(scene.ground.surface, bounds, x, y)
+    origin, direction = scene.camera.rays(image_border(scene.camera.size), level)
+    down = (direction[:, 2] < 0) & (origin[:, 2] > level)
+    if down.any():
+        foot = origin[down] + direction[down] * ((level - origin[down, 2]) / direction[down, 2])[:, None]
+        (xmin, ymin), (xmax, ymax) = foot[:, :2].min(axis=0), foot[:, :2].max(axis=0)
+        looks = f"looks at {_extent((xmin, ymin, xmax, ymax))} on the level {level:.0f}"
+    else:
+        looks = f"does not look down to the level {level:.0f}"
+    return f"{center} {looks}; the terrain is {_extent(bounds)}"
+
+
+def _extent(bounds: tuple[float, float, float, float] | None) -> str:
+    return "everywhere" if bounds is None else " ".join(f"{b:.0f}" for b in bounds)
+
+
+def _refuse_equal_names(products: Iterable[OrthoProduct]) -> None:
+    seen: dict[str, str] = {}
+    for product in products:
+        # Many file systems do not tell capitals from small letters.
+        name = product.plan.name.casefold()
+        if name in seen:
+            raise UsageError(
+                f"images {seen[name]} and {product.plan.image} would both be written as {product.plan.name}.tif; "
+                "rename one"
+            )
+        seen[name] = product.plan.image
+
+
+def render(
+    plan: OrthoPlan, name: str, bounds: tuple[float, float, float, float] | None = None
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """Execute a product, or a part of it, into memory.
+
+    Parameters
+    ----------
+    plan : OrthoPlan
+    name : str
+        Name of the image or product.
+    bounds : (float, float, float, float), optional
+        xmin ymin xmax ymax of the part, snapped outwards to pixels; the whole product if it is None.
+
+    Returns
+    -------
+    values : ndarray, shape (bands, height, width)
+        0 where invalid.
+    valid : ndarray of bool, shape (height, width)
+    """
+    product = plan[name]
+    window = product.grid.window if bounds is None else window_of(product.grid, bounds)
+    scene = open_scene(plan.project, product.plan.image)
+    values = np.zeros((scene.reader.bands, window.height, window.width), scene.reader.dtype)
+    valid = np.zeros((window.height, window.width), bool)
+    for tile in product.plan.tiles:
+        common = tile.window & window
+        if not common.size:
+            continue
+        pixels = render_tile(product.plan, plan.settings.kernel, scene, tile)
+        if pixels.values is None or pixels.valid is None:
+            continue
+        to = np.s_[
+            common.row - window.row : common.stop[1] - window.row, common.col - window.col : common.stop[0] - window.col
+        ]
+        of = np.s_[
+            common.row - tile.window.row : common.stop[1] - tile.window.row,
+            common.col - tile.window.col : common.stop[0] - tile.window.col,
+        ]
+        values[:, to[0], to[1]] = pixels.values[:, of[0], of[1]]
+        valid[to] = pixels.valid[of]
+    return values, valid
+
+
+def window_of(grid: MapGrid, bounds: tuple[float, float, float, float]) -> Window:
+    """Pixels of a grid that map bounds touch; empty if there are none."""
+    part = MapGrid.covering(bounds, grid.resolution, grid.crs)
+    col = round((part.left - grid.left) / grid.resolution)
+    row = round((grid.top - part.top) / grid.resolution)
+    left, top = max(col, 0), max(row, 0)
+    return Window(left, top, max(0, col + part.width - left), max(0, row + part.height - top)) & grid.window
+
+
+def render_tile(product: ProductPlan, kernel: str, scene: Scene, tile: Tile) -> Pixels:
+    """Pixels of one tile of a product."""
+    return render_window(product, tile.window, scene.camera, scene.surface, scene.reader, kernel)

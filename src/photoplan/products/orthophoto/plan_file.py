@@ -1,0 +1,278 @@
+"""Write a plan with its figures, and read it back to execute it."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sqlite3
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan import __version__
+from photoplan.errors import InputError, ResourceError, UsageError
+from photoplan.io.disk import disk_error, free_megabytes
+from photoplan.io.plan_file import PlanTables, read_plan_tables, write_plan_tables
+from photoplan.io.product import check_output
+from photoplan.io.project.file import parse_project
+from photoplan.plan.product import compile_tile
+from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, plan_orthophotos
+from photoplan.products.orthophoto.settings import OrthoSettings
+from photoplan.project.scene import input_files, open_scene
+
+
+@dataclass(frozen=True, eq=False)
+class PlanFigures:
+    """What compiling every tile of a plan tells, one row a tile."""
+
+    product: NDArray[np.object_]
+    image: NDArray[np.object_]
+    index: NDArray[np.int64]
+    cells_of_tile: NDArray[np.int64]
+    residual_of_tile: NDArray[np.float64]
+    source: NDArray[np.int64]
+    """Column, row, width, height of the source window; shape (n, 4)."""
+    windows: NDArray[np.int64]
+    """Column, row, width, height of the tile in its product; shape (n, 4)."""
+    bounds: NDArray[np.float64]
+    """Outer edges of the tile in the product's CRS; shape (n, 4)."""
+
+    @property
+    def tiles(self) -> int:
+        """Tiles that hold a part of their image."""
+        return int((self.cells_of_tile > 0).sum())
+
+    @property
+    def cells(self) -> int:
+        """Boxes of all anchors."""
+        return int(self.cells_of_tile.sum())
+
+    @property
+    def residual(self) -> float:
+        """Worst residual of the anchors, pixels."""
+        return float(self.residual_of_tile.max(initial=0.0))
+
+    def to_dict(self, plan: OrthoPlan) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        products = []
+        for p in plan.products:
+            mine = self.product == p.plan.name
+            products.append(
+                {
+                    "name": p.plan.name,
+                    "image": p.plan.image,
+                    "width": p.grid.width,
+                    "height": p.grid.height,
+                    "resolution": p.grid.resolution,
+                    "bounds": p.grid.bounds,
+                    "gsd": p.gsd,
+                    "tiles": int((self.cells_of_tile[mine] > 0).sum()),
+                    "cells": int(self.cells_of_tile[mine].sum()),
+                    "worst_anchor_residual_px": float(self.residual_of_tile[mine].max(initial=0.0)),
+                }
+            )
+        return {
+            "products": products,
+            "tiles": self.tiles,
+            "cells": self.cells,
+            "worst_anchor_residual_px": self.residual,
+            "blind": list(plan.blind),
+        }
+
+
+def compile_figures(plan: OrthoPlan, report: Callable[[int, int], None] = lambda tiles, pixels: None) -> PlanFigures:
+    """Compile relief and anchors of every tile, keep the figures, forget the rest.
+
+    Parameters
+    ----------
+    plan : OrthoPlan
+    report : callable
+        Called after each tile with 1 and its number of pixels.
+    """
+    rows: list[tuple[Any, ...]] = []
+    for product in plan.products:
+        scene = open_scene(plan.project, product.plan.image)
+        for tile in product.plan.tiles:
+            anchors = compile_tile(product.plan, tile.window, scene.camera, scene.surface).anchors
+            cells, residual, source = (
+                (0, 0.0, (0, 0, 0, 0))
+                if anchors is None
+                else (len(anchors.corners), anchors.residual, _numbers(anchors.source_window))
+            )
+            bounds = product.grid.bounds_of(tile.window)
+            rows.append(
+                (
+                    product.plan.name,
+                    product.plan.image,
+                    tile.index,
+                    cells,
+                    residual,
+                    source,
+                    _numbers(tile.window),
+                    bounds,
+                )
+            )
+            report(1, tile.window.size)
+    columns = list(zip(*rows))
+    return PlanFigures(
+        np.array(columns[0], object),
+        np.array(columns[1], object),
+        np.array(columns[2], np.int64),
+        np.array(columns[3], np.int64),
+        np.array(columns[4], float),
+        np.array(columns[5], np.int64),
+        np.array(columns[6], np.int64),
+        np.array(columns[7], float),
+    )
+
+
+def _numbers(window: Any) -> tuple[int, int, int, int]:
+    return window.col, window.row, window.width, window.height
+
+
+def write_plan(path: Path, plan: OrthoPlan, figures: PlanFigures, output: Path, overwrite: bool = False) -> None:
+    """Write a plan as a GeoPackage with the layers `tiles` and `footprints`.
+
+    Parameters
+    ----------
+    path : Path
+    plan : OrthoPlan
+    figures : PlanFigures
+        Of this plan, from `compile_figures`.
+    output : Path
+        Folder for the products when the plan is executed.
+    overwrite : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    UsageError
+        The file exists and `overwrite` is False, is an input or the project, or cannot be written.
+    ResourceError
+        The disk is full.
+    """
+    check_plan_path(path, plan, overwrite)
+    there = figures.cells_of_tile > 0
+    header = {
+        "photoplan": __version__,
+        "project": plan.project.model_dump(mode="json", exclude_none=True),
+        "folder": os.path.relpath(plan.project.folder.resolve(), path.resolve().parent),
+        "output": os.path.relpath(output.resolve(), path.resolve().parent),
+        "settings": plan.settings.to_dict(),
+        "products": [
+            {"image": p.plan.image, "key": p.key, "tiles": int((there & (figures.product == p.plan.name)).sum())}
+            for p in plan.products
+        ],
+    }
+    tiles = {
+        "product": figures.product[there],
+        "image": figures.image[there],
+        "tile": figures.index[there],
+        "cells": figures.cells_of_tile[there],
+        "residual_px": figures.residual_of_tile[there],
+        **{name: figures.windows[there, i] for i, name in enumerate(("col", "row", "width", "height"))},
+        **{f"source_{name}": figures.source[there, i] for i, name in enumerate(("col", "row", "width", "height"))},
+    }
+    footprints = {
+        "product": np.array([p.plan.name for p in plan.products], object),
+        "image": np.array([p.plan.image for p in plan.products], object),
+        "gsd": np.array([p.gsd for p in plan.products]),
+        "resolution": np.array([p.grid.resolution for p in plan.products]),
+        "on_terrain": np.array([p.coverage.on_surface for p in plan.products]),
+    }
+    outlines = [_outline(p) for p in plan.products]
+    tables = PlanTables(header, tiles, figures.bounds[there], footprints, outlines, plan.project.crs)
+    try:
+        write_plan_tables(path, tables, overwrite)
+    except OSError as error:
+        raise disk_error(path, error) from error
+    except (RuntimeError, sqlite3.Error) as error:
+        # What the libraries of vector files and of SQLite raise does not tell a full disk from a place without rights.
+        if free_megabytes(path) < 1:
+            raise ResourceError(f"{path}: cannot be written, the disk is full; free some space") from error
+        raise UsageError(f"{path}: cannot be written ({error}); choose a folder that can be written") from error
+
+
+def check_plan_path(path: Path, plan: OrthoPlan, overwrite: bool = False) -> None:
+    """Refuse a place for a plan before the work of compiling it.
+
+    Raises
+    ------
+    UsageError
+        The name is not that of a GeoPackage, the file exists and `overwrite` is False, or it is an input.
+    """
+    if path.suffix.lower() != ".gpkg":
+        raise UsageError(f"{path}: a plan is a GeoPackage; give it a name that ends in .gpkg")
+    check_output(path, input_files(plan.project), overwrite=overwrite)
+
+
+def _outline(product: OrthoProduct) -> NDArray[np.float64]:
+    """Footprint polygon; the product's rectangle where the image's border does not meet the terrain."""
+    seen = product.coverage.outline[np.isfinite(product.coverage.outline).all(axis=1), :2]
+    if len(seen) >= 3:
+        return seen
+    xmin, ymin, xmax, ymax = product.grid.bounds
+    return np.array([(xmin, ymin), (xmax, ymin), (xmax, ymax), (xmin, ymax)])
+
+
+def read_plan(path: Path | str) -> tuple[OrthoPlan, Path]:
+    """Read a plan back, and make sure that it still means what it meant.
+
+    Returns
+    -------
+    plan : OrthoPlan
+    output : Path
+        Folder that was chosen for the products.
+
+    Raises
+    ------
+    InputError
+        The file is no plan, or an input, the project or the version has changed since it was written.
+    """
+    path = Path(path)
+    try:
+        header, tiles = read_plan_tables(path)
+        plan, output = _plan_again(path, header)
+        counts = {p["image"]: (p["key"], int(p["tiles"])) for p in header["products"]}
+        changed = [p.plan.image for p in plan.products if counts.get(p.plan.image, ("", 0))[0] != p.key]
+        if changed or len(plan.products) != len(counts):
+            raise InputError(
+                f"{path}: inputs have changed since the plan was written ({', '.join(changed) or 'images are gone'}); "
+                "make the plan again with `photoplan ortho --plan`"
+            )
+        chosen = _with_tiles(plan, tiles, {image: count for image, (_, count) in counts.items()})
+    except (KeyError, TypeError, ValueError, UsageError) as error:
+        raise InputError(
+            f"{path}: the plan is damaged ({error}); make it again with `photoplan ortho --plan`"
+        ) from error
+    if not chosen.products:
+        raise InputError(f"{path}: the plan has no tiles left; make it again with `photoplan ortho --plan`")
+    return chosen, output
+
+
+def _plan_again(path: Path, header: dict[str, Any]) -> tuple[OrthoPlan, Path]:
+    """The plan that a header describes, made again, and its folder for products."""
+    folder = (path.resolve().parent / header["folder"]).resolve()
+    project = parse_project(header["project"], folder, str(path))
+    images = [p["image"] for p in header["products"]]
+    plan = plan_orthophotos(project, images, OrthoSettings.from_dict(header["settings"]))
+    return plan, (path.resolve().parent / header["output"]).resolve()
+
+
+def _with_tiles(plan: OrthoPlan, tiles: dict[str, NDArray[Any]], planned: dict[str, int]) -> OrthoPlan:
+    """Keep the tiles that the layer lists. A person may have deleted some: the product is then another one."""
+    products = []
+    for product in plan.products:
+        listed = set(tiles["tile"][tiles["product"] == product.plan.name].tolist())
+        chosen = tuple(t for t in product.plan.tiles if t.index in listed)
+        if not chosen:
+            continue
+        key = product.key
+        if len(listed) != planned[product.plan.image]:
+            key = hashlib.sha256(f"{key} {[t.index for t in chosen]}".encode()).hexdigest()
+        products.append(replace(product, plan=replace(product.plan, tiles=chosen), key=key))
+    return replace(plan, products=tuple(products))

@@ -1,0 +1,75 @@
+"""What a user may choose about orthophotos."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal, get_args
+
+from photoplan.errors import UsageError
+from photoplan.products.choices import Compression, Kernel
+
+
+@dataclass(frozen=True)
+class OrthoSettings:
+    """Choices that change the pixels or the file of an orthophoto; checked at birth."""
+
+    resolution: float | None = None
+    """Side of a ground pixel, metres; None: the mean ground sampling distance of the images, to two figures."""
+    bounds: tuple[float, float, float, float] | None = None
+    """Outer edges xmin ymin xmax ymax in the project's CRS; None: all that the image sees of the terrain."""
+    kernel: Kernel = "bicubic"
+    """Resampling kernel; bicubic is a = −0.5, bicubic-1 is a = −1."""
+    tolerance: float = 0.02
+    """Largest residual of the anchors, pixels of the source image."""
+    tile: int = 512
+    """Side of a tile, pixels; a multiple of 16 from 128 on."""
+    nodata: str = "auto"
+    """A number, ``mask`` (an internal mask band), or ``auto``: 0 for unsigned integers, −32768 for int16, NaN for
+    floats."""
+    compress: Compression = "deflate"
+    """Compression of the file; jpeg needs ``nodata = "mask"`` and sets it."""
+    overviews: bool = True
+    """Whether the file holds overviews."""
+
+    def __post_init__(self) -> None:
+        if self.resolution is not None and not self.resolution > 0:
+            raise UsageError(f"resolution {self.resolution}; a positive number of metres is needed")
+        if self.kernel not in get_args(Kernel):
+            raise UsageError(f"kernel {self.kernel!r}; allowed are {', '.join(get_args(Kernel))}")
+        if self.compress not in get_args(Compression):
+            raise UsageError(f"compression {self.compress!r}; allowed are {', '.join(get_args(Compression))}")
+        if not 1e-6 <= self.tolerance <= 10:
+            raise UsageError(f"tolerance {self.tolerance} px; allowed are 1e-6 to 10, usual is 0.02")
+        if self.tile < 128 or self.tile > 4096 or self.tile % 16:
+            raise UsageError(f"tile side {self.tile}; allowed are multiples of 16 from 128 to 4096")
+        if self.bounds is not None:
+            object.__setattr__(self, "bounds", tuple(float(b) for b in self.bounds))
+        if self.nodata not in ("auto", "mask"):
+            try:
+                float(self.nodata)
+            except ValueError:
+                raise UsageError(f"nodata {self.nodata!r}; allowed are auto, mask or a number") from None
+
+    @property
+    def nodata_value(self) -> float | Literal["auto", "mask"]:
+        """`nodata` as the product's writer takes it."""
+        return self.nodata if self.nodata in ("auto", "mask") else float(self.nodata)  # type: ignore[return-value]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for plan and run record."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> OrthoSettings:
+        """Settings from the plain values of `to_dict`.
+
+        Raises
+        ------
+        UsageError
+            A name is unknown or a value not allowed.
+        """
+        known = {f.name for f in fields(cls)}
+        unknown = sorted(set(values) - known)
+        if unknown:
+            raise UsageError(f"unknown settings {', '.join(unknown)}; known are {', '.join(sorted(known))}")
+        return cls(**values)

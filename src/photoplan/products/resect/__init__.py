@@ -1,0 +1,1 @@
+"""Space resection of the images of a project."""

@@ -1,0 +1,1 @@
+"""What a sensor can do, from its data sheet."""

@@ -1,0 +1,1 @@
+"""Images of known truth, as a camera would take them."""

@@ -1,0 +1,1 @@
+"""Tie points between the images of a project."""

@@ -1,0 +1,208 @@
+"""What tie points start from: images with what is known of their cameras and places, and the pairs to look at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.base import Camera, project
+from photoplan.cameras.build import oriented_camera
+from photoplan.errors import InputError
+from photoplan.io.names import match_key
+from photoplan.io.observed_positions import read_observed_positions
+from photoplan.io.orientation.table import TableFormat
+from photoplan.io.plain_files import read_text
+from photoplan.io.project.cameras import interior_of, lens_of
+from photoplan.io.project.model import FilmCamera, Image, Project
+from photoplan.io.raster import RasterReader
+from photoplan.matching.grey import GreyImage
+from photoplan.matching.pairs import Guide, all_pairs, pairs_by_distance, pairs_by_footprints
+from photoplan.matching.verify import Calibration
+from photoplan.project.scene import ground_of, pose_of
+
+#: Up to so many images all pairs are tried where nothing is known of their places.
+FEW_IMAGES = 30
+#: Where a feature is expected in another image by approximate orientation, it is looked for within this part of the
+#: image's diagonal.
+_SEARCH = 0.15
+#: Part of the extent of the marks that is left out along the border of a scan: the marks themselves are no ground.
+_FRAME = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class TieImage:
+    """An image and what is known of it."""
+
+    name: str
+    path: Path
+    grey: GreyImage
+    calibration: Calibration | None
+    """None: a scan whose marks are not measured."""
+    camera: Camera | None
+    """Approximate orientation; None: not oriented, or not to be used."""
+    level: float
+    """Height of the ground below, metres; NaN: not known."""
+    position: NDArray[np.float64] | None
+    """Projection centre or antenna (3,), metres; None: not known."""
+
+    @property
+    def placed(self) -> bool:
+        """Whether orientation and height of the ground are known."""
+        return self.camera is not None and bool(np.isfinite(self.level))
+
+    def on_ground(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where rays of image points (n, 2) meet the level of the ground, (n, 3); NaN for those that do not."""
+        assert self.camera is not None
+        origin, direction = self.camera.rays(xy, self.level)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (self.level - origin[:, 2:]) / direction[:, 2:]
+            return np.where((direction[:, 2:] < 0) & (t > 0), origin + t * direction, np.nan)
+
+
+def open_images(project_: Project, names: Sequence[str], use_orientation: bool) -> tuple[list[TieImage], list[str]]:
+    """The images of a project, and notes on what is not known of some.
+
+    Raises
+    ------
+    InputError
+        An image cannot be read, or has another size than its camera.
+    """
+    images = [project_.image(name) for name in names]
+    positions = _positions(project_, use_orientation)
+    cameras, levels = _placed(project_, images) if use_orientation else ([None] * len(images), [np.nan] * len(images))
+    opened, notes = [], []
+    for image, camera, level in zip(images, cameras, levels):
+        reader = RasterReader(project_.resolve(image.file))
+        calibration = _calibration(project_, image, reader.size)
+        if calibration is None:
+            notes.append(f"{image.name}: fiducial marks not measured, its pairs are verified without a camera")
+        position = positions.get(match_key(image.name)) if camera is None else camera.center
+        grey = GreyImage(reader, _area(image, reader.size))
+        opened.append(TieImage(image.name, reader.path, grey, calibration, camera, level, position))
+    return opened, notes
+
+
+def _calibration(project_: Project, image: Image, size: tuple[int, int]) -> Calibration | None:
+    description = project_.cameras[image.camera]
+    stated = image.size or description.size
+    if stated is not None and tuple(stated) != size:
+        raise InputError(
+            f"{image.file}: {size[0]} × {size[1]} pixels, but camera {image.camera!r} has {stated[0]} × {stated[1]}; "
+            "an image that was cropped or scaled needs a camera of its own"
+        )
+    if isinstance(description, FilmCamera) and not image.fiducials:
+        return None
+    return Calibration(interior_of(description, image, size), lens_of(description))
+
+
+def _area(image: Image, size: tuple[int, int]) -> tuple[float, float, float, float] | None:
+    """Inside of the fiducial marks of a scan."""
+    if not image.fiducials:
+        return None
+    xy = np.array(list(image.fiducials.values()), float)
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    inset = _FRAME * (high - low)
+    xmin, ymin = np.maximum(low + inset, 0)
+    xmax, ymax = np.minimum(high - inset, np.array(size) - 1)
+    return float(xmin), float(ymin), float(xmax), float(ymax)
+
+
+def _positions(project_: Project, use: bool) -> dict[str, NDArray[np.float64]]:
+    """Observed positions by the images' names."""
+    if not use or project_.observations.positions is None:
+        return {}
+    orientation = project_.orientation
+    form = TableFormat(angle_unit=orientation.angle_unit, rotation=orientation.rotation)
+    table = read_observed_positions(project_.resolve(project_.observations.positions), form, crs=project_.crs)
+    return {match_key(name): XYZ for name, XYZ in zip(table.images, table.XYZ)}
+
+
+def _placed(project_: Project, images: Sequence[Image]) -> tuple[list[Camera | None], list[float]]:
+    """Cameras of the oriented images, and the height of the ground below each."""
+    cameras: list[Camera | None] = [None] * len(images)
+    levels = np.full(len(images), np.nan)
+    if project_.terrain is None:
+        return cameras, levels.tolist()
+    ground = ground_of(project_)
+    for k, image in enumerate(images):
+        if image.center is None or (isinstance(project_.cameras[image.camera], FilmCamera) and not image.fiducials):
+            continue
+        description = project_.cameras[image.camera]
+        pose = pose_of(project_, image, ground)
+        cameras[k] = oriented_camera(interior_of(description, image), lens_of(description), pose)
+        levels[k] = float(ground.surface.heights(pose.center[:2]))
+    if np.isfinite(levels).any():
+        levels = np.where(np.isfinite(levels), levels, np.nanmedian(levels))
+    return cameras, levels.tolist()
+
+
+def chosen_pairs(images: Sequence[TieImage], how: str) -> tuple[list[tuple[int, int]] | None, str]:
+    """Pairs to look at and how they were chosen; None: the features must tell.
+
+    Parameters
+    ----------
+    images : sequence of TieImage
+    how : str
+        ``"auto"``, ``"all"``, or a file with the names of two images in each line.
+
+    Raises
+    ------
+    InputError
+        The file names an image that is not among these.
+    """
+    if how == "all":
+        return all_pairs(len(images)), "all pairs"
+    if how != "auto":
+        return _listed(images, Path(how)), f"pairs of {how}"
+    if all(image.placed for image in images):
+        border = [image.on_ground(_border(image.grey.size)) for image in images]
+        outlines = [b[np.isfinite(b).all(axis=1), :2] for b in border]
+        if min(map(len, outlines)) >= 3:
+            return pairs_by_footprints(outlines), "pairs with common ground by approximate orientation"
+    if all(image.position is not None for image in images):
+        positions = np.array([image.position for image in images])
+        return pairs_by_distance(positions), "pairs of neighbours by position"
+    if len(images) <= FEW_IMAGES:
+        return all_pairs(len(images)), "all pairs"
+    return None, "pairs that share large features"
+
+
+def _border(size: tuple[int, int]) -> NDArray[np.float64]:
+    t = np.linspace(-0.5, 0.5, 5)
+    edge = np.concatenate([np.stack([t, np.full(5, s)], axis=1)[:, ::d] for s in (-0.5, 0.5) for d in (1, -1)])
+    return (edge + 0.5) * np.array(size) - 0.5
+
+
+def _listed(images: Sequence[TieImage], path: Path) -> list[tuple[int, int]]:
+    at = {match_key(image.name): k for k, image in enumerate(images)}
+    found = set()
+    for number, line in enumerate(read_text(path, 50_000_000).split("\n"), 1):
+        text = line.strip()
+        if not text or text.startswith("#"):
+            continue
+        words = [w.strip() for w in text.replace(";", ",").replace("\t", ",").split(",")]
+        words = text.split() if len(words) == 1 else words
+        if len(words) != 2:
+            raise InputError(f"{path}:{number}: {len(words)} names; two images are needed in each line")
+        lost = [w for w in words if match_key(w) not in at]
+        if lost:
+            raise InputError(f"{path}:{number}: image {lost[0]!r} is not among the {len(images)} images of this run")
+        i, j = sorted(at[match_key(w)] for w in words)
+        if i == j:
+            raise InputError(f"{path}:{number}: image {words[0]!r} is paired with itself")
+        found.add((i, j))
+    if not found:
+        raise InputError(f"{path}: holds no pair; give the names of two images in each line")
+    return sorted(found)
+
+
+def guide_of(a: TieImage, b: TieImage, xy: NDArray[np.float64]) -> Guide | None:
+    """Where features of a are to be expected in b by approximate orientation; None if that is not known."""
+    if not (a.placed and b.placed):
+        return None
+    assert b.camera is not None
+    return Guide(project(b.camera, a.on_ground(xy)), _SEARCH * float(np.hypot(*b.grey.size)))

@@ -1,0 +1,331 @@
+"""Tie points of a project: found, refined, written and entered into the project file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from photoplan.cameras.observed import ImagePoints
+from photoplan.errors import GeometryError, UsageError
+from photoplan.io.image_points import write_image_points
+from photoplan.io.product import check_output
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
+from photoplan.io.project.model import Project
+from photoplan.matching.features import FeatureSettings, opencv
+from photoplan.matching.grey import Grey, ReducedImage
+from photoplan.matching.loops import Loops, close_loops
+from photoplan.matching.refine import Refined, RefineSettings, reference_points, refine_tracks
+from photoplan.matching.thin import thin_tracks
+from photoplan.matching.tracks import Tracks, TracksFound, build_tracks, connected_parts
+from photoplan.matching.verify import PairMatches, VerifySettings
+from photoplan.products.init.match import some
+from photoplan.products.tie.inputs import TieImage, chosen_pairs, open_images
+from photoplan.products.tie.picture import draw_ties
+from photoplan.products.tie.work import (
+    FeatureStore,
+    Map,
+    Stage,
+    find_features,
+    find_pairs,
+    like_pairs,
+    threads,
+    unwatched,
+)
+from photoplan.project.scene import input_files
+
+#: Longer sides are reduced before features are looked for, unless the scale is stated, pixels.
+_LONGEST = 6000
+#: Tracks that go into refinement for each that is wanted: some are lost there.
+_SPARE = 1.5
+#: Standard deviation of a feature's place that is not refined: at least this, and this part of its scale, pixels.
+_FEATURE_SIGMA, _FEATURE_SHARE = 0.3, 0.2
+
+
+@dataclass(frozen=True)
+class TieRequest:
+    """What is asked."""
+
+    project: Path
+    images: tuple[str, ...] = ()
+    """Names or patterns; none: all."""
+    pairs: str = "auto"
+    """auto, all, or a file."""
+    scale: float | None = None
+    """Of the image in which features are looked for: 1, 0.5, 0.33 …; None: as the size of the images asks."""
+    features: int = 4000
+    """Features per image."""
+    per_image: int = 500
+    """Tie points that an image is to have."""
+    refine: bool = True
+    use_orientation: bool = True
+    output: Path | None = None
+    picture: bool = True
+    workers: int = 1
+    overwrite: bool = False
+    dry_run: bool = False
+
+
+@dataclass(frozen=True)
+class TieReport:
+    """What was found."""
+
+    output: Path | None
+    """The table of image points; None after a dry run."""
+    picture: Path | None
+    images: tuple[str, ...]
+    chosen: str
+    """How pairs were chosen."""
+    factor: int
+    """Features were looked for in means of so many pixels along each side."""
+    pairs: int
+    verified: int
+    tracks: int
+    """Before thinning."""
+    ambiguous: int
+    """Dropped: two places in one image."""
+    points: int
+    rays: dict[int, int]
+    """Number of points by their number of images."""
+    per_image: dict[str, int]
+    parts: tuple[tuple[str, ...], ...]
+    """Images that hang together, the largest part first."""
+    refined: Refined | None
+    loops: Loops | None
+    sigma: float
+    """Median standard deviation of a coordinate, pixels."""
+    notes: tuple[str, ...]
+
+    @property
+    def unconnected(self) -> tuple[str, ...]:
+        """Images outside the largest part."""
+        return tuple(name for part in self.parts[1:] for name in part)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        refined, loops = self.refined, self.loops
+        return {
+            "output": None if self.output is None else str(self.output),
+            "picture": None if self.picture is None else str(self.picture),
+            "images": len(self.images),
+            "chosen": self.chosen,
+            "scale": 1 / self.factor,
+            "pairs": {"tried": self.pairs, "verified": self.verified},
+            "tracks": self.tracks,
+            "ambiguous": self.ambiguous,
+            "points": self.points,
+            "rays": {str(k): v for k, v in self.rays.items()},
+            "per_image": self.per_image,
+            "parts": [list(part) for part in self.parts],
+            "unconnected": list(self.unconnected),
+            "sigma": None if not np.isfinite(self.sigma) else self.sigma,
+            "refined": None
+            if refined is None
+            else {
+                "correlation": refined.correlation,
+                "unsettled": refined.unsettled,
+                "unlike": refined.unlike,
+                "uncertain": refined.uncertain,
+            },
+            "loops": None
+            if loops is None
+            else {"count": loops.count, "factor": loops.factor, "measured": loops.measured},
+            "notes": list(self.notes),
+        }
+
+
+def find_ties(request: TieRequest, stage: Stage = unwatched) -> TieReport:
+    """Find tie points between the images of a project.
+
+    Features and matches are kept in a folder ``NAME.cache`` beside the output: a run that was interrupted continues.
+
+    Parameters
+    ----------
+    request : TieRequest
+    stage : callable
+        Called with what is done next and the number of its parts; gives a context that counts them.
+
+    Raises
+    ------
+    UsageError
+        The output exists, or OpenCV is not installed.
+    InputError
+        An input cannot be used.
+    GeometryError
+        No two images have enough in common.
+    """
+    project = load_project(request.project)
+    names = project.select(request.images or None)
+    output = _check(request, project, names)
+    images, notes = open_images(project, names, request.use_orientation)
+    factor = _factor(request, images)
+    pairs, chosen = chosen_pairs(images, request.pairs)
+    store = FeatureStore(output.with_suffix(".cache"), tuple(images), FeatureSettings(request.features, factor))
+    if request.dry_run:
+        return _dry(names, pairs, chosen, factor, notes)
+    with threads(request.workers) as run:
+        with stage("features", len(images)) as done:
+            features = find_features(store, run, done)
+        pairs = like_pairs(store) if pairs is None else pairs
+        with stage("pairs", len(pairs)) as done:
+            verify = VerifySettings(threshold=2.0 * factor)
+            verified = [p for p in find_pairs(store, pairs, verify, run, done) if len(p)]
+        _refuse_nothing(request, verified, len(pairs), names)
+        found = build_tracks(features, verified, same=1.5 * factor)
+        sizes = [image.grey.size for image in images]
+        spare = found.tracks.of_tracks(thin_tracks(found.tracks, sizes, round(_SPARE * request.per_image)))
+        tracks, refined, loops = _refine(request, spare, images, factor, run, stage)
+    tracks = tracks.of_tracks(thin_tracks(tracks, sizes, request.per_image))
+    if not len(tracks):
+        raise GeometryError("no tie point is left after refinement; look at the images, or give --no-refine")
+    points = _points(tracks, names)
+    write_image_points(output, points)
+    _enter(request.project, project, output)
+    drawn = draw_ties(output.with_suffix(".png"), images, tracks) if request.picture else None
+    report = _report(names, chosen, factor, (len(pairs), verified), found, tracks, notes)
+    return replace(report, output=output, picture=drawn, refined=refined, loops=loops)
+
+
+def _check(request: TieRequest, project: Project, names: Sequence[str]) -> Path:
+    """The output, and everything that can be refused before any work."""
+    if len(names) < 2:
+        raise UsageError(f"{len(names)} image; tie points need two images at least")
+    if request.features < 50 or request.per_image < 1:
+        raise UsageError(
+            f"{request.features} features and {request.per_image} points per image; 50 and 1 are the least"
+        )
+    opencv()
+    output = request.output or request.project.resolve().parent / "tie_points.csv"
+    points = [project.resolve(file) for file in project.observations.image_points]  # an older run's among them
+    inputs = [request.project, *(file for file in input_files(project) if file not in points)]
+    if output.suffix.lower() in (".png", ".cache"):
+        raise UsageError(f"{output}: a table is written; give it a name such as tie_points.csv")
+    if not request.dry_run:
+        for path in (output, output.with_suffix(".png")):
+            check_output(path, inputs, overwrite=request.overwrite)
+    return output
+
+
+def _factor(request: TieRequest, images: Sequence[TieImage]) -> int:
+    if request.scale is not None:
+        if not 0.01 <= request.scale <= 1:
+            raise UsageError(f"scale {request.scale:g}; a number from 0.01 to 1 is needed, such as 0.5")
+        return round(1 / request.scale)
+    longest = max(max(image.grey.size) for image in images)
+    return max(1, -(-longest // _LONGEST))
+
+
+def _dry(
+    names: Sequence[str], pairs: list[tuple[int, int]] | None, chosen: str, factor: int, notes: list[str]
+) -> TieReport:
+    return TieReport(
+        output=None,
+        picture=None,
+        images=tuple(names),
+        chosen=chosen,
+        factor=factor,
+        pairs=0 if pairs is None else len(pairs),
+        verified=0,
+        tracks=0,
+        ambiguous=0,
+        points=0,
+        rays={},
+        per_image={},
+        parts=(),
+        refined=None,
+        loops=None,
+        sigma=float("nan"),
+        notes=tuple(notes),
+    )
+
+
+def _refuse_nothing(request: TieRequest, verified: Sequence[PairMatches], tried: int, names: Sequence[str]) -> None:
+    if not verified:
+        raise GeometryError(
+            f"{request.project}: none of {tried} pairs of {len(names)} images ({some(list(names))}) could be verified: "
+            "no overlap, or too little texture. Choose other images with --images, give --pairs all, more --features, "
+            "or another --scale"
+        )
+
+
+def _refine(
+    request: TieRequest, tracks: Tracks, images: Sequence[TieImage], factor: int, run: Map, stage: Stage
+) -> tuple[Tracks, Refined | None, Loops | None]:
+    """Tracks with standard deviations; first at the scale of the features, then at full resolution."""
+    if not request.refine:
+        sigma = np.maximum(_FEATURE_SIGMA * factor, _FEATURE_SHARE * tracks.scale)
+        return replace(tracks, sigma=np.repeat(sigma[:, None], 2, axis=1)), None, None
+    greys: list[Grey] = [image.grey for image in images]
+    settings = RefineSettings()
+    with stage("images refined", 1) as done:
+        if factor > 1:
+            small: list[Grey] = [ReducedImage(image.grey, factor) for image in images]
+            rough = refine_tracks(_scaled(tracks, 1 / factor), small, replace(settings, sigma=np.inf), run=run)
+            tracks = _scaled(rough.tracks, factor)
+        loops = close_loops(tracks, reference_points(tracks, [g.size for g in greys]), greys, settings, run=run)
+        refined = refine_tracks(tracks, greys, settings, loops.factor, run)
+        done(1, 0)
+    return refined.tracks, refined, loops
+
+
+def _scaled(tracks: Tracks, by: float) -> Tracks:
+    """Tracks in another scale of the images; standard deviations are not carried over."""
+    return replace(tracks, xy=(tracks.xy + 0.5) * by - 0.5, scale=tracks.scale * by)
+
+
+def _points(tracks: Tracks, names: Sequence[str]) -> ImagePoints:
+    digits = len(str(tracks.count))
+    points = tuple(f"T{k + 1:0{digits}d}" for k in range(tracks.count))
+    used, image = np.unique(tracks.image, return_inverse=True)
+    return ImagePoints(
+        tuple(names[k] for k in used), points, image.reshape(-1).astype(np.int64), tracks.track, tracks.xy, tracks.sigma
+    )
+
+
+def _enter(path: Path, project: Project, output: Path) -> None:
+    """Add the table to [observations] image_points."""
+    listed = project.observations.image_points
+    if any(project.resolve(file) == output.resolve() for file in listed):
+        return
+    folder = path.resolve().parent
+    whole = output.resolve()
+    written = whole.relative_to(folder).as_posix() if whole.is_relative_to(folder) else os.fspath(whole)
+    edit_project(path, ProjectChanges(tables={"observations": {"image_points": [*listed, written]}}))
+
+
+def _report(
+    names: Sequence[str],
+    chosen: str,
+    factor: int,
+    pairs: tuple[int, Sequence[PairMatches]],
+    found: TracksFound,
+    tracks: Tracks,
+    notes: list[str],
+) -> TieReport:
+    rays, number = np.unique(tracks.rays, return_counts=True)
+    per_image = np.bincount(tracks.image, minlength=len(names))
+    parts = connected_parts(len(names), tracks)
+    return TieReport(
+        output=None,
+        picture=None,
+        images=tuple(names),
+        chosen=chosen,
+        factor=factor,
+        pairs=pairs[0],
+        verified=len(pairs[1]),
+        tracks=found.tracks.count,
+        ambiguous=found.ambiguous,
+        points=tracks.count,
+        rays={int(k): int(n) for k, n in zip(rays, number)},
+        per_image={name: int(n) for name, n in zip(names, per_image)},
+        parts=tuple(tuple(names[k] for k in part) for part in parts),
+        refined=None,
+        loops=None,
+        sigma=float(np.median(tracks.sigma)),
+        notes=tuple(notes),
+    )

@@ -1,0 +1,125 @@
+"""Source images whose light fall-off is corrected while they are read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.geometry.grid import Window
+from photoplan.io.fingerprint import fingerprint
+from photoplan.io.raster import RasterReader
+from photoplan.project.derived_reader import DerivedReader
+from photoplan.project.fall_off_correction import read_fall_off
+from photoplan.quality.camera.fall_off_model import FallOffModel, correct_fall_off, largest_gain
+from photoplan.quality.linearise import Linearisation
+from photoplan.quality.restoration.restorer import light_of
+
+
+@dataclass(frozen=True)
+class FallOffFile:
+    """A correction and the file that it comes from."""
+
+    path: Path
+    model: FallOffModel
+    gain: float
+    """The largest in the image: noise grows by it there."""
+    digest: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON and records."""
+        model = self.model
+        return {
+            "path": str(self.path),
+            "sampled_sha256": self.digest,
+            "size": list(model.size),
+            "largest_gain": self.gain,
+            "principal_point_px": list(model.principal_point),
+            "camera_constant_px": model.camera_constant,
+            "dark_dn": model.dark,
+            "terms": [[n, m, value] for (n, m), value in zip(model.terms, model.coefficients)],
+        }
+
+
+def load_fall_off(path: Path) -> FallOffFile:
+    """A correction of a file that `photoplan characterise` wrote.
+
+    Raises
+    ------
+    InputError
+        The file cannot be used, or its model gives no brightness somewhere in the image.
+    """
+    model = read_fall_off(path)
+    try:
+        return FallOffFile(path, model, largest_gain(model), fingerprint(path).digest)
+    except InputError as error:
+        message = str(error)
+        raise InputError(message if message.startswith(str(path)) else f"{path}: {message}") from None
+
+
+def fall_off_line(used: FallOffFile) -> str:
+    """A correction in words."""
+    return f"light fall-off corrected by {used.path.name}: gain up to {used.gain:.3g}, noise there grows with it"
+
+
+@dataclass(frozen=True, eq=False)
+class FallOffReader(DerivedReader):
+    """A source image behind the engine's `Reader` as light, with the same gain in all bands.
+
+    Grey values are decoded to light and corrected; what is read is float32 on the scale of the image's type, neither
+    rounded nor clipped. The grey value of no light is decoded by the same curve. The result does not depend on the
+    windows in which it is read.
+
+    Raises
+    ------
+    InputError
+        When made: the model is for images of another size. When read: damaged pixels, or grey values that the
+        linearisation's table does not have.
+    """
+
+    source: RasterReader
+    fall_off: FallOffFile
+    linearisation: Linearisation
+
+    def __post_init__(self) -> None:
+        size, known = self.source.size, self.fall_off.model.size
+        if size != known:
+            raise InputError(
+                f"{self.source.path}: {size[0]} × {size[1]} pixels; the light fall-off in {self.fall_off.path} is for "
+                f"images of {known[0]} × {known[1]}: an image that was cropped or scaled needs a correction of its own"
+            )
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the light: float32, whatever the image has."""
+        return np.dtype(np.float32)
+
+    def read(self, window: Window) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+        """Light of a window inside the image, shape (bands, height, width), and its validity."""
+        pixels, valid = self.source.read(window)
+        light = np.empty(pixels.shape, np.float32)
+        dark = np.zeros((pixels.shape[0], 1, 1), np.float32)
+        try:
+            for band, grey in enumerate(pixels, start=1):
+                if valid is not None and not valid.any():
+                    light[band - 1] = 0.0
+                    continue
+                light[band - 1] = light_of(self.linearisation, grey, valid, band)
+                dark[band - 1] = self._dark(band)
+        except InputError as error:
+            raise InputError(f"{self.path}: {error}") from None
+        none = replace(self.fall_off.model, dark=0.0)
+        corrected, _ = correct_fall_off(light - dark, window, none)
+        return corrected + dark, valid
+
+    def _dark(self, band: int) -> float:
+        """Light of the grey value of no light: that of a fraction of the type's scale, too."""
+        dark, curve = self.fall_off.model.dark, self.linearisation
+        if curve.is_linear or dark == 0.0:
+            return dark
+        scale = curve.full_scale(self.source.dtype) if curve.kind == "srgb" else 1.0
+        return float(curve.to_linear(np.array([dark / scale]), band)[0]) * scale

@@ -1,0 +1,110 @@
+"""A terrain file as a surface, whatever its kind: what the commands on terrain start from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from photoplan.errors import InputError
+from photoplan.geometry.crs import CrsStep, crs_step, require_projected_metres, same_crs
+from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
+from photoplan.io.terrain.reader import TerrainReader
+from photoplan.surfaces.hybrid import HybridSurface
+from photoplan.surfaces.raster import RasterSurface
+
+
+@dataclass(frozen=True, eq=False)
+class OpenTerrain:
+    """A terrain model in its own CRS, or placed in another one."""
+
+    path: Path
+    surface: RasterSurface | HybridSurface
+    bounds: tuple[float, float, float, float]
+    """Outer edges xmin, ymin, xmax, ymax, metres."""
+    crs: str
+    height_system: str | None
+    """As the file gives it; None: not stated."""
+    resolution: float
+    """Mesh width, of a hybrid model the finest, metres."""
+    model: ModelReader | None = None
+    """The file of a hybrid model, with its units, lines and figures; None: a raster of heights."""
+
+    def in_crs(self, crs: str) -> tuple[OpenTerrain, tuple[CrsStep, ...]]:
+        """The same terrain with its surface in another CRS, and the coordinate operation that leads to the file's.
+
+        Raises
+        ------
+        InputError
+            The two CRSs cannot be joined exactly.
+        """
+        if same_crs(self.crs, crs):
+            return self, ()
+        back = crs_step(self.crs, crs, self.bounds)
+        t = np.linspace(0, 1, 17)
+        xmin, ymin, xmax, ymax = self.bounds
+        x, y = xmin + t * (xmax - xmin), ymin + t * (ymax - ymin)
+        corners = back(np.stack(np.meshgrid(x, y), axis=-1)).reshape(-1, 2)
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+        step = crs_step(crs, self.crs, bounds)
+        surface: RasterSurface | HybridSurface
+        if isinstance(self.surface, RasterSurface):
+            surface = replace(self.surface, to_grid_crs=step)
+        else:
+            assert self.model is not None
+            surface = HybridSurface(self.model, step)
+        return replace(self, surface=surface, bounds=bounds, crs=crs), (step,)
+
+
+def open_terrain(path: Path, crs: str | None = None, option: str = "with --crs EPSG:nnnn") -> OpenTerrain:
+    """Open a terrain model.
+
+    Parameters
+    ----------
+    path : Path
+        A model of `photoplan dtm build`, or a GeoTIFF of heights.
+    crs : str, optional
+        CRS of a file that does not state its own.
+    option : str, optional
+        How a user states it, for the message.
+
+    Raises
+    ------
+    InputError
+        The file is no terrain model, its CRS is unknown, or it is in feet or in degrees.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".gpkg" or is_terrain_model(path):
+        reader = ModelReader(path)
+        header = reader.header
+        require_projected_metres(header.crs, f"{path}: CRS")
+        return OpenTerrain(
+            path,
+            HybridSurface(reader),
+            reader.layout.bounds,
+            header.crs,
+            header.height_system,
+            reader.finest,
+            reader,
+        )
+    return _open_raster(path, crs, option)
+
+
+def _open_raster(path: Path, crs: str | None, option: str) -> OpenTerrain:
+    reader = TerrainReader(path)
+    info = reader.info
+    assert info.to_map is not None
+    found = info.crs or crs
+    if found is None:
+        raise InputError(f"{path}: no CRS; state it {option}, it is not guessed")
+    if info.metres_per_unit not in (None, 1.0):
+        raise InputError(f"{path}: heights in {info.unit}; convert them to metres first")
+    x0, xx, xy, y0, yx, yy = info.to_map
+    if xy or yx or xx <= 0 or yy >= 0:
+        raise InputError(f"{path}: the grid is rotated or not north-up; bring it north-up with gdalwarp first")
+    columns, rows = info.size
+    bounds = (x0 - xx / 2, y0 + yy * (rows - 0.5), x0 + xx * (columns - 0.5), y0 - yy / 2)
+    surface = RasterSurface(reader, (x0, y0), (xx, -yy))
+    return OpenTerrain(info.path, surface, bounds, found, info.vertical_crs, min(xx, -yy))

@@ -1,0 +1,287 @@
+"""From a project's description to the things that plan and engine work with: camera, surface, pixels."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.base import Camera
+from photoplan.cameras.build import oriented_camera
+from photoplan.errors import InputError
+from photoplan.geometry.crs import CrsStep
+from photoplan.geometry.heights import HeightStep, declared_pair, height_step
+from photoplan.geometry.pose import Pose
+from photoplan.geometry.rotation import rotation_from_angles
+from photoplan.io.fingerprint import fingerprint
+from photoplan.io.names import resolve_input
+from photoplan.io.orientation.table import angle_in_radians
+from photoplan.io.project.cameras import interior_of, lens_of
+from photoplan.io.project.file import parse_project
+from photoplan.io.project.model import Image, Project, Terrain
+from photoplan.io.raster import RasterReader
+from photoplan.project.filter_files import load_filter
+from photoplan.project.linearisation import linearisation_of
+from photoplan.project.open_terrain import open_terrain
+from photoplan.project.reach import reach
+from photoplan.project.restored_reader import RestoredReader, restored_reader
+from photoplan.surfaces.base import Surface
+from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.shifted import ShiftedSurface
+
+
+@dataclass(frozen=True)
+class SceneAddress:
+    """All that a worker needs to open a scene: small, hashable, pickles."""
+
+    text: str
+    """JSON of a project that holds this image alone."""
+    folder: str
+    """Folder from which its relative paths start."""
+    digests: tuple[tuple[str, str], ...]
+    """Path and content digest of each input file."""
+
+    def open(self) -> Scene:
+        """The scene; kept for the next tile.
+
+        Raises
+        ------
+        InputError
+            An input has changed since the address was made.
+        """
+        return _open(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """The terrain of a project, in the project's CRS and the orientation's height system."""
+
+    surface: Surface
+    bounds: tuple[float, float, float, float] | None
+    """Outer edges xmin, ymin, xmax, ymax; None: everywhere."""
+    file: Path | None
+    """The height raster or terrain model."""
+    operations: tuple[CrsStep | HeightStep, ...]
+    """Coordinate operations on the way from the file, for the run record."""
+    height_systems: tuple[str, str]
+    """Those of the terrain file and of the orientation, as declared or read."""
+    working_system: str
+    """The one that surface and cameras are in."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One image with its camera and the ground below it."""
+
+    camera: Camera
+    surface: Surface
+    terrain_bounds: tuple[float, float, float, float]
+    """Where the surface can be seen from this camera at all."""
+    reader: RasterReader | RestoredReader
+    ground: Ground
+    address: SceneAddress
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know of the pixels, one sentence each."""
+        found = self.reader.info.warnings
+        if isinstance(self.reader, RestoredReader):
+            found += (f"{self.reader.info.path.name}: {self.reader.describe()}",)
+        return found
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Input files."""
+        return tuple(Path(path) for path, _ in self.address.digests)
+
+    @property
+    def facts(self) -> list[Any]:
+        """What identifies the scene in a product's key: description and contents, not places."""
+        return [self.address.text, [digest for _, digest in self.address.digests]]
+
+
+def input_files(project: Project) -> list[Path]:
+    """All files that a project names; nothing that is written may replace one of them."""
+    files = [image.file for image in project.images]
+    restored = [project.restoration(image) for image in project.images]
+    files += [file for each in restored if each is not None for file in each.files]
+    files += [] if project.terrain is None or project.terrain.file is None else [project.terrain.file]
+    observed = project.observations
+    files += [*observed.image_points, *observed.control, *([observed.positions] if observed.positions else [])]
+    return [project.resolve(file) for file in files]
+
+
+def open_scene(project: Project, name: str) -> Scene:
+    """Camera, surface and pixels of one image of a project.
+
+    Raises
+    ------
+    InputError
+        A file is missing or cannot be used, an image's size differs from its camera's, or height systems are not
+        declared or cannot be joined exactly.
+    """
+    image = project.image(name)
+    alone = project.model_copy(update={"images": (image,), "cameras": {image.camera: project.cameras[image.camera]}})
+    files = [project.resolve(image.file)]
+    if project.ground.file is not None:
+        files.append(project.resolve(project.ground.file))
+    restoration = project.restoration(image)
+    if restoration is not None:
+        files += [project.resolve(file) for file in restoration.files]
+    digests = tuple((str(path), _digest(str(path), _stamp(path))) for path in files)
+    return _open(
+        SceneAddress(alone.model_dump_json(exclude={"ortho"}, exclude_none=True), str(project.folder), digests)
+    )
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    try:
+        state = path.stat()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check that it is there and readable") from error
+    return state.st_size, state.st_mtime_ns
+
+
+@lru_cache(maxsize=4096)
+def _digest(path: str, stamp: tuple[int, int]) -> str:
+    """Digest of a file's content; read again only when size or time of the file change."""
+    return fingerprint(path).digest
+
+
+@lru_cache(maxsize=64)
+def _open(address: SceneAddress) -> Scene:
+    for path, digest in address.digests:
+        if _digest(path, _stamp(Path(path))) != digest:
+            raise InputError(f"{path}: has changed since the run was planned; plan it again")
+    project = parse_project(json.loads(address.text), Path(address.folder), "project")
+    image = project.images[0]
+    ground = ground_of(project)
+    reader = _reader(project, image)
+    camera = _camera(project, image, ground, reader.size)
+    return Scene(camera, ground.surface, reach(camera, ground.surface, ground.bounds), reader, ground, address)
+
+
+def _reader(project: Project, image: Image) -> RasterReader | RestoredReader:
+    """The image's pixels, restored if the project says so."""
+    source = RasterReader(project.resolve(image.file))
+    restoration = project.restoration(image)
+    if restoration is None:
+        return source
+    table = restoration.linearisation
+    light = linearisation_of(table if table in ("linear", "srgb") else str(project.resolve(table)))
+    return restored_reader(source, load_filter(project.resolve(restoration.filter)), light)
+
+
+@dataclass(frozen=True)
+class _GroundAddress:
+    """What decides the ground of a project; hashable."""
+
+    terrain: Terrain
+    orientation_system: str | None
+    to_ellipsoid: bool
+    crs: str
+    folder: str
+    stamp: tuple[int, int]
+    """Size and time of the file: a file that changes is opened again."""
+
+
+def ground_of(project: Project) -> Ground:
+    """The terrain of a project as a surface, in the project's CRS and the height system that the cameras work in.
+
+    Raises
+    ------
+    InputError
+        The terrain file cannot be used, or its CRS is not known or not joined exactly to the project's.
+    HeightSystemError
+        Height systems are not declared, or the grid that joins them is missing.
+    """
+    orientation = project.orientation
+    strict = orientation.earth_curvature == "strict"
+    file = project.ground.file
+    stamp = (0, 0) if file is None else _stamp(project.resolve(file))
+    return _ground(
+        _GroundAddress(project.ground, orientation.height_system, strict, project.crs, str(project.folder), stamp)
+    )
+
+
+@lru_cache(maxsize=8)
+def _ground(address: _GroundAddress) -> Ground:
+    terrain = address.terrain
+    if terrain.height is not None:
+        systems = declared_pair(terrain.height_system, address.orientation_system)
+        return _in_system(Ground(LevelSurface(terrain.height), None, None, (), systems, systems[1]), address)
+    assert terrain.file is not None
+    path = resolve_input(Path(address.folder), terrain.file)
+    own = open_terrain(path, terrain.crs, 'as crs = "EPSG:nnnn" in [terrain]')
+    systems = declared_pair(terrain.height_system or own.height_system, address.orientation_system)
+    placed, steps = own.in_crs(address.crs)
+    return _in_system(Ground(placed.surface, placed.bounds, placed.path, steps, systems, systems[1]), address)
+
+
+def _in_system(ground: Ground, address: _GroundAddress) -> Ground:
+    """The ground with heights in the system that the cameras work in."""
+    terrain, orientation = ground.height_systems
+    wanted = "ellipsoidal" if address.to_ellipsoid and orientation != "same" else orientation
+    step = height_step(terrain, wanted, address.crs, ground.bounds)
+    surface = ground.surface if step.definition is None else ShiftedSurface(ground.surface, _Undulation(step))
+    operations = ground.operations if step.definition is None else (*ground.operations, step)
+    return replace(ground, surface=surface, operations=operations, working_system=wanted)
+
+
+@dataclass(frozen=True)
+class _Undulation:
+    """What a height step adds at map points."""
+
+    step: HeightStep
+
+    def __call__(self, XY: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self.step(np.concatenate([XY, np.zeros((*XY.shape[:-1], 1))], axis=-1))
+
+
+def stated_pose(project: Project, image: Image) -> Pose:
+    """Exterior orientation of an image as the project states it, in the orientation's height system.
+
+    Raises
+    ------
+    InputError
+        It states none.
+    """
+    orientation = project.orientation
+    center, angles = image.pose_numbers
+    radians = angle_in_radians(np.array(angles), orientation.angle_unit)
+    return Pose(np.array(center, float), rotation_from_angles(radians, orientation.rotation))
+
+
+def pose_of(project: Project, image: Image, ground: Ground) -> Pose:
+    """Exterior orientation of an image, in the height system that the ground has."""
+    stated = stated_pose(project, image)
+    center = stated.center.copy()
+    center[2] = height_step(ground.height_systems[1], ground.working_system, project.crs)(center)
+    return Pose(center, stated.R_ground_camera)
+
+
+def _camera(project: Project, image: Image, ground: Ground, size: tuple[int, int]) -> Camera:
+    description = project.cameras[image.camera]
+    stated = image.size or description.size
+    if stated is not None and tuple(stated) != size:
+        raise InputError(
+            f"{image.file}: {size[0]} × {size[1]} pixels, but camera {image.camera!r} has {stated[0]} × {stated[1]}; "
+            "an image that was cropped or scaled needs a camera of its own"
+        )
+    interior = interior_of(description, image, size)
+    pose = pose_of(project, image, ground)
+    nadir = float(ground.surface.heights(pose.center[:2]))
+    return oriented_camera(
+        interior,
+        lens_of(description),
+        pose,
+        crs=project.crs,
+        earth_curvature=project.orientation.earth_curvature,
+        refraction=project.orientation.refraction,
+        mean_ground=nadir if np.isfinite(nadir) else 0.0,
+    )

@@ -1,0 +1,1 @@
+"""Triangles of a hybrid model where lines pass."""

@@ -1,0 +1,1 @@
+"""Contradictions in measured points and lines, cleaned or reported."""

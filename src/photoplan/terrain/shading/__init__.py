@@ -1,0 +1,1 @@
+"""Shading, slope and tints."""
