@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from affine import Affine
 from hypothesis import given
 from hypothesis import strategies as st
+from rasterio.crs import CRS
 
 from photoplan.errors import InputError, UsageError
-from photoplan.geometry.grid import MapGrid, Window
+from photoplan.geometry.grid import MapGrid, Placement, Window
 from photoplan.geometry.pose import Pose
 
 finite = st.floats(-1e6, 1e6)
@@ -93,3 +95,26 @@ def test_a_mirror_is_no_pose() -> None:
         Pose(np.zeros(3), np.diag([1.0, 1.0, -1.0]))
     with pytest.raises(InputError, match="centre"):
         Pose(np.array([0, np.nan, 0]), np.eye(3))
+
+
+def test_placement_of_a_grid_is_where_the_grid_is() -> None:
+    grid = MapGrid(500_000.5, 5_200_000.25, 0.5, 70, 30, "EPSG:32633")
+    place = grid.placement
+    assert (place.bounds, place.crs, place.size, place.unit) == (grid.bounds, grid.crs, (70, 30), "metre")
+    uv = np.array([(0.0, 0.0), (69.0, 29.0), (12.25, -3.5)])
+    np.testing.assert_array_equal(place.to_plane(uv), grid.to_map(uv))
+    part = Window(3, 5, 20, 10)
+    assert place.part(part).bounds == grid.bounds_of(part)
+
+
+def test_placement_goes_to_an_affine_and_back() -> None:
+    turned = Affine.translation(10, 20) * Affine.rotation(30) * Affine.scale(0.5, -0.25)
+    place = Placement.from_affine(turned, CRS.from_epsg(32633), size=(40, 20))
+    assert (place.affine, place.crs) == (turned, "EPSG:32633")
+    # An affine counts from the corner of a pixel, pixel coordinates from its centre.
+    np.testing.assert_allclose(place.to_plane((7, 3)), turned * (7.5, 3.5), atol=1e-12)
+    assert Placement((40, 20)).unit == "pixel"
+    np.testing.assert_array_equal(Placement((40, 20)).to_plane((0, 0)), (0.5, 0.5))
+    for wrong in ({"transform": (1.0, 2.0, 0.0, 2.0, 4.0, 0.0)}, {"transform": (np.nan,) * 6}, {"size": (0, 4)}):
+        with pytest.raises(UsageError):
+            Placement(**({"size": (4, 4)} | wrong))

@@ -18,11 +18,12 @@ from photoplan.io.product import ProductFile
 from photoplan.io.tiff_layout import TiffLayout, read_tiff_layout, read_tiff_layouts
 
 GRID = MapGrid(0, 0, 1, 1500, 1100, "EPSG:32633")
+PLACE = GRID.placement
 
 
 def product(path: Path, **options: Any) -> list[TiffLayout]:
     tile = np.random.default_rng(1).integers(1, 250, (3, 256, 256), dtype=np.uint8)
-    with ProductFile(path, GRID, 3, np.dtype("uint8"), run_key="k", tile=256, **options) as file:
+    with ProductFile(path, PLACE, 3, np.dtype("uint8"), run_key="k", tile=256, **options) as file:
         for index in np.random.default_rng(2).permutation(len(file.windows)).tolist():
             window = file.windows[index]
             if index != 7:
@@ -82,7 +83,7 @@ def test_overviews_are_averages_of_valid_pixels(tmp_path: Path) -> None:
     grid = MapGrid(0, 0, 1, 512, 256, "EPSG:32633")
     pixels = np.random.default_rng(4).integers(1, 250, (1, 256, 512)).astype(np.float32)
     valid = np.random.default_rng(5).random((256, 512)) > 0.3
-    with ProductFile(tmp_path / "a.tif", grid, 1, np.dtype("float32"), run_key="k", tile=256) as file:
+    with ProductFile(tmp_path / "a.tif", grid.placement, 1, np.dtype("float32"), run_key="k", tile=256) as file:
         for index, window in enumerate(file.windows):
             cols = slice(window.col, window.stop[0])
             file.append(index, pixels[:, :, cols], valid[:, cols])

@@ -17,6 +17,7 @@ from photoplan.io import disk
 from photoplan.io.grid_writer import GridOptions, write_grid
 
 GRID = MapGrid(500_000.0, 5_200_000.0, 0.5, 700, 300, "EPSG:32633")
+PLACE = GRID.placement
 Usage = namedtuple("Usage", "total used free")
 
 
@@ -33,7 +34,7 @@ def test_values_come_back_with_holes(tmp_path: Path, workers: int) -> None:
     calls: list[tuple[int, int]] = []
     facts = write_grid(
         tmp_path / "a.tif",
-        GRID,
+        PLACE,
         "float32",
         1,
         "auto",
@@ -53,7 +54,7 @@ def test_values_come_back_with_holes(tmp_path: Path, workers: int) -> None:
 
 def test_one_and_more_workers_write_the_same_bytes(tmp_path: Path) -> None:
     for workers in (1, 4):
-        write_grid(tmp_path / f"{workers}.tif", GRID, "float32", 1, "auto", ramp, GridOptions(workers=workers))
+        write_grid(tmp_path / f"{workers}.tif", PLACE, "float32", 1, "auto", ramp, GridOptions(workers=workers))
     assert (tmp_path / "1.tif").read_bytes() == (tmp_path / "4.tif").read_bytes()
 
 
@@ -66,7 +67,7 @@ def test_classes_keep_their_colours_and_are_not_averaged(tmp_path: Path) -> None
 
     colours = {0: (0, 0, 0), 1: (10, 20, 30), 9: (250, 240, 230)}
     options = GridOptions(tile=128, resampling="nearest", colours=colours, workers=2)
-    write_grid(tmp_path / "a.tif", GRID, "uint8", 1, "auto", classes, options)
+    write_grid(tmp_path / "a.tif", PLACE, "uint8", 1, "auto", classes, options)
     with rasterio.open(tmp_path / "a.tif") as file:
         table = file.colormap(1)
         assert [table[k][:3] for k in colours] == list(colours.values())
@@ -84,7 +85,7 @@ def test_mask_and_validity(tmp_path: Path) -> None:
         values = np.zeros((3, window.height, window.width), np.uint8)
         return values, np.ones((window.height, window.width), bool)
 
-    write_grid(tmp_path / "a.tif", GRID, "uint8", 3, "mask", picture, GridOptions(tile=128))
+    write_grid(tmp_path / "a.tif", PLACE, "uint8", 3, "mask", picture, GridOptions(tile=128))
     with rasterio.open(tmp_path / "a.tif") as file:
         mask = file.dataset_mask()
     assert mask[:256].all()
@@ -99,17 +100,17 @@ def test_fault_13_an_existing_output_is_refused_before_any_work(tmp_path: Path) 
     path = tmp_path / "a.tif"
     path.write_bytes(b"old")
     with pytest.raises(UsageError, match="exists already"):
-        write_grid(path, GRID, "uint8", 1, "auto", _no_work, GridOptions())
+        write_grid(path, PLACE, "uint8", 1, "auto", _no_work, GridOptions())
     with pytest.raises(UsageError, match="is the input"):
         (tmp_path / "b.tif").symlink_to(path)
-        write_grid(tmp_path / "b.tif", GRID, "uint8", 1, "auto", _no_work, GridOptions(inputs=[path], overwrite=True))
+        write_grid(tmp_path / "b.tif", PLACE, "uint8", 1, "auto", _no_work, GridOptions(inputs=[path], overwrite=True))
     assert path.read_bytes() == b"old"
 
 
 def test_fault_04_too_little_space_is_seen_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(disk.shutil, "disk_usage", lambda path: Usage(0, 0, 3_000_000))
     with pytest.raises(ResourceError, match=r"needs up to \d+ MB"):
-        write_grid(tmp_path / "a.tif", GRID, "float32", 1, "auto", _no_work, GridOptions())
+        write_grid(tmp_path / "a.tif", PLACE, "float32", 1, "auto", _no_work, GridOptions())
     assert not list(tmp_path.iterdir())
 
 
@@ -124,7 +125,7 @@ def test_a_failed_window_leaves_nothing(tmp_path: Path, workers: int) -> None:
         return ramp(window)
 
     with pytest.raises(RuntimeError, match="no luck"):
-        write_grid(tmp_path / "a.tif", GRID, "float32", 1, "auto", failing, GridOptions(tile=128, workers=workers))
+        write_grid(tmp_path / "a.tif", PLACE, "float32", 1, "auto", failing, GridOptions(tile=128, workers=workers))
     assert done.is_set()
     assert not list(tmp_path.iterdir())
 
@@ -143,10 +144,10 @@ def test_a_run_with_a_key_is_continued(tmp_path: Path) -> None:
 
     options = GridOptions(tile=128, workers=1, run_key="same inputs")
     with pytest.raises(RuntimeError):
-        write_grid(tmp_path / "a.tif", GRID, "float32", 1, "auto", halfway, options)
-    write_grid(tmp_path / "a.tif", GRID, "float32", 1, "auto", counting, options)
+        write_grid(tmp_path / "a.tif", PLACE, "float32", 1, "auto", halfway, options)
+    write_grid(tmp_path / "a.tif", PLACE, "float32", 1, "auto", counting, options)
     assert {w.row for w in computed} == {256}
-    write_grid(tmp_path / "b.tif", GRID, "float32", 1, "auto", ramp, GridOptions(tile=128))
+    write_grid(tmp_path / "b.tif", PLACE, "float32", 1, "auto", ramp, GridOptions(tile=128))
     assert (tmp_path / "a.tif").read_bytes() == (tmp_path / "b.tif").read_bytes()
 
 
@@ -162,4 +163,4 @@ def test_a_run_with_a_key_is_continued(tmp_path: Path) -> None:
 )
 def test_wrong_use_is_refused(tmp_path: Path, dtype: str, bands: int, options: dict[str, Any]) -> None:
     with pytest.raises(UsageError):
-        write_grid(tmp_path / "a.tif", GRID, dtype, bands, "auto", _no_work, GridOptions(**options))
+        write_grid(tmp_path / "a.tif", PLACE, dtype, bands, "auto", _no_work, GridOptions(**options))

@@ -21,6 +21,7 @@ from photoplan.io.storage import BlockCoder, nodata_for
 from photoplan.io.tiff_layout import read_tiff_layouts
 
 GRID = MapGrid(500_000.25, 5_200_000.5, 0.25, 600, 400, "EPSG:32633")
+PLACE = GRID.placement
 
 
 def scene(bands: int, dtype: Any, grid: MapGrid = GRID) -> tuple[np.ndarray, np.ndarray]:
@@ -45,7 +46,7 @@ def make(
     path: Path, pixels: np.ndarray, valid: np.ndarray | None, grid: MapGrid = GRID, **options: Any
 ) -> ProductFacts:
     options = {"run_key": "k", "tile": 128} | options
-    with ProductFile(path, grid, len(pixels), pixels.dtype, **options) as file:
+    with ProductFile(path, grid.placement, len(pixels), pixels.dtype, **options) as file:
         fill(file, pixels, valid)
         return file.complete({"SOURCE": "test"})
 
@@ -153,7 +154,9 @@ def test_nodata_moves_to_the_neighbour_inside_the_type(dtype: str, nodata: float
 @pytest.mark.parametrize("options", [{"compress": "none", "overviews": False}, {"compress": "deflate"}])
 def test_empty_tiles_are_not_stored(tmp_path: Path, options: dict[str, Any]) -> None:
     grid = MapGrid(0, 0, 1, 2048, 2048, "EPSG:32633")
-    with ProductFile(tmp_path / "a.tif", grid, 3, np.dtype("uint8"), run_key="k", tile=256, **options) as file:
+    with ProductFile(
+        tmp_path / "a.tif", grid.placement, 3, np.dtype("uint8"), run_key="k", tile=256, **options
+    ) as file:
         for index in range(64):
             if index == 9:
                 file.append(index, np.full((3, 256, 256), 7, np.uint8), None)
@@ -179,7 +182,7 @@ def test_the_order_of_tiles_does_not_matter(tmp_path: Path) -> None:
         for seed in range(3):
             path = tmp_path / f"{seed}" / "a.tif"
             path.parent.mkdir(exist_ok=True)
-            with ProductFile(path, GRID, 3, pixels.dtype, run_key="k", tile=128, overwrite=True, **options) as file:
+            with ProductFile(path, PLACE, 3, pixels.dtype, run_key="k", tile=128, overwrite=True, **options) as file:
                 fill(file, pixels, valid, iter(np.random.default_rng(seed).permutation(20).tolist()))
                 file.complete()
             seen.add(path.read_bytes())
@@ -192,15 +195,15 @@ def test_a_run_continues_with_its_own_key_only(tmp_path: Path) -> None:
     make(path, pixels, valid)
     undisturbed = path.read_bytes()
     path.unlink()
-    with ProductFile(path, GRID, 3, pixels.dtype, run_key="k", tile=128) as file:
+    with ProductFile(path, PLACE, 3, pixels.dtype, run_key="k", tile=128) as file:
         fill(file, pixels, valid, iter(range(9)))
         with pytest.raises(PhotoplanError, match="11 tiles are missing, the first is 9"):
             file.complete()
     assert not path.exists()
-    with ProductFile(path, GRID, 3, pixels.dtype, run_key="other", tile=128) as file:
+    with ProductFile(path, PLACE, 3, pixels.dtype, run_key="other", tile=128) as file:
         assert not file.finished
         fill(file, pixels, valid, iter(range(9)))
-    with ProductFile(path, GRID, 3, pixels.dtype, run_key="other", tile=128) as file:
+    with ProductFile(path, PLACE, 3, pixels.dtype, run_key="other", tile=128) as file:
         assert file.finished == set(range(9))
         fill(file, pixels, valid, iter(range(9, 20)))
         facts = file.complete({"SOURCE": "test"})
@@ -211,13 +214,13 @@ def test_a_run_continues_with_its_own_key_only(tmp_path: Path) -> None:
 def test_missing_tiles_are_nodata_and_the_log_stays(tmp_path: Path) -> None:
     path = tmp_path / "a.tif"
     pixels, _ = scene(1, "uint8")
-    with ProductFile(path, GRID, 1, pixels.dtype, run_key="k", tile=128) as file:
+    with ProductFile(path, PLACE, 1, pixels.dtype, run_key="k", tile=128) as file:
         fill(file, pixels, None, iter(i for i in range(20) if i not in (3, 12)))
         facts = file.complete(allow_missing=True)
     assert facts.missing_tiles == (3, 12)
     with rasterio.open(path) as opened:
         assert (opened.read(1)[:128, 384:512] == 0).all()
-    with ProductFile(path, GRID, 1, pixels.dtype, run_key="k", tile=128, overwrite=True) as file:
+    with ProductFile(path, PLACE, 1, pixels.dtype, run_key="k", tile=128, overwrite=True) as file:
         assert file.finished == set(range(20)) - {3, 12}
         fill(file, pixels, None, iter([3, 12]))
         assert file.complete().missing_tiles == ()
@@ -237,11 +240,11 @@ def test_missing_tiles_are_nodata_and_the_log_stays(tmp_path: Path) -> None:
 def test_wrong_use_is_named(tmp_path: Path, change: dict[str, Any], message: str) -> None:
     options = {"bands": 3, "dtype": np.dtype("uint8"), "run_key": "k"} | change
     with pytest.raises(UsageError, match=message):
-        ProductFile(tmp_path / "a.tif", GRID, **options)
+        ProductFile(tmp_path / "a.tif", PLACE, **options)
 
 
 def test_a_tile_of_another_shape_or_type_is_refused(tmp_path: Path) -> None:
-    with ProductFile(tmp_path / "a.tif", GRID, 3, np.dtype("uint8"), run_key="k", tile=256) as file:
+    with ProductFile(tmp_path / "a.tif", PLACE, 3, np.dtype("uint8"), run_key="k", tile=256) as file:
         for wrong in (
             np.zeros((3, 256, 256), np.int16),
             np.zeros((1, 256, 256), np.uint8),
@@ -261,7 +264,7 @@ from photoplan.io.product import ProductFile
 from photoplan.io.run_record import peak_memory_bytes
 grid = MapGrid(0, 0, 0.1, 9000, 6000, "EPSG:32633")
 tile = np.random.default_rng(0).integers(1, 255, (3, 512, 512), dtype=np.uint8)
-with ProductFile(Path(sys.argv[1]), grid, 3, np.dtype("uint8"), run_key="k", compress="lzw") as file:
+with ProductFile(Path(sys.argv[1]), grid.placement, 3, np.dtype("uint8"), run_key="k", compress="lzw") as file:
     file.append(0, tile)
     before = peak_memory_bytes()
     for i, w in enumerate(file.windows):

@@ -19,6 +19,7 @@ from photoplan.io.product import ProductFile, check_output
 from photoplan.io.product_check import check_product
 
 GRID = MapGrid(1000, 2000, 1, 1200, 1000, "EPSG:32633")
+PLACE = GRID.placement
 
 
 def tile_of(index: int, height: int, width: int) -> np.ndarray:
@@ -26,7 +27,7 @@ def tile_of(index: int, height: int, width: int) -> np.ndarray:
 
 
 def run(path: Path, **options: object) -> None:
-    with ProductFile(path, GRID, 3, np.dtype("uint8"), run_key="k", tile=128, **options) as file:  # type: ignore[arg-type]
+    with ProductFile(path, PLACE, 3, np.dtype("uint8"), run_key="k", tile=128, **options) as file:  # type: ignore[arg-type]
         for index in sorted(set(range(len(file.windows))) - file.finished):
             window = file.windows[index]
             file.append(index, tile_of(index, window.height, window.width))
@@ -75,7 +76,7 @@ class TestFault13Output:
 
     def test_fault_13_a_file_that_appears_meanwhile(self, tmp_path: Path) -> None:
         path = tmp_path / "a.tif"
-        with ProductFile(path, GRID, 3, np.dtype("uint8"), run_key="k") as file:
+        with ProductFile(path, PLACE, 3, np.dtype("uint8"), run_key="k") as file:
             path.write_text("precious")
             for index in range(len(file.windows)):
                 file.append_empty(index)
@@ -86,7 +87,7 @@ class TestFault13Output:
 
 def test_fault_26_two_runs_on_one_output(tmp_path: Path) -> None:
     path = tmp_path / "a.tif"
-    with ProductFile(path, GRID, 3, np.dtype("uint8"), run_key="k") as first:
+    with ProductFile(path, PLACE, 3, np.dtype("uint8"), run_key="k") as first:
         first.append_empty(0)
         with pytest.raises(RunLocked, match="another run"):
             run(path)
@@ -133,7 +134,7 @@ def test_fault_03_killed_while_writing(tmp_path: Path, moment: str, before: str)
     command = [sys.executable, "-c", KILLED, str(path), str(Path(__file__).parent), moment, before]
     assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
     assert path.read_text() == "old" if before == "old" else not path.exists()
-    with ProductFile(path, GRID, 3, np.dtype("uint8"), run_key="k", tile=128, overwrite=True) as file:
+    with ProductFile(path, PLACE, 3, np.dtype("uint8"), run_key="k", tile=128, overwrite=True) as file:
         assert len(file.finished) == (30 if moment == "append" else 80)
     run(path, overwrite=True)
     assert path.read_bytes() == whole.read_bytes()
@@ -171,7 +172,7 @@ def test_fault_04_no_more_room(tmp_path: Path, limit: int, compress: str, overvi
     assert out.startswith(f"5 {tmp_path}")
     assert "finished tiles are kept" in out
     assert [p.name for p in tmp_path.iterdir()] == [".a.tif.tiles"]
-    with ProductFile(path, GRID, 3, np.dtype("uint8"), run_key="k", tile=128) as file:
+    with ProductFile(path, PLACE, 3, np.dtype("uint8"), run_key="k", tile=128) as file:
         assert len(file.finished) == (40 if limit == 2_000_000 else 80)
     run(path)
 
@@ -206,7 +207,7 @@ def test_fault_04_a_real_disk_runs_full(small_disk: Path, free: int, compress: s
         names = {p.name for p in small_disk.iterdir()}
         assert names == {"ballast", ".a.tif.tiles"}
         (small_disk / "ballast").unlink()
-        with ProductFile(path, GRID, 3, np.dtype("uint8"), run_key="k", tile=128, compress=compress) as file:
+        with ProductFile(path, PLACE, 3, np.dtype("uint8"), run_key="k", tile=128, compress=compress) as file:
             assert file.finished
         run(path, compress=compress)
     else:

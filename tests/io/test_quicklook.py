@@ -21,7 +21,7 @@ def product(
 ) -> Path:
     """One colour, its lower right quarter invalid."""
     grid = MapGrid(left, 1000, 1, size, size, more.pop("crs", "EPSG:32633"))
-    with ProductFile(path, grid, len(colour), np.dtype(dtype), run_key="k", tile=256, **more) as file:
+    with ProductFile(path, grid.placement, len(colour), np.dtype(dtype), run_key="k", tile=256, **more) as file:
         for index, w in enumerate(file.windows):
             y, x = np.mgrid[w.row : w.stop[1], w.col : w.stop[0]]
             pixels = np.empty((len(colour), *x.shape), dtype)
@@ -52,7 +52,7 @@ def test_one_product(tmp_path: Path, nodata: Any) -> None:
 @pytest.mark.parametrize(("dtype", "bands"), [("uint16", 1), ("float32", 2), ("int16", 5)])
 def test_other_types_and_bands_are_shown(tmp_path: Path, dtype: str, bands: int) -> None:
     grid = MapGrid(0, 0, 1, 300, 300, "EPSG:32633")
-    with ProductFile(tmp_path / "a.tif", grid, bands, np.dtype(dtype), run_key="k") as file:
+    with ProductFile(tmp_path / "a.tif", grid.placement, bands, np.dtype(dtype), run_key="k") as file:
         ramp = np.broadcast_to(np.arange(300) * 30 + 100, (bands, 300, 300)).astype(dtype)
         file.append(0, ramp)
         file.complete()

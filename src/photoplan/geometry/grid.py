@@ -1,15 +1,18 @@
-"""Windows of pixels and the map grid of a product."""
+"""Windows of pixels, where rasters lie, and the map grid of a product."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import UsageError
+
+Six = tuple[float, float, float, float, float, float]
 
 
 @dataclass(frozen=True, order=True)
@@ -48,6 +51,93 @@ class Window:
         for row in range(self.row, bottom, side):
             for col in range(self.col, right, side):
                 yield Window(col, row, min(side, right - col), min(side, bottom - row))
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Size of a raster, and how its pixels lie in a plane.
+
+    The plane is a map, a wall, an unrolled vault or a picture; a plain image lies in none.
+    """
+
+    size: tuple[int, int]
+    """Width and height in pixels."""
+    transform: Six | None = None
+    """a to f: X = a·col + b·row + c, Y = d·col + e·row + f, where col and row count from the outer corner of the
+    upper-left pixel, as GDAL has it and unlike pixel coordinates; None: the raster lies nowhere."""
+    crs: str | None = None
+    """Reference system of X and Y as a string that pyproj reads; None: none, or unknown."""
+    unit: str = "metre"
+    """What X and Y count; `pixel` where there is no transform."""
+
+    def __post_init__(self) -> None:
+        width, height = self.size
+        if width < 1 or height < 1:
+            raise UsageError(f"raster of {width} × {height} pixels; it must hold at least one")
+        if self.transform is None:
+            object.__setattr__(self, "unit", "pixel")
+            return
+        a, b, _, d, e, _ = self.transform
+        if not (all(math.isfinite(t) for t in self.transform) and a * e - b * d != 0):
+            raise UsageError(f"transform {self.transform}; six finite numbers and pixels with an area are needed")
+
+    @classmethod
+    def from_affine(cls, affine: Any, crs: Any = None, *, size: tuple[int, int], unit: str = "metre") -> Placement:
+        """From an `affine.Affine`, as rasterio has it.
+
+        Parameters
+        ----------
+        affine : affine.Affine
+            Or anything with the attributes a to f.
+        crs : optional
+            A string, or a CRS object of rasterio or pyproj.
+        size : (width, height)
+            Pixels.
+        unit : str
+            Of the affine's results.
+        """
+        a, b, c, d, e, f = (float(getattr(affine, name)) for name in "abcdef")
+        return cls(size, (a, b, c, d, e, f), crs if crs is None or isinstance(crs, str) else crs.to_string(), unit)
+
+    @property
+    def coefficients(self) -> Six:
+        """The transform; that of the pixels themselves where there is none."""
+        return self.transform or (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+
+    @property
+    def affine(self) -> Any:
+        """`affine.Affine`: with `crs` all that rasterio, xarray or GeoPandas want to know."""
+        from affine import Affine  # noqa: PLC0415  (not needed to write a product)
+
+        return Affine(*self.coefficients)
+
+    @property
+    def window(self) -> Window:
+        """All pixels."""
+        return Window(0, 0, *self.size)
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Outer edges xmin, ymin, xmax, ymax."""
+        width, height = self.size
+        corners = self.to_plane([(-0.5, -0.5), (width - 0.5, -0.5), (-0.5, height - 0.5), (width - 0.5, height - 0.5)])
+        (xmin, ymin), (xmax, ymax) = corners.min(axis=0), corners.max(axis=0)
+        return float(xmin), float(ymin), float(xmax), float(ymax)
+
+    def to_plane(self, xy: ArrayLike) -> NDArray[np.float64]:
+        """Pixel coordinates (column, row), whole at pixel centres, to X, Y; shapes (..., 2)."""
+        col, row = np.moveaxis(np.asarray(xy, float) + 0.5, -1, 0)
+        a, b, c, d, e, f = self.coefficients
+        return np.stack([a * col + b * row + c, d * col + e * row + f], axis=-1)
+
+    def part(self, window: Window) -> Placement:
+        """The placement of a window."""
+        size = (window.width, window.height)
+        if self.transform is None:
+            return Placement(size)
+        a, b, _, d, e, _ = self.transform
+        X, Y = self.to_plane((window.col - 0.5, window.row - 0.5)).tolist()
+        return Placement(size, (a, b, X, d, e, Y), self.crs, self.unit)
 
 
 @dataclass(frozen=True)
@@ -109,6 +199,12 @@ class MapGrid:
             self.left + self.width * self.resolution,
             self.top,
         )
+
+    @property
+    def placement(self) -> Placement:
+        """The same for files, which know other places than maps too."""
+        corner = (self.resolution, 0.0, self.left, 0.0, -self.resolution, self.top)
+        return Placement((self.width, self.height), corner, self.crs)
 
     def to_map(self, uv: ArrayLike) -> NDArray[np.float64]:
         """Pixel coordinates (column, row) to map X, Y; shapes (..., 2)."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import ResourceError, UsageError
-from photoplan.geometry.grid import MapGrid, Window
+from photoplan.geometry.grid import Placement, Window
 from photoplan.io.disk import free_megabytes
 from photoplan.io.product import ProductFacts, ProductFile, check_output
 from photoplan.io.storage import Nodata
@@ -56,7 +56,7 @@ class GridOptions:
 
 
 def write_grid(
-    path: Path, grid: MapGrid, dtype: Any, bands: int, nodata: Nodata, tiles: GridTiles, options: GridOptions
+    path: Path, placement: Placement, dtype: Any, bands: int, nodata: Nodata, tiles: GridTiles, options: GridOptions
 ) -> ProductFacts:
     """Write a raster as a cloud-optimised GeoTIFF, crash-safe, with bounded memory.
 
@@ -67,8 +67,8 @@ def write_grid(
     ----------
     path
         The file.
-    grid
-        Where its pixels are on the map.
+    placement
+        Its size, and where its pixels are.
     dtype, bands
         uint8, uint16, int16 or float32; number of bands.
     nodata
@@ -103,7 +103,7 @@ def write_grid(
     key = options.run_key or secrets.token_hex(16)
     with ProductFile(
         path,
-        grid,
+        placement,
         bands,
         dtype,
         run_key=key,

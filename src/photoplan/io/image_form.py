@@ -1,4 +1,4 @@
-"""What a processed copy of an image takes over from it: place on the map, names and colours of bands, metadata."""
+"""What a processed copy of an image takes over from it: place, names and colours of bands, metadata."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import rasterio
 import rasterio.enums
 
+from photoplan.geometry.grid import Placement
 from photoplan.io.gdal import GDAL_ERRORS, gdal_settings, open_raster
 from photoplan.io.raster_info import RasterInfo
 from photoplan.io.scan_pitch import read_pitch
@@ -23,10 +24,6 @@ _XMP = "xml:XMP"
 class ImageForm:
     """The form of an image, without its pixels."""
 
-    crs: str | None = None
-    """Reference system as WKT; None: none is known."""
-    transform: tuple[float, float, float, float, float, float] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-    """GDAL's coefficients a to f from pixel **corners** to the map; those of the pixels themselves if there is none."""
     colours: tuple[str, ...] = ()
     """Colour interpretation of every band, as GDAL names it; empty: by their number."""
     descriptions: tuple[str | None, ...] = ()
@@ -44,12 +41,16 @@ class ImageForm:
         return "RGB" if self.colours[:3] == ("red", "green", "blue") else "MINISBLACK"
 
 
+def placement_of(info: RasterInfo) -> Placement:
+    """Where a file that `read_info` has checked lies."""
+    if info.to_map is None:
+        return Placement(info.size, crs=info.crs)
+    x0, xx, xy, y0, yx, yy = info.to_map
+    return Placement(info.size, (xx, xy, x0 - (xx + xy) / 2, yx, yy, y0 - (yx + yy) / 2), info.crs)
+
+
 def form_of(info: RasterInfo) -> ImageForm:
     """The form of a file that `read_info` has checked; a palette counts as the three colours that it stands for."""
-    transform = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-    if info.to_map is not None:
-        x0, xx, xy, y0, yx, yy = info.to_map
-        transform = (xx, xy, x0 - (xx + xy) / 2, yx, yy, y0 - (yx + yy) / 2)
     with open_raster(info.path, info.driver) as file, gdal_settings():
         tags: dict[str, Any] = file.tags()
         packet = file.tags(ns=_XMP).get(_XMP)
@@ -62,7 +63,7 @@ def form_of(info: RasterInfo) -> ImageForm:
     _add_pitch(info, kept)
     colours = ("red", "green", "blue") if info.palette else tuple(info.colours[b - 1] for b in info.colour_bands)
     xmp = packet if packet and "=" in packet and len(packet) <= _LONGEST_XMP else None
-    return ImageForm(info.crs, transform, colours, () if info.palette else names, tuple(kept.items())[:_MOST_TAGS], xmp)
+    return ImageForm(colours, () if info.palette else names, tuple(kept.items())[:_MOST_TAGS], xmp)
 
 
 def _add_pitch(info: RasterInfo, tags: dict[str, str]) -> None:

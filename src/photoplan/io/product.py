@@ -15,7 +15,7 @@ import rasterio.transform
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import PhotoplanError, ResourceError, UsageError
-from photoplan.geometry.grid import MapGrid, Window
+from photoplan.geometry.grid import Placement, Window
 from photoplan.io.cog import CogOptions, write_cog
 from photoplan.io.disk import disk_error, free_megabytes, sync_file, sync_folder
 from photoplan.io.gdal import GDAL_ERRORS, first_cause
@@ -39,7 +39,7 @@ class ProductFacts:
     bytes: int
     """Its size."""
     tiles: int
-    """Tiles of the grid."""
+    """Tiles of the product."""
     empty_tiles: int
     """Tiles without a valid pixel; they are not stored."""
     missing_tiles: tuple[int, ...]
@@ -91,8 +91,8 @@ class ProductFile:
 
     path: Path
     """The product."""
-    grid: MapGrid
-    """Where its pixels are on the map."""
+    placement: Placement
+    """Its size, and where its pixels are."""
     bands: int
     """Bands."""
     dtype: np.dtype[Any]
@@ -122,8 +122,7 @@ class ProductFile:
     colours: Mapping[int, tuple[int, int, int]] | None = None
     """Colour table of one band of uint8."""
     form: ImageForm | None = None
-    """Of an image whose copy the product is: its place on the map counts instead of the grid's, and its names and
-    colours of bands and its metadata are taken over."""
+    """Of an image whose copy the product is: its names and colours of bands and its metadata are taken over."""
     _log: TileLog | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -146,7 +145,7 @@ class ProductFile:
         )
         value = nodata_for(self.dtype, self.nodata, self.compress)
         self._coder = BlockCoder(self.tile, self.bands, self.dtype, value, lossy=self.compress == "jpeg")
-        self._windows = tuple(self.grid.window.tiles(self.tile))
+        self._windows = tuple(self.placement.window.tiles(self.tile))
         self._lock = FileLock(self.path.with_name(f".{self.path.name}.lock"))
         self._state = threading.Lock()
 
@@ -157,7 +156,7 @@ class ProductFile:
             # The run before may have finished between the check and the lock.
             check_output(self.path, self.inputs, overwrite=self.overwrite)
             self._remove_parts()
-            key = f"{self.run_key} {self.grid} {self._coder}"
+            key = f"{self.run_key} {self.placement} {self._coder}"
             self._log = TileLog(self.path.with_name(f".{self.path.name}.tiles"), key)
         except BaseException:
             self._lock.release()
@@ -174,7 +173,7 @@ class ProductFile:
 
     @property
     def windows(self) -> tuple[Window, ...]:
-        """The tiles of the grid, row by row; a tile's index is its place here."""
+        """The tiles, row by row; a tile's index is its place here."""
         return self._windows
 
     @property
@@ -281,25 +280,22 @@ class ProductFile:
 
     def _profile(self) -> dict[str, Any]:
         """What GDAL is told about the product."""
-        grid = self.grid
         blocks = len(self._windows) * (self._coder.pixel_bytes + self._coder.mask_bytes)
-        stated = grid.crs if self.form is None else self.form.crs
+        stated = self.placement.crs
         try:
             crs = rasterio.crs.CRS.from_user_input(stated) if stated else None
         except GDAL_ERRORS as error:
             raise UsageError(f"{self.path}: the reference system {stated!r} is not understood ({error})") from error
-        # GDAL's transform refers to the outer edge of the upper-left pixel, as the grid's edges do.
-        place = (grid.resolution, 0.0, grid.left, 0.0, -grid.resolution, grid.top)
         photometric = "RGB" if self.bands in (3, 4) and self.dtype != np.float32 else "MINISBLACK"
         if self.form is not None:
-            place, photometric = self.form.transform, self.form.photometric or photometric
+            photometric = self.form.photometric or photometric
         return {
-            "width": grid.width,
-            "height": grid.height,
+            "width": self.placement.size[0],
+            "height": self.placement.size[1],
             "count": self.bands,
             "dtype": self.dtype.name,
             "crs": crs,
-            "transform": rasterio.transform.Affine(*place),
+            "transform": rasterio.transform.Affine(*self.placement.coefficients),
             "nodata": self._coder.nodata,
             "blockxsize": self.tile,
             "blockysize": self.tile,
@@ -348,7 +344,7 @@ class ProductFile:
             list(samples),
             expected,
             lossy=self.compress == "jpeg",
-            overviews=self.overviews and max(self.grid.width, self.grid.height) > self.tile,
+            overviews=self.overviews and max(self.placement.size) > self.tile,
         )
 
     def _facts(self, log: TileLog, missing: tuple[int, ...]) -> ProductFacts:
@@ -359,7 +355,7 @@ class ProductFile:
             len(self._windows),
             sum(log.place(i)[1] == 0 for i in log.finished),
             missing,
-            sum(count for _, count in notes) / self.grid.window.size,
+            sum(count for _, count in notes) / self.placement.window.size,
             sum(moved for moved, _ in notes),
         )
 

@@ -143,10 +143,10 @@ def _export_raster(request: ExportRequest, terrain: OpenTerrain, progress: Progr
 
     if request.sigma is not None and not isinstance(surface, HybridSurface):
         raise UsageError(f"{request.model}: a raster of heights has no standard deviations; leave --sigma out")
-    facts = write_grid(request.output, grid, np.float32, 1, "auto", heights, options)
+    facts = write_grid(request.output, grid.placement, np.float32, 1, "auto", heights, options)
     paths = [request.output]
     if request.sigma is not None:
-        write_grid(request.sigma, grid, np.float32, 1, "auto", sigmas, options)
+        write_grid(request.sigma, grid.placement, np.float32, 1, "auto", sigmas, options)
         paths.append(request.sigma)
     size = {"columns": grid.width, "rows": grid.height, "resolution": grid.resolution}
     return ExportReport(tuple(paths), {**size, "share_with_height": facts.valid_share})

@@ -237,7 +237,7 @@ def _write(request: FlowRequest, grid: MapGrid, flow: Flow, depth: NDArray[np.fl
         resampling="nearest",
         tags={"BANDS": "; ".join(BANDS)},
     )
-    write_grid(request.output, grid, np.float32, len(BANDS), "auto", tile, options)
+    write_grid(request.output, grid.placement, np.float32, len(BANDS), "auto", tile, options)
 
 
 def _write_catchments(path: Path, grid: MapGrid, flow: Flow, rows: Sequence[OutletRow], crs: str) -> None:

@@ -142,7 +142,7 @@ def make_picture(
     def tile(window: Window) -> GridTile:
         return made.tile(terrain, grid, window)
 
-    facts: ProductFacts = write_grid(request.output, grid, made.dtype, made.bands, made.nodata, tile, options)
+    facts: ProductFacts = write_grid(request.output, grid.placement, made.dtype, made.bands, made.nodata, tile, options)
     if request.preview is not None:
         write_quicklook(request.output, request.preview, max_side=1200)
     return ShadingFacts(request.output, request.preview, made.kind, grid, made.settings, facts.valid_share, facts.bytes)

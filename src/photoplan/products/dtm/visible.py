@@ -162,7 +162,7 @@ def dtm_visible(
         right, bottom = window.stop
         return bands[:, window.row : bottom, window.col : right]
 
-    write_grid(request.output, grid, bands.dtype, len(bands), _nodata(request), tile, options)
+    write_grid(request.output, grid.placement, bands.dtype, len(bands), _nodata(request), tile, options)
     far = horizon(rows[0].eye - float(terrain.surface.heights(np.array(places[0][1:3]))), sight)
     return VisibleReport(request.output, tuple(names), grid.resolution, radius, far, tuple(rows))
 

@@ -233,4 +233,4 @@ def _write_difference(
 
     assert request.difference is not None
     options = GridOptions(tile=TILE, overwrite=request.overwrite, inputs=inputs)
-    write_grid(request.difference, grid, np.float32, 1, "auto", tile, options)
+    write_grid(request.difference, grid.placement, np.float32, 1, "auto", tile, options)

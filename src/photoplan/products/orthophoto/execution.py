@@ -188,7 +188,7 @@ def _make(
     tally = _Tally()
     with ProductFile(
         product_path(folder, product),
-        product.grid,
+        product.grid.placement,
         scene.reader.bands,
         scene.reader.dtype,
         run_key=product.key,

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from photoplan import __version__
 from photoplan.engine.executors import Workers, executor_factory, run_tiles
 from photoplan.errors import PhotoplanError
-from photoplan.geometry.grid import MapGrid
-from photoplan.io.image_form import ImageForm
+from photoplan.io.image_form import ImageForm, placement_of
 from photoplan.io.product import ProductFacts, ProductFile
 from photoplan.io.quicklook import write_quicklook
 from photoplan.io.run_record import peak_memory_bytes, record_path, versions, write_run_record
@@ -168,7 +167,7 @@ def restore_one(
     counted = _Counted()
     with ProductFile(
         job.target,
-        MapGrid(0.0, 0.0, 1.0, width, height, ""),
+        placement_of(reader.info),
         reader.bands,
         reader.dtype,
         run_key=job.key,
