@@ -90,7 +90,7 @@ def test_gross_errors_and_lines_of_the_model_that_counts(files: tuple[Path, Path
         with ModelWriter(path, layout, name, overwrite=True) as writer:
             for f in figures:
                 writer.add(units[f.column, f.row], f)
-            from photoplan.surfaces.mesh.faces import on_grid
+            from photoplan.surfaces.mesh.lines import on_grid
 
             meshes = np.full((layout.rows, layout.columns), figures[0].meshes)
             header = replace(before.header, layout=layout)
