@@ -47,7 +47,7 @@ def test_sharpened_images_are_recognised(amount: float, enhanced: bool) -> None:
         assert at.size == 60
         assert found.size == pytest.approx(sharp.max() - 1.0, abs=0.02)
         assert "restoration is limited" in found.warning
-        assert found.to_dict()["enhanced"] is True
+        assert found.json_fields()["enhanced"] is True
 
 
 def test_noisy_edges_without_enhancement() -> None:

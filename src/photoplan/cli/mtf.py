@@ -51,16 +51,21 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any
     from photoplan.cli.progress import progress
     from photoplan.products.mtf.result import group_lines
     from photoplan.products.mtf.run import MtfRequest, measure_mtf
+    from photoplan.report.mtf.page import mtf_page
+    from photoplan.report.page import open_report
 
     talk = talking(quiet)
+    inputs = [*images, options["linearisation"], options["lab"]]
+    page = open_report(options.pop("report"), inputs, overwrite=options["overwrite"], table=options["csv"])
     request = MtfRequest(images, **edge_options(options))
     report = measure_mtf(request, lambda total: progress(total, quiet, "tiles"), talk)
-    say_images(report, as_json, talk)
+    written = page.write(mtf_page(report, page.mpl)) if page is not None and report.images else None
+    say_images(report, written, as_json, talk)
     if len(report.images) > 1:
         if not as_json:
             click.echo(f"all {len(report.images)} images\n{group_lines(report.groups)}")
         if report.enhancement is not None and report.enhancement.enhanced:
             talk(f"all images: {report.enhancement.warning}")
     if not as_json:
-        say_files(report)
+        say_files(report, written)
     end_with_failures(report.failed, len(report.images))

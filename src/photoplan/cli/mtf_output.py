@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import click
+
+from photoplan.plain import json_text, plain
 
 
 class _Image(Protocol):
@@ -21,10 +22,7 @@ class _Report(Protocol):
     @property
     def images(self) -> Sequence[_Image]: ...
     @property
-    def report(self) -> Path | None: ...
-    @property
     def csv(self) -> Path | None: ...
-    def to_dict(self) -> dict[str, Any]: ...
 
 
 def talking(quiet: bool) -> Callable[[str], None]:
@@ -32,10 +30,10 @@ def talking(quiet: bool) -> Callable[[str], None]:
     return lambda text: None if quiet else click.echo(text, err=True)
 
 
-def say_images(report: _Report, as_json: bool, talk: Callable[[str], None]) -> None:
+def say_images(report: _Report, page: Path | None, as_json: bool, talk: Callable[[str], None]) -> None:
     """The figures of every image on stdout, or all as JSON; notes are talk."""
     if as_json:
-        click.echo(json.dumps(report.to_dict(), indent=2, ensure_ascii=False))
+        click.echo(json_text({**plain(report), "report": page}))
     for image in report.images:
         if not as_json:
             click.echo(str(image))
@@ -43,8 +41,8 @@ def say_images(report: _Report, as_json: bool, talk: Callable[[str], None]) -> N
             talk(f"{image.name}: {note}")
 
 
-def say_files(report: _Report) -> None:
+def say_files(report: _Report, page: Path | None) -> None:
     """The files that were written."""
-    for path in (report.csv, report.report):
+    for path in (report.csv, page):
         if path is not None:
             click.echo(str(path))

@@ -57,15 +57,20 @@ def run_patterns(images: tuple[Path, ...], as_json: bool, quiet: bool, options: 
         An option is for edges.
     """
     from photoplan.products.mtf.patterns import PatternRequest, measure_patterns
+    from photoplan.report.mtf.patterns import pattern_page
+    from photoplan.report.page import open_report
 
     _refuse(_OF_EDGES, f"is for edges, not for --pattern {options['pattern']}")
 
     talk = talking(quiet)
+    inputs = [*images, options["linearisation"]]
+    page = open_report(options.pop("report"), inputs, overwrite=options["overwrite"], table=options["csv"])
     kept = {name: value for name, value in options.items() if name not in _OF_EDGES}
     report = measure_patterns(PatternRequest(images, **kept), talk)
-    say_images(report, as_json, talk)
+    written = page.write(pattern_page(report, page.mpl)) if page is not None and report.images else None
+    say_images(report, written, as_json, talk)
     if not as_json:
-        say_files(report)
+        say_files(report, written)
     end_with_failures(report.failed, len(report.images))
 
 

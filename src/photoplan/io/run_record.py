@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
-import math
 import platform
 import sys
-from datetime import date, datetime
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import psutil
 import rasterio
 
-from photoplan.errors import UsageError
 from photoplan.io.disk import write_atomically
+from photoplan.plain import json_text
 
 try:
     import resource
@@ -35,8 +30,6 @@ def record_path(product: Path) -> Path:
 def write_run_record(path: Path, record: dict[str, Any]) -> Path:
     """Write a record as JSON; the name holds the old or the whole new record.
 
-    Data classes become objects, paths text, arrays lists; NaN and infinity become null.
-
     Raises
     ------
     UsageError
@@ -44,8 +37,7 @@ def write_run_record(path: Path, record: dict[str, Any]) -> Path:
     ResourceError
         If the disk is full.
     """
-    text = json.dumps(_plain(record, "record"), indent=2, ensure_ascii=False, allow_nan=False)
-    write_atomically(Path(path), (text + "\n").encode())
+    write_atomically(Path(path), (json_text(record) + "\n").encode())
     return Path(path)
 
 
@@ -68,27 +60,3 @@ def peak_memory_bytes() -> int:
         return int(psutil.Process().memory_info().peak_wset)
     # Linux counts in KiB, macOS in bytes.
     return int(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) * (1 if sys.platform == "darwin" else 1024)
-
-
-def _plain(value: Any, where: str) -> Any:
-    """What JSON can say of a value."""
-    if value is None or isinstance(value, str | bool | int):
-        return value
-    if isinstance(value, float | np.floating):
-        return float(value) if math.isfinite(value) else None
-    if isinstance(value, np.integer | np.bool_):
-        return value.item()
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist(), where)
-    if isinstance(value, Path):
-        return value.as_posix()
-    if isinstance(value, datetime | date):
-        return value.isoformat()
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name), f"{where}.{f.name}") for f in dataclasses.fields(value)}
-    if isinstance(value, dict):
-        return {str(key): _plain(item, f"{where}.{key}") for key, item in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        items = sorted(value) if isinstance(value, set | frozenset) else value
-        return [_plain(item, f"{where}[{i}]") for i, item in enumerate(items)]
-    raise UsageError(f"{where} is a {type(value).__name__}; a run record holds numbers, texts, lists and tables")

@@ -7,6 +7,14 @@ import html
 import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+from photoplan.errors import UsageError
+from photoplan.io.disk import write_atomically
+from photoplan.io.product import check_output
+from photoplan.report.drawing import load_matplotlib
 
 _STYLE = """
 :root { --ink: #1c2730; --soft: #5c6b77; --rule: #d7dee3; --accent: #0b5c8c; --ground: #f6f8f9; }
@@ -110,6 +118,67 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str | Cell]]) -> str:
     return f'<div class="scroll"><table>\n<thead><tr>{heads}</tr></thead>\n<tbody>\n{body}\n</tbody>\n</table></div>'
 
 
+def cells(row: Sequence[str], words: int = 0) -> list[Cell]:
+    """A row whose first columns are words and the others numbers."""
+    return [Cell(value, number >= words) for number, value in enumerate(row)]
+
+
+def number(value: float, digits: int) -> str:
+    """A number with so many digits after the point; a dash for NaN and infinity."""
+    return f"{value:.{digits}f}" if isfinite(value) else "–"
+
+
 def _cell(tag: str, cell: str | Cell) -> str:
     value = cell if isinstance(cell, Cell) else Cell(cell)
     return f"<{tag}" + (' class="number">' if value.number else ">") + f"{text(value.text)}</{tag}>"
+
+
+@dataclass(frozen=True, eq=False)
+class ReportFile:
+    """A report that can be written: seen before any work."""
+
+    path: Path
+    mpl: Any
+    """``matplotlib``, with which its plots are drawn."""
+
+    def write(self, document: str) -> Path:
+        """Write the document whole or not at all; returns its path.
+
+        Raises
+        ------
+        UsageError, ResourceError
+            The folder cannot be written, or the disk is full.
+        """
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(self.path, document.encode("utf-8", errors="replace"))
+        return self.path
+
+
+def open_report(
+    path: Path | None, inputs: Iterable[Path | str | None], *, overwrite: bool, table: Path | None = None
+) -> ReportFile | None:
+    """A report to be; None if none is asked for.
+
+    Parameters
+    ----------
+    path : Path, optional
+    inputs : iterable of Path
+        What it must not replace; None and words that are no files are passed over.
+    overwrite : bool
+        It may exist.
+    table : Path, optional
+        Another file that is written.
+
+    Raises
+    ------
+    UsageError
+        The file exists, is an input or the table, does not end in .html, or matplotlib is missing.
+    """
+    if path is None:
+        return None
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise UsageError(f"{path}: a report is written as HTML; give a name that ends in .html")
+    check_output(path, [source for source in inputs if source is not None], overwrite=overwrite)
+    if table is not None and table.resolve() == path.resolve():
+        raise UsageError(f"{path}: is to be the report and the table; give two files")
+    return ReportFile(path, load_matplotlib("a report"))

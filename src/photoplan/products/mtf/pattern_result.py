@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from photoplan.geometry.grid import Window
-from photoplan.products.plain_values import plain
+from photoplan.plain import pick
+from photoplan.quality.linearise import Linearisation
 from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.patterns.bar_curve import BarCurve, coltman_mtf
 from photoplan.quality.patterns.siemens import StarMtf
@@ -32,6 +33,8 @@ class PatternResult:
     """Of bars: the window of each frequency group, in the order of these."""
     coltman: bool = False
     """Convert the contrast transfer of bars into an MTF."""
+    pixel_um: float | None = None
+    """Distance of pixels on the sensor, micrometres."""
     notes: tuple[str, ...] = ()
 
     @property
@@ -52,9 +55,9 @@ class PatternResult:
             return {"mtf": ("mtf", self.found.mtf), **single}
         return {}
 
-    def to_dict(self, pixel_um: float | None) -> dict[str, Any]:
-        """Plain values for JSON."""
-        values: dict[str, Any] = {"band": self.band, "roi": _roi(self.window), "notes": list(self.notes)}
+    def json_fields(self) -> dict[str, Any]:
+        """Figures of the kind of pattern, and its curves by name."""
+        values: dict[str, Any] = {"roi": _roi(self.window), **pick(self, "band", "notes")}
         if isinstance(self.found, BarCurve):
             values |= _bars(self.found, self.parts)
         elif isinstance(self.found, StarMtf):
@@ -62,7 +65,9 @@ class PatternResult:
         else:
             values |= _usaf(self.found, self.window)
         for name, (_, curve) in self.curves().items():
-            entry = _curve(curve, pixel_um)
+            entry = pick(curve, "modulation", "sigma", "mtf50", "mtf10", cycles_per_px="frequency")
+            if self.pixel_um is not None:
+                entry["lp_per_mm"] = curve.frequency * 1000.0 / self.pixel_um
             key = name.replace(" by Coltman's series", "_coltman").replace(" ", "_")
             if " at " in name:
                 values.setdefault("directions", []).append({"direction_deg": float(name.split()[-1][:-1]), **entry})
@@ -128,43 +133,17 @@ def _figures(curve: MtfCurve) -> str:
     return f"{'  '.join(words) or 'stays above 0.5'}  ({first:.3f} to {last:.3f} cy/px)"
 
 
-def _curve(curve: MtfCurve, pixel_um: float | None) -> dict[str, Any]:
-    values: dict[str, Any] = {
-        "cycles_per_px": curve.frequency,
-        "modulation": curve.modulation,
-        "sigma": curve.sigma,
-        "mtf50": curve.mtf50,
-        "mtf10": curve.mtf10,
-    }
-    if pixel_um is not None:
-        values["lp_per_mm"] = curve.frequency * 1000.0 / pixel_um
-    return values
-
-
 def _roi(window: Window) -> list[int]:
     return [window.col, window.row, window.width, window.height]
 
 
 def _bars(found: BarCurve, windows: Sequence[Window]) -> dict[str, Any]:
+    own = ("angle_deg", "phase", "duty", "periods", "low", "high", "modulation", "modulation_sigma", "fundamental",
+           "fundamental_sigma", "aligned")  # fmt: skip
     groups = [
-        {
-            "roi": _roi(window),
-            "cycles_per_px": g.frequency,
-            "angle_deg": g.angle_deg,
-            "phase": g.phase,
-            "duty": g.duty,
-            "periods": g.periods,
-            "low": g.low,
-            "high": g.high,
-            "modulation": g.modulation,
-            "modulation_sigma": g.modulation_sigma,
-            "fundamental": g.fundamental,
-            "fundamental_sigma": g.fundamental_sigma,
-            "aligned": g.aligned,
-        }
-        for g, window in zip(found.groups, windows)
+        {"roi": _roi(window), **pick(g, *own, cycles_per_px="frequency")} for g, window in zip(found.groups, windows)
     ]
-    return {"groups": groups, "low": found.low, "high": found.high, "levels_from": found.levels_from}
+    return {"groups": groups, **pick(found, "low", "high", "levels_from")}
 
 
 def _star(found: StarMtf, window: Window) -> dict[str, Any]:
@@ -173,53 +152,30 @@ def _star(found: StarMtf, window: Window) -> dict[str, Any]:
         "row": found.centre[1] + window.row,
         "col_sigma": found.centre_sigma[0],
         "row_sigma": found.centre_sigma[1],
-        "sectors": found.sectors,
-        "wave": found.wave,
-        "low": found.low,
-        "high": found.high,
-        "levels_from": found.levels_from,
-        "radii": found.radii,
+        **pick(found, "sectors", "wave", "low", "high", "levels_from", "radii"),
     }
 
 
-def _limit(bars: UsafBars | None) -> dict[str, Any] | None:
-    if bars is None:
-        return None
-    return {
-        "group": bars.group,
-        "element": bars.element,
-        "lp_per_mm": bars.lp_mm,
-        "cycles_per_px": bars.frequency,
-        "contrast": bars.contrast,
-        "sigma": bars.sigma,
-    }
+def _three(bars: UsafBars | None, *more: str) -> dict[str, Any] | None:
+    own = ("group", "element", "contrast", "sigma", *more)
+    return None if bars is None else pick(bars, *own, lp_per_mm="lp_mm", cycles_per_px="frequency")
 
 
 def _usaf(found: UsafResult, window: Window) -> dict[str, Any]:
     elements = [
         {
-            "group": b.group,
-            "element": b.element,
+            **(_three(b, "resolved", "seen") or {}),
             "bars": _kind(b),
-            "lp_per_mm": b.lp_mm,
-            "cycles_per_px": b.frequency,
             "col": b.centre[0] + window.col,
             "row": b.centre[1] + window.row,
-            "contrast": b.contrast,
-            "sigma": b.sigma,
-            "resolved": b.resolved,
-            "seen": b.seen,
         }
         for b in found.bars
     ]
     return {
-        "groups": list(found.groups),
-        "resolved_groups": list(found.resolved_groups),
-        "pixel_on_target_um": found.pixel_um,
-        "matched": found.place.matched,
-        "rms": found.place.rms,
-        "limit_horizontal": _limit(found.limit(horizontal=True)),
-        "limit_vertical": _limit(found.limit(horizontal=False)),
+        **pick(found, "groups", "resolved_groups", pixel_on_target_um="pixel_um"),
+        **pick(found.place, "matched", "rms"),
+        "limit_horizontal": _three(found.limit(horizontal=True)),
+        "limit_vertical": _three(found.limit(horizontal=False)),
         "elements": elements,
     }
 
@@ -258,15 +214,9 @@ class ImagePattern:
         """What a user should know."""
         return tuple(dict.fromkeys(note for result in self.results for note in result.notes))
 
-    def to_dict(self, pixel_um: float | None = None) -> dict[str, Any]:
-        """Plain values for JSON."""
-        return {
-            "image": self.name,
-            "file": str(self.file),
-            "size": list(self.size),
-            "linearisation": self.linearisation,
-            "patterns": [result.to_dict(pixel_um) for result in self.results],
-        }
+    def json_fields(self) -> dict[str, Any]:
+        """Its results as patterns."""
+        return pick(self, "file", "size", "linearisation", image="name", patterns="results")
 
     def __str__(self) -> str:
         lines = [f"{self.name}: {self.linearisation}"]
@@ -284,25 +234,17 @@ class PatternReport:
     images: tuple[ImagePattern, ...]
     failed: Mapping[str, str]
     """Why, by name of the image."""
-    linearisation: str
+    linearisation: Linearisation
     pixel_um: float | None
-    report: Path | None
     csv: Path | None
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON: NaN is null."""
-        values: dict[str, Any] = plain(
-            {
-                "pattern": self.pattern,
-                "linearisation": self.linearisation,
-                "pixel_size_um": self.pixel_um,
-                "images": [image.to_dict(self.pixel_um) for image in self.images],
-                "failed": [{"image": name, "reason": reason} for name, reason in self.failed.items()],
-                "report": self.report and str(self.report),
-                "csv": self.csv and str(self.csv),
-            }
-        )
-        return values
+    def json_fields(self) -> dict[str, Any]:
+        """The linearisation in words."""
+        return {
+            **pick(self, "pattern", "images", "csv", pixel_size_um="pixel_um"),
+            "linearisation": self.linearisation.describe(),
+            "failed": [{"image": name, "reason": reason} for name, reason in self.failed.items()],
+        }
 
     @property
     def csv_rows(self) -> tuple[Sequence[str], list[list[object]]]:

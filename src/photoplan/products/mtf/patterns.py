@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, PhotoplanError, ResourceError, UsageError
 from photoplan.geometry.grid import Window
-from photoplan.io.disk import write_atomically
 from photoplan.io.named_table import write_named_table
 from photoplan.products.mtf.image import LUMINANCE, LightImage
-from photoplan.products.mtf.pattern_facts import pattern_facts, thinning
 from photoplan.products.mtf.pattern_result import ImagePattern, PatternReport, PatternResult
 from photoplan.products.mtf.request import ENCODED, check_files, unique_names
 from photoplan.project.linearisation import linearisation_of
@@ -25,13 +23,12 @@ from photoplan.quality.patterns.bars import measure_bars
 from photoplan.quality.patterns.pixels import clipped_pixels
 from photoplan.quality.patterns.siemens import StarRules, measure_star
 from photoplan.quality.patterns.usaf import UsafRules, measure_usaf
-from photoplan.report.pattern_plots import PatternPlots, pattern_page
 
 Array = NDArray[np.float64]
 Roi = tuple[int, int, int, int]
 
 #: Pixels of the largest window that is read at once.
-_MOST_PIXELS = 1 << 26
+MOST_PIXELS = 1 << 26
 
 
 @dataclass(frozen=True)
@@ -56,7 +53,6 @@ class PatternRequest:
     """Grey values of wide dark and bright areas, for bars and stars; None: found in the pattern."""
     coltman: bool = False
     """Convert the contrast transfer of bars into an MTF by Coltman's series too."""
-    report: Path | None = None
     csv: Path | None = None
     overwrite: bool = False
 
@@ -67,13 +63,12 @@ def measure_patterns(request: PatternRequest, talk: Callable[[str], None] = lamb
     Raises
     ------
     UsageError
-        Options contradict each other, an output exists, a window leaves an image, or matplotlib is missing.
+        Options contradict each other, an output exists, or a window leaves an image.
     InputError
         The linearisation table cannot be used.
     """
     _check(request)
     linearisation = linearisation_of(request.linearisation or "linear")
-    plots = PatternPlots() if request.report is not None else None
     results: list[ImagePattern] = []
     failed: dict[str, str] = {}
     names = dict(zip(request.images, unique_names(request.images)))
@@ -95,26 +90,12 @@ def measure_patterns(request: PatternRequest, talk: Callable[[str], None] = lamb
         request.pattern,
         tuple(results),
         failed,
-        linearisation.describe(),
+        linearisation,
         request.pixel_um,
-        request.report if done else None,
         request.csv if done else None,
     )
     if made.csv is not None:
         write_named_table(made.csv, *made.csv_rows)
-    if made.report is not None and plots is not None:
-        pictures = {
-            result.name: _overview(LightImage.open(result.image[1], linearisation), result.window)
-            for image_ in results
-            for result in image_.results
-        }
-        facts = [
-            pattern_facts(result, made.linearisation, made.pixel_um, pictures[result.name])
-            for image_ in results
-            for result in image_.results
-        ]
-        text = pattern_page(facts, plots)
-        write_atomically(made.report, text.encode("utf-8", errors="replace"))
     return made
 
 
@@ -130,7 +111,7 @@ def _check(request: PatternRequest) -> None:
         raise UsageError("--levels goes with --pattern bars or star; a USAF target shows its levels itself")
     if request.pixel_um is not None and not 1e-3 <= request.pixel_um <= 1e6:
         raise UsageError(f"--pixel-size {request.pixel_um:g}; 0.001 to 1000000 micrometres are allowed")
-    check_files(request.images, (request.linearisation,), (request.report, request.csv), request.overwrite)
+    check_files(request.images, (request.linearisation,), request.csv, request.overwrite)
 
 
 def _windows(image: LightImage, rois: tuple[Roi, ...]) -> list[Window]:
@@ -144,7 +125,7 @@ def _windows(image: LightImage, rois: tuple[Roi, ...]) -> list[Window]:
             )
     windows = [Window(*roi) for roi in rois] or [Window(0, 0, width, height)]
     for window in windows:
-        if window.width * window.height > _MOST_PIXELS:
+        if window.width * window.height > MOST_PIXELS:
             raise InputError(
                 f"{image.reader.path}: a window of {window.width} × {window.height} pixels; give the pattern "
                 "alone with --roi column row width height"
@@ -184,7 +165,7 @@ def _measure(named: tuple[str, Path], image: LightImage, request: PatternRequest
             except InputError as error:
                 raise InputError(f"{path}: {error} (--levels LOW HIGH)") from None
             parts = tuple(window for _, window in sorted(zip(groups, windows), key=lambda part: part[0].frequency))
-            results.append(PatternResult(named, band, _hull(windows), curve, parts, request.coltman))
+            results.append(PatternResult(named, band, _hull(windows), curve, parts, request.coltman, request.pixel_um))
             continue
         for k, window in enumerate(windows):
             light, clipped = _read(image, window, channel)
@@ -192,11 +173,13 @@ def _measure(named: tuple[str, Path], image: LightImage, request: PatternRequest
             if request.pattern == "star":
                 rules = StarRules(sectors=request.sectors, levels=levels)
                 found = measure_star(light, rules, clipped=clipped, what=what)
-                results.append(PatternResult(named, band, window, found))
+                results.append(PatternResult(named, band, window, found, pixel_um=request.pixel_um))
             else:
                 usaf = UsafRules(request.group, None if request.group is not None else request.pixel_um)
                 target = measure_usaf(light, usaf, clipped=clipped, what=what)
-                results.append(PatternResult(named, band, window, target, notes=_stretched(light)))
+                results.append(
+                    PatternResult(named, band, window, target, pixel_um=request.pixel_um, notes=_stretched(light))
+                )
     return ImagePattern(name, path, image.size, image.linearisation.describe(), tuple(results))
 
 
@@ -243,12 +226,3 @@ def _hull(windows: list[Window]) -> Window:
     """The smallest window that holds all of them."""
     col, row = min(w.col for w in windows), min(w.row for w in windows)
     return Window(col, row, max(w.col + w.width for w in windows) - col, max(w.row + w.height for w in windows) - row)
-
-
-def _overview(image: LightImage, window: Window) -> NDArray[np.float32] | None:
-    """Light of a window for a picture; None if it is too large (bars far apart)."""
-    if window.width * window.height > _MOST_PIXELS:
-        return None
-    step = thinning(window)
-    grey = image.picture(window, image.channels(None)[0]).grey
-    return np.asarray(grey[::step, ::step], np.float32)

@@ -18,7 +18,7 @@ ENCODED = (
 def check_files(
     images: Sequence[Path],
     tables: Sequence[Path | str | None],
-    outputs: tuple[Path | None, Path | None],
+    csv: Path | None,
     overwrite: bool,
 ) -> None:
     """Refuse images, inputs and outputs that cannot be meant together.
@@ -28,10 +28,10 @@ def check_files(
     images : sequence of Path
     tables : sequence
         Other inputs; None and the words ``linear`` and ``srgb`` are no files.
-    outputs : tuple
-        Report and CSV table.
+    csv : Path, optional
+        The table that is written.
     overwrite : bool
-        Outputs may exist.
+        It may exist.
 
     Raises
     ------
@@ -45,11 +45,8 @@ def check_files(
     if twice:
         raise UsageError(f"image {twice[0]} is given twice")
     inputs = [*images, *(Path(table) for table in tables if table not in (None, "linear", "srgb"))]
-    written = [path for path in outputs if path is not None]
-    for path in written:
-        check_output(path, inputs, overwrite=overwrite)
-    if len(written) == 2 and written[0].resolve() == written[1].resolve():
-        raise UsageError(f"--report and --csv both name {written[0]}; give two files")
+    if csv is not None:
+        check_output(csv, inputs, overwrite=overwrite)
 
 
 def unique_names(paths: Sequence[Path]) -> list[str]:

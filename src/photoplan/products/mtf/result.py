@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.products.plain_values import plain
+from photoplan.plain import pick
 from photoplan.quality.edges.enhancement import Enhancement
 from photoplan.quality.edges.find import REASONS
 from photoplan.quality.edges.groups import CombinedValue, GaussianFit
@@ -20,6 +20,11 @@ from photoplan.quality.edges.response import EdgeMeasurement
 from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.restoration.filter_design import point_spread
 from photoplan.quality.spread import SpreadFunction
+
+#: Of a measured edge, in JSON under their own names.
+_FIGURES = ("angle_deg", "length", "sampling", "dark", "bright", "snr", "mtf50", "mtf50_interval", "mtf10",
+            "mtf10_interval", "fwhm", "fwhm_interval", "gaussian_fwhm", "overshoot", "overshoot_sigma", "undershoot",
+            "undershoot_sigma")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,41 +65,15 @@ class MeasuredEdge:
         """``x``: brightness changes along the rows, the spread function in x is measured; ``y``: along the columns."""
         return self.measured.direction
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        m = self.measured
-        found = spread_of_edge(m)
+    def json_fields(self) -> dict[str, Any]:
+        """The figures, without profiles and curves."""
+        found = spread_of_edge(self.measured)
         return {
-            "number": self.number,
-            "line": self.line,
-            "col": round(self.col, 2),
-            "row": round(self.row, 2),
-            "ends": [[round(v, 1) for v in end] for end in self.ends],
-            "band": self.band,
-            "direction": self.direction,
-            "flight_direction": self.flight,
-            "angle_deg": m.angle_deg,
-            "length": m.length,
-            "half_width": self.half,
-            "aligned": self.aligned,
-            "sampling": m.sampling,
-            "dark": m.dark,
-            "bright": m.bright,
-            "snr": m.snr,
-            "mtf50": m.mtf50,
-            "mtf50_interval": m.mtf50_interval,
-            "mtf10": m.mtf10,
-            "mtf10_interval": m.mtf10_interval,
-            "fwhm": m.fwhm,
-            "fwhm_interval": m.fwhm_interval,
-            "gaussian_fwhm": m.gaussian_fwhm,
-            "modulation_at_half": m.nyquist,
-            "spread": [] if found is None else [round(float(v), 6) for v in found.spread.values],
+            **pick(self, "number", "line", "col", "row", "ends", "band", "direction", "aligned"),
+            **pick(self, flight_direction="flight", half_width="half"),
+            **pick(self.measured, *_FIGURES, modulation_at_half="nyquist"),
+            "spread": [] if found is None else found.spread.values,
             "spread_beyond": None if found is None else found.beyond,
-            "overshoot": m.overshoot,
-            "overshoot_sigma": m.overshoot_sigma,
-            "undershoot": m.undershoot,
-            "undershoot_sigma": m.undershoot_sigma,
         }
 
 
@@ -114,14 +93,9 @@ class LabComparison:
         known = np.isfinite(self.measured)
         return float(np.sqrt(np.mean((self.measured - self.laboratory)[known] ** 2))) if known.any() else float("nan")
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        return {
-            "cycles_per_px": self.frequency,
-            "laboratory": self.laboratory,
-            "measured": self.measured,
-            "rms_difference": self.rms,
-        }
+    def json_fields(self) -> dict[str, Any]:
+        """With the difference."""
+        return pick(self, "laboratory", "measured", cycles_per_px="frequency", rms_difference="rms")
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,19 +124,15 @@ class EdgeGroup:
     spread: tuple[CombinedValue, ...]
     """Shares of light on the pixel itself and on those 1, 2, 3 pixels away (Kölbl's Z, A, B …); empty unless for one
     direction."""
-    lab: LabComparison | None
+    laboratory: LabComparison | None
 
-    def to_dict(self, pixel_um: float | None) -> dict[str, Any]:
-        """Plain values for JSON."""
-        per_mm = None if pixel_um is None else 1000.0 / pixel_um
-        values = {
-            "band": self.band,
-            "direction": self.direction,
-            "flight_direction": self.flight,
+    def json_fields(self) -> dict[str, Any]:
+        """The figures flat, the curve as an object."""
+        return {
+            **pick(self, "band", "direction", "laboratory", flight_direction="flight", mtf50_quantiles="mtf50_range"),
             "cell": self.cell and {"row": self.cell[0], "col": self.cell[1], "bounds": self.bounds},
             "edges": self.mtf50.edges,
             **_combined("mtf50", self.mtf50),
-            "mtf50_quantiles": self.mtf50_range,
             **_combined("mtf10", self.mtf10),
             **_combined("fwhm", self.fwhm),
             "overshoot": self.overshoot.value,
@@ -170,17 +140,8 @@ class EdgeGroup:
             "gaussian": {"fwhm": self.gaussian.fwhm, "rms_difference": self.gaussian.rms},
             "spread": [share.value for share in self.spread],
             "spread_sigma": [share.sigma for share in self.spread],
-            "laboratory": self.lab and self.lab.to_dict(),
-            "curve": {
-                "cycles_per_px": self.curve.frequency,
-                "modulation": self.curve.modulation,
-                "sigma": self.curve.sigma,
-            },
+            "curve": pick(self.curve, "modulation", "sigma", cycles_per_px="frequency"),
         }
-        if per_mm is not None:
-            values["mtf50_cycles_per_mm"] = self.mtf50.value * per_mm
-            values["mtf10_cycles_per_mm"] = self.mtf10.value * per_mm
-        return values
 
 
 def _combined(name: str, value: CombinedValue) -> dict[str, Any]:
@@ -222,20 +183,12 @@ class ImageMtf:
         """Groups of a channel: of the whole field, or of its cells."""
         return [g for g in self.groups if g.channel == channel and (g.cell is not None) == cells]
 
-    def to_dict(self, pixel_um: float | None = None) -> dict[str, Any]:
-        """Plain values for JSON."""
+    def json_fields(self) -> dict[str, Any]:
+        """With the point spread function of both directions together."""
         return {
-            "image": self.name,
-            "file": str(self.file),
-            "size": list(self.size),
-            "linearisation": self.linearisation,
-            "edges": [edge.to_dict() for edge in self.edges],
-            "summary": [group.to_dict(pixel_um) for group in self.groups],
+            **pick(self, "file", "size", "linearisation", "edges", "enhancement", "rejected", "notes"),
+            **pick(self, image="name", summary="groups", edges_found="found"),
             "point_spread": point_spread_of(self.groups),
-            "enhancement": self.enhancement.to_dict(),
-            "edges_found": self.found,
-            "rejected": dict(self.rejected),
-            "notes": list(self.notes),
         }
 
     def __str__(self) -> str:
@@ -310,25 +263,26 @@ class MtfReport:
     linearisation: str
     pixel_um: float | None
     flight: str | None
-    report: Path | None
     csv: Path | None
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON: NaN is null."""
-        values: dict[str, Any] = plain(
-            {
-                "linearisation": self.linearisation,
-                "pixel_size_um": self.pixel_um,
-                "flight": self.flight,
-                "images": [image.to_dict(self.pixel_um) for image in self.images],
-                "summary": [group.to_dict(self.pixel_um) for group in self.groups],
-                "enhancement": self.enhancement and self.enhancement.to_dict(),
-                "failed": [{"image": name, "reason": reason} for name, reason in self.failed.items()],
-                "report": self.report and str(self.report),
-                "csv": self.csv and str(self.csv),
-            }
-        )
-        return values
+    def json_fields(self) -> dict[str, Any]:
+        """Means in cycles per millimetre too, where the distance of pixels is known."""
+        return {
+            **pick(self, "linearisation", "flight", "enhancement", "csv", pixel_size_um="pixel_um"),
+            "images": [{**image.json_fields(), "summary": self._summary(image.groups)} for image in self.images],
+            "summary": self._summary(self.groups),
+            "failed": [{"image": name, "reason": reason} for name, reason in self.failed.items()],
+        }
+
+    def _summary(self, groups: Sequence[EdgeGroup]) -> list[dict[str, Any]]:
+        if self.pixel_um is None:
+            return [group.json_fields() for group in groups]
+        per_mm = 1000.0 / self.pixel_um
+        return [
+            group.json_fields()
+            | {"mtf50_cycles_per_mm": per_mm * group.mtf50.value, "mtf10_cycles_per_mm": per_mm * group.mtf10.value}
+            for group in groups
+        ]
 
     @property
     def csv_rows(self) -> tuple[Sequence[str], list[list[object]]]:
@@ -371,7 +325,7 @@ _COLUMNS = (
 
 
 def _flat(edge: MeasuredEdge) -> dict[str, Any]:
-    values = edge.to_dict()
+    values = edge.json_fields()
     for name in ("mtf50", "fwhm"):
         values[f"{name}_low"], values[f"{name}_high"] = values[f"{name}_interval"]
     return values

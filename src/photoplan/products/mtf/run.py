@@ -9,20 +9,17 @@ from pathlib import Path
 from typing import Literal
 
 from photoplan.errors import PhotoplanError, ResourceError, UsageError
-from photoplan.io.disk import write_atomically
 from photoplan.io.mtf_file import read_mtf_table
 from photoplan.io.named_table import write_named_table
 from photoplan.products.mtf.groups import group_edges
 from photoplan.products.mtf.image import LightImage
 from photoplan.products.mtf.measure import Measuring, measure_image
-from photoplan.products.mtf.page import mtf_page
 from photoplan.products.mtf.request import ENCODED, check_files, unique_names
 from photoplan.products.mtf.result import EdgeGroup, ImageMtf, MtfReport
 from photoplan.project.linearisation import linearisation_of
 from photoplan.quality.edges.enhancement import Enhancement, enhancement_of
 from photoplan.quality.edges.find import EdgeRules
 from photoplan.quality.linearise import Linearisation
-from photoplan.report.mtf_plots import MtfPlots
 
 #: Cells of the field in each direction that a report can show.
 MOST_CELLS = 50
@@ -56,8 +53,6 @@ class MtfRequest:
     """Contrast over noise."""
     half_width: int = 20
     """Pixels of an edge reach at most so far to both sides."""
-    report: Path | None = None
-    """HTML."""
     csv: Path | None = None
     """A row for each edge."""
     overwrite: bool = False
@@ -90,7 +85,7 @@ def measure_mtf(
     Raises
     ------
     UsageError
-        Options contradict each other, an output exists, or matplotlib is missing for a report.
+        Options contradict each other, or an output exists.
     InputError
         The linearisation table or the laboratory values cannot be used.
     """
@@ -110,7 +105,6 @@ def measure_mtf(
         request.flight,
         None if lab is None else (lab.per_pixel(request.pixel_um), lab.modulation),
     )
-    plots = MtfPlots() if request.report is not None else None
     names = dict(zip(request.images, unique_names(request.images)))
     opened, failed = _opened(request, linearisation, names)
     if request.linearisation is None and any(image.reader.dtype == "uint8" for image in opened.values()):
@@ -132,14 +126,10 @@ def measure_mtf(
         linearisation.describe(),
         request.pixel_um,
         request.flight,
-        request.report if done else None,
         request.csv if done else None,
     )
     if made.csv is not None:
         write_named_table(made.csv, *made.csv_rows)
-    if made.report is not None and plots is not None:
-        text = mtf_page(made, {result.file: opened[result.file] for result in results}, plots)
-        write_atomically(made.report, text.encode("utf-8", errors="replace"))
     return made
 
 
@@ -190,4 +180,4 @@ def _check(request: MtfRequest) -> None:
     if request.pixel_um is not None and not 0.01 <= request.pixel_um <= 1e4:
         raise UsageError(f"--pixel-size {request.pixel_um:g}; 0.01 to 10000 micrometres are allowed")
     tables = (request.linearisation, request.lab)
-    check_files(request.images, tables, (request.report, request.csv), request.overwrite)
+    check_files(request.images, tables, request.csv, request.overwrite)

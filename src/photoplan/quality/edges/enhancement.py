@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from photoplan.errors import InputError
+from photoplan.plain import pick
 from photoplan.quality.edges.groups import CombinedValue, combine
 
 #: Mean of over- and undershoot from which an image counts as enhanced, parts of the contrast. Diffraction and ideal
@@ -70,18 +71,14 @@ class Enhancement:
             "lens, and restoration is limited: it would sharpen twice. Use the unsharpened image if there is one"
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+    def json_fields(self) -> dict[str, Any]:
+        """Means flat, with the warning."""
         return {
-            "enhanced": self.enhanced,
-            "size": self.size,
-            "sigma": self.sigma,
+            **pick(self, "enhanced", "size", "sigma", "edges", "share"),
             "overshoot": self.overshoot.value,
             "overshoot_sigma": self.overshoot.sigma,
             "undershoot": self.undershoot.value,
             "undershoot_sigma": self.undershoot.sigma,
-            "edges": self.edges,
-            "share": self.share,
             "warning": self.warning or None,
         }
 

@@ -1,0 +1,85 @@
+"""From values to JSON: the one way to what ``--json`` prints, run records hold, and other JSON files.
+
+A data class becomes an object of its fields, under their names. One whose JSON has other keys says so with a method
+``json_fields``; `pick` helps it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping
+from datetime import date, datetime
+from enum import Enum
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from photoplan.errors import UsageError
+
+
+@runtime_checkable
+class HasJsonFields(Protocol):
+    """A value whose JSON is not just its fields."""
+
+    def json_fields(self) -> Mapping[str, Any]:
+        """Values by key; they need not be plain."""
+        ...
+
+
+def pick(value: object, *names: str, **keys: str) -> dict[str, Any]:
+    """Attributes of a value by their names, and by other keys: ``pick(run, "tiles", seconds="wall_seconds")``."""
+    return {name: getattr(value, name) for name in names} | {key: getattr(value, name) for key, name in keys.items()}
+
+
+def plain(value: Any, where: str = "value") -> Any:
+    """What JSON can say of a value.
+
+    Data classes and mappings become objects, arrays, tuples and sets (sorted) lists, enumerations their values, paths
+    and dates text. NaN and infinity become None: JSON does not know them.
+
+    Parameters
+    ----------
+    value : object
+    where : str
+        What a message calls it.
+
+    Raises
+    ------
+    UsageError
+        Something in it is none of these.
+    """
+    if value is None or type(value) in (str, bool, int):
+        return value
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, Enum):
+        return plain(value.value, where)
+    if isinstance(value, str | int):
+        return value
+    if isinstance(value, np.integer | np.bool_):
+        return value.item()
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, datetime | date):
+        return value.isoformat()
+    if isinstance(value, HasJsonFields):
+        value = value.json_fields()
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = pick(value, *(field.name for field in dataclasses.fields(value)))
+    if isinstance(value, Mapping):
+        return {str(key): plain(item, f"{where}.{key}") for key, item in value.items()}
+    if isinstance(value, set | frozenset):
+        value = sorted(value)
+    if isinstance(value, list | tuple):
+        return [plain(item, f"{where}[{i}]") for i, item in enumerate(value)]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist(), where)
+    raise UsageError(f"{where} is a {type(value).__name__}; JSON holds numbers, texts, lists and tables")
+
+
+def json_text(value: Any, indent: int | None = 2) -> str:
+    """A value as JSON text; see `plain`."""
+    return json.dumps(plain(value), indent=indent, ensure_ascii=False, allow_nan=False)

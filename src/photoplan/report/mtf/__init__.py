@@ -1,0 +1,1 @@
+"""Reports of edges and test patterns."""
