@@ -80,6 +80,6 @@ def plain(value: Any, where: str = "value") -> Any:
     raise UsageError(f"{where} is a {type(value).__name__}; JSON holds numbers, texts, lists and tables")
 
 
-def json_text(value: Any, indent: int | None = 2) -> str:
+def json_text(value: Any, where: str = "value", indent: int | None = 2) -> str:
     """A value as JSON text; see `plain`."""
-    return json.dumps(plain(value), indent=indent, ensure_ascii=False, allow_nan=False)
+    return json.dumps(plain(value, where), indent=indent, ensure_ascii=False, allow_nan=False)

@@ -37,7 +37,7 @@ def write_run_record(path: Path, record: dict[str, Any]) -> Path:
     ResourceError
         If the disk is full.
     """
-    write_atomically(Path(path), (json_text(record) + "\n").encode())
+    write_atomically(Path(path), (json_text(record, "record") + "\n").encode())
     return Path(path)
 
 
