@@ -17,13 +17,22 @@ from tools.command import Here
 from photoplan.errors import UsageError
 from photoplan.io.raster import RasterReader
 from photoplan.products.restore.design import DesignedPart, DesignRequest
-from photoplan.products.restore.details import compare
 from photoplan.products.restore.filter import FilterRequest, FoundFilter, requested_filter
-from photoplan.products.restore.page import _pictures, filter_facts
-from photoplan.products.restore.report import open_report
 from photoplan.quality.restoration.design import DesignOptions, design_filter
 from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
 from photoplan.quality.restoration.regularised import SceneStatistics
+from photoplan.report.page import open_report
+from photoplan.report.restore.details import compare
+from photoplan.report.restore.page import (
+    axis_pictures,
+    distinct_kernels,
+    distinct_parts,
+    field_maps,
+    origin,
+    part_name,
+    part_rows,
+    plain_facts,
+)
 
 PNG = "data:image/png;base64,"
 
@@ -63,9 +72,8 @@ def found(scene: Path) -> FoundFilter:
 
 
 def test_the_expected_curve_is_mtf_times_response(found: FoundFilter) -> None:
-    facts = filter_facts(found)
     part = found.measured.parts[0]
-    picture = facts.parts[0].axes[0]
+    picture = axis_pictures(part)[0]
     # By the transform of the filter itself, column sums along a row.
     size = 200
     line = np.zeros(size)
@@ -84,7 +92,7 @@ def test_an_exact_inverse_is_expected_to_lift_the_curve_to_that_of_whole_pixels(
     both = (sharpness(0.4), sharpness(0.5))
     scene = SceneStatistics(0.01, 0.05)
     design = design_filter(*both, scene, DesignOptions("exact", "separable"))
-    pictures = _pictures(DesignedPart(None, None, 9, both, (), scene, design))
+    pictures = axis_pictures(DesignedPart(None, None, 9, both, (), scene, design))
     for one, picture in zip(both, pictures):
         curve = one.modulation()
         exact = np.interp(picture.frequency, curve.frequency, curve.modulation)
@@ -95,19 +103,20 @@ def test_an_exact_inverse_is_expected_to_lift_the_curve_to_that_of_whole_pixels(
 
 
 def test_facts_of_a_measured_filter(found: FoundFilter) -> None:
-    facts = filter_facts(found)
     parts = [p for p in found.measured.parts if p.edges]
+    drawn = distinct_parts(found.measured.parts)
+    rows = [row for part in drawn for row in part_rows(part)]
     assert (
-        facts.origin
+        origin(found)
         == "The filter was measured at edges of scene.tif. Linearisation: linear: grey values are taken as light."
     )
-    assert len(facts.rows) == 2 * len(facts.parts) and len(facts.parts) >= len(parts)
-    row = dict(zip(("part", "edges", "method", "along", "Z"), facts.rows[0]))
+    assert len(rows) == 2 * len(drawn) and len(drawn) >= len(parts)
+    row = dict(zip(("part", "edges", "method", "along", "Z"), rows[0]))
     first = found.measured.parts[0]
     assert row["Z"] == f"{first.sharpness[0].spread.side()[0]:.3f}"
-    assert facts.rows[0][7] == f"{first.design.condition_x.neighbour_ratio:.3f}"
-    assert facts.parts[0].rule == first.design.reason
-    ((name, maps),) = facts.maps
+    assert rows[0][7] == f"{first.design.condition_x.neighbour_ratio:.3f}"
+    assert drawn[0].design.reason == first.design.reason
+    ((name, maps),) = field_maps(found.filter, found.measured)
     assert name == "all bands" and [m.values.shape for m in maps] == [(2, 2)] * 3
     gains = [k.noise_gain for k in found.filter.kernels]
     assert maps[0].values.ravel() == pytest.approx(gains)
@@ -122,21 +131,21 @@ def test_parts_without_edges_are_named_once_and_stay_empty_in_the_map(found: Fou
     poor = tuple(replace(p, edges=0, design=whole.design, sharpness=whole.sharpness) for p in measured.parts[1:])
     kernels = tuple(FilterKernel(whole.design.kernel, p.at) for p in measured.parts)
     filter_ = RestorationFilter(kernels, found.filter.image_size)
-    facts = filter_facts(replace(found, filter=filter_, measured=replace(measured, parts=(whole, *poor))))
-    assert [part.name for part in facts.parts] == ["at 52, 52", "whole field"]
-    assert [k.title for k in facts.kernels] == ["at 52, 52 and 3 more"]
-    assert np.isfinite(facts.maps[0][1][1].values).sum() == 1
+    measured = replace(measured, parts=(whole, *poor))
+    assert [part_name(part) for part in distinct_parts(measured.parts)] == ["at 52, 52", "whole field"]
+    assert [name for name, _ in distinct_kernels(filter_)] == ["at 52, 52 and 3 more"]
+    assert np.isfinite(field_maps(filter_, measured)[0][1][1].values).sum() == 1
 
 
 def test_filters_of_files_and_apertures_say_where_they_come_from(tmp_path: Path) -> None:
     (tmp_path / "one.txt").write_text("1\n")
     made = requested_filter(FilterRequest(tmp_path / "one.txt"), lambda total: None)
-    facts = filter_facts(made)
-    assert facts.origin == f"The filter comes from the file {tmp_path / 'one.txt'}."
-    assert facts.parts == facts.rows == facts.maps == ()
-    facts = filter_facts(requested_filter(FilterRequest(aperture="round:1.2"), lambda total: None))
-    assert "aperture of a scanner, round:1.2" in facts.origin
-    assert facts.facts[0][0] == "rule" and "Ecker 1991" in facts.facts[0][1]
+    assert origin(made) == f"The filter comes from the file {tmp_path / 'one.txt'}."
+    assert made.measured is None and field_maps(made.filter, None) == []
+    made = requested_filter(FilterRequest(aperture="round:1.2"), lambda total: None)
+    assert "aperture of a scanner, round:1.2" in origin(made)
+    first = plain_facts(made.filter)[0]
+    assert first[0] == "rule" and "Ecker 1991" in first[1]
 
 
 def test_the_detail_shows_the_place_of_largest_contrast(tmp_path: Path) -> None:
@@ -183,9 +192,9 @@ def test_a_report_that_exists_or_is_none_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "report.html"
     path.write_text("mine")
     with pytest.raises(UsageError, match="exists"):
-        open_report(path, ())
+        open_report(path, (), overwrite=False)
     with pytest.raises(UsageError, match=r"ends in \.html"):
-        open_report(tmp_path / "report.tif", ())
+        open_report(tmp_path / "report.tif", (), overwrite=False)
     assert open_report(path, (), overwrite=True).path == path
     with pytest.raises(UsageError, match="input"):
         open_report(path, (path,), overwrite=True)
@@ -194,8 +203,8 @@ def test_a_report_that_exists_or_is_none_is_refused(tmp_path: Path) -> None:
 def test_without_matplotlib_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.setitem(sys.modules, "matplotlib.cm", None)
-    with pytest.raises(UsageError, match=r"photoplan\[report\].*leave --report out"):
-        open_report(tmp_path / "report.html", ())
+    with pytest.raises(UsageError, match=r"photoplan\[report\].*leave the report out"):
+        open_report(tmp_path / "report.html", (), overwrite=False)
 
 
 class TestCommand:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
 
 from photoplan.cli.options import json_option
+from photoplan.plain import json_text
 
 
 @click.command("info")
@@ -20,14 +20,14 @@ def command(file: Path, plot: Path | None, overwrite: bool, as_json: bool) -> No
     from photoplan.products.describe.run import describe
 
     if plot is not None:
-        from photoplan.products.describe.filter import draw_filter
+        from photoplan.report.restore.filters import draw_filter
 
         draw_filter(file, plot, overwrite=overwrite)
     facts = describe(file)
     if plot is not None:
         facts["picture"] = str(plot)
     if as_json:
-        click.echo(json.dumps(facts, indent=2))
+        click.echo(json_text(facts))
         return
     width = max(len(key) for key in facts)
     for key, value in facts.items():

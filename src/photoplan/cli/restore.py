@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,9 +10,9 @@ import click
 from photoplan.cli.failures import end_with_failures
 from photoplan.cli.options import BYTES, json_option
 from photoplan.cli.restore_options import filter_options, filter_request
+from photoplan.plain import json_text, plain
 
 if TYPE_CHECKING:
-    from photoplan.products.restore.report import ReportFile
     from photoplan.products.restore.run import RestoredImage, RestorePlan
     from photoplan.project.restored_reader import RestoredReader
 
@@ -53,6 +52,8 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
     from photoplan.cli.progress import progress
     from photoplan.products.restore.filter import FILTER_NAME, keep_filter, requested_filter
     from photoplan.products.restore.run import RestoreRequest, plan_restoration, restore_images
+    from photoplan.report.page import open_report
+    from photoplan.report.restore.page import restore_page
 
     def talk(text: str) -> None:
         if not quiet:
@@ -63,7 +64,9 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
     options["quicklook"] = not options.pop("no_quicklook")
     options["workers"] = options["workers"] or psutil.cpu_count() or 1
     asked = filter_request(images, options)
-    kept, page = options.pop("save_filter"), _page(options, [*images, asked.file])
+    kept = options.pop("save_filter")
+    files = [path for path in (asked.file, options["chromatic"], options["fall_off"]) if isinstance(path, Path)]
+    page = open_report(options.pop("report"), [*images, *files], overwrite=options["overwrite"])
     found = requested_filter(asked, lambda total: progress(total, quiet, "tiles"), talk)
     request = RestoreRequest(images, asked.file or found.filter, **options)
     plan = plan_restoration(request)
@@ -84,22 +87,14 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
             talk(line)
 
     report = restore_images(request, lambda total: progress(total, quiet), talk, finished)
-    if page is not None:
-        report = page.write(found, plan.jobs, report)
+    written = None
+    if page is not None and report.images:
+        written = page.write(restore_page(found, plan.jobs, report, page.mpl))
     if as_json:
-        click.echo(json.dumps(report.to_dict(), indent=2, ensure_ascii=False))
-    elif report.report is not None:
-        click.echo(str(report.report))
+        click.echo(json_text({**plain(report), "report": written}))
+    elif written is not None:
+        click.echo(str(written))
     end_with_failures(report.failed, len(report.images))
-
-
-def _page(options: dict[str, Any], inputs: list[Path | None]) -> ReportFile | None:
-    """The report that the options ask for, which are taken out; refused before any work."""
-    from photoplan.products.restore.report import open_report
-
-    path: Path | None = options.pop("report")
-    files = [each for each in (*inputs, options["chromatic"], options["fall_off"]) if isinstance(each, Path)]
-    return None if path is None else open_report(path, files, overwrite=options["overwrite"])
 
 
 def _before(plan: RestorePlan) -> list[str]:
@@ -139,9 +134,9 @@ def _show(plan: RestorePlan, as_json: bool) -> None:
 
     rows: list[dict[str, Any]] = [
         {
-            "image": str(job.reader.info.path),
-            "path": str(job.target),
-            "size": list(job.reader.size),
+            "image": job.reader.info.path,
+            "path": job.target,
+            "size": job.reader.size,
             "bands": job.reader.bands,
             "dtype": str(job.reader.dtype),
             "tiles": job.tiles,
@@ -149,7 +144,7 @@ def _show(plan: RestorePlan, as_json: bool) -> None:
         for job in plan.jobs
     ]
     if as_json:
-        click.echo(json.dumps({"filter": filter_figures(plan.filter), "images": rows, "failed": plan.failed}, indent=2))
+        click.echo(json_text({"filter": filter_figures(plan.filter), "images": rows, "failed": plan.failed}))
         return
     for row in rows:
         click.echo(

@@ -181,4 +181,4 @@ def open_report(
     check_output(path, [source for source in inputs if source is not None], overwrite=overwrite)
     if table is not None and table.resolve() == path.resolve():
         raise UsageError(f"{path}: is to be the report and the table; give two files")
-    return ReportFile(path, load_matplotlib("a report"))
+    return ReportFile(path, load_matplotlib("a report", "leave the report out"))

@@ -1,16 +1,13 @@
-"""What a restoration filter holds, in words and as a picture."""
+"""What a restoration filter holds, in words."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-from photoplan.io.disk import write_atomically
-from photoplan.io.product import check_output
 from photoplan.project.filter_files import load_filter
 from photoplan.quality.restoration.convolution import Convolution
 from photoplan.quality.restoration.filters import FilterKernel
-from photoplan.report.filter_plots import FilterPlots, KernelPicture
 
 
 def describe_filter(path: Path) -> dict[str, Any]:
@@ -37,27 +34,10 @@ def describe_filter(path: Path) -> dict[str, Any]:
 def _kernel(kernel: FilterKernel) -> str:
     rows, columns = kernel.values.shape
     even = "symmetric" if Convolution(kernel).even else "general"
-    return f"{_place(kernel)}: {columns} × {rows}, {even}, sum {kernel.total:.4g}, noise gain {kernel.noise_gain:.4g}"
+    return f"{place_of(kernel)}: {columns} × {rows}, {even}, sum {kernel.total:.4g}, noise gain {kernel.noise_gain:.4g}"
 
 
-def _place(kernel: FilterKernel) -> str:
+def place_of(kernel: FilterKernel) -> str:
+    """Band and place in the field of a kernel."""
     band = "all bands" if kernel.band is None else f"band {kernel.band}"
     return band if kernel.at is None else f"{band} at {kernel.at[0]:g}, {kernel.at[1]:g}"
-
-
-def draw_filter(path: Path, picture: Path, *, overwrite: bool = False) -> Path:
-    """Draw a filter file as PNG.
-
-    Raises
-    ------
-    InputError
-        The file is no filter.
-    UsageError
-        The picture exists and `overwrite` is False, or matplotlib is not installed.
-    """
-    check_output(picture, [path], overwrite=overwrite)
-    plots = FilterPlots()
-    used = load_filter(path)
-    kernels = [KernelPicture(_place(kernel), kernel.values) for kernel in used.kernels]
-    write_atomically(picture, plots.draw(used.description or path.name, kernels))
-    return picture

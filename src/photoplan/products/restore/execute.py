@@ -21,6 +21,7 @@ from photoplan.io.quicklook import write_quicklook
 from photoplan.io.run_record import peak_memory_bytes, record_path, versions, write_run_record
 from photoplan.io.storage import Nodata
 from photoplan.io.tile_log import TileLog
+from photoplan.plain import pick
 from photoplan.products.chromatic import model_figures, save_chromatic
 from photoplan.products.restore.request import RestoreRequest
 from photoplan.project.restored_reader import PART, RestoredReader
@@ -86,22 +87,10 @@ class RestoredImage:
         valid = self.valid_share * self.pixels * len(self.below)
         return (sum(self.below) + sum(self.above)) / valid if valid else 0.0
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        return {
-            "image": self.image,
-            "path": str(self.path),
-            "dtype": self.dtype,
-            "noise_gain": self.noise_gain,
-            "clipped_below": list(self.below),
-            "clipped_above": list(self.above),
-            "clipped_share": self.clipped_share,
-            "valid_share": self.valid_share,
-            "pixels": self.pixels,
-            "tiles": self.tiles,
-            "resumed_tiles": self.resumed,
-            "seconds": round(self.seconds, 3),
-        }
+    def json_fields(self) -> dict[str, Any]:
+        """With the share of clipped pixels."""
+        own = ("image", "path", "dtype", "noise_gain", "clipped_share", "valid_share", "pixels", "tiles", "seconds")
+        return pick(self, *own, clipped_below="below", clipped_above="above", resumed_tiles="resumed")
 
 
 def memory_of_a_tile(reader: RestoredReader) -> int:
@@ -267,7 +256,7 @@ def _record(job: Job, how: RestoreRequest, result: RestoredImage, facts: Product
     """The run record: what a person needs to answer for the result, and to make it again."""
     restorer = job.reader.restorer
     return {
-        "product": result.to_dict(),
+        "product": result,
         "key": job.key,
         "inputs": [{"path": job.reader.info.path, "sampled_sha256": job.digest}]
         + [{"path": path} for path in job.inputs if path.resolve() != job.reader.info.path.resolve()],

@@ -22,6 +22,7 @@ from photoplan.io.product import check_output
 from photoplan.io.raster import RasterReader
 from photoplan.io.run_record import record_path
 from photoplan.io.storage import Nodata
+from photoplan.plain import pick
 from photoplan.products.chromatic import load_chromatic, measured_once, model_figures
 from photoplan.products.restore.execute import Job, RestoredImage, earlier_result, memory_of_a_tile, restore_one
 from photoplan.products.restore.request import RestoreRequest
@@ -49,18 +50,10 @@ class RestoreReport:
     """Why an image could not be restored, by its name."""
     filter: RestorationFilter
     folder: Path
-    report: Path | None = None
-    """The report with plots, where one was written."""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        return {
-            "filter": filter_figures(self.filter),
-            "images": [image.to_dict() for image in self.images],
-            "failed": dict(self.failed),
-            "folder": str(self.folder),
-            "report": None if self.report is None else str(self.report),
-        }
+    def json_fields(self) -> dict[str, Any]:
+        """The filter by its figures."""
+        return {**pick(self, "images", "failed", "folder"), "filter": filter_figures(self.filter)}
 
 
 def filter_figures(filter_: RestorationFilter) -> dict[str, Any]:

@@ -4,30 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.io.disk import write_atomically
+from photoplan.io.product import check_output
+from photoplan.products.describe.filter import place_of
+from photoplan.project.filter_files import load_filter
 from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, SOFT, STYLE, load_matplotlib, png
+
+Array = NDArray[np.float64]
 
 #: Kernels that are drawn; of more, the first ones are.
 MOST_DRAWN = 12
 _DIRECTIONS = (("row", BLUE, "-"), ("column", ORANGE, "--"), ("diagonal", GREEN, ":"))
 
 
-@dataclass(frozen=True, eq=False)
-class KernelPicture:
-    """What is drawn of a kernel."""
-
-    title: str
-    values: NDArray[np.float64]
-    """(2 m + 1, 2 n + 1)."""
-
-
-def frequency_response(
-    values: NDArray[np.float64], frequency: NDArray[np.float64], direction: tuple[float, float]
-) -> NDArray[np.float64]:
+def frequency_response(values: Array, frequency: Array, direction: tuple[float, float]) -> Array:
     """Factor by which a kernel changes the amplitude of waves.
 
     Parameters
@@ -44,45 +40,38 @@ def frequency_response(
     return np.asarray(np.abs(np.exp(-2j * np.pi * np.multiply.outer(frequency, along)) @ values.ravel()))
 
 
+@dataclass(frozen=True, eq=False)
 class FilterPlots:
-    """Draws; made before any work, so that a missing library is known at once.
+    """Draws kernels."""
 
-    Raises
-    ------
-    UsageError
-        When made: matplotlib is not installed.
-    """
+    mpl: Any
 
-    def __init__(self) -> None:
-        self._mpl = load_matplotlib("a picture of a filter")
-
-    def draw(self, title: str, kernels: Sequence[KernelPicture]) -> bytes:
-        """PNG with a row of three panels for each kernel."""
+    def draw(self, title: str, kernels: Sequence[tuple[str, Array]]) -> bytes:
+        """PNG with a row of three panels for each kernel, given by name and values (2 m + 1, 2 n + 1)."""
         drawn = list(kernels[:MOST_DRAWN])
         height = 3.0 * len(drawn) + 0.7
-        with self._mpl.rc_context(STYLE):
-            fig = self._mpl.figure.Figure(figsize=(11.0, height), layout="constrained")
+        with self.mpl.rc_context(STYLE):
+            fig = self.mpl.figure.Figure(figsize=(11.0, height), layout="constrained")
             more = f" (the first {MOST_DRAWN} of {len(kernels)} kernels)" if len(kernels) > MOST_DRAWN else ""
             fig.suptitle(title + more, x=0.01, ha="left", fontsize=11, color=INK)
             rows = fig.subplots(len(drawn), 3, squeeze=False, gridspec_kw={"width_ratios": [1.0, 1.3, 1.3]})
-            for panels, kernel in zip(rows, drawn):
-                self._weights(panels[0], kernel)
-                self._sections(panels[1], kernel)
-                self._response(panels[2], kernel)
+            for panels, (name, values) in zip(rows, drawn):
+                panels[0].set_title(name)
+                self._weights(panels[0], values)
+                self._sections(panels[1], values)
+                self._response(panels[2], values)
             return png(fig)
 
-    def _weights(self, axes: Any, kernel: KernelPicture) -> None:
+    def _weights(self, axes: Any, values: Array) -> None:
         """Heat map; the colour is that of the root, since the middle is far larger than all others."""
-        values = kernel.values
         m, n = (side // 2 for side in values.shape)
         rooted = np.sign(values) * np.sqrt(np.abs(values))
         most = float(np.abs(rooted).max()) or 1.0
         box = (-n - 0.5, n + 0.5, m + 0.5, -m - 0.5)
         axes.imshow(rooted, cmap="RdBu_r", vmin=-most, vmax=most, extent=box, interpolation="nearest")
         axes.grid(visible=False)
-        axes.set_title(kernel.title)
         for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_locator(self._mpl.ticker.MaxNLocator(integer=True))
+            axis.set_major_locator(self.mpl.ticker.MaxNLocator(integer=True))
         axes.set_xlabel("columns (colour: root of the weight)")
         axes.set_ylabel("rows")
         if values.size <= 49:
@@ -92,9 +81,8 @@ class FilterPlots:
                     k - n, i - m, f"{value:.2g}", ha="center", va="center", fontsize=6, color="white" if strong else INK
                 )
 
-    def _sections(self, axes: Any, kernel: KernelPicture) -> None:
+    def _sections(self, axes: Any, values: Array) -> None:
         """Middle row, middle column, and sums."""
-        values = kernel.values
         m, n = (side // 2 for side in values.shape)
         axes.axhline(0.0, color=SOFT, linewidth=0.8)
         axes.plot(np.arange(-n, n + 1), values[m], "o-", color=BLUE, markersize=3.5, linewidth=1.2, label="middle row")
@@ -104,21 +92,39 @@ class FilterPlots:
         axes.plot(
             np.arange(-n, n + 1), values.sum(0), "^:", color=GREEN, markersize=3, linewidth=1.2, label="column sums"
         )
-        axes.xaxis.set_major_locator(self._mpl.ticker.MaxNLocator(integer=True))
+        axes.xaxis.set_major_locator(self.mpl.ticker.MaxNLocator(integer=True))
         axes.set_title(f"sections; sum {values.sum():.4g}")
         axes.set_xlabel("pixels from the middle")
         axes.legend(fontsize=7.5)
 
     @staticmethod
-    def _response(axes: Any, kernel: KernelPicture) -> None:
+    def _response(axes: Any, values: Array) -> None:
         """Up to the Nyquist frequency along rows and columns."""
         frequency = np.linspace(0.0, 0.5, 101)
         for (name, colour, line), direction in zip(_DIRECTIONS, ((1.0, 0.0), (0.0, 1.0), (0.5**0.5, 0.5**0.5))):
-            response = frequency_response(kernel.values, frequency, direction)
+            response = frequency_response(values, frequency, direction)
             axes.plot(frequency, response, line, color=colour, linewidth=1.6, label=f"along a {name}")
         axes.set_xlim(0.0, 0.5)
         axes.set_ylim(bottom=0.0)
-        gain = float(np.sqrt((kernel.values**2).sum()))
+        gain = float(np.sqrt((values**2).sum()))
         axes.set_title(f"frequency response |R|; noise grows {gain:.3g} times")
         axes.set_xlabel("cycles per pixel")
         axes.legend(fontsize=7.5)
+
+
+def draw_filter(path: Path, picture: Path, *, overwrite: bool = False) -> Path:
+    """Draw a filter file as PNG.
+
+    Raises
+    ------
+    InputError
+        The file is no filter.
+    UsageError
+        The picture exists and `overwrite` is False, or matplotlib is not installed.
+    """
+    check_output(picture, [path], overwrite=overwrite)
+    plots = FilterPlots(load_matplotlib("a picture of a filter"))
+    used = load_filter(path)
+    kernels = [(place_of(kernel), kernel.values) for kernel in used.kernels]
+    write_atomically(picture, plots.draw(used.description or path.name, kernels))
+    return picture

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.report.drawing import BLUE, INK, ORANGE, SOFT, STYLE, load_matplotlib, png
-from photoplan.report.filter_plots import FilterPlots, KernelPicture
+from photoplan.report.drawing import BLUE, INK, ORANGE, SOFT, STYLE, png
+from photoplan.report.restore.details import HistogramEnds
 
 Array = NDArray[np.float64]
 
@@ -49,37 +49,15 @@ class FieldMap:
 
 
 @dataclass(frozen=True, eq=False)
-class EndsPicture:
-    """The dark and the bright end of a histogram."""
-
-    edges: tuple[Array, Array]
-    """Limits of the classes of grey values."""
-    before: tuple[Array, Array]
-    """Share of the pixels in each class, percent."""
-    after: tuple[Array, Array]
-
-
 class RestorePlots:
-    """Draws; made before any work, so that a missing library is known at once.
+    """Draws sharpness, maps of the field, details and histograms."""
 
-    Raises
-    ------
-    UsageError
-        When made: matplotlib is not installed.
-    """
-
-    def __init__(self) -> None:
-        self._mpl = load_matplotlib("a report", "leave --report out")
-        self._filters = FilterPlots()
-
-    def filters(self, title: str, kernels: Sequence[KernelPicture]) -> bytes:
-        """Weights, sections and frequency responses of kernels."""
-        return self._filters.draw(title, kernels)
+    mpl: Any
 
     def sharpness(self, axes: Sequence[AxisPicture]) -> bytes:
         """Discrete spread functions as bars, and MTF curves with what they become."""
-        with self._mpl.rc_context(STYLE):
-            fig = self._mpl.figure.Figure(figsize=(_WIDTH, 3.4), layout="constrained")
+        with self.mpl.rc_context(STYLE):
+            fig = self.mpl.figure.Figure(figsize=(_WIDTH, 3.4), layout="constrained")
             left, right = fig.subplots(1, 2, gridspec_kw={"width_ratios": [1.0, 1.25]})
             self._spreads(left, axes)
             self._curves(right, axes)
@@ -106,7 +84,7 @@ class RestorePlots:
             )
         axes.axhline(0.0, color=SOFT, linewidth=0.8)
         axes.set(xlabel="pixels from the middle", title="spread function: share of the light", ylim=(None, 1.3 * top))
-        axes.xaxis.set_major_locator(self._mpl.ticker.MaxNLocator(integer=True))
+        axes.xaxis.set_major_locator(self.mpl.ticker.MaxNLocator(integer=True))
         axes.legend(loc="upper left", fontsize=7.5)
 
     @staticmethod
@@ -124,8 +102,8 @@ class RestorePlots:
 
     def field(self, maps: Sequence[FieldMap]) -> bytes:
         """Values over the field side by side, each with a scale of its own."""
-        with self._mpl.rc_context(STYLE):
-            fig = self._mpl.figure.Figure(figsize=(3.1 * max(len(maps), 2), 2.7), layout="constrained")
+        with self.mpl.rc_context(STYLE):
+            fig = self.mpl.figure.Figure(figsize=(3.1 * max(len(maps), 2), 2.7), layout="constrained")
             for axes, each in zip(fig.subplots(1, len(maps), squeeze=False)[0], maps):
                 known = each.values[np.isfinite(each.values)]
                 low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
@@ -153,8 +131,8 @@ class RestorePlots:
         factor = max(1, _DETAIL // max(height, width))
         wide, tall, gap, head = factor * width, factor * height, 48, 68
         total = 2 * wide + gap, tall + head
-        with self._mpl.rc_context(STYLE):
-            fig = self._mpl.figure.Figure(figsize=(total[0] / _DPI, total[1] / _DPI))
+        with self.mpl.rc_context(STYLE):
+            fig = self.mpl.figure.Figure(figsize=(total[0] / _DPI, total[1] / _DPI))
             for number, (name, picture) in enumerate((("as it was", before), ("restored", after))):
                 place = number * (wide + gap) / total[0], 0.0, wide / total[0], tall / total[1]
                 axes = fig.add_axes(place)
@@ -163,10 +141,10 @@ class RestorePlots:
                 axes.set_title(f" {name}", fontsize=9, color=INK)
             return png(fig, _DPI)
 
-    def ends(self, picture: EndsPicture) -> bytes:
+    def ends(self, picture: HistogramEnds) -> bytes:
         """How many pixels have the darkest and the brightest grey values, before and after."""
-        with self._mpl.rc_context(STYLE):
-            fig = self._mpl.figure.Figure(figsize=(_WIDTH, 2.6), layout="constrained")
+        with self.mpl.rc_context(STYLE):
+            fig = self.mpl.figure.Figure(figsize=(_WIDTH, 2.6), layout="constrained")
             shares = np.concatenate([*picture.before, *picture.after])
             low = float(shares[shares > 0].min()) / 2 if (shares > 0).any() else 1e-3
             panels = fig.subplots(1, 2, sharey=True)
@@ -177,7 +155,7 @@ class RestorePlots:
                 axes.stairs(now, edges, baseline=low, color=BLUE, linewidth=1.5, label="restored")
                 axes.set(yscale="log", title=name, xlabel="grey value", xlim=(edges[0], edges[-1]))
                 axes.set_ylim(low, max(2.0 * float(shares.max()), 4.0 * low))
-                axes.yaxis.set_major_formatter(self._mpl.ticker.FuncFormatter(lambda value, at: f"{value:g}"))
+                axes.yaxis.set_major_formatter(self.mpl.ticker.FuncFormatter(lambda value, at: f"{value:g}"))
             panels[0].set_ylabel("share of the pixels, %")
             panels[1].legend(fontsize=7.5, loc="upper left")
             return png(fig)

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
-from photoplan.report.restore_plots import EndsPicture
 
 #: Side of a detail, pixels; and places in each direction at which details are looked at.
 SIDE = 160
@@ -23,6 +22,17 @@ _SHARE = 256
 
 
 @dataclass(frozen=True, eq=False)
+class HistogramEnds:
+    """The dark and the bright end of a histogram."""
+
+    edges: tuple[NDArray[np.float64], NDArray[np.float64]]
+    """Limits of the classes of grey values."""
+    before: tuple[NDArray[np.float64], NDArray[np.float64]]
+    """Share of the pixels in each class, percent."""
+    after: tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+@dataclass(frozen=True, eq=False)
 class Compared:
     """A detail before and after, and the ends of the histograms."""
 
@@ -30,7 +40,7 @@ class Compared:
     before: NDArray[np.uint8]
     """(height, width) or (height, width, 3)."""
     after: NDArray[np.uint8]
-    ends: EndsPicture | None
+    ends: HistogramEnds | None
     """None: no pixel is valid."""
 
 
@@ -102,7 +112,7 @@ def _detail(before: RasterReader, after: RasterReader, window: Window) -> tuple[
     return pictures[0], pictures[1]
 
 
-def _ends(before: NDArray[Any], after: NDArray[Any], dtype: np.dtype[Any]) -> EndsPicture | None:
+def _ends(before: NDArray[Any], after: NDArray[Any], dtype: np.dtype[Any]) -> HistogramEnds | None:
     """Shares of the pixels in 16 classes at each end of the range: that of 8 bits, else what occurs."""
     before, after = (v[np.isfinite(v)].astype(np.float64) for v in (before, after))
     if before.size == 0 or after.size == 0:
@@ -121,4 +131,4 @@ def _ends(before: NDArray[Any], after: NDArray[Any], dtype: np.dtype[Any]) -> En
     steps = np.asarray(width * np.arange(_CLASSES + 1), np.float64)
     edges = low + steps, high - steps[::-1]
     was, now = (tuple(100.0 * np.histogram(v, e)[0] / v.size for e in edges) for v in (before, after))
-    return EndsPicture(edges, (was[0], was[1]), (now[0], now[1]))
+    return HistogramEnds(edges, (was[0], was[1]), (now[0], now[1]))

@@ -1,0 +1,1 @@
+"""Reports of restorations and pictures of filters."""
