@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -162,11 +163,11 @@ def test_plot_and_report(photoplan: Here, tmp_path: Path) -> None:
 
 def test_vectors_are_drawn_to_one_round_scale() -> None:
     pytest.importorskip("matplotlib")
-    from photoplan.report.interior import ResidualPanel, vector_scale
+    from photoplan.report.interior import vector_scale
 
     plane = np.array(list(FILM.marks.values()))
     for longest, want in ((56.0, 1000.0), (5.6, 10_000.0), (560.0, 100.0), (60.0, 700.0)):
-        panel = ResidualPanel("a", tuple(FILM.marks), plane, np.full((8, 2), longest / math.sqrt(2)))
+        panel = SimpleNamespace(plane_mm=plane, residuals_um=np.full((8, 2), longest / math.sqrt(2)))
         assert vector_scale([panel]) == pytest.approx(want)
 
 

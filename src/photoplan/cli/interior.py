@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import click
 
 from photoplan.cli.failures import end_with_failures
 from photoplan.cli.options import json_option
+from photoplan.plain import json_text, plain
 
 
 @click.command("interior")
@@ -34,14 +34,25 @@ def command(images: tuple[str, ...], as_json: bool, quiet: bool, **options: Any)
     (exit code 4).
     """
     from photoplan.products.interior import InteriorRequest, interior_orientations
+    from photoplan.report.interior import InteriorPlots, interior_page
+    from photoplan.report.page import open_picture, open_report
 
+    project, overwrite = options["project"], options.pop("overwrite")
+    page = open_report(options.pop("report"), (), overwrite=overwrite, project=project)
+    plot = open_picture(options.pop("plot"), (), overwrite=overwrite, project=project)
     found = interior_orientations(InteriorRequest(images=images or None, **options))
+    report = picture = None
+    if page is not None and found.images:
+        title = f"Interior orientation · {project.resolve().parent.name}"
+        report = page.write(interior_page(found, title, page.mpl))
+    if plot is not None and found.images:
+        picture = plot.write(InteriorPlots(plot.mpl).residuals(found.images))
     if as_json:
-        click.echo(json.dumps(found.to_dict(), indent=2, ensure_ascii=False))
+        click.echo(json_text({**plain(found), "report": report, "plot": picture}))
     else:
         for image in found.images:
             click.echo(str(image))
-        for path in (found.report, found.plot):
+        for path in (report, picture):
             if path is not None:
                 click.echo(str(path))
     if not quiet:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +9,7 @@ import click
 
 from photoplan.cli.failures import end_with_failures
 from photoplan.cli.options import json_option
+from photoplan.plain import json_text, plain
 
 if TYPE_CHECKING:
     from photoplan.products.resect.image import ResectedImage
@@ -44,26 +44,32 @@ def command(as_json: bool, quiet: bool, free: str | None, **options: Any) -> Non
     """
     from photoplan.cli.progress import progress
     from photoplan.products.resect.run import ResectRequest, resect_project
+    from photoplan.report.page import open_report
+    from photoplan.report.resect import resect_page
 
     parameters = tuple(dict.fromkeys(p.strip() for p in (free or "").split(",") if p.strip()))
+    given = [*options["image_points"], *options["control"]]
+    overwrite, project = options.pop("overwrite"), options["project"]
+    page = open_report(options.pop("report"), given, overwrite=overwrite, project=project)
     request = ResectRequest(free=parameters, **options)
     with progress(0, quiet, "images") as advance:
         result = resect_project(request, lambda _: advance(1, 0))
+    report = None if page is None or not result.images else page.write(resect_page(result, page.mpl))
     if as_json:
-        click.echo(json.dumps(result.to_dict(), indent=2, ensure_ascii=False))
+        click.echo(json_text({**plain(result), "report": report}))
     else:
-        _show(result)
+        _show(result, report)
     if not quiet:
         _talk(result)
     end_with_failures(result.failed, len(result.images), "images could not be oriented")
 
 
-def _show(result: ResectResult) -> None:
+def _show(result: ResectResult, report: Path | None) -> None:
     for image in result.images:
         for line in _lines(image):
             click.echo(line)
-    if result.report is not None:
-        click.echo(str(result.report))
+    if report is not None:
+        click.echo(str(report))
 
 
 def _lines(image: ResectedImage) -> list[str]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 
 from photoplan.cli.options import json_option
+from photoplan.plain import json_text, plain
 
 
 @click.command("sensor")
@@ -22,13 +22,19 @@ from photoplan.cli.options import json_option
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Resolution, bandwidth, charge transfer and noise of the sensor that FILE (TOML) describes."""
     from photoplan.products.sensor.run import SensorRequest, describe_sensor
+    from photoplan.report.page import open_report
+    from photoplan.report.sensor import sensor_page
 
+    overwrite, table = options["overwrite"], options["csv"]
+    page = open_report(options.pop("report"), [options["file"]], overwrite=overwrite, table=table)
     found = describe_sensor(SensorRequest(**options))
+    report = None if page is None or options["dry_run"] else page.write(sensor_page(found, page.mpl))
+    written = [path for path in (report, found.csv) if path is not None]
     if as_json:
-        click.echo(json.dumps(found.to_dict(), indent=2, ensure_ascii=False))
+        click.echo(json_text({**plain(found), "written": written}))
     else:
         click.echo(str(found))
-        for path in found.written:
+        for path in written:
             click.echo(str(path))
     differing = [f for f in found.figures if f.stated is not None and abs(f.value - f.stated) > 0.01 * abs(f.stated)]
     if not quiet:

@@ -1,4 +1,4 @@
-"""Interior orientation of a project's film scans from their measured marks: figures, plots, choice of a model."""
+"""Interior orientation of a project's film scans from their measured marks: figures, choice of a model."""
 
 from __future__ import annotations
 
@@ -15,16 +15,12 @@ from photoplan.cameras.affine_facts import AffineFacts, Shrinkage, affine_facts,
 from photoplan.cameras.fiducials_fit import MODELS, FiducialFit
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.io.camera.model import FilmCamera
-from photoplan.io.disk import write_atomically
-from photoplan.io.product import check_output
 from photoplan.io.project.cameras import fiducial_fit
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Image, Project
 from photoplan.io.scan_pitch import parse_pitch, read_pitch
-from photoplan.products.plain_values import plain
-from photoplan.project.scene import input_files
-from photoplan.report.interior import InteriorPlots, ResidualPanel, interior_report
+from photoplan.plain import pick
 
 #: A film that seems to have changed by more was not scanned with the pitch that its file states.
 UNBELIEVABLE = 0.01
@@ -41,13 +37,8 @@ class InteriorRequest:
     """One of `MODELS`; None: what the camera states."""
     scan_resolution: str | None = None
     """Such as ``1200dpi`` or ``21um``; None: as the files state it."""
-    report: Path | None = None
-    """HTML."""
-    plot: Path | None = None
-    """PNG."""
     write: bool = False
     """Whether the model becomes that of the cameras."""
-    overwrite: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,33 +64,23 @@ class ImageInterior:
         """Standard deviation of one measured coordinate on the film; NaN without redundancy."""
         return self.fit.sigma0 * 1000 * math.sqrt(self.facts.pixel_size[0] * self.facts.pixel_size[1])
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
+    def json_fields(self) -> dict[str, Any]:
+        """Every mark with its residuals, and the figures in practical units."""
         fit, facts, shrinkage = self.fit, self.facts, self.shrinkage
-        marks = [
-            {"name": n, "x_mm": p[0], "y_mm": p[1], "residual_px": v.tolist(), "residual_um": u.tolist()}
-            for n, p, v, u in zip(fit.names, self.plane_mm.tolist(), fit.residuals, self.residuals_um)
-        ]
-        coefficients = {k: float(getattr(fit.transformation, k)) for k in fit.transformation.__dataclass_fields__}
         return {
-            "image": self.image,
-            "camera": self.camera,
-            "model": fit.model,
-            "marks": marks,
-            "missing": list(fit.missing),
-            "redundancy": fit.redundancy,
-            "sigma0_px": plain(fit.sigma0),
-            "sigma0_um": plain(self.sigma0_um),
-            "mm_to_px": coefficients,
-            "scale_px_per_mm": list(facts.scale),
+            **pick(self, "image", "camera", "sigma0_um", "note"),
+            **pick(fit, "model", "missing", "redundancy", sigma0_px="sigma0", mm_to_px="transformation"),
+            "marks": [
+                {"name": name, "x_mm": place[0], "y_mm": place[1], "residual_px": px, "residual_um": um}
+                for name, place, px, um in zip(fit.names, self.plane_mm, fit.residuals, self.residuals_um)
+            ],
+            **pick(facts, "mirrored", scale_px_per_mm="scale"),
             "pixel_um": [1000 * s for s in facts.pixel_size],
             "rotation_deg": math.degrees(facts.rotation),
             "shear_mrad": 1000 * facts.shear,
-            "mirrored": facts.mirrored,
             "scan_pitch_um": self.pitch and [1000 * p for p in self.pitch],
             "shrinkage_permille": shrinkage and [1000 * shrinkage.x, 1000 * shrinkage.y],
-            "sigma_shrinkage_permille": shrinkage and plain([1000 * s for s in shrinkage.sigma]),
-            "note": self.note,
+            "sigma_shrinkage_permille": shrinkage and [1000 * s for s in shrinkage.sigma],
         }
 
     def __str__(self) -> str:
@@ -143,19 +124,11 @@ class InteriorResult:
     """Film scans whose marks cannot be right, and why."""
     written: tuple[str, ...]
     """Cameras whose model was set in the project file."""
-    report: Path | None
-    plot: Path | None
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        return {
-            "images": [image.to_dict() for image in self.images],
-            "unmeasured": list(self.unmeasured),
-            "failed": [{"image": name, "reason": reason} for name, reason in self.failed.items()],
-            "written": list(self.written),
-            "report": self.report and str(self.report),
-            "plot": self.plot and str(self.plot),
-        }
+    def json_fields(self) -> dict[str, Any]:
+        """Failures as a list."""
+        failed = [{"image": name, "reason": reason} for name, reason in self.failed.items()]
+        return {**pick(self, "images", "unmeasured", "written"), "failed": failed}
 
 
 def interior_orientations(request: InteriorRequest) -> InteriorResult:
@@ -167,7 +140,7 @@ def interior_orientations(request: InteriorRequest) -> InteriorResult:
     Raises
     ------
     UsageError
-        An output exists, matplotlib is missing, `write` without a model, or the resolution is not understood.
+        `write` without a model, or the resolution is not understood.
     InputError
         The project has no film scan, or none with measured marks.
     """
@@ -175,10 +148,6 @@ def interior_orientations(request: InteriorRequest) -> InteriorResult:
         raise UsageError("--write sets the model of the cameras; say which with --model")
     pitch = None if request.scan_resolution is None else parse_pitch(request.scan_resolution)
     project = load_project(request.project)
-    for path in (request.report, request.plot):
-        if path is not None:
-            check_output(path, [request.project, *input_files(project)], overwrite=request.overwrite)
-    plots = InteriorPlots() if request.report or request.plot else None
     scans = _scans(project, request)
     unmeasured = tuple(image.name for image in scans if not image.fiducials)
     if len(unmeasured) == len(scans):
@@ -193,18 +162,8 @@ def interior_orientations(request: InteriorRequest) -> InteriorResult:
                 found.append(_interior(project, image, request.model, pitch))
             except InputError as error:
                 failed[image.name] = str(error)
-    if plots is not None and found:
-        _draw(request, found, failed, plots)
     written = _write(request, found) if request.write and not failed else ()
-    drawn = bool(found)
-    return InteriorResult(
-        tuple(found),
-        unmeasured,
-        failed,
-        written,
-        request.report if drawn else None,
-        request.plot if drawn else None,
-    )
+    return InteriorResult(tuple(found), unmeasured, failed, written)
 
 
 def _scans(project: Project, request: InteriorRequest) -> list[Image]:
@@ -248,18 +207,6 @@ def _interior(project: Project, image: Image, model: str | None, pitch: tuple[fl
             )
             return replace(plain, note=note)
     return replace(plain, pitch=pitch, shrinkage=film_shrinkage(fit.transformation, pitch, fit.covariance))
-
-
-def _draw(
-    request: InteriorRequest, found: Sequence[ImageInterior], failed: dict[str, str], plots: InteriorPlots
-) -> None:
-    panels = [ResidualPanel(i.image, i.fit.names, i.plane_mm, i.residuals_um) for i in found]
-    if request.plot is not None:
-        write_atomically(request.plot, plots.residuals(panels))
-    if request.report is not None:
-        pairs = list(zip(panels, (i.to_dict() for i in found)))
-        title = f"Interior orientation · {request.project.resolve().parent.name}"
-        write_atomically(request.report, interior_report(title, pairs, failed, plots).encode("utf-8", "replace"))
 
 
 def _write(request: InteriorRequest, found: Sequence[ImageInterior]) -> tuple[str, ...]:

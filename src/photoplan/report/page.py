@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from photoplan.errors import UsageError
-from photoplan.io.disk import write_atomically
+from photoplan.io.disk import disk_error, write_atomically
 from photoplan.io.product import check_output
+from photoplan.io.project.file import load_project
+from photoplan.project.scene import input_files
 from photoplan.report.drawing import load_matplotlib
 
 _STYLE = """
@@ -135,27 +137,36 @@ def _cell(tag: str, cell: str | Cell) -> str:
 
 @dataclass(frozen=True, eq=False)
 class ReportFile:
-    """A report that can be written: seen before any work."""
+    """A report or picture that can be written: seen before any work."""
 
     path: Path
     mpl: Any
-    """``matplotlib``, with which its plots are drawn."""
+    """``matplotlib``, with which plots are drawn."""
 
-    def write(self, document: str) -> Path:
-        """Write the document whole or not at all; returns its path.
+    def write(self, content: str | bytes) -> Path:
+        """Write it whole or not at all; its folder is made. Returns its path.
 
         Raises
         ------
         UsageError, ResourceError
             The folder cannot be written, or the disk is full.
         """
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(self.path, document.encode("utf-8", errors="replace"))
+        data = content if isinstance(content, bytes) else content.encode("utf-8", errors="replace")
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise disk_error(self.path, error) from None
+        write_atomically(self.path, data)
         return self.path
 
 
 def open_report(
-    path: Path | None, inputs: Iterable[Path | str | None], *, overwrite: bool, table: Path | None = None
+    path: Path | None,
+    inputs: Iterable[Path | str | None],
+    *,
+    overwrite: bool,
+    table: Path | None = None,
+    project: Path | None = None,
 ) -> ReportFile | None:
     """A report to be; None if none is asked for.
 
@@ -168,6 +179,8 @@ def open_report(
         It may exist.
     table : Path, optional
         Another file that is written.
+    project : Path, optional
+        Project file: it and all that it names are inputs, too.
 
     Raises
     ------
@@ -176,9 +189,24 @@ def open_report(
     """
     if path is None:
         return None
+    if table is not None and table.resolve() == path.resolve():
+        raise UsageError(f"{path}: report and table are the same file; give two names")
     if path.suffix.lower() not in (".html", ".htm"):
         raise UsageError(f"{path}: a report is written as HTML; give a name that ends in .html")
-    check_output(path, [source for source in inputs if source is not None], overwrite=overwrite)
-    if table is not None and table.resolve() == path.resolve():
-        raise UsageError(f"{path}: is to be the report and the table; give two files")
-    return ReportFile(path, load_matplotlib("a report", "leave the report out"))
+    return open_picture(path, inputs, overwrite=overwrite, project=project, what="a report")
+
+
+def open_picture(
+    path: Path | None,
+    inputs: Iterable[Path | str | None],
+    *,
+    overwrite: bool,
+    project: Path | None = None,
+    what: str = "a picture",
+) -> ReportFile | None:
+    """A picture to be; see `open_report`."""
+    if path is None:
+        return None
+    files = [] if project is None else [project, *input_files(load_project(project))]
+    check_output(path, [*files, *(source for source in inputs if source is not None)], overwrite=overwrite)
+    return ReportFile(path, load_matplotlib(what, f"leave {what.replace('a ', 'the ')} out"))

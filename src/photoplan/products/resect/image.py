@@ -20,10 +20,10 @@ from photoplan.io.project.model import ANGLE_UNITS, Image, Project
 from photoplan.orientation.bundle.block import AdjustedCamera
 from photoplan.orientation.resection.adjust import resect
 from photoplan.orientation.resection.model import MeasuredPoints, Resected, ResectSettings
+from photoplan.plain import pick
 from photoplan.products.adjust.cameras import Calibrated, block_camera, calibrated, camera_entries
 from photoplan.products.adjust.frame import angle_derivatives, block_frame, nadir_heights
 from photoplan.products.adjust.inputs import AdjustInputs
-from photoplan.products.plain_values import plain
 from photoplan.project.scene import stated_pose
 
 Array = NDArray[np.float64]
@@ -85,37 +85,34 @@ class ResectedImage:
             )
         return lines
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
+    def json_fields(self) -> dict[str, Any]:
+        """Orientation, quality, and every point."""
         found = self.found
         return {
             "image": self.image.name,
             **self.image_entries,
-            "sigma0": found.sigma0,
-            "redundancy": found.redundancy,
-            "rms_px": found.rms,
-            "camera": None if self.calibrated is None else _camera_dict(self.calibrated),
+            **pick(found, "sigma0", "redundancy", rms_px="rms"),
+            "camera": None if self.calibrated is None else _camera_fields(self.calibrated),
             "points": [
                 {
                     "name": name,
-                    "xy": self.points.xy[k].tolist(),
-                    "residual_px": plain(found.residuals[k]),
-                    "normalised": plain(found.normalised[k]),
-                    "redundancy": plain(found.redundancies[k]),
-                    "rejected": bool(found.rejected[k]),
+                    "xy": self.points.xy[k],
+                    "residual_px": found.residuals[k],
+                    "normalised": found.normalised[k],
+                    "redundancy": found.redundancies[k],
+                    "rejected": found.rejected[k],
                 }
                 for k, name in enumerate(self.points.names)
             ],
-            "notes": list(self.notes),
+            "notes": self.notes,
         }
 
 
-def _camera_dict(found: Calibrated) -> dict[str, Any]:
+def _camera_fields(found: Calibrated) -> dict[str, Any]:
+    columns = zip(found.parameters, found.after, found.sigma, found.units, found.before)
     return {
-        name: {"value": float(value), "sigma": float(sigma), "unit": unit, "before": float(before)}
-        for name, value, sigma, unit, before in zip(
-            found.parameters, found.after, found.sigma, found.units, found.before
-        )
+        name: {"value": value, "sigma": sigma, "unit": unit, "before": before}
+        for name, value, sigma, unit, before in columns
     }
 
 

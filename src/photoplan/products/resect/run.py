@@ -9,16 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from photoplan.errors import PhotoplanError, UsageError
-from photoplan.io.disk import write_atomically
-from photoplan.io.product import check_output
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
 from photoplan.orientation.resection.model import ResectSettings
+from photoplan.plain import pick
 from photoplan.products.adjust.inputs import AdjustInputs, read_inputs
 from photoplan.products.resect.image import ResectedImage, control_rows, resect_image
-from photoplan.project.scene import input_files
-from photoplan.report.resect_report import ResectFacts, ResectPlots, resect_report
 
 #: Control points from which an image is tried where none is named.
 _LEAST = 3
@@ -44,11 +41,8 @@ class ResectRequest:
     unknown_camera_constant: bool = False
     """The stated camera constant is no start value either."""
     critical: float = 4.0
-    report: Path | None = None
-    """HTML."""
     dry_run: bool = False
     """Whether the project is left as it is."""
-    overwrite: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,19 +56,13 @@ class ResectResult:
     left_out: tuple[str, ...]
     """Images with fewer than three control points."""
     written: bool
-    report: Path | None
     notes: tuple[str, ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
+    def json_fields(self) -> dict[str, Any]:
+        """Failures as a list."""
         return {
-            "project": str(self.project),
-            "written": self.written,
-            "images": [image.to_dict() for image in self.images],
+            **pick(self, "project", "written", "images", "left_out", "notes"),
             "failed": [{"image": name, "reason": reason} for name, reason in self.failed.items()],
-            "left_out": list(self.left_out),
-            "report": self.report and str(self.report),
-            "notes": list(self.notes),
         }
 
 
@@ -90,18 +78,12 @@ def resect_project(request: ResectRequest, step: Callable[[str], None] = lambda 
     Raises
     ------
     UsageError
-        The report exists, or parameters of a camera should be free for several of its images.
+        Parameters of a camera should be free for several of its images.
     InputError
         Project or measurements cannot be used, or no image has three control points.
     """
     settings = ResectSettings(request.free, not request.unknown_camera_constant, request.critical)
-    stated = load_project(request.project)
-    project = _overridden(stated, request)
-    plots = None
-    if request.report is not None:
-        given = [request.project, *input_files(stated), *input_files(project)]
-        check_output(request.report, given, overwrite=request.overwrite)
-        plots = ResectPlots()
+    project = _overridden(load_project(request.project), request)
     names = project.select(request.images or None)
     inputs = read_inputs(project, names)
     counts = {name: len(control_rows(inputs, name)) for name in names}
@@ -119,14 +101,8 @@ def resect_project(request: ResectRequest, step: Callable[[str], None] = lambda 
     written = bool(done) and not request.dry_run
     if written:
         edit_project(request.project, _changes(done))
-    if plots is not None and done:
-        assert request.report is not None
-        text = resect_report(request.project.name, [_facts(image) for image in done], plots)
-        write_atomically(request.report, text.encode("utf-8", errors="replace"))
     left = tuple(n for n in names if n not in wanted)
-    return ResectResult(
-        request.project, tuple(done), failed, left, written, request.report if done else None, inputs.notes
-    )
+    return ResectResult(request.project, tuple(done), failed, left, written, inputs.notes)
 
 
 def _overridden(project: Project, request: ResectRequest) -> Project:
@@ -166,37 +142,4 @@ def _changes(done: Sequence[ResectedImage]) -> ProjectChanges:
     return ProjectChanges(
         images={r.image.name: r.image_entries for r in done},
         cameras={r.image.camera: r.camera_entries for r in done if r.camera_entries},
-    )
-
-
-def _facts(result: ResectedImage) -> ResectFacts:
-    orientation = [
-        (name, f"{value:.3f} m", f"{sigma:.3f} m")
-        for name, value, sigma in zip(("X0", "Y0", "Z0"), result.center, result.sigma_center)
-    ]
-    orientation += [
-        (name, f"{value:.5f}{result.angle_sign}", f"{sigma:.5f}{result.angle_sign}")
-        for name, value, sigma in zip(result.angle_names, result.angles, result.sigma_angles)
-    ]
-    if result.calibrated is not None:
-        c = result.calibrated
-        orientation += [
-            (name, f"{value:.4f} {u}", f"{sigma:.4f} {u}")
-            for name, value, sigma, u in zip(c.parameters, c.after, c.sigma, c.units)
-        ]
-    found = result.found
-    return ResectFacts(
-        result.image.name,
-        result.size,
-        result.points.names,
-        result.points.xy,
-        found.residuals,
-        found.normalised,
-        found.redundancies,
-        found.rejected,
-        found.sigma0,
-        found.redundancy,
-        found.rms,
-        tuple(orientation),
-        (*result.gross_errors, *result.notes),
     )

@@ -37,20 +37,6 @@ class Figure:
     stated: float | None = None
     """The value that the description states for it."""
 
-    def to_dict(self) -> dict[str, object]:
-        """Plain values."""
-        values: dict[str, object] = {
-            "section": self.section,
-            "name": self.name,
-            "meaning": self.meaning,
-            "value": self.value,
-            "unit": self.unit,
-            "source": self.source,
-        }
-        if self.stated is not None:
-            values["stated"] = self.stated
-        return values
-
 
 Found = Iterator[tuple[str, str, float, str, str]]
 
