@@ -15,14 +15,13 @@ import numpy as np
 import psutil
 import pytest
 import rasterio
-from tools.command import OPTIONS, Here, Undisturbed, process, sabotage, start, wait_for
+from tools.command import OPTIONS, Here, Undisturbed, patience, process, sabotage, start, wait_for
 from tools.small_block import NAMES, Block
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals and limits")
 
 TILE_BYTES = 128 * 128 * 3
 """What a finished tile adds to the log, at least."""
-SLOW = 0.25
 
 
 def ortho(small: Block, *words: object) -> list[object]:
@@ -49,7 +48,7 @@ class TestFault03Killed:
             folder.mkdir()
             (folder / "one_ortho.tif").write_text("old")
             words.append("--overwrite")
-        running = start(*words, env=sabotage(slow=SLOW))
+        running = start(*words, env=sabotage(hold=small.folder / "go", quick=2))
         wait_for(lambda: tiles_done(folder) >= 2, running)
         running.kill()
         running.communicate()
@@ -63,13 +62,15 @@ class TestFault03Killed:
         assert product.read_bytes() == undisturbed.bytes_of("one")
         assert left_behind(folder) == set()
 
-    def test_fault_03_worker_processes_end_with_a_killed_parent(self, small: Block) -> None:
+    def test_fault_03_worker_processes_end_with_a_killed_parent(
+        self, small: Block, begun: Path, tmp_path: Path
+    ) -> None:
         words = ["ortho", small.project, *OPTIONS, "--executor", "processes", "--workers", 2]
-        running = start(*words, env=sabotage(slow=30))
-        children = workers_of(running, 2)
+        running = start(*words, env=sabotage(hold=tmp_path / "go", begun=begun))
+        children = at_work(begun, 2, running)
         running.kill()
         running.wait()
-        gone, alive = psutil.wait_procs(children, timeout=5)
+        gone, alive = psutil.wait_procs(children, timeout=patience(5))
         for child in alive:
             child.kill()
         assert len(gone) == 2
@@ -77,7 +78,7 @@ class TestFault03Killed:
     def test_fault_03_another_command_does_not_take_the_tiles(self, small: Block, undisturbed: Undisturbed) -> None:
         """Tiles of other parameters are of no use; their log is started afresh."""
         folder = small.folder / "products"
-        running = start(*ortho(small, "--kernel", "nearest"), env=sabotage(slow=SLOW))
+        running = start(*ortho(small, "--kernel", "nearest"), env=sabotage(hold=small.folder / "go", quick=2))
         wait_for(lambda: tiles_done(folder) >= 2, running)
         running.kill()
         running.communicate()
@@ -88,9 +89,11 @@ class TestFault03Killed:
     def test_fault_03_a_killed_run_of_many_products_goes_on(self, small: Block, undisturbed: Undisturbed) -> None:
         folder = small.folder / "products"
         words = ["ortho", small.project, *OPTIONS, "--json"]
-        running = start(*words, env=sabotage(slow=SLOW))
+        running = start(*words, env=sabotage(hold=small.folder / "go", quick=2, image="three"))
         # Products come in the order of the project's images: one, three, two.
-        wait_for(lambda: tiles_done(folder, "three") >= 2, running)
+        # The first one is completed while the second one is held up.
+        record = folder / "one_ortho.run.json"
+        wait_for(lambda: tiles_done(folder, "three") >= 2 and record.exists(), running)
         running.kill()
         running.communicate()
         made = (folder / "one_ortho.tif").stat().st_mtime_ns
@@ -103,6 +106,14 @@ class TestFault03Killed:
         assert products["two"]["resumed_tiles"] == 0
         assert (folder / "one_ortho.tif").stat().st_mtime_ns == made
         assert [(folder / f"{n}_ortho.tif").read_bytes() for n in NAMES] == [undisturbed.bytes_of(n) for n in NAMES]
+
+
+@pytest.fixture
+def begun(tmp_path: Path) -> Path:
+    """Where workers that are at a slow tile leave their numbers."""
+    folder = tmp_path / "begun"
+    folder.mkdir()
+    return folder
 
 
 @pytest.fixture
@@ -155,15 +166,10 @@ class TestFault04FullDisk:
         assert [p.name for p in small_disk.iterdir()] == ["ballast"]
 
 
-def workers_of(running: subprocess.Popen[str], count: int) -> list[psutil.Process]:
-    """The worker processes of a command, without Python's resource tracker."""
-    parent = psutil.Process(running.pid)
-
-    def found() -> list[psutil.Process]:
-        return [c for c in parent.children() if "spawn_main" in " ".join(c.cmdline())]
-
-    wait_for(lambda: len(found()) >= count, running)
-    return found()
+def at_work(begun: Path, count: int, running: subprocess.Popen[str]) -> list[psutil.Process]:
+    """The processes of a command that are at a tile, when there are so many."""
+    wait_for(lambda: len(list(begun.iterdir())) >= count, running)
+    return [psutil.Process(int(path.name)) for path in begun.iterdir()]
 
 
 class TestFault05DeadWorkers:
@@ -205,23 +211,31 @@ class TestFault25Interrupts:
         ids=["threads-TERM", "threads-INT-INT", "processes-INT", "processes-TERM-TERM"],
     )
     def test_fault_25_gone_in_5_seconds(
-        self, small: Block, undisturbed: Undisturbed, executor: str, signals: list[signal.Signals]
+        self,
+        small: Block,
+        undisturbed: Undisturbed,
+        begun: Path,
+        tmp_path: Path,
+        executor: str,
+        signals: list[signal.Signals],
     ) -> None:
-        """Tiles that take 30 s do not hold it; all processes are gone, and the same command goes on."""
+        """Tiles that never end do not hold it; all processes are gone, and the same command goes on."""
         folder = small.folder / "products"
         words = ["ortho", small.project, *OPTIONS, "--executor", executor, "--workers", 2, "--images", "one"]
         # The first tiles are quick, so that there is something to go on with.
-        running = start(*words, env=sabotage(slow=30, quick=2))
+        running = start(*words, env=sabotage(hold=tmp_path / "go", quick=2, begun=begun))
         wait_for(lambda: tiles_done(folder) >= 2, running)
-        children = workers_of(running, 2) if executor == "processes" else []
+        children = at_work(begun, 2 if executor == "processes" else 1, running)
+        children = [child for child in children if child.pid != running.pid]
+        within = patience(5)
         began = time.monotonic()
         for number in signals:
             # A terminal sends Ctrl-C to all processes of the job, `kill` a signal to one.
             send = os.killpg if number == signal.SIGINT else os.kill
             send(running.pid, number)
-        out, err = running.communicate(timeout=20)
-        _, alive = psutil.wait_procs(children, timeout=max(0.1, 5 - (time.monotonic() - began)))
-        assert time.monotonic() - began < 5
+        out, err = running.communicate(timeout=4 * within)
+        _, alive = psutil.wait_procs(children, timeout=max(0.1, within - (time.monotonic() - began)))
+        assert time.monotonic() - began < within
         assert not alive
         assert running.returncode == 130
         assert "Traceback" not in err
@@ -236,9 +250,12 @@ class TestFault25Interrupts:
     def test_fault_25_ignored_stays_ignored(self, small: Block) -> None:
         """A command under `nohup` or in the background of a script does not mind Ctrl-C."""
         folder = small.folder / "products"
-        running = start(*ortho(small), env=sabotage(slow=SLOW), before=["bash", "-c", 'trap "" INT; exec "$@"', "bash"])
+        go = small.folder / "go"
+        ignoring = ["bash", "-c", 'trap "" INT; exec "$@"', "bash"]
+        running = start(*ortho(small), env=sabotage(hold=go, quick=1), before=ignoring)
         wait_for(lambda: tiles_done(folder) >= 1, running)
         os.killpg(running.pid, signal.SIGINT)
+        go.touch()
         running.communicate(timeout=60)
         assert running.returncode == 0
 
@@ -265,9 +282,11 @@ class TestFault26Equality:
 
     def test_fault_26_a_second_run_is_refused_while_the_first_lives(self, photoplan: Here, small: Block) -> None:
         folder = small.folder / "products"
-        running = start(*ortho(small), env=sabotage(slow=SLOW))
+        go = small.folder / "go"
+        running = start(*ortho(small), env=sabotage(hold=go, quick=1))
         wait_for(lambda: tiles_done(folder) >= 1, running)
         second = photoplan(*ortho(small))
+        go.touch()
         assert second.code == 2
         assert f"another run (process {running.pid}) is writing this product" in second.err
         out, err = running.communicate(timeout=60)

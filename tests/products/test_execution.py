@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 import random
 from collections.abc import Iterator
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import rasterio
+from tools.events import Told
 from tools.small_block import CRS, NAMES, SIZE, Block, make_project, texture, write_image
 
+from photoplan.engine import run as engine_run
 from photoplan.engine.executors import run_tiles
 from photoplan.errors import InputError, ResourceError, TilesFailed, UsageError
 from photoplan.io.product import ProductFile
@@ -20,7 +23,6 @@ from photoplan.io.project.file import load_project
 from photoplan.products.orthophoto import execution
 from photoplan.products.orthophoto.execution import BASE_MEMORY, Run, execute
 from photoplan.products.orthophoto.plan import OrthoPlan, plan_orthophotos
-from photoplan.products.orthophoto.results import ProductResult
 from photoplan.project import scene
 from photoplan.project.scene import open_scene
 
@@ -67,7 +69,7 @@ class TestFault26Equality:
             order.shuffle(tasks)
             return run_tiles(tasks, *rest)
 
-        monkeypatch.setattr(execution, "run_tiles", shuffled)
+        monkeypatch.setattr(engine_run, "run_tiles", shuffled)
         execute(plan, tmp_path, Run(2, quicklook=False))
         assert products(tmp_path) == serial
 
@@ -107,13 +109,11 @@ class TestContinuing:
             self.broken_after(patch, 4)
             with pytest.raises(ResourceError):
                 execute(plan, tmp_path, QUIET)
-        talk: list[str] = []
-        done: list[tuple[int, int]] = []
-        run = Run(2, quicklook=False, talk=talk.append, progress=lambda *step: done.append(step))
-        results = execute(plan, tmp_path, run)
+        told = Told()
+        results = execute(plan, tmp_path, Run(2, quicklook=False, events=told))
         assert [r.resumed for r in results] == [4, 0, 0]
-        assert "one_ortho: 4 of 6 tiles are finished already" in talk
-        assert sum(tiles for tiles, _ in done) == sum(len(p.plan.tiles) for p in plan.products)
+        assert "one_ortho: 4 of 6 tiles are finished already" in told.talked
+        assert told.units["tiles"] == sum(len(p.plan.tiles) for p in plan.products)
         assert products(tmp_path) == serial
         # Figures of tiles that were taken over are in the record as well.
         assert results[0].cells >= 6
@@ -146,9 +146,9 @@ class TestContinuing:
             with pytest.raises(ResourceError):
                 execute(plan, tmp_path, QUIET)
         first = (tmp_path / "one_ortho.tif").stat()
-        reported: list[ProductResult] = []
-        results = execute(plan, tmp_path, Run(quicklook=False, report=reported.append))
-        assert reported == results
+        told = Told()
+        results = execute(plan, tmp_path, Run(quicklook=False, events=told))
+        assert told.results == results
         assert results[0].resumed == results[0].tiles
         assert (tmp_path / "one_ortho.tif").stat().st_mtime_ns == first.st_mtime_ns
         assert products(tmp_path) == serial
@@ -178,13 +178,13 @@ def test_fault_05_failed_tiles_cost_their_product_only(
         return render(product, kernel, scene, tile)
 
     monkeypatch.setattr(execution, "render_tile", failing)
-    reported: list[ProductResult] = []
+    told = Told()
     with pytest.raises(TilesFailed) as error:
-        execute(plan, tmp_path, Run(2, report=reported.append))
+        execute(plan, tmp_path, Run(2, events=told))
     assert error.value.exit_code == 4
     assert "three_ortho.tif: tiles 2, 5 (tile " in str(error.value)
     assert "RuntimeError: out of luck" in str(error.value)
-    assert [r.failed for r in reported] == [(), (2, 5), ()]
+    assert [r.failed for r in told.results] == [(), (2, 5), ()]
     assert not (tmp_path / "three_ortho.tif").exists()
     assert not (tmp_path / "three_ortho.run.json").exists()
     assert (tmp_path / "overview.png").exists()
@@ -231,7 +231,11 @@ def test_the_record_answers_for_the_product(plan: OrthoPlan, pristine: Block, tm
     assert record["grid"]["crs"] == CRS
     assert record["heights"] == {"terrain": "same", "orientation": "same", "working": "same"}
     assert record["projection_centre"] == [500300.0, 5300200.0, 400.0]
-    assert record["run"] == {"workers": 2, "executor": "threads", "memory": None}
+    run = record["run"]
+    assert (run["workers"], run["executor"], run["memory"]) == (2, "threads", None)
+    started, finished = (datetime.fromisoformat(run[name]) for name in ("started", "finished"))
+    assert started <= finished
+    assert run["seconds"] == record["product"]["seconds"]
     assert record["product"]["tiles"] == plan["one"].plan.tile_count
     assert record["versions"]["photoplan"]
     assert record["peak_memory_bytes"] > 50 * 2**20

@@ -100,6 +100,11 @@ def wait_for(condition: Callable[[], object], running: subprocess.Popen[str], se
         time.sleep(0.02)
 
 
+def patience(seconds: float) -> float:
+    """A time that a quiet machine keeps, longer where others use this one as well."""
+    return seconds * max(1.0, 2 * os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
 @dataclass(frozen=True)
 class Here:
     """The command inside the test's process: the same without start-up; for whatever needs no process."""

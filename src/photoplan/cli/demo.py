@@ -32,23 +32,24 @@ def command(folder: Path, resolution: float, quiet: bool) -> None:
     data = folder / "data"
     with as_file(files("photoplan") / "demo_block") as block:
         shutil.copytree(block, data, dirs_exist_ok=True)
-    how.talk(
-        f"$ photoplan init {folder} --images '{data}/images/*.jpg' --camera {data}/int.yaml "
-        f"--orientation {data}/ext.csv --terrain {data}/dsm.tif --height-system same"
-    )
-    request = InitRequest(
-        folder,
-        (str(data / "images" / "*.jpg"),),
-        data / "int.yaml",
-        data / "ext.csv",
-        str(data / "dsm.tif"),
-        height_system="same",
-        overwrite=True,
-    )
-    project = init_project(request, lambda line: how.talk(f"  {line}")).path
-    how.talk(f"$ photoplan check {project}")
-    loaded = load_project(project)
-    how.talk(str(check_project(loaded)))
-    how.talk(f"$ photoplan ortho {project} --resolution {resolution:g}")
-    plan = plan_orthophotos(loaded, resolution=resolution)
-    running.execute_and_report(plan, folder / "products", how)
+    with running.telling(how) as events:
+        events.talk(
+            f"$ photoplan init {folder} --images '{data}/images/*.jpg' --camera {data}/int.yaml "
+            f"--orientation {data}/ext.csv --terrain {data}/dsm.tif --height-system same"
+        )
+        request = InitRequest(
+            folder,
+            (str(data / "images" / "*.jpg"),),
+            data / "int.yaml",
+            data / "ext.csv",
+            str(data / "dsm.tif"),
+            height_system="same",
+            overwrite=True,
+        )
+        project = init_project(request, lambda line: events.talk(f"  {line}")).path
+        events.talk(f"$ photoplan check {project}")
+        loaded = load_project(project)
+        events.talk(str(check_project(loaded)))
+        events.talk(f"$ photoplan ortho {project} --resolution {resolution:g}")
+        plan = plan_orthophotos(loaded, resolution=resolution, events=events)
+        running.execute_and_report(plan, folder / "products", how, events)

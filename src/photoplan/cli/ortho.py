@@ -42,14 +42,15 @@ def command(
     from photoplan.products.orthophoto.plan import plan_orthophotos
 
     how = running.How.from_options(options)
-    loaded = load_project(project)
-    changes = {k: v for k, v in options.items() if v is not None and v != ()}
-    plan = plan_orthophotos(loaded, images or None, **changes)
-    folder = output or loaded.folder / "products"
-    if dry_run or plan_file is not None:
-        # Here, since plans as files need a library for vector data that a product does not: 30 MB of memory.
-        from photoplan.cli.show_plan import show_plan
+    with running.telling(how) as events:
+        loaded = load_project(project)
+        changes = {k: v for k, v in options.items() if v is not None and v != ()}
+        plan = plan_orthophotos(loaded, images or None, events=events, **changes)
+        folder = output or loaded.folder / "products"
+        if dry_run or plan_file is not None:
+            # Here, since plans as files need a library for vector data that a product does not: 30 MB of memory.
+            from photoplan.cli.show_plan import show_plan
 
-        show_plan(plan, folder, plan_file, how)
-        return
-    running.execute_and_report(plan, folder, how)
+            show_plan(plan, folder, plan_file, how, events)
+        else:
+            running.execute_and_report(plan, folder, how, events)

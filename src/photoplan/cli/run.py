@@ -23,5 +23,6 @@ def command(plan: Path, output: Path | None, **options: Any) -> None:
     from photoplan.products.orthophoto.plan_file import read_plan
 
     how = running.How.from_options(options)
-    loaded, folder = read_plan(plan)
-    running.execute_and_report(loaded, output or folder, how)
+    with running.telling(how) as events:
+        loaded, folder = read_plan(plan)
+        running.execute_and_report(loaded, output or folder, how, events)

@@ -11,7 +11,7 @@ from typing import Any
 import click
 import psutil
 
-from photoplan.cli.progress import progress
+from photoplan.cli.telling import Telling
 from photoplan.errors import TilesFailed
 from photoplan.products.orthophoto.execution import ProductResult, Run, execute
 from photoplan.products.orthophoto.plan import OrthoPlan
@@ -42,46 +42,44 @@ class How:
             quiet=options.pop("quiet"),
         )
 
-    def talk(self, text: str) -> None:
-        """Say something on stderr."""
-        if not self.quiet:
-            click.echo(text, err=True)
+
+def telling(how: How) -> Telling:
+    """Events of a run: paths of products go to stdout as soon as they are complete."""
+
+    def product(value: object) -> None:
+        if isinstance(value, ProductResult) and not value.failed and not how.as_json:
+            click.echo(str(value.path))
+
+    return Telling(how.quiet, product)
 
 
-def execute_and_report(plan: OrthoPlan, folder: Path, how: How) -> None:
+def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling) -> None:
     """Make the products and print their paths, or one JSON object."""
     started = time.perf_counter()
     settings = plan.settings
     tiles = sum(len(p.plan.tiles) for p in plan.products)
-    how.talk(
+    events.talk(
         f"plan: {len(plan.products)} products, {tiles} tiles · {settings.resolution:g} m · kernel {settings.kernel} · "
         f"tolerance {settings.tolerance:g} px · nodata {settings.nodata} · {how.workers} {how.executor}"
     )
     for line in plan.blind:
-        how.talk(f"  sees no terrain and is left out: {line}")
-    results: list[ProductResult] = []
-
-    def finished(result: ProductResult) -> None:
-        results.append(result)
-        if not how.as_json and not result.failed:
-            click.echo(str(result.path))
-
+        events.talk(f"  sees no terrain and is left out: {line}")
+    run = Run(how.workers, how.executor, how.memory, how.overwrite, how.quicklook, events)
     failed = None
-    with progress(tiles, how.quiet) as report:
-        run = Run(how.workers, how.executor, how.memory, how.overwrite, how.quicklook, report, how.talk, finished)
-        try:
-            execute(plan, folder, run)
-        except TilesFailed as error:
-            failed = error
+    try:
+        execute(plan, folder, run)
+    except TilesFailed as error:
+        failed = error
     seconds = time.perf_counter() - started
+    results = [value for value in events.results if isinstance(value, ProductResult)]
     if how.as_json:
         products = [r.to_dict() for r in results]
         click.echo(json.dumps({"products": products, "seconds": round(seconds, 3), "folder": str(folder)}, indent=2))
     if failed is not None:
         raise failed
-    how.talk(_summary(results, plan, seconds))
+    events.talk(_summary(results, plan, seconds))
     if how.quicklook:
-        how.talk(f"quick look: {folder / 'overview.png'}")
+        events.talk(f"quick look: {folder / 'overview.png'}")
 
 
 def _summary(results: list[ProductResult], plan: OrthoPlan, seconds: float) -> str:

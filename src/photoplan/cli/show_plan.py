@@ -7,19 +7,17 @@ from pathlib import Path
 
 import click
 
-from photoplan.cli.progress import progress
 from photoplan.cli.running import How
+from photoplan.events import Events
 from photoplan.products.orthophoto.plan import OrthoPlan
 from photoplan.products.orthophoto.plan_file import PlanFigures, check_plan_path, compile_figures, write_plan
 
 
-def show_plan(plan: OrthoPlan, folder: Path, plan_file: Path | None, how: How) -> None:
+def show_plan(plan: OrthoPlan, folder: Path, plan_file: Path | None, how: How, events: Events) -> None:
     """Compile every tile's geometry, print the figures, write the plan if asked."""
     if plan_file is not None:
         check_plan_path(plan_file, plan, how.overwrite)
-    tiles = sum(len(p.plan.tiles) for p in plan.products)
-    with progress(tiles, how.quiet) as report:
-        figures = compile_figures(plan, report)
+    figures = compile_figures(plan, events)
     if plan_file is not None:
         write_plan(plan_file, plan, figures, folder, how.overwrite)
     if how.as_json:

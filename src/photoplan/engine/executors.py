@@ -30,6 +30,8 @@ from photoplan.errors import PhotoplanError, UsageError
 
 #: How often a tile is tried again after its worker died or an unforeseen error.
 RETRIES = 2
+#: Seconds after which a wait is interrupted for a sign of life.
+PULSE = 1.0
 
 
 class SerialExecutor(Executor):
@@ -159,6 +161,11 @@ def _dask_executor(address: str) -> Executor:
     return _DaskExecutor(client)
 
 
+def call(work: Callable[[Any], Any], task: Any) -> Any:
+    """What a worker does with a task."""
+    return work(task)
+
+
 class Workers:
     """The executor of a whole run, a context manager: made when first needed, and anew when its workers died.
 
@@ -190,7 +197,7 @@ class Workers:
         """
         if self._executor is None:
             self._executor = self._make()
-        return self._executor.submit(work, task)
+        return self._executor.submit(call, work, task)
 
     def end(self, wait: bool = True) -> None:
         """Let the workers go, at once or after the tasks they are at."""
@@ -199,7 +206,13 @@ class Workers:
             executor.shutdown(wait=wait, cancel_futures=True)
 
 
-def run_tiles(tasks: Iterable[Any], work: Callable[[Any], Any], workers: Workers, in_flight: int) -> Iterator[Outcome]:
+def run_tiles(
+    tasks: Iterable[Any],
+    work: Callable[[Any], Any],
+    workers: Workers,
+    in_flight: int,
+    pulse: Callable[[], None] = lambda: None,
+) -> Iterator[Outcome]:
     """Run `work(task)` for every task and yield outcomes as they come, in any order.
 
     Parameters
@@ -212,6 +225,8 @@ def run_tiles(tasks: Iterable[Any], work: Callable[[Any], Any], workers: Workers
         They stay for the next call.
     in_flight : int
         Tasks that are submitted and not yet yielded: what bounds memory.
+    pulse : callable
+        Called about every second while nothing comes.
 
     Raises
     ------
@@ -231,7 +246,9 @@ def run_tiles(tasks: Iterable[Any], work: Callable[[Any], Any], workers: Workers
                 if not pending:
                     workers.end(wait=False)
                     continue
-            done, _ = wait(pending, return_when=FIRST_COMPLETED)
+            done, _ = wait(pending, PULSE, FIRST_COMPLETED)
+            if not done:
+                pulse()
             broken = [f for f in done if isinstance(f.exception(), BrokenExecutor)]
             if broken:
                 lost, pending = list(pending.values()), {}

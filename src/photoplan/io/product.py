@@ -186,7 +186,17 @@ class ProductFile:
         """The nodata value that is stored; None if there is a mask band."""
         return self._coder.nodata
 
-    def append(self, index: int, pixels: ArrayLike, valid: NDArray[np.bool_] | None = None) -> None:
+    def record(self, index: int) -> dict[str, Any]:
+        """The figures that were kept with a finished tile."""
+        return self._open_log().figures(index)
+
+    def append(
+        self,
+        index: int,
+        pixels: ArrayLike,
+        valid: NDArray[np.bool_] | None = None,
+        record: Mapping[str, Any] | None = None,
+    ) -> None:
         """Add a finished tile.
 
         Parameters
@@ -197,6 +207,8 @@ class ProductFile:
             Shape (bands, height, width) of the tile's window, in the product's type.
         valid
             Shape (height, width), True = valid; None: all.
+        record
+            Its figures, for whoever goes on with this run: numbers and lists of numbers.
         """
         pixels = np.asarray(pixels)
         window = self._windows[index]
@@ -208,16 +220,16 @@ class ProductFile:
             )
         count = window.size if valid is None else int(np.count_nonzero(valid))
         if count == 0:
-            self.append_empty(index)
+            self.append_empty(index, record)
             return
         payload, moved = self._coder.encode(pixels, None if count == window.size else valid)
-        self._open_log().append(index, payload, (moved, count))
+        self._open_log().append(index, payload, (moved, count), record)
 
-    def append_empty(self, index: int) -> None:
+    def append_empty(self, index: int, record: Mapping[str, Any] | None = None) -> None:
         """Add a tile without any valid pixel."""
         if not 0 <= index < len(self._windows):
             raise UsageError(f"{self.path}: tile {index}; the product has tiles 0 to {len(self._windows) - 1}")
-        self._open_log().append(index)
+        self._open_log().append(index, figures=record)
 
     def complete(self, tags: dict[str, str] | None = None, *, allow_missing: bool = False) -> ProductFacts:
         """Make the product and give it its name.

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import platform
 import sys
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -52,6 +55,17 @@ def versions() -> dict[str, str]:
     found["GDAL"] = rasterio.__gdal_version__
     found["PROJ"] = rasterio.__proj_version__
     return found
+
+
+def run_times() -> Callable[[], dict[str, Any]]:
+    """A clock that starts now; called at the end it gives `started` and `finished` (UTC) and `seconds`."""
+    began, started = datetime.now(UTC), time.perf_counter()
+
+    def ended() -> dict[str, Any]:
+        seconds = time.perf_counter() - started
+        return {"started": began, "finished": datetime.now(UTC), "seconds": round(seconds, 3)}
+
+    return ended
 
 
 def peak_memory_bytes() -> int:

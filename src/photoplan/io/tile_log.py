@@ -1,29 +1,31 @@
 """The crash-safe store of finished tiles: one file to which records are only appended.
 
-The file begins with the key of its run. Each record is a header (magic, tile, two notes, length, checksum of the
-payload, checksum of the header) and the payload; an empty tile is a record of length 0. A process that dies at any byte
-leaves whole records and at most one torn tail, which is cut off when the log is opened again.
+The file begins with the key of its run. Each record is a header (magic, tile, two notes, lengths of figures and
+payload, checksum of both, checksum of the header), the tile's figures as JSON, and the payload; an empty tile has none.
+A process that dies at any byte leaves whole records and at most one torn tail, which is cut off when the log is opened
+again.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import struct
 import threading
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from photoplan.errors import PhotoplanError
 from photoplan.io.disk import disk_error, write_all
 
-_MAGIC = b"PPTILES2"
+_MAGIC = b"PPTILES3"
 _START = struct.Struct("<8s32sI")
-_RECORD = struct.Struct("<4sQQQQI")
+_RECORD = struct.Struct("<4sQQQIQI")
 _CHECK = struct.Struct("<I")
 _TILE = b"TILE"
 _CHUNK = 1 << 20
@@ -34,7 +36,10 @@ class _Place:
     """Where a payload stands in the file, and what its record says of it."""
 
     position: int
+    """First byte of the payload; its figures stand before it."""
     length: int
+    figures: int
+    """Length of the figures."""
     checksum: int
     notes: tuple[int, int]
 
@@ -103,15 +108,30 @@ class TileLog:
         """The two whole numbers that were kept with a tile."""
         return self._places[index].notes
 
-    def append(self, index: int, payload: bytes | memoryview = b"", notes: tuple[int, int] = (0, 0)) -> None:
-        """Add a tile and two notes about it; without a payload it is an empty one.
+    def figures(self, index: int) -> dict[str, Any]:
+        """The figures that were kept with a tile; empty if there were none."""
+        place = self._places[index]
+        if place.figures == 0:
+            return {}
+        found: dict[str, Any] = json.loads(self._read(place.position - place.figures, place.figures))
+        return found
+
+    def append(
+        self,
+        index: int,
+        payload: bytes | memoryview = b"",
+        notes: tuple[int, int] = (0, 0),
+        figures: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Add a tile, two notes about it, and its figures; without a payload it is an empty one.
 
         A tile that is there already is replaced.
         """
         payload = memoryview(payload).cast("B")
-        length, checksum = len(payload), zlib.crc32(payload)
-        head = _RECORD.pack(_TILE, index, *notes, length, checksum)
-        head += _CHECK.pack(zlib.crc32(head))
+        text = json.dumps(figures).encode() if figures else b""
+        length, checksum = len(payload), zlib.crc32(payload, zlib.crc32(text))
+        head = _RECORD.pack(_TILE, index, *notes, len(text), length, checksum)
+        head += _CHECK.pack(zlib.crc32(head)) + text
         with self._lock:
             os.lseek(self._descriptor, self._end, os.SEEK_SET)
             try:
@@ -122,7 +142,7 @@ class TileLog:
                 if isinstance(error, OSError):
                     raise disk_error(self.path, error) from error
                 raise
-            self._places[index] = _Place(self._end + len(head), length, checksum, notes)
+            self._places[index] = _Place(self._end + len(head), length, len(text), checksum, notes)
             self._end += len(head) + length
 
     def read(self, index: int) -> bytes:
@@ -136,19 +156,21 @@ class TileLog:
             If the payload is no longer what was written.
         """
         place = self._places[index]
-        length = place.length
+        content = self._read(place.position - place.figures, place.figures + place.length)
+        if zlib.crc32(content) != place.checksum:
+            raise PhotoplanError(f"{self.path}: tile {index} has changed since it was written; delete the file, rerun")
+        return content[place.figures :]
+
+    def _read(self, position: int, length: int) -> bytes:
         with self._lock:
-            os.lseek(self._descriptor, place.position, os.SEEK_SET)
+            os.lseek(self._descriptor, position, os.SEEK_SET)
             parts = []
             while length > 0:
                 parts.append(os.read(self._descriptor, length))
                 if not parts[-1]:
                     break
                 length -= len(parts[-1])
-        payload = b"".join(parts)
-        if zlib.crc32(payload) != place.checksum:
-            raise PhotoplanError(f"{self.path}: tile {index} has changed since it was written; delete the file, rerun")
-        return payload
+        return b"".join(parts)
 
     def close(self) -> None:
         """Close the file; it stays for the next run."""
@@ -186,12 +208,13 @@ class TileLog:
             head = file.read(_RECORD.size + _CHECK.size)
             if len(head) < _RECORD.size + _CHECK.size:
                 return
-            magic, index, note0, note1, length, checksum = _RECORD.unpack_from(head)
+            magic, index, note0, note1, figures, length, checksum = _RECORD.unpack_from(head)
             (head_checksum,) = _CHECK.unpack_from(head, _RECORD.size)
             position += len(head)
-            if magic != _TILE or zlib.crc32(head[: _RECORD.size]) != head_checksum or position + length > size:
+            end = position + figures + length
+            if magic != _TILE or zlib.crc32(head[: _RECORD.size]) != head_checksum or end > size:
                 return
-            found, left = 0, length
+            found, left = 0, figures + length
             while left:
                 part = file.read(min(left, _CHUNK))
                 if not part:
@@ -199,5 +222,5 @@ class TileLog:
                 found, left = zlib.crc32(part, found), left - len(part)
             if found != checksum:
                 return
-            yield index, _Place(position, length, checksum, (note0, note1))
-            position += length
+            yield index, _Place(position + figures, length, figures, checksum, (note0, note1))
+            position = end

@@ -1,7 +1,9 @@
 """Python imports this at its start where a test has put its folder on the path; worker processes do so too.
 
-SABOTAGE_SLOW    seconds that every tile takes longer
-SABOTAGE_QUICK   number of tiles that do not, by their place in the product
+SABOTAGE_HOLD    a file; tiles are not made before it is there
+SABOTAGE_QUICK   number of tiles that are, by their place in the product
+SABOTAGE_IMAGE   the only image that is held up [all]
+SABOTAGE_BEGUN   a folder; a worker that is held up has a file there, named by its process
 SABOTAGE_DEADLY  image:tile whose worker kills itself whenever it gets there
 SABOTAGE_ONCE    a file; the first worker that finds it removes it and kills itself
 """
@@ -11,25 +13,29 @@ import signal
 import time
 from pathlib import Path
 
-from photoplan.products.orthophoto import execution
+from photoplan.engine import executors
 
-_render = execution.render_tile
+_call = executors.call
+_how = {name: os.environ.get(f"SABOTAGE_{name}", "") for name in ("HOLD", "QUICK", "IMAGE", "BEGUN", "DEADLY", "ONCE")}
 
 
-def _sabotaged(product, kernel, scene, tile):  # type: ignore[no-untyped-def]
-    if tile.index >= int(os.environ.get("SABOTAGE_QUICK", "0")):
-        time.sleep(float(os.environ.get("SABOTAGE_SLOW", "0")))
-    if os.environ.get("SABOTAGE_DEADLY") == f"{product.image}:{tile.index}":
+def _sabotaged(job, tile):  # type: ignore[no-untyped-def]
+    image = getattr(getattr(job, "product", None), "image", "")
+    if _how["HOLD"] and _how["IMAGE"] in ("", image) and tile.index >= int(_how["QUICK"] or 0):
+        if _how["BEGUN"]:
+            (Path(_how["BEGUN"]) / str(os.getpid())).touch()
+        while not Path(_how["HOLD"]).exists():
+            time.sleep(0.01)
+    if _how["DEADLY"] == f"{image}:{tile.index}":
         os.kill(os.getpid(), signal.SIGKILL)
-    once = os.environ.get("SABOTAGE_ONCE")
-    if once:
+    if _how["ONCE"]:
         try:
-            Path(once).unlink()
+            Path(_how["ONCE"]).unlink()
         except FileNotFoundError:
             pass
         else:
             os.kill(os.getpid(), signal.SIGKILL)
-    return _render(product, kernel, scene, tile)
+    return _call(job, tile)
 
 
-execution.render_tile = _sabotaged
+executors.call = _sabotaged

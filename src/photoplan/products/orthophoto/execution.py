@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from photoplan import __version__
-from photoplan.engine.execute import MOST_SOURCE_BYTES, Pixels
-from photoplan.engine.executors import Outcome, Workers, executor_factory, run_tiles
+from photoplan.engine.execute import MOST_SOURCE_BYTES
+from photoplan.engine.executors import Workers, executor_factory
+from photoplan.engine.run import Kept, Made, Runner, Tally, Work, run_works, tiles_in_flight
 from photoplan.errors import TilesFailed, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.io.product import ProductFile
 from photoplan.io.quicklook import write_overview
-from photoplan.io.run_record import peak_memory_bytes, record_path, versions, write_run_record
+from photoplan.io.run_record import peak_memory_bytes, record_path, run_times, versions, write_run_record
 from photoplan.kernels.rectify import is_compiled
-from photoplan.plan.anchors import Anchors
-from photoplan.plan.product import ProductPlan, Tile, compile_tile
+from photoplan.plan.product import ProductPlan, Tile
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, render_tile
 from photoplan.products.orthophoto.results import ProductResult, finished_products, product_path
 from photoplan.project.restored_reader import RestoredReader
@@ -43,12 +43,8 @@ class Run:
     """Whether finished products may be replaced."""
     quicklook: bool = True
     """Whether to write `overview.png`."""
-    progress: Callable[[int, int], None] = lambda tiles, pixels: None
-    """Called with the number of tiles just finished and of their pixels."""
-    talk: Callable[[str], None] = lambda text: None
-    """Called with a sentence that a user may want to read while it goes on."""
-    report: Callable[[ProductResult], None] = lambda result: None
-    """Called with each product's result as soon as it is known, also if some of its tiles failed."""
+    events: Events = SILENT
+    """Told of tiles that are done, and of each product's result, also if some of its tiles failed."""
 
     @property
     def in_flight(self) -> int:
@@ -60,30 +56,23 @@ class Run:
             `memory` does not suffice for one tile.
         """
         wanted = self.workers if self.workers == 1 else 2 * self.workers
-        if self.memory is None:
-            return wanted
         # A tile holds its source window as read and as packed for the kernel, relief, anchors and result.
-        per_tile = 3 * MOST_SOURCE_BYTES
-        fits = (self.memory - BASE_MEMORY) // per_tile
-        if fits < 1:
-            least = (BASE_MEMORY + per_tile) / 2**20
-            raise UsageError(
-                f"--memory {self.memory / 2**20:.0f} MiB; at least {least:.0f} MiB are needed for one tile"
-            )
-        return int(min(wanted, fits))
+        return tiles_in_flight(wanted, self.memory, BASE_MEMORY, 3 * MOST_SOURCE_BYTES)
 
 
 @dataclass(frozen=True)
-class _Job:
+class OrthoJob:
     """What a worker is told once: small, and pickles."""
 
     scene: SceneAddress
     product: ProductPlan
     kernel: str
 
-
-def _work(job: _Job, tile: Tile) -> Pixels:
-    return render_tile(job.product, job.kernel, job.scene.open(), tile)
+    def __call__(self, tile: Tile) -> Made:
+        """Pixels of a tile, and the figures of its anchors."""
+        pixels = render_tile(self.product, self.kernel, self.scene.open(), tile)
+        layer = None if pixels.values is None else (pixels.values, pixels.valid)
+        return Made((layer,), {"worst_residual": pixels.residual, "cells": pixels.cells})
 
 
 def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list[ProductResult]:
@@ -124,14 +113,13 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     kept = finished_products(plan, folder, run.overwrite)
     _make_folder(folder)
     if kept:
-        run.talk(f"{len(kept)} of {len(plan.products)} products are finished already")
-    results = []
+        run.events.talk(f"{len(kept)} of {len(plan.products)} products are finished already")
+    run.events.begin("tiles", sum(len(p.plan.tiles) for p in plan.products))
     with Workers(make) as workers:
-        for product in plan.products:
-            results.append(
-                kept.get(product.plan.name) or _make(plan, product, folder, run, partial(_tiles, workers, in_flight))
-            )
-            run.report(results[-1])
+        results = run_works(
+            (_work(plan, p, folder, run, kept.get(p.plan.name)) for p in plan.products),
+            Runner(workers, in_flight, run.events),
+        )
     if run.quicklook:
         write_overview([r.path for r in results if not r.failed], picture)
     failed = [f"{r.path.name}: tiles {', '.join(map(str, r.failed))} ({r.reason})" for r in results if r.failed]
@@ -167,26 +155,18 @@ def _make_folder(folder: Path) -> None:
         raise UsageError(f"{folder}: no such folder, and it cannot be made ({error.strerror})") from None
 
 
-def _tiles(workers: Workers, in_flight: int, job: _Job, tiles: list[Tile]) -> Iterator[Outcome]:
-    return run_tiles(tiles, partial(_work, job), workers, in_flight)
-
-
-def _make(
-    plan: OrthoPlan,
-    product: OrthoProduct,
-    folder: Path,
-    run: Run,
-    compute: Callable[[_Job, list[Tile]], Iterator[Outcome]],
-) -> ProductResult:
-    started = time.perf_counter()
+def _work(
+    plan: OrthoPlan, product: OrthoProduct, folder: Path, run: Run, kept: ProductResult | None
+) -> Work[ProductResult] | Kept[ProductResult]:
+    """What there is to do for a product."""
+    if kept is not None:
+        return Kept(kept, len(product.plan.tiles))
     settings, scene = plan.settings, open_scene(plan.project, product.plan.image)
     for note in scene.notes:
-        run.talk(f"note: {note}")
+        run.events.talk(f"note: {note}")
     if not is_compiled(scene.reader.dtype, scene.reader.bands, settings.kernel):
-        run.talk("compiling the resampling kernels for this kind of image, once (up to a minute)")
-    job = _Job(scene.address, replace(product.plan, tiles=()), settings.kernel)
-    tally = _Tally()
-    with ProductFile(
+        run.events.talk("compiling the resampling kernels for this kind of image, once (up to a minute)")
+    file = ProductFile(
         product_path(folder, product),
         product.grid.placement,
         scene.reader.bands,
@@ -199,16 +179,36 @@ def _make(
         overwrite=run.overwrite,
         inputs=scene.files,
         threads=run.workers,
-    ) as file:
-        _collect(file, product.plan, scene, partial(compute, job), run, tally)
-        facts = None if tally.failed else file.complete(_tags(plan, product))
+    )
+    return Work(
+        name=product.plan.name,
+        job=OrthoJob(scene.address, replace(product.plan, tiles=()), settings.kernel),
+        tiles=product.plan.tiles,
+        count=product.plan.tile_count,
+        sinks=(file,),
+        complete=partial(_complete, plan, product, scene, run, file, run_times()),
+    )
+
+
+def _complete(
+    plan: OrthoPlan,
+    product: OrthoProduct,
+    scene: Scene,
+    run: Run,
+    file: ProductFile,
+    times: Callable[[], dict[str, Any]],
+    tally: Tally,
+) -> ProductResult:
+    """Give the product its name and its record; with failed tiles it gets neither."""
+    facts = None if tally.failed else file.complete(_tags(plan, product))
+    ran = times()
     result = ProductResult(
-        product_path(folder, product),
+        file.path,
         product.plan.image,
-        time.perf_counter() - started,
+        ran["seconds"],
         0.0 if facts is None else facts.valid_share,
-        tally.residual,
-        tally.cells,
+        tally.totals.get("worst_residual", 0.0),
+        tally.totals.get("cells", 0),
         product.plan.tile_count,
         tally.resumed,
         tuple(sorted(tally.failed)),
@@ -216,64 +216,11 @@ def _make(
     )
     if facts is not None:
         record = _record(plan, product, scene, run, result)
+        record["run"] |= ran
         write_run_record(
             record_path(result.path), {**record, "values_moved_off_nodata": facts.moved_values, "bytes": facts.bytes}
         )
     return result
-
-
-def _collect(
-    file: ProductFile,
-    product: ProductPlan,
-    scene: Scene,
-    compute: Callable[[list[Tile]], Iterator[Outcome]],
-    run: Run,
-    tally: _Tally,
-) -> None:
-    """Bring every tile of a product into its file: those of an earlier run are there, the others are computed."""
-    finished = file.finished
-    for tile in product.tiles:
-        if tile.index in finished:
-            tally.again(compile_tile(product, tile.window, scene.camera, scene.surface).anchors)
-    if tally.resumed:
-        run.talk(f"{product.name}: {tally.resumed} of {len(product.tiles)} tiles are finished already")
-        run.progress(tally.resumed, 0)
-    # Tiles that the plan leaves out hold nothing of the image.
-    for index in set(range(product.tile_count)) - {tile.index for tile in product.tiles} - finished:
-        file.append_empty(index)
-    for outcome in compute([tile for tile in product.tiles if tile.index not in finished]):
-        done: Tile = outcome.task
-        if outcome.error is not None:
-            tally.failed.append(done.index)
-            tally.reasons.append(f"tile {done.index}: {outcome.error}")
-        else:
-            pixels: Pixels = outcome.result
-            if pixels.values is None:
-                file.append_empty(done.index)
-            else:
-                file.append(done.index, pixels.values, pixels.valid)
-            tally.add(pixels)
-        run.progress(1, done.window.size)
-
-
-@dataclass
-class _Tally:
-    residual: float = 0.0
-    cells: int = 0
-    resumed: int = 0
-    failed: list[int] = field(default_factory=list)
-    reasons: list[str] = field(default_factory=list)
-
-    def add(self, pixels: Pixels) -> None:
-        self.residual = max(self.residual, pixels.residual)
-        self.cells += pixels.cells
-
-    def again(self, anchors: Anchors | None) -> None:
-        """Count a tile that an earlier run has finished."""
-        self.resumed += 1
-        if anchors is not None:
-            self.residual = max(self.residual, anchors.residual)
-            self.cells += len(anchors.corners)
 
 
 def _tags(plan: OrthoPlan, product: OrthoProduct) -> dict[str, str]:

@@ -17,6 +17,7 @@ from photoplan.cameras.base import Camera
 from photoplan.engine.execute import Pixels
 from photoplan.engine.execute import render as render_window
 from photoplan.errors import GeometryError, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.names import safe_stem
 from photoplan.io.project.model import Project
@@ -82,7 +83,12 @@ class OrthoPlan:
 
 
 def plan_orthophotos(
-    project: Project, images: Sequence[str] | None = None, settings: OrthoSettings | None = None, **changes: Any
+    project: Project,
+    images: Sequence[str] | None = None,
+    settings: OrthoSettings | None = None,
+    *,
+    events: Events = SILENT,
+    **changes: Any,
 ) -> OrthoPlan:
     """Plan an orthophoto for each image; no pixel is touched.
 
@@ -93,6 +99,8 @@ def plan_orthophotos(
         Names of images (patterns with ``*`` and ``?`` allowed); all images if it is None.
     settings : OrthoSettings, optional
         The project's own if it is None.
+    events : Events
+        Told of each image.
     **changes
         Single settings by name, for example ``resolution=0.1``.
 
@@ -110,13 +118,17 @@ def plan_orthophotos(
         chosen = OrthoSettings.from_dict({**chosen.to_dict(), **changes})
     looks = []
     blind: list[str] = []
-    for name in project.select(images):
+    names = project.select(images)
+    # Each image is looked at twice: where it lies, and which tiles it needs.
+    events.begin("planning", 2 * len(names), "steps")
+    for name in names:
         scene = open_scene(project, name)
         coverage = cover(scene.camera, scene.surface, scene.terrain_bounds)
         if coverage.bounds is None:
             blind.append(_sees_no_terrain(scene, name))
         else:
             looks.append((name, scene, coverage, mean_gsd(scene.camera, coverage)))
+        events.done()
     resolution = chosen.resolution or (two_figures(float(np.mean([look[3] for look in looks]))) if looks else 1.0)
     products = []
     for name, scene, coverage, gsd in looks:
@@ -125,6 +137,7 @@ def plan_orthophotos(
             blind.append(f"{name}: sees {_extent(coverage.bounds)}; the bounds are {_extent(chosen.bounds)}")
         else:
             products.append(OrthoProduct(plan, coverage, gsd, _key(scene, plan, chosen)))
+        events.done()
     if not products:
         where = "the terrain" if chosen.bounds is None else "terrain inside the bounds"
         raise GeometryError(f"no image sees {where} (xmin ymin xmax ymax in metres):\n  " + "\n  ".join(blind))

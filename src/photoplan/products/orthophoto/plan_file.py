@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 import sqlite3
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from photoplan import __version__
 from photoplan.errors import InputError, ResourceError, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.io.disk import disk_error, free_megabytes
 from photoplan.io.plan_file import PlanTables, read_plan_tables, write_plan_tables
 from photoplan.io.product import check_output
@@ -84,15 +84,16 @@ class PlanFigures:
         }
 
 
-def compile_figures(plan: OrthoPlan, report: Callable[[int, int], None] = lambda tiles, pixels: None) -> PlanFigures:
+def compile_figures(plan: OrthoPlan, events: Events = SILENT) -> PlanFigures:
     """Compile relief and anchors of every tile, keep the figures, forget the rest.
 
     Parameters
     ----------
     plan : OrthoPlan
-    report : callable
-        Called after each tile with 1 and its number of pixels.
+    events : Events
+        Told of each tile.
     """
+    events.begin("compiling tiles", sum(len(p.plan.tiles) for p in plan.products))
     rows: list[tuple[Any, ...]] = []
     for product in plan.products:
         scene = open_scene(plan.project, product.plan.image)
@@ -116,7 +117,7 @@ def compile_figures(plan: OrthoPlan, report: Callable[[int, int], None] = lambda
                     bounds,
                 )
             )
-            report(1, tile.window.size)
+            events.done(1, tile.window.size)
     columns = list(zip(*rows))
     return PlanFigures(
         np.array(columns[0], object),

@@ -1,0 +1,114 @@
+"""Events on stderr: a line that moves on a terminal, a line now and then without one."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from types import TracebackType
+
+import click
+
+#: Seconds between two lines where there is no terminal, and between two changes of the line on one.
+SELDOM, OFTEN = 30.0, 0.1
+_BAR = 24
+
+
+class Telling:
+    """The events of a command; a context manager that leaves no unfinished line behind.
+
+    Parameters
+    ----------
+    quiet : bool
+        Whether nothing is told but results.
+    result : callable
+        Prints a result; it goes to stdout.
+    terminal : bool or None
+        Whether stderr is one; None: as it is.
+    clock : callable
+        Seconds from anywhere.
+    """
+
+    def __init__(
+        self,
+        quiet: bool,
+        result: Callable[[object], None] = lambda value: None,
+        terminal: bool | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._quiet, self._print, self._clock = quiet, result, clock
+        self._terminal = sys.stderr.isatty() if terminal is None else terminal
+        self._drawn = False
+        self.results: list[object] = []
+        """All results so far."""
+        self.begin("")
+
+    def __enter__(self) -> Telling:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._clear()
+
+    def begin(self, phase: str, units: int = 0, unit: str = "tiles") -> None:
+        """A phase begins."""
+        self._phase, self._units, self._unit = phase, units, unit
+        self._finished = self._pixels = 0
+        self._began = self._last = self._clock()
+
+    def done(self, units: int = 1, pixels: int = 0) -> None:
+        """Count what is done; tell it if that is due."""
+        self._finished += units
+        self._pixels += pixels
+        now = self._clock()
+        if self._quiet or not self._phase or now - self._last < (OFTEN if self._terminal else SELDOM):
+            return
+        self._last = now
+        if self._terminal:
+            self._clear()
+            click.echo(self.line(now), err=True, nl=False)
+            self._drawn = True
+        else:
+            click.echo(self.line(now), err=True)
+
+    def line(self, now: float) -> str:
+        """What there is to say at a time: phase, units done, rate, time left."""
+        took = max(now - self._began, 1e-6)
+        words = [f"{self._phase}:"]
+        if self._units:
+            share = min(1.0, self._finished / self._units)
+            if self._terminal:
+                words.append("▇" * round(_BAR * share) + "·" * (_BAR - round(_BAR * share)))
+            words.append(f"{self._finished}/{self._units} {self._unit}")
+        elif self._finished:
+            words.append(f"{self._finished} {self._unit}")
+        if self._pixels:
+            words.append(f"{self._pixels / 1e6 / took:.3g} Mpx/s")
+        if 0 < self._finished < self._units:
+            words.append(f"{_time(took / self._finished * (self._units - self._finished))} left")
+        else:
+            words.append(f"for {_time(took)}")
+        return " ".join(words)
+
+    def talk(self, text: str) -> None:
+        """Say something on stderr."""
+        if not self._quiet:
+            self._clear()
+            click.echo(text, err=True)
+
+    def result(self, value: object) -> None:
+        """Keep a result and print it."""
+        self.results.append(value)
+        self._clear()
+        self._print(value)
+
+    def _clear(self) -> None:
+        if self._drawn:
+            click.echo("\r\x1b[K", err=True, nl=False, color=True)
+            self._drawn = False
+
+
+def _time(seconds: float) -> str:
+    whole = round(seconds)
+    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"

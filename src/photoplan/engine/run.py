@@ -1,0 +1,298 @@
+"""The one loop: tiles to workers, pixels and figures to sinks, what is finished kept, products completed meanwhile.
+
+A product says what a tile is (`Work.job`), where its outputs go (`Work.sinks`) and what is done when all tiles are
+there (`Work.complete`). Order, retries, resuming and the bound on memory are here. While one product is completed (its
+file assembled, compared and named), the tiles of the next one are computed.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.engine.executors import PULSE, Workers, run_tiles
+from photoplan.errors import PhotoplanError, UsageError
+from photoplan.events import Events
+from photoplan.plan.product import Tile
+
+Layer = tuple[NDArray[Any], NDArray[np.bool_] | None]
+"""Values of a tile, shape (bands, height, width), and their validity, (height, width); None: all are valid."""
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """What became of one tile."""
+
+    layers: tuple[Layer | None, ...]
+    """One for each sink; None: not one valid pixel."""
+    record: Mapping[str, Any] = field(default_factory=dict)
+    """Figures that the product adds up, kept with the tile: numbers and lists of numbers. Names that begin with
+    ``worst`` are maxima, all others sums."""
+
+
+class Sink(Protocol):
+    """One of the outputs of a product: it keeps finished tiles, whatever happens; open inside its context."""
+
+    def __enter__(self) -> Any: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+    @property
+    def finished(self) -> frozenset[int]:
+        """Indices of the tiles that it has, those of an earlier run among them."""
+        ...
+
+    def append(self, index: int, pixels: NDArray[Any], valid: NDArray[np.bool_] | None, record: Any, /) -> None:
+        """Keep a tile and its record."""
+        ...
+
+    def append_empty(self, index: int, record: Any = ..., /) -> None:
+        """Keep that a tile has no valid pixel."""
+        ...
+
+    def record(self, index: int) -> dict[str, Any]:
+        """The record that was kept with a tile."""
+        ...
+
+
+@dataclass
+class Tally:
+    """Figures of all tiles of a product so far."""
+
+    totals: dict[str, Any] = field(default_factory=dict)
+    resumed: int = 0
+    """Tiles taken over from an earlier run."""
+    failed: list[int] = field(default_factory=list)
+    reasons: list[str] = field(default_factory=list)
+
+    def add(self, record: Mapping[str, Any]) -> None:
+        """Add a tile's figures: maxima of those that begin with ``worst``, sums of the others."""
+        for name, value in record.items():
+            before = self.totals.get(name)
+            if before is None:
+                self.totals[name] = value
+            elif name.startswith("worst"):
+                self.totals[name] = max(before, value)
+            else:
+                self.totals[name] = (
+                    [a + b for a, b in zip(before, value, strict=True)] if isinstance(value, list) else before + value
+                )
+
+
+@dataclass(frozen=True, eq=False)
+class Work(Generic[T]):
+    """One product to be made."""
+
+    name: str
+    job: Callable[[Tile], Made]
+    """Makes a tile: what a worker is told once, small; it pickles for processes and clusters."""
+    tiles: Sequence[Tile]
+    """Tiles that can hold something."""
+    count: int
+    """All tiles; those that `tiles` leaves out are empty."""
+    sinks: Sequence[Sink]
+    complete: Callable[[Tally], T]
+    """Called when all tiles are there or have failed, with the sinks still open; in a thread of its own."""
+
+
+@dataclass(frozen=True)
+class Kept(Generic[T]):
+    """The result of a product that an earlier run has made."""
+
+    result: T
+    tiles: int
+
+
+def tiles_in_flight(wanted: int, memory: int | None, base: int, each: int) -> int:
+    """Tiles that may be under way at once.
+
+    Parameters
+    ----------
+    wanted : int
+        Without a bound on memory.
+    memory : int or None
+        Bytes that the run should stay under.
+    base, each : int
+        Bytes taken whatever runs, and by each tile.
+
+    Raises
+    ------
+    UsageError
+        `memory` does not suffice for one tile.
+    """
+    if memory is None:
+        return wanted
+    fits = (memory - base) // each
+    if fits < 1:
+        raise UsageError(
+            f"--memory {memory / 2**20:.0f} MiB; at least {(base + each) / 2**20:.0f} MiB are needed for one tile"
+        )
+    return int(min(wanted, fits))
+
+
+class Runner(Generic[T]):
+    """Makes products one after the other; a context manager that waits for the last one.
+
+    Parameters
+    ----------
+    workers : Workers
+        Compute tiles.
+    in_flight : int
+        Tiles under way at once.
+    events : Events
+        Told of tiles that are done, and of each product's result.
+    excuse : callable
+        Gets a product and the error it ended with: returns its result, or raises the error to end the run.
+    """
+
+    def __init__(
+        self,
+        workers: Workers,
+        in_flight: int,
+        events: Events,
+        excuse: Callable[[Work[T], PhotoplanError], T] | None = None,
+    ) -> None:
+        self.results: list[T] = []
+        """In the order of the products; complete when the context ends."""
+        self._workers, self._in_flight, self._events = workers, in_flight, events
+        self._excuse = excuse
+        self._completing: deque[tuple[Work[T] | Kept[T], Future[T]]] = deque()
+        self._pool = ThreadPoolExecutor(1, "photoplan-complete")
+
+    def __enter__(self) -> Runner[T]:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is not None and not isinstance(error, Exception):
+            self._pool.shutdown(wait=False, cancel_futures=True)
+            return
+        try:
+            # Also after an error: what is complete but for its name is a result.
+            self._settle(0)
+        except Exception:
+            if error is None:
+                raise
+        finally:
+            self._pool.shutdown()
+
+    def make(self, work: Work[T] | Kept[T]) -> None:
+        """Compute a product's tiles, and have it completed."""
+        if isinstance(work, Kept):
+            future: Future[T] = Future()
+            future.set_result(work.result)
+            self._events.done(work.tiles)
+        else:
+            with ExitStack() as opened:
+                try:
+                    for sink in work.sinks:
+                        opened.enter_context(sink)
+                    tally = self._compute(work)
+                except PhotoplanError as error:
+                    self._settle(0)
+                    self._tell(self._excused(work, error))
+                    return
+                # Files of one product are assembled at a time; that of the next one is already computed.
+                self._settle(0)
+                future = self._pool.submit(_complete, work, tally, opened.pop_all())
+        self._completing.append((work, future))
+        self._settle_done()
+
+    def _compute(self, work: Work[T]) -> Tally:
+        """Bring every tile of a product into its sinks: those of an earlier run are there, the others are computed."""
+        tally = Tally()
+        finished = frozenset.intersection(*(sink.finished for sink in work.sinks))
+        for tile in work.tiles:
+            if tile.index in finished:
+                tally.resumed += 1
+                tally.add(work.sinks[0].record(tile.index))
+        if tally.resumed:
+            self._events.talk(f"{work.name}: {tally.resumed} of {len(work.tiles)} tiles are finished already")
+            self._events.done(tally.resumed)
+        for index in set(range(work.count)) - {tile.index for tile in work.tiles} - finished:
+            for sink in work.sinks:
+                sink.append_empty(index)
+        waiting = [tile for tile in work.tiles if tile.index not in finished]
+        for outcome in run_tiles(waiting, work.job, self._workers, self._in_flight, self._pulse):
+            tile = outcome.task
+            if outcome.error is None:
+                _store(work.sinks, tile.index, outcome.result)
+                tally.add(outcome.result.record)
+            else:
+                tally.failed.append(tile.index)
+                tally.reasons.append(f"tile {tile.index}: {outcome.error}")
+            self._events.done(1, tile.window.size)
+            self._settle_done()
+        return tally
+
+    def _pulse(self) -> None:
+        self._events.done(0)
+        self._settle_done()
+
+    def _settle_done(self) -> None:
+        while self._completing and self._completing[0][1].done():
+            self._take()
+
+    def _settle(self, left: int) -> None:
+        """Wait until no more than `left` products are being completed."""
+        while len(self._completing) > left:
+            while not wait([self._completing[0][1]], PULSE).done:
+                self._events.done(0)
+            self._take()
+
+    def _take(self) -> None:
+        work, future = self._completing.popleft()
+        try:
+            result = future.result()
+        except PhotoplanError as error:
+            assert isinstance(work, Work)
+            result = self._excused(work, error)
+        self._tell(result)
+
+    def _excused(self, work: Work[T], error: PhotoplanError) -> T:
+        if self._excuse is None:
+            raise error
+        return self._excuse(work, error)
+
+    def _tell(self, result: T) -> None:
+        self.results.append(result)
+        self._events.result(result)
+
+
+def _store(sinks: Sequence[Sink], index: int, made: Made) -> None:
+    for sink, layer in zip(sinks, made.layers, strict=True):
+        if layer is None:
+            sink.append_empty(index, made.record)
+        else:
+            sink.append(index, *layer, made.record)
+
+
+def _complete(work: Work[T], tally: Tally, opened: ExitStack) -> T:
+    with opened:
+        return work.complete(tally)
+
+
+def run_works(works: Iterable[Work[T] | Kept[T]], runner: Runner[T]) -> list[T]:
+    """Make all products.
+
+    Raises
+    ------
+    PhotoplanError
+        A product could not be made, and its error was not excused; finished tiles are kept.
+    """
+    with runner:
+        for work in works:
+            runner.make(work)
+    return runner.results

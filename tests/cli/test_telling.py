@@ -1,0 +1,61 @@
+"""Signs of life: seldom without a terminal, often on one, never in the way of results."""
+
+from __future__ import annotations
+
+import pytest
+
+from photoplan.cli.telling import OFTEN, SELDOM, Telling
+
+
+class Clock:
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_without_a_terminal_a_line_now_and_then(capsys: pytest.CaptureFixture[str]) -> None:
+    clock = Clock()
+    with Telling(False, terminal=False, clock=clock) as events:
+        events.begin("tiles", 100)
+        for _ in range(50):
+            clock.now += SELDOM / 20
+            events.done(1, 1_000_000)
+        events.begin("completing")
+        clock.now += 2 * SELDOM
+        events.done(0)
+    assert capsys.readouterr().err.splitlines() == [
+        "tiles: 20/100 tiles 0.667 Mpx/s 0:02:00 left",
+        "tiles: 40/100 tiles 0.667 Mpx/s 0:01:30 left",
+        "completing: for 0:01:00",
+    ]
+
+
+def test_on_a_terminal_a_line_that_moves_and_gives_way(capsys: pytest.CaptureFixture[str]) -> None:
+    clock = Clock()
+    with Telling(False, print, terminal=True, clock=clock) as events:
+        events.begin("tiles", 4)
+        events.done()
+        clock.now += 2 * OFTEN
+        events.done()
+        events.result("product.tif")
+        clock.now += 2 * OFTEN
+        events.done()
+    said = capsys.readouterr()
+    assert said.out == "product.tif\n"
+    assert said.err.count("\r\x1b[K") == 2 and said.err.endswith("\r\x1b[K")
+    assert "▇▇▇▇▇▇▇▇▇▇▇▇············ 2/4 tiles 0:00:00 left" in said.err
+    assert "\n" not in said.err
+    assert events.results == ["product.tif"]
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_quiet_tells_results_alone(capsys: pytest.CaptureFixture[str], terminal: bool) -> None:
+    clock = Clock()
+    with Telling(True, print, terminal=terminal, clock=clock) as events:
+        events.begin("tiles", 4)
+        clock.now += 10 * SELDOM
+        events.done()
+        events.talk("hello")
+        events.result(7)
+    assert capsys.readouterr() == ("7\n", "")

@@ -1,0 +1,177 @@
+"""The one loop: nothing is made twice, figures add up, products are completed while others are computed."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from tools.events import Told
+
+from photoplan.engine.executors import Workers, executor_factory
+from photoplan.engine.run import Kept, Made, Runner, Tally, Work, run_works, tiles_in_flight
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.grid import Window
+from photoplan.plan.product import Tile
+
+TILES = tuple(Tile(i, Window(i * 4, 0, 4, 4)) for i in range(6))
+
+
+class Memory:
+    """A sink that keeps its tiles in memory, and whether it is open."""
+
+    def __init__(self, tiles: dict[int, tuple[Any, Any]] | None = None) -> None:
+        self.tiles = dict(tiles or {})
+        self.open = False
+
+    def __enter__(self) -> Memory:
+        self.open = True
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.open = False
+
+    @property
+    def finished(self) -> frozenset[int]:
+        return frozenset(self.tiles)
+
+    def append(self, index: int, pixels: Any, valid: Any, record: Any) -> None:
+        assert self.open
+        self.tiles[index] = pixels, record
+
+    def append_empty(self, index: int, record: Any = None) -> None:
+        assert self.open
+        self.tiles[index] = None, record
+
+    def record(self, index: int) -> dict[str, Any]:
+        return self.tiles[index][1] or {}
+
+
+def made(tile: Tile, layers: int = 1) -> Made:
+    pixels = np.full((1, 4, 4), tile.index)
+    return Made(((pixels, None),) * layers, {"worst_residual": tile.index / 10, "cells": 2, "clipped": [1, tile.index]})
+
+
+def work(
+    name: str,
+    sinks: Sequence[Memory],
+    job: Callable[[Tile], Made] = made,
+    complete: Callable[[Tally], Any] = lambda tally: tally,
+) -> Work[Any]:
+    return Work(name=name, job=job, tiles=TILES[:5], count=6, sinks=sinks, complete=complete)
+
+
+def run(*works: Work[Any] | Kept[Any], workers: int = 1, excuse: Any = None) -> tuple[list[Any], Told]:
+    told = Told()
+    told.begin("tiles")
+    with Workers(executor_factory("threads", workers)) as pool:
+        return run_works(works, Runner(pool, 4, told, excuse)), told
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_tiles_go_to_every_sink_and_figures_add_up(workers: int) -> None:
+    sinks = [Memory(), Memory()]
+    (tally,), told = run(work("a", sinks, lambda tile: made(tile, 2)), workers=workers)
+    for sink in sinks:
+        assert sorted(sink.tiles) == list(range(6))
+        assert sink.tiles[5] == (None, None)
+        assert [sink.tiles[i][0][0, 0, 0] for i in range(5)] == list(range(5))
+        assert not sink.open
+    assert tally.totals == {"worst_residual": 0.4, "cells": 10, "clipped": [5, 10]}
+    assert (told.units["tiles"], told.pixels, told.results) == (5, 80, [tally])
+
+
+def test_a_finished_tile_is_not_made_again_and_its_figures_count() -> None:
+    """A tile that one of two sinks lacks is made again, for both."""
+    half, whole = Memory(), Memory()
+    run(work("a", [half, whole], lambda tile: made(tile, 2)))
+    before = dict(whole.tiles)
+    del half.tiles[3]
+    again: list[int] = []
+
+    def job(tile: Tile) -> Made:
+        again.append(tile.index)
+        return made(tile, 2)
+
+    (tally,), told = run(work("a", [half, whole], job))
+    assert again == [3]
+    assert tally.resumed == 4
+    assert tally.totals == {"worst_residual": 0.4, "cells": 10, "clipped": [5, 10]}
+    assert told.talked == ["a: 4 of 5 tiles are finished already"]
+    assert whole.tiles.keys() == before.keys()
+
+
+def test_one_product_is_completed_while_the_next_is_computed() -> None:
+    """The first one's end waits for the second one's first tile: one after the other, neither would come."""
+    begun = threading.Event()
+
+    def job(tile: Tile) -> Made:
+        begun.set()
+        return made(tile)
+
+    def complete(tally: Tally) -> str:
+        assert begun.wait(60)
+        return "first"
+
+    results, told = run(
+        work("a", [Memory()], complete=complete), work("b", [Memory()], job, lambda tally: "second"), Kept("third", 7)
+    )
+    assert results == told.results == ["first", "second", "third"]
+    assert told.units["tiles"] == 17
+
+
+def test_sinks_are_open_while_completed_and_closed_after_an_error() -> None:
+    sinks = [Memory(), Memory()]
+    results, _ = run(work("a", sinks[:1], complete=lambda tally: sinks[0].open))
+    assert results == [True]
+
+    def job(tile: Tile) -> Made:
+        raise InputError("damaged")
+
+    with pytest.raises(InputError):
+        run(work("a", sinks[1:], job))
+    assert not sinks[0].open and not sinks[1].open
+
+
+@pytest.mark.parametrize("where", ["tile", "end"])
+def test_an_excused_error_costs_its_own_product_only(where: str) -> None:
+    def fail(*arguments: Any) -> Any:
+        raise InputError("damaged")
+
+    bad = work("bad", [Memory()], fail) if where == "tile" else work("bad", [Memory()], complete=fail)
+    works = [work("a", [Memory()], complete=lambda t: "a"), bad, work("c", [Memory()], complete=lambda t: "c")]
+    results, told = run(*works, excuse=lambda of, error: f"{of.name}: {error}")
+    assert results == told.results == ["a", "bad: damaged", "c"]
+
+
+def test_what_was_complete_is_told_before_an_error_ends_the_run() -> None:
+    def fail(tile: Tile) -> Made:
+        raise InputError("damaged")
+
+    told = Told()
+    told.begin("tiles")
+    with Workers(executor_factory("threads", 1)) as pool, pytest.raises(InputError):
+        run_works([work("a", [Memory()], complete=lambda t: "a"), work("b", [Memory()], fail)], Runner(pool, 1, told))
+    assert told.results == ["a"]
+
+
+def test_failed_tiles_are_told_to_whoever_completes() -> None:
+    def job(tile: Tile) -> Made:
+        if tile.index == 2:
+            raise RuntimeError("no luck")
+        return made(tile)
+
+    sink = Memory()
+    (tally,), _ = run(work("a", [sink], job))
+    assert (tally.failed, tally.reasons) == ([2], ["tile 2: RuntimeError: no luck"])
+    assert 2 not in sink.tiles
+
+
+def test_memory_bounds_tiles_in_flight() -> None:
+    assert tiles_in_flight(8, None, 100, 10) == 8
+    assert tiles_in_flight(8, 150, 100, 10) == 5
+    assert tiles_in_flight(8, 10**6, 100, 10) == 8
+    with pytest.raises(UsageError, match="--memory 1 MiB; at least 3 MiB"):
+        tiles_in_flight(8, 1 << 20, 1 << 20, 2 << 20)

@@ -1,0 +1,31 @@
+"""Events that are kept, for tests."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+
+class Told:
+    """All that was told."""
+
+    def __init__(self) -> None:
+        self.phases: list[tuple[str, int, str]] = []
+        self.units: Counter[str] = Counter()
+        """Units done, by phase."""
+        self.pixels = 0
+        self.talked: list[str] = []
+        self.results: list[Any] = []
+
+    def begin(self, phase: str, units: int = 0, unit: str = "tiles") -> None:
+        self.phases.append((phase, units, unit))
+
+    def done(self, units: int = 1, pixels: int = 0) -> None:
+        self.units[self.phases[-1][0]] += units
+        self.pixels += pixels
+
+    def talk(self, text: str) -> None:
+        self.talked.append(text)
+
+    def result(self, value: object) -> None:
+        self.results.append(value)
