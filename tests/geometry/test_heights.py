@@ -52,7 +52,7 @@ def test_fault_02_undeclared_heights_are_refused_and_the_message_says_what_to_de
         declared_pair(*pair)
     text = str(error.value)
     assert "not stated" in text
-    assert "--height-system same" in text
+    assert "`height_system` same" in text
     assert "EPSG:nnnn" in text
     assert error.value.exit_code == 3
 

@@ -170,5 +170,5 @@ def test_as_a_target_of_convert_and_as_a_mistaken_orientation(tmp_path: Path) ->
     assert [f.name for f in files] == ["out_cam_1.yml", "out_cam_2.yml"]
     again = {name: c for f in files for name, c in read_cameras(f).cameras.items()}
     assert_same_cameras(block, OrientationBlock(block.table, again))
-    with pytest.raises(InputError, match="describes a camera and no orientation; give it with --camera"):
+    with pytest.raises(InputError, match="describes a camera and no orientation; give it with `camera`"):
         read_orientation(files[0])

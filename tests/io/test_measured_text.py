@@ -72,7 +72,7 @@ def test_fault_18_points_are_read_however_they_are_written(write: Write, text: s
         ("x,y,z\n", "only a header"),
         ("# nothing\n\n", "no line with data"),
         ("1,5 2,5 3,5\n1,5 2,5 3,5\n", r"p\.csv:1: .*decimal commas"),
-        ("1;2;3\n4;5;6,5\n", r"p\.csv:2: z = '6,5'.*--decimal-comma"),
+        ("1;2;3\n4;5;6,5\n", r"p\.csv:2: z = '6,5'.*`decimal_comma`"),
         ("a b c\n1 2 3\n", "neither a record nor a header"),
         ("1 2\n3 4\n", "fewer than three columns"),
         ("1 2 3 code 0.1 n l 4 5\n1 2 3 code 0.1 n l 4 5\n", "9 columns without a header"),

@@ -70,7 +70,7 @@ class TestLaboratory:
         assert table.per_pixel(None).tolist() == [0.1, 0.4]
         table = read_mtf_table(written(tmp_path, "lp/mm;MTF\n20;0.8\n40;0.5\n"))
         np.testing.assert_allclose(table.per_pixel(6.5), [0.13, 0.26])
-        with pytest.raises(InputError, match="--pixel-size"):
+        with pytest.raises(InputError, match="`pixel_size`"):
             table.per_pixel(None)
 
     @pytest.mark.parametrize(

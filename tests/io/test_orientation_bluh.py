@@ -107,7 +107,7 @@ def test_other_conventions_are_declared(tmp_path):
     assert (table.angle_unit, table.rotation, table.direction) == ("rad", "kpo", "ground-to-camera")
     assert table.images[0].angles == (3.0, 1.0, 2.0)
     # The value that is the default of tables has to be declared expressly.
-    with pytest.raises(InputError, match="tells the unit of angles in files of BLUH; declare --angle-unit"):
+    with pytest.raises(InputError, match="tells the unit of angles in files of BLUH; declare `angle_unit`"):
         read_orientation(path, TableFormat(angle_unit="deg"), "bluh")
     declared = TableFormat(angle_unit="deg", rotation="opk", declared=frozenset({"angle_unit", "rotation"}))
     table = read_orientation(path, declared, "bluh")

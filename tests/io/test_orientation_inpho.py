@@ -107,7 +107,7 @@ def test_fault_14_what_the_matrix_does_is_told_by_angles_in_the_file_or_declared
     np.testing.assert_allclose(found.rotations[0], R, atol=1e-12)
     # In gon the same numbers mean something else, which fits neither.
     text = TEXT.replace("$ANGULAR_UNITS : deg", "$ANGULAR_UNITS : gon") + own
-    with pytest.raises(InputError, match=r"differ from the angles of \$INS by \d+° or more, .*--list-readings"):
+    with pytest.raises(InputError, match=r"differ from the angles of \$INS by \d+° or more, .*`list_readings`"):
         read_orientation_block(write(tmp_path, text))
     # A declaration stands above the angles.
     assert np.allclose(read_orientation_block(write(tmp_path, TEXT + own), TO_CAMERA).table.rotations[0], R)

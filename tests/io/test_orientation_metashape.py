@@ -257,7 +257,7 @@ def test_losses_and_refusals_in_writing(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="none is given"):
         write_orientation(block_of({}), tmp_path / "c.xml", "metashape")
     write_orientation(block_of({"a": frame()}), tmp_path / "c.xml", "metashape")
-    with pytest.raises(UsageError, match="--overwrite"):
+    with pytest.raises(UsageError, match="`overwrite`"):
         write_orientation(block_of({"a": frame()}), tmp_path / "c.xml", "metashape")
 
 

@@ -44,7 +44,7 @@ def test_both_directions_against_the_collinearity_equations(tmp_path):
 
 
 def test_fault_14_what_the_matrix_does_is_not_guessed(tmp_path):
-    with pytest.raises(InputError, match=r"block\.ori: .*declare --rotation-direction .*--list-readings"):
+    with pytest.raises(InputError, match=r"block\.ori: .*declare `rotation_direction` .*`list_readings`"):
         read_orientation(write(tmp_path))
 
 

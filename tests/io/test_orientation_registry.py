@@ -41,7 +41,7 @@ def test_a_file_that_two_formats_claim_is_asked_about(tmp_path, monkeypatch):
     """Both marks in one file: the user says which it is."""
     path = tmp_path / "both.txt"
     path.write_text("$PROJECT 5\nORIA a 1 2 3 4 5 6\n")
-    with pytest.raises(InputError, match=r"bingo \(.*\), inpho \(.*\); say it with --format"):
+    with pytest.raises(InputError, match=r"bingo \(.*\), inpho \(.*\); say it with `format`"):
         read_orientation(path)
     assert read_orientation(path, format="bingo").images[0].name == "a"
 
@@ -170,6 +170,6 @@ def test_a_local_system_is_refused_where_its_origin_cannot_be_stated(tmp_path, n
 
     made = block()
     local = replace(made, table=replace(made.table, origin=(47.0, 11.0, 600.0)))
-    with pytest.raises(InputError, match="carry them into a map with --crs"):
+    with pytest.raises(InputError, match="carry them into a map with `crs`"):
         write_orientation(local, tmp_path / "x", name)
     assert not list(tmp_path.iterdir())

@@ -70,7 +70,7 @@ def test_fault_18_delimiters_line_ends_and_marks(tmp_path: Path, delimiter: str,
 def test_fault_18_decimal_comma_is_read_when_declared_and_hinted_at_when_not(tmp_path: Path) -> None:
     text = "name;x;y;z;omega;phi;kappa\na;1,5;2,25;3;0,5;-0,5;100\n"
     path = write(tmp_path, text)
-    with pytest.raises(InputError, match=r"ext\.csv:2: x = '1,5' is not a number; .*--decimal-comma"):
+    with pytest.raises(InputError, match=r"ext\.csv:2: x = '1,5' is not a number; .*`decimal_comma`"):
         read_orientation(path)
     assert read_orientation(path, TableFormat(decimal_comma=True)).images[0].center == (1.5, 2.25, 3.0)
     with pytest.raises(UsageError, match="both delimiter and decimal sign"):

@@ -40,7 +40,7 @@ class TestFault13Output:
     def test_fault_13_existing(self, tmp_path: Path) -> None:
         path = tmp_path / "a.tif"
         path.write_text("precious")
-        with pytest.raises(UsageError, match=r"a\.tif: exists already; .*--overwrite") as error:
+        with pytest.raises(UsageError, match=r"a\.tif: exists already; .*`overwrite`") as error:
             run(path)
         assert error.value.exit_code == 2
         assert path.read_text() == "precious"

@@ -364,7 +364,7 @@ def test_fault_13_outputs_are_refused_before_any_work(tmp_path: Path) -> None:
     made = write_project(tmp_path)
     exactly(made)
     text = made.project_text()
-    with pytest.raises(UsageError, match=r"report\.html: exists already; choose another output or say --overwrite"):
+    with pytest.raises(UsageError, match=r"report\.html: exists already; choose another output or say `overwrite`"):
         exactly(made)
     assert made.project_text() == text
     (tmp_path / "control.csv").rename(tmp_path / "away.csv")

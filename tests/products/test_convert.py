@@ -77,7 +77,7 @@ def test_unknown_formats_are_refused(toml):
 
 def test_a_lens_is_never_lost_in_silence(block, tmp_path):
     request = ConvertRequest(block / "ext.csv", "inpho", tmp_path / "o.prj", camera=block / "int.yaml")
-    with pytest.raises(UsageError, match=r"no lens of type opencv .*--drop-lens"):
+    with pytest.raises(UsageError, match=r"no lens of type opencv .*`drop_lens`"):
         convert_orientation(request)
     assert not (tmp_path / "o.prj").exists()
     done = convert_orientation(
@@ -210,7 +210,7 @@ def test_fault_14_readings_of_a_table_and_the_options_to_give(tmp_path, toml, me
     found = list_readings(ConvertRequest(table, "csv", camera=toml), *measured)
     assert (found.points, found.images, found.matrices) == (120, 3, False)
     options = found.options(found.fitting[0].reading)
-    assert options == f"--angle-unit {unit} --rotation kpo --rotation-direction ground-to-camera"
+    assert options == f"`angle_unit` {unit} `rotation` kpo `rotation_direction` ground-to-camera"
     assert len(found.fitting) == 1 and len(found.others) == 5
     assert found.fitting[0].median < 0.02
     assert found.to_dict()["fitting"][0]["options"] == options
@@ -220,7 +220,7 @@ def test_fault_14_readings_of_matrices(tmp_path, toml, measured):
     path = convert_orientation(ConvertRequest(toml, "patb", tmp_path / "o.ori", matrix="ground-to-camera")).files[0]
     found = list_readings(ConvertRequest(path, "csv", camera=toml), *measured)
     assert found.matrices
-    assert [found.options(f.reading) for f in found.fitting] == ["--rotation-direction ground-to-camera"]
+    assert [found.options(f.reading) for f in found.fitting] == ["`rotation_direction` ground-to-camera"]
 
 
 def test_readings_of_film_scans_use_their_marks(tmp_path):
@@ -266,7 +266,7 @@ def test_readings_of_film_scans_use_their_marks(tmp_path):
 
 def test_readings_need_a_camera_and_say_when_none_fits(tmp_path, toml, measured):
     bare = write_orientation(block(camera=None), tmp_path / "bare.csv", "csv")[0]
-    with pytest.raises(UsageError, match="give --camera FILE"):
+    with pytest.raises(UsageError, match="give `camera` FILE"):
         list_readings(ConvertRequest(bare, "csv"), *measured)
     points, control = measured
     text = control.read_text().split("\n")

@@ -55,7 +55,7 @@ def test_fault_20_models_in_degrees_or_feet(tmp_path: Path, crs: str, message: s
 
 def test_fault_20_a_raster_without_crs(tmp_path: Path) -> None:
     dem = write_terrain(tmp_path / "dem.tif", crs=None)
-    with pytest.raises(InputError, match="state it with --crs EPSG:nnnn, it is not guessed"):
+    with pytest.raises(InputError, match="state it with `crs` EPSG:nnnn, it is not guessed"):
         open_terrain(dem)
     assert open_terrain(dem, "EPSG:32633").crs == "EPSG:32633"
     with pytest.raises(InputError, match=r"state it as crs = \.\.\."):

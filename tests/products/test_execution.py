@@ -162,7 +162,7 @@ class TestContinuing:
                 (tmp_path / "one_ortho.run.json").unlink()
             elif change == "damaged":
                 (tmp_path / "one_ortho.run.json").write_text("{}")
-            with pytest.raises(UsageError, match=r"one_ortho\.tif exists; give --overwrite"):
+            with pytest.raises(UsageError, match=r"one_ortho\.tif exists; give `overwrite`"):
                 execute(plan, tmp_path, QUIET)
         assert sorted(p.name for p in tmp_path.iterdir()) == ["one_ortho.run.json", "one_ortho.tif"]
 
@@ -217,7 +217,7 @@ class TestFault06Memory:
         assert counts[-1] > 8
 
     def test_too_little_memory_is_refused_before_any_work(self, plan: OrthoPlan, tmp_path: Path) -> None:
-        with pytest.raises(UsageError, match="--memory 320 MiB; at least 464 MiB are needed"):
+        with pytest.raises(UsageError, match="`memory` 320 MiB; at least 464 MiB are needed"):
             execute(plan, tmp_path / "out", Run(memory=BASE_MEMORY))
         assert not (tmp_path / "out").exists()
 

@@ -98,7 +98,7 @@ def test_fault_02_undeclared_height_systems_stop_after_the_summary(block: Path, 
         init_project(request, said.append)
     assert "18 images" in said[0]
     assert str(error.value).startswith(
-        "height systems: terrain not stated, orientation not stated → declare one, or --height-system same"
+        "height systems: terrain not stated, orientation not stated → declare one, or `height_system` same"
     )
     assert not (tmp_path / "x").exists()
 
@@ -167,7 +167,7 @@ def test_fault_12_stems_that_differ_only_in_what_is_replaced(files: dict[str, An
 def test_fault_13_an_existing_project_is_kept(files: dict[str, Any]) -> None:
     init_project(InitRequest(**files))
     before = InitRequest(**files).path.read_text()
-    with pytest.raises(UsageError, match="--overwrite"):
+    with pytest.raises(UsageError, match="`overwrite`"):
         init_project(InitRequest(**{**files, "terrain": "12.5"}))
     assert InitRequest(**files).path.read_text() == before
     init_project(InitRequest(**{**files, "terrain": "12.5", "overwrite": True}))
@@ -206,7 +206,7 @@ def test_stated_height_systems_are_taken_and_not_overruled_by_accident(files: di
 def test_fault_20_crs_missing_or_unfit(files: dict[str, Any], tmp_path: Path) -> None:
     side = files["orientation"].with_suffix(".prj")
     side.unlink()
-    with pytest.raises(InputError, match=r"ext\.csv: does not state the CRS .*--crs"):
+    with pytest.raises(InputError, match=r"ext\.csv: does not state the CRS .*`crs`"):
         make_project(InitRequest(**files))
     assert make_project(InitRequest(**files, crs="EPSG:32632")).project.crs == "EPSG:32632"
     for crs, says in (("EPSG:4326", "geographic"), ("EPSG:2225", "foot"), ("EPSG:32632+5773", "joins")):
@@ -418,9 +418,9 @@ def test_terrain_without_orientation_and_orientation_without_terrain(files: dict
 
 def test_fault_02_and_20_without_orientation_crs_and_heights_are_declared(files: dict[str, Any]) -> None:
     bare = {**files, "orientation": None, "terrain": None}
-    with pytest.raises(InputError, match=r"nothing states the CRS .*--crs"):
+    with pytest.raises(InputError, match=r"nothing states the CRS .*`crs`"):
         make_project(InitRequest(**bare))
-    with pytest.raises(HeightSystemError, match=r"control points and orientation not stated .*--height-system"):
+    with pytest.raises(HeightSystemError, match=r"control points and orientation not stated .*`height_system`"):
         make_project(InitRequest(**{**bare, "height_system": None}, crs="EPSG:32632"))
     with pytest.raises(InputError, match=r"nowhere\.csv: no such file"):
         make_project(InitRequest(**bare, crs="EPSG:32632", control=(Path("nowhere.csv"),)))

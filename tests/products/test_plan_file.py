@@ -173,7 +173,7 @@ def test_fault_13_a_plan_exists(planned: tuple[Path, OrthoPlan]) -> None:
     path, plan = planned
     figures = compile_figures(plan)
     before = path.read_bytes()
-    with pytest.raises(UsageError, match=r"p\.gpkg.*--overwrite"):
+    with pytest.raises(UsageError, match=r"p\.gpkg.*`overwrite`"):
         write_plan(path, plan, figures, path.parent)
     assert path.read_bytes() == before
     write_plan(path, plan, figures, path.parent, overwrite=True)

@@ -124,7 +124,7 @@ def test_fault_14_gon_read_as_degrees() -> None:
     opk, centers = strips()
     text = fails(assess(views(opk % 360, centers, lambda a: a / 0.9), hills))
     assert "gon" in text
-    assert "--angle-unit gon" in text
+    assert "`angle_unit` gon" in text
 
 
 def test_fault_14_gon_with_a_half_turn_read_as_degrees() -> None:
@@ -135,29 +135,29 @@ def test_fault_14_gon_with_a_half_turn_read_as_degrees() -> None:
     assert len(result.implausible) == 12
     text = fails(result)
     assert "gon" in text
-    assert "--angle-unit gon" in text
+    assert "`angle_unit` gon" in text
     assert "turned by 180°" in text or "y down" in text
 
 
 def test_fault_14_degrees_read_as_gon_and_radians() -> None:
     opk, centers = strips()
-    assert "--angle-unit deg" in fails(assess(views(opk, centers, unit="gon"), hills))
-    assert "--angle-unit deg" in fails(assess(views(opk, centers, unit="rad"), hills))
+    assert "`angle_unit` deg" in fails(assess(views(opk, centers, unit="gon"), hills))
+    assert "`angle_unit` deg" in fails(assess(views(opk, centers, unit="rad"), hills))
 
 
 def test_fault_14_the_declared_unit_is_the_one_that_is_named() -> None:
     opk, centers = strips()
     text = fails(assess(views((opk + 180) % 360 - 180, centers, np.radians, unit="gon"), hills))
-    assert "radians that were declared as gon; declare --angle-unit rad" in text
+    assert "radians that were declared as gon; declare `angle_unit` rad" in text
     opk, centers = strips(heading=150)
     text = fails(assess(views(opk, centers, lambda a: a / 0.9, unit="rad"), hills))
-    assert "gon that were declared as radians; declare --angle-unit gon" in text
+    assert "gon that were declared as radians; declare `angle_unit` gon" in text
 
 
 def test_fault_14_radians_read_as_degrees() -> None:
     opk, centers = strips()
     text = fails(assess(views((opk + 180) % 360 - 180, centers, np.radians), hills))
-    assert "--angle-unit rad" in text
+    assert "`angle_unit` rad" in text
     assert "instead of 0°" in text
 
 
@@ -188,7 +188,7 @@ def test_fault_14_transposed_rotation_of_a_block_in_two_directions() -> None:
     def transposed(a: np.ndarray) -> np.ndarray:
         return np.degrees(angles_from_rotation(rotation_opk(*np.radians(a)).T))
 
-    assert "--rotation-direction ground-to-camera" in fails(assess(views(opk, centers, transposed), hills))
+    assert "`rotation_direction` ground-to-camera" in fails(assess(views(opk, centers, transposed), hills))
 
 
 def inwards(order: str) -> tuple[list[list[float]], np.ndarray]:
@@ -206,7 +206,7 @@ def inwards(order: str) -> tuple[list[list[float]], np.ndarray]:
 @pytest.mark.parametrize("order", ["kpo", "kop", "okp", "pko"])
 def test_fault_14_rotation_order_that_sends_oblique_images_elsewhere(order: str) -> None:
     result = assess(views(*inwards(order)), hills)
-    assert f"--rotation {order}" in fails(result)
+    assert f"`rotation` {order}" in fails(result)
 
 
 @pytest.mark.parametrize("order", ["opk", "pok"])
@@ -238,10 +238,10 @@ def test_every_reading_has_a_sentence_and_the_declared_one_none() -> None:
     ("written", "unit", "says"),
     [
         (lambda a: a, "deg", None),
-        (np.radians, "deg", "--angle-unit rad"),
+        (np.radians, "deg", "`angle_unit` rad"),
         (lambda a: a + np.array([180.0, 0, 0]), "deg", "turned by 180°"),
-        (np.degrees, "deg", "--angle-unit deg"),
-        (lambda a: a, "rad", "degrees that were declared as radians; declare --angle-unit deg"),
+        (np.degrees, "deg", "`angle_unit` deg"),
+        (lambda a: a, "rad", "degrees that were declared as radians; declare `angle_unit` deg"),
     ],
 )
 def test_fault_14_on_the_real_drone_block(

@@ -283,7 +283,7 @@ class TestPlans:
 
     def test_a_point_far_from_all_others_is_refused(self) -> None:
         xyz = np.vstack([with_heights(GROUND, smooth), [6.0e6, 5.0e6, 300.0]])
-        with pytest.raises(InputError, match=r"far from all others.*--grid-width"):
+        with pytest.raises(InputError, match=r"far from all others.*`grid_width`"):
             plan_build(terrain(xyz), BuildSettings())
 
     @pytest.mark.parametrize("count", [3, 4, 9])

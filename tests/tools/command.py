@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -10,9 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import click
 import pytest
 
-from photoplan.cli.main import run
+from photoplan.cli.main import photoplan, run
 
 COMMAND = (sys.executable, "-m", "photoplan.cli.main")
 OPTIONS = ("--resolution", "1", "--tile", "128")
@@ -114,7 +116,44 @@ class Here:
     def __call__(self, *words: object) -> Said:
         self.capture.readouterr()
         code = run([str(word) for word in words])
-        return Said(code, *self.capture.readouterr())
+        said = Said(code, *self.capture.readouterr())
+        assert unknown_options([str(word) for word in words], said.err) == [], said.err
+        return said
+
+
+def verbs() -> dict[str, click.Command]:
+    """Every verb by its words, as in ``"dtm build"``."""
+    found: dict[str, click.Command] = {}
+    for name, command in _subcommands(photoplan).items():
+        below = _subcommands(command) if isinstance(command, click.Group) else {}
+        found |= {f"{name} {word}": verb for word, verb in below.items()} or {name: command}
+    return found
+
+
+def _subcommands(group: click.Group) -> dict[str, click.Command]:
+    context = click.Context(group)
+    return {name: command for name in group.list_commands(context) if (command := group.get_command(context, name))}
+
+
+def options_of(command: click.Command) -> set[str]:
+    """How the options of a verb are spelled."""
+    return {o for p in command.params if isinstance(p, click.Option) for o in (*p.opts, *p.secondary_opts)} | {"--help"}
+
+
+def unknown_options(words: Sequence[str], message: str) -> list[str]:
+    """Options in a message that neither the verb that ran has nor one that the message names with them."""
+    if message.startswith("Usage:") or " --version" in message:  # click names what it does not know
+        return []
+    known = verbs()
+    own = next((known[w] for w in (" ".join(words[:2]), *words[:1]) if w in known), None)
+    allowed = options_of(own) if own else set()
+    for name, command in known.items():
+        if f"photoplan {name} " in message:
+            allowed |= options_of(command)
+    parameters = {o[2:].replace("-", "_") for command in known.values() for o in options_of(command)}
+    left = [word for word in re.findall(r"`([a-z_]+)`", message) if word in parameters]
+    foreign = re.sub(r"(pyproj sync|colmap model_converter) --\w+", "", message)
+    return left + [o for o in re.findall(r"(?<![\w-])--[a-z][a-z-]*", foreign) if o not in allowed]
 
 
 def edit(path: Path, old: str, new: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from photoplan.cli.options import json_option
+from photoplan.cli.output import show, show_json, talking
 
 if TYPE_CHECKING:
     from photoplan.products.adjust.run import AdjustReport
@@ -42,10 +42,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """
     from photoplan.products.adjust.run import AdjustRequest, adjust_project
 
-    def talk(text: str) -> None:
-        if not quiet:
-            click.echo(text, err=True)
-
+    talk = talking(quiet)
     terminal = sys.stderr.isatty() and not quiet
 
     def progress(number: int, rms: float) -> None:
@@ -58,12 +55,12 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     if terminal:
         click.echo("\r\033[K", err=True, nl=False)
     if as_json:
-        click.echo(json.dumps(report.to_dict(), indent=2, ensure_ascii=False))
+        show_json(report.to_dict())
     else:
         for path in report.written:
-            click.echo(str(path))
+            show(path)
         for line in _figures(report):
-            click.echo(line)
+            show(line)
     for line in _talk(report):
         talk(line)
 

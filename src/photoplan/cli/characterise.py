@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.failures import end_with_failures
 from photoplan.cli.options import json_option
+from photoplan.cli.output import end_with_failures, say, show, show_json
 
 if TYPE_CHECKING:
     from photoplan.products.characterise.run import AnalysisRun, CharacteriseReport
@@ -36,7 +35,7 @@ def command(series: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     request = CharacteriseRequest(series, **options)
     report = characterise(request, lambda total: progress(total, quiet, "analyses"))
     if as_json:
-        click.echo(json.dumps(report.to_dict(), indent=2, ensure_ascii=False))
+        show_json(report.to_dict())
     else:
         _print(report)
     if not quiet:
@@ -48,30 +47,29 @@ def _print(report: CharacteriseReport) -> None:
     """Figures, refusals and paths on stdout."""
     for run in report.runs:
         if run.state == "possible":
-            click.echo(f"{run.analysis.name}: possible")
+            show(f"{run.analysis.name}: possible")
         if run.outcome is not None:
-            click.echo(run.analysis.title)
+            show(run.analysis.title)
             for figure in run.outcome.figures:
-                click.echo(f"  {figure}")
+                show(f"  {figure}")
             for what, why in run.outcome.refused.items():
-                click.echo(f"  not known: {what}: {why}")
+                show(f"  not known: {what}: {why}")
     for path in report.written:
-        click.echo(str(path))
+        show(path)
 
 
 def _talk(report: CharacteriseReport, dry_run: bool) -> None:
     """What was not done, and remarks, on stderr."""
     for note in report.notes:
-        click.echo(note, err=True)
+        say(note)
     for run in report.runs:
         for note in _notes(run):
-            click.echo(note, err=True)
+            say(note)
     states = [run.state for run in report.runs]
     done = states.count("possible" if dry_run else "done")
-    click.echo(
+    say(
         f"{len(report.series.frames)} frames, {len(report.series.reduced)} reduced figures: {done} analyses "
-        f"{'possible' if dry_run else 'done'}, {states.count('missing')} lack data",
-        err=True,
+        f"{'possible' if dry_run else 'done'}, {states.count('missing')} lack data"
     )
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
 
 from photoplan.cli.options import json_option
+from photoplan.cli.output import show, show_json
 
 
 @click.command("check")
@@ -25,9 +25,9 @@ def command(project: Path, images: tuple[str, ...], as_json: bool) -> None:
 
     found = check_project(load_project(project), images or None)
     if as_json:
-        click.echo(json.dumps(found.to_dict(), indent=2))
+        show_json(found.to_dict())
     else:
-        click.echo(str(found))
+        show(found)
     if found.implausible or found.alternative is not None:
         faults = f"{len(found.implausible)} of {len(found.images)} images are implausible"
         if not found.implausible:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import click
 
 from photoplan.cli.options import json_option
+from photoplan.cli.output import say, show, show_json
 
 
 @click.command("control")
@@ -53,25 +53,25 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     request = ControlRequest(**options)
     found = propose_control(request, lambda words, count: progress(count, quiet, words))
     if as_json:
-        click.echo(json.dumps(found.to_dict(), indent=2, ensure_ascii=False))
+        show_json(found.to_dict())
         return
     if found.output is None:
-        click.echo(f"{found.patches} patches at {found.resolution:g} m")
+        show(f"{found.patches} patches at {found.resolution:g} m")
         return
-    click.echo(str(found.output))
-    click.echo(str(found.image_points))
+    show(found.output)
+    show(found.image_points)
     plane, height, image = found.sigma
-    click.echo(
+    show(
         f"{found.points} control points of {found.patches} patches at {found.resolution:g} m; standard deviations "
         f"{plane:.2g} m, height {height:.2g} m, image {image:.2g} px (medians)"
     )
     width = max(5, *(len(i.name) for i in found.images))
-    click.echo(f"{'image':{width}}  tried found  kept  shift px          residual px")
+    show(f"{'image':{width}}  tried found  kept  shift px          residual px")
     for i in found.images:
         x, y, rms = (f"{v:.{digits}f}" if math.isfinite(v) else "–" for v, digits in zip((*i.shift, i.rms), (1, 1, 2)))
-        click.echo(f"{i.name:{width}} {i.tried:6} {i.matched:5} {len(i.points):5}  {x:>7} {y:>7}  {rms:>10}")
+        show(f"{i.name:{width}} {i.tried:6} {i.matched:5} {len(i.points):5}  {x:>7} {y:>7}  {rms:>10}")
     if not quiet:
         for i in found.images:
             if not len(i.points):
                 reasons = ", ".join(f"{count} {reason}" for reason, count in i.reasons.items())
-                click.echo(f"{i.name}: no control ({reasons})", err=True)
+                say(f"{i.name}: no control ({reasons})")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import click
 
 from photoplan.cli.options import json_option
 from photoplan.cli.orientation_options import DIRECTIONS, reading_options, table_format
+from photoplan.cli.output import say, show, show_json
 
 
 @click.command("convert")
@@ -78,16 +78,16 @@ def _convert(request: Any, as_json: bool, quiet: bool) -> None:
 
     done = convert_orientation(request)
     if as_json:
-        click.echo(json.dumps(done.to_dict(), indent=2, ensure_ascii=False))
+        show_json(done.to_dict())
     else:
         for file in done.files:
-            click.echo(str(file))
+            show(file)
     if not quiet:
-        click.echo(f"  {done.images} images, from {done.source_format} to {done.target_format}", err=True)
+        say(f"  {done.images} images, from {done.source_format} to {done.target_format}")
         for note in done.notes:
-            click.echo(f"  {note}", err=True)
+            say(f"  {note}")
         for loss in done.lost:
-            click.echo(f"  {done.target_format} holds {loss.text}", err=True)
+            say(f"  {done.target_format} holds {loss.text}")
 
 
 def _list(request: Any, image_points: Path, control: Path, as_json: bool, quiet: bool) -> None:
@@ -95,12 +95,12 @@ def _list(request: Any, image_points: Path, control: Path, as_json: bool, quiet:
 
     found = list_readings(request, image_points, control)
     if as_json:
-        click.echo(json.dumps(found.to_dict(), indent=2, ensure_ascii=False))
+        show_json(found.to_dict())
     else:
         for fits, readings in (("fits", found.fitting), ("", found.others)):
             for r in readings:
-                click.echo(f"{r.median:10.2f} px  {fits:4}  {found.options(r.reading)}")
+                show(f"{r.median:10.2f} px  {fits:4}  {found.options(r.reading)}")
     if not quiet:
-        click.echo(f"  medians of {found.points} points in {found.images} images", err=True)
+        say(f"  medians of {found.points} points in {found.images} images")
         for note in found.notes:
-            click.echo(f"  {note}", err=True)
+            say(f"  {note}")

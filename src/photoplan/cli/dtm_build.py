@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from photoplan.cli.options import json_option
+from photoplan.cli.output import show, show_json, talking
 
 if TYPE_CHECKING:
     from photoplan.products.dtm.build import BuildReport, BuildRequest
@@ -63,19 +63,16 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
 
     request = _request(options)
 
-    def talk(text: str) -> None:
-        if not quiet:
-            click.echo(text, err=True)
-
+    talk = talking(quiet)
     if dry_run:
         measured, findings, crs, system = load(request)
         plan = plan_build(measured, request.settings)
         if as_json:
-            click.echo(json.dumps(plan_facts(plan, measured, findings, crs, system), indent=2, ensure_ascii=False))
+            show_json(plan_facts(plan, measured, findings, crs, system))
             return
-        click.echo(describe_plan(plan, measured, crs, system))
+        show(describe_plan(plan, measured, crs, system))
         for finding in findings:
-            click.echo(f"  {finding.kind}: {finding.text}")
+            show(f"  {finding.kind}: {finding.text}")
         return
     with ExitStack() as stack:
 
@@ -87,11 +84,11 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
 
         built = dtm_build(request, steps, talk)
     if as_json:
-        click.echo(json.dumps(built.to_dict(), indent=2, ensure_ascii=False))
+        show_json(built.to_dict())
         return
-    click.echo(str(built.path))
+    show(built.path)
     if built.page is not None:
-        click.echo(str(built.page))
+        show(built.page)
     for line in _summary(built):
         talk(line)
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 
 from photoplan.cli.options import json_option
+from photoplan.cli.output import say, show, show_json
 
 _PATH = click.Path(path_type=Path)
 _POSITIVE = click.FloatRange(0, min_open=True)
@@ -53,18 +53,17 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     with ExitStack() as stack:
         facts = make_contours(request, lambda parts: stack.enter_context(progress(parts, quiet)))
     if as_json:
-        click.echo(json.dumps(facts.to_dict(), indent=2))
+        show_json(facts.to_dict())
         return
     for path in [*facts.files, *([facts.preview] if facts.preview else [])]:
-        click.echo(str(path))
+        show(path)
     if quiet:
         return
     if not facts.lines:
-        click.echo(f"no contour: no level of {chosen.base:g} + n × {chosen.interval:g} m is passed", err=True)
+        say(f"no contour: no level of {chosen.base:g} + n × {chosen.interval:g} m is passed")
         return
     labels = "" if facts.text_height is None else f", {facts.labels} labels {facts.text_height:g} m high"
-    click.echo(
+    say(
         f"{facts.lines} contours from {facts.low:.10g} to {facts.high:.10g} m, {facts.length / 1000:.6g} km, "
-        f"{facts.vertices} vertices; {facts.closed} closed, {facts.depressions} round hollows{labels}",
-        err=True,
+        f"{facts.vertices} vertices; {facts.closed} closed, {facts.depressions} round hollows{labels}"
     )

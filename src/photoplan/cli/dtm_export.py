@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 
 from photoplan.cli.options import json_option
+from photoplan.cli.output import say, show, show_json
 
 
 @click.command("export")
@@ -33,9 +33,9 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     with progress(0 if quiet else export_steps(request), quiet) as report:
         found = dtm_export(request, report)
     if as_json:
-        click.echo(json.dumps(found.to_dict(), indent=2))
+        show_json(found.to_dict())
         return
     for path in found.paths:
-        click.echo(str(path))
+        show(path)
     if not quiet:
-        click.echo(" · ".join(f"{k.replace('_', ' ')} {v:.6g}" for k, v in found.figures.items()), err=True)
+        say(" · ".join(f"{k.replace('_', ' ')} {v:.6g}" for k, v in found.figures.items()))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 
 from photoplan.cli.options import BYTES, json_option
+from photoplan.cli.output import say, show, show_json
 
 
 @click.command("flow")
@@ -34,19 +34,19 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     found = dtm_flow(FlowRequest(**options))
     if as_json:
-        click.echo(json.dumps(found.to_dict(), indent=2))
+        show_json(found.to_dict())
         return
-    click.echo(str(found.path))
+    show(found.path)
     if found.catchments is not None:
-        click.echo(str(found.catchments))
-    click.echo(
+        show(found.catchments)
+    show(
         f"area {found.area:.8g} m², leaves by its edge {found.outflow:.8g} m²; "
         f"pits filled on {found.pits:.6g} m² with {found.pit_volume:.6g} m³"
     )
     for row in found.rows:
-        click.echo(
-            f"outlet {row.name} at {row.X:.10g} {row.Y:.10g}: {row.area:.8g} m² upstream, {row.own:.8g} m² of its own, "
+        show(
+            f"outlet {row.name} at {row.X:.10g} {row.Y:.10g}: {row.area:.8g} m² upstream, "
             f"longest way {row.longest:.6g} m"
         )
     if not quiet:
-        click.echo(f"bands: {', '.join(BANDS)}; cells {found.resolution:g} m", err=True)
+        say(f"bands: {', '.join(BANDS)}; cells {found.resolution:g} m")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
 
 from photoplan.cli.options import json_option
+from photoplan.cli.output import show, show_json
 
 
 @click.command("info")
@@ -20,15 +20,15 @@ def command(model: Path, gross: bool, as_json: bool) -> None:
 
     found = dtm_info(model)
     if as_json:
-        click.echo(json.dumps(found.figures | ({"gross_errors": found.gross} if gross else {}), indent=2))
+        show_json(found.figures | ({"gross_errors": found.gross} if gross else {}))
         return
     width = max(len(key) for key in found.facts)
     for key, value in found.facts.items():
         lines = value if isinstance(value, list) else [value]
         for i, line in enumerate(lines):
-            click.echo(f"{key if i == 0 else '':<{width}}  {line}")
+            show(f"{key if i == 0 else '':<{width}}  {line}")
     for g in found.gross if gross else ():
-        click.echo(
+        show(
             f"{g['name']}  {g['kind']}  X {g['x']:.3f} Y {g['y']:.3f} Z {g['z']:.3f}  residual {g['residual']:+.3f} m "
             f"({g['normalised']:+.1f} σ, redundancy {g['redundancy']:.2f})"
         )

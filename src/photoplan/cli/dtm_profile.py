@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 
 from photoplan.cli.options import json_option
+from photoplan.cli.output import say, show, show_json
 
 
 @click.command("profile")
@@ -38,12 +38,12 @@ def command(x: str | None, y: str | None, decimal_comma: bool, as_json: bool, qu
     found = dtm_profile(request)
     if as_json:
         files = [str(path) for path in request.outputs]
-        click.echo(json.dumps({"files": files, "profiles": [p.to_dict() for p in found]}, indent=2))
+        show_json({"files": files, "profiles": [p.to_dict() for p in found]})
         return
     for path in request.outputs:
-        click.echo(str(path))
+        show(path)
     if not quiet:
         for p in found:
             f = p.to_dict()
             heights = "no surface" if f["low"] is None else f"{f['low']:.3f} to {f['high']:.3f} m"
-            click.echo(f"{p.name}: {f['length']:.2f} m, {f['points']} points, {heights}", err=True)
+            say(f"{p.name}: {f['length']:.2f} m, {f['points']} points, {heights}")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 
 from photoplan.cli.options import json_option
+from photoplan.cli.output import say, show, show_json
 
 _PATH = click.Path(path_type=Path)
 
@@ -35,9 +35,9 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     found = dtm_refine(RefineRequest(**options))
     if as_json:
-        click.echo(json.dumps(found.to_dict(), indent=2))
+        show_json(found.to_dict())
         return
-    click.echo(str(found.path))
+    show(found.path)
     if not quiet:
         change = f", largest change of a post {found.largest:.3f} m" if found.largest == found.largest else ""
-        click.echo(f"{found.changed} of {found.units} units are new{change}; {found.lines} lines", err=True)
+        say(f"{found.changed} of {found.units} units are new{change}; {found.lines} lines")

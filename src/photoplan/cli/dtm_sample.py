@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 
 from photoplan.cli.options import json_option
+from photoplan.cli.output import say, show, show_json
 
 
 @click.command("sample")
@@ -50,14 +50,13 @@ def command(
     form = PointTableFormat(x, y, spelled.get(delimiter or "", delimiter), decimal_comma, not no_header)
     found = dtm_sample(SampleRequest(form=form, **options))
     if as_json:
-        click.echo(json.dumps(found.to_dict(), indent=2))
+        show_json(found.to_dict())
         return
-    click.echo(str(found.path))
+    show(found.path)
     if not quiet:
         sigma = f", sigma {found.sigma:.3f} m" if found.sigma == found.sigma else ""
         heights = f" · {found.low:.3f} to {found.high:.3f} m{sigma}" if found.outside < found.points else ""
-        click.echo(
+        say(
             f"{found.points} points, {found.outside} without a model{heights} · {crs_label(found.crs)} · "
-            f"heights {height_label(found.height_system)}",
-            err=True,
+            f"heights {height_label(found.height_system)}"
         )

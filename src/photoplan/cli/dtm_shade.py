@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from photoplan.cli.options import json_option
+from photoplan.cli.output import say, show, show_json
 
 if TYPE_CHECKING:
     from photoplan.products.dtm.shading import ShadingFacts
@@ -65,7 +65,7 @@ def take_request(options: dict[str, Any]) -> Any:
     return PictureRequest(**{name: options.pop(name) for name in names})
 
 
-def say(make: Callable[[Any], ShadingFacts], as_json: bool, quiet: bool) -> None:
+def report_picture(make: Callable[[Any], ShadingFacts], as_json: bool, quiet: bool) -> None:
     """Make a picture under a progress bar, and print what came of it."""
     from contextlib import ExitStack
 
@@ -74,17 +74,16 @@ def say(make: Callable[[Any], ShadingFacts], as_json: bool, quiet: bool) -> None
     with ExitStack() as stack:
         facts = make(lambda tiles: stack.enter_context(progress(tiles, quiet)))
     if as_json:
-        click.echo(json.dumps(facts.to_dict(), indent=2))
+        show_json(facts.to_dict())
         return
-    click.echo(str(facts.path))
+    show(facts.path)
     if facts.preview is not None:
-        click.echo(str(facts.preview))
+        show(facts.preview)
     if not quiet:
         grid, settings = facts.grid, ", ".join(f"{k} {v}" for k, v in facts.settings.items() if k != "ramp_colours")
-        click.echo(
+        say(
             f"{facts.kind}: {grid.width} × {grid.height} pixels of {grid.resolution:g} m, {facts.valid_share:.1%} with "
-            f"terrain; {settings}",
-            err=True,
+            f"terrain; {settings}"
         )
 
 
@@ -99,4 +98,4 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     from photoplan.products.dtm.shading import make_picture, shade_picture
 
     picture, request = shade_picture(take_light(options)), take_request(options)
-    say(lambda begin: make_picture(request, picture, begin), as_json, quiet)
+    report_picture(lambda begin: make_picture(request, picture, begin), as_json, quiet)

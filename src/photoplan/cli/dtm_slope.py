@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.dtm_shade import picture_options, say, take_request
+from photoplan.cli.dtm_shade import picture_options, report_picture, take_request
 
 
 @click.command("slope")
@@ -25,7 +25,7 @@ def command(percent: bool, classes: str | None, aspect: bool, as_json: bool, qui
         raise click.UsageError("--aspect goes with neither --percent nor --classes")
     picture = aspect_picture() if aspect else slope_picture("percent" if percent else "degrees", _limits(classes))
     request = take_request(options)
-    say(lambda begin: make_picture(request, picture, begin), as_json, quiet)
+    report_picture(lambda begin: make_picture(request, picture, begin), as_json, quiet)
 
 
 def _limits(text: str | None) -> tuple[float, ...]:

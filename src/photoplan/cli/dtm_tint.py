@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.dtm_shade import light_options, picture_options, say, take_light, take_request
+from photoplan.cli.dtm_shade import light_options, picture_options, report_picture, take_light, take_request
 
 
 @click.command("tint")
@@ -34,4 +34,4 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     light = take_light(options)
     picture = tint_picture(ramp, span, 0 if classed else steps, light if shade else None, strength)
     request = take_request(options)
-    say(lambda begin: make_picture(request, picture, begin), as_json, quiet)
+    report_picture(lambda begin: make_picture(request, picture, begin), as_json, quiet)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import click
 
 from photoplan.cli.options import BYTES, json_option
+from photoplan.cli.output import say, show, show_json
 
 
 @click.command("visible")
@@ -40,12 +40,12 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     found = dtm_visible(VisibleRequest(**options), lambda observers: progress(observers, quiet))
     if as_json:
-        click.echo(json.dumps(found.to_dict(), indent=2))
+        show_json(found.to_dict())
         return
-    click.echo(str(found.path))
+    show(found.path)
     for row in found.rows:
         share = row.visible / row.looked_at if row.looked_at else 0.0
-        click.echo(
+        show(
             f"observer {row.name}: eye at {row.eye:.2f} m, sees {row.visible:.6g} m² of {row.looked_at:.6g} m² "
             f"({share:.1%}); {row.missing:.6g} m² without heights"
         )
@@ -53,4 +53,4 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
         k = options["refraction"]
         bend = f"R = {found.earth_radius / 1000:.0f} km, k = {k:g}" if options["curvature"] else "flat earth"
         far = f"; horizon of a smooth earth {found.horizon:.0f} m" if math.isfinite(found.horizon) else ""
-        click.echo(f"bands: {', '.join(found.bands)}; pixel {found.resolution:g} m; {bend}{far}", err=True)
+        say(f"bands: {', '.join(found.bands)}; pixel {found.resolution:g} m; {bend}{far}")

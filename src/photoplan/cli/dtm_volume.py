@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 
 from photoplan.cli.options import json_option
+from photoplan.cli.output import say, show, show_json
 
 
 @click.command("volume")
@@ -37,27 +37,21 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     found = dtm_volume(VolumeRequest(**options), lambda windows: progress(windows, quiet))
     if as_json:
-        click.echo(json.dumps(found.to_dict(), indent=2))
+        show_json(found.to_dict())
         return
     width = max(7, *(len(row.name) for row in found.rows))
-    click.echo(
-        f"{'polygon':<{width}}  {'cut m³':>14} {'fill m³':>14} {'net m³':>14} {'area m²':>13} {'no model m²':>13}"
-    )
+    show(f"{'polygon':<{width}}  {'cut m³':>14} {'fill m³':>14} {'net m³':>14} {'area m²':>13} {'no model m²':>13}")
     for row in found.rows:
         v = row.volume
-        click.echo(
-            f"{row.name:<{width}}  {v.cut:>14.2f} {v.fill:>14.2f} {v.net:>14.2f} {v.area:>13.1f} {v.missing:>13.1f}"
-        )
-        click.echo(
-            f"{'':<{width}}  {v.error_cut:>13.2g}i {v.error_fill:>13.2g}i {v.error_net:>13.2g}i  cells {v.cell:g} m"
-        )
+        show(f"{row.name:<{width}}  {v.cut:>14.2f} {v.fill:>14.2f} {v.net:>14.2f} {v.area:>13.1f} {v.missing:>13.1f}")
+        show(f"{'':<{width}}  {v.error_cut:>13.2g}i {v.error_fill:>13.2g}i {v.error_net:>13.2g}i  cells {v.cell:g} m")
         if row.sigma is not None:
             s = row.sigma
-            click.echo(f"{'':<{width}}  {s.cut:>13.2f}σ {s.fill:>13.2f}σ {s.net:>13.2f}σ")
-    click.echo("i: change with the last halving of the cells; σ: standard deviation from that of the heights")
+            show(f"{'':<{width}}  {s.cut:>13.2f}σ {s.fill:>13.2f}σ {s.net:>13.2f}σ")
+    show("i: change with the last halving of the cells; σ: standard deviation from that of the heights")
     if found.difference is not None:
-        click.echo(str(found.difference))
+        show(found.difference)
     if not quiet:
-        click.echo(f"height system: {found.height_system}", err=True)
+        say(f"height system: {found.height_system}")
         for note in found.notes:
-            click.echo(note, err=True)
+            say(note)

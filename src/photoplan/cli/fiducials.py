@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 
-from photoplan.cli.failures import end_with_failures
 from photoplan.cli.options import json_option
+from photoplan.cli.output import end_with_failures, say, show, show_json
 
 _ANSWER = {"auto": None, "yes": True, "no": False}
 
@@ -46,17 +45,17 @@ def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any)
     request = FiducialsRequest(scans, **_values(options))
     report = locate_fiducials(request, lambda total: progress(total, quiet, "images"))
     if as_json:
-        click.echo(json.dumps(report.to_dict(), indent=2, ensure_ascii=False))
+        show_json(report.to_dict())
     for image in report.images:
         if not as_json:
-            click.echo(str(image))
+            show(image)
             if image.picture is not None:
-                click.echo(str(image.picture))
+                show(image.picture)
         if not quiet:
             for note in image.found.notes:
-                click.echo(f"{image.name}: {note}", err=True)
+                say(f"{image.name}: {note}")
     if report.written is not None and not quiet:
-        click.echo(f"{report.written}: fiducial marks of {len(report.images)} images written", err=True)
+        say(f"{report.written}: fiducial marks of {len(report.images)} images written")
     end_with_failures(report.failed, len(report.images))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from photoplan.cli.options import json_option
-from photoplan.plain import json_text
+from photoplan.cli.output import show, show_json
 
 
 @click.command("info")
@@ -27,10 +27,10 @@ def command(file: Path, plot: Path | None, overwrite: bool, as_json: bool) -> No
     if plot is not None:
         facts["picture"] = str(plot)
     if as_json:
-        click.echo(json_text(facts))
+        show_json(facts)
         return
     width = max(len(key) for key in facts)
     for key, value in facts.items():
         lines = value if isinstance(value, list) else [value]
         for i, line in enumerate(lines):
-            click.echo(f"{key if i == 0 else '':<{width}}  {line}")
+            show(f"{key if i == 0 else '':<{width}}  {line}")

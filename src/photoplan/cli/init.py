@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import click
 
 from photoplan.cli.options import json_option
 from photoplan.cli.orientation_options import reading_options, table_format
+from photoplan.cli.output import show, show_json, talking
 
 _FILE = click.Path(path_type=Path)
 
@@ -56,10 +56,10 @@ def command(
     from photoplan.products.init.run import InitRequest, init_project
 
     form = table_format(options)
-    talk = (lambda line: None) if quiet else (lambda line: click.echo(line, err=True))
+    talk = talking(quiet)
     result = init_project(InitRequest(folder=folder, form=form, **options), talk)
     if not as_json:
-        click.echo(str(result.path))
+        show(result.path)
         return
     facts = {
         "project": str(result.path),
@@ -72,4 +72,4 @@ def command(
         "without_orientation": list(result.without_orientation),
         "without_image": list(result.without_image),
     }
-    click.echo(json.dumps(facts, indent=2, ensure_ascii=False))
+    show_json(facts)

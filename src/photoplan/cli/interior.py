@@ -7,9 +7,9 @@ from typing import Any
 
 import click
 
-from photoplan.cli.failures import end_with_failures
 from photoplan.cli.options import json_option
-from photoplan.plain import json_text, plain
+from photoplan.cli.output import end_with_failures, say, show, show_json
+from photoplan.plain import plain
 
 
 @click.command("interior")
@@ -48,16 +48,16 @@ def command(images: tuple[str, ...], as_json: bool, quiet: bool, **options: Any)
     if plot is not None and found.images:
         picture = plot.write(InteriorPlots(plot.mpl).residuals(found.images))
     if as_json:
-        click.echo(json_text({**plain(found), "report": report, "plot": picture}))
+        show_json({**plain(found), "report": report, "plot": picture})
     else:
         for image in found.images:
-            click.echo(str(image))
+            show(image)
         for path in (report, picture):
             if path is not None:
-                click.echo(str(path))
+                show(path)
     if not quiet:
         if found.unmeasured:
-            click.echo(f"marks not measured in {', '.join(found.unmeasured)}: photoplan fiducials finds them", err=True)
+            say(f"marks not measured in {', '.join(found.unmeasured)}: photoplan fiducials finds them")
         for camera in found.written:
-            click.echo(f"camera {camera!r}: interior = {options['model']!r} written to the project", err=True)
+            say(f"camera {camera!r}: interior = {options['model']!r} written to the project")
     end_with_failures(found.failed, len(found.images))

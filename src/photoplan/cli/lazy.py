@@ -8,6 +8,9 @@ from typing import Any
 
 import click
 
+from photoplan.cli.output import spelled
+from photoplan.errors import PhotoplanError
+
 
 class LazyGroup(click.Group):
     """Lists verbs without importing them."""
@@ -17,6 +20,15 @@ class LazyGroup(click.Group):
         self.verbs = verbs
         self.package = package
         """What a verb's name is appended to, to give the module that holds its `command`."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a verb; its errors name parameters as the verb's options."""
+        try:
+            return super().invoke(ctx)
+        except PhotoplanError as error:
+            verb = self.get_command(ctx, ctx.invoked_subcommand or "")
+            error.args = (spelled(str(error), verb, ctx.find_root().command), *error.args[1:])
+            raise
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """The verbs, in the order of a job."""

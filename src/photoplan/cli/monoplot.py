@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 
 from photoplan.cli.options import json_option
+from photoplan.cli.output import say, show, show_json
 
 
 @click.command("monoplot")
@@ -35,20 +35,20 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     found = monoplot_file(MonoplotRequest(**options))
     if as_json:
-        click.echo(json.dumps(found.to_dict(), indent=2))
+        show_json(found.to_dict())
         return
-    click.echo(str(found.output))
+    show(found.output)
     if found.vectors is not None:
-        click.echo(str(found.vectors))
-    click.echo(f"{found.met} of {found.points} points on the ground")
+        show(found.vectors)
+    show(f"{found.met} of {found.points} points on the ground")
     for reason, count in found.reasons.items():
-        click.echo(f"  {count} without: {reason}")
+        show(f"  {count} without: {reason}")
     if found.grazing or found.through_holes:
-        click.echo(f"  {found.grazing} under less than 5° to the terrain, {found.through_holes} through holes")
+        show(f"  {found.grazing} under less than 5° to the terrain, {found.through_holes} through holes")
     if found.median_sigma is not None:
         X, Y, Z = found.median_sigma
-        click.echo(f"median standard deviation X {X:.3f} Y {Y:.3f} Z {Z:.3f} m")
+        show(f"median standard deviation X {X:.3f} Y {Y:.3f} Z {Z:.3f} m")
     if not quiet:
-        click.echo(f"height system: {found.height_system}", err=True)
+        say(f"height system: {found.height_system}")
         for note in found.notes:
-            click.echo(note, err=True)
+            say(note)

@@ -7,10 +7,10 @@ from typing import Any
 
 import click
 
-from photoplan.cli.failures import end_with_failures
-from photoplan.cli.mtf_output import say_files, say_images, talking
+from photoplan.cli.mtf_output import say_files, say_images
 from photoplan.cli.mtf_patterns import edge_options, pattern_options, run_patterns
 from photoplan.cli.options import json_option
+from photoplan.cli.output import end_with_failures, show, talking
 
 
 @click.command("mtf")
@@ -63,7 +63,7 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any
     say_images(report, written, as_json, talk)
     if len(report.images) > 1:
         if not as_json:
-            click.echo(f"all {len(report.images)} images\n{group_lines(report.groups)}")
+            show(f"all {len(report.images)} images\n{group_lines(report.groups)}")
         if report.enhancement is not None and report.enhancement.enhanced:
             talk(f"all images: {report.enhancement.warning}")
     if not as_json:

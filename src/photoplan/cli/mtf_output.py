@@ -6,9 +6,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
-import click
-
-from photoplan.plain import json_text, plain
+from photoplan.cli.output import show, show_json
+from photoplan.plain import plain
 
 
 class _Image(Protocol):
@@ -25,18 +24,13 @@ class _Report(Protocol):
     def csv(self) -> Path | None: ...
 
 
-def talking(quiet: bool) -> Callable[[str], None]:
-    """What says a line on stderr, or nothing."""
-    return lambda text: None if quiet else click.echo(text, err=True)
-
-
 def say_images(report: _Report, page: Path | None, as_json: bool, talk: Callable[[str], None]) -> None:
     """The figures of every image on stdout, or all as JSON; notes are talk."""
     if as_json:
-        click.echo(json_text({**plain(report), "report": page}))
+        show_json({**plain(report), "report": page})
     for image in report.images:
         if not as_json:
-            click.echo(str(image))
+            show(image)
         for note in image.notes:
             talk(f"{image.name}: {note}")
 
@@ -45,4 +39,4 @@ def say_files(report: _Report, page: Path | None) -> None:
     """The files that were written."""
     for path in (report.csv, page):
         if path is not None:
-            click.echo(str(path))
+            show(path)

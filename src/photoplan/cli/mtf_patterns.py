@@ -8,8 +8,8 @@ from typing import Any
 
 import click
 
-from photoplan.cli.failures import end_with_failures
-from photoplan.cli.mtf_output import say_files, say_images, talking
+from photoplan.cli.mtf_output import say_files, say_images
+from photoplan.cli.output import end_with_failures, talking
 
 #: Options that speak of edges only, and those that speak of patterns only.
 _OF_EDGES = {"lab", "flight", "grid", "most_edges", "least_length", "least_snr", "half_width"}

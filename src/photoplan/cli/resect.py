@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.failures import end_with_failures
 from photoplan.cli.options import json_option
-from photoplan.plain import json_text, plain
+from photoplan.cli.output import end_with_failures, say, show, show_json
+from photoplan.plain import plain
 
 if TYPE_CHECKING:
     from photoplan.products.resect.image import ResectedImage
@@ -56,7 +56,7 @@ def command(as_json: bool, quiet: bool, free: str | None, **options: Any) -> Non
         result = resect_project(request, lambda _: advance(1, 0))
     report = None if page is None or not result.images else page.write(resect_page(result, page.mpl))
     if as_json:
-        click.echo(json_text({**plain(result), "report": report}))
+        show_json({**plain(result), "report": report})
     else:
         _show(result, report)
     if not quiet:
@@ -67,9 +67,9 @@ def command(as_json: bool, quiet: bool, free: str | None, **options: Any) -> Non
 def _show(result: ResectResult, report: Path | None) -> None:
     for image in result.images:
         for line in _lines(image):
-            click.echo(line)
+            show(line)
     if report is not None:
-        click.echo(str(report))
+        show(report)
 
 
 def _lines(image: ResectedImage) -> list[str]:
@@ -94,12 +94,12 @@ def _lines(image: ResectedImage) -> list[str]:
 
 def _talk(result: ResectResult) -> None:
     for note in result.notes:
-        click.echo(note, err=True)
+        say(note)
     for image in result.images:
         for note in image.notes:
-            click.echo(f"{image.image.name}: {note}", err=True)
+            say(f"{image.image.name}: {note}")
     if result.left_out:
         names = ", ".join(result.left_out[:5]) + (" …" if len(result.left_out) > 5 else "")
-        click.echo(f"{len(result.left_out)} images have fewer than 3 control points: {names}", err=True)
+        say(f"{len(result.left_out)} images have fewer than 3 control points: {names}")
     if result.written:
-        click.echo(f"{result.project}: orientation of {len(result.images)} images written", err=True)
+        say(f"{result.project}: orientation of {len(result.images)} images written")

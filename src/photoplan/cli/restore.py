@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.failures import end_with_failures
 from photoplan.cli.options import BYTES, json_option
+from photoplan.cli.output import end_with_failures, show, show_json, talking
 from photoplan.cli.restore_options import filter_options, filter_request
-from photoplan.plain import json_text, plain
+from photoplan.plain import plain
 
 if TYPE_CHECKING:
     from photoplan.products.restore.run import RestoredImage, RestorePlan
@@ -55,10 +55,7 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
     from photoplan.report.page import open_report
     from photoplan.report.restore.page import restore_page
 
-    def talk(text: str) -> None:
-        if not quiet:
-            click.echo(text, err=True)
-
+    talk = talking(quiet)
     if options["chromatic"] not in (None, "measure"):
         options["chromatic"] = Path(options["chromatic"])
     options["quicklook"] = not options.pop("no_quicklook")
@@ -82,7 +79,7 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
 
     def finished(image: RestoredImage) -> None:
         if not as_json:
-            click.echo(str(image.path))
+            show(image.path)
         for line in _after(image):
             talk(line)
 
@@ -91,9 +88,9 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
     if page is not None and report.images:
         written = page.write(restore_page(found, plan.jobs, report, page.mpl))
     if as_json:
-        click.echo(json_text({**plain(report), "report": written}))
+        show_json({**plain(report), "report": written})
     elif written is not None:
-        click.echo(str(written))
+        show(written)
     end_with_failures(report.failed, len(report.images))
 
 
@@ -144,10 +141,10 @@ def _show(plan: RestorePlan, as_json: bool) -> None:
         for job in plan.jobs
     ]
     if as_json:
-        click.echo(json_text({"filter": filter_figures(plan.filter), "images": rows, "failed": plan.failed}))
+        show_json({"filter": filter_figures(plan.filter), "images": rows, "failed": plan.failed})
         return
     for row in rows:
-        click.echo(
+        show(
             f"{row['image']}: {row['size'][0]} × {row['size'][1]}, {_count(row['bands'], 'band')} of {row['dtype']}, "
             f"{_count(row['tiles'], 'tile')} → {row['path']}"
         )

@@ -8,7 +8,8 @@ from typing import Any
 import click
 
 from photoplan.cli.options import json_option
-from photoplan.plain import json_text, plain
+from photoplan.cli.output import say, show, show_json
+from photoplan.plain import plain
 
 
 @click.command("sensor")
@@ -31,12 +32,12 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     report = None if page is None or options["dry_run"] else page.write(sensor_page(found, page.mpl))
     written = [path for path in (report, found.csv) if path is not None]
     if as_json:
-        click.echo(json_text({**plain(found), "written": written}))
+        show_json({**plain(found), "written": written})
     else:
-        click.echo(str(found))
+        show(found)
         for path in written:
-            click.echo(str(path))
+            show(path)
     differing = [f for f in found.figures if f.stated is not None and abs(f.value - f.stated) > 0.01 * abs(f.stated)]
     if not quiet:
         for figure in differing:
-            click.echo(f"{figure.name}: {figure.value:.4g} by {figure.source}; {figure.stated:g} is stated", err=True)
+            say(f"{figure.name}: {figure.value:.4g} by {figure.source}; {figure.stated:g} is stated")

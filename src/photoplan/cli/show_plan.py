@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-import click
-
+from photoplan.cli.output import show, show_json
 from photoplan.cli.running import How
 from photoplan.events import Events
 from photoplan.products.orthophoto.plan import OrthoPlan
@@ -21,14 +19,14 @@ def show_plan(plan: OrthoPlan, folder: Path, plan_file: Path | None, how: How, e
     if plan_file is not None:
         write_plan(plan_file, plan, figures, folder, how.overwrite)
     if how.as_json:
-        click.echo(json.dumps({"plan": plan_file and str(plan_file), **figures.to_dict(plan)}, indent=2))
+        show_json({"plan": plan_file and str(plan_file), **figures.to_dict(plan)})
         return
-    click.echo(str(plan))
-    click.echo(_sums(plan, figures))
+    show(plan)
+    show(_sums(plan, figures))
     for line in plan.blind:
-        click.echo(f"  sees no terrain: {line}")
+        show(f"  sees no terrain: {line}")
     if plan_file is not None:
-        click.echo(str(plan_file))
+        show(plan_file)
 
 
 def _sums(plan: OrthoPlan, figures: PlanFigures) -> str:

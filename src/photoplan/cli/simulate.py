@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 
 from photoplan.cli.options import json_option
+from photoplan.cli.output import say, show, show_json
 
 
 @click.command("simulate")
@@ -44,19 +44,18 @@ def command(scene: str, as_json: bool, quiet: bool, **options: Any) -> None:
 
     report = simulate(SimulateRequest(scene, **options), lambda total: progress(total, quiet, "images"))
     if as_json:
-        click.echo(json.dumps(report.to_dict(), indent=2, ensure_ascii=False))
+        show_json(report.to_dict())
     else:
         for image in report.images:
-            click.echo(str(image.path))
+            show(image.path)
     if quiet:
         return
     if options["dry_run"]:
-        click.echo("dry run: nothing was written", err=True)
+        say("dry run: nothing was written")
     along = " ".join(f"{axis} {value:.4f}" for axis, value in zip("xy", report.mtf50))
-    click.echo(
+    say(
         f"{len(report.images)} images of {report.bands} × {report.size[0]} × {report.size[1]} pixels, {report.dtype} · "
-        f"MTF50 of the model: {along} cycles per pixel",
-        err=True,
+        f"MTF50 of the model: {along} cycles per pixel"
     )
     for note in report.notes:
-        click.echo(note, err=True)
+        say(note)

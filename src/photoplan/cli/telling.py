@@ -9,6 +9,8 @@ from types import TracebackType
 
 import click
 
+from photoplan.cli.output import say
+
 #: Seconds between two lines where there is no terminal, and between two changes of the line on one.
 SELDOM, OFTEN = 30.0, 0.1
 _BAR = 24
@@ -70,7 +72,7 @@ class Telling:
             click.echo(self.line(now), err=True, nl=False)
             self._drawn = True
         else:
-            click.echo(self.line(now), err=True)
+            say(self.line(now))
 
     def line(self, now: float) -> str:
         """What there is to say at a time: phase, units done, rate, time left."""
@@ -95,7 +97,7 @@ class Telling:
         """Say something on stderr."""
         if not self._quiet:
             self._clear()
-            click.echo(text, err=True)
+            say(text)
 
     def result(self, value: object) -> None:
         """Keep a result and print it."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from photoplan.cli.options import json_option
+from photoplan.cli.output import say, show, show_json
 
 if TYPE_CHECKING:
     from photoplan.products.tie.run import TieReport
@@ -48,13 +48,13 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     request = TieRequest(**options)
     found = find_ties(request, lambda words, count: progress(count, quiet, words))
     if as_json:
-        click.echo(json.dumps(found.to_dict(), indent=2, ensure_ascii=False))
+        show_json(found.to_dict())
     elif found.output is None:
-        click.echo(f"{len(found.images)} images, {found.pairs or 'not yet known number of'} pairs: {found.chosen}")
+        show(f"{len(found.images)} images, {found.pairs or 'not yet known number of'} pairs: {found.chosen}")
     else:
-        click.echo(str(found.output))
+        show(found.output)
         if found.picture is not None:
-            click.echo(str(found.picture))
+            show(found.picture)
         _print(found)
     if not quiet:
         _talk(found)
@@ -79,21 +79,18 @@ def _print(found: TieReport) -> None:
             ("  left out", f"{r.unsettled} not found, {r.unlike} unlike, {r.uncertain} uncertain"),
         ]
     for what, text in rows:
-        click.echo(f"{what:12} {text}")
+        show(f"{what:12} {text}")
     width = max(map(len, found.per_image))
-    click.echo(f"{'image':{width}}  points")
+    show(f"{'image':{width}}  points")
     for name, count in found.per_image.items():
-        click.echo(f"{name:{width}}  {count:6}")
+        show(f"{name:{width}}  {count:6}")
 
 
 def _talk(found: TieReport) -> None:
     for note in found.notes:
-        click.echo(note, err=True)
+        say(note)
     if len(found.parts) > 1:
-        click.echo(
-            f"no overlap: {len(found.unconnected)} of {len(found.images)} images do not hang together with the others:",
-            err=True,
-        )
+        say(f"no overlap: {len(found.unconnected)} of {len(found.images)} images do not hang together with the others:")
         for part in found.parts[1:]:
-            click.echo(f"  {', '.join(part)}", err=True)
-        click.echo("they cannot be adjusted together; give --pairs all, more --features, or leave them out", err=True)
+            say(f"  {', '.join(part)}")
+        say("they cannot be adjusted together; give --pairs all, more --features, or leave them out")

@@ -136,7 +136,7 @@ def tiles_in_flight(wanted: int, memory: int | None, base: int, each: int) -> in
     fits = (memory - base) // each
     if fits < 1:
         raise UsageError(
-            f"--memory {memory / 2**20:.0f} MiB; at least {(base + each) / 2**20:.0f} MiB are needed for one tile"
+            f"`memory` {memory / 2**20:.0f} MiB; at least {(base + each) / 2**20:.0f} MiB are needed for one tile"
         )
     return int(min(wanted, fits))
 

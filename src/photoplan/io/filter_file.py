@@ -31,7 +31,7 @@ _KERNEL_ENTRIES = {"band", "at", "values"}
 _HEADER = """\
 # Restoration filter of photoplan: the restored image is the image convolved with it.
 # values[m + i][n + k] is the weight of the pixel i rows above and k columns left of the restored one; m and n are the
-# middle row and column. Values may be edited; a sum of 1 keeps the brightness. Plot it: photoplan info FILE --plot PNG
+# middle row and column. Values may be edited; a sum of 1 keeps the brightness. photoplan info plots it
 """
 
 

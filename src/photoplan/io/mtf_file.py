@@ -44,7 +44,7 @@ class MtfTable:
             return self.frequency
         if pixel_um is None:
             raise InputError(
-                "laboratory values in cycles per mm need the size of a pixel on the sensor: give --pixel-size UM, or a "
+                "laboratory values in cycles per mm need the size of a pixel on the sensor: give `pixel_size` UM, or a "
                 "column cycles_per_px"
             )
         return self.frequency * (pixel_um / 1000.0)

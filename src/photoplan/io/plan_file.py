@@ -46,7 +46,7 @@ def write_plan_tables(path: Path, plan: PlanTables, overwrite: bool = False) -> 
         The file exists and `overwrite` is False.
     """
     if path.exists() and not overwrite:
-        raise UsageError(f"{path} exists; give --overwrite to replace it")
+        raise UsageError(f"{path} exists; give `overwrite` to replace it")
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.stem}.partial.gpkg")
     partial.unlink(missing_ok=True)
@@ -108,9 +108,7 @@ def read_plan_tables(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]
             row = db.execute(f"SELECT format, content FROM {_HEADER}").fetchone()
         db.close()
     except sqlite3.Error as error:
-        raise InputError(
-            f"{path}: not a plan of photoplan ({error}); make one with `photoplan ortho --plan`"
-        ) from error
+        raise InputError(f"{path}: not a plan of photoplan ({error}); make one with `photoplan ortho`") from error
     if row is None or row[0] != FORMAT:
         raise InputError(f"{path}: plan format {row and row[0]}; this version reads {FORMAT}: make the plan again")
     meta, _, _, values = pyogrio.raw.read(str(path), layer="tiles", read_geometry=False)

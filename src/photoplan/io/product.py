@@ -65,7 +65,7 @@ def check_output(path: Path, inputs: Sequence[Path | str] = (), *, overwrite: bo
     if path.is_dir():
         raise UsageError(f"{path}: is a folder; give the name of a file")
     if not overwrite and (path.exists() or path.is_symlink()):
-        raise UsageError(f"{path}: exists already; choose another output or say --overwrite")
+        raise UsageError(f"{path}: exists already; choose another output or say `overwrite`")
 
 
 @dataclass(eq=False)

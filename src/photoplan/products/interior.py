@@ -145,7 +145,7 @@ def interior_orientations(request: InteriorRequest) -> InteriorResult:
         The project has no film scan, or none with measured marks.
     """
     if request.write and request.model is None:
-        raise UsageError("--write sets the model of the cameras; say which with --model")
+        raise UsageError("`write` sets the model of the cameras; say which with `model`")
     pitch = None if request.scan_resolution is None else parse_pitch(request.scan_resolution)
     project = load_project(request.project)
     scans = _scans(project, request)
@@ -198,12 +198,12 @@ def _interior(project: Project, image: Image, model: str | None, pitch: tuple[fl
         except InputError:
             return replace(plain, note="film shrinkage is not known: the scan cannot be opened")
         if pitch is None:
-            return replace(plain, note="film shrinkage is not known: the file states no resolution; --scan-resolution")
+            return replace(plain, note="film shrinkage is not known: the file states no resolution; `scan_resolution`")
         shrinkage = film_shrinkage(fit.transformation, pitch, fit.covariance)
         if max(abs(shrinkage.x), abs(shrinkage.y)) > UNBELIEVABLE:
             note = (
                 f"film shrinkage is not known: the file says {25.4 / pitch[0]:.4g} dpi, its marks say "
-                f"{25.4 * facts.scale[0]:.4g} dpi; --scan-resolution"
+                f"{25.4 * facts.scale[0]:.4g} dpi; `scan_resolution`"
             )
             return replace(plain, note=note)
     return replace(plain, pitch=pitch, shrinkage=film_shrinkage(fit.transformation, pitch, fit.covariance))

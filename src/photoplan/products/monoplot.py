@@ -126,7 +126,7 @@ def monoplot_file(request: MonoplotRequest) -> MonoplotReport:
         sigma = request.sigma_terrain
     notes = []
     if sigma is None:
-        notes.append("no standard deviations: the terrain has none of its own; give --sigma-terrain METRES")
+        notes.append("no standard deviations: the terrain has none of its own; give `sigma_terrain` METRES")
     pose = pose_of(project, project.image(name), scene.ground)
     unit = project.orientation.angle_unit
     errors = MonoplotErrors(

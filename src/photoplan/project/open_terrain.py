@@ -58,7 +58,7 @@ class OpenTerrain:
         return replace(self, surface=surface, bounds=bounds, crs=crs), (step,)
 
 
-def open_terrain(path: Path, crs: str | None = None, option: str = "with --crs EPSG:nnnn") -> OpenTerrain:
+def open_terrain(path: Path, crs: str | None = None, option: str = "with `crs` EPSG:nnnn") -> OpenTerrain:
     """Open a terrain model.
 
     Parameters

@@ -86,7 +86,7 @@ class ChartDrawer:
     """
 
     def __init__(self) -> None:
-        self._mpl = load_matplotlib("a report", "leave --report out")
+        self._mpl = load_matplotlib("a report", "leave `report` out")
 
     def draw(self, plot: Chart | Picture) -> bytes:
         """A plot as PNG."""

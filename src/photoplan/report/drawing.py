@@ -42,7 +42,7 @@ def load_matplotlib(what: str, otherwise: str = "") -> Any:
     what : str
         What needs it, for the message: "a report".
     otherwise : str
-        How to do without it, for the message: "leave --report out".
+        How to do without it, for the message: "leave `report` out".
 
     Returns
     -------

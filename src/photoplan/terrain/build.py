@@ -91,7 +91,7 @@ def plan_build(measured: MeasuredTerrain, settings: BuildSettings) -> BuildPlan:
     if columns * rows > _MOST_UNITS:
         raise InputError(
             f"points from {xy.min(axis=0)} to {xy.max(axis=0)} with a grid of {width:g} m make {columns} × {rows} "
-            f"units, at most {_MOST_UNITS} are allowed; is there a point far from all others? Else give --grid-width"
+            f"units, at most {_MOST_UNITS} are allowed; is there a point far from all others? Else give `grid_width`"
         )
     layout = UnitLayout(float(low[0] * side), float(high[1] * side), side, columns, rows)
     reach = settings.reach or _REACH * seen.spacing

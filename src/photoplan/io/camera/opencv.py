@@ -161,7 +161,7 @@ def _yaml_number(value: float) -> str:
 
 
 def _refuse(path: Path, form: TableFormat) -> OrientationBlock:
-    raise InputError(f"{path}: a calibration of OpenCV describes a camera and no orientation; give it with --camera")
+    raise InputError(f"{path}: a calibration of OpenCV describes a camera and no orientation; give it with `camera`")
 
 
 def _render_block(block: OrientationBlock, path: Path) -> dict[Path, str]:

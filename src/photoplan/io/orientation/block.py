@@ -106,7 +106,7 @@ class OrientationFormat:
     """A file format for orientations."""
 
     name: str
-    """As `--format` and `--to` spell it."""
+    """As users spell it."""
     title: str
     """As users know it."""
     sniff: Callable[[Path, str], bool]
@@ -137,7 +137,7 @@ def require_map(block: OrientationBlock, path: Path) -> None:
     if block.table.origin is not None:
         raise InputError(
             f"{path}: the orientations of {block.table.file} are in a local system that this format cannot state; "
-            "carry them into a map with --crs EPSG:nnnn"
+            "carry them into a map with `crs` EPSG:nnnn"
         )
 
 

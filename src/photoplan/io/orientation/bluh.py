@@ -34,8 +34,8 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     lines = word_lines(path)
     if not form.declares_angle_unit:
         raise InputError(
-            f"{path}: no public description tells the unit of angles in files of BLUH; declare --angle-unit gon, deg "
-            "or rad (with measured points, --list-readings tells which)"
+            f"{path}: no public description tells the unit of angles in files of BLUH; declare `angle_unit` gon, deg "
+            "or rad (with measured points, `list_readings` tells which)"
         )
     for line in lines:
         if len(line.words) < COLUMNS:

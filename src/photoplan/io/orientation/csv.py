@@ -138,8 +138,8 @@ def _why_no_header(row: _Row, renamed: dict[str, str] | None, path: Path) -> str
     header = [f.casefold() for f in row.fields]
     if sum(bool(NUMBER.fullmatch(f)) for f in row.fields) >= 3:
         return (
-            f"{where}: no header; declare the columns, for example --columns name,x,y,z,omega,phi,kappa, or the format "
-            "with --format"
+            f"{where}: no header; declare the columns, for example `columns` name,x,y,z,omega,phi,kappa, or the format "
+            "with `format`"
         )
     if "latitude" in header or "longitude" in header:
         return f"{where}: positions are geographic; transform them into a projected CRS in metres beforehand"
@@ -152,7 +152,7 @@ def _why_no_header(row: _Row, renamed: dict[str, str] | None, path: Path) -> str
         if count != 1:
             missing.append(f"{role} ({'no' if count == 0 else count} column called {' or '.join(names)})")
     return (
-        f"{where}: header {', '.join(row.fields)}: {'; '.join(missing)}; declare them with --columns {NEEDED[0]}=…,x=…"
+        f"{where}: header {', '.join(row.fields)}: {'; '.join(missing)}; declare them with `columns` {NEEDED[0]}=…,x=…"
     )
 
 
@@ -182,7 +182,7 @@ def _number(row: _Row, role: str, roles: dict[str, int], form: TableFormat, path
         return number
     hint = ""
     if not form.decimal_comma and has_decimal_comma(text):
-        hint = "; if the table uses decimal commas, declare it (--decimal-comma)"
+        hint = "; if the table uses decimal commas, declare it (`decimal_comma`)"
     elif not text or text.casefold().lstrip("+-") in ("nan", "inf", "null", "none", "na", "n/a"):
         hint = "; give the orientation or delete the line"
     raise InputError(f"{path}:{row.line}: {role} = {text!r} is not a number{hint}")

@@ -62,7 +62,7 @@ def choose_format(path: Path, form: TableFormat) -> OrientationFormat:
     claiming = [f for f in map(orientation_format, FORMATS) if f.sniff(path, head)]
     if len(claiming) > 1:
         kinds = ", ".join(f"{f.name} ({f.title})" for f in claiming)
-        raise InputError(f"{path}: its content does not tell which format it is: {kinds}; say it with --format")
+        raise InputError(f"{path}: its content does not tell which format it is: {kinds}; say it with `format`")
     return claiming[0] if claiming else orientation_format(_BY_SUFFIX.get(path.suffix.lower(), "csv"))
 
 
@@ -129,7 +129,7 @@ def write_orientation(block: OrientationBlock, path: str | Path, format: str, *,
     texts = render(block, Path(path))
     present = [str(file) for file in texts if file.exists()]
     if present and not overwrite:
-        raise UsageError(f"{', '.join(present)}: exists already; choose another output or say --overwrite")
+        raise UsageError(f"{', '.join(present)}: exists already; choose another output or say `overwrite`")
     for file, text in texts.items():
         try:
             file.parent.mkdir(parents=True, exist_ok=True)

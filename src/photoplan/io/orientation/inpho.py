@@ -211,7 +211,7 @@ def _direction(poses: list[_Pose], file: _File, form: TableFormat, path: Path) -
             words = ins.value.split()[:3]
             angles[name] = [number(w, f"{path}:{ins.line}", f"$INS of image {name!r}") * unit for w in words]
     known = [(pose.M, rotation_opk(*angles[pose.name])) for pose in poses if len(angles.get(pose.name, [])) == 3]
-    usual = ", as MATCH-AT writes them (another program's project: --rotation-direction camera-to-ground)"
+    usual = ", as MATCH-AT writes them (another program's project: `rotation_direction` camera-to-ground)"
     if not known:
         return OWN, usual
     off: dict[Direction, float] = {
@@ -222,8 +222,8 @@ def _direction(poses: list[_Pose], file: _File, form: TableFormat, path: Path) -
     if not fitting:
         raise InputError(
             f"{path}: the rotation matrices differ from the angles of $INS by {min(off.values()):.0f}° or more, "
-            "whatever they do; declare --rotation-direction ground-to-camera (as MATCH-AT writes them) or "
-            "camera-to-ground (with measured points, --list-readings tells which)"
+            "whatever they do; declare `rotation_direction` ground-to-camera (as MATCH-AT writes them) or "
+            "camera-to-ground (with measured points, `list_readings` tells which)"
         )
     if len(fitting) == 1:
         return fitting[0], ", as the angles of $INS tell"

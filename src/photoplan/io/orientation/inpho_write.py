@@ -46,7 +46,7 @@ def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     """
     require_map(block, path)
     if not block.cameras:
-        raise InputError(f"{path}: an Inpho project states a camera constant with every image; give --camera FILE")
+        raise InputError(f"{path}: an Inpho project states a camera constant with every image; give `camera` FILE")
     lines = ["$PROJECT 5.0.0", f"  $PROJECT_NAME : {_word(path.stem)}", "  $ANGULAR_UNITS : deg", "$END"]
     if block.table.crs is not None:
         crs = " ".join(block.table.crs.split())

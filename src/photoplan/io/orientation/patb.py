@@ -45,8 +45,8 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         raise InputError(f"{path}: holds no image")
     if not form.declares_direction:
         raise InputError(
-            f"{path}: PATB does not say what its rotation matrix does; declare --rotation-direction camera-to-ground "
-            "or ground-to-camera (with measured points, --list-readings tells which)"
+            f"{path}: PATB does not say what its rotation matrix does; declare `rotation_direction` camera-to-ground "
+            "or ground-to-camera (with measured points, `list_readings` tells which)"
         )
     if len(lines) % 3:
         raise InputError(

@@ -156,7 +156,7 @@ def angle_block(
             if abs(value) > ANGLE_UNITS[unit] * (1 + 1e-9):
                 raise InputError(
                     f"{line.where}: image {name!r}: {what} = {value:g} is more than a full circle in {unit}; declare "
-                    "the angle unit of the file with --angle-unit"
+                    "the angle unit of the file with `angle_unit`"
                 )
         a, b, c = (named[letter] for letter in rotation)
         images.append(OrientedImage(name, (X, Y, Z), (a, b, c), None, line.line))

@@ -234,7 +234,7 @@ def _number(text: str, comma: bool) -> float | None:
 
 def _comma_hint(fields: list[str], comma: bool) -> str:
     if not comma and any(re.fullmatch(r"[-+]?\d+,\d+|\d+ [-+]?\d+", f) for f in fields):
-        return "; if the file uses decimal commas, declare it (--decimal-comma)"
+        return "; if the file uses decimal commas, declare it (`decimal_comma`)"
     return ""
 
 

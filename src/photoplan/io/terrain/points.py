@@ -77,7 +77,7 @@ class PointTable:
             self.names = fields if form.header else [str(i + 1) for i in range(len(fields))]
             if form.header and all(_number(f, form.decimal_comma) is not None for f in fields):
                 raise InputError(
-                    f"{self.path}:{line}: the first line holds numbers, no names of columns; say --no-header, "
+                    f"{self.path}:{line}: the first line holds numbers, no names of columns; say `header=False`, "
                     "and which columns are X and Y if not the first two"
                 )
             self._x, self._y = self._column("x", line), self._column("y", line)
@@ -95,7 +95,7 @@ class PointTable:
             for line, text in lines:
                 fields = self._split(line, text)
                 if len(fields) != len(self.names):
-                    hint = "; is the decimal sign a comma? then say --decimal-comma" if self.delimiter == "," else ""
+                    hint = "; is the decimal sign a comma? then say `decimal_comma`" if self.delimiter == "," else ""
                     raise InputError(
                         f"{self.path}:{line}: {len(fields)} columns, the first line has {len(self.names)}{hint}"
                     )
@@ -172,7 +172,7 @@ class PointTable:
         if value is None:
             text = fields[column]
             comma = re.fullmatch(r"[-+]?\d+,\d+", text) and not self.form.decimal_comma
-            hint = "; if the table uses decimal commas, say --decimal-comma" if comma else ""
+            hint = "; if the table uses decimal commas, say `decimal_comma`" if comma else ""
             raise InputError(f"{self.path}:{line}: {self.names[column]} = {text[:40]!r} is not a finite number{hint}")
         return value
 

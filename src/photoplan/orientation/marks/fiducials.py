@@ -222,7 +222,7 @@ def _decide(
     listed = ", ".join(str(f[1].turn) for f in sorted(left, key=lambda f: (f[1].turn.mirrored, f[1].turn.rotation)))
     said = (
         f"the marks fit every one of these rotations of the scan: {listed}; {usual.turn} is assumed. "
-        f"State --rotation and --mirrored if that is wrong{f' (others are excluded {told})' if told else ''}"
+        f"State `rotation` and `mirrored` if that is wrong{f' (others are excluded {told})' if told else ''}"
     )
     return taken[1].turn, taken[2], taken[3], [said]
 
@@ -305,7 +305,7 @@ def _result(
     elif np.abs(residuals).max() > 1000 * DEFORMED_MM:
         said.append(
             f"residuals of {np.abs(residuals).max():.0f} µm are more than film deforms: the scanner is not true, or "
-            "one of the marks is something else (look at --pictures), or the calibration another camera's"
+            "one of the marks is something else (look at `pictures`), or the calibration another camera's"
         )
     rivals = sorted(measured.placement.rivals, key=lambda rival: -rival[3])
     if len(rivals) > RIVALS:
@@ -341,7 +341,7 @@ def _nothing(layout: MarkLayout, scan: Scan, known: FiducialSearch) -> str:
     return (
         f"none of the {len(layout.names)} fiducial marks found in the scan of {width} × {height} px; not found: "
         f"{', '.join(layout.names)}. Check that the camera's marks look as described and that the scan shows them; "
-        "state its resolution with --scan-resolution"
+        "state its resolution with `scan_resolution`"
     )
 
 
@@ -359,7 +359,7 @@ def _better_turn(scan: Scan, layout: MarkLayout, known: FiducialSearch, measured
         return None
     return (
         f"turned by {measured.placement.turn}, as stated, the scan shows {len(measured.found)} of {len(layout.names)} "
-        f"marks; turned by {best.turn} it would show {len(best.found)}: check --rotation and --mirrored"
+        f"marks; turned by {best.turn} it would show {len(best.found)}: check `rotation` and `mirrored`"
     )
 
 

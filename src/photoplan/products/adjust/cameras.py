@@ -76,14 +76,14 @@ def parse_calibrate(options: Sequence[str], cameras: Sequence[str]) -> Free:
             name = cameras[0]
         if name not in cameras:
             raise UsageError(
-                f"--calibrate {option!r}: cameras of the project are {', '.join(map(repr, cameras))}; write "
+                f"`calibrate` {option!r}: cameras of the project are {', '.join(map(repr, cameras))}; write "
                 "CAMERA=c,x0,y0,k1"
             )
         parts = [p.partition(":") for p in listed.split(",") if p.strip()]
         parameters = {p.strip(): _prior(option, colon, sigma) for p, colon, sigma in parts}
         unknown = [p for p in parameters if p not in PARAMETERS]
         if unknown or not parameters:
-            raise UsageError(f"--calibrate {option!r}: {unknown[:1] or 'nothing'}; allowed are {', '.join(PARAMETERS)}")
+            raise UsageError(f"`calibrate` {option!r}: {unknown[:1] or 'nothing'}; allowed are {', '.join(PARAMETERS)}")
         found[name] = parameters
     return found
 
@@ -96,7 +96,7 @@ def _prior(option: str, colon: str, text: str) -> float | None:
     except ValueError:
         sigma = math.nan
     if not (math.isfinite(sigma) and sigma > 0):
-        raise UsageError(f"--calibrate {option!r}: {text!r} is no standard deviation; write c:5 for ± 5")
+        raise UsageError(f"`calibrate` {option!r}: {text!r} is no standard deviation; write c:5 for ± 5")
     return sigma
 
 

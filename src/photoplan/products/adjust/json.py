@@ -1,4 +1,4 @@
-"""The result of a bundle adjustment as plain values, for report.json and `--json`."""
+"""The result of a bundle adjustment as plain values, for report.json."""
 
 from __future__ import annotations
 

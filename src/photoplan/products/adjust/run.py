@@ -114,7 +114,7 @@ def adjust_project(
         The disk is full.
     """
     if not (math.isfinite(request.critical) and request.critical > 0):
-        raise UsageError(f"--critical {request.critical:g}; a positive number of standard deviations is needed")
+        raise UsageError(f"`critical` {request.critical:g}; a positive number of standard deviations is needed")
     project = load_project(request.project)
     free = _free(project, request.calibrate)
     names = project.select(request.images or None)
@@ -155,7 +155,7 @@ def _prepare_outputs(request: AdjustRequest, project: Project) -> AdjustPlots:
         folder for folder in (request.folder.absolute(), *request.folder.absolute().parents) if folder.exists()
     )
     if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
-        raise UsageError(f"{request.folder}: cannot be made, as {there} cannot be written into; give another --output")
+        raise UsageError(f"{request.folder}: cannot be made, as {there} cannot be written into; give another `output`")
     _refuse_inputs(request, [request.project, *input_files(project)])
     return AdjustPlots()
 

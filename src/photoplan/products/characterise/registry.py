@@ -24,10 +24,10 @@ class Analysis:
     """One analysis."""
 
     name: str
-    """As in `--only`."""
+    """As users spell it."""
     title: str
     needs: str
-    """Which frames it needs, for the documentation and `--dry-run`."""
+    """Which frames it needs, for the documentation and dry runs."""
     module: str
     """Holds `missing` and `analyse`; imported when it is asked."""
 

@@ -154,7 +154,7 @@ def _chosen(only: Sequence[str]) -> list[Analysis]:
     known = {analysis.name: analysis for analysis in ANALYSES}
     unknown = [name for name in only if name not in known]
     if unknown:
-        raise UsageError(f"--only {unknown[0]}: no such analysis; known are {', '.join(known)}")
+        raise UsageError(f"`only` {unknown[0]}: no such analysis; known are {', '.join(known)}")
     return [analysis for analysis in ANALYSES if not only or analysis.name in only]
 
 
@@ -183,12 +183,12 @@ def _check_outputs(request: CharacteriseRequest, series: Series) -> ChartDrawer 
     if request.csv is not None:
         folder = request.csv
         if folder.exists() and not folder.is_dir():
-            raise UsageError(f"{folder}: is no folder; --csv takes one")
+            raise UsageError(f"{folder}: is no folder; `csv` takes one")
         if folder.is_dir() and any(folder.glob("*.csv")) and not request.overwrite:
-            raise UsageError(f"{folder}: holds tables; give --overwrite to replace them, or another --csv")
+            raise UsageError(f"{folder}: holds tables; give `overwrite` to replace them, or another `csv`")
         for path in folder.glob("*.csv"):
             if path.resolve() in {p.resolve() for p in series.inputs}:
-                raise UsageError(f"{path}: is an input of the series; give another --csv")
+                raise UsageError(f"{path}: is an input of the series; give another `csv`")
     if request.report is None:
         return None
     check_output(request.report, list(series.inputs), overwrite=request.overwrite)

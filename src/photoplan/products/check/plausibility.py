@@ -334,9 +334,10 @@ def _sentence(what: str, before: list[ImagePlausibility], after: list[ImagePlaus
     def middles(images: list[ImagePlausibility]) -> int:
         return sum(i.middle_on_terrain for i in images)
 
+    where = "; it is declared to `photoplan init`, or under [orientation] in the project file" if "`" in what else ""
     return (
         f"{what}: tilts are then {tilts(after)} instead of {tilts(before)}, and of {len(after)} images "
-        f"{middles(after)} look at the terrain instead of {middles(before)}"
+        f"{middles(after)} look at the terrain instead of {middles(before)}{where}"
     )
 
 

@@ -62,12 +62,12 @@ class Reading:
         if self.unit is not None:
             parts.append(
                 f"the angles look like {NAMES[self.unit]} that were declared as {NAMES[self.declared]}; "
-                f"declare --angle-unit {self.unit}"
+                f"declare `angle_unit` {self.unit}"
             )
         if self.order is not None:
-            parts.append(f"the rotation order looks like {self.order}; declare --rotation {self.order}")
+            parts.append(f"the rotation order looks like {self.order}; declare `rotation` {self.order}")
         if self.transposed:
-            parts.append("the rotation looks like ground to camera; declare --rotation-direction ground-to-camera")
+            parts.append("the rotation looks like ground to camera; declare `rotation_direction` ground-to-camera")
         if self.camera_flipped:
             parts.append("the camera's axes look like y down, z forwards, as in computer vision")
         if self.ground_flipped:

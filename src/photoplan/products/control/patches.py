@@ -93,7 +93,7 @@ def choose_patches(
     cells = int(np.ceil(search / resolution))
     if cells > _LARGEST:
         raise UsageError(
-            f"--search {search:g} m are {cells} pixels of {resolution:g} m; at most {_LARGEST} are searched; give "
+            f"`search` {search:g} m are {cells} pixels of {resolution:g} m; at most {_LARGEST} are searched; give "
             f"{_LARGEST * resolution:g} m or less, or a coarser orthophoto"
         )
     step = max(float(np.median([np.sqrt(area.area) for area, _ in areas])) / grid, resolution)

@@ -149,7 +149,7 @@ def propose_control(request: ControlRequest, stage: Stage = unwatched) -> Contro
             raise GeometryError(f"no patch of the orthophoto was found in an image: {listed}")
         raise GeometryError(
             f"{found} of {sum(i.tried for i in images)} patches were found, but they do not agree on an orientation of "
-            "any image; give a larger --search, another --correlation, or an orthophoto of a similar date"
+            "any image; give a larger `search`, another `correlation`, or an orthophoto of a similar date"
         )
     write_ground_points(output, ground)
     write_image_points(image_output, points)
@@ -174,17 +174,17 @@ def _with_heights(project: Project, request: ControlRequest) -> Project:
 def _check(request: ControlRequest, project: Project) -> tuple[Path, Path]:
     """Outputs, and everything that can be refused before any work."""
     for what, value, low in (
-        ("--grid", request.grid, 1),
-        ("--search", request.search, 0.0),
-        ("--radius", request.radius, 5),
-        ("--height-sigma", request.height_sigma, 0.0),
+        ("`grid`", request.grid, 1),
+        ("`search`", request.search, 0.0),
+        ("`radius`", request.radius, 5),
+        ("`height_sigma`", request.height_sigma, 0.0),
     ):
         if not (np.isfinite(value) and value >= low):
             raise UsageError(f"{what} {value:g}; {low:g} or more is needed")
     if not -1 <= request.correlation < 1:
-        raise UsageError(f"--correlation {request.correlation:g}; a number below 1 is needed, such as 0.7")
+        raise UsageError(f"`correlation` {request.correlation:g}; a number below 1 is needed, such as 0.7")
     if request.ortho_sigma is not None and not request.ortho_sigma > 0:
-        raise UsageError(f"--ortho-sigma {request.ortho_sigma:g}; a positive number of metres is needed")
+        raise UsageError(f"`ortho_sigma` {request.ortho_sigma:g}; a positive number of metres is needed")
     output = request.output or request.project.resolve().parent / "control.csv"
     image_output = output.with_name(f"{output.stem}_points{output.suffix or '.csv'}")
     if not request.dry_run:
@@ -216,7 +216,7 @@ def _open_ortho(request: ControlRequest, project: Project) -> Ortho:
             first = f"{request.ortho[0]} are {Ortho((readers[0],)).resolution:g} m"
             raise InputError(
                 f"{path}: pixels of {xx:g} m, those of {first}; orthophotos of one run need "
-                "the same: use gdalwarp -tr, or a run for each with an --output of its own"
+                "the same: use gdalwarp -tr, or a run for each with an `output` of its own"
             )
         readers.append(reader)
     return Ortho(tuple(readers))

@@ -50,12 +50,12 @@ class ReadingsReport:
 
     def options(self, reading: Reading) -> str:
         """What to give to `photoplan convert` so that it reads the file so."""
-        words = [] if self.matrices else [f"--angle-unit {reading.angle_unit}", f"--rotation {reading.rotation}"]
-        words.append(f"--rotation-direction {reading.direction}")
+        words = [] if self.matrices else [f"`angle_unit` {reading.angle_unit}", f"`rotation` {reading.rotation}"]
+        words.append(f"`rotation_direction` {reading.direction}")
         if reading.camera_axes != Reading.camera_axes:
-            words.append(f"--camera-axes {reading.camera_axes}")
+            words.append(f"`camera_axes` {reading.camera_axes}")
         if reading.turned:
-            words.append(f"--image-turned {reading.turned}")
+            words.append(f"`image_turned` {reading.turned}")
         if reading.swapped:
             words.append("and exchange X and Y")
         if reading.mirrored:
@@ -103,7 +103,7 @@ def list_readings(request: ConvertRequest, image_points: Path, control: Path) ->
     if request.camera is not None:
         block = with_cameras(block, request.camera)
     if not block.cameras:
-        raise UsageError("to compare readings the camera has to be known; give --camera FILE")
+        raise UsageError("to compare readings the camera has to be known; give `camera` FILE")
     table = block.table
     names = tuple(image.name for image in table.images)
     observed, unknown = named_as(read_image_points(image_points), names)

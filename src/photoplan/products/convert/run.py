@@ -164,7 +164,7 @@ def _in_crs(block: OrientationBlock, crs: str | None) -> OrientationBlock:
     """The block in a CRS; heights stay as they are."""
     if crs is None:
         return block
-    require_projected_metres(crs, "--crs")
+    require_projected_metres(crs, "`crs`")
     table, crs = block.table, canonical_crs(crs)
     if table.crs is None and table.origin is None:
         return replace(block, table=replace(table, crs=crs))
@@ -202,7 +202,7 @@ def _without_lost_lenses(
     if not request.drop_lens:
         raise UsageError(
             f"{request.target} holds {'; '.join(loss.text for loss in lenses)}; measured points would be off by the "
-            "distortion. Choose another format, or say --drop-lens and correct the images before"
+            "distortion. Choose another format, or say `drop_lens` and correct the images before"
         )
     if not block.cameras:
         raise InputError(f"{block.table.file}: a lens would be lost, and no camera is described")

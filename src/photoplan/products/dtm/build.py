@@ -92,7 +92,7 @@ def load(request: BuildRequest) -> tuple[MeasuredTerrain, tuple[Finding, ...], s
     raw = read_measured(request.inputs, request.options)
     if raw.crs is None:
         names = ", ".join(path.name for path in request.inputs)
-        raise InputError(f"{names}: no CRS; state it with --crs EPSG:nnnn, it is not guessed")
+        raise InputError(f"{names}: no CRS; state it with `crs` EPSG:nnnn, it is not guessed")
     system = _height_system(raw, request.height_system)
     _check_memory(raw)
     measured, findings = clean(raw, sigmas=request.settings.filters or None)
@@ -261,9 +261,9 @@ def _check_report(request: BuildRequest) -> None:
     """Refuse a report that cannot be written before any work is done."""
     page = _page_path(request.output)
     if request.report is not False and page.exists() and not request.overwrite:
-        raise UsageError(f"{page} exists; give --overwrite to replace it, or --no-report")
+        raise UsageError(f"{page} exists; give `overwrite` to replace it, or `report=False`")
     if request.report and not _can_plot():
-        raise UsageError("the report needs matplotlib: pip install 'photoplan[report]', or give --no-report")
+        raise UsageError("the report needs matplotlib: pip install 'photoplan[report]', or give `report=False`")
 
 
 def _page_path(output: Path) -> Path:

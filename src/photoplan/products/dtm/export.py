@@ -142,7 +142,7 @@ def _export_raster(request: ExportRequest, terrain: OpenTerrain, progress: Progr
         return surface.relief_with_sigma(target, window)[1][None]
 
     if request.sigma is not None and not isinstance(surface, HybridSurface):
-        raise UsageError(f"{request.model}: a raster of heights has no standard deviations; leave --sigma out")
+        raise UsageError(f"{request.model}: a raster of heights has no standard deviations; leave `sigma` out")
     facts = write_grid(request.output, grid.placement, np.float32, 1, "auto", heights, options)
     paths = [request.output]
     if request.sigma is not None:

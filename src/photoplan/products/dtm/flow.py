@@ -177,7 +177,7 @@ def _grid(request: FlowRequest, terrain: OpenTerrain) -> MapGrid:
     if need > request.memory:
         raise ResourceError(
             f"{grid.width} × {grid.height} cells take {need / 2**30:.1f} GiB, allowed are "
-            f"{request.memory / 2**30:.1f}: water knows no tiles; give a coarser --resolution or more --memory"
+            f"{request.memory / 2**30:.1f}: water knows no tiles; give a coarser `resolution` or more `memory`"
         )
     return grid
 
@@ -197,13 +197,13 @@ def _cells(
         except InputError:
             raise InputError(
                 f"{request.outlets}: outlet {name} at {x:.10g} {y:.10g} has no terrain within {request.snap:g} m; "
-                "move it, or give a larger --snap"
+                "move it, or give a larger `snap`"
             ) from None
         other = cells.index(cells[-1])
         if other < len(cells) - 1:
             raise InputError(
                 f"{request.outlets}: outlets {points[other][0]} and {name} come to lie in one cell; leave one out, or "
-                "give a smaller --snap or --resolution"
+                "give a smaller `snap` or `resolution`"
             )
     return cells
 

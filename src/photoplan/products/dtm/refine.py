@@ -120,7 +120,7 @@ def _one_system(coarse: ModelReader, fine: ModelReader, declared: str | None) ->
         )
     if len(named) < 2 and declared is None:
         without = " and ".join(str(r.path) for r, s in zip((coarse, fine), stated) if s is None)
-        raise HeightSystemError(f"{without}: no height system stated; if both have the same, say --height-system same")
+        raise HeightSystemError(f"{without}: no height system stated; if both have the same, say `height_system` same")
     return named[0] if named else None
 
 

@@ -88,7 +88,7 @@ def dtm_sample(request: SampleRequest, progress: Callable[[int, int], None] | No
     table = PointTable(request.points, request.form)
     taken = [name for name in request.names if name in table.names]
     if taken:
-        raise UsageError(f"{request.points}: has a column {taken[0]} already; name the new ones: --names HEIGHT SIGMA")
+        raise UsageError(f"{request.points}: has a column {taken[0]} already; name the new ones: `names` HEIGHT SIGMA")
     count = outside = known = 0
     low, high, squares = np.inf, -np.inf, 0.0
     delimiter = table.delimiter

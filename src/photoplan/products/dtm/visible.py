@@ -180,7 +180,7 @@ def _places(request: VisibleRequest, terrain: OpenTerrain) -> list[Place]:
     if request.file is not None:
         places += _from_file(request.file, request.height_observer, terrain)
     if not places:
-        raise UsageError("no observer; give --from X Y or --observers FILE")
+        raise UsageError("no observer; give `points` X Y or `observers` FILE")
     if len(places) > 254:
         raise UsageError(f"{len(places)} observers; at most 254 are counted in one map")
     xmin, ymin, xmax, ymax = terrain.bounds
@@ -238,7 +238,7 @@ def _check_memory(grid: MapGrid, count: int, request: VisibleRequest) -> None:
     if need > request.memory:
         raise ResourceError(
             f"{grid.width} × {grid.height} posts and {count} observers take {need / 2**30:.1f} GiB, allowed are "
-            f"{request.memory / 2**30:.1f}; give a --radius, a coarser --resolution, fewer observers or more --memory"
+            f"{request.memory / 2**30:.1f}; give a `radius`, a coarser `resolution`, fewer observers or more `memory`"
         )
 
 

@@ -174,7 +174,7 @@ def _one_system(a: OpenTerrain, b: OpenTerrain, declared: str | None) -> str:
     if len(named) < 2 and declared is None:
         without = " and ".join(str(t.path) for t in (a, b) if t.height_system is None)
         raise HeightSystemError(
-            f"{without}: no height system stated; if both models have the same, say --height-system same"
+            f"{without}: no height system stated; if both models have the same, say `height_system` same"
         )
     return named[0] if named else "same, not named"
 
@@ -206,7 +206,7 @@ def _errors(
     for letter, terrain, given in (("a", a, request.sigma_a), ("b", b, request.sigma_b)):
         sigma = given if given is not None else _own(terrain)
         if sigma is None:
-            return None, [f"no standard deviation: {terrain.path} has none of its own; give --sigma-{letter} METRES"]
+            return None, [f"no standard deviation: {terrain.path} has none of its own; give `sigma_{letter}` METRES"]
         models.append(ErrorModel(sigma, request.correlation or terrain.resolution))
     return (models[0], models[1]), []
 

@@ -111,14 +111,14 @@ def _project(request: FiducialsRequest) -> Project | None:
     """The project that is given in place of images."""
     if len(request.images) == 1 and request.images[0].suffix.lower() == ".toml":
         if request.camera is not None or request.camera_name is not None:
-            raise UsageError("a project describes its cameras itself; leave out --camera and --camera-name")
+            raise UsageError("a project describes its cameras itself; leave out `camera` and `camera_name`")
         return load_project(request.images[0])
     if not request.images:
-        raise UsageError("no image is given; give scans and --camera FILE, or a project file")
+        raise UsageError("no image is given; give scans and `camera` FILE, or a project file")
     if request.select:
-        raise UsageError("--images chooses among the images of a project; here the images are given themselves")
+        raise UsageError("`images` chooses among the images of a project; here the images are given themselves")
     if request.camera is None:
-        raise UsageError("--camera FILE is needed: it describes the fiducial marks; or give a project file")
+        raise UsageError("`camera` FILE is needed: it describes the fiducial marks; or give a project file")
     return None
 
 
@@ -158,7 +158,7 @@ def _film_camera(path: Path, wanted: str | None) -> tuple[str, FilmCamera]:
             raise UsageError(f"{path}: has no film camera {wanted!r}; its film cameras are {listed}")
         return wanted, film[wanted]
     if len(film) != 1:
-        raise UsageError(f"{path}: describes {len(film)} film cameras ({listed}); choose one with --camera-name")
+        raise UsageError(f"{path}: describes {len(film)} film cameras ({listed}); choose one with `camera_name`")
     return next(iter(film.items()))
 
 

@@ -132,7 +132,7 @@ def camera_by_size(file: Path, size: tuple[int, int], cameras: CameraFile) -> st
     raise InputError(
         f"{cameras.file} describes {len(cameras.cameras)} cameras ({known}), and {len(of_size)} of them have the "
         f"{size[0]} × {size[1]} px of {file}; make a project with one camera's file, or give an orientation table with "
-        "a column `camera`"
+        "a column called camera"
     )
 
 
@@ -156,7 +156,7 @@ def camera_name(image: OrientedImage, cameras: CameraFile, table: Path) -> str:
         return next(iter(cameras.cameras))
     raise InputError(
         f"{cameras.file} describes {len(cameras.cameras)} cameras ({known}), and {table} does not say which image has "
-        "which; add a column `camera`"
+        "which; add a column called camera"
     )
 
 

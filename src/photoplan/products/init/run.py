@@ -127,7 +127,7 @@ def init_project(request: InitRequest, talk: Callable[[str], None] = lambda line
         Height systems are not declared, or the grid that joins them is missing.
     """
     if request.path.exists() and not request.overwrite:
-        raise UsageError(f"{request.path} exists; give --overwrite to replace it, or another folder")
+        raise UsageError(f"{request.path} exists; give `overwrite` to replace it, or another folder")
     result = make_project(request, talk)
     try:
         request.folder.mkdir(parents=True, exist_ok=True)

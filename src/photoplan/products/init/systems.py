@@ -103,12 +103,12 @@ def terrain_entry(request: Systems) -> tuple[Terrain | None, TerrainFacts | None
     file = Path(text)
     info = _terrain_facts(file)
     if info.crs is None and request.terrain_crs is None:
-        raise InputError(f"terrain {file}: states no CRS; say the one it is in: --terrain-crs EPSG:nnnn")
+        raise InputError(f"terrain {file}: states no CRS; say the one it is in: `terrain_crs` EPSG:nnnn")
     stated = info.crs or request.terrain_crs
     parse_crs(stated or "", f"terrain {file}")
     if info.crs is not None and request.terrain_crs is not None and not same_crs(info.crs, request.terrain_crs):
         raise InputError(
-            f"terrain {file}: states {crs_label(info.crs)}, not {request.terrain_crs}; leave --terrain-crs out"
+            f"terrain {file}: states {crs_label(info.crs)}, not {request.terrain_crs}; leave `terrain_crs` out"
         )
     crs = None if info.crs is not None else request.terrain_crs
     return Terrain(file=relative_path(file.absolute(), request.folder), crs=crs), replace(info, crs=stated)
@@ -127,14 +127,14 @@ def project_crs(request: Systems, table: OrientationTable | None, terrain: Terra
     elif table is None:
         raise InputError(
             "without an orientation nothing states the CRS of the project; declare that of the control points with "
-            "--crs EPSG:nnnn"
+            "`crs` EPSG:nnnn"
         )
     elif table.crs is not None:
         crs, source = table.crs, f"from {(table.crs_file or table.file).name}"
     elif table.origin is not None and terrain is not None and terrain.crs is not None:
         crs, source = _horizontal(terrain.crs), f"from {terrain.path.name}"
     else:
-        raise InputError(f"{table.file}: does not state the CRS of its coordinates; declare it with --crs EPSG:nnnn")
+        raise InputError(f"{table.file}: does not state the CRS of its coordinates; declare it with `crs` EPSG:nnnn")
     require_projected_metres(crs, f"CRS ({source})")
     return canonical_crs(crs), source
 
@@ -163,20 +163,20 @@ def height_systems(
         request.orientation_height_system or stated_table or request.height_system,
     ]
     if request.height_system is not None:
-        declared = check_height_system(request.height_system, "--height-system")
+        declared = check_height_system(request.height_system, "`height_system`")
         of_files = [s for s in (stated_terrain, stated_table) if s is not None]
         if len(of_files) == 2 and declared not in [check_height_system(s) for s in of_files]:
             raise UsageError(
-                f"--height-system {request.height_system}: both files state theirs "
+                f"`height_system` {request.height_system}: both files state theirs "
                 f"({height_label(stated[0])}; {height_label(stated[1])}); to overrule a file use "
-                "--terrain-height-system or --orientation-height-system"
+                "`terrain_height_system` or `orientation_height_system`"
             )
     terrain_system, orientation_system = stated
     if request.terrain is not None:
         return declared_pair(terrain_system, orientation_system)
     if orientation_system is None:
         raise HeightSystemError(
-            "height system of control points and orientation not stated → declare it with --height-system: "
+            "height system of control points and orientation not stated → declare it with `height_system`: "
             "ellipsoidal, EPSG:nnnn (a vertical CRS, such as EPSG:5773 for EGM96), or same (as that of all heights)"
         )
     return None, check_height_system(orientation_system, "orientation")
@@ -206,7 +206,7 @@ def placed(table: OrientationTable, crs: str, system: str) -> tuple[NDArray[np.f
     if source.axis_info[0].unit_conversion_factor != 1.0 and system in ("same", "ellipsoidal"):
         raise HeightSystemError(
             f"{table.file}: {crs_label(table.crs)} is in {source.axis_info[0].unit_name}, and the unit of Z is not "
-            "stated; declare the vertical CRS with --orientation-height-system EPSG:nnnn"
+            "stated; declare the vertical CRS with `orientation_height_system` EPSG:nnnn"
         )
     XY = table.centers[:, :2]
     bounds = (XY[:, 0].min(), XY[:, 1].min(), XY[:, 0].max(), XY[:, 1].max())

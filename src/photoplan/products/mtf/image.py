@@ -79,7 +79,7 @@ class LightImage:
         if band == "all":
             return (LUMINANCE, *range(1, bands + 1)) if bands >= 3 else tuple(range(1, bands + 1))
         if not band.isdecimal() or not 1 <= int(band) <= bands:
-            raise UsageError(f"{self.reader.path}: --band {band}; the file has bands 1 to {bands}, or say all")
+            raise UsageError(f"{self.reader.path}: `band` {band}; the file has bands 1 to {bands}, or say all")
         return (int(band),)
 
     def picture(self, window: Window, channel: int) -> EdgePicture:

@@ -59,7 +59,7 @@ class Measuring:
             col, row, w, h = roi
             if min(w, h) < 1 or col < 0 or row < 0 or col + w > width or row + h > height:
                 raise UsageError(
-                    f"--roi {col} {row} {w} {h} (column, row, width, height): leaves {image.reader.path} of {width} × "
+                    f"`roi` {col} {row} {w} {h} (column, row, width, height): leaves {image.reader.path} of {width} × "
                     f"{height} pixels"
                 )
         return [Window(*roi) for roi in self.rois]
@@ -174,7 +174,7 @@ def _regions(
     for roi, area in zip(how.rois, how.areas(image)):
         in_roi = search_edges(image, channel, area, how.rules, advance)
         if not in_roi.regions:
-            raise InputError(f"{image.reader.path}: --roi {' '.join(map(str, roi))}: {_why(in_roi)}")
+            raise InputError(f"{image.reader.path}: `roi` {' '.join(map(str, roi))}: {_why(in_roi)}")
         chosen.append(in_roi.regions[0])
         rejected += in_roi.rejected
     return chosen, len(chosen), rejected

@@ -102,15 +102,15 @@ def measure_patterns(request: PatternRequest, talk: Callable[[str], None] = lamb
 def _check(request: PatternRequest) -> None:
     """Refuse what cannot be meant before any work."""
     if request.sectors is not None and request.pattern != "star":
-        raise UsageError(f"--sectors goes with --pattern star, not {request.pattern}")
+        raise UsageError(f"`sectors` goes with `pattern` star, not {request.pattern}")
     if request.group is not None and request.pattern != "usaf":
-        raise UsageError(f"--group goes with --pattern usaf, not {request.pattern}")
+        raise UsageError(f"`group` goes with `pattern` usaf, not {request.pattern}")
     if request.coltman and request.pattern != "bars":
-        raise UsageError(f"--coltman goes with --pattern bars, not {request.pattern}")
+        raise UsageError(f"`coltman` goes with `pattern` bars, not {request.pattern}")
     if request.levels is not None and request.pattern == "usaf":
-        raise UsageError("--levels goes with --pattern bars or star; a USAF target shows its levels itself")
+        raise UsageError("`levels` goes with `pattern` bars or star; a USAF target shows its levels itself")
     if request.pixel_um is not None and not 1e-3 <= request.pixel_um <= 1e6:
-        raise UsageError(f"--pixel-size {request.pixel_um:g}; 0.001 to 1000000 micrometres are allowed")
+        raise UsageError(f"`pixel_size` {request.pixel_um:g}; 0.001 to 1000000 micrometres are allowed")
     check_files(request.images, (request.linearisation,), request.csv, request.overwrite)
 
 
@@ -120,7 +120,7 @@ def _windows(image: LightImage, rois: tuple[Roi, ...]) -> list[Window]:
     for col, row, w, h in rois:
         if min(w, h) < 1 or col < 0 or row < 0 or col + w > width or row + h > height:
             raise UsageError(
-                f"--roi {col} {row} {w} {h} (column, row, width, height): leaves {image.reader.path} of {width} × "
+                f"`roi` {col} {row} {w} {h} (column, row, width, height): leaves {image.reader.path} of {width} × "
                 f"{height} pixels"
             )
     windows = [Window(*roi) for roi in rois] or [Window(0, 0, width, height)]
@@ -128,7 +128,7 @@ def _windows(image: LightImage, rois: tuple[Roi, ...]) -> list[Window]:
         if window.width * window.height > MOST_PIXELS:
             raise InputError(
                 f"{image.reader.path}: a window of {window.width} × {window.height} pixels; give the pattern "
-                "alone with --roi column row width height"
+                "alone with `roi` column row width height"
             )
     return windows
 
@@ -163,7 +163,7 @@ def _measure(named: tuple[str, Path], image: LightImage, request: PatternRequest
             try:
                 curve = bar_curve(groups, levels)
             except InputError as error:
-                raise InputError(f"{path}: {error} (--levels LOW HIGH)") from None
+                raise InputError(f"{path}: {error} (`levels` LOW HIGH)") from None
             parts = tuple(window for _, window in sorted(zip(groups, windows), key=lambda part: part[0].frequency))
             results.append(PatternResult(named, band, _hull(windows), curve, parts, request.coltman, request.pixel_um))
             continue
@@ -193,7 +193,7 @@ def _levels(
     grey = np.array(levels, np.float64)
     if not (np.isfinite(grey).all() and 0.0 <= grey[0] < grey[1]):
         raise UsageError(
-            f"--levels {levels[0]:g} {levels[1]:g}; the grey value of dark areas, then that of bright ones"
+            f"`levels` {levels[0]:g} {levels[1]:g}; the grey value of dark areas, then that of bright ones"
         )
     if linearisation.kind == "srgb":
         # As floating point the full scale is 1.

@@ -11,7 +11,7 @@ from photoplan.io.product import check_output
 #: Said where nobody states how 8 bits are encoded.
 ENCODED = (
     "linearisation: linear (by default: grey values are taken as light). Images of 8 bits are usually encoded by a "
-    "curve such as sRGB, and that alone moves MTF50 by about 12 %; say --linearisation srgb, a table, or linear"
+    "curve such as sRGB, and that alone moves MTF50 by about 12 %; say `linearisation` srgb, a table, or linear"
 )
 
 

@@ -172,12 +172,12 @@ def _check(request: MtfRequest) -> None:
         Naming the option.
     """
     if not 1 <= request.grid <= MOST_CELLS:
-        raise UsageError(f"--grid {request.grid}; 1 to {MOST_CELLS} cells are allowed")
+        raise UsageError(f"`grid` {request.grid}; 1 to {MOST_CELLS} cells are allowed")
     if not 1 <= request.most_edges <= MOST_EDGES:
-        raise UsageError(f"--most-edges {request.most_edges}; 1 to {MOST_EDGES} are allowed")
+        raise UsageError(f"`most_edges` {request.most_edges}; 1 to {MOST_EDGES} are allowed")
     if not 6 <= request.half_width <= 60:
-        raise UsageError(f"--half-width {request.half_width}; 6 to 60 px are allowed")
+        raise UsageError(f"`half_width` {request.half_width}; 6 to 60 px are allowed")
     if request.pixel_um is not None and not 0.01 <= request.pixel_um <= 1e4:
-        raise UsageError(f"--pixel-size {request.pixel_um:g}; 0.01 to 10000 micrometres are allowed")
+        raise UsageError(f"`pixel_size` {request.pixel_um:g}; 0.01 to 10000 micrometres are allowed")
     tables = (request.linearisation, request.lab)
     check_files(request.images, tables, request.csv, request.overwrite)

@@ -136,7 +136,7 @@ def _refuse_inputs(plan: OrthoPlan, outputs: list[Path]) -> None:
     inputs = {_identity(file) for file in input_files(plan.project)}
     for path in outputs:
         if _identity(path) in inputs:
-            raise UsageError(f"{path}: the output is an input of the project; choose another --output")
+            raise UsageError(f"{path}: the output is an input of the project; choose another `output`")
 
 
 def _identity(path: Path) -> object:

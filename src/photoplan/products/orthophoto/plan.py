@@ -177,7 +177,7 @@ def _check_storable(scene: Scene, name: str, grid: MapGrid, settings: OrthoSetti
     if tiles > MOST_TILES:
         raise UsageError(
             f"{name}: resolution {settings.resolution:g} m gives {grid.width:.3g} × {grid.height:.3g} pixels in "
-            f"{tiles:.3g} tiles, more than {MOST_TILES}; choose a larger --resolution or --tile, or smaller --bounds"
+            f"{tiles:.3g} tiles, more than {MOST_TILES}; choose a larger `resolution` or `tile`, or smaller `bounds`"
         )
     nodata_for(scene.reader.dtype, settings.nodata_value, settings.compress)
     if settings.compress == "jpeg" and (scene.reader.dtype != np.uint8 or scene.reader.bands not in (1, 3)):

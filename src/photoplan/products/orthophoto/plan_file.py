@@ -243,15 +243,13 @@ def read_plan(path: Path | str) -> tuple[OrthoPlan, Path]:
         if changed or len(plan.products) != len(counts):
             raise InputError(
                 f"{path}: inputs have changed since the plan was written ({', '.join(changed) or 'images are gone'}); "
-                "make the plan again with `photoplan ortho --plan`"
+                "make the plan again with `photoplan ortho`"
             )
         chosen = _with_tiles(plan, tiles, {image: count for image, (_, count) in counts.items()})
     except (KeyError, TypeError, ValueError, UsageError) as error:
-        raise InputError(
-            f"{path}: the plan is damaged ({error}); make it again with `photoplan ortho --plan`"
-        ) from error
+        raise InputError(f"{path}: the plan is damaged ({error}); make it again with `photoplan ortho`") from error
     if not chosen.products:
-        raise InputError(f"{path}: the plan has no tiles left; make it again with `photoplan ortho --plan`")
+        raise InputError(f"{path}: the plan has no tiles left; make it again with `photoplan ortho`")
     return chosen, output
 
 

@@ -68,7 +68,7 @@ def finished_products(plan: OrthoPlan, folder: Path, overwrite: bool) -> dict[st
     if foreign or len(existing) == len(plan.products):
         first = product_path(folder, plan[foreign[0]] if foreign else existing[0])
         more = f" and {len(existing) - 1} more" if len(existing) > 1 else ""
-        raise UsageError(f"{first}{more} exists; give --overwrite to replace it, or another --output")
+        raise UsageError(f"{first}{more} exists; give `overwrite` to replace it, or another `output`")
     return {name: result for name, result in kept.items() if result is not None}
 
 

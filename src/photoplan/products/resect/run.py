@@ -133,8 +133,7 @@ def _refuse(inputs: AdjustInputs, wanted: Sequence[str], counts: dict[str, int],
         if images > 1:
             raise UsageError(
                 f"{', '.join(settings.free)} of camera {camera!r} cannot be found for {images} images one by one, as "
-                "each gives another value; name one with --images, or free the parameters in `photoplan adjust "
-                "--calibrate`"
+                "each gives another value; name one with `images`, or free the parameters in `photoplan adjust`"
             )
 
 

@@ -113,7 +113,7 @@ def _for_aperture(text: str) -> RestorationFilter:
         ratio = float("nan")
     if shape not in ("square", "round") or ratio != ratio:
         raise UsageError(
-            f"--aperture {text}; it is square or round, with :RATIO of aperture by step, such as round:1.2"
+            f"`aperture` {text}; it is square or round, with :RATIO of aperture by step, such as round:1.2"
         )
     kernel = FilterKernel(aperture_filter(cast(Literal["square", "round"], shape), ratio))
     facts = {"rule": f"inverse of the transfer function of a {shape} aperture of {ratio:g} steps (Ecker 1991, eq. 4.5)"}

@@ -203,7 +203,7 @@ def _in_flight(request: RestoreRequest, jobs: list[Job]) -> int:
     fits = (request.memory - BASE_MEMORY) // each
     if fits < 1:
         raise UsageError(
-            f"--memory {request.memory / 2**20:.0f} MiB; at least {(BASE_MEMORY + each) / 2**20:.0f} MiB are needed "
+            f"`memory` {request.memory / 2**20:.0f} MiB; at least {(BASE_MEMORY + each) / 2**20:.0f} MiB are needed "
             "for one tile"
         )
     return int(min(wanted, fits))
@@ -243,7 +243,7 @@ def restore_images(
     kept = {job.target: earlier_result(job, settings) for job in plan.jobs} if not request.overwrite else {}
     if plan.jobs and all(kept.get(job.target) for job in plan.jobs):
         first = plan.jobs[0].target
-        raise UsageError(f"{first}: exists already; choose another output or say --overwrite")
+        raise UsageError(f"{first}: exists already; choose another output or say `overwrite`")
     _make_folder(request.folder)
     results, failed = [], dict(plan.failed)
     with begin(plan.tiles) as advance:

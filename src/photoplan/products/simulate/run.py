@@ -231,7 +231,7 @@ def _scene(request: SimulateRequest, model: ImageModel) -> Scene:
     scene: Scene
     if pattern is None:
         if request.size is not None or request.levels is not None or request.phase is not None:
-            raise UsageError(f"--size, --levels and --phase are for patterns ({', '.join(PATTERNS)}), not for files")
+            raise UsageError(f"`size`, `levels` and `phase` are for patterns ({', '.join(PATTERNS)}), not for files")
         if not Path(request.scene).exists() and ":" in request.scene:
             raise UsageError(
                 f"scene {request.scene!r}: no such file, and no pattern; patterns are {', '.join(PATTERNS)}"

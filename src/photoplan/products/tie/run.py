@@ -182,7 +182,7 @@ def find_ties(request: TieRequest, stage: Stage = unwatched) -> TieReport:
         tracks, refined, loops = _refine(request, spare, images, factor, run, stage)
     tracks = tracks.of_tracks(thin_tracks(tracks, sizes, request.per_image))
     if not len(tracks):
-        raise GeometryError("no tie point is left after refinement; look at the images, or give --no-refine")
+        raise GeometryError("no tie point is left after refinement; look at the images, or give `refine=False`")
     points = _points(tracks, names)
     write_image_points(output, points)
     _enter(request.project, project, output)
@@ -248,8 +248,8 @@ def _refuse_nothing(request: TieRequest, verified: Sequence[PairMatches], tried:
     if not verified:
         raise GeometryError(
             f"{request.project}: none of {tried} pairs of {len(names)} images ({some(list(names))}) could be verified: "
-            "no overlap, or too little texture. Choose other images with --images, give --pairs all, more --features, "
-            "or another --scale"
+            "no overlap, or too little texture. Choose other images with `images`, give `pairs` all, more `features`, "
+            "or another `scale`"
         )
 
 

@@ -105,7 +105,7 @@ def design_filter(
         if exact is None:
             raise InputError(
                 "the image cannot be restored exactly: " + "; ".join(broken) + ". Objects that have fused cannot be "
-                "told apart; use --method regularised"
+                "told apart; use `method` regularised"
             )
         return Design(exact, "exact", "exact, as asked for; the condition holds", *conditions)
     if exact is not None and asked.method == "auto":

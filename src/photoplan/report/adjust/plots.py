@@ -44,7 +44,7 @@ class AdjustPlots:
     """
 
     def __init__(self) -> None:
-        self._mpl = load_matplotlib("a report", "say --dry-run")
+        self._mpl = load_matplotlib("a report", "say `dry_run`")
 
     def network(self, facts: AdjustFacts) -> bytes:
         """Image centres by strip, tie points, control and check points."""

@@ -218,8 +218,7 @@ def _fields(facts: AdjustFacts, plots: AdjustPlots) -> list[str]:
         paragraph(
             "Mean residuals (computed minus measured) of all images in cells of the image format. A pattern that hangs "
             "together is an error of the camera's model: a lens, a principal point or a film that calibration "
-            "parameters "
-            "(--calibrate) may take up."
+            "parameters may take up."
         )
     ]
     for field in facts.fields:

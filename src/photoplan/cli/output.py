@@ -1,0 +1,107 @@
+"""What verbs print: results on stdout, talk on stderr, and parameters under the names that the command line gives them.
+
+The library names a parameter in backticks: ``give `overwrite` to replace it``. Here, and nowhere else, that becomes the
+option of the verb that runs: ``give --overwrite to replace it``. `` `report=False` `` becomes ``--no-report``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+
+import click
+
+from photoplan.errors import InputError, TilesFailed
+
+_PARAMETER = re.compile(r"`([a-z][a-z0-9_]*)(=False)?`")
+
+
+def spelled(text: str, verb: click.Command | None, group: click.Command | None = None) -> str:
+    """A text of the library with its parameters as options.
+
+    Parameters
+    ----------
+    text : str
+    verb : click.Command or None
+        The verb that runs.
+    group : click.Command, optional
+        Holds the verbs that a text may name, as in ``declare `crs` to `photoplan init` ``: theirs are the options that
+        `verb` does not have.
+
+    Returns
+    -------
+    str
+        Parameters that none of the verbs has stay as they are.
+    """
+    if "`" not in text or verb is None:
+        return text
+    spellings: dict[str, str] = {}
+    for command in reversed([verb, *_named(text, group)]):
+        options = [p for p in command.params if isinstance(p, click.Option)]
+        spellings |= {"--" + (p.name or "").replace("_", "-"): p.opts[-1] for p in options}
+        spellings |= {o: o for p in options for o in (*p.opts, *p.secondary_opts)}
+
+    def option(found: re.Match[str]) -> str:
+        return spellings.get("--" + "no-" * bool(found[2]) + found[1].replace("_", "-"), found[0])
+
+    return _PARAMETER.sub(option, text)
+
+
+def _named(text: str, group: click.Command | None) -> list[click.Command]:
+    if not isinstance(group, click.Group):
+        return []
+    names = dict.fromkeys(re.findall(r"`photoplan ([a-z]+)", text))
+    return [command for name in names if (command := group.get_command(click.Context(group), name))]
+
+
+def show(text: object) -> None:
+    """Print a result on stdout."""
+    click.echo(_spelled(text))
+
+
+def show_json(values: object) -> None:
+    """Print a value as one JSON object on stdout."""
+    from photoplan.plain import json_text  # brings NumPy, which --help does without
+
+    show(json_text(values))
+
+
+def say(text: object) -> None:
+    """Say something on stderr."""
+    click.echo(_spelled(text), err=True)
+
+
+def talking(quiet: bool) -> Callable[[str], None]:
+    """What says a line on stderr, or nothing if `quiet`."""
+    return (lambda text: None) if quiet else say
+
+
+def _spelled(text: object) -> str:
+    context = click.get_current_context(silent=True)
+    return spelled(str(text), context.command, context.find_root().command) if context else str(text)
+
+
+def end_with_failures(failed: Mapping[str, str], done: int, what: str = "images failed") -> None:
+    """Name the images that failed, if any did.
+
+    Parameters
+    ----------
+    failed : mapping
+        Why, by name of the image.
+    done : int
+        Number of the others.
+    what : str
+        What the message says of them.
+
+    Raises
+    ------
+    InputError
+        All failed.
+    TilesFailed
+        Some did.
+    """
+    if failed and not done:
+        raise InputError("\n".join(failed.values()))
+    if failed:
+        listed = "\n".join(f"  {reason}" for reason in failed.values())
+        raise TilesFailed(f"{len(failed)} of {len(failed) + done} {what}:\n{listed}")

@@ -1,0 +1,69 @@
+"""Messages name the options of the verb that runs, and the library names no option at all."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tools.command import options_of, unknown_options, verbs
+
+import photoplan
+from photoplan.cli.main import photoplan as command
+from photoplan.cli.output import spelled
+
+SOURCE = Path(photoplan.__file__).parent
+#: Options of other programs, and the names of colours in style sheets.
+FOREIGN = re.compile(
+    r"pyproj sync --file|colmap model_converter --output_type|(var\(|:root .*)--[a-z]+"
+    r"|[Pp]lain values for `--json`"
+)
+VERBS = verbs()
+WORDS = sorted(
+    {o.removeprefix("--").removeprefix("no-").replace("-", "_") for c in VERBS.values() for o in options_of(c)}
+)
+
+
+def test_the_library_names_no_option() -> None:
+    """Strings, docstrings among them, outside the command line."""
+    found = []
+    for path in sorted(SOURCE.rglob("*.py")):
+        if path.relative_to(SOURCE).parts[0] == "cli":
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                text = FOREIGN.sub("", node.value)
+                found += [f"{path}:{node.lineno}: {o}" for o in re.findall(r"(?<![\w-])--[a-z][a-z-]*", text)]
+    assert found == []
+
+
+@given(st.sampled_from(sorted(VERBS)), st.lists(st.tuples(st.sampled_from(WORDS), st.booleans()), max_size=5))
+def test_parameters_become_options_that_the_verb_has(name: str, words: list[tuple[str, bool]]) -> None:
+    text = ", or ".join(f"give `{word}{'=False' * off}`" for word, off in words)
+    said = spelled(text, VERBS[name])
+    assert not [o for o in unknown_options(name.split(), said) if o.startswith("-")]
+    assert re.sub(r"`[^`]*`|-[-a-z]+", "", said) == re.sub(r"`[^`]*`", "", text)
+    assert spelled(said, VERBS[name]) == said
+
+
+@pytest.mark.parametrize(
+    ("verb", "text", "said"),
+    [
+        ("ortho", "give `overwrite` to replace it", "give --overwrite to replace it"),
+        ("dtm build", "or `report=False`", "or --no-report"),
+        ("tie", "or give `refine=False`", "or give --no-refine"),
+        ("dtm visible", "give `points` X Y", "give --from X Y"),
+        ("interior", "leave `report` out, and `with` alone", "leave --report out, and `with` alone"),
+        ("check", "give `overwrite`; run `photoplan ortho`", "give `overwrite`; run `photoplan ortho`"),
+    ],
+)
+def test_examples(verb: str, text: str, said: str) -> None:
+    assert spelled(text, VERBS[verb]) == said
+
+
+def test_a_verb_that_is_named_lends_its_options() -> None:
+    text = "declare `angle_unit` gon to `photoplan init`; `overwrite`"
+    assert spelled(text, VERBS["check"], command) == "declare --angle-unit gon to `photoplan init`; --overwrite"
