@@ -148,7 +148,7 @@ def unknown_options(words: Sequence[str], message: str) -> list[str]:
     own = next((known[w] for w in (" ".join(words[:2]), *words[:1]) if w in known), None)
     allowed = options_of(own) if own else set()
     for name, command in known.items():
-        if f"photoplan {name} " in message:
+        if re.search(rf"photoplan {name}\b", message):
             allowed |= options_of(command)
     parameters = {o[2:].replace("-", "_") for command in known.values() for o in options_of(command)}
     left = [word for word in re.findall(r"`([a-z_]+)`", message) if word in parameters]

@@ -68,8 +68,8 @@ def declared_pair(terrain: str | None, orientation: str | None) -> tuple[str, st
     if terrain is None or orientation is None:
         raise HeightSystemError(
             f"height systems: terrain {height_label(terrain)}, orientation {height_label(orientation)} → declare "
-            f"one, or `height_system` same; in the project file: height_system in [terrain] and [orientation]; "
-            f"allowed are {OPTIONS}"
+            f"one, or `height_system` same, to `photoplan init`; in the project file: height_system in [terrain] "
+            f"and [orientation]; allowed are {OPTIONS}"
         )
     pair = [check_height_system(terrain, "terrain"), check_height_system(orientation, "orientation")]
     named = [p for p in pair if p != "same"]
