@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.linear import Fit, solve
 from photoplan.cameras.plane import Affine2D, Bilinear2D
 from photoplan.errors import GeometryError, InputError
 
@@ -222,12 +223,9 @@ def _bilinear_design(xy: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _adjust(plane: NDArray[np.float64], scan: NDArray[np.float64], design: _Design) -> _Adjusted:
     """Least squares with one design for columns and rows."""
-    A = design(plane)
-    unknowns, Q = _solve(A, scan)
-    residuals = A @ unknowns - scan
-    redundancy, sigma0 = _spread(residuals, unknowns.size)
-    covariance = np.asarray(np.kron(np.eye(2), Q) * sigma0**2, float)
-    return _Adjusted(unknowns.T.ravel(), covariance, residuals, redundancy, sigma0)
+    fit = _solve(design(plane), scan)
+    covariance = np.asarray(np.kron(np.eye(2), fit.cofactors) * fit.sigma0**2, float)
+    return _Adjusted(fit.unknowns.T.ravel(), covariance, fit.residuals, fit.redundancy, fit.sigma0)
 
 
 def _adjust_similarity(plane: NDArray[np.float64], scan: NDArray[np.float64], mirrored: bool) -> _Adjusted:
@@ -235,29 +233,16 @@ def _adjust_similarity(plane: NDArray[np.float64], scan: NDArray[np.float64], mi
     turn = 1.0 if mirrored else -1.0
     # Coefficients a1 … a6 of p, q, s, t.
     J = np.array([[1, 0, 0, 0], [0, -turn, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [turn, 0, 0, 0], [0, 0, 0, 1]], float)
-    A = np.kron(np.eye(2), _affine_design(plane)) @ J
-    unknowns, Q = _solve(A, scan.T.ravel())
-    residuals = (A @ unknowns).reshape(2, -1).T - scan
-    redundancy, sigma0 = _spread(residuals, 4)
-    return _Adjusted(J @ unknowns, J @ Q @ J.T * sigma0**2, residuals, redundancy, sigma0)
+    fit = _solve(np.kron(np.eye(2), _affine_design(plane)) @ J, scan.T.ravel())
+    covariance = J @ fit.covariance @ J.T if fit.redundancy else np.full((6, 6), math.nan)
+    return _Adjusted(J @ fit.unknowns, covariance, fit.residuals.reshape(2, -1).T, fit.redundancy, fit.sigma0)
 
 
-def _solve(A: NDArray[np.float64], observed: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Unknowns and their cofactors."""
-    # Columns of very different size (1 and x y) are brought to one length.
-    length = np.linalg.norm(A, axis=0)
-    U, s, Vt = np.linalg.svd(A / length, full_matrices=False)
-    if s[-1] < 1e-9 * s[0]:
+def _solve(A: NDArray[np.float64], observed: NDArray[np.float64]) -> Fit:
+    fit = solve(A, observed)
+    if fit.rank < A.shape[1]:
         raise GeometryError("the fiducial marks do not determine the transformation; marks at other places are needed")
-    inverse = Vt.T / s
-    unknowns = ((inverse @ (U.T @ observed)).T / length).T
-    return unknowns, (inverse @ inverse.T) / np.outer(length, length)
-
-
-def _spread(residuals: NDArray[np.float64], unknowns: int) -> tuple[int, float]:
-    """Redundancy and sigma0."""
-    redundancy = residuals.size - unknowns
-    return redundancy, math.sqrt(float((residuals**2).sum()) / redundancy) if redundancy else math.nan
+    return fit
 
 
 def _check_marks(common: _Pairs, residuals: NDArray[np.float64], affine: NDArray[np.float64], mirrored: bool) -> None:

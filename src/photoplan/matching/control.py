@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
+from photoplan.adjustment.robust import MEDIAN_2D, cauchy
 from photoplan.cameras.base import Camera, project
 from photoplan.kernels.patch_match import CONVERGED, CORRELATION, RESULTS, match_patches, spline_coefficients
 
@@ -23,7 +24,7 @@ _LIKE = 0.4
 LEAST = 6
 #: Prior standard deviation of the rotations of a correction, radians.
 _TURN = 0.03
-_MEDIAN = 2 * np.log(2.0)
+_MEDIAN = MEDIAN_2D**2
 #: Fits are at least so much too sure of themselves: what loops of tie points show (see `photoplan.matching.loops`).
 _FACTOR = 2.0
 
@@ -206,8 +207,8 @@ def agree(camera: Camera, XYZ: Array, xy: Array, covariances: tuple[Array, Array
     residual, scale = gap - middle, 0.0
     for step in range(30):
         length = np.linalg.norm(residual, axis=1)
-        scale = max(float(np.median(length)) / np.sqrt(_MEDIAN), 0.05)
-        weight = 1.0 / (1.0 + (length / (2.5 * scale)) ** 2)
+        scale = max(float(np.median(length)) / MEDIAN_2D, 0.05)
+        weight = cauchy(length, 2.5 * scale)
         moved, J = _moved(camera, XYZ, delta)
         actual = xy - project(camera, moved)
         W = np.diag(1.0 / np.array([reach, reach, reach, _TURN, _TURN, _TURN]) ** 2) * scale**2

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.robust import MEDIAN_2D
 from photoplan.matching.grey import Grey
 from photoplan.matching.refine import Map, Matched, RefineSettings, disc, local_affines, match_between
 from photoplan.matching.tracks import Tracks
@@ -28,7 +29,7 @@ LEAST = 30
 #: Factor where there are too few loops: a third ray is missing, or texture.
 ASSUMED = 3.0
 #: Median of the squared length of a two-dimensional normal vector of unit variance.
-_MEDIAN = 2 * np.log(2.0)
+_MEDIAN = MEDIAN_2D**2
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.linear import solve
+from photoplan.adjustment.robust import cauchy
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
 from photoplan.matching.features import opencv
@@ -130,9 +132,7 @@ def _adjusted(
         turned = [_cross(base) @ cv2.Rodrigues(step * axis)[0] @ R for axis in np.eye(3)]
         moved = [_cross(base + step * side) @ R for side in across]
         J = np.stack([(distances(m) - now) / step for m in (*turned, *moved)], axis=1)
-        weight = 1.0 / (1.0 + (2.0 * now / threshold) ** 2)
-        N = (J * weight[:, None]).T @ J
-        change = -np.linalg.lstsq(N, (J * weight[:, None]).T @ now, rcond=1e-10)[0]
+        change = -solve(J, now, cauchy(now, 0.5 * threshold)).unknowns
         R = cv2.Rodrigues(change[:3])[0] @ R
         base = base + change[3:] @ across
         base /= np.linalg.norm(base)

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.linear import solve
+from photoplan.adjustment.robust import spread
 from photoplan.kernels.fit_covariance import block_score, minimise
 from photoplan.kernels.sides import sides_of
 from photoplan.terrain.neighbours import Neighbours
@@ -170,11 +172,11 @@ def _block(seen: Observations, numbers: NDArray[np.int64]) -> _Blocks:
     given = seen.given[numbers]
     known = ~np.isnan(given)
     noise = np.column_stack([np.where(known, given, 0.0) ** 2, np.where(known, 0.0, seen.share[numbers]) ** 2])
-    rest = b[:, 0] - b[:, 1:] @ np.linalg.lstsq(b[:, 1:], b[:, 0], rcond=None)[0]
-    spread = 1.4826 * np.median(np.abs(rest - np.median(rest)))
-    wild = np.abs(rest - np.median(rest)) > _OUTLIER * spread
-    if spread > 0:
-        noise[wild, 0] = 1e6 * spread**2
+    rest = -solve(b[:, 1:], b[:, 0]).residuals
+    size = spread(rest, None)
+    wild = np.abs(rest - np.median(rest)) > _OUTLIER * size
+    if size > 0:
+        noise[wild, 0] = 1e6 * size**2
     return _Blocks(d2[None], apart[None], b[None], noise[None])
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.robust import MEDIAN_1D, MEDIAN_2D, geman_mcclure, huber, spread
 from photoplan.errors import GeometryError
 from photoplan.orientation.bundle.active import Active
 from photoplan.orientation.bundle.model import Model
@@ -27,8 +28,6 @@ _HUBER = 5
 _HUBER_LIMIT, _FALL = 2.0, 3.0
 #: Control points from which it is asked with which of them most agree.
 _LEAST_CONTROL = 5
-#: Medians of the length of normally distributed errors, σ = 1, in one and in two coordinates.
-_MEDIAN_1D, _MEDIAN_2D = 0.6745, 1.1774
 #: Image points are not judged by less than this part of their stated standard deviation, however small residuals are.
 _BEST = 0.05
 #: An observation that was taken out comes back when its residual is below this part of the critical value.
@@ -126,7 +125,7 @@ def robust_scale(e: _Floats, kind: tuple[str, str]) -> float:
     e = e[np.isfinite(e)]
     if len(e) < 20:
         return 1.0
-    return max(float(np.median(np.abs(e))) / _MEDIAN_1D, _BEST if kind[1] == "px" else 1.0)
+    return max(spread(e), _BEST if kind[1] == "px" else 1.0)
 
 
 def _joined(e: _Floats, kind: tuple[str, str]) -> _Floats:
@@ -137,7 +136,7 @@ def _joined(e: _Floats, kind: tuple[str, str]) -> _Floats:
     if kind[1] != "px":
         return e
     length: _Floats = np.linalg.norm(e.reshape(-1, 2), axis=1)
-    return np.repeat(length * (_MEDIAN_1D / _MEDIAN_2D), 2)
+    return np.repeat(length * (MEDIAN_1D / MEDIAN_2D), 2)
 
 
 def robust_weights(model: Model, e: _Floats, turn: int) -> _Floats:
@@ -153,9 +152,7 @@ def robust_weights(model: Model, e: _Floats, turn: int) -> _Floats:
         mine = np.flatnonzero(of == k)
         # Sizes of two or three coordinates are longer than single ones; the scale is that of the single ones.
         s = size[mine] / (robust_scale(_joined(e[mine], kinds[k]), kinds[k]) * stretch)
-        weight[mine] = (
-            _HUBER_LIMIT / np.maximum(s, _HUBER_LIMIT) if turn < _HUBER else 1.0 / (1 + (s / _FALL) ** 2) ** 2
-        )
+        weight[mine] = huber(s, _HUBER_LIMIT) if turn < _HUBER else geman_mcclure(s, _FALL)
     return np.nan_to_num(weight)
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.robust import geman_mcclure
 from photoplan.orientation.bundle.active import Active
 from photoplan.orientation.bundle.block import Block
 
@@ -178,6 +179,6 @@ def intersect(
             angle = np.where(distance > 0, across / distance, 0.0)
         scale = max(float(np.nanmedian(angle[good_rays])) if good_rays.any() else 0.0, 1e-12)
         # Far rays count less, as their error across is larger; gross errors hardly count.
-        weight = np.nan_to_num(1.0 / np.maximum(distance, 1e-9) ** 2 / (1.0 + (angle / (3.0 * scale)) ** 2) ** 2)
+        weight = np.nan_to_num(geman_mcclure(angle, 3.0 * scale) / np.maximum(distance, 1e-9) ** 2)
     good: NDArray[np.bool_] = determined & np.isfinite(XYZ).all(axis=1)
     return XYZ, good

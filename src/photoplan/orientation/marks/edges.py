@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from photoplan.adjustment.linear import solve
+from photoplan.adjustment.robust import bisquare, spread
 from photoplan.cameras.mark_pattern import MarkPattern
 
 _STEP = 1.0
@@ -303,27 +305,27 @@ def _adjust(
     n, d, at, piece = normal[seen], offset[seen], about[seen], edge[seen]
     # n · (shift + rotation r⊥ + scale r) = d, with r⊥ = (−y, x) in columns and rows.
     A = np.column_stack([n, n[:, 1] * at[:, 0] - n[:, 0] * at[:, 1], (n * at).sum(axis=1)])
+    equations, observed = np.vstack([A, np.eye(4)[2:]]), np.append(d, prior[0])
     weight = np.ones(len(d))
-    spread = max(1.4826 * float(np.median(np.abs(d - np.median(d)))), _FLOOR)
+    size = max(spread(d, None), _FLOOR)
     for _ in range(20):
         # Points of a cluster err together: the prior weighs against clusters, not points.
-        P = np.diag([0.0, 0.0, *((spread / prior[1]) ** 2 * _CLUSTER)])
-        normal_matrix = A.T @ (weight[:, None] * A) + P
-        if np.linalg.eigvalsh(normal_matrix[:2, :2])[0] < 1e-3 * weight.sum() or np.linalg.cond(normal_matrix) > 1e12:
+        known = (size / prior[1]) ** 2 * _CLUSTER
+        fit = solve(equations, observed, np.append(weight, known))
+        plane = A[:, :2].T @ (weight[:, None] * A[:, :2])
+        if np.linalg.eigvalsh(plane)[0] < 1e-3 * weight.sum() or fit.rank < 4:
             return None
-        unknowns = np.linalg.solve(normal_matrix, A.T @ (weight * d) + P @ np.array([0.0, 0.0, *prior[0]]))
-        residual = d - A @ unknowns
-        spread = max(1.4826 * float(np.median(np.abs(residual))), _FLOOR)
-        weight = np.clip(1 - (residual / (_TUKEY * spread)) ** 2, 0, None) ** 2
-    inverse = np.linalg.inv(normal_matrix)
+        residual = -fit.residuals[:-2]
+        size = max(spread(residual), _FLOOR)
+        weight = bisquare(residual / size, _TUKEY)
     along = at[:, 0] * n[:, 1] - at[:, 1] * n[:, 0]
     cluster = piece * 100003 + np.floor(along / _CLUSTER).astype(np.int64)
     _, group = np.unique(cluster, return_inverse=True)
     scores = np.zeros((int(group.max()) + 1, A.shape[1]))
     np.add.at(scores, group, (weight * residual)[:, None] * A)
     groups = len(scores)
-    meat = scores.T @ scores * groups / max(groups - A.shape[1], 1) + spread**2 * _CLUSTER * P
-    covariance = (inverse @ meat @ inverse)[:2, :2]
+    meat = scores.T @ scores * groups / max(groups - A.shape[1], 1) + size**2 * _CLUSTER * np.diag([0.0, 0.0, *known])
+    covariance = (fit.cofactors @ meat @ fit.cofactors)[:2, :2]
     good = weight > 0
     rms = math.sqrt(float((weight * residual**2).sum() / weight.sum()))
-    return _Solution(unknowns[:2], unknowns[2:], covariance, rms, float(good.sum()) / total, int(good.sum()))
+    return _Solution(fit.unknowns[:2], fit.unknowns[2:], covariance, rms, float(good.sum()) / total, int(good.sum()))

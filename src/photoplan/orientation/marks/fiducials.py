@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.linear import solve
 from photoplan.cameras.fiducials_fit import FiducialFit, fit_affine
 from photoplan.errors import InputError
 from photoplan.orientation.marks.layout import TURNS, MarkLayout, Placement, Turn
@@ -277,9 +278,7 @@ def _without_false(layout: MarkLayout, measured: Measured, turn: Turn) -> tuple[
 def _sigma0(layout: MarkLayout, measured: Measured, names: Sequence[str], turn: Turn) -> float:
     P = layout.mm[[layout.names.index(n) for n in names]]
     p = np.array([(measured.found[n].x, measured.found[n].y) for n in names])
-    A = np.column_stack([P, np.ones(len(P))])
-    v = A @ np.linalg.lstsq(A, p, rcond=None)[0] - p
-    return math.sqrt(float((v**2).sum()) / (2 * len(P) - 6)) if len(P) > 3 else math.nan
+    return solve(np.column_stack([P, np.ones(len(P))]), p).sigma0
 
 
 def _result(

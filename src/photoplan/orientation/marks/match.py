@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from photoplan.adjustment.linear import Fit, solve
 from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
 from photoplan.kernels.template_match import sample_template
 from photoplan.orientation.marks.drawn import draw
@@ -122,12 +123,11 @@ def match_template(image: NDArray[np.floating], template: FineTemplate, x: float
 
 @dataclass(frozen=True, eq=False)
 class _Fitted:
-    """Where the iteration ended: place, design, unknowns, grey values, template values, pixels that are compared."""
+    """Where the iteration ended: place, fit, grey values, template values, pixels that are compared."""
 
     x: float
     y: float
-    A: NDArray[np.float64]
-    unknowns: NDArray[np.float64]
+    fit: Fit
     grey: NDArray[np.float64]
     T: NDArray[np.float64]
     used: NDArray[np.bool_]
@@ -147,33 +147,30 @@ def _fit(
     rows, columns = np.nonzero(used)
     g = image[used]
     flat = np.column_stack([np.ones_like(g), columns - at[0], rows - at[1]])
-    gain = float(np.linalg.lstsq(np.column_stack([sampled[0][used], flat]), g, rcond=None)[0][0])
+    gain = float(solve(np.column_stack([sampled[0][used], flat]), g).unknowns[0])
     for iteration in range(1, _ITERATIONS + 1):
         T, Tx, Ty = (layer[used] for layer in sampled[:3])
         A = np.column_stack([-gain * Tx, -gain * Ty, T, flat])
-        unknowns, _, rank, _ = np.linalg.lstsq(A, g, rcond=None)
-        if rank < A.shape[1]:
+        fit = solve(A, g)
+        if fit.rank < A.shape[1]:
             return None
-        step = np.clip(unknowns[:2], -0.5, 0.5)
-        gain = float(unknowns[2])
+        step = np.clip(fit.unknowns[:2], -0.5, 0.5)
+        gain = float(fit.unknowns[2])
         x, y = x + float(step[0]), y + float(step[1])
         if max(abs(x - start[0]), abs(y - start[1])) > _FAR or not math.isfinite(x + y):
             return None
         if np.abs(step).max() < _SMALL:
-            return _Fitted(x, y, A, unknowns, g, T, used, iteration)
+            return _Fitted(x, y, fit, g, T, used, iteration)
         _sample(template, x, y, sampled)
     return None
 
 
 def _result(fitted: _Fitted) -> Match:
-    A, unknowns, g, T = fitted.A, fitted.unknowns, fitted.grey, fitted.T
-    residuals = A @ unknowns - g
-    sigma0 = math.sqrt(float(residuals @ residuals) / (len(g) - len(unknowns)))
-    influence = A @ np.linalg.inv(A.T @ A)
-    covariance = _covariance(influence, residuals, fitted.used, sigma0)
-    trend = A[:, 3:] @ unknowns[3:]
+    fit, g, T = fitted.fit, fitted.grey, fitted.T
+    covariance = _covariance(fit.influence, fit.residuals, fitted.used, fit.sigma0)
+    trend = fit.A[:, 3:] @ fit.unknowns[3:]
     r = float(np.corrcoef(T, g - trend)[0, 1]) if np.ptp(T) > 0 and np.ptp(g - trend) > 0 else 0.0
-    return Match(fitted.x, fitted.y, covariance, float(unknowns[2]), r, sigma0, fitted.iterations)
+    return Match(fitted.x, fitted.y, covariance, float(fit.unknowns[2]), r, fit.sigma0, fitted.iterations)
 
 
 def _sample(template: FineTemplate, x: float, y: float, out: NDArray[np.float64]) -> None:
@@ -186,7 +183,7 @@ def _covariance(
 ) -> NDArray[np.float64]:
     """Covariance of the shift: BᵀCB, with the influence B of each grey value on it and the correlation of residuals."""
     B = np.zeros((2, *used.shape))
-    B[:, used] = influence[:, :2].T
+    B[:, used] = influence[:2]
     v = np.zeros(used.shape)
     v[used] = residuals
     there = used.astype(float)

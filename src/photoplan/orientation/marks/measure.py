@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.linear import solve
 from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
@@ -201,6 +202,6 @@ def _refit(
     if len(found) > 3:
         A = np.column_stack([layout.mm[index], np.ones(len(index))])
         if np.linalg.matrix_rank(A, tol=1e-3 * layout.extent) == 3:
-            solution = np.linalg.lstsq(A, xy, rcond=None)[0]
+            solution = solve(A, xy).unknowns
             matrix, shift = solution[:2].T, solution[2]
     return matrix, layout.mm @ matrix.T + shift

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.robust import spread
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
@@ -329,11 +330,9 @@ def _tested(task: _Task, equations: _Equations, use: NDArray[np.bool_]) -> _Test
     # A point that cannot be predicted (behind the camera) does not fit.
     normalised[~use & ~np.isfinite(equations.residuals).all(axis=1)] = np.inf
     numbers = np.where(use[:, None], np.diagonal(np.eye(2) - fitted, axis1=1, axis2=2), np.nan)
-    inside = np.abs(normalised[use])
-    inside = inside[np.isfinite(inside)]
-    scale = 1.4826 * float(np.median(inside)) if redundancy > 2 and len(inside) else sigma0
+    scale = spread(normalised[use]) if redundancy > 2 else sigma0
     units = equations.units
-    return _Tests(cofactor * units[:, None] * units, normalised, numbers, max(1.0, scale), sigma0)
+    return _Tests(cofactor * units[:, None] * units, normalised, numbers, float(np.nanmax([1.0, scale])), sigma0)
 
 
 def _unknowns(task: _Task, equations: _Equations) -> Unknowns:

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from photoplan.adjustment.linear import solve
+from photoplan.adjustment.robust import huber
 from photoplan.errors import GeometryError
 from photoplan.geometry.pose import Pose
 from photoplan.orientation.intersection import Rays, intersect
@@ -175,8 +177,7 @@ def _refined(pose: Pose, a: Array, b: Array, limit: float) -> Pose:
         J = np.stack(
             [(signed(stepped(pose, h * e)) - signed(stepped(pose, -h * e))) / (2 * h) for e in list(np.eye(5))], 1
         )
-        weight = np.minimum(1.0, 0.5 * limit / np.maximum(np.abs(now), 1e-300))[:, None] ** 0.5
-        step = np.asarray(np.linalg.lstsq(J * weight, -now * weight[:, 0], rcond=1e-12)[0], float)
+        step = -solve(J, now, huber(now, 0.5 * limit)).unknowns
         trial = stepped(pose, step)
         after = signed(trial)
         if not np.minimum(np.abs(after), limit).sum() < np.minimum(np.abs(now), limit).sum():

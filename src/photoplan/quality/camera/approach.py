@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, stats
+from scipy import optimize
 
+from photoplan.adjustment.chances import chance_gain
+from photoplan.adjustment.linear import solve
 from photoplan.errors import InputError
 
 Array = NDArray[np.float64]
@@ -169,8 +171,8 @@ def _for_tau(t: Array, y: Array, w: Array, tau: float) -> tuple[Array, float]:
     """Start and end for a given time constant, and the sum of squares that remains."""
     decay = np.exp(-t / tau)
     A = w[:, None] * np.column_stack([decay, 1.0 - decay])
-    found, *_ = np.linalg.lstsq(A, w * y, rcond=None)
-    return found, float(((A @ found - w * y) ** 2).sum())
+    fit = solve(A, w * y)
+    return fit.unknowns, fit.square
 
 
 def _refined(t: Array, y: Array, w: Array, taus: Array, best: int) -> tuple[float, float, float, float]:
@@ -190,9 +192,8 @@ def _probability(rss0: float, rss1: float, n: int, taus: Array) -> float:
     """Of the F-test; as the best of many time constants was taken, the chances of independent ones add up."""
     if rss1 <= 1e-24 * max(rss0, 1e-300):
         return 0.0 if rss0 > 0.0 else 1.0
-    ratio = ((rss0 - rss1) / 2.0) / (rss1 / (n - 3))
     trials = 1.0 + math.log(taus[-1] / taus[0]) / 4.0
-    return min(1.0, trials * float(stats.f.sf(ratio, 2, n - 3)))
+    return min(1.0, trials * chance_gain(rss0, rss1, 2, n - 3))
 
 
 def _sigmas(t: Array, w: Array, found: tuple[float, float, float], rms: float) -> tuple[float, float, float, float]:
@@ -200,10 +201,10 @@ def _sigmas(t: Array, w: Array, found: tuple[float, float, float], rms: float) -
     start, end, tau = found
     decay = np.exp(-t / tau)
     J = w[:, None] * np.column_stack([decay, 1.0 - decay, (start - end) * decay * t / tau**2])
-    length = np.linalg.norm(J, axis=0)
-    if not (length > 0.0).all() or np.linalg.cond(J / length) > 1e8:
+    fit = solve(J, np.zeros(len(t)))
+    if fit.condition < 1e-8:
         return math.inf, math.inf, math.inf, math.inf
-    Q = np.linalg.inv((J / length).T @ (J / length)) / np.outer(length, length) * rms**2
+    Q = fit.cofactors * rms**2
     of_change = Q[0, 0] + Q[1, 1] - 2.0 * Q[0, 1]
     return math.sqrt(Q[0, 0]), math.sqrt(Q[1, 1]), math.sqrt(Q[2, 2]), math.sqrt(max(of_change, 0.0))
 

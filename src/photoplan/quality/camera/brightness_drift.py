@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
+from photoplan.adjustment.chances import chance_t
 from photoplan.errors import InputError
 from photoplan.quality.camera.approach import check_times
 
@@ -141,7 +142,7 @@ def brightness_drift(
         # Of n−1 differences that overlap: variance of their mean square is (3n−4)/(n−1)² σ⁴ for white noise.
         short * math.sqrt(3.0 * n - 4.0) / (n - 1) / 2.0,
         neumann,
-        float(stats.norm.cdf(z)),
+        float(special.ndtr(z)),
         trend,
         sigma_trend,
         probability,
@@ -171,7 +172,7 @@ def _trend(t: Array, y: Array) -> tuple[float, float, float]:
     count = max(n * (1.0 - r) / (1.0 + r), 3.0)
     freedom = max(count - 2.0, 1.0)
     sigma = math.sqrt(rss / (n - 2.0) / square * n / count)
-    return slope, sigma, 2.0 * float(stats.t.sf(abs(slope) / sigma, freedom))
+    return slope, sigma, chance_t(slope / sigma, freedom)
 
 
 def _variation(t: Array, y: Array) -> Variation:

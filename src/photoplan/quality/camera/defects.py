@@ -12,8 +12,9 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, norm
+from scipy import special
 
+from photoplan.adjustment.robust import spread
 from photoplan.errors import InputError
 from photoplan.quality.camera.high_pass import background
 
@@ -59,13 +60,12 @@ class DefectList:
 
 def _scatter(values: NDArray[np.float64], least: float) -> float:
     """Robust standard deviation, not below `least`."""
-    middle = float(np.nanmedian(values))
-    return max(1.4826 * float(np.nanmedian(np.abs(values - middle))), least)
+    return max(spread(values, None), least)
 
 
 def _factor(count: int) -> float:
     """How many standard deviations a Gaussian value exceeds by chance in 0.01 of such images."""
-    return float(norm.isf(_ALARMS / max(count, 1) / 2))
+    return float(-special.ndtri(_ALARMS / max(count, 1) / 2))
 
 
 def find_defects(
@@ -153,7 +153,7 @@ def find_blinking(variance: NDArray[np.float64], frames: int, step: float = 1.0)
     """
     if frames < 4:
         raise InputError(f"{frames} frames at a setting; blinking pixels need four or more")
-    usual = float(np.nanmedian(variance)) * (frames - 1) / float(chi2.median(frames - 1))
+    usual = float(np.nanmedian(variance)) * (frames - 1) / float(special.chdtri(frames - 1, 0.5))
     if usual < 1e-3 * step**2:
         raise InputError(
             "most pixels do not change at all from frame to frame (black cut off, or rounding): there is no noise with "
@@ -161,7 +161,7 @@ def find_blinking(variance: NDArray[np.float64], frames: int, step: float = 1.0)
         )
     usual = max(usual, float(np.nanmean(np.minimum(variance, 16 * usual))))
     # Shot noise differs from pixel to pixel with its light, so the limit is taken generously.
-    limit = 1.5 * usual * float(chi2.isf(_ALARMS / np.isfinite(variance).sum(), frames - 1)) / (frames - 1)
+    limit = 1.5 * usual * float(special.chdtri(frames - 1, _ALARMS / np.isfinite(variance).sum())) / (frames - 1)
     rows, cols = np.nonzero(variance > limit)
     sigma = np.sqrt(variance[rows, cols])
     order = np.argsort(-sigma, kind="stable")[:MOST]
@@ -233,5 +233,5 @@ def log_histogram(deviation: NDArray[np.float64], scatter: float) -> LogHistogra
     classes = int(np.clip(3 * (high - low) / scatter, 20, 4000)) if scatter > 0 else 200
     edges = np.linspace(low, high if high > low else low + 1.0, classes + 1)
     count, _ = np.histogram(deviation, edges)
-    model = np.diff(norm.cdf(edges, float(np.median(deviation)), scatter)) * deviation.size
+    model = np.diff(special.ndtr((edges - float(np.median(deviation))) / scatter)) * deviation.size
     return LogHistogram((edges[:-1] + edges[1:]) / 2, count, model)

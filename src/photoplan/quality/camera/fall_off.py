@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from photoplan.adjustment.robust import spread
 from photoplan.errors import GeometryError, InputError
 from photoplan.quality.camera.fall_off_adjust import (
     FallOffSettings,
@@ -300,7 +301,7 @@ def _dirt(blocks: Blocks, residuals: Array, relative: Array) -> tuple[Dirt, ...]
     """Connected blocks that stand out, the deepest first."""
     known = np.isfinite(residuals)
     # In grey values: the relative noise is larger in the corners.
-    limit = _DIRTY * 1.4826 * float(np.median(np.abs(residuals[known])))
+    limit = _DIRTY * spread(residuals[known])
     if not limit > 0.0:
         return ()
     pieces, _ = ndimage.label(known & (np.abs(residuals) > limit), np.ones((3, 3)))

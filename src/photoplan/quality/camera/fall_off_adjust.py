@@ -9,8 +9,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.linear import solve
+from photoplan.adjustment.robust import bisquare, spread
 from photoplan.errors import GeometryError, InputError
-from photoplan.quality.camera.fall_off_blocks import Blocks, robust_weights
+from photoplan.quality.camera.fall_off_blocks import Blocks
 from photoplan.quality.camera.fall_off_model import MOST_DEGREE, half_diagonal, surface_terms, term_values
 
 Array = NDArray[np.float64]
@@ -70,11 +72,6 @@ class Fit:
     free: tuple[str, ...]
 
 
-def solve(A: Array, y: Array) -> Array:
-    """Least squares; what the columns do not determine becomes 0."""
-    return np.asarray(np.linalg.lstsq(A, y, rcond=1e-10)[0], float)
-
-
 def columns(blocks: Blocks, point: tuple[float, float], c: float | None, terms: tuple[tuple[int, int], ...]) -> Array:
     """Design of the linear unknowns for all known blocks, shape (n, 1 + terms): the level, then each term.
 
@@ -103,20 +100,21 @@ def adjust(
     point = start
     for step in range(40):
         A = columns(blocks, point, c, terms)
-        linear = solve(A * w[:, None], y * w)
-        residuals = y - A @ linear
+        fit = solve(A, y, w)
+        linear, residuals = fit.unknowns, -fit.residuals
         change = 0.0
         if free:
             J = np.column_stack([_derivatives(blocks, (point, c), (terms, linear), free), A])
-            found = solve(J * w[:, None], residuals * w)
+            found = solve(J, residuals, w).unknowns
             point, c, change = _moved(point, c, found, free, blocks.size)
         if weights is None and step < 30:
-            w = robust_weights(residuals)
+            size = spread(residuals)
+            w = bisquare(residuals / size) if size > 0.0 else np.ones_like(y)
         if step >= 6 and change < 1e-7:
             break
     A = columns(blocks, point, c, terms)
-    linear = solve(A * w[:, None], y * w)
-    residuals = y - A @ linear
+    fit = solve(A, y, w)
+    linear, residuals = fit.unknowns, -fit.residuals
     J = np.column_stack([_derivatives(blocks, (point, c), (terms, linear), free), A]) if free else A
     return Fit(point, c, terms, linear, _covariance(blocks, J, residuals, w), w, residuals, free)
 
@@ -124,7 +122,7 @@ def adjust(
 def _start_constant(blocks: Blocks, point: tuple[float, float]) -> float:
     """From the curvature at the principal point, where cos⁴ω falls by 2 r² / c²."""
     A = columns(blocks, point, None, ((1, 1), (1, -1), (2, 0)))
-    found = solve(A, blocks.known)
+    found = solve(A, blocks.known).unknowns
     fall = -found[3] / found[0]
     if not fall > 1e-4:
         raise GeometryError(
@@ -180,27 +178,19 @@ def _covariance(blocks: Blocks, J: Array, residuals: Array, w: Array) -> Array:
     used = w > 0.0
     freedom = max(int(used.sum()) - J.shape[1], 1)
     # Weights below 1 make residuals smaller than they are: the variance is that of the spread's robust measure.
-    spread = 1.4826 * float(np.median(np.abs(residuals[used])))
-    variance = spread**2 * used.sum() / freedom
-    length = np.linalg.norm(J * w[:, None], axis=0)
-    length[length == 0.0] = 1.0
-    scaled = J * w[:, None] / length
-    Q = np.linalg.pinv(scaled.T @ scaled, rcond=1e-13) / np.outer(length, length)
-    return Q * variance * blocks.inflation(np.where(used, residuals, np.nan))
+    variance = spread(residuals[used]) ** 2 * used.sum() / freedom
+    return solve(J, residuals, w).cofactors * variance * blocks.inflation(np.where(used, residuals, np.nan))
 
 
 def separability(blocks: Blocks, fit: Fit) -> dict[str, float]:
     """For each estimated unknown, the sine of the angle between its effect and what all others can do."""
     J = _derivatives(blocks, (fit.point, fit.camera_constant), (fit.terms, fit.linear), fit.free)
     A = columns(blocks, fit.point, fit.camera_constant, fit.terms)
-    whole = np.column_stack([J, A]) * fit.weights[:, None]
-    whole /= np.linalg.norm(whole, axis=0)
+    whole = np.column_stack([J, A])
     shares = {}
     for k, name in enumerate(fit.free):
-        others = np.delete(whole, k, axis=1)
-        Q, _ = np.linalg.qr(others)
-        rest = whole[:, k] - Q @ (Q.T @ whole[:, k])
-        shares[name] = float(np.linalg.norm(rest))
+        rest = solve(np.delete(whole, k, axis=1), whole[:, k], fit.weights).square
+        shares[name] = math.sqrt(rest / float(fit.weights @ whole[:, k] ** 2))
     return shares
 
 
@@ -208,13 +198,14 @@ def significant(blocks: Blocks, fit: Fit) -> tuple[tuple[int, int], ...]:
     """Terms that are significant after all of lower degree, and those of the same direction below them."""
     if not fit.terms:
         return ()
-    A = columns(blocks, fit.point, fit.camera_constant, fit.terms) * fit.weights[:, None]
+    root = np.sqrt(fit.weights)
+    A = columns(blocks, fit.point, fit.camera_constant, fit.terms) * root[:, None]
     Q, _ = np.linalg.qr(A / np.linalg.norm(A, axis=0))
     used = fit.weights > 0.0
-    spread = 1.4826 * float(np.median(np.abs(fit.residuals[used])))
-    spread *= math.sqrt(blocks.inflation(np.where(used, fit.residuals, np.nan)))
-    effect = np.abs(Q.T @ (blocks.known * fit.weights))[1:]
-    strong = {term for term, e in zip(fit.terms, effect) if e > SIGNIFICANT * max(spread, 1e-300)}
+    size = spread(fit.residuals[used])
+    size *= math.sqrt(blocks.inflation(np.where(used, fit.residuals, np.nan)))
+    effect = np.abs(Q.T @ (blocks.known * root))[1:]
+    strong = {term for term, e in zip(fit.terms, effect) if e > SIGNIFICANT * max(size, 1e-300)}
     return tuple(t for t in fit.terms if any(s[1] == t[1] and s[0] >= t[0] for s in strong))
 
 

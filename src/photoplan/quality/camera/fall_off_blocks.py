@@ -12,7 +12,6 @@ Array = NDArray[np.float64]
 
 #: Blocks along the longer side.
 ACROSS = 96
-_BISQUARE = 4.685
 """Tukey's constant: 95 % efficient for normal noise."""
 
 
@@ -102,11 +101,3 @@ def to_blocks(image: NDArray[np.floating]) -> Blocks:
         known = np.isfinite(parts).all(axis=1)
         values[row] = np.where(known, np.sort(parts, axis=1)[:, low:high].mean(axis=1), np.nan)
     return Blocks((width, height), side, (left, top), values)
-
-
-def robust_weights(residuals: Array) -> Array:
-    """Square roots of Tukey's bisquare weights, 0 beyond 4.685 standard deviations (median of absolute residuals)."""
-    scale = 1.4826 * float(np.median(np.abs(residuals)))
-    if not scale > 0.0:
-        return np.ones_like(residuals)
-    return np.asarray(np.clip(1.0 - (residuals / (_BISQUARE * scale)) ** 2, 0.0, 1.0))

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
+from photoplan.adjustment.chances import chance_f, chance_normal
 from photoplan.errors import InputError
 from photoplan.quality.camera.approach import LEAST_VALUES, Approach, check_times, fit_approach
 
@@ -147,7 +147,7 @@ def compare_transitions(dark: GainControl, bright: GainControl) -> Asymmetry:
         none = a.rms * math.sqrt(2.0 / (a.redundancy + 1))
         variances.append((a.sigma_change if a.sigma_change is not None else none) ** 2)
     difference, sigma = sizes[0] - sizes[1], math.sqrt(sum(variances))
-    probability = 2.0 * float(stats.norm.sf(abs(difference) / sigma)) if sigma > 0.0 else float(difference == 0.0)
+    probability = chance_normal(difference / sigma) if sigma > 0.0 else float(difference == 0.0)
     return Asymmetry(difference, sigma, probability)
 
 
@@ -176,5 +176,5 @@ def _first_after(t: Array, y: Array, step_time: float | None, name: str) -> int:
 def _ratio_test(spread: float | None, redundancy: int, approach: Approach) -> float | None:
     if spread is None or not (spread > 0.0 and approach.rms > 0.0):
         return None
-    one = float(stats.f.sf((spread / approach.rms) ** 2, redundancy, approach.redundancy))
+    one = chance_f((spread / approach.rms) ** 2, redundancy, approach.redundancy)
     return 2.0 * min(one, 1.0 - one)

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, stats
+from scipy import ndimage
 
+from photoplan.adjustment.chances import chance_t
+from photoplan.adjustment.robust import spread
 from photoplan.errors import InputError
 from photoplan.quality.camera.line_period import (
     Adjusted,
@@ -168,7 +170,7 @@ def line_jitter(position: Array, name: str = "edge", degree: int | None = None) 
         fit.sigma0,
         offset,
         sigma_offset,
-        2.0 * float(stats.t.sf(ratio, freedom)),
+        chance_t(ratio, freedom),
         tuple(sorted(fit.harmonics, key=lambda h: -h.amplitude)),
         whole,
         spikes,
@@ -191,7 +193,7 @@ def _chosen(t: Array, y: Array, degree: int | None, lines: int) -> tuple[int, Ad
         # The last but one unknown is the highest polynomial's; the last, that of the fields.
         ratio = abs(fit.unknowns[-2]) / max(fit.sigmas[-2], 1e-300)
         freedom = max(len(t) - d - 2 - 3 * len(fit.harmonics), 1)
-        if d > 1 and 2.0 * stats.t.sf(ratio, freedom) < LEVEL:
+        if d > 1 and chance_t(ratio, freedom) < LEVEL:
             best = d
     return best, *tried[best]
 
@@ -220,10 +222,12 @@ def _adjusted(waves: Waves, t: Array, y: Array, shape: tuple[int, int]) -> tuple
 def _spikes(t: Array, y: Array) -> NDArray[np.bool_]:
     """Lines far from the running median of their neighbours, after a robust straight line is taken off."""
     step = max(1, len(t) // 200)
-    slope = float(stats.theilslopes(y[::step], t[::step])[0])
+    i, j = np.triu_indices(len(t[::step]), 1)
+    # Theil (1950): the median of the slopes of all pairs.
+    slope = float(np.median((y[::step][j] - y[::step][i]) / (t[::step][j] - t[::step][i])))
     level = y - slope * t
     rest = level - ndimage.median_filter(level, _NEIGHBOURS, mode="nearest")
-    scale = 1.4826 * float(np.median(np.abs(rest - np.median(rest))))
+    scale = spread(rest, None)
     return np.abs(rest) > max(_SPIKE * scale, _LEAST_SPIKE)
 
 

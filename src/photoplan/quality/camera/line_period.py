@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.linear import solve
+
 Array = NDArray[np.float64]
 
 #: Frequencies that are tried within the width of a spectral line, so that none is passed by.
@@ -174,29 +176,21 @@ def adjust_periods(t: Array, y: Array, base: Array, frequencies: list[float], ch
     k = base.shape[1]
     for _ in range(12):
         A = _design(t - middle, base, f)
-        found = _solve(A, y)
+        found = solve(A, y)
         if not len(f):
             break
-        J = np.column_stack([A, _by_frequency(t - middle, f, found[k:])])
-        step = _solve(J, y - A @ found)
-        change = np.clip(step[A.shape[1] :], -limit, limit)
+        J = np.column_stack([A, _by_frequency(t - middle, f, found.unknowns[k:])])
+        change = np.clip(solve(J, -found.residuals).unknowns[A.shape[1] :], -limit, limit)
         f = np.clip(f + change, 1e-6, 0.5 - 1e-6)
         if np.abs(change).max() < 1e-12:
             break
     A = _design(t - middle, base, f)
-    found = _solve(A, y)
-    J = np.column_stack([A, _by_frequency(t - middle, f, found[k:])])
-    residuals = A @ found - y
-    sigma0 = math.sqrt(float(residuals @ residuals) / max(len(t) - J.shape[1], 1))
-    length = np.linalg.norm(J, axis=0)
-    length[length == 0.0] = 1.0
-    covariance = np.linalg.pinv((J / length).T @ (J / length)) / np.outer(length, length) * sigma0**2
-    harmonics = tuple(_harmonic(i, k, f, found, covariance, middle, chances) for i in range(len(f)))
-    return Adjusted(found[:k], np.sqrt(np.diag(covariance)[:k]), harmonics, residuals, sigma0)
-
-
-def _solve(A: Array, y: Array) -> Array:
-    return np.asarray(np.linalg.lstsq(A, y, rcond=None)[0], float)
+    found = solve(A, y)
+    J = np.column_stack([A, _by_frequency(t - middle, f, found.unknowns[k:])])
+    sigma0 = math.sqrt(found.square / max(len(t) - J.shape[1], 1))
+    covariance = solve(J, y).cofactors * sigma0**2
+    harmonics = tuple(_harmonic(i, k, f, found.unknowns, covariance, middle, chances) for i in range(len(f)))
+    return Adjusted(found.unknowns[:k], np.sqrt(np.diag(covariance)[:k]), harmonics, found.residuals, sigma0)
 
 
 def _design(t: Array, base: Array, f: Array) -> Array:

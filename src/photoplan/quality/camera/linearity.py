@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import erfc
 
+from photoplan.adjustment.linear import solve
 from photoplan.errors import InputError
 
 #: Parts of saturation between which levels count (EMVA 1288 release 4 linear).
@@ -93,13 +94,13 @@ def linearity(
         )
     u, v = x[used], y[used]
     design = np.column_stack([1 / v, u / v])  # minimises the sum of ((y − a − b x) / y)²
-    solve = np.linalg.pinv(design)
-    offset, slope = solve @ np.ones_like(u)
+    fit = solve(design, np.ones_like(u))
+    offset, slope = fit.unknowns
     fitted = offset + slope * x
     deviation = 100 * (y - fitted) / fitted
     error = float(np.abs(deviation[used]).mean())
     relative = s[used] / v
-    error_sigma = _error_sigma(deviation[used], np.eye(u.size) - design @ solve, 100 * relative)
+    error_sigma = _error_sigma(deviation[used], np.eye(u.size) - design @ fit.influence, 100 * relative)
     with np.errstate(invalid="ignore"):
         segment = np.concatenate([[np.nan], np.diff(y) / np.diff(x)])
     return Linearity(
@@ -111,7 +112,7 @@ def linearity(
         used,
         float(offset),
         float(slope),
-        float(np.sqrt((solve[1] ** 2) @ relative**2)),
+        float(np.sqrt((fit.influence[1] ** 2) @ relative**2)),
         deviation,
         error,
         error_sigma,

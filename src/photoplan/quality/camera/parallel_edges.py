@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
+from photoplan.adjustment.chances import chance_f, chance_normal
 from photoplan.errors import InputError
 from photoplan.quality.camera.line_jitter import LineJitter
 from photoplan.quality.camera.plumb_edge import LEAST_LINES
@@ -114,7 +114,7 @@ def compare_edges(first: LineJitter, second: LineJitter, offset: int = 0, *, per
         common,
         of_covariance / (2.0 * common) if common > 0.0 else math.nan,
         (math.sqrt(max(variances[0] - covariance, 0.0)), math.sqrt(max(variances[1] - covariance, 0.0))),
-        2.0 * float(stats.norm.sf(abs(z) / half)),
+        chance_normal(z / half),
         tuple(sorted(spikes_a & spikes_b)),
         tuple(sorted(spikes_a ^ spikes_b)),
     )
@@ -125,7 +125,7 @@ def above_control(edge: LineJitter, control: LineJitter) -> AboveControl:
     n, m = int(edge.used.sum()) - edge.degree - 1, int(control.used.sum()) - control.degree - 1
     difference = edge.sigma**2 - control.sigma**2
     ratio = edge.sigma**2 / max(control.sigma**2, 1e-300)
-    probability = float(stats.f.sf(ratio, max(n, 1), max(m, 1)))
+    probability = chance_f(ratio, max(n, 1), max(m, 1))
     if difference <= 0.0:
         return AboveControl(0.0, math.nan, probability)
     of_difference = math.sqrt(2.0 * edge.sigma**4 / max(n, 1) + 2.0 * control.sigma**4 / max(m, 1))

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from photoplan.adjustment.linear import solve
+from photoplan.adjustment.robust import spread
 from photoplan.errors import InputError
 
 #: Share of samples at the largest grey value from which on a level is clipped.
@@ -70,7 +72,7 @@ def full_well(mean: ArrayLike, temporal_variance: float, step: float = 1.0) -> F
     """
     values = np.asarray(mean, float)
     level = float(np.median(values))
-    pattern = 1.4826 * float(np.median(np.abs(values - level)))
+    pattern = spread(values, level)
     noise = sqrt(pattern**2 + (temporal_variance if isfinite(temporal_variance) else 0.0) + step**2 / 12)
     return FullWell(level, level - _SPREAD * noise)
 
@@ -131,7 +133,7 @@ def find_saturation(
 def _black_of_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
     """Grey value at no exposure of the line of least relative deviations; not below 0, nor above the darkest level."""
     below = np.maximum(y, 1e-300)
-    offset, _ = np.linalg.lstsq(np.column_stack([1 / below, x / below]), np.ones_like(x), rcond=None)[0]
+    offset, _ = solve(np.column_stack([1 / below, x / below]), np.ones_like(x)).unknowns
     return float(np.clip(offset, 0.0, max(0.0, float(y[0]))))
 
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
+from photoplan.adjustment.chances import chance_f, chance_gain
+from photoplan.adjustment.linear import Fit, solve
 from photoplan.cameras.affine_facts import AffineFacts, affine_facts
 from photoplan.cameras.plane import Affine2D
 from photoplan.errors import GeometryError, InputError
@@ -92,9 +93,9 @@ def stage_calibration(
     used = np.ones(len(labels), bool)
     while True:
         A = np.column_stack([S, np.ones(len(S))])
-        unknowns, Q = _solve(A[used], P[used])
-        residuals = P - A @ unknowns
-        worst = _worst(A, residuals, used) if gross_errors else None
+        fit = solve(A[used], P[used])
+        residuals = P - A @ fit.unknowns
+        worst = _worst(fit, used) if gross_errors else None
         if worst is None:
             break
         used[worst] = False
@@ -104,11 +105,9 @@ def stage_calibration(
                 f"stage calibration: after {lost} no affine transformation fits the {int(used.sum())} points that are "
                 "left; check the stage coordinates, their signs and their order"
             )
-    freedom = int(used.sum()) - 3
-    columns, rows = np.sqrt((residuals[used] ** 2).sum(axis=0) / freedom)
-    sigma0 = math.sqrt(float((residuals[used] ** 2).sum()) / (2 * freedom))
-    forward = Affine2D(*(float(v) for v in unknowns.T.ravel()))
-    covariance = np.asarray(np.kron(np.eye(2), Q) * sigma0**2, float)
+    columns, rows = np.sqrt((fit.residuals**2).sum(axis=0) / (fit.redundancy / 2))
+    forward = Affine2D(*(float(v) for v in fit.unknowns.T.ravel()))
+    covariance = np.asarray(np.kron(np.eye(2), fit.covariance), float)
     sizes, directions, shear = _sigmas(forward, covariance)
     return StageCalibration(
         labels,
@@ -119,8 +118,8 @@ def stage_calibration(
         covariance,
         residuals,
         (float(columns), float(rows)),
-        sigma0,
-        2 * freedom,
+        fit.sigma0,
+        fit.redundancy,
         tuple(n for n, u in zip(labels, used) if not u),
         affine_facts(forward),
         sizes,
@@ -163,32 +162,16 @@ def _checked(names: Iterable[str], stage: Array, measured: Array) -> tuple[tuple
     return labels, S, P
 
 
-def _solve(A: Array, P: Array) -> tuple[Array, Array]:
-    # Stage coordinates may be thousands of micrometres beside a 1.
-    length = np.linalg.norm(A, axis=0)
-    Q = np.linalg.inv((A / length).T @ (A / length)) / np.outer(length, length)
-    unknowns = np.asarray(np.linalg.lstsq(A / length, P, rcond=None)[0], float)
-    return unknowns / length[:, None], Q
-
-
-def _worst(A: Array, residuals: Array, used: NDArray[np.bool_]) -> int | None:
+def _worst(fit: Fit, used: NDArray[np.bool_]) -> int | None:
     """The point whose residual is farthest beyond what the others allow; None: no gross error."""
-    B, v = A[used], residuals[used]
-    n = len(B)
-    freedom = 2 * (n - 3)
-    if freedom < 6:
+    freedom = fit.redundancy
+    if freedom < 6 or not fit.square > 1e-18 * float((fit.A**2).mean()):
         return None
-    hat = np.einsum("ij,jk,ik->i", B, np.linalg.inv(B.T @ B), B)
-    square = (v**2).sum(axis=1) / (1.0 - np.clip(hat, 0.0, 0.999))
-    total = float((v**2).sum())
-    if not total > 1e-18 * float((A**2).mean()):
-        return None
+    square = (fit.residuals**2).sum(axis=1) / np.clip(fit.redundancies, 1e-3, 1.0)
     # Without the point itself, so that a large error does not hide behind the sigma it makes.
-    ratio = (square / 2.0) / np.maximum((total - square) / (freedom - 2), 1e-300)
+    ratio = (square / 2.0) / np.maximum((fit.square - square) / (freedom - 2), 1e-300)
     k = int(ratio.argmax())
-    if stats.f.sf(float(ratio[k]), 2, freedom - 2) * n < LEVEL:
-        return int(np.flatnonzero(used)[k])
-    return None
+    return int(np.flatnonzero(used)[k]) if chance_f(ratio[k], 2, freedom - 2) * len(square) < LEVEL else None
 
 
 def _sigmas(forward: Affine2D, covariance: Array) -> tuple[tuple[float, float], tuple[float, float], float]:
@@ -218,14 +201,10 @@ def _systematic(S: Array, residuals: Array) -> float | None:
     d = (S - S.mean(axis=0)) / np.maximum(np.ptp(S, axis=0), 1e-300)
     x, y = d.T
     A = np.column_stack([np.ones(n), x, y, x * x, x * y, y * y])
-    if np.linalg.matrix_rank(A, tol=1e-8) < 6:
+    fit = solve(A, residuals)
+    if fit.rank < 6 or not fit.square > 1e-24:
         return None
-    found, *_ = np.linalg.lstsq(A, residuals, rcond=None)
-    rest = float(((residuals - A @ found) ** 2).sum())
-    whole = float((residuals**2).sum())
-    if not rest > 1e-24:
-        return None
-    return float(stats.f.sf(((whole - rest) / 6.0) / (rest / (2 * (n - 6))), 6, 2 * (n - 6)))
+    return chance_gain(float((residuals**2).sum()), fit.square, 6, fit.redundancy)
 
 
 def b4_lines(found: StageCalibration, unit: str) -> tuple[str, ...]:

@@ -7,8 +7,9 @@ from math import sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gammaincc
 
+from photoplan.adjustment.chances import chance_chi_square
+from photoplan.adjustment.linear import solve
 from photoplan.errors import InputError
 
 #: Level of significance at which the scatter about the line is taken as larger than stated.
@@ -76,13 +77,9 @@ def fit_line(x: ArrayLike, y: ArrayLike, sigma: ArrayLike, *, through_origin: bo
     scale = float(np.abs(x - shift).max()) or 1.0
     u = (x - shift) / scale
     design = u[:, None] if through_origin else np.column_stack([np.ones_like(u), u])
-    weighted = design / sigma[:, None]
-    cofactor = np.linalg.inv(weighted.T @ weighted)
-    solution = cofactor @ (weighted.T @ (y / sigma))
-    chi_square = float(np.sum(((y - design @ solution) / sigma) ** 2))
-    degrees = len(x) - unknowns
-    if degrees and gammaincc(degrees / 2, chi_square / 2) < _SIGNIFICANT:
-        cofactor = cofactor * chi_square / degrees
+    fit = solve(design, y, sigma**-2.0)
+    solution, chi_square, degrees = fit.unknowns, fit.square, fit.redundancy
+    cofactor = fit.covariance if degrees and chance_chi_square(chi_square, degrees) < _SIGNIFICANT else fit.cofactors
     if through_origin:
         slope = float(solution[0]) / scale
         return StraightLine(0.0, slope, (0.0, 0.0, float(cofactor[0, 0]) / scale**2), chi_square, degrees)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.linear import Decomposed, solve
 from photoplan.errors import GeometryError, InputError
 from photoplan.quality.camera.approach import LEAST_VALUES, Approach, check_times, fit_approach
 
@@ -212,8 +213,8 @@ def _epochs(
     """Parameters of every epoch, their cofactors; sums of squares of columns and rows, redundancy and weights."""
     A = _design(d, model)
     k, m, u = len(d), moved.shape[1], A.shape[1]
-    singular = np.linalg.svd(A / np.maximum(np.linalg.norm(A, axis=0), 1e-300), compute_uv=False)
-    if singular[-1] < 1e-6 * singular[0]:
+    parts = Decomposed.of(A)
+    if parts.s[-1] < 1e-6 * parts.s[0]:
         raise GeometryError(
             f"warm-up: the {k} targets do not determine the model {model}: they lie at one place or on a line; "
             "measure targets beside it, or ask for a smaller model"
@@ -224,17 +225,12 @@ def _epochs(
     for i in range(m):
         y = moved[:, i].T.ravel()
         use = np.isfinite(y)
-        if use.sum() < u or np.linalg.matrix_rank(A[use], tol=1e-9) < u:
+        fit = solve(A[use], y[use], np.repeat(weights, k)[use] ** 2) if use.sum() >= u else None
+        if fit is None or fit.rank < u:
             continue
-        w = np.repeat(weights, k)[use]
-        B = A[use] * w[:, None]
-        Q = np.linalg.inv(B.T @ B)
-        values[i] = Q @ (B.T @ (y[use] * w))
-        cofactors[i] = Q
-        rest = np.full(2 * k, np.nan)
-        rest[use] = A[use] @ values[i] - y[use]
-        squares += np.nansum(rest.reshape(2, k) ** 2, axis=1)
-        freedom += int(use.sum()) - u
+        values[i], cofactors[i] = fit.unknowns, fit.cofactors
+        squares += np.bincount(np.flatnonzero(use) // k, fit.residuals**2, 2)
+        freedom += fit.redundancy
     # One epoch's redundancy goes into the reference.
     freedom -= 2 * k - u
     return values, cofactors, (squares, max(freedom, 0), weights)

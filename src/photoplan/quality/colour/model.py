@@ -8,6 +8,8 @@ from math import hypot
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.linear import solve
+from photoplan.adjustment.robust import spread
 from photoplan.errors import GeometryError, InputError
 
 _Array = NDArray[np.float64]
@@ -240,30 +242,23 @@ def _columns(kind: str, size: tuple[int, int], measured: Displacements) -> _Arra
 
 def _solve(kind: str, size: tuple[int, int], measured: Displacements, kept: NDArray[np.bool_]) -> _Solved | None:
     """Weighted least squares of one kind; None: it is not determined, or leaves too little to test it by."""
-    matrix = _columns(kind, size, measured) / measured.sigma[:, None]
-    right = measured.value / measured.sigma
-    a, b = matrix[kept], right[kept]
-    n, m = a.shape
+    columns = _columns(kind, size, measured)
+    matrix = columns / measured.sigma[:, None]
     groups = [np.flatnonzero(measured.group[kept] == g) for g in np.unique(measured.group[kept])]
-    if n < 1.5 * m + 2 or (m and np.linalg.matrix_rank(a) < m):
+    if kept.sum() < 1.5 * matrix.shape[1] + 2:
         return None
-    inverse = np.linalg.inv(a.T @ a) if m else np.zeros((0, 0))
-    unknowns = inverse @ (a.T @ b)
-    left = b - a @ unknowns
-    errors = []
-    for rows in groups:
-        # Residuals of prediction without the group: (I − H)⁻¹ times the residuals with it.
-        hat = a[rows] @ inverse @ a[rows].T
-        try:
-            out = np.linalg.solve(np.eye(rows.size) - hat, left[rows])
-        except np.linalg.LinAlgError:
-            return None
-        errors.append(float(out @ out) / rows.size)
-    factor = float(left @ left) / max(n - m, 1)
+    fit = solve(matrix[kept], (measured.value / measured.sigma)[kept])
+    if fit.rank < matrix.shape[1]:
+        return None
+    try:
+        errors = [float(np.mean(fit.without(rows) ** 2)) for rows in groups]
+    except np.linalg.LinAlgError:
+        return None
     scale = float(np.sqrt(np.mean(measured.sigma[kept] ** 2)))
-    residual = (right - matrix @ unknowns) * measured.sigma
+    residual = measured.value - columns @ fit.unknowns
     rms = float(np.sqrt(np.mean(residual[kept] ** 2)))
-    return _Solved(kind, unknowns, inverse * max(factor, 1.0), residual, rms, np.array(errors), scale)
+    cofactors = fit.cofactors * max(fit.square / max(fit.redundancy, 1), 1.0)
+    return _Solved(kind, fit.unknowns, cofactors, residual, rms, np.array(errors), scale)
 
 
 def _without_gross(
@@ -277,8 +272,7 @@ def _without_gross(
             raise GeometryError("the displacements do not determine even a shift; give more discs or edges")
         best = next((s for s in tried if s.kind == (kind or _chosen(tried))), tried[-1])
         scaled = np.abs(best.residual) / measured.sigma
-        middle = float(np.median(scaled[kept]))
-        limit = _GROSS * max(1.4826 * middle, 1e-6)
+        limit = _GROSS * max(spread(scaled[kept]), 1e-6)
         bad = np.unique(measured.group[scaled > limit])
         now = ~np.isin(measured.group, bad)
         if (now == kept).all() or now.sum() < 0.6 * now.size:

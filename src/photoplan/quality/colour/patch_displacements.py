@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from photoplan.adjustment.linear import solve
 from photoplan.errors import InputError
 from photoplan.quality.colour.model import Displacements
 
@@ -94,19 +95,17 @@ def _matched(here: _Array, there: _Array) -> tuple[float, float, float, float] |
         values = ndimage.map_coordinates(spline, at, order=3, prefilter=False).ravel()
         # band(place + displacement) = contrast · reference + brightness.
         matrix = np.stack([-contrast * slopes[0], -contrast * slopes[1], grey, np.ones(grey.size)], 1)
-        normal = matrix.T @ matrix
-        if np.linalg.cond(normal / np.sqrt(np.outer(np.diag(normal), np.diag(normal)) + 1e-30)) > 1e8:
+        fit = solve(matrix, values)
+        unknowns = fit.unknowns
+        if fit.condition < 1e-4:
             return None
-        unknowns = np.linalg.solve(normal, matrix.T @ values)
         moved += np.clip(unknowns[:2], -1.0, 1.0)
         if np.abs(moved).max() > _MARGIN - 3 or unknowns[2] <= 0.0:
             return None
         contrast = unknowns[2]
         if np.abs(unknowns[:2]).max() < 1e-4:
             break
-    left = values - matrix @ unknowns
-    noise = float(left @ left) / (grey.size - 4)
-    sigma = np.sqrt(noise * np.diag(np.linalg.inv(normal))[:2])
+    sigma = fit.sigmas[:2]
     if sigma.max() > _MOST_SIGMA:
         return None
     if np.corrcoef(values, grey)[0, 1] < _LEAST_CORRELATION:

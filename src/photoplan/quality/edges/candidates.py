@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter1d
 
+from photoplan.adjustment.robust import huber, spread
 from photoplan.kernels.edge_chains import grow, ridge
 
 Array = NDArray[np.float64]
@@ -255,8 +256,7 @@ def _solid(
         slope, shift = np.polyfit(tp, dp, 1)
         for _ in range(3):
             residual = dp - slope * tp - shift
-            scale = max(1.4826 * float(np.median(np.abs(residual))), 0.02)
-            weight = np.minimum(1.0, 2.0 * scale / np.maximum(np.abs(residual), 1e-9))
-            slope, shift = np.polyfit(tp, dp, 1, w=np.sqrt(weight))
+            scale = max(spread(residual), 0.02)
+            slope, shift = np.polyfit(tp, dp, 1, w=np.sqrt(huber(residual / scale, 2.0)))
         a, b = (middle + at * along + (slope * at + shift) * across for at in (tp[0], tp[-1]))
         yield StraightEdge.between((float(a[0]), float(a[1])), (float(b[0]), float(b[1])), strength)

@@ -11,8 +11,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
 
+from photoplan.adjustment.chances import chance_chi_square
+from photoplan.adjustment.robust import spread
 from photoplan.errors import InputError
 
 #: Side of the squares beside the edge whose means are tested for structure, pixels.
@@ -181,7 +182,7 @@ def grain(pixels: NDArray[np.float64], along: NDArray[np.float64], across: NDArr
     order = np.lexsort((along, across))
     near = (np.diff(along[order]) == 1.0) & (np.diff(across[order]) == 0.0)
     steps = np.diff(pixels[order])[near]
-    return float(np.median(np.abs(steps)) / 0.6745 / np.sqrt(2.0)) if steps.size else 0.0
+    return spread(steps) / float(np.sqrt(2.0)) if steps.size else 0.0
 
 
 def check_line(residuals: Residuals, most: float, curve: int) -> float:
@@ -204,7 +205,7 @@ def check_line(residuals: Residuals, most: float, curve: int) -> float:
     shift = sums / total
     noise = float(residuals.value[near].var())
     excess = float((shift**2).mean() - noise * (1.0 / total).mean())
-    chance = float(chdtrc(shift.size, (shift**2 * total).sum() / max(noise, 1e-30)))
+    chance = chance_chi_square((shift**2 * total).sum() / max(noise, 1e-30), shift.size)
     deviation = float(np.sqrt(max(excess, 0.0)))
     if chance < CHANCE and deviation > most:
         advice = ("measure it as a curve of degree 2, or " if curve == 1 else "") + "choose a shorter region"
@@ -231,7 +232,7 @@ def check_sides(residuals: Residuals, most: float) -> float:
     frame[along, across] = value
     steps = np.diff(frame, axis=0)
     steps = steps[np.isfinite(steps)]
-    noise = float(np.median(np.abs(steps)) / 0.6745) ** 2 / 2.0 if steps.size else 0.0
+    noise = spread(steps) ** 2 / 2.0 if steps.size else 0.0
     noise = max(noise, float((steps**2).mean()) / 2.0 if steps.size else 0.0)
     side = (residuals.distance[far] > 0.0).astype(np.intp)
     cell = (along // CELL * (across.max() // CELL + 1) + across // CELL) * 2 + side
@@ -241,7 +242,7 @@ def check_sides(residuals: Residuals, most: float) -> float:
     if count.size < 4:
         return 0.0
     square = sums**2 / count
-    chance = float(chdtrc(count.size, square.sum() / max(noise, 1e-30)))
+    chance = chance_chi_square(square.sum() / max(noise, 1e-30), count.size)
     structure = float(np.sqrt(max((square.sum() - noise * count.size) / count.sum(), 0.0)))
     if chance < CHANCE and structure > most:
         largest = float(np.abs(sums / count).max())

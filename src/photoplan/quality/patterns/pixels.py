@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.linear import solve
 from photoplan.errors import InputError
 
 Array = NDArray[np.float64]
@@ -103,22 +104,14 @@ def white_noise(values: Array) -> float:
 
 
 def least_squares(columns: Array, values: Array) -> tuple[Array, Array, Array]:
-    """Solution, its covariance, and residuals of an overdetermined linear system.
+    """Solution, its covariance, and residuals (observed minus computed) of an overdetermined linear system.
 
     Raises
     ------
     InputError
         The columns depend on each other.
     """
-    scale = np.sqrt((columns**2).sum(axis=0))
-    scale[scale == 0.0] = 1.0
-    normal = (columns / scale).T @ (columns / scale)
-    try:
-        inverse = np.linalg.inv(normal)
-    except np.linalg.LinAlgError:
-        raise InputError("the pixels do not determine the pattern: too few of its bars are in the window") from None
-    solution = inverse @ ((columns / scale).T @ values)
-    residuals = values - (columns / scale) @ solution
-    freedom = max(values.size - columns.shape[1], 1)
-    covariance = inverse * float(residuals @ residuals) / freedom / np.outer(scale, scale)
-    return solution / scale, covariance, residuals
+    fit = solve(columns, values)
+    if fit.rank < columns.shape[1]:
+        raise InputError("the pixels do not determine the pattern: too few of its bars are in the window")
+    return fit.unknowns, fit.covariance, -fit.residuals

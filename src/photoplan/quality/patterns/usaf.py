@@ -13,6 +13,7 @@ from math import log2
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.linear import solve
 from photoplan.errors import InputError
 from photoplan.quality.patterns.pixels import MOST_CLIPPED, pattern_window
 from photoplan.quality.patterns.usaf_bars import ThreeBars, measure_three, place_pair
@@ -204,7 +205,7 @@ def _full(found: Sequence[tuple[UsafElement, ThreeBars]], what: str) -> tuple[Ar
     if len(flat) >= 6:
         columns = np.array([[1.0, *three.centre] for three in flat])
         if np.linalg.matrix_rank(columns - [0.0, *columns[:, 1:].mean(axis=0)], 1.0) == 3:
-            return np.linalg.lstsq(columns, levels, rcond=None)[0], len(flat)
+            return solve(columns, levels).unknowns, len(flat)
     return np.array([float(levels.mean()), 0.0, 0.0]), len(flat)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from photoplan.adjustment.linear import solve
 from photoplan.errors import InputError
 from photoplan.quality.patterns.usaf_layout import UsafElement, usaf_layout
 
@@ -180,9 +181,9 @@ def _place(threes: Sequence[_Three], bright: bool) -> UsafPlace | None:
         wanted = np.array([threes[t].centre for t, _ in matches])
         if np.linalg.matrix_rank(design, 1e-3 * float(np.abs(design).max())) < 3:
             return None
-        solution, _, _, _ = np.linalg.lstsq(design, wanted, rcond=None)
-        matrix, origin = solution[:2].T, solution[2]
-        rms = float(np.sqrt(((design @ solution - wanted) ** 2).mean()))
+        fit = solve(design, wanted)
+        matrix, origin = fit.unknowns[:2].T, fit.unknowns[2]
+        rms = float(np.sqrt((fit.residuals**2).mean()))
     return UsafPlace(matrix, origin, len(matches), rms, bright)
 
 
