@@ -23,6 +23,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.none import NoLens
+from photoplan.engine.base import Source
 from photoplan.engine.execute import render
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
@@ -217,7 +218,8 @@ class _Photo:
     def dtype(self) -> np.dtype[Any]:
         return self.image.dtype
 
-    def read(self, window: Window) -> tuple[NDArray[Any], None]:
+    def read(self, window: Window, level: int = 0) -> tuple[NDArray[Any], None]:
+        assert level == 0, "as fine as the product"
         return self.image[:, window.row : window.stop[1], window.col : window.stop[0]], None
 
 
@@ -229,8 +231,8 @@ def ortho_grid() -> MapGrid:
 def orthophoto(view: FrameCamera, image: NDArray[np.float32], surface: Surface) -> NDArray[np.float32]:
     """The orthophoto, shape (rows, columns), by the package's own chain."""
     grid = ortho_grid()
-    plan = ProductPlan("road_ortho", "road", MapTarget(grid), 512, AnchorRule(0.005, 3, 64), (Tile(0, grid.window),))
-    pixels = render(plan, grid.window, view, surface, _Photo(image), "bicubic")
+    plan = ProductPlan("road_ortho", ("road",), MapTarget(grid), 512, AnchorRule(0.005, 3, 64), (Tile(0, grid.window),))
+    pixels = render(plan, plan.tiles[0], [Source(view, _Photo(image))], surface, "bicubic")
     assert pixels.values is not None and pixels.valid is not None
     return np.where(pixels.valid, pixels.values[0], np.nan)
 

@@ -9,10 +9,14 @@ from hypothesis import strategies as st
 from tools.arrays import ArrayReader, noise, product
 from tools.pinhole import Pinhole
 
+from photoplan.engine.base import Source
 from photoplan.engine.execute import render
-from photoplan.engine.twin import strict_positions, strict_scales, twin_resample
+from photoplan.engine.twin import TwinSource, twin_compose
+from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
+from photoplan.plan.owner import GivenOwners
+from photoplan.plan.product import ProductPlan, Tile, compile_tile
 from photoplan.surfaces.level import LevelSurface
 from photoplan.targets.map import MapTarget
 
@@ -29,11 +33,17 @@ def both(cam: Pinhole, resolution: float, kernel: str, reader: ArrayReader, half
     grid = MapGrid.covering(
         (-half * resolution, -half * resolution, half * resolution, half * resolution), resolution, "EPSG:32615"
     )
+    return composed(product(grid, reduces=kernel != "nearest"), Tile(0, grid.window), [cam], [reader], kernel)
+
+
+def composed(plan: ProductPlan, tile: Tile, cameras: list[Pinhole], readers: list[ArrayReader], kernel: str):  # type: ignore[no-untyped-def]
+    """A tile by the engine and by the twin."""
     surface = LevelSurface(0.0)
-    plan = product(grid)
-    got = render(plan, grid.window, cam, surface, reader, kernel)
-    xy, uvh = strict_positions(MapTarget(grid), grid.window, cam, surface)
-    want, good = twin_resample(reader.image, reader.valid, xy, kernel, strict_scales(MapTarget(grid), cam, uvh))
+    got = render(plan, tile, [Source(*pair) for pair in zip(cameras, readers)], surface, kernel)
+    compiled = compile_tile(plan, tile, cameras, surface)
+    levels = {layer.source: layer.level for layer in compiled.layers}
+    twins = [TwinSource(r.image, r.valid, c, levels.get(i, 0)) for i, (c, r) in enumerate(zip(cameras, readers))]
+    want, good = twin_compose(plan.target, tile.window, surface, twins, compiled.owner, kernel)
     return got, want, good
 
 
@@ -94,17 +104,83 @@ def test_a_tile_with_too_large_a_source_is_cut_and_is_the_same(monkeypatch: pyte
     reader = ArrayReader(noise(3, 600, 800, "uint8"))
     cam = Pinhole(Pose.from_angles((0, 0, 100), (0.02, 0.01, 0.3)), 400.0, (800, 600))
     grid = MapGrid.covering((-80, -60, 80, 60), 0.4, "EPSG:32615")
-    whole = render(product(grid), grid.window, cam, LevelSurface(0.0), reader, "bicubic")
+    whole = render(product(grid), Tile(0, grid.window), [Source(cam, reader)], LevelSurface(0.0), "bicubic")
     monkeypatch.setattr("photoplan.engine.execute.MOST_SOURCE_BYTES", 100_000)
-    parts = render(product(grid), grid.window, cam, LevelSurface(0.0), reader, "bicubic")
+    parts = render(product(grid), Tile(0, grid.window), [Source(cam, reader)], LevelSurface(0.0), "bicubic")
     assert whole.valid is not None and parts.valid is not None and parts.values is not None
     assert np.count_nonzero(whole.valid != parts.valid) <= 3
     assert np.abs(whole.values.astype(int) - parts.values.astype(int)).max() <= 1
-    assert parts.source_window == whole.source_window
 
 
 def test_a_window_beside_the_image_holds_nothing() -> None:
     reader = ArrayReader(noise(1, SIZE[1], SIZE[0], "uint8"))
     grid = MapGrid.covering((1000, 1000, 1100, 1100), 1.0, "EPSG:32615")
-    nothing = render(product(grid), Window(0, 0, 64, 64), camera(0.0), LevelSurface(0.0), reader, "bicubic")
+    nothing = render(
+        product(grid), Tile(0, Window(0, 0, 64, 64)), [Source(camera(0.0), reader)], LevelSurface(0.0), "bicubic"
+    )
     assert nothing.values is None and nothing.valid is None and nothing.valid_count == 0
+
+
+@settings(max_examples=15, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
+@given(
+    count=st.integers(2, 8),
+    kernel=st.sampled_from(KERNELS[1:]),
+    dtype=st.sampled_from(["uint8", "uint16", "float32"]),
+    bands=st.sampled_from([1, 3]),
+    resolution=st.sampled_from([0.7, 1.2, 4.5]),
+    holes=st.booleans(),
+    seed=st.integers(0, 1000),
+)
+def test_many_sources_compose_as_the_twin_says(
+    count: int, kernel: str, dtype: str, bands: int, resolution: float, holes: bool, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    half = 24
+    side = half * resolution
+    grid = MapGrid.covering((-side, -side, side, side), resolution, "EPSG:32615")
+    cameras, readers = [], []
+    for k in range(count):
+        pose = Pose.from_angles((*rng.uniform(-20, 20, 2), 100), (*rng.uniform(-0.2, 0.2, 2), rng.uniform(-3, 3)))
+        cameras.append(Pinhole(pose, 101.3, SIZE))
+        valid = rng.random((SIZE[1], SIZE[0])) > 0.1 if holes else None
+        readers.append(ArrayReader(noise(bands, SIZE[1], SIZE[0], dtype, seed + k), valid))
+    # Compact regions, single pixels among them, and pixels that nobody may paint.
+    nearest = rng.uniform(0, 2 * half, (count + 1, 2))
+    v, u = np.mgrid[: 2 * half, : 2 * half]
+    owner = np.argmin((u[..., None] - nearest[:, 0]) ** 2 + (v[..., None] - nearest[:, 1]) ** 2, axis=-1)
+    loose = rng.random(owner.shape) < 0.05
+    owner[loose] = rng.integers(0, count + 1, int(loose.sum()))
+    names = tuple(f"image {k}" for k in range(count))
+    plan = product(grid, names=names, owners=GivenOwners(owner.astype(np.uint16)))
+    got, want, good = composed(plan, Tile(0, grid.window, tuple(range(count))), cameras, readers, kernel)
+    spread = 4.0 if dtype == "float32" else float(np.iinfo(dtype).max) - np.iinfo(dtype).min
+    compare(got, want, good, dtype, 0.501 * (dtype != "float32") + 4e-3 * spread)
+    if got.valid is not None:
+        np.testing.assert_array_equal(got.owner, np.where(got.valid, owner, 0))
+
+
+def test_a_tile_of_one_owner_is_that_of_its_source_byte_by_byte() -> None:
+    """Owners cut runs, and a cut changes no bit of what is left."""
+    cameras = [camera(0.3), camera(1.9)]
+    readers = [ArrayReader(noise(3, SIZE[1], SIZE[0], "uint8", k)) for k in range(2)]
+    sources = [Source(*pair) for pair in zip(cameras, readers)]
+    grid = MapGrid.covering((-25, -25, 25, 25), 0.8, "EPSG:32615")
+    tile, surface = Tile(0, grid.window, (0, 1)), LevelSurface(0.0)
+    alone = [render(product(grid), Tile(0, grid.window), [source], surface, "lanczos3") for source in sources]
+    rng = np.random.default_rng(1)
+    owner = rng.integers(0, 3, (grid.height, grid.width)).astype(np.uint16)
+    both = render(product(grid, names=("a", "b"), owners=GivenOwners(owner)), tile, sources, surface, "lanczos3")
+    for number, single in enumerate(alone, 1):
+        mine = owner == number
+        np.testing.assert_array_equal(both.valid[mine], single.valid[mine])
+        np.testing.assert_array_equal(both.values[:, mine], single.values[:, mine])
+    assert not both.valid[owner == 0].any() and not both.values[:, owner == 0].any()
+
+
+def test_owners_of_another_size_are_refused() -> None:
+    grid = MapGrid.covering((-25, -25, 25, 25), 0.8, "EPSG:32615")
+    owners = GivenOwners(np.ones((3, 3), np.uint16))
+    with pytest.raises(UsageError, match=r"owners of shape \(3, 3\)"):
+        owners.owner(MapTarget(grid), grid.window, np.zeros((grid.height, grid.width), np.float32))
+    with pytest.raises(UsageError, match="say which of them paints"):
+        product(grid, names=("a", "b"))

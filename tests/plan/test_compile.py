@@ -144,7 +144,7 @@ def test_scale_is_that_of_the_mapping() -> None:
     relief = np.full((64, 64), 100, np.float32)
     anchors = compile_anchors(camera, TARGET, window, relief, RULE)
     assert anchors is not None
-    assert anchors.scale == pytest.approx(12500 / 700 * 0.06, rel=0.05)
+    assert anchors.scales == pytest.approx((12500 / 700 * 0.06,) * 2, rel=0.05)
 
 
 def test_nothing_behind_the_camera_and_nothing_beside_the_image() -> None:

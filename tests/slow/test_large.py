@@ -11,10 +11,12 @@ import rasterio
 from tools.command import peak_of
 from tools.real_projects import drone_project
 
+from photoplan.engine.base import Source
 from photoplan.engine.execute import render
 from photoplan.engine.twin import strict_positions, strict_scales, twin_resample
 from photoplan.geometry.grid import Window
 from photoplan.io.project.file import load_project
+from photoplan.plan.product import Tile
 from photoplan.products.init.run import InitRequest, init_project
 from photoplan.products.orthophoto.plan import plan_orthophotos
 from photoplan.project.scene import open_scene
@@ -34,7 +36,7 @@ def test_a_real_tile_is_what_the_twin_says(project, kernel: str, resolution: flo
     plan = plan_orthophotos(project, ["DJI_0032"], resolution=resolution, kernel=kernel)
     product, scene = plan.products[0].plan, open_scene(project, "DJI_0032")
     middle = Window(product.size[0] // 2 - 60, product.size[1] // 2 - 60, 120, 120)
-    got = render(product, middle, scene.camera, scene.surface, scene.reader, kernel)
+    got = render(product, Tile(0, middle), [Source(scene.camera, scene.reader)], scene.surface, kernel)
     xy, uvh = strict_positions(product.target, middle, scene.camera, scene.surface)
     image, usable = scene.reader.read(Window(0, 0, *scene.reader.size))
     want, good = twin_resample(image, usable, xy, kernel, strict_scales(product.target, scene.camera, uvh))

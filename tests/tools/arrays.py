@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.geometry.grid import MapGrid, Window
+from photoplan.geometry.levels import reduced
 from photoplan.plan.compile import AnchorRule
 from photoplan.plan.product import ProductPlan, Tile
 from photoplan.targets.map import MapTarget
@@ -33,16 +34,21 @@ class ArrayReader:
     def dtype(self) -> np.dtype[Any]:
         return self.image.dtype
 
-    def read(self, window: Window) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+    def read(self, window: Window, level: int = 0) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+        if level:
+            return reduced(self, window, level)
         assert window & Window(0, 0, *self.size) == window, "read outside the image"
         part = np.s_[window.row : window.stop[1], window.col : window.stop[0]]
         return self.image[:, part[0], part[1]], None if self.valid is None else self.valid[part]
 
 
-def product(grid: MapGrid, side: int = 512, tolerance: float = 0.02, radius: int = 3, cell: int = 512) -> ProductPlan:
+def product(
+    grid: MapGrid, side: int = 512, names: tuple[str, ...] = ("image",), owners: Any = None, **rule: Any
+) -> ProductPlan:
     """A plan that has every tile of a grid."""
-    tiles = tuple(Tile(i, w) for i, w in enumerate(grid.window.tiles(side)))
-    return ProductPlan("image_ortho", "image", MapTarget(grid), side, AnchorRule(tolerance, radius, cell), tiles)
+    cut = AnchorRule(**({"tolerance": 0.02, "radius": 3, "cell": 512} | rule))
+    tiles = tuple(Tile(i, w, tuple(range(len(names)))) for i, w in enumerate(grid.window.tiles(side)))
+    return ProductPlan("image_ortho", names, MapTarget(grid), side, cut, tiles, owners)
 
 
 def noise(bands: int, rows: int, cols: int, dtype: str, seed: int = 0) -> NDArray[Any]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.cameras.base import Camera
 from photoplan.geometry.grid import Window
 
 
@@ -28,9 +30,29 @@ class Reader(Protocol):
         """Type of the pixels: uint8, uint16, int16 or float32."""
         ...
 
-    def read(self, window: Window) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+    def read(self, window: Window, level: int = 0) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
         """Pixels of a window inside the image, shape (bands, height, width), and their validity.
 
-        The validity has shape (height, width), True = valid; None means that every pixel is valid.
+        Parameters
+        ----------
+        window : Window
+            Pixels of the image as it is at `level`.
+        level : int
+            The image is reduced by f = 2 to the power of this: pixel (i, j) is the mean of the valid pixels among
+            columns i·f to i·f + f − 1 and rows j·f to j·f + f − 1, and valid if at least half of those that are inside
+            the image are. `level_size` gives its size. Never a choice of single pixels, which would alias.
+
+        Returns
+        -------
+        values, valid
+            The validity has shape (height, width), True = valid; None means that every pixel is valid.
         """
         ...
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A row of the table of sources as the engine needs it."""
+
+    camera: Camera
+    reader: Reader

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Camera
-from photoplan.engine.base import Reader
+from photoplan.engine.base import Source
 from photoplan.geometry.grid import Window
+from photoplan.kernels.position import ALL_MINE
 from photoplan.kernels.rectify import rectify_tile
-from photoplan.plan.product import CompiledTile, ProductPlan, compile_tile
+from photoplan.plan.product import CompiledTile, Layer, ProductPlan, Tile, compile_tile
 from photoplan.surfaces.base import Surface
 
 #: A window of the source larger than this (bytes as read) is not read at once; its tile is executed in parts.
@@ -26,15 +27,16 @@ class Pixels:
     """Pixels of a window of a product."""
 
     values: NDArray[Any] | None
-    """(bands, height, width) in the source's dtype, 0 where invalid; None if no pixel is valid."""
+    """(bands, height, width) in the sources' dtype, 0 where invalid; None if no pixel is valid."""
     valid: NDArray[np.bool_] | None
     """(height, width); None if no pixel is valid."""
+    owner: NDArray[np.uint16] | None
+    """(height, width): row of the table of sources, plus one, that painted each pixel; 0 where invalid. None if there
+    is one source, or no pixel is valid."""
     residual: float
     """Worst residual of the anchors, pixels of the source image."""
     cells: int
     """Boxes that the anchors have."""
-    source_window: Window
-    """Part of the source that was needed."""
 
     @property
     def valid_count(self) -> int:
@@ -42,54 +44,66 @@ class Pixels:
         return 0 if self.valid is None else int(np.count_nonzero(self.valid))
 
 
-def execute_tile(tile: CompiledTile, reader: Reader, kernel: str) -> Pixels:
-    """Resample one compiled tile.
+def execute_tile(tile: CompiledTile, sources: Sequence[Source], kernel: str) -> Pixels:
+    """Compose one compiled tile: each source paints the pixels that it owns, and nothing else is computed.
 
     Parameters
     ----------
     tile : CompiledTile
-    reader : Reader
-        The image that the tile's anchors refer to.
+    sources : sequence of Source
+        One for each row of the table of sources; all with the same bands and type of pixels.
     kernel : str
         Name of a resampling kernel.
     """
-    anchors = tile.anchors
-    if anchors is None or anchors.source_window.size == 0:
-        return Pixels(None, None, 0.0, 0, Window(0, 0, 0, 0))
-    source, usable = reader.read(anchors.source_window)
-    values = np.zeros((source.shape[0], *tile.relief.shape), source.dtype)
-    valid = np.zeros(tile.relief.shape, bool)
-    if usable is None or usable.any():
-        arrays = (anchors.rects, anchors.box_start, anchors.box_heights, anchors.corners)
-        border = _border(anchors.source_window, reader.size)
-        rectify_tile(arrays, tile.relief, source, usable, border, kernel, values, valid)
+    values, valid = np.zeros((0, *tile.relief.shape)), np.zeros(tile.relief.shape, bool)
+    for layer in tile.layers:
+        window, reader = layer.anchors.source_window, sources[layer.source].reader
+        if not window.size:
+            continue
+        pixels, usable = reader.read(window, layer.level)
+        if not len(values):
+            values = np.zeros((len(pixels), *tile.relief.shape), pixels.dtype)
+        if usable is None or usable.any():
+            anchors = layer.anchors
+            arrays = (anchors.rects, anchors.box_start, anchors.box_heights, anchors.corners)
+            border = _border(layer, reader.size)
+            owned = ALL_MINE if tile.owner is None else (tile.owner, layer.source + 1)
+            rectify_tile(arrays, tile.relief, pixels, usable, border, kernel, values, valid, owned=owned)
     if not valid.any():
-        return Pixels(None, None, anchors.residual, len(anchors.corners), anchors.source_window)
-    return Pixels(values, valid, anchors.residual, len(anchors.corners), anchors.source_window)
+        return Pixels(None, None, None, tile.residual, tile.cells)
+    owner = None if tile.owner is None else np.where(valid, tile.owner, np.uint16(0))
+    return Pixels(values, valid, owner, tile.residual, tile.cells)
 
 
-def render(
-    product: ProductPlan, window: Window, camera: Camera, surface: Surface, reader: Reader, kernel: str
-) -> Pixels:
-    """Compile and execute a window of a product, in parts if it needs too much of the source at once.
+def render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface: Surface, kernel: str) -> Pixels:
+    """Compile and execute a tile of a product, in parts if it needs too much of a source at once.
 
-    Whether and how it is cut depends on the window and the source alone, so that the result does not depend on
+    Whether and how it is cut depends on the tile and the sources alone, so that the result does not depend on
     memory, workers or order.
     """
-    tile = compile_tile(product, window, camera, surface)
-    if tile.anchors is None:
-        return Pixels(None, None, 0.0, 0, Window(0, 0, 0, 0))
-    needed = tile.anchors.source_window.size * reader.bands * reader.dtype.itemsize
+    window = tile.window
+    compiled = compile_tile(product, tile, [source.camera for source in sources], surface)
+    needed = max((_bytes(layer, sources[layer.source]) for layer in compiled.layers), default=0)
     if needed <= MOST_SOURCE_BYTES or max(window.width, window.height) <= SMALLEST_PART:
-        return execute_tile(tile, reader, kernel)
+        return execute_tile(compiled, sources, kernel)
     side = max(SMALLEST_PART, -(-max(window.width, window.height) // 2))
-    parts = [(part, render(product, part, camera, surface, reader, kernel)) for part in window.tiles(side)]
-    return _joined(window, parts, reader)
+    parts = [replace(tile, window=part) for part in window.tiles(side)]
+    return _joined(window, [(part.window, render(product, part, sources, surface, kernel)) for part in parts])
 
 
-def _joined(window: Window, parts: list[tuple[Window, Pixels]], reader: Reader) -> Pixels:
-    values = np.zeros((reader.bands, window.height, window.width), reader.dtype)
-    valid = np.zeros((window.height, window.width), bool)
+def _bytes(layer: Layer, source: Source) -> int:
+    """What a layer reads."""
+    return layer.anchors.source_window.size * source.reader.bands * source.reader.dtype.itemsize
+
+
+def _joined(window: Window, parts: list[tuple[Window, Pixels]]) -> Pixels:
+    residual, cells = max(p.residual for _, p in parts), sum(p.cells for _, p in parts)
+    some = next((p for _, p in parts if p.values is not None), None)
+    if some is None or some.values is None:
+        return Pixels(None, None, None, residual, cells)
+    shape = (window.height, window.width)
+    values, valid = np.zeros((len(some.values), *shape), some.values.dtype), np.zeros(shape, bool)
+    owner = None if some.owner is None else np.zeros(shape, np.uint16)
     for part, pixels in parts:
         if pixels.values is None or pixels.valid is None:
             continue
@@ -97,24 +111,12 @@ def _joined(window: Window, parts: list[tuple[Window, Pixels]], reader: Reader) 
         cols = slice(part.col - window.col, part.stop[0] - window.col)
         values[:, rows, cols] = pixels.values
         valid[rows, cols] = pixels.valid
-    used = [p.source_window for _, p in parts if p.source_window.size]
-    return Pixels(
-        values if valid.any() else None,
-        valid if valid.any() else None,
-        max(p.residual for _, p in parts),
-        sum(p.cells for _, p in parts),
-        _hull(used),
-    )
+        if owner is not None and pixels.owner is not None:
+            owner[rows, cols] = pixels.owner
+    return Pixels(values, valid, owner, residual, cells)
 
 
-def _hull(windows: list[Window]) -> Window:
-    if not windows:
-        return Window(0, 0, 0, 0)
-    col, row = min(w.col for w in windows), min(w.row for w in windows)
-    right, bottom = max(w.stop[0] for w in windows), max(w.stop[1] for w in windows)
-    return Window(col, row, right - col, bottom - row)
-
-
-def _border(window: Window, size: tuple[int, int]) -> tuple[float, float, float, float]:
-    """Outer edges of the image x_min, y_min, x_max, y_max in the window's pixel coordinates."""
-    return (-0.5 - window.col, -0.5 - window.row, size[0] - 0.5 - window.col, size[1] - 0.5 - window.row)
+def _border(layer: Layer, size: tuple[int, int]) -> tuple[float, float, float, float]:
+    """Outer edges of the image x_min, y_min, x_max, y_max in the pixel coordinates of the layer's window."""
+    window, f = layer.anchors.source_window, 2.0**layer.level
+    return (-0.5 - window.col, -0.5 - window.row, size[0] / f - 0.5 - window.col, size[1] / f - 0.5 - window.row)

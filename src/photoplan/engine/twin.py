@@ -5,7 +5,8 @@ It shares no code with the kernels, so that an error in one shows as a differenc
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -99,6 +100,77 @@ def twin_resample(
         good[r, c] = True
         pixels = np.where(w != 0, image[:, part[0], part[1]], 0)
         values[:, r, c] = (pixels * w).sum(axis=(1, 2)) / w.sum()
+    return values, good
+
+
+def twin_reduce(
+    image: NDArray[Any], valid: NDArray[np.bool_] | None, level: int
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """An image and its validity as `engine.base.Reader` gives them at a level."""
+    bands, rows, cols = image.shape
+    f = 2**level
+    high, wide = -(-rows // f), -(-cols // f)
+    known = np.zeros((bands, high * f, wide * f))
+    known[:, :rows, :cols] = image
+    inside, weight = np.zeros((2, high * f, wide * f))
+    inside[:rows, :cols] = 1.0
+    weight[:rows, :cols] = 1.0 if valid is None else valid
+    known = np.where(weight > 0, known, 0.0)
+    count, total = (a.reshape(high, f, wide, f).sum(axis=(1, 3)) for a in (weight, inside))
+    good = 2 * count >= total
+    mean = known.reshape(bands, high, f, wide, f).sum(axis=(2, 4)) / np.maximum(count, 1)
+    if image.dtype.kind != "f":
+        mean = np.floor(mean + 0.5)
+    return np.where(good, mean, 0).astype(image.dtype), good
+
+
+@dataclass(frozen=True, eq=False)
+class TwinSource:
+    """A whole image in memory with its camera."""
+
+    image: NDArray[Any]
+    """(bands, rows, cols)"""
+    valid: NDArray[np.bool_] | None
+    """(rows, cols); None: everywhere."""
+    camera: Camera
+    level: int = 0
+    """How often it is halved before it is resampled."""
+
+
+def twin_compose(
+    target: Target,
+    window: Window,
+    surface: Surface,
+    sources: Sequence[TwinSource],
+    owner: NDArray[np.uint16] | None,
+    kernel: str,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """A window of a product of many sources, each resampled as a whole and then cut to its own pixels.
+
+    Parameters
+    ----------
+    owner : ndarray, shape (height, width), or None
+        Number of the source, from one, that paints each pixel; 0: none. None: the first one.
+
+    Returns
+    -------
+    values, good
+        As `twin_resample`.
+    """
+    values = np.zeros((len(sources[0].image), window.height, window.width))
+    good = np.zeros((window.height, window.width), bool)
+    for number, source in enumerate(sources, 1):
+        xy, uvh = strict_positions(target, window, source.camera, surface)
+        size, f = np.array(source.camera.size), 2.0**source.level
+        with np.errstate(invalid="ignore"):
+            inside = np.all((xy >= -0.5) & (xy <= size - 0.5), axis=-1)
+        mine = inside if owner is None else inside & (owner == number)
+        scales = strict_scales(target, source.camera, uvh) / f
+        image, valid = twin_reduce(source.image, source.valid, source.level)
+        xy = np.where(mine[..., None], (xy + 0.5) / f - 0.5, np.nan)
+        theirs, there = twin_resample(image, valid, xy, kernel, scales)
+        values[:, there] = theirs[:, there]
+        good |= there
     return values, good
 
 

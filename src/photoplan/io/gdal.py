@@ -98,8 +98,8 @@ def first_cause(error: BaseException) -> str:
     return all_causes(error)[0]
 
 
-def open_raster(path: Path, driver: str | None) -> Any:
-    """Open a raster for reading with one driver (None: any), under `gdal_settings`.
+def open_raster(path: Path, driver: str | None, overview: int | None = None) -> Any:
+    """Open a raster, or one of its overviews (from 0), for reading with one driver (None: any).
 
     Raises
     ------
@@ -108,7 +108,8 @@ def open_raster(path: Path, driver: str | None) -> Any:
     """
     try:
         with not_georeferenced(), gdal_settings():
-            return rasterio.open(path, driver=driver, sharing=False)
+            options = {} if overview is None else {"OVERVIEW_LEVEL": overview}
+            return rasterio.open(path, driver=driver, sharing=False, **options)
     except (*GDAL_ERRORS, OSError, ValueError) as error:
         raise InputError(
             f"{path}: cannot be opened ({first_cause(error)}); the file is damaged or cut off, get a fresh copy"
@@ -130,24 +131,24 @@ class _Handles(threading.local):
     """Open rasters of one thread; they close when the thread ends. GDAL's handles must not be shared."""
 
     def __init__(self) -> None:
-        self.open: OrderedDict[tuple[str, int, int], Any] = OrderedDict()
+        self.open: OrderedDict[tuple[str, int, int, int | None], Any] = OrderedDict()
 
 
 _handles = _Handles()
 
 
-def handle(path: Path, driver: str | None) -> Any:
-    """This thread's open handle of a raster; opened again when the file has been replaced."""
+def handle(path: Path, driver: str | None, overview: int | None = None) -> Any:
+    """This thread's open handle of a raster or of one of its overviews; opened again when the file was replaced."""
     try:
         state = path.stat()
-        key = str(path), state.st_mtime_ns, state.st_ino
+        key = str(path), state.st_mtime_ns, state.st_ino, overview
     except OSError as error:
         if driver is not None:
             raise InputError(f"{path}: is no longer there ({error.strerror})") from error
-        key = str(path), 0, 0
+        key = str(path), 0, 0, overview
     found = _handles.open.get(key)
     if found is None:
-        found = open_raster(path, driver)
+        found = open_raster(path, driver, overview)
         _handles.open[key] = found
         while len(_handles.open) > _HANDLES_PER_THREAD:
             _handles.open.popitem(last=False)[1].close()

@@ -171,30 +171,76 @@ def locate_run(
             _keep_from(heights, np.float32(box_heights[box, 0]), higher[0], higher[1], dx, dy)
 
 
+@inner
+def _next_span(line: NDArray[np.uint16], mine: int, first: int, end: int) -> tuple[int, int]:
+    """First and end column of the next pixels of `line` that are `mine`; first = end where there are none."""
+    while first < end and line[first] != mine:
+        first += 1
+    last = first
+    while last < end and line[last] == mine:
+        last += 1
+    return first, last
+
+
 @kernel
+def _write_runs(
+    rects: NDArray[np.int32],
+    chosen: NDArray[np.int64],
+    offset: tuple[int, int],
+    size: tuple[int, int],
+    owned: tuple[Any, ...],
+    runs: NDArray[np.int32],
+) -> int:
+    """Fill `runs` as far as it has room; returns how many there are."""
+    owner, mine = owned
+    count = 0
+    for index in chosen:
+        right, bottom = min(rects[index, 2], offset[0] + size[1]), min(rects[index, 3], offset[1] + size[0])
+        for v in range(max(rects[index, 1], offset[1]), bottom):
+            for u_run in range(rects[index, 0], right, RUN):
+                u, end = max(u_run, offset[0]), min(u_run + RUN, right)
+                while u < end:
+                    last = end
+                    if owner.size > 0:
+                        line = owner[v - offset[1]]
+                        first, last = _next_span(line, mine, u - offset[0], end - offset[0])
+                        u, last = first + offset[0], last + offset[0]
+                        if u == last:
+                            break
+                    if count < runs.shape[0]:
+                        runs[count, 0], runs[count, 1], runs[count, 2] = index, v, u_run
+                        runs[count, 3], runs[count, 4] = u, last
+                    count += 1
+                    u = last
+    return count
+
+
+ALL_MINE: tuple[NDArray[np.uint16], int] = (np.empty((0, 0), np.uint16), 0)
+"""Every pixel belongs to the one source."""
+
+
 def tile_runs(
-    rects: NDArray[np.int32], chosen: NDArray[np.int64], offset: tuple[int, int], rows: int, cols: int
+    rects: NDArray[np.int32],
+    chosen: NDArray[np.int64],
+    offset: tuple[int, int],
+    size: tuple[int, int],
+    owned: tuple[NDArray[np.uint16], int] = ALL_MINE,
 ) -> NDArray[np.int32]:
-    """Runs of the rectangles `chosen` inside rows × cols pixels from `offset` (column, row) on.
+    """Runs of the rectangles `chosen` inside `size` (rows, columns) pixels from `offset` (column, row) on.
+
+    `owned` is a raster of that size and the number in it whose pixels are wanted. A run that is cut at the border of
+    such pixels keeps the column from which its coefficients hold, and with it every bit of its positions.
 
     Returns (k, 5) int32: rectangle, row, column from which the run's coefficients hold, first and end column; in the
     tile's pixels.
     """
-    count = 0
-    for index in chosen:
-        width = rects[index, 2] - rects[index, 0]
-        count += max(0, rects[index, 3] - rects[index, 1]) * (width // RUN + 1)
-    runs = np.empty((count, 5), np.int32)
-    count = 0
-    for index in chosen:
-        right, bottom = min(rects[index, 2], offset[0] + cols), min(rects[index, 3], offset[1] + rows)
-        for v in range(max(rects[index, 1], offset[1]), bottom):
-            for u_run in range(rects[index, 0], right, RUN):
-                u, end = max(u_run, offset[0]), min(u_run + RUN, right)
-                if u < end:
-                    runs[count, 0], runs[count, 1], runs[count, 2] = index, v, u_run
-                    runs[count, 3], runs[count, 4] = u, end
-                    count += 1
+    columns = np.maximum(rects[chosen, 2] - rects[chosen, 0], 0) // RUN + 1
+    room = int((np.maximum(rects[chosen, 3] - rects[chosen, 1], 0) * columns).sum())
+    runs = np.empty((room, 5), np.int32)
+    count = _write_runs(rects, chosen, offset, size, owned, runs)
+    if count > room:
+        runs = np.empty((count, 5), np.int32)
+        _write_runs(rects, chosen, offset, size, owned, runs)
     return runs[:count]
 
 
@@ -239,6 +285,6 @@ def positions(
         (x, y) in pixels of the source window; NaN where there is no surface or no rectangle.
     """
     result = np.full((*relief.shape, 2), np.nan, np.float32)
-    runs = tile_runs(anchors[0], np.arange(len(anchors[0])), offset, *relief.shape)
+    runs = tile_runs(anchors[0], np.arange(len(anchors[0])), offset, relief.shape)
     _positions(tuple(anchors), runs, np.ascontiguousarray(relief, np.float32), offset, result)
     return result

@@ -20,12 +20,15 @@ from photoplan.kernels.gather import gather_runs
 from photoplan.kernels.jit import is_ready
 from photoplan.kernels.pack import as_bytes, pack, solid_patches
 from photoplan.kernels.place import empty_block, place_runs
-from photoplan.kernels.position import RUN, tile_runs
+from photoplan.kernels.position import ALL_MINE, RUN, tile_runs
 from photoplan.kernels.scale import largest_scales, stretch_runs
 from photoplan.kernels.weights import KERNELS, STRETCH_FROM, weight_table
 
 AnchorArrays = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]
 """rects (m, 4), box_start (m + 1,), box_heights (n, 2), corners (n, 8, 3): the fields of `photoplan.plan.Anchors`."""
+
+Owned = tuple[NDArray[np.uint16], int]
+"""A raster of the tile's owners, and the one whose pixels are painted."""
 
 Border = tuple[float, float, float, float]
 """Outer edges of the image x_min, y_min, x_max, y_max in pixels of the source window."""
@@ -65,6 +68,7 @@ def rectify_tile(
     out: NDArray[Any],
     out_valid: NDArray[np.bool_],
     offset: tuple[int, int] = (0, 0),
+    owned: Owned = ALL_MINE,
 ) -> None:
     """Resample one tile from a source window as it was read.
 
@@ -83,19 +87,22 @@ def rectify_tile(
     kernel : str
         A name of `KERNELS`.
     out : ndarray, shape (bands, rows, cols), type of `source`
-        Written everywhere; 0 where the pixel is not valid.
+        Written everywhere; 0 where the pixel is not valid. With `owned`, only there.
     out_valid : ndarray, shape (rows, cols), bool
-        Written everywhere.
+        As `out`.
     offset : (column, row)
         First pixel of `relief` and `out` in the tile's pixels: part of a tile is the same, byte by byte, as the tile
         cut afterwards.
+    owned : (raster of uint16, number)
+        Pixels that the source paints, of the shape of `relief`; all others are left as they are. Several sources
+        compose a tile one after the other, at the cost of their own pixels.
 
     Notes
     -----
     Integers are rounded half away from zero and clipped. Where the target is coarser than the source the kernel is
     widened along image x and y (see `weights.stretch`), except for "nearest", which keeps grey values.
     """
-    rectify_packed(anchors, relief, pack(source, valid), valid, border, kernel, out, out_valid, offset)
+    rectify_packed(anchors, relief, pack(source, valid), valid, border, kernel, out, out_valid, offset, owned)
 
 
 def rectify_packed(
@@ -108,6 +115,7 @@ def rectify_packed(
     out: NDArray[Any],
     out_valid: NDArray[np.bool_],
     offset: tuple[int, int] = (0, 0),
+    owned: Owned = ALL_MINE,
 ) -> None:
     """Resample one tile from a source window that went through `pack` (for several tiles from one window).
 
@@ -115,8 +123,9 @@ def rectify_packed(
     """
     height, width = packed.shape[1:3]
     target, target_valid = _plain(out, out.dtype), _plain(out_valid, bool)
-    target[...] = 0
-    target_valid[...] = False
+    if owned is ALL_MINE:
+        target[...] = 0
+        target_valid[...] = False
     arrays = tuple(_plain(np.asarray(array), dtype) for array, dtype in zip(anchors, _ANCHOR_TYPES))
     if packed.size and len(arrays[0]):
         mask = solid = np.empty((0, 0), np.uint8)
@@ -126,7 +135,8 @@ def rectify_packed(
         edges = (-0.5, -0.5, width - 0.5, height - 0.5) if border is None else tuple(float(edge) for edge in border)
         image = (_plain(packed, packed.dtype), mask, solid, edges)
         place = (int(offset[0]), int(offset[1]))
-        _resample(arrays, _plain(relief, np.float32), image, kernel, place, (target, target_valid))
+        wanted = (_plain(owned[0], np.uint16), int(owned[1]))
+        _resample(arrays, _plain(relief, np.float32), image, kernel, (place, wanted), (target, target_valid))
     if target is not out:
         out[...] = target
     if target_valid is not out_valid:
@@ -143,17 +153,18 @@ def _resample(
     relief: NDArray[np.float32],
     image: tuple[Any, ...],
     name: str,
-    offset: tuple[int, int],
+    part: tuple[tuple[int, int], Owned],
     result: tuple[Any, ...],
 ) -> None:
     """Rectangles at about the source's scale, and those that are coarser, block by block."""
     rects, box_start, _, corners = anchors
+    offset, owned = part
     coarse = np.zeros(len(rects), bool)
     if name != "nearest":
         coarse = ~(largest_scales(rects, box_start, corners) <= _LOOK_CLOSER)
     for averaging in (False, True):
         chosen = np.flatnonzero(coarse == averaging)
-        runs = tile_runs(rects, chosen, offset, *relief.shape)
+        runs = tile_runs(rects, chosen, offset, relief.shape, owned)
         block = empty_block(min(BLOCK, len(runs)))
         for start in range(0, len(runs), BLOCK):
             _block(anchors, runs[start : start + BLOCK], relief, image, name, offset, (block, averaging), result)

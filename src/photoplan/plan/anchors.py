@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.geometry.grid import Window
+from photoplan.geometry.levels import level_size
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,5 +33,21 @@ class Anchors:
     """Worst difference to the strict projection measured at the boxes' centre, face and edge middles, pixels."""
     source_window: Window
     """Part of the source image that holds every position, with the kernel's margin, cut at the image's border."""
-    scale: float
-    """Largest number of source pixels per target pixel along x or y, at the boxes' corners."""
+    scales: tuple[float, float]
+    """Smallest and largest number of source pixels per target pixel along x or y, at the boxes' corners."""
+
+    def at_level(self, level: int, size: tuple[int, int]) -> Anchors:
+        """The same for an image of `size` that is reduced by 2 to the power of `level`; the residual stays as it is."""
+        if level == 0:
+            return self
+        f, old = 2.0**level, self.source_window
+        limit = level_size(size, level)
+        # A pixel more all round: the margin was made for pixels of full size.
+        col, row = max((old.col >> level) - 1, 0), max((old.row >> level) - 1, 0)
+        right, bottom = (min(-(-stop >> level) + 1, most) for stop, most in zip(old.stop, limit))
+        window = Window(col, row, max(0, right - col), max(0, bottom - row))
+        corners = self.corners.copy()
+        for axis, (before, after) in enumerate(((old.col, col), (old.row, row))):
+            corners[..., axis] /= f
+            corners[..., axis] += ((before + 0.5) / f - 0.5 - after) * corners[..., 2]
+        return replace(self, corners=corners, source_window=window, scales=(self.scales[0] / f, self.scales[1] / f))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,10 +43,21 @@ class AnchorRule:
     """Half the support of the resampling kernel at scale 1, pixels: what the source window adds all round."""
     cell: int
     """Side of the first rectangles, target pixels; halved where the residual asks for it."""
+    reduces: bool = True
+    """Whether a source that is much finer than the target is read reduced; not if grey values must stay as they are."""
 
     def __post_init__(self) -> None:
         if not self.tolerance > 0:
             raise UsageError(f"tolerance {self.tolerance} px; a positive number is needed (default 0.02)")
+
+    def level(self, anchors: Anchors) -> int:
+        """How often a source is halved before it is resampled.
+
+        At least two pixels of the reduced source stay for every target pixel, also where the source is coarsest: the
+        kernel, widened to them, decides what the product looks like, not the means before it.
+        """
+        finer = anchors.scales[0] / 2.0
+        return int(math.log2(finer)) if self.reduces and finer >= 2.0 else 0
 
 
 @dataclass
@@ -278,10 +290,10 @@ def _assemble(
     order = np.lexsort((box_heights[:, 0], box_rects[:, 0], box_rects[:, 1]))
     box_rects, box_heights, corners = box_rects[order], box_heights[order], corners[order]
     first = np.flatnonzero(np.r_[True, (np.diff(box_rects, axis=0) != 0).any(axis=1)])
-    scale = _largest_scale(box_rects, corners)
+    scales = _scales(box_rects, corners)
     xy = corners[..., :2] / corners[..., 2:]
     low, high = xy.min(axis=(0, 1)), xy.max(axis=(0, 1))
-    margin = int(np.ceil(radius * max(1.0, scale))) + 2
+    margin = int(np.ceil(radius * max(1.0, scales[1]))) + 2
     width, height = camera.size
     # Clipped before the conversion: far outside the image a position may exceed any integer.
     col0, row0 = (int(np.clip(np.floor(a) - margin, 0, s)) for a, s in zip(low, (width, height)))
@@ -297,12 +309,12 @@ def _assemble(
         corners=np.ascontiguousarray(corners),
         residual=residual,
         source_window=source,
-        scale=scale,
+        scales=scales,
     )
 
 
-def _largest_scale(rects: NDArray[np.int32], corners: NDArray[np.float64]) -> float:
-    """Largest length of (∂x/∂u, ∂x/∂v) or (∂y/∂u, ∂y/∂v) at the corners of the boxes, pixels per pixel."""
+def _scales(rects: NDArray[np.int32], corners: NDArray[np.float64]) -> tuple[float, float]:
+    """Smallest and largest length of (∂x/∂u, ∂x/∂v) and (∂y/∂u, ∂y/∂v) at the corners, pixels per pixel."""
     c = corners.reshape(-1, 2, 2, 2, 3)
     width = (rects[:, 2] - rects[:, 0]).astype(float)[:, None, None, None]
     height = (rects[:, 3] - rects[:, 1]).astype(float)[:, None, None, None]
@@ -312,4 +324,5 @@ def _largest_scale(rects: NDArray[np.int32], corners: NDArray[np.float64]) -> fl
     xy = c[..., :2] / w
     slope_u = (du[..., :2] - xy * du[..., 2:]) / w
     slope_v = (dv[..., :2] - xy * dv[..., 2:]) / w
-    return float(np.hypot(slope_u, slope_v).max())
+    lengths = np.hypot(slope_u, slope_v)
+    return float(lengths.min()), float(lengths.max())

@@ -1,16 +1,19 @@
-"""A product before its pixels: grid, tiles, and how each tile is compiled."""
+"""A product before its pixels: target, table of sources, tiles, and how each tile is compiled."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.base import Camera
+from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.plan.anchors import Anchors
 from photoplan.plan.compile import AnchorRule, compile_anchors
+from photoplan.plan.owner import Ownership
 from photoplan.surfaces.base import Surface
 from photoplan.targets.base import Target
 
@@ -23,30 +26,62 @@ class Tile:
     """Its place among all tiles of the product, row by row: also the empty ones are counted."""
     window: Window
     """Its pixels in the product."""
+    sources: tuple[int, ...] = (0,)
+    """Rows of the table of sources that can paint here; all others are never looked at."""
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """What one source gives to a tile."""
+
+    source: int
+    """Row of the table of sources."""
+    level: int
+    """The source is read reduced by 2 to the power of this; the anchors refer to pixels of the reduced image."""
+    anchors: Anchors
+    """Where the tile's pixels lie in it."""
+
+    def window(self, size: tuple[int, int]) -> Window:
+        """What is read of a source of this size, in its pixels at full size."""
+        at = self.anchors.source_window
+        level = self.level
+        full = Window(at.col << level, at.row << level, at.width << level, at.height << level)
+        return full & Window(0, 0, *size)
 
 
 @dataclass(frozen=True, eq=False)
 class CompiledTile:
-    """Relief, anchors and owner of a tile: all that the engine needs besides pixels."""
+    """Relief, owner and anchors of a tile: all that the engine needs besides pixels."""
 
     window: Window
     """Its pixels in the product."""
     relief: NDArray[np.float32]
     """h of each pixel, shape (height, width); NaN where there is no surface."""
-    anchors: Anchors | None
-    """Where its pixels lie in the source; None if it holds none of the image."""
-    owner: int
-    """Which source paints it: 1-based, 0 = none."""
+    layers: tuple[Layer, ...]
+    """Sources that paint a part of it, each once; those that show none of it are left out."""
+    owner: NDArray[np.uint16] | None
+    """Row of the table of sources, plus one, that paints each pixel, shape (height, width); 0: none. None: there is
+    one source, and it paints whatever it shows."""
+
+    @property
+    def residual(self) -> float:
+        """Worst residual of all layers, pixels of their sources at full size."""
+        return max((layer.anchors.residual for layer in self.layers), default=0.0)
+
+    @property
+    def cells(self) -> int:
+        """Boxes of all layers' anchors."""
+        return sum(len(layer.anchors.corners) for layer in self.layers)
 
 
 @dataclass(frozen=True)
 class ProductPlan:
-    """One product of one source."""
+    """One product, of one source or of many."""
 
     name: str
     """Name of the product, and of its file without the extension."""
-    image: str
-    """Name of the source image in the project."""
+    sources: tuple[str, ...]
+    """The table of sources: names of the images; tiles and owners count its rows."""
     target: Target
     """The product's own coordinates."""
     tile_side: int
@@ -54,7 +89,18 @@ class ProductPlan:
     rule: AnchorRule
     """How finely tiles are cut."""
     tiles: tuple[Tile, ...]
-    """Tiles that can hold a part of the image; all others stay empty."""
+    """Tiles that can hold a part of an image; all others stay empty."""
+    owners: Ownership | None = None
+    """Who paints which pixel; None: there is one source."""
+
+    def __post_init__(self) -> None:
+        if len(self.sources) != 1 and self.owners is None:
+            raise UsageError(f"product {self.name!r} of {len(self.sources)} sources; say which of them paints a pixel")
+
+    @property
+    def image(self) -> str:
+        """Name of the first source: the only one of an orthophoto of one image."""
+        return self.sources[0]
 
     @property
     def size(self) -> tuple[int, int]:
@@ -68,17 +114,26 @@ class ProductPlan:
         return across * down
 
 
-def compile_tile(product: ProductPlan, window: Window, camera: Camera, surface: Surface) -> CompiledTile:
-    """Relief and anchors of a window of a product. Pure: the same inputs give the same bytes.
+def compile_tile(product: ProductPlan, tile: Tile, cameras: Sequence[Camera], surface: Surface) -> CompiledTile:
+    """Relief, owner and anchors of a tile of a product. Pure: the same inputs give the same bytes.
 
     Parameters
     ----------
     product : ProductPlan
-    window : Window
+    tile : Tile
         A tile of the product, or a part of one.
-    camera, surface : Camera, Surface
-        Those of the product's image and project.
+    cameras : sequence of Camera
+        One for each row of the product's table of sources.
+    surface : Surface
+        What the target's depth is taken from.
     """
-    relief = surface.relief(product.target, window)
-    anchors = compile_anchors(camera, product.target, window, relief, product.rule)
-    return CompiledTile(window, relief, anchors, 0 if anchors is None else 1)
+    relief = surface.relief(product.target, tile.window)
+    owner = None if product.owners is None else product.owners.owner(product.target, tile.window, relief)
+    layers = []
+    for source in tile.sources:
+        mine = relief if owner is None else np.where(owner == source + 1, relief, np.float32(np.nan))
+        anchors = compile_anchors(cameras[source], product.target, tile.window, mine, product.rule)
+        if anchors is not None:
+            level = product.rule.level(anchors)
+            layers.append(Layer(source, level, anchors.at_level(level, cameras[source].size)))
+    return CompiledTile(tile.window, relief, tuple(layers), owner)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
+from photoplan.geometry.levels import reduced
 from photoplan.io.raster import RasterReader
 from photoplan.kernels.shift_bands import limits_of, no_mask, shift_band
 from photoplan.kernels.weights import KERNELS
@@ -63,8 +64,10 @@ class AlignedReader(DerivedReader):
         """Type of the pixels."""
         return self.source.dtype
 
-    def read(self, window: Window) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+    def read(self, window: Window, level: int = 0) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
         """Pixels of a window inside the image, shape (bands, height, width), and their validity."""
+        if level:
+            return reduced(self, window, level)
         reach: dict[int, float] = self._reach  # type: ignore[attr-defined]
         margin = ceil(max(reach.values(), default=0.0)) + KERNELS[self.kernel].margin + 1
         width, height = self.size

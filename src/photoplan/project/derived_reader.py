@@ -40,8 +40,8 @@ class ImageReader(Protocol):
         """Type of the pixels."""
         ...
 
-    def read(self, window: Window) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
-        """Pixels of a window inside the image, shape (bands, height, width), and their validity."""
+    def read(self, window: Window, level: int = 0) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+        """Pixels of a window and their validity, see `engine.base.Reader`."""
         ...
 
 

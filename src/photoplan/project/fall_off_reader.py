@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
+from photoplan.geometry.levels import reduced
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.raster import RasterReader
 from photoplan.project.derived_reader import DerivedReader
@@ -98,8 +99,10 @@ class FallOffReader(DerivedReader):
         """Type of the light: float32, whatever the image has."""
         return np.dtype(np.float32)
 
-    def read(self, window: Window) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+    def read(self, window: Window, level: int = 0) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
         """Light of a window inside the image, shape (bands, height, width), and its validity."""
+        if level:
+            return reduced(self, window, level)
         pixels, valid = self.source.read(window)
         light = np.empty(pixels.shape, np.float32)
         dark = np.zeros((pixels.shape[0], 1, 1), np.float32)

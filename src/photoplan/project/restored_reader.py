@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
+from photoplan.geometry.levels import reduced
 from photoplan.io.raster import RasterReader
 from photoplan.io.raster_info import RasterInfo
 from photoplan.io.storage import Nodata
@@ -65,8 +66,10 @@ class RestoredReader(DerivedReader):
             f"{used.noise_gain:.3g} times; {self.restorer.linearisation.describe()}"
         )
 
-    def read(self, window: Window) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+    def read(self, window: Window, level: int = 0) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
         """Restored pixels of a window inside the image, shape (bands, height, width), and their validity."""
+        if level:
+            return reduced(self, window, level)
         parts = list(window.tiles(PART))
         if len(parts) == 1:
             only = self.read_counted(window)

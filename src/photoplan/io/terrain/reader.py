@@ -14,8 +14,8 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io.block_cache import BlockCache
 from photoplan.io.checks import TERRAIN_LIMITS, RasterLimits
-from photoplan.io.raster import missing_blocks, read_pixels
 from photoplan.io.raster_info import RasterInfo, read_info
+from photoplan.io.raster_pixels import missing_blocks, read_pixels
 from photoplan.io.validity import MissingBlocks
 
 LOWEST, HIGHEST = -12_000.0, 9_000.0

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from photoplan import __version__
 from photoplan.cameras.base import Camera
+from photoplan.engine.base import Source
 from photoplan.engine.execute import Pixels
-from photoplan.engine.execute import render as render_window
+from photoplan.engine.execute import render as render_tiles
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MapGrid, Window
@@ -163,12 +164,13 @@ def _plan_one(
     tiles = tuple(Tile(i, window) for i, window in enumerate(windows) if keep[i])
     if not tiles:
         return None
-    rule = AnchorRule(settings.tolerance, max(1, math.ceil(KERNELS[settings.kernel].taps / 2)), settings.tile)
+    radius = max(1, math.ceil(KERNELS[settings.kernel].taps / 2))
+    rule = AnchorRule(settings.tolerance, radius, settings.tile, reduces=settings.kernel != "nearest")
     seen = coverage.outline[np.isfinite(coverage.outline).all(axis=1)]
     if len(seen):
         x, y, z = seen.mean(axis=0)
         rule = replace(rule, cell=initial_cell(scene.camera, target, grid.to_pixel((x, y)), z, settings.tile, rule))
-    return ProductPlan(f"{safe_stem(name)}_ortho", name, target, settings.tile, rule, tiles)
+    return ProductPlan(f"{safe_stem(name)}_ortho", (name,), target, settings.tile, rule, tiles)
 
 
 def _check_storable(scene: Scene, name: str, grid: MapGrid, settings: OrthoSettings) -> None:
@@ -311,4 +313,4 @@ def window_of(grid: MapGrid, bounds: tuple[float, float, float, float]) -> Windo
 
 def render_tile(product: ProductPlan, kernel: str, scene: Scene, tile: Tile) -> Pixels:
     """Pixels of one tile of a product."""
-    return render_window(product, tile.window, scene.camera, scene.surface, scene.reader, kernel)
+    return render_tiles(product, tile, [Source(scene.camera, scene.reader)], scene.surface, kernel)

@@ -98,21 +98,17 @@ def compile_figures(plan: OrthoPlan, events: Events = SILENT) -> PlanFigures:
     for product in plan.products:
         scene = open_scene(plan.project, product.plan.image)
         for tile in product.plan.tiles:
-            anchors = compile_tile(product.plan, tile.window, scene.camera, scene.surface).anchors
-            cells, residual, source = (
-                (0, 0.0, (0, 0, 0, 0))
-                if anchors is None
-                else (len(anchors.corners), anchors.residual, _numbers(anchors.source_window))
-            )
+            compiled = compile_tile(product.plan, tile, [scene.camera], scene.surface)
+            read = [_numbers(layer.window(scene.camera.size)) for layer in compiled.layers] or [(0, 0, 0, 0)]
             bounds = product.grid.bounds_of(tile.window)
             rows.append(
                 (
                     product.plan.name,
                     product.plan.image,
                     tile.index,
-                    cells,
-                    residual,
-                    source,
+                    compiled.cells,
+                    compiled.residual,
+                    read[0],
                     _numbers(tile.window),
                     bounds,
                 )
