@@ -15,7 +15,7 @@ from rasterio.enums import ColorInterp
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
-from photoplan.io import raster as raster_module
+from photoplan.io import raster_pixels as raster_module
 from photoplan.io.decoded import DecodedPicture, decoded_picture
 from photoplan.io.gdal import close_handles
 from photoplan.io.raster import RasterReader
