@@ -168,7 +168,7 @@ def test_small_standard_deviations_are_printed_with_two_figures(capsys: pytest.C
     from photoplan.cli.tie import _print
     from photoplan.products.tie.run import TieReport
 
-    none = {"output": None, "picture": None, "refined": None, "loops": None, "rays": {2: 7}, "notes": (), "parts": ()}
+    none = {"output": None, "refined": None, "loops": None, "rays": {2: 7}, "notes": (), "parts": ()}
     counts = {"factor": 1, "pairs": 1, "verified": 1, "tracks": 7, "ambiguous": 0, "points": 7}
     _print(TieReport(**none, **counts, images=("a", "b"), chosen="all", per_image={"a": 7, "b": 7}, sigma=0.00556))  # type: ignore[arg-type]
     assert "standard deviation 0.0056 px" in capsys.readouterr().out

@@ -31,9 +31,7 @@ def project(block: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def ties(project: Path, **how: object) -> tuple[TieReport, ImagePoints, NDArray]:
     """Report, points, and their residuals against the given orientation."""
     output = project.with_name("ties.csv")
-    report = find_ties(
-        TieRequest(project, IMAGES, features=3000, per_image=300, output=output, overwrite=True, picture=False, **how)
-    )
+    report = find_ties(TieRequest(project, IMAGES, features=3000, per_image=300, output=output, overwrite=True, **how))
     points = read_image_points(output)
     cameras = [open_scene(load_project(project), name).camera for name in points.images]
     return report, points, reprojection(points, cameras)

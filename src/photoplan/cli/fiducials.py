@@ -40,17 +40,33 @@ def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any)
     marks. An image that fails does not stop the others; they are listed at the end (exit code 4).
     """
     from photoplan.cli.progress import progress
-    from photoplan.products.fiducials.run import FiducialsRequest, locate_fiducials
+    from photoplan.io.names import unique_stems
+    from photoplan.plain import plain
+    from photoplan.products.fiducials.run import FiducialsRequest, locate_fiducials, scans_of
+    from photoplan.report.fiducials import marks_picture
+    from photoplan.report.page import open_picture
 
+    folder, overwrite = options.pop("pictures"), options.pop("overwrite")
     request = FiducialsRequest(scans, **_values(options))
+    pictures = {}
+    if folder is not None:
+        files = scans_of(request)
+        for name, stem in unique_stems(files).items():
+            place = folder / f"{stem}.fiducials.png"
+            pictures[name] = open_picture(place, [*scans, *files.values()], overwrite=overwrite)
     report = locate_fiducials(request, lambda total: progress(total, quiet, "images"))
+    drawn = {}
+    for image in report.images:
+        picture = pictures.get(image.name)
+        drawn[image.name] = None if picture is None else picture.write(marks_picture(image, picture.mpl))
     if as_json:
-        show_json(report.to_dict())
+        images = [{**plain(image), "picture": drawn[image.name]} for image in report.images]
+        show_json(report, images=images)
     for image in report.images:
         if not as_json:
             show(image)
-            if image.picture is not None:
-                show(image.picture)
+            if drawn[image.name] is not None:
+                show(drawn[image.name])
         if not quiet:
             for note in image.found.notes:
                 say(f"{image.name}: {note}")

@@ -9,7 +9,6 @@ import click
 
 from photoplan.cli.options import json_option
 from photoplan.cli.output import end_with_failures, say, show, show_json
-from photoplan.plain import plain
 
 
 @click.command("interior")
@@ -48,7 +47,7 @@ def command(images: tuple[str, ...], as_json: bool, quiet: bool, **options: Any)
     if plot is not None and found.images:
         picture = plot.write(InteriorPlots(plot.mpl).residuals(found.images))
     if as_json:
-        show_json({**plain(found), "report": report, "plot": picture})
+        show_json(found, report=report, plot=picture)
     else:
         for image in found.images:
             show(image)

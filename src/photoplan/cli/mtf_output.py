@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Protocol
 
 from photoplan.cli.output import show, show_json
-from photoplan.plain import plain
 
 
 class _Image(Protocol):
@@ -27,7 +26,7 @@ class _Report(Protocol):
 def say_images(report: _Report, page: Path | None, as_json: bool, talk: Callable[[str], None]) -> None:
     """The figures of every image on stdout, or all as JSON; notes are talk."""
     if as_json:
-        show_json({**plain(report), "report": page})
+        show_json(report, report=page)
     for image in report.images:
         if not as_json:
             show(image)

@@ -59,11 +59,11 @@ def show(text: object) -> None:
     click.echo(_spelled(text))
 
 
-def show_json(values: object) -> None:
-    """Print a value as one JSON object on stdout."""
-    from photoplan.plain import json_text  # brings NumPy, which --help does without
+def show_json(values: object, **more: object) -> None:
+    """Print a value as one JSON object on stdout, with `more` keys."""
+    from photoplan.plain import json_text, plain  # bring NumPy, which --help does without
 
-    show(json_text(values))
+    show(json_text({**plain(values), **more} if more else values))
 
 
 def say(text: object) -> None:

@@ -9,7 +9,6 @@ import click
 
 from photoplan.cli.options import json_option
 from photoplan.cli.output import end_with_failures, say, show, show_json
-from photoplan.plain import plain
 
 if TYPE_CHECKING:
     from photoplan.products.resect.image import ResectedImage
@@ -56,7 +55,7 @@ def command(as_json: bool, quiet: bool, free: str | None, **options: Any) -> Non
         result = resect_project(request, lambda _: advance(1, 0))
     report = None if page is None or not result.images else page.write(resect_page(result, page.mpl))
     if as_json:
-        show_json({**plain(result), "report": report})
+        show_json(result, report=report)
     else:
         _show(result, report)
     if not quiet:

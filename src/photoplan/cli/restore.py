@@ -10,7 +10,6 @@ import click
 from photoplan.cli.options import BYTES, json_option
 from photoplan.cli.output import end_with_failures, show, show_json, talking
 from photoplan.cli.restore_options import filter_options, filter_request
-from photoplan.plain import plain
 
 if TYPE_CHECKING:
     from photoplan.products.restore.run import RestoredImage, RestorePlan
@@ -88,7 +87,7 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
     if page is not None and report.images:
         written = page.write(restore_page(found, plan.jobs, report, page.mpl))
     if as_json:
-        show_json({**plain(report), "report": written})
+        show_json(report, report=written)
     elif written is not None:
         show(written)
     end_with_failures(report.failed, len(report.images))

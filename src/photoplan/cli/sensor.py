@@ -9,7 +9,6 @@ import click
 
 from photoplan.cli.options import json_option
 from photoplan.cli.output import say, show, show_json
-from photoplan.plain import plain
 
 
 @click.command("sensor")
@@ -32,7 +31,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     report = None if page is None or options["dry_run"] else page.write(sensor_page(found, page.mpl))
     written = [path for path in (report, found.csv) if path is not None]
     if as_json:
-        show_json({**plain(found), "written": written})
+        show_json(found, written=written)
     else:
         show(found)
         for path in written:

@@ -40,21 +40,29 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     from photoplan.cli.progress import progress
     from photoplan.products.tie.run import TieRequest, find_ties
+    from photoplan.report.drawing import has_matplotlib
+    from photoplan.report.page import open_picture
+    from photoplan.report.tie import TiePlots
 
     options["refine"] = not options.pop("no_refine")
     options["use_orientation"] = not options.pop("ignore_orientation")
-    options["picture"] = not options.pop("no_picture")
     options["workers"] = options["workers"] or psutil.cpu_count() or 1
+    wanted = not options.pop("no_picture") and not options["dry_run"] and has_matplotlib()
     request = TieRequest(**options)
+    place = request.table.with_suffix(".png") if wanted else None
+    drawing = open_picture(place, [request.project], overwrite=request.overwrite)
     found = find_ties(request, lambda words, count: progress(count, quiet, words))
+    picture = None
+    if drawing is not None and found.found is not None:
+        picture = drawing.write(TiePlots(drawing.mpl).ties(found.sources, found.found))
     if as_json:
-        show_json(found.to_dict())
+        show_json(found, picture=picture)
     elif found.output is None:
         show(f"{len(found.images)} images, {found.pairs or 'not yet known number of'} pairs: {found.chosen}")
     else:
         show(found.output)
-        if found.picture is not None:
-            show(found.picture)
+        if picture is not None:
+            show(picture)
         _print(found)
     if not quiet:
         _talk(found)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import io
 from typing import Any
 
@@ -32,6 +33,11 @@ STYLE = {
 }
 _DPI = 150
 _PARTS = ("cm", "collections", "colors", "figure", "lines", "patches", "ticker")
+
+
+def has_matplotlib() -> bool:
+    """Whether it is installed."""
+    return importlib.util.find_spec("matplotlib") is not None
 
 
 def load_matplotlib(what: str, otherwise: str = "") -> Any:

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from photoplan.orientation.marks.fiducials import FiducialResult
+from photoplan.orientation.marks.layout import MarkLayout
+from photoplan.plain import pick
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,58 +24,37 @@ class ImageFiducials:
     size: tuple[int, int]
     grey: str
     """Which grey values were used."""
+    band: int | None
+    """Band that was used; None: luminance."""
+    layout: MarkLayout
+    """What was sought."""
     found: FiducialResult
-    picture: Path | None
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
+    def json_fields(self) -> dict[str, Any]:
+        """Every mark, and the affine transformation."""
         found, fit = self.found, self.found.fit
-        residuals = {name: [_number(v, 2) for v in row] for name, row in zip(fit.names, found.residuals_um)}
-        t = fit.transformation
+        residuals = dict(zip(fit.names, found.residuals_um))
         return {
-            "image": self.name,
-            "file": str(self.file),
-            "camera": self.camera,
-            "size": list(self.size),
-            "grey": self.grey,
-            "pixel_um": _number(1000 * found.pixel_mm, 4),
-            "rotation": found.turn.rotation,
-            "mirrored": found.turn.mirrored,
-            "negative": found.negative,
-            "blur_px": _number(found.blur_px, 2),
+            **pick(self, "file", "camera", "size", "grey", image="name"),
+            "pixel_um": 1000 * found.pixel_mm,
+            **pick(found.turn, "rotation", "mirrored"),
+            **pick(found, "negative", "blur_px", "notes"),
             "marks": [
                 {
-                    "name": m.name,
-                    "x": _number(m.x, 4),
-                    "y": _number(m.y, 4),
-                    "sigma": [_number(m.sigma_x, 4), _number(m.sigma_y, 4)],
-                    "correlation": _number(m.correlation, 4),
-                    "method": m.method,
-                    "paraboloid": m.paraboloid and [_number(v, 4) for v in m.paraboloid],
-                    "matching": m.matching and [_number(v, 4) for v in m.matching],
+                    **pick(m, "name", "x", "y", "correlation", "method", "paraboloid", "matching"),
+                    "sigma": [m.sigma_x, m.sigma_y],
                     "residual_um": residuals[m.name],
                 }
                 for m in found.marks
             ],
-            "missing": [
-                {
-                    "name": m.name,
-                    "x": _number(m.x, 1),
-                    "y": _number(m.y, 1),
-                    "best_correlation": _number(m.correlation, 4),
-                    "reason": m.reason,
-                }
-                for m in found.missing
-            ],
+            "missing": [pick(m, "name", "x", "y", "reason", best_correlation="correlation") for m in found.missing],
             "affine": {
-                "parameters": [getattr(t, f"a{k}") for k in range(1, 7)],
+                "parameters": [getattr(fit.transformation, f"a{k}") for k in range(1, 7)],
                 "residuals_um": residuals,
-                "sigma0_px": _number(fit.sigma0, 4),
-                "sigma0_um": _number(found.sigma0_um, 2),
+                "sigma0_px": fit.sigma0,
+                **pick(found, "sigma0_um"),
                 "redundancy": fit.redundancy,
             },
-            "notes": list(found.notes),
-            "picture": self.picture and str(self.picture),
         }
 
     def __str__(self) -> str:
@@ -106,15 +87,7 @@ class FiducialsReport:
     written: Path | None
     """Project file that received the marks."""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        return {
-            "images": [image.to_dict() for image in self.images],
-            "failed": [{"image": name, "reason": reason} for name, reason in self.failed.items()],
-            "project": self.written and str(self.written),
-        }
-
-
-def _number(value: float, digits: int) -> float | None:
-    """Rounded; None for NaN, which JSON does not know."""
-    return round(float(value), digits) if math.isfinite(value) else None
+    def json_fields(self) -> dict[str, Any]:
+        """Failures as a list."""
+        failed = [{"image": name, "reason": reason} for name, reason in self.failed.items()]
+        return {**pick(self, "images", project="written"), "failed": failed}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +10,6 @@ from pathlib import Path
 from photoplan.errors import InputError, PhotoplanError, ResourceError, UsageError
 from photoplan.io.camera.file import read_cameras
 from photoplan.io.camera.model import FilmCamera, FrameCamera
-from photoplan.io.names import unique_stems
-from photoplan.io.product import check_output
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
@@ -19,7 +17,6 @@ from photoplan.io.scan_pitch import parse_pitch
 from photoplan.orientation.marks.fiducials import FiducialSearch, find_fiducials
 from photoplan.orientation.marks.layout import MarkLayout
 from photoplan.orientation.marks.locate import LEAST_CORRELATION
-from photoplan.products.fiducials.picture import MarksPicture
 from photoplan.products.fiducials.result import FiducialsReport, ImageFiducials
 from photoplan.project.camera_marks import mark_patterns
 from photoplan.project.scan_image import ScanImage, stated_pixel_mm
@@ -44,9 +41,6 @@ class FiducialsRequest:
     negative: bool | None = None
     band: int | None = None
     least_correlation: float = LEAST_CORRELATION
-    pictures: Path | None = None
-    """Folder that receives a picture of the marks of each image."""
-    overwrite: bool = False
     dry_run: bool = False
     """Do not write into the project."""
 
@@ -80,21 +74,19 @@ def locate_fiducials(
     Raises
     ------
     UsageError
-        Options contradict each other, or a picture exists or cannot be drawn because matplotlib is missing.
+        Options contradict each other.
     InputError
         Camera or project cannot be used.
     """
     project = _project(request)
     jobs = _jobs(request, project)
-    pictures = _pictures(request, jobs)
-    drawer = MarksPicture() if pictures else None
     pixel_mm = sum(parse_pitch(request.scan_resolution)) / 2 if request.scan_resolution else None
     results: list[ImageFiducials] = []
     failed: dict[str, str] = {}
     with begin(len(jobs)) as advance:
         for job in jobs:
             try:
-                results.append(_locate(request, job, pixel_mm, drawer, pictures, project is not None))
+                results.append(_locate(request, job, pixel_mm, project is not None))
             except ResourceError:
                 raise
             except PhotoplanError as error:
@@ -105,6 +97,17 @@ def locate_fiducials(
         written = request.images[0]
         edit_project(written, ProjectChanges(images={r.name: _entries(project, r) for r in results}))
     return FiducialsReport(tuple(results), failed, written)
+
+
+def scans_of(request: FiducialsRequest) -> dict[str, Path]:
+    """Files of the images that a request asks for, by the names in its report.
+
+    Raises
+    ------
+    UsageError, InputError
+        See `locate_fiducials`.
+    """
+    return {job.name: job.file for job in _jobs(request, _project(request))}
 
 
 def _project(request: FiducialsRequest) -> Project | None:
@@ -169,24 +172,10 @@ def _layout(camera: FilmCamera, name: str, folder: Path) -> MarkLayout:
         raise InputError(f"camera {name!r}: {error}") from None
 
 
-def _pictures(request: FiducialsRequest, jobs: Sequence[_Job]) -> dict[str, Path]:
-    """Where each image's picture goes; refused before any work if it exists."""
-    if request.pictures is None:
-        return {}
-    stems = unique_stems(job.name for job in jobs)
-    paths = {name: request.pictures / f"{stem}.fiducials.png" for name, stem in stems.items()}
-    inputs = [*request.images, *(job.file for job in jobs)]
-    for path in paths.values():
-        check_output(path, inputs, overwrite=request.overwrite)
-    return paths
-
-
 def _locate(
     request: FiducialsRequest,
     job: _Job,
     pixel_mm: float | None,
-    drawer: MarksPicture | None,
-    pictures: Mapping[str, Path],
     in_project: bool,
 ) -> ImageFiducials:
     scan = ScanImage(job.file, request.band)
@@ -208,10 +197,16 @@ def _locate(
             f"{job.camera_name!r} states mirrored = {str(job.camera.mirrored).lower()}; correct that entry, or give "
             "scans of the other kind a camera of their own"
         )
-    picture = pictures.get(job.name)
-    if drawer is not None and picture is not None:
-        drawer.draw(picture, scan, job.layout, found, job.name)
-    return ImageFiducials(job.name, job.file, job.camera_name, scan.size, scan.rule, found, picture)
+    return ImageFiducials(
+        name=job.name,
+        file=job.file,
+        camera=job.camera_name,
+        size=scan.size,
+        grey=scan.rule,
+        band=request.band,
+        layout=job.layout,
+        found=found,
+    )
 
 
 def _entries(project: Project, result: ImageFiducials) -> dict[str, object]:

@@ -24,9 +24,9 @@ from photoplan.matching.refine import Refined, RefineSettings, reference_points,
 from photoplan.matching.thin import thin_tracks
 from photoplan.matching.tracks import Tracks, TracksFound, build_tracks, connected_parts
 from photoplan.matching.verify import PairMatches, VerifySettings
+from photoplan.plain import pick
 from photoplan.products.init.match import some
 from photoplan.products.tie.inputs import TieImage, chosen_pairs, open_images
-from photoplan.products.tie.picture import draw_ties
 from photoplan.products.tie.work import (
     FeatureStore,
     Map,
@@ -65,10 +65,14 @@ class TieRequest:
     refine: bool = True
     use_orientation: bool = True
     output: Path | None = None
-    picture: bool = True
     workers: int = 1
     overwrite: bool = False
     dry_run: bool = False
+
+    @property
+    def table(self) -> Path:
+        """The table that is written."""
+        return self.output or self.project.resolve().parent / "tie_points.csv"
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,6 @@ class TieReport:
 
     output: Path | None
     """The table of image points; None after a dry run."""
-    picture: Path | None
     images: tuple[str, ...]
     chosen: str
     """How pairs were chosen."""
@@ -100,42 +103,27 @@ class TieReport:
     sigma: float
     """Median standard deviation of a coordinate, pixels."""
     notes: tuple[str, ...]
+    sources: tuple[TieImage, ...] = ()
+    """The images, as they were opened."""
+    found: Tracks | None = None
+    """The points; None after a dry run."""
 
     @property
     def unconnected(self) -> tuple[str, ...]:
         """Images outside the largest part."""
         return tuple(name for part in self.parts[1:] for name in part)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        refined, loops = self.refined, self.loops
+    def json_fields(self) -> dict[str, Any]:
+        """Counts by name, without the points."""
+        own = ("output", "chosen", "tracks", "ambiguous", "points", "rays", "per_image", "parts", "unconnected",
+               "sigma", "loops", "notes")  # fmt: skip
+        refined = self.refined
         return {
-            "output": None if self.output is None else str(self.output),
-            "picture": None if self.picture is None else str(self.picture),
+            **pick(self, *own),
             "images": len(self.images),
-            "chosen": self.chosen,
             "scale": 1 / self.factor,
             "pairs": {"tried": self.pairs, "verified": self.verified},
-            "tracks": self.tracks,
-            "ambiguous": self.ambiguous,
-            "points": self.points,
-            "rays": {str(k): v for k, v in self.rays.items()},
-            "per_image": self.per_image,
-            "parts": [list(part) for part in self.parts],
-            "unconnected": list(self.unconnected),
-            "sigma": None if not np.isfinite(self.sigma) else self.sigma,
-            "refined": None
-            if refined is None
-            else {
-                "correlation": refined.correlation,
-                "unsettled": refined.unsettled,
-                "unlike": refined.unlike,
-                "uncertain": refined.uncertain,
-            },
-            "loops": None
-            if loops is None
-            else {"count": loops.count, "factor": loops.factor, "measured": loops.measured},
-            "notes": list(self.notes),
+            "refined": refined and pick(refined, "correlation", "unsettled", "unlike", "uncertain"),
         }
 
 
@@ -186,9 +174,8 @@ def find_ties(request: TieRequest, stage: Stage = unwatched) -> TieReport:
     points = _points(tracks, names)
     write_image_points(output, points)
     _enter(request.project, project, output)
-    drawn = draw_ties(output.with_suffix(".png"), images, tracks) if request.picture else None
     report = _report(names, chosen, factor, (len(pairs), verified), found, tracks, notes)
-    return replace(report, output=output, picture=drawn, refined=refined, loops=loops)
+    return replace(report, output=output, refined=refined, loops=loops, sources=tuple(images), found=tracks)
 
 
 def _check(request: TieRequest, project: Project, names: Sequence[str]) -> Path:
@@ -200,14 +187,13 @@ def _check(request: TieRequest, project: Project, names: Sequence[str]) -> Path:
             f"{request.features} features and {request.per_image} points per image; 50 and 1 are the least"
         )
     opencv()
-    output = request.output or request.project.resolve().parent / "tie_points.csv"
+    output = request.table
     points = [project.resolve(file) for file in project.observations.image_points]  # an older run's among them
     inputs = [request.project, *(file for file in input_files(project) if file not in points)]
     if output.suffix.lower() in (".png", ".cache"):
         raise UsageError(f"{output}: a table is written; give it a name such as tie_points.csv")
     if not request.dry_run:
-        for path in (output, output.with_suffix(".png")):
-            check_output(path, inputs, overwrite=request.overwrite)
+        check_output(output, inputs, overwrite=request.overwrite)
     return output
 
 
@@ -225,7 +211,6 @@ def _dry(
 ) -> TieReport:
     return TieReport(
         output=None,
-        picture=None,
         images=tuple(names),
         chosen=chosen,
         factor=factor,
@@ -312,7 +297,6 @@ def _report(
     parts = connected_parts(len(names), tracks)
     return TieReport(
         output=None,
-        picture=None,
         images=tuple(names),
         chosen=chosen,
         factor=factor,

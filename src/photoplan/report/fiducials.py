@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from photoplan.io.disk import disk_error, write_atomically
 from photoplan.orientation.marks.drawn import draw
 from photoplan.orientation.marks.fiducials import FiducialResult, LocatedMark, MissingMark
 from photoplan.orientation.marks.layout import MarkLayout
 from photoplan.orientation.marks.measure import mark_window
 from photoplan.orientation.marks.search import Scan
-from photoplan.report.drawing import load_matplotlib, png
+from photoplan.products.fiducials.result import ImageFiducials
+from photoplan.project.scan_image import ScanImage
+from photoplan.report.drawing import png
 
 _ACROSS = 2
 """Marks in a row."""
@@ -23,51 +23,20 @@ _MOST = 200
 _CROSS, _LOST = "#d81b60", "#b03000"
 
 
-class MarksPicture:
-    """Draws marks; made before any work, so that a missing library is known at once.
-
-    Raises
-    ------
-    UsageError
-        When made: matplotlib is not installed.
-    """
-
-    def __init__(self) -> None:
-        self._mpl = load_matplotlib("a picture")
-
-    def draw(self, path: Path, scan: Scan, layout: MarkLayout, found: FiducialResult, title: str) -> None:
-        """Write a PNG; its folder is made.
-
-        Parameters
-        ----------
-        path : Path
-        scan : Scan
-        layout : MarkLayout
-            What was sought.
-        found : FiducialResult
-            What was found.
-        title : str
-
-        Raises
-        ------
-        ResourceError, UsageError
-            The disk is full, or the folder cannot be written to.
-        """
-        marks: list[LocatedMark | MissingMark] = [*found.marks, *found.missing]
-        across = min(_ACROSS, len(marks))
-        down = math.ceil(len(marks) / across)
-        figure = self._mpl.figure.Figure(figsize=(4.6 * across, 0.6 + 3.0 * down), layout="constrained")
-        figure.suptitle(title, fontsize=11)
-        panels = figure.subplots(down, 2 * across, squeeze=False).ravel()
-        for panel in panels:
-            panel.set_axis_off()
-        for k, mark in enumerate(marks):
-            _panels(panels[2 * k : 2 * k + 2], scan, layout, found, mark)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise disk_error(path, error) from error
-        write_atomically(path, png(figure, dpi=110))
+def marks_picture(image: ImageFiducials, mpl: Any) -> bytes:
+    """The marks of an image as PNG; the scan is opened again."""
+    found, scan = image.found, ScanImage(image.file, image.band)
+    marks: list[LocatedMark | MissingMark] = [*found.marks, *found.missing]
+    across = min(_ACROSS, len(marks))
+    down = math.ceil(len(marks) / across)
+    figure = mpl.figure.Figure(figsize=(4.6 * across, 0.6 + 3.0 * down), layout="constrained")
+    figure.suptitle(image.name, fontsize=11)
+    panels = figure.subplots(down, 2 * across, squeeze=False).ravel()
+    for panel in panels:
+        panel.set_axis_off()
+    for k, mark in enumerate(marks):
+        _panels(panels[2 * k : 2 * k + 2], scan, image.layout, found, mark)
+    return png(figure, dpi=110)
 
 
 def _panels(
