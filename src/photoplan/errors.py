@@ -57,3 +57,7 @@ class ResourceError(PhotoplanError):
     """Disk or memory ran out; nothing half-written was left under a product's name."""
 
     exit_code = 5
+
+
+class PhotoplanWarning(UserWarning):
+    """Something that a user should know and that stops nothing."""

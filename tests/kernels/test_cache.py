@@ -7,7 +7,10 @@ import subprocess
 import sys
 
 import pytest
+from numba import njit
 
+from photoplan.errors import PhotoplanWarning
+from photoplan.kernels import jit, numba_parts
 from photoplan.kernels.jit import COMPILED
 from photoplan.kernels.rectify import is_compiled
 
@@ -37,10 +40,96 @@ def test_second_process_loads_what_the_first_compiled(tmp_path):
         for _ in range(2)
     ]
     assert talk[0].split() == ["False", "True", "1", "1"]
-    assert talk[1].split() == ["True", "True", "0", "0"]
+    # What lies on the disk is asked of numba's inside; where that is not leaned on, the answer is no.
+    assert talk[1].split() == [str(numba_parts.USABLE), "True", "0", "0"]
 
 
 def test_is_compiled_knows_all_kinds():
     for dtype in ("uint8", "float32"):
         for bands in (1, 3):
             assert is_compiled(dtype, bands, "lanczos3") in ((True, False) if COMPILED else (True,))
+
+
+TINY = """
+import os, sys, tempfile, warnings
+
+def refuse(folder, make):
+    if not str(folder).startswith(os.environ["TMPDIR"]):
+        raise PermissionError(13, "Read-only file system", str(folder))
+    return make()
+
+plain = tempfile.TemporaryFile
+tempfile.TemporaryFile = lambda *args, dir=None, **more: refuse(dir, lambda: plain(*args, dir=dir, **more))
+with warnings.catch_warnings(record=True) as said:
+    warnings.simplefilter("always")
+    from photoplan.kernels.jit import kernel
+    import tiny
+print(tiny.once(2.0) + tiny.twice(2.0), sum(tiny.twice.stats.cache_misses.values()), len(said))
+print(*(each.message for each in said), os.environ.get("NUMBA_CACHE_DIR"))
+"""
+TINY_KERNELS = """
+from photoplan.kernels.jit import kernel
+
+@kernel
+def once(x):
+    return x
+
+@kernel
+def twice(x):
+    return 2 * x
+"""
+
+
+@pytest.fixture
+def nowhere(tmp_path):
+    """Runs `TINY` where numba finds no folder of its own that it may write."""
+    (tmp_path / "code").mkdir()
+    (tmp_path / "code" / "tiny.py").write_text(TINY_KERNELS)
+    (tmp_path / "temporary").mkdir()
+    path = os.pathsep.join(filter(None, [str(tmp_path / "code"), os.environ.get("PYTHONPATH")]))
+    environment = {**os.environ, "PYTHONPATH": path, "TMPDIR": str(tmp_path / "temporary")}
+    environment.pop("NUMBA_CACHE_DIR", None)
+
+    def run(**more):
+        done = subprocess.run(
+            [sys.executable, "-c", TINY], env=environment | more, check=True, capture_output=True, text=True
+        )
+        return done.stdout.split("\n", 1)
+
+    return run
+
+
+@pytest.mark.skipif(not COMPILED, reason="nothing is compiled")
+def test_where_nothing_can_be_written_a_temporary_folder_is_used_and_named_once(nowhere, tmp_path):
+    for misses in (1, 0):
+        figures, talk = nowhere()
+        assert figures.split() == ["6.0", str(misses), "1"]
+        assert talk.count(str(tmp_path / "temporary" / "photoplan-kernels-")) == 2  # it is told, and inherited
+        assert "Set NUMBA_CACHE_DIR" in talk
+
+
+@pytest.mark.skipif(not COMPILED or os.name != "posix", reason="nothing is compiled, or folders have no owners")
+def test_a_temporary_folder_that_others_can_write_is_not_trusted(nowhere, tmp_path):
+    open_to_all = tmp_path / "temporary" / f"photoplan-kernels-{os.getuid()}"
+    open_to_all.mkdir()
+    open_to_all.chmod(0o777)
+    assert nowhere()[0].split() == ["6.0", "1", "1"]
+    assert not list(open_to_all.iterdir())
+    assert len(list((tmp_path / "temporary").iterdir())) == 2
+
+
+@pytest.mark.skipif(not COMPILED, reason="nothing is compiled")
+def test_without_any_folder_kernels_work_and_it_is_said(monkeypatch):
+    def refuse(*options, cache=False, **more):
+        if cache:
+            raise RuntimeError("cannot cache function")
+        return njit(*options, **more)
+
+    def no_folder():
+        raise FileNotFoundError("No usable temporary directory found")
+
+    monkeypatch.setattr(jit, "njit", refuse)
+    monkeypatch.setattr(jit.tempfile, "gettempdir", no_folder)
+    with pytest.warns(PhotoplanWarning, match="NUMBA_CACHE_DIR"):
+        twice = jit.kernel(lambda x: 2 * x)
+    assert twice(2.0) == 4.0

@@ -12,7 +12,7 @@ import click
 
 from photoplan.cli.interrupt import CODE, catch_interrupts, stop_children
 from photoplan.cli.lazy import LazyGroup
-from photoplan.errors import PhotoplanError, ResourceError
+from photoplan.errors import PhotoplanError, PhotoplanWarning, ResourceError
 
 #: Verb and its one-line help, in the order of a job; the command is `photoplan.cli.<verb>:command`.
 VERBS = {
@@ -61,6 +61,7 @@ def main() -> None:
     catch_interrupts()
     # Photos have no georeference. Here and not only where files are opened, since a filter there holds for one thread.
     warnings.filterwarnings("ignore", "Dataset has no geotransform")
+    warnings.formatwarning = _warning
     _leave(run())
 
 
@@ -97,6 +98,15 @@ def run(arguments: Sequence[str] | None = None) -> int:
 def _say(message: str, code: int) -> int:
     click.echo(f"photoplan: {message}", err=True)
     return code
+
+
+def _warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
+    """Our own warnings as messages, others as Python shows them."""
+    if issubclass(category, PhotoplanWarning):
+        return f"photoplan: {message}\n"
+    return f"{filename}:{lineno}: {category.__name__}: {message}\n"
 
 
 def _os_message(error: OSError) -> str:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
+import os
+import stat
+import tempfile
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from numba import config, njit, typeof
+
+from photoplan.errors import PhotoplanWarning
+from photoplan.kernels.numba_parts import INNER_OPTIONS, KERNEL_OPTIONS, is_cached, stamp
 
 COMPILED: bool = not config.DISABLE_JIT
 """False when `NUMBA_DISABLE_JIT=1`: everything then runs as plain Python, slowly, with the same results."""
@@ -16,41 +21,59 @@ COMPILED: bool = not config.DISABLE_JIT
 # `contract` allows fused multiply-add, `arcp` one reciprocal for two divisions, `nsz` ignores the sign of zero.
 # NaN and infinity keep their meaning: relief uses NaN for "no surface".
 _FAST = {"contract", "arcp", "nsz"}
-
-
-def _fingerprint() -> tuple[str, int]:
-    """Digest of all kernel sources: numba looks at one file's date only, but kernels inline each other."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest(), 0
-
-
-_STAMP = _fingerprint() if COMPILED else ("", 0)
+_OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": _FAST}
 
 
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile `function` on its first call for each set of types; later processes load it from the disk."""
-    dispatcher = njit(nogil=True, cache=True, error_model="numpy", fastmath=_FAST, no_cfunc_wrapper=True)(function)
-    # In plain Python there is no cache; a numba that keeps its stamp elsewhere follows its own rule.
-    with contextlib.suppress(AttributeError):
-        dispatcher._cache._cache_file._source_stamp = _STAMP
+    if not COMPILED:
+        return function
+    try:
+        dispatcher = njit(cache=True, **_OPTIONS, **KERNEL_OPTIONS)(function)
+    except RuntimeError:  # neither the package's folder nor the user's can be written
+        folder = _temporary_folder()
+        if folder is None:
+            warnings.warn(_NOWHERE, PhotoplanWarning, stacklevel=2)
+            return njit(**_OPTIONS, **KERNEL_OPTIONS)(function)
+        # For the kernels after this one, and for processes that this one starts.
+        config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = folder
+        warnings.warn(_ELSEWHERE.format(folder), PhotoplanWarning, stacklevel=2)
+        dispatcher = njit(cache=True, **_OPTIONS, **KERNEL_OPTIONS)(function)
+    stamp(dispatcher)
     return dispatcher
 
 
+_NOWHERE = (
+    "no folder can be written to keep compiled kernels: every run compiles them anew, for a minute or so. "
+    "Set NUMBA_CACHE_DIR to a folder that can be written"
+)
+_ELSEWHERE = (
+    "neither the package's folder nor the user's can be written: compiled kernels are kept in {}. "
+    "Set NUMBA_CACHE_DIR to a folder that lasts"
+)
+
+
+def _temporary_folder() -> str | None:
+    """A temporary folder of this user; None if there is none. What others could have written there is not run."""
+    try:
+        above = Path(tempfile.gettempdir())
+        owner = os.getuid() if os.name == "posix" else 0
+        folder = above / f"photoplan-kernels-{owner}"
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+        if os.name == "posix" and (not stat.S_ISDIR(found.st_mode) or found.st_uid != owner or found.st_mode & 0o022):
+            return tempfile.mkdtemp(prefix="photoplan-kernels-")
+        return str(folder)
+    except OSError:
+        return None
+
+
 def inner(function: Callable[..., Any]) -> Any:
-    """Compile a part of a kernel: called by kernels only, and always inlined there.
+    """Compile a part of a kernel: called by kernels only, and always inlined there where numba can be told to.
 
     Arrays are many machine words each; a real call would spend more time on passing them than some parts need.
     """
-    return njit(
-        nogil=True,
-        error_model="numpy",
-        fastmath=_FAST,
-        no_cpython_wrapper=True,
-        no_cfunc_wrapper=True,
-        forceinline=True,
-    )(function)
+    return njit(**_OPTIONS, **INNER_OPTIONS)(function)
 
 
 def is_ready(dispatcher: Any, arguments: tuple[Any, ...]) -> bool:
@@ -58,10 +81,4 @@ def is_ready(dispatcher: Any, arguments: tuple[Any, ...]) -> bool:
     if not COMPILED:
         return True
     signature = tuple(typeof(each) for each in arguments)
-    if signature in dispatcher.overloads:
-        return True
-    try:
-        cache = dispatcher._cache
-        return cache._index_key(signature, dispatcher.targetctx.codegen()) in cache._cache_file._load_index()
-    except (AttributeError, TypeError, OSError):  # a numba with another cache inside, or none that can be read
-        return False
+    return signature in dispatcher.overloads or is_cached(dispatcher, signature)

@@ -1,0 +1,284 @@
+"""All that leans on the inside of numba: where it keeps compiled code, and code that is written as LLVM vectors.
+
+Numba promises none of it to stay. With a version that was not tried (`TRIED`), or where a part is missing, `USABLE` is
+False: kernels are then compiled from the plain loops in `sampling` by documented ways alone, to the same values within
+rounding, slower. `PHOTOPLAN_PLAIN_KERNELS=1` chooses that too, so that tests run both ways.
+
+A pixel is gathered as vectors: a row of taps is one load of 4 × 4 bytes or so; the rows are weighted and added first,
+then the columns. The same few lines emit the code for every pixel type, number of taps and one or four interleaved
+bands; LLVM lowers the vectors to whatever the processor has.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba import types
+from numba.extending import intrinsic
+
+try:
+    from llvmlite import ir
+    from numba.core import cgutils
+    from numba.core.caching import FunctionCache
+except ImportError:
+    _FOUND = False
+else:
+    _FOUND = True
+
+TRIED = ((0, 60), (0, 68))
+"""First and last version of numba that these parts were tried with."""
+
+
+def _is_usable(version: str, plain: str | None) -> bool:
+    """Whether the parts below may be leaned on with this version, unless plain loops are asked for."""
+    number = tuple(int(each) for each in version.split(".")[:2] if each.isdigit())
+    return _FOUND and not plain and not numba.config.DISABLE_JIT and TRIED[0] <= number <= TRIED[1]
+
+
+USABLE = _is_usable(numba.__version__, os.environ.get("PHOTOPLAN_PLAIN_KERNELS"))
+
+# A call from Python or from C code needs wrappers, which are never used here; a call between parts is inlined, since
+# arrays are many machine words each.
+KERNEL_OPTIONS = {"no_cfunc_wrapper": True} if USABLE else {}
+INNER_OPTIONS = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "forceinline": True} if USABLE else {}
+
+
+def _fingerprint() -> tuple[str, int]:
+    """Digest of all kernel sources: numba looks at one file's date only, but kernels inline each other."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest(), 0
+
+
+_STAMP = _fingerprint() if USABLE else ("", 0)
+
+
+def stamp(dispatcher: Any) -> None:
+    """Let a kernel's cache hold as long as no kernel changes; a numba of another version follows its own rule."""
+    if USABLE:
+        dispatcher._cache._cache_file._source_stamp = _STAMP
+
+
+def is_cached(dispatcher: Any, signature: tuple[Any, ...]) -> bool:
+    """Whether compiled code for these types is on the disk; False where that cannot be known."""
+    if not USABLE or not isinstance(dispatcher._cache, FunctionCache):
+        return False
+    cache = dispatcher._cache
+    try:
+        return cache._index_key(signature, dispatcher.targetctx.codegen()) in cache._cache_file._load_index()
+    except OSError:  # none that can be read
+        return False
+
+
+_FUSE = ("contract", "nsz")
+BLOCK = {1: 8, 4: 4}
+"""Columns of a block of `add_block`, by the number of bands side by side."""
+DEGREE = {1: 0, 2: 1, 4: 3, 6: 12}
+"""Of the polynomials that are the weights, by the number of taps."""
+
+
+def _vector(count: int, element: Any) -> Any:
+    return ir.VectorType(element, count)
+
+
+def _splat(builder: Any, value: Any, count: int) -> Any:
+    """A scalar in all elements of a vector."""
+    one = builder.insert_element(ir.Constant(_vector(count, value.type), ir.Undefined), value, ir.IntType(32)(0))
+    return _shuffle(builder, one, [0] * count)
+
+
+def _shuffle(builder: Any, vector: Any, picks: list[int]) -> Any:
+    mask = ir.Constant(_vector(len(picks), ir.IntType(32)), picks)
+    return builder.shuffle_vector(vector, ir.Constant(vector.type, ir.Undefined), mask)
+
+
+def _fused(builder: Any, a: Any, b: Any, c: Any) -> Any:
+    """a · b + c; one rounding where the processor can."""
+    return builder.fadd(builder.fmul(a, b, flags=_FUSE), c, flags=_FUSE)
+
+
+def _load(builder: Any, data: Any, index: Any, count: int) -> Any:
+    """`count` elements from data[index] on, at any alignment."""
+    place = builder.gep(data, [index])
+    element = data.type.pointee
+    return builder.load(builder.bitcast(place, _vector(count, element).as_pointer()), align=1)
+
+
+def _widen(builder: Any, vector: Any, dtype: Any) -> Any:
+    """Pixels as float32."""
+    if isinstance(dtype, types.Float):
+        return vector
+    wide = _vector(vector.type.count, ir.FloatType())
+    return builder.sitofp(vector, wide) if dtype.signed else builder.uitofp(vector, wide)
+
+
+def _weights(builder: Any, coefficients: Any, degree: int, width: int, g: tuple[Any, Any]) -> Any:
+    """Weights of x in the lower half, of y in the upper half of one vector (Horner's rule)."""
+    lower, upper = (_splat(builder, each, width) for each in g)
+    mask = ir.Constant(_vector(2 * width, ir.IntType(32)), list(range(2 * width)))
+    both = builder.shuffle_vector(lower, upper, mask)
+    result = _load(builder, coefficients, ir.IntType(64)(degree * 2 * width), 2 * width)
+    for power in range(degree - 1, -1, -1):
+        row = _load(builder, coefficients, ir.IntType(64)(power * 2 * width), 2 * width)
+        result = _fused(builder, result, both, row)
+    return result
+
+
+def _total(builder: Any, vector: Any, lanes: int) -> Any:
+    """Sum of the taps of a vector of taps × lanes."""
+    count = vector.type.count
+    while count > lanes:
+        half = count // 2
+        lower = _shuffle(builder, vector, list(range(half)))
+        upper = _shuffle(builder, vector, list(range(half, count)))
+        vector = builder.fadd(lower, upper, flags=_FUSE)
+        count = half
+    return vector
+
+
+def _narrow(builder: Any, value: Any, dtype: Any) -> Any:
+    """Round half away from zero, clip, convert to the pixels' type."""
+    if isinstance(dtype, types.Float):
+        return value
+    kind = value.type
+
+    def number(x: float) -> Any:
+        return ir.Constant(kind, [x] * kind.count)
+
+    half = number(0.5)
+    if dtype.signed:
+        half = builder.select(builder.fcmp_ordered("<", value, number(0.0)), number(-0.5), half)
+    value = builder.fadd(value, half)
+    low, high = float(dtype.minval), float(dtype.maxval)
+    value = builder.select(builder.fcmp_ordered(">", value, number(low)), value, number(low))
+    value = builder.select(builder.fcmp_ordered("<", value, number(high)), value, number(high))
+    whole = builder.fptosi(value, _vector(kind.count, ir.IntType(32)))
+    return builder.trunc(whole, _vector(kind.count, ir.IntType(dtype.bitwidth)))
+
+
+def _chunks(taps: int) -> list[tuple[int, int]]:
+    """(first tap, number of taps) of each load of a row."""
+    return {1: [(0, 1)], 2: [(0, 2)], 4: [(0, 4)], 6: [(0, 4), (4, 2)]}[taps]
+
+
+def _emit(builder: Any, dtype: Any, taps: int, lanes: int, data: tuple[Any, Any, Any], place: tuple[Any, ...]) -> None:
+    """The code of one gather; `data` = source, coefficients, out; `place` = first, stride, gx, gy, at."""
+    source, coefficients, out = data
+    first, stride, gx, gy, at = place
+    width = {1: 1, 2: 2, 4: 4, 6: 8}[taps]
+    weights = _weights(builder, coefficients, DEGREE[taps], width, (gx, gy))
+    is_float = isinstance(dtype, types.Float)
+    middle = max(taps // 2 - 1, 0)
+    rows = [first]
+    for _ in range(taps - 1):
+        rows.append(builder.add(rows[-1], stride))
+    if is_float:
+        centre = builder.add(rows[middle], ir.IntType(64)(middle * lanes))
+        base = _load(builder, source, centre, lanes)
+    total = None
+    for start, count in _chunks(taps):
+        columns = None
+        for r in range(taps):
+            index = builder.add(rows[r], ir.IntType(64)(start * lanes))
+            pixels = _widen(builder, _load(builder, source, index, count * lanes), dtype)
+            if is_float:
+                pixels = builder.fsub(pixels, _shuffle(builder, base, list(range(lanes)) * count))
+            weight = _shuffle(builder, weights, [width + r] * (count * lanes))
+            columns = (
+                builder.fmul(weight, pixels, flags=_FUSE)
+                if columns is None
+                else _fused(builder, weight, pixels, columns)
+            )
+        weight = _shuffle(builder, weights, [start + j for j in range(count) for _ in range(lanes)])
+        part = _total(builder, builder.fmul(weight, columns, flags=_FUSE), lanes)
+        total = part if total is None else builder.fadd(total, part, flags=_FUSE)
+    if is_float:
+        total = builder.fadd(total, base)
+    result = _narrow(builder, total, dtype)
+    target = builder.gep(out, [builder.mul(at, ir.IntType(64)(lanes))])
+    builder.store(result, builder.bitcast(target, result.type.as_pointer()), align=1)
+
+
+@intrinsic
+def gather(
+    typingctx: Any,
+    source: Any,
+    first: Any,
+    stride: Any,
+    gx: Any,
+    gy: Any,
+    coefficients: Any,
+    taps_tag: Any,
+    lanes_tag: Any,
+    out: Any,
+    at: Any,
+) -> Any:
+    """The vectors of `sampling.gather`."""
+    taps, lanes, dtype = len(taps_tag), len(lanes_tag), source.dtype
+    signature = types.void(
+        source,
+        types.int64,
+        types.int64,
+        types.float32,
+        types.float32,
+        coefficients,
+        taps_tag,
+        lanes_tag,
+        out,
+        types.int64,
+    )
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        def data(position: Any) -> Any:
+            return context.make_array(signature.args[position])(context, builder, value=args[position]).data
+
+        _emit(builder, dtype, taps, lanes, (data(0), data(5), data(8)), (args[1], args[2], args[3], args[4], args[9]))
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+def _emit_block(builder: Any, dtype: Any, lanes: int, data: tuple[Any, ...], place: tuple[Any, ...]) -> None:
+    """The code of `add_block`; `data` = source, wx, wy, base, sums."""
+    source, wx, wy, base, sums = data
+    first, stride, rows, at_x, at_y = place
+    many = BLOCK[lanes]
+    count = many * lanes
+    zero = ir.Constant(_vector(count, ir.FloatType()), [0.0] * count)
+    total = cgutils.alloca_once_value(builder, zero)
+    is_float = isinstance(dtype, types.Float)
+    if is_float:
+        level = _shuffle(builder, _load(builder, base, ir.IntType(64)(0), lanes), list(range(lanes)) * many)
+    with cgutils.for_range(builder, rows) as loop:
+        index = builder.add(first, builder.mul(loop.index, stride))
+        pixels = _widen(builder, _load(builder, source, index, count), dtype)
+        if is_float:
+            pixels = builder.fsub(pixels, level)
+        weight = _splat(builder, builder.load(builder.gep(wy, [builder.add(at_y, loop.index)])), count)
+        builder.store(_fused(builder, weight, pixels, builder.load(total)), total)
+    weight = _shuffle(builder, _load(builder, wx, at_x, many), [i for i in range(many) for _ in range(lanes)])
+    result = _total(builder, builder.fmul(weight, builder.load(total), flags=_FUSE), lanes)
+    result = builder.fadd(_load(builder, sums, ir.IntType(64)(0), lanes), result)
+    builder.store(result, builder.bitcast(sums, result.type.as_pointer()), align=1)
+
+
+@intrinsic
+def add_block(typingctx: Any, source: Any, place: Any, wx: Any, wy: Any, base: Any, lanes_tag: Any, sums: Any) -> Any:
+    """The vectors of `sampling.add_block`."""
+    lanes, dtype = len(lanes_tag), source.dtype
+    signature = types.void(source, types.UniTuple(types.int64, 5), wx, wy, base, lanes_tag, sums)
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        def data(position: Any) -> Any:
+            return context.make_array(signature.args[position])(context, builder, value=args[position]).data
+
+        place = cgutils.unpack_tuple(builder, args[1], 5)
+        _emit_block(builder, dtype, lanes, (data(0), data(2), data(3), data(4), data(6)), place)
+        return context.get_dummy_value()
+
+    return signature, codegen
