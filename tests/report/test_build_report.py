@@ -10,11 +10,12 @@ import pytest
 
 from photoplan.errors import ResourceError, UsageError
 from photoplan.kernels.collocation import correlation
-from photoplan.products.dtm import report as dtm_report
-from photoplan.products.dtm import report_covariance as dtm_report_covariance
-from photoplan.report.build_report import build_report
-from photoplan.report.page import text
-from photoplan.report.plots import Plots
+from photoplan.report.drawing import load_matplotlib
+from photoplan.report.dtm import covariance as dtm_covariance
+from photoplan.report.dtm import samples
+from photoplan.report.dtm.page import build_page, open_build_report
+from photoplan.report.dtm.plots import Plots
+from photoplan.report.page import ReportFile, text
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
 from photoplan.terrain.build import build, plan_build
 from photoplan.terrain.clean.run import Finding, clean
@@ -68,12 +69,12 @@ def built(measured):
 @pytest.fixture(scope="module")
 def facts(built, measured):
     findings = [Finding("crossing heights", f"{HOSTILE} meets {k}", 300_010.0, 5_000_010.0) for k in range(60)]
-    return dtm_report.build_facts("model", built, measured, findings, (), 12.3)
+    return samples.build_facts("model", built, measured, findings, (), 12.3)
 
 
 @pytest.fixture(scope="module")
 def document(facts):
-    return build_report(facts, Plots())
+    return build_page(facts, load_matplotlib("a report"))
 
 
 def test_nothing_outside_the_document_is_asked_for(document):
@@ -146,7 +147,7 @@ def test_many_findings_are_counted(document):
 
 
 def test_the_same_model_has_the_same_report(facts, document):
-    assert build_report(facts, Plots()) == document
+    assert build_page(facts, load_matplotlib("a report")) == document
 
 
 def test_every_plot_names_its_units(facts):
@@ -154,7 +155,7 @@ def test_every_plot_names_its_units(facts):
     import matplotlib.axes
 
     seen = []
-    plots = Plots()
+    plots = Plots(load_matplotlib("a report"))
     original = matplotlib.axes.Axes.set
 
     def spy(self, **options):
@@ -172,20 +173,20 @@ def test_correlation_is_that_of_the_prediction(family):
     t = np.linspace(0, 4, 30)
     plain = getattr(correlation, "py_func", correlation)
     kernel = [plain(d**2, FAMILIES.index(family)) for d in t]
-    np.testing.assert_allclose(dtm_report_covariance.correlation_at(family, t), kernel, atol=1e-12)
+    np.testing.assert_allclose(dtm_covariance.correlation_at(family, t), kernel, atol=1e-12)
 
 
 def test_expected_products_are_the_mean_of_simulated_ones(built):
     """If the fitted function is the terrain's, residuals from the plane have just these products on average."""
-    leaves = dtm_report_covariance._leaves(built.fit)
-    leaf = next(leaf for leaf in leaves if len(dtm_report_covariance._block(built.fit, leaf)[0]))
+    leaves = dtm_covariance._leaves(built.fit)
+    leaf = next(leaf for leaf in leaves if len(dtm_covariance._block(built.fit, leaf)[0]))
     # As much noise as signal, so that either would be missed.
     fit = replace(built.fit, noise=np.where(built.fit.noise < 0, -1.0, built.fit.units[0].variance))
-    _, _, expected = dtm_report_covariance._block(fit, leaf)
+    _, _, expected = dtm_covariance._block(fit, leaf)
     seen = fit.seen
     points = fit.neighbours.near[0].tree.query(fit.leaves.middle[leaf], k=90)[1]
     points = fit.neighbours.near[0].numbers[points]
-    covariance = dtm_report_covariance._matrix(fit, leaf, seen.xyz[points, :2])
+    covariance = dtm_covariance._matrix(fit, leaf, seen.xyz[points, :2])
     noise = np.sqrt(np.abs(fit.noise[points]))
     root = np.linalg.cholesky(covariance + 1e-9 * covariance[0, 0] * np.eye(len(points)))
     rng = np.random.default_rng(0)
@@ -193,7 +194,7 @@ def test_expected_products_are_the_mean_of_simulated_ones(built):
     for _ in range(runs):
         xyz = seen.xyz.copy()
         xyz[points, 2] = root @ rng.normal(size=len(points)) + noise * rng.normal(size=len(points))
-        total += dtm_report_covariance._block(replace(fit, seen=replace(seen, xyz=xyz)), leaf)[1]
+        total += dtm_covariance._block(replace(fit, seen=replace(seen, xyz=xyz)), leaf)[1]
     mean = total / runs
     assert np.corrcoef(mean, expected)[0, 1] > 0.87
     slope = (mean * expected).sum() / (expected**2).sum()
@@ -206,8 +207,8 @@ def test_neighbourhoods_that_a_breakline_parts_are_left_out(built):
     beside = np.abs(middle[:, 0] - 300_030)
     on_line = int(np.flatnonzero((fit.leaves.count > 3) & (np.abs(middle[:, 1] - 5_000_050) < 30) & (beside < 5))[0])
     far = int(np.flatnonzero((fit.leaves.count > 3) & (beside > 40) & (beside < 60))[0])
-    assert len(dtm_report_covariance._block(fit, on_line)[0]) == 0
-    assert len(dtm_report_covariance._block(fit, far)[0]) > 1000
+    assert len(dtm_covariance._block(fit, on_line)[0]) == 0
+    assert len(dtm_covariance._block(fit, far)[0]) > 1000
 
 
 def test_covariance_classes_use_all_pairs_once(facts):
@@ -218,35 +219,36 @@ def test_covariance_classes_use_all_pairs_once(facts):
     assert (c.low <= c.high).all()
 
 
-def test_without_matplotlib_the_message_says_how_to_get_it(monkeypatch):
+def test_without_matplotlib_the_message_says_how_to_get_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(UsageError, match=r"pip install 'photoplan\[report\]'"):
-        dtm_report.check_report()
+        open_build_report(tmp_path / "model.gpkg", True, False)
 
 
-def test_a_full_disk_leaves_the_old_report(built, measured, tmp_path, monkeypatch):
+def test_a_full_disk_leaves_the_old_report(document, tmp_path, monkeypatch):
     import errno
     from pathlib import Path
 
     path = tmp_path / "model.report.html"
     path.write_text("old")
+    page = open_build_report(tmp_path / "model.gpkg", None, True)
 
     def full(self, content):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(ResourceError):
-        dtm_report.write_report(path, built, measured, (), (), 1.0)
+        page.write(document)
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["model.report.html"]
 
 
 def test_work_is_bounded(built, measured, monkeypatch):
-    monkeypatch.setattr(dtm_report, "_SAMPLE", 50)
-    monkeypatch.setattr(dtm_report, "_RESIDUALS", 60)
-    monkeypatch.setattr(dtm_report, "_VERTICES", 20)
-    monkeypatch.setattr(dtm_report, "_SIDE", 64)
-    facts = dtm_report.build_facts("model", built, measured, (), (), 1.0)
+    monkeypatch.setattr(samples, "_SAMPLE", 50)
+    monkeypatch.setattr(samples, "_RESIDUALS", 60)
+    monkeypatch.setattr(samples, "_VERTICES", 20)
+    monkeypatch.setattr(samples, "_SIDE", 64)
+    facts = samples.build_facts("model", built, measured, (), (), 1.0)
     assert len(facts.effects[0].differences) <= 50 and facts.effects[0].count == 699
     assert len(facts.normalised) <= 60
     assert max(facts.map.heights.shape) <= 65
@@ -257,7 +259,9 @@ def test_file_is_named_and_titled_after_the_model(built, measured, tmp_path):
     path = tmp_path / "dam.report.html"
     source = tmp_path / "survey <1>.csv"
     source.write_text("x")
-    dtm_report.write_report(path, built, measured, (), (source,), 1.0)
+    mpl = load_matplotlib("a report")
+    facts = samples.build_facts("dam", built, measured, (), (source,), 1.0)
+    ReportFile(path, mpl).write(build_page(facts, mpl))
     page = path.read_text("utf-8")
     assert re.search("<h1>dam</h1>", page)
     assert "survey &lt;1&gt;.csv" in page

@@ -59,8 +59,11 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
 
     from photoplan.cli.progress import progress
     from photoplan.products.dtm.build import describe_plan, dtm_build, load, plan_facts
+    from photoplan.report.dtm.page import build_page, open_build_report
+    from photoplan.report.dtm.samples import build_facts
     from photoplan.terrain.build import plan_build
 
+    wanted = options.pop("report")
     request = _request(options)
 
     talk = talking(quiet)
@@ -74,6 +77,9 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
         for finding in findings:
             show(f"  {finding.kind}: {finding.text}")
         return
+    page = open_build_report(request.output, wanted, request.overwrite)
+    if page is None and wanted is None:
+        talk("no report: it needs matplotlib (pip install 'photoplan[report]')")
     with ExitStack() as stack:
 
         def steps(name: str, parts: int) -> Any:
@@ -83,12 +89,17 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
             return lambda done: bar(done, 0)
 
         built = dtm_build(request, steps, talk)
+    report = None
+    if page is not None:
+        title, seconds = request.output.stem, built.figures["seconds"]
+        facts = build_facts(title, built.built, built.measured, built.findings, request.inputs, seconds)
+        report = page.write(build_page(facts, page.mpl))
     if as_json:
-        show_json(built.to_dict())
+        show_json(built, report=report)
         return
     show(built.path)
-    if built.page is not None:
-        show(built.page)
+    if report is not None:
+        show(report)
     for line in _summary(built):
         talk(line)
 
@@ -150,4 +161,4 @@ def _summary(built: BuildReport) -> list[str]:
     if built.findings:
         lines.append(f"findings in the measurements: {len(built.findings)}")
         lines += [f"  {finding.kind}: {finding.text}" for finding in built.findings[:_SHOWN]]
-    return lines + [f"  {note}" for note in built.notes[:_SHOWN]]
+    return lines + [f"  {note}" for note in built.measured.notes[:_SHOWN]]

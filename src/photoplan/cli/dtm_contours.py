@@ -45,25 +45,33 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     from photoplan.cli.progress import progress
     from photoplan.products.dtm.contours import ContourRequest, make_contours
+    from photoplan.report.dtm.contours import contours_picture
+    from photoplan.report.page import open_picture
     from photoplan.terrain.contours.run import ContourOptions
 
     names = ("interval", "base", "index", "smooth", "simplify", "band", "shortest")
     chosen = ContourOptions(**{name: options.pop(name) for name in names})
-    request = ContourRequest(options=chosen, **options)
+    preview, output = options.pop("preview"), options["output"]
+    if preview is not None and preview.resolve() == output.resolve():
+        raise click.UsageError(f"{preview}: the preview has the name of the output; choose another one")
+    drawing = open_picture(preview, [options["model"]], overwrite=options["overwrite"])
+    request = ContourRequest(options=chosen, sketch=drawing is not None, **options)
     with ExitStack() as stack:
         facts = make_contours(request, lambda parts: stack.enter_context(progress(parts, quiet)))
+    if drawing is not None:
+        drawing.write(contours_picture(facts, drawing.mpl))
     if as_json:
-        show_json(facts.to_dict())
+        show_json(facts, preview=preview)
         return
-    for path in [*facts.files, *([facts.preview] if facts.preview else [])]:
+    for path in [*facts.files, *([preview] if preview else [])]:
         show(path)
     if quiet:
         return
     if not facts.lines:
         say(f"no contour: no level of {chosen.base:g} + n × {chosen.interval:g} m is passed")
         return
-    labels = "" if facts.text_height is None else f", {facts.labels} labels {facts.text_height:g} m high"
+    labels = "" if facts.text_height is None else f", {len(facts.labels)} labels {facts.text_height:g} m high"
     say(
-        f"{facts.lines} contours from {facts.low:.10g} to {facts.high:.10g} m, {facts.length / 1000:.6g} km, "
+        f"{facts.lines} contours from {facts.lowest:.10g} to {facts.highest:.10g} m, {facts.length / 1000:.6g} km, "
         f"{facts.vertices} vertices; {facts.closed} closed, {facts.depressions} round hollows{labels}"
     )

@@ -26,24 +26,38 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
 @json_option
 @click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
-def command(x: str | None, y: str | None, decimal_comma: bool, as_json: bool, quiet: bool, **options: Any) -> None:
+def command(
+    outputs: tuple[Path, ...],
+    x: str | None,
+    y: str | None,
+    decimal_comma: bool,
+    as_json: bool,
+    quiet: bool,
+    **options: Any,
+) -> None:
     """Profiles of MODEL over LINES: a vector file of lines, or a CSV of points along them, in the model's CRS.
 
     There is a point wherever the surface bends: at grid lines, breaklines and edges of triangles; at a wall two.
     """
     from photoplan.io.terrain.points import PointTableFormat
     from photoplan.products.dtm.profile import ProfileRequest, dtm_profile
+    from photoplan.report.dtm.profile import profile_picture
+    from photoplan.report.page import open_picture
 
-    request = ProfileRequest(form=PointTableFormat(x, y, None, decimal_comma), **options)
-    found = dtm_profile(request)
+    pictures = [path for path in outputs if path.suffix.lower() == ".png"]
+    tables = tuple(path for path in outputs if path not in pictures)
+    inputs, overwrite = [options["model"], options["lines"]], options["overwrite"]
+    drawings = [open_picture(path, inputs, overwrite=overwrite) for path in pictures]
+    found = dtm_profile(ProfileRequest(outputs=tables, form=PointTableFormat(x, y, None, decimal_comma), **options))
+    for drawing in drawings:
+        if drawing is not None:
+            drawing.write(profile_picture(found, drawing.mpl))
     if as_json:
-        files = [str(path) for path in request.outputs]
-        show_json({"files": files, "profiles": [p.to_dict() for p in found]})
+        show_json({"files": outputs, "profiles": found})
         return
-    for path in request.outputs:
+    for path in outputs:
         show(path)
     if not quiet:
         for p in found:
-            f = p.to_dict()
-            heights = "no surface" if f["low"] is None else f"{f['low']:.3f} to {f['high']:.3f} m"
-            say(f"{p.name}: {f['length']:.2f} m, {f['points']} points, {heights}")
+            heights = "no surface" if p.range is None else "{:.3f} to {:.3f} m".format(*p.range)
+            say(f"{p.name}: {p.length:.2f} m, {len(p.distance)} points, {heights}")

@@ -1,4 +1,4 @@
-"""From files of measured terrain to a terrain model: read, clean, plan, predict, write, report."""
+"""From files of measured terrain to a terrain model: read, clean, plan, predict, write."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from photoplan.io.terrain.files import read_measured
 from photoplan.io.terrain.model_tables import GrossError, ModelHeader, empty_figures, input_facts
 from photoplan.io.terrain.model_write import ModelParts, ModelWriter
 from photoplan.io.terrain.options import ReadOptions
+from photoplan.plain import pick
 from photoplan.surfaces.measured import MeasuredTerrain
 from photoplan.terrain.build import BuildPlan, Built, Steps, build, plan_build
 from photoplan.terrain.clean.run import Finding, clean
@@ -46,36 +46,30 @@ class BuildRequest:
     height_system: str | None = None
     """Declared height system; None: what the files state."""
     workers: int = 1
-    report: bool | None = None
-    """Whether a page with plots is written beside the model; None: if matplotlib is there."""
     overwrite: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BuildReport:
     """What came out."""
 
     path: Path
     figures: dict[str, Any]
-    """Figures of the whole model, plain values."""
+    """Figures of the whole model."""
     gross: tuple[GrossError, ...]
     findings: tuple[Finding, ...]
-    notes: tuple[str, ...]
-    page: Path | None
-    """The report, or None."""
+    built: Built
+    measured: MeasuredTerrain
+    """The clean measurements that the model was built from."""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
+    def json_fields(self) -> dict[str, Any]:
+        """Figures, gross errors, findings and notes."""
         return {
-            "model": str(self.path),
+            "model": self.path,
             **self.figures,
-            "gross_errors": [
-                {"name": g.name, "xyz": list(g.xyz), "residual": g.residual, "normalised": g.normalised}
-                for g in self.gross
-            ],
-            "findings": [{"kind": f.kind, "text": f.text, "X": f.X, "Y": f.Y} for f in self.findings],
-            "notes": list(self.notes),
-            "report": None if self.page is None else str(self.page),
+            "gross_errors": [pick(g, "name", "xyz", "residual", "normalised") for g in self.gross],
+            "findings": self.findings,
+            "notes": self.measured.notes,
         }
 
 
@@ -102,7 +96,7 @@ def load(request: BuildRequest) -> tuple[MeasuredTerrain, tuple[Finding, ...], s
 def dtm_build(
     request: BuildRequest, steps: Steps | None = None, talk: Callable[[str], None] = lambda text: None
 ) -> BuildReport:
-    """Build a terrain model and write it, with its run record and its report.
+    """Build a terrain model and write it, with its run record.
 
     Raises
     ------
@@ -119,7 +113,6 @@ def dtm_build(
     if not request.output.resolve().parent.is_dir():
         raise UsageError(f"{request.output}: no such folder; make it first")
     check_output(request.output, request.inputs, overwrite=request.overwrite)
-    _check_report(request)
     measured, findings, crs, system = load(request)
     plan = plan_build(measured, request.settings)
     talk(describe_plan(plan, measured, crs, system))
@@ -140,10 +133,9 @@ def dtm_build(
         )
         writer.finish(ModelParts(header, built.lines, gross, plan.polygon))
     seconds = time.perf_counter() - started
-    figures = {**totals, "crs": crs_label(crs), "height_system": system, "seconds": round(seconds, 3)}
-    page = _page(request, built, measured, findings, seconds, talk)
-    report = BuildReport(request.output, figures, gross, findings, measured.notes, page)
-    record = {"product": request.output.name, "kind": "terrain model", **report.to_dict()}
+    figures = {**totals, "crs": crs_label(crs), "height_system": system, "seconds": seconds}
+    report = BuildReport(request.output, figures, gross, findings, built, measured)
+    record = {"product": request.output.name, "kind": "terrain model", **report.json_fields()}
     del record["findings"]
     record |= {"inputs": facts, "settings": request.settings.to_dict(), "versions": versions()}
     record |= {"finding_counts": dict(Counter(f.kind for f in findings)), "peak_memory_bytes": peak_memory_bytes()}
@@ -178,7 +170,7 @@ def plan_facts(
         "widest_gap": 2 * plan.reach,
         "crs": crs_label(crs),
         "height_system": system,
-        "findings": [{"kind": f.kind, "text": f.text, "X": f.X, "Y": f.Y} for f in findings],
+        "findings": findings,
     }
 
 
@@ -255,41 +247,3 @@ def _totals(built: Built, measured: MeasuredTerrain, findings: Sequence[Finding]
         "gross": gross,
         "findings": len(findings),
     }
-
-
-def _check_report(request: BuildRequest) -> None:
-    """Refuse a report that cannot be written before any work is done."""
-    page = _page_path(request.output)
-    if request.report is not False and page.exists() and not request.overwrite:
-        raise UsageError(f"{page} exists; give `overwrite` to replace it, or `report=False`")
-    if request.report and not _can_plot():
-        raise UsageError("the report needs matplotlib: pip install 'photoplan[report]', or give `report=False`")
-
-
-def _page_path(output: Path) -> Path:
-    return output.with_name(f"{output.stem}.report.html")
-
-
-def _can_plot() -> bool:
-    return find_spec("matplotlib") is not None
-
-
-def _page(
-    request: BuildRequest,
-    built: Built,
-    measured: MeasuredTerrain,
-    findings: Sequence[Finding],
-    seconds: float,
-    talk: Callable[[str], None],
-) -> Path | None:
-    if request.report is False:
-        return None
-    if not _can_plot():
-        talk("no report: it needs matplotlib (pip install 'photoplan[report]')")
-        return None
-    # matplotlib takes a second to import, and is optional.
-    from photoplan.products.dtm.report import write_report  # noqa: PLC0415
-
-    page = _page_path(request.output)
-    write_report(page, built, measured, findings, request.inputs, seconds)
-    return page

@@ -8,10 +8,13 @@ from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from photoplan.errors import GeometryError, UsageError
 from photoplan.io.contour_file import ContourRow, LabelRow, contour_files, write_contours
 from photoplan.io.product import check_output
-from photoplan.products.dtm.contours_picture import ContourPicture
+from photoplan.plain import pick
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.terrain.contours.labels import Labeller, decimals_of
@@ -20,6 +23,8 @@ from photoplan.terrain.contours.run import ContourLine, ContourOptions, trace_co
 
 #: Meshes along the side of a piece of a height grid.
 SIDE = 512
+#: Longer side of a sketch, pixels; and vertices after which further lines are left out of it.
+SKETCH_SIDE, SKETCH_MOST = 1400, 2_000_000
 #: Labels of a line stand this many text heights apart, and a text is so-manieth part of the terrain's extent high.
 LABEL_SPACING, LABEL_PART = 60.0, 200.0
 
@@ -45,9 +50,39 @@ class ContourRequest:
     """Distance of labels along a line, metres; None: sixty text heights."""
     crs: str | None = None
     """CRS of a model that does not state its own."""
-    preview: Path | None = None
-    """A small PNG to look at."""
+    sketch: bool = False
+    """Keep the lines at the resolution of a small picture, too."""
     overwrite: bool = False
+
+
+@dataclass(eq=False)
+class ContourSketch:
+    """Lines at the resolution of a small picture."""
+
+    bounds: tuple[float, float, float, float]
+    lines: dict[str, list[NDArray[np.float64]]] = field(default_factory=lambda: {"plain": [], "index": [], "low": []})
+    """By kind: vertices (n, 2)."""
+    count: int = 0
+    """Vertices."""
+
+    @property
+    def pixel(self) -> float:
+        """Side of a pixel of the picture, metres."""
+        xmin, ymin, xmax, ymax = self.bounds
+        return max(xmax - xmin, ymax - ymin) / SKETCH_SIDE
+
+    def add(self, line: ContourLine) -> None:
+        """Take a line."""
+        if self.count > SKETCH_MOST:
+            return
+        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line.xy, axis=0).T))])
+        if along[-1] < self.pixel:
+            return
+        # One vertex in every stretch of a pixel, and the last one.
+        keep = np.append(np.diff(np.floor(along / self.pixel), prepend=-1)[:-1] > 0, True)
+        xy = line.xy[keep]
+        self.count += len(xy)
+        self.lines["index" if line.index else "low" if line.depression else "plain"].append(xy)
 
 
 @dataclass(eq=False)
@@ -55,18 +90,18 @@ class ContourFacts:
     """What was made."""
 
     files: list[Path]
-    preview: Path | None = None
     lines: int = 0
     closed: int = 0
     depressions: int = 0
     vertices: int = 0
     length: float = 0.0
     """Metres."""
-    low: float = math.nan
-    """Lowest contour, metres; NaN: there are none."""
-    high: float = math.nan
-    labels: int = 0
+    lowest: float = math.nan
+    """Metres; NaN: there are no contours."""
+    highest: float = math.nan
+    labels: list[LabelRow] = field(default_factory=list)
     text_height: float | None = None
+    sketch: ContourSketch | None = None
 
     def add(self, line: ContourLine) -> None:
         """Count a line."""
@@ -75,24 +110,13 @@ class ContourFacts:
         self.depressions += line.depression
         self.vertices += len(line.xy)
         self.length += line.length
-        self.low = line.height if math.isnan(self.low) else min(self.low, line.height)
-        self.high = line.height if math.isnan(self.high) else max(self.high, line.height)
+        self.lowest = line.height if math.isnan(self.lowest) else min(self.lowest, line.height)
+        self.highest = line.height if math.isnan(self.highest) else max(self.highest, line.height)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`; heights are null if there are no contours."""
-        return {
-            "files": [str(file) for file in self.files],
-            "preview": self.preview and str(self.preview),
-            "lines": self.lines,
-            "closed": self.closed,
-            "depressions": self.depressions,
-            "vertices": self.vertices,
-            "length": self.length,
-            "lowest": None if math.isnan(self.low) else self.low,
-            "highest": None if math.isnan(self.high) else self.high,
-            "labels": self.labels,
-            "text_height": self.text_height,
-        }
+    def json_fields(self) -> dict[str, Any]:
+        """Labels as their number."""
+        own = ("files", "lines", "closed", "depressions", "vertices", "length", "lowest", "highest", "text_height")
+        return {**pick(self, *own), "labels": len(self.labels)}
 
 
 @dataclass(eq=False)
@@ -102,8 +126,6 @@ class _Run:
     facts: ContourFacts
     labeller: Labeller | None
     label_all: bool
-    picture: ContourPicture | None
-    labels: list[LabelRow] = field(default_factory=list)
 
     def rows(self, lines: Iterable[ContourLine]) -> Iterator[ContourRow]:
         for line in lines:
@@ -111,9 +133,9 @@ class _Run:
             if self.labeller is not None and (line.index or self.label_all):
                 size = self.labeller.size
                 new = [LabelRow(a.X, a.Y, a.height, a.angle, a.text, size) for a in self.labeller.place(line)]
-                self.labels += new
-            if self.picture is not None:
-                self.picture.add(line)
+                self.facts.labels += new
+            if self.facts.sketch is not None:
+                self.facts.sketch.add(line)
             yield ContourRow(line.xy, line.height, line.index, line.depression)
 
 
@@ -141,27 +163,18 @@ def make_contours(
     """
     for file in contour_files(request.output, request.labels):
         check_output(file, [request.model], overwrite=request.overwrite)
-    if request.preview is not None:
-        if request.preview.resolve() == request.output.resolve():
-            raise UsageError(f"{request.preview}: the preview has the name of the output; choose another one")
-        check_output(request.preview, [request.model], overwrite=request.overwrite)
     terrain = open_terrain(request.model, request.crs)
     bounds = _bounds(request, terrain)
-    facts = ContourFacts([])
-    picture = None if request.preview is None else ContourPicture(bounds)
-    run = _Run(facts, _labeller(request, bounds), request.label_all or request.options.index == 0, picture)
+    facts = ContourFacts([], sketch=ContourSketch(bounds) if request.sketch else None)
+    run = _Run(facts, _labeller(request, bounds), request.label_all or request.options.index == 0)
     parts, count = _parts(terrain, request)
     report = (lambda parts, meshes: None) if begin is None else begin(count)
     lines = trace_contours(_counted(parts, report), request.options)
-    labels = (lambda: run.labels) if request.labels else None
+    labels = (lambda: facts.labels) if request.labels else None
     facts.files = write_contours(
         request.output, run.rows(lines), labels, terrain.crs, inputs=[request.model], overwrite=request.overwrite
     )
-    facts.labels = len(run.labels)
     facts.text_height = None if run.labeller is None else run.labeller.size
-    if picture is not None and request.preview is not None:
-        picture.write(request.preview, [(a.X, a.Y, a.angle, a.text) for a in run.labels], facts.text_height or 1.0)
-        facts.preview = request.preview
     return facts
 
 

@@ -1,4 +1,4 @@
-"""Profiles over lines of a file, as a table and as a picture."""
+"""Profiles over lines of a file, as values and as a table."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from photoplan.io.polygons import read_features
 from photoplan.io.product import check_output
 from photoplan.io.terrain.export import replacing
 from photoplan.io.terrain.points import PointTable, PointTableFormat
-from photoplan.products.dtm.profile_plot import ProfilePlot
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.profile import profile
@@ -42,17 +41,21 @@ class Profile:
     sigmas: NDArray[np.float64]
     """Standard deviations of the heights, metres; NaN: unknown."""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Figures as plain values."""
-        there = np.isfinite(self.heights)
-        known = self.heights[there]
-        return {
-            "line": self.name,
-            "length": float(self.distance[-1]),
-            "points": len(self.distance),
-            "low": float(known.min()) if known.size else None,
-            "high": float(known.max()) if known.size else None,
-        }
+    @property
+    def length(self) -> float:
+        """Metres."""
+        return float(self.distance[-1])
+
+    @property
+    def range(self) -> tuple[float, float] | None:
+        """Lowest and highest, metres; None: there is no surface."""
+        known = self.heights[np.isfinite(self.heights)]
+        return (float(known.min()), float(known.max())) if known.size else None
+
+    def json_fields(self) -> dict[str, Any]:
+        """Figures."""
+        low, high = self.range or (None, None)
+        return {"line": self.name, "length": self.length, "points": len(self.distance), "low": low, "high": high}
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,7 @@ class ProfileRequest:
     lines: Path
     """A vector file of lines, or a CSV of points along them."""
     outputs: tuple[Path, ...]
-    """`.csv`, and `.png` for a picture."""
+    """Tables, `.csv`; none: nothing is written."""
     form: PointTableFormat = field(default_factory=PointTableFormat)
     line_column: str | None = None
     """Column of a CSV that tells lines apart; None: `line`, `line_id` or `profile`, else all points are one line."""
@@ -80,26 +83,22 @@ def dtm_profile(request: ProfileRequest) -> list[Profile]:
     Raises
     ------
     UsageError
-        An output exists, is an input, or is of no known kind; a picture is asked for and matplotlib is missing.
+        An output exists, is an input, or of no known kind.
     InputError
         The terrain or the lines cannot be used, or they are in different CRSs.
     """
     inputs = [request.model, request.lines]
     for path in request.outputs:
-        if path.suffix.lower() not in (*TABLES, ".png"):
+        if path.suffix.lower() not in TABLES:
             raise UsageError(f"{path}: {path.suffix or 'no suffix'}; profiles are written as .csv and .png")
         check_output(path, inputs, overwrite=request.overwrite)
     if len({path.resolve() for path in request.outputs}) < len(request.outputs):
         raise UsageError(f"{request.outputs[0]}: is given twice as an output")
-    plot = ProfilePlot() if any(path.suffix.lower() == ".png" for path in request.outputs) else None
     terrain = open_terrain(request.model, request.crs)
     found = profiles_of(terrain, _lines(request, terrain), request.tolerance)
     for path in request.outputs:
         with replacing(path, inputs, request.overwrite) as part:
-            if plot is not None and path.suffix.lower() == ".png":
-                plot.draw(part, found)
-            else:
-                _write_table(part, found)
+            _write_table(part, found)
     return found
 
 

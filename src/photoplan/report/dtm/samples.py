@@ -1,9 +1,10 @@
-"""The report of a terrain model that was just built: what is known in memory, brought into plain values."""
+"""What the report of a built terrain model shows: figures, maps and samples, computed from the model in memory."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
@@ -12,10 +13,7 @@ from numpy.typing import NDArray
 
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.grid import MapGrid
-from photoplan.io.disk import write_atomically
-from photoplan.products.dtm.report_covariance import covariance_facts
-from photoplan.report.build_report import BuildFacts, FilterEffect, GrossError, Note, ReportMap, build_report
-from photoplan.report.plots import Plots
+from photoplan.report.dtm.covariance import CovarianceTest, covariance_test
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.measured import MeasuredTerrain
 from photoplan.surfaces.memory_units import MemoryUnits
@@ -41,51 +39,117 @@ _WORDS = {
 }
 
 
-def check_report() -> Plots:
-    """What draws the report; asked for before a model is built, so that a missing library is known at once.
+@dataclass(frozen=True, eq=False)
+class ReportMap:
+    """Heights and standard deviations of a model on the pixels of a small map."""
 
-    Raises
-    ------
-    UsageError
-        matplotlib is not installed.
-    """
-    return Plots()
+    left: float
+    """X of the outer left edge, metres."""
+    top: float
+    """Y of the outer upper edge, metres."""
+    resolution: float
+    """Side of a pixel, metres."""
+    heights: NDArray[np.float32]
+    """Shape (rows, columns), row 0 in the north, metres; NaN: no surface."""
+    sigmas: NDArray[np.float32]
+    """Standard deviations, the same shape."""
+    lines: tuple[tuple[str, NDArray[np.float64]], ...] = ()
+    """Kind and vertices (n, 2) of lines, metres."""
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Left, right, bottom, top, metres."""
+        rows, columns = self.heights.shape
+        return (
+            self.left,
+            self.left + columns * self.resolution,
+            self.top - rows * self.resolution,
+            self.top,
+        )
 
 
-def write_report(
-    path: Path,
-    built: Built,
-    measured: MeasuredTerrain,
-    findings: Sequence[Finding],
-    inputs: Sequence[Path],
-    seconds: float,
-) -> None:
-    """Write the report of a model as one HTML file, complete or not at all.
+@dataclass(frozen=True, eq=False)
+class FilterEffect:
+    """Measured minus filtered heights of one class."""
 
-    Parameters
-    ----------
-    path : Path
-    built : Built
-    measured : MeasuredTerrain
-        The clean measurements that the model was built from.
-    findings : sequence of Finding
-        What cleaning found.
-    inputs : sequence of Path
-        The files that were read.
-    seconds : float
-        What the model took.
+    name: str
+    """What the class is called."""
+    count: int
+    """Members of the class, of which `xy` may be a part."""
+    sigma: float
+    """Filter value, metres; NaN: differs within the class."""
+    xy: NDArray[np.float64]
+    """Places, shape (n, 2), metres."""
+    differences: NDArray[np.float64]
+    """Shape (n,), metres; NaN: no surface there."""
 
-    Raises
-    ------
-    UsageError
-        matplotlib is not installed, or the folder cannot be written.
-    ResourceError
-        The disk is full.
-    """
-    plots = check_report()
-    title = path.name.removesuffix(".html").removesuffix(".report")
-    facts = build_facts(title, built, measured, findings, inputs, seconds)
-    write_atomically(path, build_report(facts, plots).encode("utf-8", errors="replace"))
+
+@dataclass(frozen=True)
+class GrossError:
+    """A point that was left out."""
+
+    name: str
+    X: float
+    Y: float
+    height: float
+    """As measured, metres."""
+    difference: float
+    """Measured height minus the model's, metres; NaN: no surface there."""
+    normalised: float
+    """Difference from what its neighbours predict, in standard deviations."""
+
+
+@dataclass(frozen=True)
+class Note:
+    """Something found in the measurements, and what was done about it."""
+
+    kind: str
+    text: str
+    X: float = float("nan")
+    Y: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class BuildFacts:
+    """All that the report shows."""
+
+    title: str
+    crs: str
+    """Name of the CRS and the height system."""
+    counts: tuple[tuple[str, int], ...]
+    """Classes of points and lines with their numbers."""
+    units: int
+    """Computing units that have a surface."""
+    empty: int
+    """Units that have none."""
+    widths: tuple[tuple[float, int], ...]
+    """Grid widths, metres, and the number of units that have each."""
+    family: str
+    """Family of the covariance functions."""
+    variance: float
+    """Of the whole area's function, m²."""
+    length: float
+    """Its half-value distance, metres."""
+    noise: float
+    """Filter value of mass points in the whole area, metres."""
+    sigma: float
+    """Root mean square of the standard deviations of posts, metres."""
+    spread: float
+    """Spread of the normalised residuals; NaN: too few points."""
+    seconds: float
+    map: ReportMap
+    normalised: NDArray[np.float64]
+    """Normalised residuals of points that were used, or a sample of them."""
+    covariance: CovarianceTest
+    effects: tuple[FilterEffect, ...]
+    gross: tuple[GrossError, ...]
+    notes: tuple[Note, ...] = ()
+    """What cleaning found."""
+    settings: tuple[tuple[str, str], ...] = ()
+    inputs: tuple[tuple[str, str], ...] = ()
+    """Files, and what there is to say of each."""
+    limit: float = field(default=float("nan"))
+    """Normalised residual beyond which a point was a gross error."""
 
 
 def build_facts(
@@ -123,7 +187,7 @@ def build_facts(
         seconds=seconds,
         map=_map(built, surface),
         normalised=_thin(used, _RESIDUALS),
-        covariance=covariance_facts(fit),
+        covariance=covariance_test(fit),
         effects=_effects(built, measured, surface),
         gross=_gross(built, measured, surface),
         notes=(

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.kernels.sides import sides_of
-from photoplan.report.build_report import CovarianceFacts
 from photoplan.terrain.covariance import Covariance, near_lines
 from photoplan.terrain.fit import Fit
 from photoplan.terrain.settings import FAMILIES
@@ -23,6 +23,27 @@ _PARTED = 0.4
 _MATERN_HALF = 1.6783469900166605
 
 
+@dataclass(frozen=True, eq=False)
+class CovarianceTest:
+    """Covariance over distance: what was fitted, and what the data show."""
+
+    distance: NDArray[np.float64]
+    """Shape (n,), metres, from 0."""
+    whole: NDArray[np.float64]
+    """The function of the whole area, shape (n,), m²."""
+    low: NDArray[np.float64]
+    """The tenth and the ninetieth of a hundred units at each distance, shape (n,), m²."""
+    high: NDArray[np.float64]
+    classes: NDArray[np.float64]
+    """Mean distance of the pairs of each class, shape (k,), metres."""
+    empirical: NDArray[np.float64]
+    """Mean product of the pairs' residuals from a plane, shape (k,), m²; NaN: no pairs."""
+    expected: NDArray[np.float64]
+    """What the fitted functions let expect of these means, shape (k,), m²."""
+    pairs: NDArray[np.int64]
+    """Pairs in each class, shape (k,)."""
+
+
 def correlation_at(family: str, t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Correlation at distances in half-value distances: ½ at 1."""
     if family == "gaussian":
@@ -32,7 +53,7 @@ def correlation_at(family: str, t: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.exp(-np.log(2) * t))
 
 
-def covariance_facts(fit: Fit) -> CovarianceFacts:
+def covariance_test(fit: Fit) -> CovarianceTest:
     """Fitted functions over distance, and the covariance of the points' heights above local planes.
 
     A plane through a neighbourhood takes a part of the signal with it. So the fitted functions are not compared with
@@ -59,7 +80,7 @@ def covariance_facts(fit: Fit) -> CovarianceFacts:
         with np.errstate(invalid="ignore"):
             return np.asarray(np.bincount(number, values, minlength=_CLASSES + 1)[:_CLASSES] / count)
 
-    return CovarianceFacts(
+    return CovarianceTest(
         distance, _curve(fit.whole, distance), low, high, mean(d), mean(product), mean(expected), count
     )
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.report.drawing import BLUE, INK, PURPLE, RED, SKY, SOFT, STYLE, load_matplotlib, png
-
-if TYPE_CHECKING:
-    from photoplan.report.build_report import CovarianceFacts, FilterEffect, GrossError, ReportMap
+from photoplan.report.drawing import BLUE, INK, PURPLE, RED, SKY, SOFT, STYLE, png
+from photoplan.report.dtm.covariance import CovarianceTest
+from photoplan.report.dtm.samples import FilterEffect, GrossError, ReportMap
 
 #: What lines of each kind are called.
 LINE_WORDS = {"breakline": "breaklines", "formline": "form lines", "border": "border lines", "hole": "holes"}
@@ -24,25 +24,19 @@ _NUMBERED = 30
 _DOTS = 60_000
 
 
+@dataclass(frozen=True, eq=False)
 class Plots:
-    """Draws; made before any work, so that a missing library is known at once.
+    """Draws maps, histograms and covariances of a terrain model."""
 
-    Raises
-    ------
-    UsageError
-        When made: matplotlib is not installed.
-    """
-
-    def __init__(self) -> None:
-        self._mpl = load_matplotlib("a report", "leave the report out")
+    mpl: Any
 
     def heights(self, area: ReportMap) -> bytes:
         """Heights as shaded tints, with lines."""
-        with self._mpl.rc_context(STYLE):
+        with self.mpl.rc_context(STYLE):
             fig, axes = self._map(area)
             low, high = _limits(area.heights, 0.5)
-            norm = self._mpl.colors.Normalize(low, high)
-            tints = _lighter(self._mpl, "cividis")
+            norm = self.mpl.colors.Normalize(low, high)
+            tints = _lighter(self.mpl, "cividis")
             rgb = tints(norm(np.nan_to_num(area.heights, nan=low)))[..., :3] * _shade(area)[..., None]
             rgb[~np.isfinite(area.heights)] = 1.0
             axes.imshow(np.clip(rgb, 0, 1), extent=area.extent, interpolation="nearest")
@@ -52,19 +46,19 @@ class Plots:
 
     def sigmas(self, area: ReportMap) -> bytes:
         """Standard deviations."""
-        with self._mpl.rc_context(STYLE):
+        with self.mpl.rc_context(STYLE):
             fig, axes = self._map(area)
             low, high = _limits(area.sigmas, 1.0)
-            norm = self._mpl.colors.Normalize(max(0.0, low), high)
-            tints = self._mpl.colormaps["viridis_r"]
+            norm = self.mpl.colors.Normalize(max(0.0, low), high)
+            tints = self.mpl.colormaps["viridis_r"]
             axes.imshow(area.sigmas, extent=area.extent, cmap=tints, norm=norm, interpolation="nearest")
             self._bar(fig, axes, tints, norm, "standard deviation m", extend="both")
             return png(fig)
 
     def normalised(self, values: NDArray[np.float64], limit: float) -> bytes:
         """Histogram of normalised residuals with the normal curve."""
-        with self._mpl.rc_context(STYLE):
-            fig = self._mpl.figure.Figure(figsize=(_WIDTH, 2.9), layout="constrained")
+        with self.mpl.rc_context(STYLE):
+            fig = self.mpl.figure.Figure(figsize=(_WIDTH, 2.9), layout="constrained")
             axes = fig.subplots()
             z = values[np.isfinite(values)]
             edge = 5.0
@@ -85,10 +79,10 @@ class Plots:
             axes.legend(loc="upper right")
             return png(fig)
 
-    def covariance(self, facts: CovarianceFacts) -> bytes:
+    def covariance(self, facts: CovarianceTest) -> bytes:
         """Fitted functions, and the test by the covariance of residuals."""
-        with self._mpl.rc_context(STYLE):
-            fig = self._mpl.figure.Figure(figsize=(_WIDTH, 3.1), layout="constrained")
+        with self.mpl.rc_context(STYLE):
+            fig = self.mpl.figure.Figure(figsize=(_WIDTH, 3.1), layout="constrained")
             fitted, test = fig.subplots(1, 2)
             square = 1e4
             fitted.fill_between(
@@ -117,10 +111,10 @@ class Plots:
 
     def filter_histograms(self, effects: Sequence[FilterEffect]) -> bytes:
         """A histogram for each class, all in one scale."""
-        with self._mpl.rc_context(STYLE):
+        with self.mpl.rc_context(STYLE):
             columns = min(3, len(effects))
             rows = -(-len(effects) // columns)
-            fig = self._mpl.figure.Figure(figsize=(_WIDTH, 0.4 + 2.0 * rows), layout="constrained")
+            fig = self.mpl.figure.Figure(figsize=(_WIDTH, 0.4 + 2.0 * rows), layout="constrained")
             panels = fig.subplots(rows, columns, squeeze=False, sharex=True).ravel()
             reach = 100 * _reach(effects)
             for panel, effect in zip(panels, effects):
@@ -139,7 +133,7 @@ class Plots:
 
     def filter_map(self, effects: Sequence[FilterEffect], area: ReportMap) -> bytes:
         """Where heights were changed, and which way."""
-        with self._mpl.rc_context(STYLE):
+        with self.mpl.rc_context(STYLE):
             fig, axes = self._map(area)
             _grey_relief(axes, area)
             xy = np.concatenate([effect.xy for effect in effects])
@@ -147,8 +141,8 @@ class Plots:
             step = max(1, -(-len(d) // _DOTS))
             known = np.flatnonzero(np.isfinite(d))[::step]
             reach = 100 * _reach(effects)
-            norm = self._mpl.colors.Normalize(-reach, reach)
-            tints = self._mpl.colormaps["RdBu"]
+            norm = self.mpl.colors.Normalize(-reach, reach)
+            tints = self.mpl.colormaps["RdBu"]
             size = float(np.clip(3e4 / max(1, len(known)), 0.6, 14))
             axes.scatter(
                 *xy[known].T, c=d[known], cmap=tints, norm=norm, s=size, linewidths=0, rasterized=True, zorder=3
@@ -158,7 +152,7 @@ class Plots:
 
     def gross(self, errors: Sequence[GrossError], area: ReportMap) -> bytes:
         """Gross errors on the relief; those above the model point up, those below it down."""
-        with self._mpl.rc_context(STYLE):
+        with self.mpl.rc_context(STYLE):
             fig, axes = self._map(area)
             _grey_relief(axes, area)
             xy = np.array([(error.X, error.Y) for error in errors])
@@ -178,17 +172,17 @@ class Plots:
         left, right, bottom, top = area.extent
         ratio = (top - bottom) / (right - left)
         height = float(np.clip(5.9 * ratio, 2.2, 8.2)) + 0.7
-        fig = self._mpl.figure.Figure(figsize=(_WIDTH, height), layout="constrained")
+        fig = self.mpl.figure.Figure(figsize=(_WIDTH, height), layout="constrained")
         axes = fig.subplots()
         axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="X m", ylabel="Y m")
         axes.grid(False)
         for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_locator(self._mpl.ticker.MaxNLocator(5, steps=[1, 2, 5, 10]))
-            axis.set_major_formatter(self._mpl.ticker.FuncFormatter(lambda v, _: f"{v:.12g}"))
+            axis.set_major_locator(self.mpl.ticker.MaxNLocator(5, steps=[1, 2, 5, 10]))
+            axis.set_major_formatter(self.mpl.ticker.FuncFormatter(lambda v, _: f"{v:.12g}"))
         return fig, axes
 
     def _bar(self, fig: Any, axes: Any, tints: Any, norm: Any, label: str, extend: str = "neither") -> None:
-        colours = self._mpl.cm.ScalarMappable(norm, tints)
+        colours = self.mpl.cm.ScalarMappable(norm, tints)
         bar = fig.colorbar(colours, ax=axes, shrink=0.8, aspect=28, pad=0.02, extend=extend)
         bar.set_label(label)
         bar.outline.set_visible(False)
@@ -198,7 +192,7 @@ class Plots:
             some = [xy for k, xy in area.lines if k == kind]
             dashes = {"formline": "--", "hole": ":"}.get(kind, "-")
             axes.add_collection(
-                self._mpl.collections.LineCollection(
+                self.mpl.collections.LineCollection(
                     some,
                     colors=LINE_COLOURS.get(kind, INK),
                     linewidths=0.5,

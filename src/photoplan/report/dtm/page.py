@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from photoplan.report.page import Cell, figure, headline, page, section, table
-from photoplan.report.plots import LINE_WORDS, Plots
+from photoplan.errors import UsageError
+from photoplan.report.drawing import has_matplotlib, load_matplotlib
+from photoplan.report.dtm.plots import LINE_WORDS, Plots
+from photoplan.report.dtm.samples import BuildFacts
+from photoplan.report.page import Cell, ReportFile, figure, headline, page, section, table
 
 #: Rows of a list at most: more are counted.
 MOST_ROWS = 2000
@@ -17,145 +20,30 @@ MOST_ROWS = 2000
 MOST_NOTES = 50
 
 
-@dataclass(frozen=True, eq=False)
-class ReportMap:
-    """Heights and standard deviations of a model on the pixels of a small map."""
+def open_build_report(output: Path, wanted: bool | None, overwrite: bool) -> ReportFile | None:
+    """The page beside a model to be, before any work; None: it is not wanted, or left open and matplotlib is missing.
 
-    left: float
-    """X of the outer left edge, metres."""
-    top: float
-    """Y of the outer upper edge, metres."""
-    resolution: float
-    """Side of a pixel, metres."""
-    heights: NDArray[np.float32]
-    """Shape (rows, columns), row 0 in the north, metres; NaN: no surface."""
-    sigmas: NDArray[np.float32]
-    """Standard deviations, the same shape."""
-    lines: tuple[tuple[str, NDArray[np.float64]], ...] = ()
-    """Kind and vertices (n, 2) of lines, metres."""
-
-    @property
-    def extent(self) -> tuple[float, float, float, float]:
-        """Left, right, bottom, top, metres."""
-        rows, columns = self.heights.shape
-        return (
-            self.left,
-            self.left + columns * self.resolution,
-            self.top - rows * self.resolution,
-            self.top,
-        )
+    Raises
+    ------
+    UsageError
+        It exists, or it is wanted and matplotlib is missing.
+    """
+    if wanted is False:
+        return None
+    path = output.with_name(f"{output.stem}.report.html")
+    if path.exists() and not overwrite:
+        raise UsageError(f"{path} exists; give `overwrite` to replace it, or `report=False`")
+    if wanted is None and not has_matplotlib():
+        return None
+    return ReportFile(path, load_matplotlib("the report", "give `report=False`"))
 
 
-@dataclass(frozen=True, eq=False)
-class CovarianceFacts:
-    """Covariance over distance: what was fitted, and what the data show."""
-
-    distance: NDArray[np.float64]
-    """Shape (n,), metres, from 0."""
-    whole: NDArray[np.float64]
-    """The function of the whole area, shape (n,), m²."""
-    low: NDArray[np.float64]
-    """The tenth and the ninetieth of a hundred units at each distance, shape (n,), m²."""
-    high: NDArray[np.float64]
-    classes: NDArray[np.float64]
-    """Mean distance of the pairs of each class, shape (k,), metres."""
-    empirical: NDArray[np.float64]
-    """Mean product of the pairs' residuals from a plane, shape (k,), m²; NaN: no pairs."""
-    expected: NDArray[np.float64]
-    """What the fitted functions let expect of these means, shape (k,), m²."""
-    pairs: NDArray[np.int64]
-    """Pairs in each class, shape (k,)."""
-
-
-@dataclass(frozen=True, eq=False)
-class FilterEffect:
-    """Measured minus filtered heights of one class."""
-
-    name: str
-    """What the class is called."""
-    count: int
-    """Members of the class, of which `xy` may be a part."""
-    sigma: float
-    """Filter value, metres; NaN: differs within the class."""
-    xy: NDArray[np.float64]
-    """Places, shape (n, 2), metres."""
-    differences: NDArray[np.float64]
-    """Shape (n,), metres; NaN: no surface there."""
-
-
-@dataclass(frozen=True)
-class GrossError:
-    """A point that was left out."""
-
-    name: str
-    X: float
-    Y: float
-    height: float
-    """As measured, metres."""
-    difference: float
-    """Measured height minus the model's, metres; NaN: no surface there."""
-    normalised: float
-    """Difference from what its neighbours predict, in standard deviations."""
-
-
-@dataclass(frozen=True)
-class Note:
-    """Something found in the measurements, and what was done about it."""
-
-    kind: str
-    text: str
-    X: float = float("nan")
-    Y: float = float("nan")
-
-
-@dataclass(frozen=True, eq=False)
-class BuildFacts:
-    """All that the report shows."""
-
-    title: str
-    crs: str
-    """Name of the CRS and the height system."""
-    counts: tuple[tuple[str, int], ...]
-    """Classes of points and lines with their numbers."""
-    units: int
-    """Computing units that have a surface."""
-    empty: int
-    """Units that have none."""
-    widths: tuple[tuple[float, int], ...]
-    """Grid widths, metres, and the number of units that have each."""
-    family: str
-    """Family of the covariance functions."""
-    variance: float
-    """Of the whole area's function, m²."""
-    length: float
-    """Its half-value distance, metres."""
-    noise: float
-    """Filter value of mass points in the whole area, metres."""
-    sigma: float
-    """Root mean square of the standard deviations of posts, metres."""
-    spread: float
-    """Spread of the normalised residuals; NaN: too few points."""
-    seconds: float
-    map: ReportMap
-    normalised: NDArray[np.float64]
-    """Normalised residuals of points that were used, or a sample of them."""
-    covariance: CovarianceFacts
-    effects: tuple[FilterEffect, ...]
-    gross: tuple[GrossError, ...]
-    notes: tuple[Note, ...] = ()
-    """What cleaning found."""
-    settings: tuple[tuple[str, str], ...] = ()
-    inputs: tuple[tuple[str, str], ...] = ()
-    """Files, and what there is to say of each."""
-    limit: float = field(default=float("nan"))
-    """Normalised residual beyond which a point was a gross error."""
-
-
-def build_report(facts: BuildFacts, plots: Plots) -> str:
+def build_page(facts: BuildFacts, mpl: Any) -> str:
     """The report as one HTML document without links to anything outside it.
 
     Names and texts are escaped; what they contain is shown and never obeyed.
     """
+    plots = Plots(mpl)
     parts = [
         headline(_headline(facts)),
         section("The surface", _surface(facts, plots)),
