@@ -34,7 +34,8 @@ def scene(scale: float = 1.0) -> tuple[tuple[Any, ...], np.ndarray, int]:
     corners = (np.array(edges) @ matrix.T)[None]
     rects, start = np.array([[0, 0, SIDE, SIDE]], np.int32), np.array([0, 1], np.int32)
     relief = np.random.default_rng(0).uniform(0, 5, (SIDE, SIDE)).astype(np.float32)
-    return (rects, start, np.array([[0.0, 5.0]]), corners), relief, window
+    heights, frame, field = np.array([[0.0, 5.0]]), np.zeros(5), np.empty((0, 0, 2), np.float32)
+    return (rects, start, heights, corners, frame, field), relief, window
 
 
 def seconds(action: Callable[[], object]) -> float:

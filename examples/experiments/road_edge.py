@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.none import NoLens
@@ -159,8 +160,7 @@ def camera() -> FrameCamera:
     whole = FrameCamera(Interior.digital((1, 1), (FOCAL, FOCAL)), NoLens(), pose)
     xmin, ymin, xmax, ymax = ORTHO
     corners = [(x, y, z) for x in (xmin, xmax) for y in (ymin, ymax) for z in (97.0, 106.0)]
-    p = whole.project_homogeneous(corners)
-    xy = p[:, :2] / p[:, 2:]
+    xy = project(whole, corners)
     first, last = np.floor(xy.min(axis=0)) - 8, np.ceil(xy.max(axis=0)) + 8
     size = tuple((last - first).astype(int) + 1)
     offset = -first - (np.array(size) - 1) / 2
@@ -231,7 +231,7 @@ def ortho_grid() -> MapGrid:
 def orthophoto(view: FrameCamera, image: NDArray[np.float32], surface: Surface) -> NDArray[np.float32]:
     """The orthophoto, shape (rows, columns), by the package's own chain."""
     grid = ortho_grid()
-    plan = ProductPlan("road_ortho", ("road",), MapTarget(grid), 512, AnchorRule(0.005, 3, 64), (Tile(0, grid.window),))
+    plan = ProductPlan("road_ortho", ("road",), MapTarget(grid), 512, AnchorRule(0.005, 3), (Tile(0, grid.window),))
     pixels = render(plan, plan.tiles[0], [Source(view, _Photo(image))], surface, "bicubic")
     assert pixels.values is not None and pixels.valid is not None
     return np.where(pixels.valid, pixels.values[0], np.nan)

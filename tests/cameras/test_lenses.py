@@ -15,6 +15,7 @@ from camera_examples import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
@@ -121,8 +122,7 @@ def test_whole_camera_against_opencv() -> None:
     R = np.diag([1.0, -1.0, -1.0]) @ pose.R_ground_camera.T
     K = np.array([[1435.5, 0, 999.5 + 3.2], [0, 1432.9, 562.0 - 5.1], [0, 0, 1]])
     xy, _ = cv2.projectPoints(XYZ, cv2.Rodrigues(R)[0], -R @ pose.center, K, np.array(k))
-    h = FrameCamera(DIGITAL, OpenCV(*k), pose).project_homogeneous(XYZ)
-    ours = h[:, :2] / h[:, 2:]
+    ours = project(FrameCamera(DIGITAL, OpenCV(*k), pose), XYZ)
     seen = (np.abs(ours - 1000) < 1000).all(axis=1)
     assert seen.sum() > 100
     np.testing.assert_allclose(ours[seen], xy[seen, 0], atol=1e-9)

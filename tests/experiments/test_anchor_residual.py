@@ -3,6 +3,7 @@
 import anchor_residual as experiment
 import numpy as np
 import pytest
+from tools.pinhole import Pinhole
 
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
@@ -65,9 +66,16 @@ def test_the_compiler_cuts_until_the_tolerance_is_met(tolerance):
     grid = MapGrid(left=400.0, top=330.0, resolution=0.1, width=256, height=256, crs="EPSG:25832")
     relief = np.zeros((256, 256), np.float32)
     relief[:, 100:] = 60.0
-    anchors = compile_anchors(camera(), MapTarget(grid), window, relief, AnchorRule(tolerance, 2, 256))
+    pose = Pose(np.array([0.0, 0.0, experiment.FLYING_HEIGHT]), np.eye(3))
+    inside = Pinhole(pose, experiment.FOCAL, (10_000, 7_500), experiment.K1)  # its lens is in the anchors
+    np.testing.assert_allclose(project(inside, [480.0, 360.0, 7.0]), project(camera(), [480.0, 360.0, 7.0]), atol=1e-9)
+    anchors = compile_anchors(inside, MapTarget(grid), window, relief, AnchorRule(tolerance, 2))
     assert 0 < anchors.residual <= tolerance
     layers = np.diff(anchors.box_start)
     wall = (anchors.rects[:, 0] < 100) & (anchors.rects[:, 2] > 100)
     assert (layers[wall] > 1).all()
     assert (layers[~wall] == 1).all()
+    # The lens as a field: one box, and the residual is that of the nodes.
+    anchors = compile_anchors(camera(), MapTarget(grid), window, relief, AnchorRule(tolerance, 2))
+    assert len(anchors.corners) == 1
+    assert 0 < anchors.residual <= tolerance

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import road_edge as road
 
+from photoplan.cameras.base import project
+
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "experiments" / "road-edge.md"
 
 
@@ -48,8 +50,7 @@ def test_photo_is_strict():
     xy = rng.uniform(0, 1, (500, 2)) * (np.array(view.size) - 1)
     XY = road.hit(view, xy)
     Z = road.terrain(*XY.T)
-    p = view.project_homogeneous(np.column_stack([XY, Z]))
-    np.testing.assert_allclose(p[:, :2] / p[:, 2:], xy, atol=1e-3)
+    np.testing.assert_allclose(project(view, np.column_stack([XY, Z])), xy, atol=1e-3)
     # Nothing stands between the camera and the place: along the ray, the terrain stays below it.
     for t in np.linspace(0.9, 0.9999, 100):
         between = view.center + t * (np.column_stack([XY, Z]) - view.center)
@@ -61,8 +62,7 @@ def test_half_level_of_the_photo_lies_on_the_projected_edge():
     image = road.photo(view)[0]
     angles = np.arange(*road.ANGLES, 0.01)
     XY = road.on_circle(angles, road.HALF_WIDTH)
-    p = view.project_homogeneous(np.column_stack([XY, road.terrain(*XY.T)]))
-    column, row = (p[:, :2] / p[:, 2:]).T
+    column, row = project(view, np.column_stack([XY, road.terrain(*XY.T)])).T
     from scipy.ndimage import map_coordinates
 
     grey = map_coordinates(image, [row, column], order=3)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.geometry.pose import Pose
 from photoplan.io.camera.file import read_cameras
@@ -73,7 +74,7 @@ def test_positions_are_orthoritys(tmp_path: Path, kind: str) -> None:
     pose = Pose(table.centers[0], table.rotations[0])
     camera = FrameCamera(interior_of(description, image), lens_of(description), pose)
     X, Y, column, row = np.array(POSITIONS[kind]).T
-    h = camera.project_homogeneous(np.column_stack([X, Y, np.full(len(X), 300.0)]))
-    difference = h[:, :2] / h[:, 2:] - np.column_stack([column, row])
+    found = project(camera, np.column_stack([X, Y, np.full(len(X), 300.0)]))
+    difference = found - np.column_stack([column, row])
     # Half of 1/32 pixel, and the float32 in which the image holds its positions.
     assert np.abs(difference).max() < 1 / 64 + 1e-4

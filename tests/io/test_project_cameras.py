@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera as ComputingCamera
 from photoplan.errors import InputError
 from photoplan.geometry.pose import Pose
@@ -35,8 +36,7 @@ def project_at(camera: Any, points: Any, image: Image = IMAGE) -> np.ndarray:
     """Image points of camera directions (x right, y up, scene at z < 0)."""
     pose = Pose(np.zeros(3), np.eye(3))
     made = ComputingCamera(interior_of(camera, image), lens_of(camera), pose)
-    h = made.project_homogeneous(points)
-    return h[..., :2] / h[..., 2:]
+    return project(made, points)
 
 
 def test_one_camera_described_in_pixels_and_in_millimetres() -> None:

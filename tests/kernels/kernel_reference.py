@@ -112,7 +112,8 @@ class Mapping:
             for box in boxes
         ]
         start = np.arange(len(rects) + 1, dtype=np.int32) * len(boxes)
-        return rects, start, np.array(boxes * len(rects), float), np.array(corners)
+        heights = np.array(boxes * len(rects), float)
+        return rects, start, heights, np.array(corners), np.zeros(5), np.empty((0, 0, 2), np.float32)
 
 
 def noise(shape, dtype, seed=0):

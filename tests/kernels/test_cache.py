@@ -21,7 +21,8 @@ from photoplan.kernels.place import place_runs
 from photoplan.kernels.rectify import is_compiled, rectify_tile
 before = is_compiled("int16", 3, "bilinear")
 corners = np.array([[[u, v, 1.0] for h in (0, 1) for v in (-.5, 3.5) for u in (-.5, 3.5)]])
-anchors = (np.array([[0, 0, 4, 4]], np.int32), np.array([0, 1], np.int32), np.array([[0.0, 1.0]]), corners)
+anchors = (np.array([[0, 0, 4, 4]], np.int32), np.array([0, 1], np.int32), np.array([[0.0, 1.0]]), corners,
+           np.zeros(5), np.empty((0, 0, 2), np.float32))
 arrays = np.ones((3, 4, 4), np.int16), np.empty((3, 4, 4), np.int16), np.empty((4, 4), bool)
 rectify_tile(anchors, np.zeros((4, 4), np.float32), arrays[0], None, None, "bilinear", arrays[1], arrays[2])
 assert (arrays[1] == 1).all()

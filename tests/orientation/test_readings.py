@@ -8,6 +8,7 @@ import pytest
 import rasterio
 from pyproj import Transformer
 
+from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.brown import Brown
@@ -49,8 +50,7 @@ def made_block(mirrored=False, images=8, lens=LENS, sigma=0.3, seed=4):
     XYZ = np.column_stack([rng.uniform(200, 1200, (400, 2)) + ORIGIN, rng.uniform(200, 300, 400)])
     rows = []
     for k in range(images):
-        w = FrameCamera(interior, lens, Pose(centers[k], R[k])).project_homogeneous(XYZ)
-        xy = w[:, :2] / w[:, 2:] + rng.normal(0, sigma, (400, 2))
+        xy = project(FrameCamera(interior, lens, Pose(centers[k], R[k])), XYZ) + rng.normal(0, sigma, (400, 2))
         for p in np.flatnonzero((xy >= 0).all(axis=1) & (xy < SIZE).all(axis=1))[:12]:
             # A mirrored scan: columns counted from the other side of the principal point.
             col = 2 * ((SIZE[0] - 1) / 2 + 12.0) - xy[p, 0] if mirrored else xy[p, 0]
@@ -129,8 +129,8 @@ def test_strictly_vertical_images_do_not_tell_orders_and_that_is_said():
     R = np.stack([rotation_from_angles((0, 0, k)) for k in kappa])
     rows = []
     for k, name in enumerate(names):
-        w = FrameCamera(interior, LENS, Pose(centers[k], R[k])).project_homogeneous(ground.XYZ)
-        rows += [(f"p{p}", name, *(w[p, :2] / w[p, 2])) for p in range(0, 400, 50)]
+        xy = project(FrameCamera(interior, LENS, Pose(centers[k], R[k])), ground.XYZ)
+        rows += [(f"p{p}", name, *xy[p]) for p in range(0, 400, 50)]
     sights = sights_of(names, cameras, ImagePoints.from_rows(rows), ground)
     fits = fitting(judge_readings(stated(names, centers, R, Reading()), sights))
     assert {f.reading.rotation for f in fits} == set(ROTATION_ORDERS)

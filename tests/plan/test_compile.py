@@ -15,12 +15,12 @@ from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
 from photoplan.plan.anchors import Anchors
-from photoplan.plan.compile import AnchorRule, compile_anchors, initial_cell
+from photoplan.plan.compile import AnchorRule, compile_anchors
 from photoplan.targets.map import MapTarget
 
 GRID = MapGrid(760, 2310, 0.06, 9400, 9300, "EPSG:32615")
 TARGET = MapTarget(GRID)
-RULE = AnchorRule(0.02, 2, 512)
+RULE = AnchorRule(0.02, 2)
 
 
 def positions(anchors: Anchors, relief: np.ndarray) -> np.ndarray:
@@ -93,14 +93,11 @@ def test_distorted_lens_meets_the_tolerance_at_every_pixel(
 def test_residual_falls_with_the_square_of_the_cell() -> None:
     """Convergence order 2 in u and v: what the splitting relies on."""
     camera = vertical(k1=-0.08)
-    relief = np.full((256, 256), 100, np.float32)
-    loose = AnchorRule(1e3, 2, 256)
     misses = []
-    for cell in (128, 64, 32, 16):
-        anchors = compile_anchors(
-            camera, TARGET, Window(6500, 4000, 256, 256), relief, dataclasses.replace(loose, cell=cell)
-        )
-        assert anchors is not None
+    for side in (128, 64, 32, 16):
+        window, relief = Window(6628 - side // 2, 4128 - side // 2, side, side), np.full((side, side), 100, np.float32)
+        anchors = compile_anchors(camera, TARGET, window, relief, AnchorRule(1e3, 2))
+        assert anchors is not None and len(anchors.rects) == 1
         misses.append(anchors.residual)
     orders = np.log2(np.array(misses[:-1]) / misses[1:])
     np.testing.assert_allclose(orders, 2.0, atol=0.15)
@@ -109,7 +106,7 @@ def test_residual_falls_with_the_square_of_the_cell() -> None:
 def test_a_wall_is_split_in_height_and_boxes_leave_no_gap() -> None:
     camera = vertical(k1=-0.3, focal=6000)
     relief = rough((64, 64), 3, 150)
-    anchors = compile_anchors(camera, TARGET, Window(2000, 2000, 64, 64), relief, AnchorRule(0.005, 2, 64))
+    anchors = compile_anchors(camera, TARGET, Window(2000, 2000, 64, 64), relief, AnchorRule(0.005, 2))
     assert anchors is not None
     piles = np.diff(anchors.box_start)
     assert piles.max() > 1
@@ -172,12 +169,6 @@ def test_horizontal_view_divides_nothing_behind_the_camera() -> None:
     assert inside.sum() > 2000 and (inside & ~seen).sum() == 0
 
 
-def test_first_cell_depends_on_the_camera_alone() -> None:
-    assert initial_cell(vertical(), TARGET, (4700, 4600), 100, 512, RULE) == 512
-    bent = initial_cell(vertical(k1=-0.3), TARGET, (4700, 4600), 100, 512, RULE)
-    assert bent < 512
-
-
 def test_tolerance_must_be_positive() -> None:
     with pytest.raises(UsageError, match="tolerance"):
-        AnchorRule(0, 2, 512)
+        AnchorRule(0, 2)

@@ -46,7 +46,7 @@ def product(
     grid: MapGrid, side: int = 512, names: tuple[str, ...] = ("image",), owners: Any = None, **rule: Any
 ) -> ProductPlan:
     """A plan that has every tile of a grid."""
-    cut = AnchorRule(**({"tolerance": 0.02, "radius": 3, "cell": 512} | rule))
+    cut = AnchorRule(**({"tolerance": 0.02, "radius": 3} | rule))
     tiles = tuple(Tile(i, w, tuple(range(len(names)))) for i, w in enumerate(grid.window.tiles(side)))
     return ProductPlan("image_ortho", names, MapTarget(grid), side, cut, tiles, owners)
 

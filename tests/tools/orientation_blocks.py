@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera as PixelCamera
 from photoplan.geometry.pose import Pose
 from photoplan.io.camera.model import FrameCamera
@@ -34,11 +35,8 @@ def our_pixels(table, camera=CAMERA, ground=GROUND):
     for image, R in zip(table.images, table.rotations):
         described = Image(name=image.name, file="x.tif", camera="c")
         interior = interior_of(camera, described)
-        found.append(
-            PixelCamera(interior, lens_of(camera), Pose(np.array(image.center), R)).project_homogeneous(ground)
-        )
-    found = np.array(found)
-    return found[..., :2] / found[..., 2:]
+        found.append(project(PixelCamera(interior, lens_of(camera), Pose(np.array(image.center), R)), ground))
+    return np.array(found)
 
 
 def pixels_of_matrix(r, center, camera=CAMERA, ground=GROUND):

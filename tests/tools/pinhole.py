@@ -18,6 +18,9 @@ class Pinhole:
     focal: float
     size: tuple[int, int]
     k1: float = 0.0
+    field: None = None
+    """Its distortion stays in the anchors."""
+    breaks: None = None
 
     @property
     def center(self) -> NDArray[np.float64]:

@@ -1,18 +1,55 @@
-"""What every camera can do. The rest of photoplan knows no more of one."""
+"""What everything that maps ground to an image can do. The rest of photoplan knows no more of a camera."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 
-class Camera(Protocol):
-    """A mapping from ground to image, smooth wherever the point lies in front.
+@dataclass(frozen=True)
+class Breaks:
+    """Where a mapping is continuous but bent: no interpolation may cross these places unnoticed."""
+
+    columns: tuple[float, ...] = ()
+    """x of ideal image positions, increasing, pixels."""
+    rows: tuple[float, ...] = ()
+    """y of ideal image positions, increasing, pixels."""
+
+
+class ImageField(Protocol):
+    """What happens in the image, whatever the ground: from ideal positions (of the projective factor) to real ones.
+
+    Lens distortion, film deformation, the remainder of each line of a trajectory. Continuous, and close to the
+    identity: two points keep their order. All methods are vectorised; NaN in gives NaN out.
+    """
+
+    @property
+    def breaks(self) -> Breaks | None:
+        """Where it is bent; None: nowhere."""
+        ...
+
+    def __call__(self, xy: ArrayLike) -> NDArray[np.float64]:
+        """Ideal to real positions, shapes (..., 2), pixels."""
+        ...
+
+    def inverse(self, xy: ArrayLike) -> NDArray[np.float64]:
+        """Real to ideal positions, shapes (..., 2), pixels; NaN where there are none."""
+        ...
+
+    def __hash__(self) -> int:
+        """Fields are values or compared by identity: usable as keys either way."""
+        ...
+
+
+class Projection(Protocol):
+    """A mapping from ground to image in two factors: a projective or smooth one, and a field in the image.
 
     Ground coordinates are those of the product: projected X, Y and height Z, metres. Image coordinates are
-    (x, y) = (column, row) in pixels, (0, 0) the centre of the upper-left pixel. All methods are vectorised.
+    (x, y) = (column, row) in pixels, (0, 0) the centre of the upper-left pixel. All methods are vectorised. Where a
+    point lies in the image is told by `project`.
     """
 
     @property
@@ -21,17 +58,26 @@ class Camera(Protocol):
         ...
 
     @property
-    def center(self) -> NDArray[np.float64]:
-        """Projection centre in ground coordinates, shape (3,)."""
+    def field(self) -> ImageField | None:
+        """The second factor; None: ideal positions are the real ones."""
+        ...
+
+    @property
+    def breaks(self) -> Breaks | None:
+        """Where the first factor is bent, by its ideal positions (knots of a trajectory); None: nowhere."""
         ...
 
     def project_homogeneous(self, XYZ: ArrayLike) -> NDArray[np.float64]:
-        """Ground (..., 3) to homogeneous image coordinates (x·w, y·w, w), shape (..., 3).
+        """First factor: ground (..., 3) to homogeneous ideal positions (x·w, y·w, w), shape (..., 3).
 
-        w is positive in front of the camera, zero or negative behind, and for an undistorted frame camera all three
-        are linear in XYZ. NaN in gives NaN out.
+        w is positive in front of the camera, zero or negative behind, and for a frame camera all three are linear in
+        XYZ, whatever its lens. NaN in gives NaN out.
         """
         ...
+
+
+class Camera(Projection, Protocol):
+    """A projection that can be followed back to the ground. Rays and derivatives are those of both factors."""
 
     def rays(self, xy: ArrayLike, height: float | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Image points (..., 2) to rays: an origin and a unit direction (pointing away from the camera), each (..., 3).
@@ -47,9 +93,19 @@ class Camera(Protocol):
         ...
 
 
-def project(camera: Camera, XYZ: ArrayLike) -> NDArray[np.float64]:
+class CentralCamera(Camera, Protocol):
+    """A camera whose rays all pass through one point."""
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """Projection centre in ground coordinates, shape (3,)."""
+        ...
+
+
+def project(projection: Projection, XYZ: ArrayLike) -> NDArray[np.float64]:
     """Ground points (..., 3) to image points (..., 2) in pixels; NaN at and behind the camera's plane."""
-    h = camera.project_homogeneous(XYZ)
+    h = projection.project_homogeneous(XYZ)
     w = h[..., 2:]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(w > 0, h[..., :2] / w, np.nan)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        ideal = np.where(w > 0, h[..., :2] / w, np.nan)
+    return ideal if projection.field is None else projection.field(ideal)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from photoplan.cameras.base import Camera
+from photoplan.cameras.base import CentralCamera
 from photoplan.cameras.corrected import corrected_camera
 from photoplan.cameras.curved import curved_camera
 from photoplan.cameras.frame import FrameCamera
@@ -29,7 +29,7 @@ def oriented_camera(
     earth_curvature: str = "none",
     refraction: bool = False,
     mean_ground: float = 0.0,
-) -> Camera:
+) -> CentralCamera:
     """A camera in map coordinates from its interior and exterior orientation.
 
     Parameters

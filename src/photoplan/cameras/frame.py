@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import dataclasses
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from photoplan.cameras.base import ImageField
 from photoplan.cameras.interior import Interior
+from photoplan.cameras.lens_field import LensField, ideal_plane
 from photoplan.cameras.lenses.base import Lens
 from photoplan.cameras.lenses.field import FieldLimited, field_limited
 from photoplan.cameras.lenses.none import NoLens
 from photoplan.cameras.plane import Affine2D
 from photoplan.errors import UsageError
 from photoplan.geometry.pose import Pose
+
+#: Largest tangent of an image's border up to which a lens is a field. A fisheye beyond it (63°) strays so far from the
+#: ideal plane that a table of its displacements would be larger than the image.
+WIDEST_FIELD = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +31,9 @@ class FrameCamera:
     orientation was determined with the scene at z > 0 (ω near 200 gon, as in Ecker 1991, §8.1) is brought into this
     system by turning its axes, R · diag(1, −1, −1), and changing the sign of its image x.
 
-    With a lens, the homogeneous coordinates of points at and behind the camera's plane are NaN with w ≤ 0.
+    Its lens and a bilinear interior orientation are its `field`, the rest is linear. Only a fisheye whose image reaches
+    beyond 63° from the axis has no field: its lens then is part of `project_homogeneous`, which gives NaN with w ≤ 0 at
+    and behind the camera's plane.
 
     Raises
     ------
@@ -36,21 +45,27 @@ class FrameCamera:
     lens: Lens
     pose: Pose
     """Exterior orientation."""
-    _field: Lens = field(init=False, repr=False)
-    _linear: NDArray[np.float64] | None = field(init=False, repr=False)
-    _axes: NDArray[np.float64] = field(init=False, repr=False)
+    breaks: None = dataclasses.field(default=None, init=False)
+    """The mapping is smooth."""
+    field: ImageField | None = dataclasses.field(init=False, repr=False)
+    """Lens and film deformation; None: there are none, or it is a wide fisheye."""
+    _lens: Lens = dataclasses.field(init=False, repr=False)
+    _linear: NDArray[np.float64] | None = dataclasses.field(init=False, repr=False)
+    _axes: NDArray[np.float64] = dataclasses.field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         plain = isinstance(self.lens, NoLens | FieldLimited)
-        object.__setattr__(self, "_field", self.lens if plain else field_limited(self.lens, self.interior))
+        lens = self.lens if plain else field_limited(self.lens, self.interior)
+        object.__setattr__(self, "_lens", lens)
         # Columns: camera x, camera y, depth.
         axes = np.ascontiguousarray(self.pose.R_ground_camera * (1.0, 1.0, -1.0))
         object.__setattr__(self, "_axes", axes)
-        T = self.interior.tangent_to_pixel
-        linear = None
-        if isinstance(self.lens, NoLens) and isinstance(T, Affine2D):
-            linear = axes @ np.array([[T.a1, T.a4, 0.0], [T.a2, T.a5, 0.0], [T.a3, T.a6, 1.0]])
-        object.__setattr__(self, "_linear", linear)
+        ideal = isinstance(lens, NoLens) and isinstance(self.interior.tangent_to_pixel, Affine2D)
+        wide = isinstance(lens, FieldLimited) and lens.radius > WIDEST_FIELD
+        object.__setattr__(self, "field", None if ideal or wide else LensField(self.interior, lens))
+        T = ideal_plane(self.interior)
+        linear = axes @ np.array([[T.a1, T.a4, 0.0], [T.a2, T.a5, 0.0], [T.a3, T.a6, 1.0]])
+        object.__setattr__(self, "_linear", None if wide else linear)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -63,7 +78,7 @@ class FrameCamera:
         return self.pose.center
 
     def project_homogeneous(self, XYZ: ArrayLike) -> NDArray[np.float64]:
-        """Ground (..., 3) to (x·w, y·w, w), w = depth in metres; linear in XYZ without lens on an affine interior."""
+        """Ground (..., 3) to ideal (x·w, y·w, w), w = depth in metres; linear in XYZ but for a wide fisheye."""
         XYZ = np.asarray(XYZ, float)
         from_center = (XYZ - self.pose.center).reshape(-1, 3)
         if self._linear is not None:
@@ -73,13 +88,13 @@ class FrameCamera:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             t = p[:, :2] / np.where(w > 0, w, np.nan)[:, None]
             out = np.empty_like(p)
-            np.multiply(self.interior.tangent_to_pixel(self._field.distort(t)), w[:, None], out=out[:, :2])
+            np.multiply(self.interior.tangent_to_pixel(self._lens.distort(t)), w[:, None], out=out[:, :2])
         out[:, 2] = w
         return out.reshape(XYZ.shape)
 
     def rays(self, xy: ArrayLike, height: float | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Image points (..., 2) to the projection centre and unit directions, each (..., 3); `height` is not used."""
-        t = self._field.undistort(self.interior.tangent_to_pixel.inverse(xy))
+        t = self._lens.undistort(self.interior.tangent_to_pixel.inverse(xy))
         d = np.concatenate([t, np.ones((*t.shape[:-1], 1))], axis=-1) @ self._axes.T
         d /= np.linalg.norm(d, axis=-1, keepdims=True)
         return np.broadcast_to(self.pose.center, d.shape).copy(), d
@@ -93,8 +108,8 @@ class FrameCamera:
         inner = np.zeros((*t.shape[:-1], 2, 3))
         inner[..., 0, 0] = inner[..., 1, 1] = 1.0
         inner[..., :, 2] = -t
-        real = self._field.distort(t)
-        outer = self.interior.tangent_to_pixel.derivative(real) @ self._field.jacobian(t)
+        real = self._lens.distort(t)
+        outer = self.interior.tangent_to_pixel.derivative(real) @ self._lens.jacobian(t)
         return outer @ (inner / depth[..., None, None]) @ self._axes.T
 
     def matrix(self) -> NDArray[np.float64]:
@@ -105,6 +120,6 @@ class FrameCamera:
         UsageError
             The camera has a lens or a bilinear interior orientation; no matrix holds these.
         """
-        if self._linear is None:
+        if self._linear is None or self.field is not None:
             raise UsageError("only an undistorted camera with affine interior orientation is a matrix")
         return np.concatenate([self._linear.T, -(self.pose.center @ self._linear)[:, None]], axis=1)

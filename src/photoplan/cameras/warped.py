@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from photoplan.cameras.base import ImageField
 from photoplan.cameras.frame import FrameCamera
 from photoplan.errors import UsageError
 
@@ -49,8 +50,18 @@ class WarpedCamera:
         """Width and height of the image in pixels."""
         return self.frame.size
 
+    @property
+    def field(self) -> ImageField | None:
+        """The frame camera's: what happens in the image is the same."""
+        return self.frame.field
+
+    @property
+    def breaks(self) -> None:
+        """Warps are smooth."""
+        return None
+
     def project_homogeneous(self, XYZ: ArrayLike) -> NDArray[np.float64]:
-        """Ground (..., 3) to (x·w, y·w, w), w = depth in the warped space; NaN where a warp is not defined."""
+        """Ground (..., 3) to ideal (x·w, y·w, w), w = depth in the warped space; NaN where a warp is not defined."""
         return self.frame.project_homogeneous(self._warp(XYZ))
 
     def derivatives(self, XYZ: ArrayLike) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Camera
+from photoplan.cameras.base import Projection
 from photoplan.geometry.grid import Window
 
 
@@ -54,5 +54,5 @@ class Reader(Protocol):
 class Source:
     """A row of the table of sources as the engine needs it."""
 
-    camera: Camera
+    camera: Projection
     reader: Reader

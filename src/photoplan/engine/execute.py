@@ -64,11 +64,9 @@ def execute_tile(tile: CompiledTile, sources: Sequence[Source], kernel: str) -> 
         if not len(values):
             values = np.zeros((len(pixels), *tile.relief.shape), pixels.dtype)
         if usable is None or usable.any():
-            anchors = layer.anchors
-            arrays = (anchors.rects, anchors.box_start, anchors.box_heights, anchors.corners)
             border = _border(layer, reader.size)
             owned = ALL_MINE if tile.owner is None else (tile.owner, layer.source + 1)
-            rectify_tile(arrays, tile.relief, pixels, usable, border, kernel, values, valid, owned=owned)
+            rectify_tile(layer.anchors.arrays, tile.relief, pixels, usable, border, kernel, values, valid, owned=owned)
     if not valid.any():
         return Pixels(None, None, None, tile.residual, tile.cells)
     owner = None if tile.owner is None else np.where(valid, tile.owner, np.uint16(0))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Camera, project
+from photoplan.cameras.base import Projection, project
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.surfaces.base import Surface
@@ -20,7 +20,7 @@ from photoplan.targets.base import Target
 
 
 def strict_positions(
-    target: Target, window: Window, camera: Camera, surface: Surface
+    target: Target, window: Window, camera: Projection, surface: Surface
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Image position of every pixel of a window by the strict projection.
 
@@ -36,7 +36,7 @@ def strict_positions(
     return project(camera, target.to_ground(uvh)), uvh
 
 
-def strict_scales(target: Target, camera: Camera, uvh: NDArray[np.float64]) -> NDArray[np.float64]:
+def strict_scales(target: Target, camera: Projection, uvh: NDArray[np.float64]) -> NDArray[np.float64]:
     """Source pixels per target pixel along x and y at constant h, by central differences; shape (..., 2)."""
     step_u, step_v = np.array([0.5, 0, 0]), np.array([0, 0.5, 0])
     du = project(camera, target.to_ground(uvh + step_u)) - project(camera, target.to_ground(uvh - step_u))
@@ -132,7 +132,7 @@ class TwinSource:
     """(bands, rows, cols)"""
     valid: NDArray[np.bool_] | None
     """(rows, cols); None: everywhere."""
-    camera: Camera
+    camera: Projection
     level: int = 0
     """How often it is halved before it is resampled."""
 

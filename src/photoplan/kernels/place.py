@@ -121,7 +121,7 @@ def place_runs(
     Parameters
     ----------
     anchors : tuple
-        rects, box_start, box_heights, corners, as in `rectify_tile`.
+        rects, box_start, box_heights, corners, field_frame, field, as in `rectify_tile`.
     runs : (k, 5) int32
         See `tile_runs`.
     relief : (rows, cols) float32
@@ -142,13 +142,18 @@ def place_runs(
     taps, width, height, solid, border = frame
     corner, first, part, kind, fill = block
     before, shift = max(taps // 2 - 1, 0), np.float32(0.5 if taps == 1 else 0.0)
-    origin, coef = np.empty(2), np.empty((4, 3))
+    origin = np.empty(2)
+    located_by = (
+        origin,
+        np.empty((4, 3)),
+        (np.empty(RUN, np.int32), np.empty(RUN, np.float32), np.empty(RUN, np.float32)),
+    )
     moved, kinds = np.empty((2, RUN), np.float32), np.empty(RUN, np.int32)
     doubtful = 0
     for k in range(runs.shape[0]):
         row, col, n = runs[k, 1] - offset[1], runs[k, 3] - offset[0], runs[k, 4] - runs[k, 3]
         dx, dy = moved[0, :n], moved[1, :n]
-        locate_run(anchors, runs[k], relief[row, col : col + n], (origin, coef), dx, dy)
+        locate_run(anchors, runs[k], relief[row, col : col + n], located_by, dx, dy)
         edges = (
             np.float32(border[0] - origin[0]),
             np.float32(border[1] - origin[1]),

@@ -131,6 +131,53 @@ def _keep_from(
 
 
 @inner
+def _add_field(
+    frame: NDArray[np.float64],
+    nodes: NDArray[np.float32],
+    origin: NDArray[np.float64],
+    work: tuple[Any, ...],
+    dx: NDArray[np.float32],
+    dy: NDArray[np.float32],
+) -> None:
+    """Add the field to the positions of a run, bilinear between nodes; positions beyond the nodes become NaN.
+
+    Two loops: the first finds cells and fractions in vectors, the second gathers.
+    """
+    cell, along_x, along_y = work
+    rows, cols = nodes.shape[0], nodes.shape[1]
+    table = nodes.reshape(-1)
+    first_x = np.float32((origin[0] - frame[0]) * frame[2])
+    first_y = np.float32((origin[1] - frame[1]) * frame[3])
+    per_x, per_y = np.float32(frame[2]), np.float32(frame[3])
+    last_x, last_y, stride = np.float32(cols - 1), np.float32(rows - 1), np.float32(cols)
+    nothing, nowhere = np.float32(0.0), np.float32(np.nan)
+    n = dx.shape[0]
+    for i in range(n):
+        x, y = first_x + dx[i] * per_x, first_y + dy[i] * per_y
+        inside = (x >= nothing) & (x < last_x) & (y >= nothing) & (y < last_y)
+        x = x if inside else nothing
+        y = y if inside else nothing
+        col, row = np.floor(x), np.floor(y)
+        along_x[i], along_y[i] = x - col, y - row
+        cell[i] = np.int32(row * stride + col)
+        dx[i] = dx[i] if inside else nowhere
+        dy[i] = dy[i] if inside else nowhere
+    # Unsigned, or every access would ask for a negative index.
+    below = np.uint64(2 * cols)
+    one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
+    for i in range(n):
+        a = np.uint64(np.uint32(cell[i])) * two
+        b = a + below
+        fx, fy = along_x[i], along_y[i]
+        upper_x = table[a] + fx * (table[a + two] - table[a])
+        upper_y = table[a + one] + fx * (table[a + three] - table[a + one])
+        lower_x = table[b] + fx * (table[b + two] - table[b])
+        lower_y = table[b + one] + fx * (table[b + three] - table[b + one])
+        dx[i] += upper_x + fy * (lower_x - upper_x)
+        dy[i] += upper_y + fy * (lower_y - upper_y)
+
+
+@inner
 def locate_run(
     anchors: tuple[Any, ...],
     run: NDArray[np.int32],
@@ -144,18 +191,18 @@ def locate_run(
     Parameters
     ----------
     anchors : tuple
-        rects, box_start, box_heights, corners, as in `rectify_tile`.
+        rects, box_start, box_heights, corners, field_frame, field, as in `rectify_tile`.
     run : (5,) int32
         A line of `tile_runs`.
     heights : (n,) float32
-    frame : (origin (2,), coef (4, 3))
+    frame : (origin (2,), coef (4, 3), working space for the field)
         Filled: the whole source pixel to be added to dx, dy; the coefficients of the highest box.
     dx, dy : (n,) float32
         Filled. With several boxes piled up, a pixel keeps what the highest box not above it says; heights below the
         lowest box are taken by that one.
     """
-    rects, box_start, box_heights, corners = anchors
-    origin, coef = frame
+    rects, box_start, box_heights, corners, field_frame, field = anchors
+    origin, coef, work = frame
     rect, lowest = rects[run[0]], box_start[run[0]]
     u_ref, edges = middle_of_run(rect, run), row_weights(rect, run[1])
     for box in range(lowest, box_start[run[0] + 1]):
@@ -169,6 +216,8 @@ def locate_run(
             higher = np.empty((2, RUN), np.float32)
             _run_positions(coef, run[3] - u_ref, heights, h_ref, higher[0], higher[1])
             _keep_from(heights, np.float32(box_heights[box, 0]), higher[0], higher[1], dx, dy)
+    if field.size > 0:
+        _add_field(field_frame, field, origin, work, dx, dy)
 
 
 @inner
@@ -252,28 +301,31 @@ def _positions(
     offset: tuple[int, int],
     result: NDArray[Any],
 ) -> None:
-    coef, origin = np.empty((4, 3)), np.empty(2)
+    frame = (
+        np.empty(2),
+        np.empty((4, 3)),
+        (np.empty(RUN, np.int32), np.empty(RUN, np.float32), np.empty(RUN, np.float32)),
+    )
+    origin = frame[0]
     moved = np.empty((2, RUN), np.float32)
     for k in range(runs.shape[0]):
         row, col, n = runs[k, 1] - offset[1], runs[k, 3] - offset[0], runs[k, 4] - runs[k, 3]
         dx, dy = moved[0, :n], moved[1, :n]
-        locate_run(anchors, runs[k], relief[row, col : col + n], (origin, coef), dx, dy)
+        locate_run(anchors, runs[k], relief[row, col : col + n], frame, dx, dy)
         for i in range(n):
             result[row, col + i, 0] = origin[0] + dx[i]
             result[row, col + i, 1] = origin[1] + dy[i]
 
 
 def positions(
-    anchors: tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]],
-    relief: NDArray[np.float32],
-    offset: tuple[int, int] = (0, 0),
+    anchors: tuple[NDArray[Any], ...], relief: NDArray[np.float32], offset: tuple[int, int] = (0, 0)
 ) -> NDArray[np.float32]:
     """Source positions of the pixels of a tile, as the engine uses them.
 
     Parameters
     ----------
     anchors : tuple of arrays
-        rects (m, 4) int32, box_start (m + 1,) int32, box_heights (n, 2) float64, corners (n, 8, 3) float64.
+        See `rectify_tile`.
     relief : ndarray, shape (rows, cols), float32
         Height of every pixel; NaN where there is no surface.
     offset : (column, row)
@@ -282,7 +334,7 @@ def positions(
     Returns
     -------
     ndarray, shape (rows, cols, 2), float32
-        (x, y) in pixels of the source window; NaN where there is no surface or no rectangle.
+        (x, y) in pixels of the source window; NaN where there is no surface, no rectangle, or none of the image.
     """
     result = np.full((*relief.shape, 2), np.nan, np.float32)
     runs = tile_runs(anchors[0], np.arange(len(anchors[0])), offset, relief.shape)

@@ -24,8 +24,8 @@ from photoplan.kernels.position import ALL_MINE, RUN, tile_runs
 from photoplan.kernels.scale import largest_scales, stretch_runs
 from photoplan.kernels.weights import KERNELS, STRETCH_FROM, weight_table
 
-AnchorArrays = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]
-"""rects (m, 4), box_start (m + 1,), box_heights (n, 2), corners (n, 8, 3): the fields of `photoplan.plan.Anchors`."""
+AnchorArrays = tuple[NDArray[Any], ...]
+"""rects (m, 4), box_start (m + 1,), box_heights (n, 2), corners (n, 8, 3), field_frame (5,), field (rows, cols, 2)."""
 
 Owned = tuple[NDArray[np.uint16], int]
 """A raster of the tile's owners, and the one whose pixels are painted."""
@@ -41,7 +41,7 @@ BLOCK = 64
 _LOOK_CLOSER = 0.97 * STRETCH_FROM
 
 
-_ANCHOR_TYPES = (np.int32, np.int32, np.float64, np.float64)
+_ANCHOR_TYPES = (np.int32, np.int32, np.float64, np.float64, np.float64, np.float32)
 
 
 @lru_cache(maxsize=64)
@@ -75,7 +75,8 @@ def rectify_tile(
     Parameters
     ----------
     anchors : tuple of arrays
-        rects (m, 4) int32, box_start (m + 1,) int32, box_heights (n, 2) float64, corners (n, 8, 3) float64.
+        rects (m, 4) int32, box_start (m + 1,) int32, box_heights (n, 2) float64, corners (n, 8, 3) float64,
+        field_frame (5,) float64, field (rows, cols, 2) float32: the fields of `photoplan.plan.Anchors`.
     relief : ndarray, shape (rows, cols), float32
         Height of every pixel, metres; NaN where there is no surface.
     source : ndarray, shape (bands, height, width)
@@ -157,11 +158,12 @@ def _resample(
     result: tuple[Any, ...],
 ) -> None:
     """Rectangles at about the source's scale, and those that are coarser, block by block."""
-    rects, box_start, _, corners = anchors
+    rects, box_start, _, corners, frame, field = anchors
     offset, owned = part
     coarse = np.zeros(len(rects), bool)
     if name != "nearest":
-        coarse = ~(largest_scales(rects, box_start, corners) <= _LOOK_CLOSER)
+        stretch = frame[4] if field.size else 1.0
+        coarse = ~(stretch * largest_scales(rects, box_start, corners) <= _LOOK_CLOSER)
     for averaging in (False, True):
         chosen = np.flatnonzero(coarse == averaging)
         runs = tile_runs(rects, chosen, offset, relief.shape, owned)

@@ -45,34 +45,69 @@ def largest_scales(
 
 
 @inner
-def _run_stretch(
+def _run_slopes(
     coef: NDArray[np.float64],
     slope: NDArray[np.float64],
     u_first: float,
     heights: NDArray[np.float32],
     h_ref: float,
-    component: int,
-    stretch: NDArray[np.float32],
+    slopes: NDArray[np.float32],
 ) -> None:
-    """Widening of the kernel along image x (component 0) or y (1) for the pixels of a run; see `weights.stretch`.
+    """Position and derivatives of the pixels of a run: fills slopes (6, n) with x, ∂x/∂u, ∂x/∂v, y, ∂y/∂u, ∂y/∂v.
 
     coef and slope are the coefficients of the run and of its derivative along v, shifted to its origin. At constant h
     x = X / w has the derivatives ∂x/∂u = (∂X/∂u − x ∂w/∂u) / w, and so along v; jumps of the relief do not enter.
     """
-    x0, x1, x2, x3 = single(coef, component)
     w0, w1, w2, w3 = single(coef, 2)
-    a0, a1, a2, a3 = single(slope, component)
     b0, b1, b2, b3 = single(slope, 2)
     h0, first, one = np.float32(h_ref), np.float32(u_first), np.float32(1.0)
-    begin, full = np.float32(STRETCH_FROM), np.float32(STRETCH_FULL)
+    for c in range(2):
+        x0, x1, x2, x3 = single(coef, c)
+        a0, a1, a2, a3 = single(slope, c)
+        at, along_u, along_v = slopes[3 * c], slopes[3 * c + 1], slopes[3 * c + 2]
+        for i in range(heights.shape[0]):
+            u, h = first + np.float32(np.int32(i)), heights[i] - h0
+            inverse = one / ((w0 + w1 * u) + h * (w2 + w3 * u))
+            x = ((x0 + x1 * u) + h * (x2 + x3 * u)) * inverse
+            at[i] = x
+            along_u[i] = ((x1 + x3 * h) - x * (w1 + w3 * h)) * inverse
+            along_v[i] = (((a0 + a1 * u) + h * (a2 + a3 * u)) - x * ((b0 + b1 * u) + h * (b2 + b3 * u))) * inverse
+
+
+@inner
+def _bend_slopes(
+    frame: NDArray[np.float64],
+    nodes: NDArray[np.float32],
+    origin: NDArray[np.float64],
+    slopes: NDArray[np.float32],
+    count: int,
+) -> None:
+    """Derivatives of positions with the field instead of without; beyond the nodes they stay."""
+    rows, cols = nodes.shape[0], nodes.shape[1]
+    for i in range(count):
+        x = (origin[0] + slopes[0, i] - frame[0]) * frame[2]
+        y = (origin[1] + slopes[3, i] - frame[1]) * frame[3]
+        if not ((x >= 0.0) & (x < cols - 1) & (y >= 0.0) & (y < rows - 1)):
+            continue
+        col, row = np.int64(x), np.int64(y)
+        fx, fy = x - col, y - row
+        xu, xv, yu, yv = slopes[1, i], slopes[2, i], slopes[4, i], slopes[5, i]
+        for c in range(2):
+            a, b = nodes[row, col, c], nodes[row, col + 1, c]
+            d, e = nodes[row + 1, col, c], nodes[row + 1, col + 1, c]
+            by_x = ((b - a) + fy * ((e - d) - (b - a))) * frame[2]
+            by_y = ((d - a) + fx * ((e - b) - (d - a))) * frame[3]
+            slopes[3 * c + 1, i] += by_x * xu + by_y * yu
+            slopes[3 * c + 2, i] += by_x * xv + by_y * yv
+
+
+@inner
+def _widening(along_u: NDArray[np.float32], along_v: NDArray[np.float32], stretch: NDArray[np.float32]) -> None:
+    """Widening of the kernel along one axis of the image for the pixels of a run; see `weights.stretch`."""
+    begin, full, one = np.float32(STRETCH_FROM), np.float32(STRETCH_FULL), np.float32(1.0)
     rate = np.float32((STRETCH_FULL - 1.0) / (STRETCH_FULL - STRETCH_FROM))
-    for i in range(heights.shape[0]):
-        u, h = first + np.float32(np.int32(i)), heights[i] - h0
-        inverse = one / ((w0 + w1 * u) + h * (w2 + w3 * u))
-        x = ((x0 + x1 * u) + h * (x2 + x3 * u)) * inverse
-        along_u = ((x1 + x3 * h) - x * (w1 + w3 * h)) * inverse
-        along_v = (((a0 + a1 * u) + h * (a2 + a3 * u)) - x * ((b0 + b1 * u) + h * (b2 + b3 * u))) * inverse
-        scale = np.sqrt(along_u * along_u + along_v * along_v)
+    for i in range(along_u.shape[0]):
+        scale = np.sqrt(along_u[i] * along_u[i] + along_v[i] * along_v[i])
         partly = one + rate * (scale - begin)
         widened = partly if scale > begin else one
         stretch[i] = scale if scale >= full else widened
@@ -88,8 +123,8 @@ def _stretch_of_run(
     stretch: NDArray[np.float32],
 ) -> None:
     """Fills stretch (2, RUN) along image x and y."""
-    rects, box_start, box_heights, corners = anchors
-    coef, slope, higher = work
+    rects, box_start, box_heights, corners, frame, field = anchors
+    coef, slope, slopes, higher = work
     rect, lowest = rects[run[0]], box_start[run[0]]
     u_ref, edges = middle_of_run(rect, run), row_weights(rect, run[1])
     per_row = 1.0 / (rect[3] - rect[1])
@@ -99,15 +134,19 @@ def _stretch_of_run(
         run_coefficients(rect, box_heights[box], corners[box], u_ref, (-per_row, per_row), slope)
         shift_to(origin, coef)
         shift_to(origin, slope)
-        for c in range(2):
-            if box == lowest:
-                _run_stretch(coef, slope, run[3] - u_ref, heights, h_ref, c, stretch[c])
-            else:
-                _run_stretch(coef, slope, run[3] - u_ref, heights, h_ref, c, higher)
-                low = np.float32(box_heights[box, 0])
-                for i in range(n):
-                    if heights[i] >= low:
-                        stretch[c, i] = higher[i]
+        if box == lowest:
+            _run_slopes(coef, slope, run[3] - u_ref, heights, h_ref, slopes)
+        else:
+            _run_slopes(coef, slope, run[3] - u_ref, heights, h_ref, higher)
+            low = np.float32(box_heights[box, 0])
+            for i in range(n):
+                if heights[i] >= low:
+                    for k in range(6):
+                        slopes[k, i] = higher[k, i]
+    if field.size > 0:
+        _bend_slopes(frame, field, origin, slopes, n)
+    _widening(slopes[1, :n], slopes[2, :n], stretch[0])
+    _widening(slopes[4, :n], slopes[5, :n], stretch[1])
 
 
 @kernel
@@ -129,7 +168,7 @@ def stretch_runs(
     See `place_runs` for the others.
     """
     corner, _, _, kind, fill = block
-    work = (np.empty((4, 3)), np.empty((4, 3)), np.empty(RUN, np.float32))
+    work = (np.empty((4, 3)), np.empty((4, 3)), np.empty((6, RUN), np.float32), np.empty((6, RUN), np.float32))
     origin = np.empty(2)
     count = 0
     for k in range(runs.shape[0]):

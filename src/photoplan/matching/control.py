@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from photoplan.adjustment.robust import MEDIAN_2D, cauchy
-from photoplan.cameras.base import Camera, project
+from photoplan.cameras.base import CentralCamera, project
 from photoplan.kernels.patch_match import CONVERGED, CORRELATION, RESULTS, match_patches, spline_coefficients
 
 Array = NDArray[np.float64]
@@ -178,7 +178,7 @@ def find_patch(patch: Array, picture: Array, least: float = 0.7) -> FoundPatch |
     return FoundPatch((float(r[0]), float(r[1])), r[[9, 10, 10, 11]].reshape(2, 2), float(r[CORRELATION]))
 
 
-def agree(camera: Camera, XYZ: Array, xy: Array, covariances: tuple[Array, Array], reach: float) -> Agreement:
+def agree(camera: CentralCamera, XYZ: Array, xy: Array, covariances: tuple[Array, Array], reach: float) -> Agreement:
     """Which points obey one small change of the camera's position and direction.
 
     A change of the orientation moves the points of an image smoothly; what a wrong match does is its own. Six unknowns
@@ -187,7 +187,7 @@ def agree(camera: Camera, XYZ: Array, xy: Array, covariances: tuple[Array, Array
 
     Parameters
     ----------
-    camera : Camera
+    camera : CentralCamera
         The approximate orientation.
     XYZ : ndarray, shape (n, 3)
         Ground points, metres.
@@ -226,7 +226,7 @@ def agree(camera: Camera, XYZ: Array, xy: Array, covariances: tuple[Array, Array
     return Agreement(keep, residual, (float(middle[0]), float(middle[1])), factor)
 
 
-def _moved(camera: Camera, XYZ: Array, delta: Array) -> tuple[Array, Array]:
+def _moved(camera: CentralCamera, XYZ: Array, delta: Array) -> tuple[Array, Array]:
     """Points as a camera sees them that is moved by delta[:3] and turned by delta[3:], and ∂(x, y)/∂delta (n, 2, 6)."""
     v = XYZ - camera.center - delta[:3]
     angle = float(np.linalg.norm(delta[3:]))
@@ -250,7 +250,7 @@ def _moved(camera: Camera, XYZ: Array, delta: Array) -> tuple[Array, Array]:
 
 
 def _factor(
-    camera: Camera, XYZ: Array, residual: Array, covariances: tuple[Array, Array], keep: NDArray[np.bool_]
+    camera: CentralCamera, XYZ: Array, residual: Array, covariances: tuple[Array, Array], keep: NDArray[np.bool_]
 ) -> float:
     """Factor of the fits' standard deviations with which the residuals, as a whole, are as large as expected."""
     J = camera.derivatives(XYZ[keep])

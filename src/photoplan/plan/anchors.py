@@ -1,8 +1,9 @@
-"""The smooth part of a plan: where the pixels of a tile lie in the source image."""
+"""Where the pixels of a tile lie in the source image: a projective or smooth factor, and a field in the image."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,8 @@ class Anchors:
     """A tile cut into rectangles, each a pile of boxes in (u, v, h) with eight homogeneous corners.
 
     A pixel looks up the box of its rectangle that holds its height, interpolates (x·w, y·w, w) trilinearly and
-    divides once. For an undistorted frame camera over a map this is exact for a box of any size.
+    divides once. For a frame camera over a map this is exact for a box of any size. What the field of the projection
+    adds to the position (a lens) is interpolated between nodes.
     """
 
     rects: NDArray[np.int32]
@@ -27,14 +29,26 @@ class Anchors:
     """(n, 2): lowest and highest h of each box, metres."""
     corners: NDArray[np.float64]
     """(n, 8, 3): (x·w, y·w, w) at corner 4·ih + 2·iv + iu. The corners of a rectangle lie on its pixels' outer edges
-    (first column − 1/2, end column − 1/2); x and y are relative to the first pixel of `source_window`; w > 0 and
-    is scaled to be about 1 inside a tile."""
+    (first column − 1/2, end column − 1/2); x and y are relative to the first pixel of `source_window`, without the
+    field; w > 0 and is scaled to be about 1 inside a tile."""
+    field_frame: NDArray[np.float64]
+    """(5,): x and y of the field's first node, in the coordinates of `corners`; nodes per pixel along x and y; largest
+    factor by which the field makes a distance longer."""
+    field: NDArray[np.float32]
+    """(rows, columns, 2): what is added to x and y at the nodes; (0, 0, 2): the projection has no field. Positions
+    beyond the nodes are not in the image."""
     residual: float
-    """Worst difference to the strict projection measured at the boxes' centre, face and edge middles, pixels."""
+    """Worst difference to the strict position, pixels: of the boxes, measured at their centre, face and edge middles,
+    plus of the field, measured in and beside its cells' middles, and at declared breaks."""
     source_window: Window
     """Part of the source image that holds every position, with the kernel's margin, cut at the image's border."""
     scales: tuple[float, float]
-    """Smallest and largest number of source pixels per target pixel along x or y, at the boxes' corners."""
+    """Smallest and largest number of source pixels per target pixel along x or y."""
+
+    @property
+    def arrays(self) -> tuple[NDArray[Any], ...]:
+        """What the kernels take."""
+        return self.rects, self.box_start, self.box_heights, self.corners, self.field_frame, self.field
 
     def at_level(self, level: int, size: tuple[int, int]) -> Anchors:
         """The same for an image of `size` that is reduced by 2 to the power of `level`; the residual stays as it is."""
@@ -50,4 +64,15 @@ class Anchors:
         for axis, (before, after) in enumerate(((old.col, col), (old.row, row))):
             corners[..., axis] /= f
             corners[..., axis] += ((before + 0.5) / f - 0.5 - after) * corners[..., 2]
-        return replace(self, corners=corners, source_window=window, scales=(self.scales[0] / f, self.scales[1] / f))
+        frame = self.field_frame.copy()
+        for axis, (before, after) in enumerate(((old.col, col), (old.row, row))):
+            frame[axis] = (frame[axis] + before + 0.5) / f - 0.5 - after
+            frame[axis + 2] *= f
+        return replace(
+            self,
+            corners=corners,
+            field_frame=frame,
+            field=self.field / np.float32(f),
+            source_window=window,
+            scales=(self.scales[0] / f, self.scales[1] / f),
+        )

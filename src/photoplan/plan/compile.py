@@ -8,19 +8,22 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from photoplan.cameras.base import Camera
+from photoplan.cameras.base import Projection
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.extent import height_ranges
 from photoplan.plan.anchors import Anchors
+from photoplan.plan.field import FieldGrid, FieldTable, field_grid
 from photoplan.targets.base import Target
 
 #: A rectangle that still reaches behind the camera at this side is left out, pixels.
 SMALLEST_BEHIND = 4
 #: More layers than this over one rectangle do not pay; the residual that is left is reported.
 MOST_LAYERS = 64
+#: Side of the blocks with heights of their own from which the source window is found, target pixels.
+BLOCK = 64
 
 # The 3 × 3 × 3 lattice of a box in (h, v, u): eight corners, and the nineteen probes between them.
 _LATTICE = np.array(list(itertools.product((0.0, 0.5, 1.0), repeat=3)))
@@ -38,11 +41,9 @@ class AnchorRule:
     """How finely a tile is cut."""
 
     tolerance: float
-    """Largest residual of the anchors that is accepted, pixels of the source image."""
+    """Largest residual of anchors and field together that is accepted, pixels of the source image."""
     radius: int
     """Half the support of the resampling kernel at scale 1, pixels: what the source window adds all round."""
-    cell: int
-    """Side of the first rectangles, target pixels; halved where the residual asks for it."""
     reduces: bool = True
     """Whether a source that is much finer than the target is read reduced; not if grey values must stay as they are."""
 
@@ -69,15 +70,30 @@ class _Work:
     layers: NDArray[np.int64]
 
 
+@dataclass(frozen=True)
+class _Image:
+    """The image as the anchors see it: ideal positions."""
+
+    size: tuple[int, int]
+    grid: FieldGrid | None
+    tolerance: float
+    """What of the tolerance is left for the anchors, in ideal pixels."""
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """x_min, y_min, x_max, y_max of all that lies in the image."""
+        return (-0.5, -0.5, self.size[0] - 0.5, self.size[1] - 0.5) if self.grid is None else self.grid.bounds
+
+
 def compile_anchors(
-    camera: Camera, target: Target, window: Window, relief: NDArray[np.float32], rule: AnchorRule
+    projection: Projection, target: Target, window: Window, relief: NDArray[np.float32], rule: AnchorRule
 ) -> Anchors | None:
-    """Cut a tile into boxes whose trilinear homogeneous interpolation meets the tolerance.
+    """Cut a tile into boxes whose trilinear homogeneous interpolation meets the tolerance, and tabulate the field.
 
     Parameters
     ----------
-    camera : Camera
-        The source; called on a few thousand points at most.
+    projection : Projection
+        The source; its first factor is called on a few thousand points at most.
     target : Target
         Where (u, v, h) lies on the ground.
     window : Window
@@ -85,23 +101,27 @@ def compile_anchors(
     relief : ndarray, shape (height, width), float32
         h of every pixel of the tile; NaN where there is no surface.
     rule : AnchorRule
-        Tolerance, kernel radius and first cell.
+        Tolerance and kernel radius. With a field, half of the tolerance is the field's.
 
     Returns
     -------
     Anchors or None
         None if no pixel of the tile can lie in the image.
     """
-    work = _with_heights(_first_rects(window, rule.cell), relief)
+    image = _Image(projection.size, None, rule.tolerance)
+    if projection.field is not None:
+        grid = field_grid(projection.field, projection.size, rule.tolerance / 2)
+        image = _Image(projection.size, grid, rule.tolerance / 2 / grid.stretch)
+    work = _with_heights(np.array([[0, 0, window.width, window.height]], np.int32), relief)
     done: list[tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]] = []
     residual = 0.0
     while len(work.rects):
-        lattice, owner, bounds = _project(camera, target, window, work)
+        lattice, owner, bounds = _project(projection, target, window, work)
         keep, behind = _in_front(lattice, owner, len(work.rects))
         errors = _errors(lattice, owner, len(work.rects))
-        keep &= _touches_image(camera, lattice, owner, rule.radius + 2 * errors[:, 3]) | behind
+        keep &= _touches_image(image, lattice, owner, rule.radius + 2 * errors[:, 3]) | behind
         errors[behind] = np.inf
-        split_u, split_v, thin = _verdict(errors, work, rule.tolerance, behind)
+        split_u, split_v, thin = _verdict(errors, work, image.tolerance, behind)
         settled = keep & ~(split_u | split_v | thin) & ~behind
         if settled.any():
             box = settled[owner]
@@ -115,35 +135,7 @@ def compile_anchors(
             )
             residual = max(residual, float(errors[settled].max()))
         work = _next(work, relief, keep, split_u, split_v, thin)
-    if not done:
-        return None
-    return _assemble(camera, done, residual, rule.radius)
-
-
-def initial_cell(camera: Camera, target: Target, uv: ArrayLike, height: float, side: int, rule: AnchorRule) -> int:
-    """Side of the cells that flat ground needs near (u, v), so that tiles need not find it again by halving.
-
-    It depends on the camera and the target alone, not on the order in which tiles are computed, so that every run
-    gives the same bytes.
-    """
-    u, v = (int(a) for a in np.asarray(uv, float))
-    window = Window(u - side // 2, v - side // 2, side, side)
-    flat = np.full((side, side), height, np.float32)
-    anchors = compile_anchors(camera, target, window, flat, rule)
-    if anchors is None:
-        return side
-    sides = np.sort(anchors.rects[:, 2] - anchors.rects[:, 0])
-    # The side that half of the area needs: starting with it costs the fewest projections.
-    half = np.searchsorted(np.cumsum(sides.astype(float) ** 2), 0.5 * float((sides.astype(float) ** 2).sum()))
-    return int(sides[half])
-
-
-def _first_rects(window: Window, cell: int) -> NDArray[np.int32]:
-    col = np.arange(0, window.width, max(cell, 1))
-    row = np.arange(0, window.height, max(cell, 1))
-    c, r = (g.ravel() for g in np.meshgrid(col, row))
-    ends = np.minimum(c + cell, window.width), np.minimum(r + cell, window.height)
-    return np.stack([c, r, *ends], axis=1).astype(np.int32)
+    return _assemble(image, done, relief, residual, rule.radius) if done else None
 
 
 def _with_heights(
@@ -161,7 +153,7 @@ def _with_heights(
 
 
 def _project(
-    camera: Camera, target: Target, window: Window, work: _Work
+    projection: Projection, target: Target, window: Window, work: _Work
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
     """Strict homogeneous projection of every box's lattice: (boxes, 27, 3), its rectangle, its heights."""
     owner = np.repeat(np.arange(len(work.rects)), work.layers)
@@ -176,7 +168,7 @@ def _project(
     u = rect[:, :1] - 0.5 + fu * (rect[:, 2:3] - rect[:, :1]) + window.col
     v = rect[:, 1:2] - 0.5 + fv * (rect[:, 3:] - rect[:, 1:2]) + window.row
     h = bottom[:, None] + fh * (top - bottom)[:, None]
-    lattice = camera.project_homogeneous(target.to_ground(np.stack([u, v, h], axis=-1)))
+    lattice = projection.project_homogeneous(target.to_ground(np.stack([u, v, h], axis=-1)))
     return lattice, owner, np.stack([bottom, top], axis=1)
 
 
@@ -195,23 +187,23 @@ def _in_front(
 
 
 def _touches_image(
-    camera: Camera, lattice: NDArray[np.float64], owner: NDArray[np.int64], slack: NDArray[np.float64]
+    image: _Image, lattice: NDArray[np.float64], owner: NDArray[np.int64], slack: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """Which rectangles' corners, widened by `slack` pixels, span a part of the image.
 
     With w > 0 the corners bound the interpolation; the strict positions lie beside it by the residual, which is part of
     the slack.
     """
-    corners = lattice[:, _IS_CORNER]
+    corners = lattice[:, _IS_CORNER] if lattice.shape[1] == len(_IS_CORNER) else lattice
     with np.errstate(divide="ignore", invalid="ignore"):
         x, y = corners[..., 0] / corners[..., 2], corners[..., 1] / corners[..., 2]
     around = slack[owner]
-    width, height = camera.size
+    left, top, right, bottom = image.bounds
     inside = (
-        (x.max(axis=1) >= -0.5 - around)
-        & (x.min(axis=1) <= width - 0.5 + around)
-        & (y.max(axis=1) >= -0.5 - around)
-        & (y.min(axis=1) <= height - 0.5 + around)
+        (x.max(axis=1) >= left - around)
+        & (x.min(axis=1) <= right + around)
+        & (y.max(axis=1) >= top - around)
+        & (y.min(axis=1) <= bottom + around)
     )
     return _any_per_rect(inside, owner, len(slack))
 
@@ -278,11 +270,12 @@ def _halved(rects: NDArray[np.int32], in_u: bool, in_v: bool) -> NDArray[np.int3
 
 
 def _assemble(
-    camera: Camera,
+    image: _Image,
     done: list[tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]],
+    relief: NDArray[np.float32],
     residual: float,
     radius: int,
-) -> Anchors:
+) -> Anchors | None:
     box_rects = np.concatenate([d[0] for d in done])
     box_heights = np.concatenate([d[1] for d in done])
     corners = np.concatenate([d[2] for d in done])
@@ -290,27 +283,90 @@ def _assemble(
     order = np.lexsort((box_heights[:, 0], box_rects[:, 0], box_rects[:, 1]))
     box_rects, box_heights, corners = box_rects[order], box_heights[order], corners[order]
     first = np.flatnonzero(np.r_[True, (np.diff(box_rects, axis=0) != 0).any(axis=1)])
-    scales = _scales(box_rects, corners)
-    xy = corners[..., :2] / corners[..., 2:]
-    low, high = xy.min(axis=(0, 1)), xy.max(axis=(0, 1))
-    margin = int(np.ceil(radius * max(1.0, scales[1]))) + 2
-    width, height = camera.size
-    # Clipped before the conversion: far outside the image a position may exceed any integer.
-    col0, row0 = (int(np.clip(np.floor(a) - margin, 0, s)) for a, s in zip(low, (width, height)))
-    col1, row1 = (int(np.clip(np.ceil(a) + margin + 1, 0, s)) for a, s in zip(high, (width, height)))
-    source = Window(col0, row0, max(0, col1 - col0), max(0, row1 - row0))
+    blocks, block_corners = _blocks(box_rects, box_heights, corners, relief)
+    inside = _touches_image(image, block_corners, np.arange(len(blocks)), np.full(len(blocks), radius + 2 * residual))
+    if not inside.any():
+        return None
+    xy = block_corners[inside, :, :2] / block_corners[inside, :, 2:]
+    scales = _scales(blocks[inside], block_corners[inside])
+    table, origin, frame = None, np.zeros(2), np.zeros(5)
+    slack = 0.0
+    if image.grid is not None:
+        table = image.grid.table(xy.min(axis=(0, 1)), xy.max(axis=(0, 1)))
+        scales = scales[0] * max(0.0, 2.0 - image.grid.stretch), scales[1] * image.grid.stretch
+        residual = residual * image.grid.stretch + table.residual
+        slack = _bend(image.grid, table, xy)
+        xy = image.grid.field(xy)
+        origin = table.origin
+    source = _source_window(xy, slack + radius * max(1.0, scales[1]), image.size)
+    origin = np.array([source.col, source.row]) - origin
+    if table is not None and image.grid is not None:
+        frame = np.array([*(table.first - origin), *(1.0 / np.array(image.grid.spacing)), image.grid.stretch])
     corners = corners / corners[..., 2:].mean(axis=1, keepdims=True)
-    corners[..., 0] -= source.col * corners[..., 2]
-    corners[..., 1] -= source.row * corners[..., 2]
+    corners[..., :2] -= origin * corners[..., 2:]
     return Anchors(
         rects=np.ascontiguousarray(box_rects[first]),
         box_start=np.r_[first, len(box_rects)].astype(np.int32),
         box_heights=np.ascontiguousarray(box_heights),
         corners=np.ascontiguousarray(corners),
+        field_frame=frame,
+        field=np.empty((0, 0, 2), np.float32) if table is None else table.nodes,
         residual=residual,
         source_window=source,
         scales=scales,
     )
+
+
+def _blocks(
+    rects: NDArray[np.int32], heights: NDArray[np.float64], corners: NDArray[np.float64], relief: NDArray[np.float32]
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Boxes cut into blocks that have heights of their own: rectangles (m, 4), and corners (m, 8, 3) by the boxes.
+
+    A tile may be one box, but what it needs of the source is what its surface needs, not its box.
+    """
+    large = ((rects[:, 2:] - rects[:, :2]) > BLOCK).any(axis=1)
+    parts = [_parts(rect, BLOCK) for rect in rects[large]]
+    parent = np.r_[np.flatnonzero(~large), np.repeat(np.flatnonzero(large), [len(part) for part in parts])]
+    blocks = np.concatenate([rects[~large], *parts])
+    own = height_ranges(relief, blocks)
+    low, high = np.maximum(own[:, 0], heights[parent, 0]), np.minimum(own[:, 1], heights[parent, 1])
+    there = low <= high
+    parent, blocks, low, high = parent[there], blocks[there], low[there], high[there]
+    start, side = rects[parent, :2, None], rects[parent, 2:, None] - rects[parent, :2, None]
+    fu, fv = np.moveaxis((blocks.reshape(-1, 2, 2).transpose(0, 2, 1) - start) / side, 1, 0)
+    bottom, top = heights[parent].T
+    fh = (np.stack([low, high], axis=1) - bottom[:, None]) / (top - bottom)[:, None]
+    found = corners[parent].reshape(-1, 2, 2, 2, 3)
+    for axis, f in ((1, fh), (2, fv), (3, fu)):
+        a, b = (np.take(found, [i], axis=axis) for i in (0, 1))
+        shape = [len(f), 1, 1, 1, 1]
+        shape[axis] = 2
+        found = a + f.reshape(shape) * (b - a)
+    return blocks, found.reshape(-1, 8, 3)
+
+
+def _parts(rect: NDArray[np.int32], side: int) -> NDArray[np.int32]:
+    """A rectangle cut into smaller ones."""
+    c, r = (g.ravel() for g in np.meshgrid(np.arange(rect[0], rect[2], side), np.arange(rect[1], rect[3], side)))
+    return np.stack([c, r, np.minimum(c + side, rect[2]), np.minimum(r + side, rect[3])], axis=1).astype(np.int32)
+
+
+def _bend(grid: FieldGrid, table: FieldTable, xy: NDArray[np.float64]) -> float:
+    """By how much the field can bend a block's edges beyond its corners, pixels.
+
+    Linear interpolation misses a smooth function by the square of the distance, a bent one by the distance.
+    """
+    reach = np.ptp(xy, axis=1).max(axis=0) / np.array(grid.spacing)
+    return table.residual * max(1.0, float(reach.max())) ** 2
+
+
+def _source_window(xy: NDArray[np.float64], margin: float, size: tuple[int, int]) -> Window:
+    """Whole pixels that hold the positions with a margin, cut at the image's border."""
+    around = int(np.ceil(min(margin, 1e6))) + 2
+    # Clipped before the conversion: far outside the image a position may exceed any integer.
+    col0, row0 = (int(np.clip(np.floor(a) - around, 0, s)) for a, s in zip(np.nanmin(xy, axis=(0, 1)), size))
+    col1, row1 = (int(np.clip(np.ceil(a) + around + 1, 0, s)) for a, s in zip(np.nanmax(xy, axis=(0, 1)), size))
+    return Window(col0, row0, max(0, col1 - col0), max(0, row1 - row0))
 
 
 def _scales(rects: NDArray[np.int32], corners: NDArray[np.float64]) -> tuple[float, float]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Camera, project
+from photoplan.cameras.base import CentralCamera, Projection, project
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.surfaces.base import Surface
 from photoplan.surfaces.intersect import intersect
@@ -45,12 +45,12 @@ def image_border(size: tuple[int, int], per_side: int = 16) -> NDArray[np.float6
     return np.concatenate(sides)
 
 
-def cover(camera: Camera, surface: Surface, terrain_bounds: tuple[float, float, float, float]) -> Coverage:
+def cover(camera: CentralCamera, surface: Surface, terrain_bounds: tuple[float, float, float, float]) -> Coverage:
     """Footprint of an image on a surface.
 
     Parameters
     ----------
-    camera : Camera
+    camera : CentralCamera
     surface : Surface
     terrain_bounds : (float, float, float, float)
         Where the surface may be, in the product's CRS: rays are not followed beyond it.
@@ -70,7 +70,7 @@ def cover(camera: Camera, surface: Surface, terrain_bounds: tuple[float, float, 
 
 
 def _seen_bounds(
-    camera: Camera, surface: Surface, search: tuple[float, float, float, float]
+    camera: CentralCamera, surface: Surface, search: tuple[float, float, float, float]
 ) -> tuple[float, float, float, float] | None:
     """Bounds of the lattice points that fall into the image, refined until they no longer shrink much."""
     bounds: tuple[float, float, float, float] | None = search
@@ -87,7 +87,7 @@ def _seen_bounds(
 
 
 def _one_look(
-    camera: Camera, surface: Surface, bounds: tuple[float, float, float, float]
+    camera: CentralCamera, surface: Surface, bounds: tuple[float, float, float, float]
 ) -> tuple[float, float, float, float] | None:
     xmin, ymin, xmax, ymax = bounds
     x, y = np.linspace(xmin, xmax, LATTICE), np.linspace(ymin, ymax, LATTICE)
@@ -108,7 +108,7 @@ def _one_look(
 
 
 def _around_nadir(
-    camera: Camera, surface: Surface, bounds: tuple[float, float, float, float]
+    camera: CentralCamera, surface: Surface, bounds: tuple[float, float, float, float]
 ) -> tuple[float, float, float, float] | None:
     border = intersect(camera, image_border(camera.size), surface, surface.height_range(bounds))
     there = border[np.isfinite(border[:, 0])]
@@ -121,14 +121,14 @@ def _around_nadir(
     return smaller if (smaller[2] - smaller[0]) < 0.5 * (bounds[2] - bounds[0]) else None
 
 
-def _inside(camera: Camera, XYZ: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _inside(camera: Projection, XYZ: NDArray[np.float64]) -> NDArray[np.bool_]:
     xy = project(camera, XYZ)
     width, height = camera.size
     with np.errstate(invalid="ignore"):
         return (xy[..., 0] >= -0.5) & (xy[..., 0] <= width - 0.5) & (xy[..., 1] >= -0.5) & (xy[..., 1] <= height - 0.5)
 
 
-def covered_tiles(camera: Camera, surface: Surface, grid: MapGrid, tiles: list[Window]) -> list[bool]:
+def covered_tiles(camera: Projection, surface: Surface, grid: MapGrid, tiles: list[Window]) -> list[bool]:
     """Which tiles can hold a pixel of the image, judged from the heights' range under each tile.
 
     A tile is a box in X, Y and height, sampled by a lattice on its top and bottom. If the whole lattice lies beyond
@@ -144,10 +144,9 @@ def covered_tiles(camera: Camera, surface: Surface, grid: MapGrid, tiles: list[W
     lattice[..., 0] = x[:, None, None, :]
     lattice[..., 1] = y[:, None, :, None]
     lattice[..., 2] = ranges[:, :, None, None]
-    h = camera.project_homogeneous(lattice.reshape(len(tiles), -1, 3))
-    front = (h[..., 2] > 0) & np.isfinite(h).all(axis=-1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        xy = h[..., :2] / h[..., 2:]
+    xy = project(camera, lattice.reshape(len(tiles), -1, 3))
+    front = np.asarray(np.isfinite(xy).all(axis=-1))
+    with np.errstate(invalid="ignore"):
         near = (xy.max(axis=1) >= -SLACK).all(axis=-1) & (xy.min(axis=1) <= np.array(camera.size) + SLACK).all(axis=-1)
     # A box that reaches behind the camera is looked at when it is compiled.
     partly = front.any(axis=1) & ~front.all(axis=1)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Camera
+from photoplan.cameras.base import Projection
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.plan.anchors import Anchors
@@ -114,15 +114,15 @@ class ProductPlan:
         return across * down
 
 
-def compile_tile(product: ProductPlan, tile: Tile, cameras: Sequence[Camera], surface: Surface) -> CompiledTile:
-    """Relief, owner and anchors of a tile of a product. Pure: the same inputs give the same bytes.
+def compile_tile(product: ProductPlan, tile: Tile, cameras: Sequence[Projection], surface: Surface) -> CompiledTile:
+    """Relief, owner, anchors and field of a tile of a product. Pure: the same inputs give the same bytes.
 
     Parameters
     ----------
     product : ProductPlan
     tile : Tile
         A tile of the product, or a part of one.
-    cameras : sequence of Camera
+    cameras : sequence of Projection
         One for each row of the product's table of sources.
     surface : Surface
         What the target's depth is taken from.

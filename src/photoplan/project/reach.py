@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Camera
+from photoplan.cameras.base import CentralCamera
 from photoplan.plan.coverage import image_border
 from photoplan.surfaces.base import Surface
 
@@ -24,7 +24,7 @@ _LATTICE = 9
 _ROUNDS = 12
 
 
-def reach(camera: Camera, surface: Surface, bounds: Bounds | None) -> Bounds:
+def reach(camera: CentralCamera, surface: Surface, bounds: Bounds | None) -> Bounds:
     """Map bounds outside of which nothing of the surface can fall into the image.
 
     Rays of the image's border are cut with two levels; between them they stay inside the bounds of these points. If
@@ -33,7 +33,7 @@ def reach(camera: Camera, surface: Surface, bounds: Bounds | None) -> Bounds:
 
     Parameters
     ----------
-    camera : Camera
+    camera : CentralCamera
     surface : Surface
     bounds : (float, float, float, float) or None
         Outer edges of the surface; None: it is everywhere.
@@ -73,7 +73,7 @@ def reach(camera: Camera, surface: Surface, bounds: Bounds | None) -> Bounds:
     return near
 
 
-def _between(camera: Camera, low: float, high: float) -> Bounds:
+def _between(camera: CentralCamera, low: float, high: float) -> Bounds:
     """Bounds of all points that rays of the image pass between two levels."""
     x, y, z = camera.center
     xy = np.concatenate([image_border(camera.size), [[(s - 1) / 2 for s in camera.size]]])
@@ -86,7 +86,7 @@ def _between(camera: Camera, low: float, high: float) -> Bounds:
     return (x + low_xy[0], y + low_xy[1], x + high_xy[0], y + high_xy[1])
 
 
-def _feet(camera: Camera, xy: NDArray[np.float64], level: float) -> NDArray[np.float64]:
+def _feet(camera: CentralCamera, xy: NDArray[np.float64], level: float) -> NDArray[np.float64]:
     """Where rays meet a level, X and Y from the projection centre (n, 2); infinite for those that do not go down."""
     origin, direction = camera.rays(xy, level)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Camera
+from photoplan.cameras.base import CentralCamera
 from photoplan.cameras.build import oriented_camera
 from photoplan.errors import InputError
 from photoplan.geometry.crs import CrsStep
@@ -78,7 +78,7 @@ class Ground:
 class Scene:
     """One image with its camera and the ground below it."""
 
-    camera: Camera
+    camera: CentralCamera
     surface: Surface
     terrain_bounds: tuple[float, float, float, float]
     """Where the surface can be seen from this camera at all."""
@@ -265,7 +265,7 @@ def pose_of(project: Project, image: Image, ground: Ground) -> Pose:
     return Pose(center, stated.R_ground_camera)
 
 
-def _camera(project: Project, image: Image, ground: Ground, size: tuple[int, int]) -> Camera:
+def _camera(project: Project, image: Image, ground: Ground, size: tuple[int, int]) -> CentralCamera:
     description = project.cameras[image.camera]
     stated = image.size or description.size
     if stated is not None and tuple(stated) != size:

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.cameras.base import Camera
+from photoplan.cameras.base import CentralCamera
 from photoplan.surfaces.base import Surface
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.profile import profile
@@ -15,7 +15,7 @@ from photoplan.surfaces.raster import RasterSurface
 
 
 def intersect(
-    camera: Camera,
+    camera: CentralCamera,
     xy: ArrayLike,
     surface: Surface,
     height_range: tuple[float, float],
@@ -26,7 +26,7 @@ def intersect(
 
     Parameters
     ----------
-    camera : Camera
+    camera : CentralCamera
     xy : array_like, shape (n, 2)
         Image points in pixels.
     surface : Surface
@@ -74,7 +74,7 @@ def intersect(
 
 
 def intersect_strict(
-    camera: Camera,
+    camera: CentralCamera,
     xy: ArrayLike,
     surface: HybridSurface | RasterSurface,
     height_range: tuple[float, float],
@@ -87,7 +87,7 @@ def intersect_strict(
 
     Parameters
     ----------
-    camera : Camera
+    camera : CentralCamera
     xy : array_like, shape (n, 2)
         Image points in pixels.
     surface : HybridSurface or RasterSurface
@@ -138,7 +138,7 @@ def _first_hit(
     return np.asarray(upper + t * (lower - upper))
 
 
-def _at_height(camera: Camera, xy: NDArray[np.float64], height: NDArray[np.float64]) -> NDArray[np.float64]:
+def _at_height(camera: CentralCamera, xy: NDArray[np.float64], height: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points of the rays at given heights; NaN for rays that do not go down."""
     origin, direction = camera.rays(xy, float(np.mean(height)))
     with np.errstate(divide="ignore", invalid="ignore"):

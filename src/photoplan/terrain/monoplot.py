@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.cameras.base import Camera, project
+from photoplan.cameras.base import CentralCamera, project
 from photoplan.errors import UsageError
 from photoplan.surfaces.base import Surface
 from photoplan.surfaces.intersect import intersect
@@ -74,7 +74,7 @@ class GroundPoints:
 
 
 def monoplot(
-    camera: Camera,
+    camera: CentralCamera,
     xy: ArrayLike,
     terrain: Surface,
     height_range: tuple[float, float],
@@ -93,7 +93,7 @@ def monoplot(
 
     Parameters
     ----------
-    camera : Camera
+    camera : CentralCamera
     xy : array_like, shape (n, 2)
         Image points, pixels.
     terrain : Surface
@@ -127,7 +127,7 @@ def monoplot(
 
 
 def _before(
-    camera: Camera, xy: NDArray[np.float64], terrain: Surface, height_range: tuple[float, float]
+    camera: CentralCamera, xy: NDArray[np.float64], terrain: Surface, height_range: tuple[float, float]
 ) -> NDArray[np.str_]:
     """Reasons that are known before the terrain is looked at."""
     reasons = np.full(len(xy), "", "U8")
@@ -145,7 +145,7 @@ def _before(
     return reasons
 
 
-def _directions(camera: Camera, xy: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
+def _directions(camera: CentralCamera, xy: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Directions of the rays near some heights, (n, 3)."""
     if not np.isfinite(heights).any():
         return np.full((len(xy), 3), np.nan)
@@ -153,7 +153,7 @@ def _directions(camera: Camera, xy: NDArray[np.float64], heights: NDArray[np.flo
 
 
 def _onto_rays(
-    camera: Camera, xy: NDArray[np.float64], XYZ: NDArray[np.float64], terrain: Surface, mesh: float
+    camera: CentralCamera, xy: NDArray[np.float64], XYZ: NDArray[np.float64], terrain: Surface, mesh: float
 ) -> NDArray[np.float64]:
     """Points moved until they are exactly on their rays, which may be curved, and again on the terrain."""
     out = XYZ.copy()
@@ -174,7 +174,7 @@ def _onto_rays(
     return out
 
 
-def _levels(camera: Camera, xy: NDArray[np.float64], height_range: tuple[float, float], mesh: float) -> int:
+def _levels(camera: CentralCamera, xy: NDArray[np.float64], height_range: tuple[float, float], mesh: float) -> int:
     """Levels at which rays are compared with the terrain, so that none goes more than a mesh sideways in between."""
     direction = _directions(camera, xy, np.full(len(xy), height_range[0]))
     flat = np.hypot(direction[:, 0], direction[:, 1]) / -direction[:, 2]
@@ -197,7 +197,7 @@ def _slope(terrain: Surface, XY: NDArray[np.float64], reach: float) -> NDArray[n
 
 
 def _covariance(
-    camera: Camera, XYZ: NDArray[np.float64], slope: NDArray[np.float64], errors: MonoplotErrors
+    camera: CentralCamera, XYZ: NDArray[np.float64], slope: NDArray[np.float64], errors: MonoplotErrors
 ) -> NDArray[np.float64]:
     """Covariance matrices (n, 3, 3) of ground points."""
     out = np.full((len(XYZ), 3, 3), np.nan)
@@ -226,7 +226,7 @@ def _covariance(
 
 
 def _holes(
-    camera: Camera, xy: NDArray[np.float64], XYZ: NDArray[np.float64], terrain: Surface, high: float
+    camera: CentralCamera, xy: NDArray[np.float64], XYZ: NDArray[np.float64], terrain: Surface, high: float
 ) -> NDArray[np.bool_]:
     """Whether rays cross places without terrain between the highest terrain and the point."""
     crossed = np.zeros(len(xy), bool)

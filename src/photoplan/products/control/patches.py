@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Camera
+from photoplan.cameras.base import CentralCamera
 from photoplan.errors import GeometryError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
@@ -104,7 +104,7 @@ def choose_patches(
 
 def _seen(scene: Scene) -> tuple[shapely.Geometry, tuple[int, int]] | None:
     """Footprint on the level of the ground below."""
-    camera: Camera = scene.camera
+    camera: CentralCamera = scene.camera
     level = float(scene.surface.heights(camera.center[:2]))
     if not np.isfinite(level):
         low, high = scene.surface.height_range(scene.terrain_bounds)

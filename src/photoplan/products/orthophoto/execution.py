@@ -263,7 +263,6 @@ def _record(plan: OrthoPlan, product: OrthoProduct, scene: Scene, run: Run, resu
         "restored": scene.reader.describe() if isinstance(scene.reader, RestoredReader) else None,
         "projection_centre": [float(c) for c in center],
         "gsd_m": product.gsd,
-        "first_cell_px": product.plan.rule.cell,
         "run": {"workers": run.workers, "executor": run.executor, "memory": run.memory},
         "versions": versions(),
         "peak_memory_bytes": peak_memory_bytes(),

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan import __version__
-from photoplan.cameras.base import Camera
+from photoplan.cameras.base import CentralCamera
 from photoplan.engine.base import Source
 from photoplan.engine.execute import Pixels
 from photoplan.engine.execute import render as render_tiles
@@ -24,7 +24,7 @@ from photoplan.io.names import safe_stem
 from photoplan.io.project.model import Project
 from photoplan.io.storage import nodata_for
 from photoplan.kernels.weights import KERNELS
-from photoplan.plan.compile import AnchorRule, initial_cell
+from photoplan.plan.compile import AnchorRule
 from photoplan.plan.coverage import Coverage, cover, covered_tiles, image_border
 from photoplan.plan.product import ProductPlan, Tile
 from photoplan.products.orthophoto.settings import OrthoSettings
@@ -165,11 +165,7 @@ def _plan_one(
     if not tiles:
         return None
     radius = max(1, math.ceil(KERNELS[settings.kernel].taps / 2))
-    rule = AnchorRule(settings.tolerance, radius, settings.tile, reduces=settings.kernel != "nearest")
-    seen = coverage.outline[np.isfinite(coverage.outline).all(axis=1)]
-    if len(seen):
-        x, y, z = seen.mean(axis=0)
-        rule = replace(rule, cell=initial_cell(scene.camera, target, grid.to_pixel((x, y)), z, settings.tile, rule))
+    rule = AnchorRule(settings.tolerance, radius, reduces=settings.kernel != "nearest")
     return ProductPlan(f"{safe_stem(name)}_ortho", (name,), target, settings.tile, rule, tiles)
 
 
@@ -196,14 +192,14 @@ def _key(scene: Scene, plan: ProductPlan, settings: OrthoSettings) -> str:
         "version": __version__,
         "scene": scene.facts,
         "grid": [grid.left, grid.top, grid.resolution, grid.width, grid.height, grid.crs],
-        "rule": [plan.rule.tolerance, plan.rule.radius, plan.rule.cell, plan.tile_side],
+        "rule": [plan.rule.tolerance, plan.rule.radius, plan.tile_side],
         "kernel": settings.kernel,
         "nodata": settings.nodata,
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
 
-def mean_gsd(camera: Camera, coverage: Coverage) -> float:
+def mean_gsd(camera: CentralCamera, coverage: Coverage) -> float:
     """Mean ground sampling distance of an image over its footprint, metres.
 
     At each footprint point it is the square root of the ground area of one image pixel on level ground.

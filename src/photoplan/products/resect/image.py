@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Camera
+from photoplan.cameras.base import CentralCamera
 from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
@@ -210,7 +210,7 @@ def _resected(
     orientation = project.orientation
     below = float(points.XYZ[:, 2].mean()) if len(points) else 0.0
 
-    def camera_of(interior: Interior, lens: Lens, pose: Pose) -> Camera:
+    def camera_of(interior: Interior, lens: Lens, pose: Pose) -> CentralCamera:
         return oriented_camera(
             interior,
             lens,

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import Camera, project
+from photoplan.cameras.base import CentralCamera, project
 from photoplan.cameras.build import oriented_camera
 from photoplan.errors import InputError
 from photoplan.io.names import match_key
@@ -42,7 +42,7 @@ class TieImage:
     grey: GreyImage
     calibration: Calibration | None
     """None: a scan whose marks are not measured."""
-    camera: Camera | None
+    camera: CentralCamera | None
     """Approximate orientation; None: not oriented, or not to be used."""
     level: float
     """Height of the ground below, metres; NaN: not known."""
@@ -121,9 +121,9 @@ def _positions(project_: Project, use: bool) -> dict[str, NDArray[np.float64]]:
     return {match_key(name): XYZ for name, XYZ in zip(table.images, table.XYZ)}
 
 
-def _placed(project_: Project, images: Sequence[Image]) -> tuple[list[Camera | None], list[float]]:
+def _placed(project_: Project, images: Sequence[Image]) -> tuple[list[CentralCamera | None], list[float]]:
     """Cameras of the oriented images, and the height of the ground below each."""
-    cameras: list[Camera | None] = [None] * len(images)
+    cameras: list[CentralCamera | None] = [None] * len(images)
     levels = np.full(len(images), np.nan)
     if project_.terrain is None:
         return cameras, levels.tolist()
