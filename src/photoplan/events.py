@@ -1,4 +1,4 @@
-"""How long work tells what it is at: one protocol for the whole package.
+"""How long work tells what it is at, and is spread over workers: one protocol each for the whole package.
 
 Whoever works calls it; a command shows it on a terminal or writes a line now and then, a test keeps it, most callers
 want nothing of it (`SILENT`).
@@ -6,7 +6,11 @@ want nothing of it (`SILENT`).
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, Protocol
+
+Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
+"""`map`, or one by several workers: results in the order of the items."""
 
 
 class Events(Protocol):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import threading
 import time
@@ -17,6 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from photoplan.engine import executors
 from photoplan.engine.executors import RETRIES, Outcome, SerialExecutor, Workers, executor_factory, run_tiles
 from photoplan.errors import InputError, UsageError
 
@@ -203,6 +205,19 @@ def test_fault_05_a_real_worker_process_dies(tmp_path: Path) -> None:
 def test_unknown_executors_are_refused(kind: str, workers: int, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         executor_factory(kind, workers)
+
+
+def test_no_other_pool_in_the_package() -> None:
+    """Whoever wants workers gets them from the engine: one place for their number, their deaths and interrupts."""
+    source = Path(executors.__file__).parents[1]
+    pools = re.compile(r"ThreadPool|ProcessPool|multiprocessing\.(?!active_children)|from multiprocessing|Thread\(")
+    found = {
+        str(path.relative_to(source))
+        for path in source.rglob("*.py")
+        if path.parent.name != "engine" and pools.search(path.read_text(encoding="utf-8"))
+    }
+    # A thread that ends the process after a signal does no work.
+    assert found == {"cli/interrupt.py"}
 
 
 @pytest.fixture(scope="module")

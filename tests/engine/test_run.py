@@ -173,5 +173,5 @@ def test_memory_bounds_tiles_in_flight() -> None:
     assert tiles_in_flight(8, None, 100, 10) == 8
     assert tiles_in_flight(8, 150, 100, 10) == 5
     assert tiles_in_flight(8, 10**6, 100, 10) == 8
-    with pytest.raises(UsageError, match="--memory 1 MiB; at least 3 MiB"):
+    with pytest.raises(UsageError, match="`memory` 1 MiB; at least 3 MiB"):
         tiles_in_flight(8, 1 << 20, 1 << 20, 2 << 20)

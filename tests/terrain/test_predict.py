@@ -82,7 +82,7 @@ class TestExactInterpolation:
         xyz, way = points(noise=0.1), np.column_stack([np.linspace(5, 55, 61), np.linspace(30, 34, 61)])
         ridge = line(np.column_stack([way, hills(way)]))
         model = built(terrain(xyz, ridge), filters={"mass": 0.1, "breakline": 0.0})
-        (element,) = predict_lines(model.fit, 1)
+        (element,) = predict_lines(model.fit)
         # Every variance gets 1e-8 of the signal's, so that matrices can be factorised.
         assert np.abs(element.xyz[:, 2] - ridge.xyz[:, 2]).max() < 2e-3
 
@@ -154,12 +154,12 @@ def test_lines_share_the_height_of_a_common_vertex() -> None:
     one = line([[10.0, 30, 201], common, [50.0, 33, 202]], name="one")
     two = line([[28.0, 8, 200], common], name="two")
     model = built(terrain(points(noise=0.1), one, two))
-    a, b = predict_lines(model.fit, 1)
+    a, b = predict_lines(model.fit)
     assert a.xyz[1, 2] == b.xyz[1, 2]
 
 
 def test_borders_without_heights_keep_none() -> None:
     ring = np.array([[2.0, 2], [58, 2], [58, 58], [2, 58], [2, 2]])
     border = line(np.column_stack([ring, np.full(5, np.nan)]), "border")
-    (element,) = predict_lines(built(terrain(points(), border)).fit, 1)
+    (element,) = predict_lines(built(terrain(points(), border)).fit)
     assert element.kind == "border" and np.isfinite(element.xyz[:, :2]).all()

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from photoplan.engine.executors import thread_map
 from photoplan.errors import InputError, UsageError
 from photoplan.terrain.visibility import Observer, SightSettings, curvature_drop, horizon, needed_heights
 
@@ -15,7 +16,8 @@ FLAT_EARTH = SightSettings(curvature=False)
 
 def need(heights, mesh, observer, settings=FLAT_EARTH, only_whether=False, workers=1):
     heights = np.asarray(heights, np.float32)
-    return needed_heights(heights, mesh, observer, settings, only_whether=only_whether, workers=workers)
+    with thread_map(workers) as run:
+        return needed_heights(heights, mesh, observer, settings, only_whether=only_whether, run=run)
 
 
 @pytest.mark.parametrize(("column", "row"), [(20.0, 30.0), (20.37, 30.61)])

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from photoplan.engine.executors import thread_map
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
 from photoplan.surfaces.memory_units import MemoryUnits
@@ -28,7 +29,8 @@ def line(xyz: ArrayLike, kind: Any = "breakline", name: str = "line", **more: An
 
 
 def built(measured: MeasuredTerrain, workers: int = 2, **settings: Any) -> Built:
-    return build(plan_build(measured, BuildSettings(**settings)), workers)
+    with thread_map(workers) as run:
+        return build(plan_build(measured, BuildSettings(**settings)), run)
 
 
 def surface_of(model: Built) -> HybridSurface:

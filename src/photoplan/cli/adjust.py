@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from photoplan.cli.options import json_option
-from photoplan.cli.output import show, show_json, talking
+from photoplan.cli.output import show, show_json
 
 if TYPE_CHECKING:
     from photoplan.products.adjust.run import AdjustReport
@@ -40,20 +39,13 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     Measurements are the files that [observations] names. Orientations and calibrated cameras are written into the
     project file (the one before is kept as *.previous.toml), a report and the points into the output folder.
     """
+    from photoplan.cli.telling import Telling
     from photoplan.products.adjust.run import AdjustRequest, adjust_project
-
-    talk = talking(quiet)
-    terminal = sys.stderr.isatty() and not quiet
-
-    def progress(number: int, rms: float) -> None:
-        if terminal:
-            click.echo(f"\r  iteration {number} · weighted residuals {rms:.4g} \033[K", err=True, nl=False)
 
     for name in ("robust", "variance_components", "correlation"):
         options[name] = not options.pop(f"no_{name}")
-    report = adjust_project(AdjustRequest(**options), talk, progress)
-    if terminal:
-        click.echo("\r\033[K", err=True, nl=False)
+    with Telling(quiet) as events:
+        report = adjust_project(AdjustRequest(**options), events)
     if as_json:
         show_json(report.to_dict())
     else:
@@ -62,7 +54,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
         for line in _figures(report):
             show(line)
     for line in _talk(report):
-        talk(line)
+        events.talk(line)
 
 
 def _figures(report: AdjustReport) -> list[str]:

@@ -29,11 +29,12 @@ def command(series: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     SERIES is a TOML file that says which images are what (dark frames, flat frames, scenes …) and how they were
     exposed. Every analysis that they allow is made; the others are listed with what is missing.
     """
-    from photoplan.cli.progress import progress
+    from photoplan.cli.telling import Telling
     from photoplan.products.characterise.run import CharacteriseRequest, characterise
 
     request = CharacteriseRequest(series, **options)
-    report = characterise(request, lambda total: progress(total, quiet, "analyses"))
+    with Telling(quiet) as events:
+        report = characterise(request, events)
     if as_json:
         show_json(report.to_dict())
     else:

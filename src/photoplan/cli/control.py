@@ -44,14 +44,14 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     image points beside them (NAME_points.csv); both become entries of [observations] in PROJECT. Points that do not
     agree on one correction of an image's orientation are left out.
     """
-    import psutil
-
-    from photoplan.cli.progress import progress
+    from photoplan.cli.telling import Telling
+    from photoplan.engine.cpus import available_cpus
     from photoplan.products.control.run import ControlRequest, propose_control
 
-    options["workers"] = options["workers"] or psutil.cpu_count() or 1
+    options["workers"] = options["workers"] or available_cpus()
     request = ControlRequest(**options)
-    found = propose_control(request, lambda words, count: progress(count, quiet, words))
+    with Telling(quiet) as events:
+        found = propose_control(request, events)
     if as_json:
         show_json(found.to_dict())
         return

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from photoplan.cli.options import json_option
-from photoplan.cli.output import show, show_json, talking
+from photoplan.cli.output import show, show_json
 
 if TYPE_CHECKING:
     from photoplan.products.dtm.build import BuildReport, BuildRequest
@@ -55,9 +55,7 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     Least-squares collocation filters the points; slopes break at breaklines. The same command continues a run that was
     interrupted while it wrote.
     """
-    from contextlib import ExitStack
-
-    from photoplan.cli.progress import progress
+    from photoplan.cli.telling import Telling
     from photoplan.products.dtm.build import describe_plan, dtm_build, load, plan_facts
     from photoplan.report.dtm.page import build_page, open_build_report
     from photoplan.report.dtm.samples import build_facts
@@ -65,8 +63,6 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
 
     wanted = options.pop("report")
     request = _request(options)
-
-    talk = talking(quiet)
     if dry_run:
         measured, findings, crs, system = load(request)
         plan = plan_build(measured, request.settings)
@@ -78,17 +74,10 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
             show(f"  {finding.kind}: {finding.text}")
         return
     page = open_build_report(request.output, wanted, request.overwrite)
-    if page is None and wanted is None:
-        talk("no report: it needs matplotlib (pip install 'photoplan[report]')")
-    with ExitStack() as stack:
-
-        def steps(name: str, parts: int) -> Any:
-            stack.close()
-            talk(f"  {name} …")
-            bar = stack.enter_context(progress(parts, quiet, "units"))
-            return lambda done: bar(done, 0)
-
-        built = dtm_build(request, steps, talk)
+    with Telling(quiet) as events:
+        if page is None and wanted is None:
+            events.talk("no report: it needs matplotlib (pip install 'photoplan[report]')")
+        built = dtm_build(request, events)
     report = None
     if page is not None:
         title, seconds = request.output.stem, built.figures["seconds"]
@@ -101,12 +90,11 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     if report is not None:
         show(report)
     for line in _summary(built):
-        talk(line)
+        events.talk(line)
 
 
 def _request(options: dict[str, Any]) -> BuildRequest:
-    import psutil
-
+    from photoplan.engine.cpus import available_cpus
     from photoplan.io.terrain.options import CodeTable, ReadOptions, read_code_table
     from photoplan.products.dtm.build import BuildRequest
     from photoplan.terrain.settings import BuildSettings
@@ -134,7 +122,7 @@ def _request(options: dict[str, Any]) -> BuildRequest:
         gross=options.pop("gross"),
         reach=options.pop("reach"),
     )
-    workers = options.pop("workers") or psutil.cpu_count() or 1
+    workers = options.pop("workers") or available_cpus()
     return BuildRequest(inputs=options.pop("points"), options=reading, settings=settings, workers=workers, **options)
 
 

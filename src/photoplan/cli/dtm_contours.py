@@ -41,9 +41,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     Columns: height, is_index, depression. Higher ground is on a line's right. A post exactly at a level counts as above
     it.
     """
-    from contextlib import ExitStack
-
-    from photoplan.cli.progress import progress
+    from photoplan.cli.telling import Telling
     from photoplan.products.dtm.contours import ContourRequest, make_contours
     from photoplan.report.dtm.contours import contours_picture
     from photoplan.report.page import open_picture
@@ -56,8 +54,8 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
         raise click.UsageError(f"{preview}: the preview has the name of the output; choose another one")
     drawing = open_picture(preview, [options["model"]], overwrite=options["overwrite"])
     request = ContourRequest(options=chosen, sketch=drawing is not None, **options)
-    with ExitStack() as stack:
-        facts = make_contours(request, lambda parts: stack.enter_context(progress(parts, quiet)))
+    with Telling(quiet) as events:
+        facts = make_contours(request, events)
     if drawing is not None:
         drawing.write(contours_picture(facts, drawing.mpl))
     if as_json:

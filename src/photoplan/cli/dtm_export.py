@@ -26,12 +26,12 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     Triangulations hold walls as vertical triangles (LandXML cannot); points are the posts and the lines' vertices.
     """
-    from photoplan.cli.progress import progress
-    from photoplan.products.dtm.export import ExportRequest, dtm_export, export_steps
+    from photoplan.cli.telling import Telling
+    from photoplan.products.dtm.export import ExportRequest, dtm_export
 
     request = ExportRequest(**options)
-    with progress(0 if quiet else export_steps(request), quiet) as report:
-        found = dtm_export(request, report)
+    with Telling(quiet) as events:
+        found = dtm_export(request, events)
     if as_json:
         show_json(found.to_dict())
         return

@@ -66,13 +66,11 @@ def take_request(options: dict[str, Any]) -> Any:
 
 
 def report_picture(make: Callable[[Any], ShadingFacts], as_json: bool, quiet: bool) -> None:
-    """Make a picture under a progress bar, and print what came of it."""
-    from contextlib import ExitStack
+    """Make a picture, and print what came of it."""
+    from photoplan.cli.telling import Telling
 
-    from photoplan.cli.progress import progress
-
-    with ExitStack() as stack:
-        facts = make(lambda tiles: stack.enter_context(progress(tiles, quiet)))
+    with Telling(quiet) as events:
+        facts = make(events)
     if as_json:
         show_json(facts.to_dict())
         return
@@ -98,4 +96,4 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     from photoplan.products.dtm.shading import make_picture, shade_picture
 
     picture, request = shade_picture(take_light(options)), take_request(options)
-    report_picture(lambda begin: make_picture(request, picture, begin), as_json, quiet)
+    report_picture(lambda events: make_picture(request, picture, events), as_json, quiet)

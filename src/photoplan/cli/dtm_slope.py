@@ -25,7 +25,7 @@ def command(percent: bool, classes: str | None, aspect: bool, as_json: bool, qui
         raise click.UsageError("--aspect goes with neither --percent nor --classes")
     picture = aspect_picture() if aspect else slope_picture("percent" if percent else "degrees", _limits(classes))
     request = take_request(options)
-    report_picture(lambda begin: make_picture(request, picture, begin), as_json, quiet)
+    report_picture(lambda events: make_picture(request, picture, events), as_json, quiet)
 
 
 def _limits(text: str | None) -> tuple[float, ...]:

@@ -34,4 +34,4 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     light = take_light(options)
     picture = tint_picture(ramp, span, 0 if classed else steps, light if shade else None, strength)
     request = take_request(options)
-    report_picture(lambda begin: make_picture(request, picture, begin), as_json, quiet)
+    report_picture(lambda events: make_picture(request, picture, events), as_json, quiet)

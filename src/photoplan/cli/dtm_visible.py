@@ -35,10 +35,11 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     Places without terrain block nothing.
     """
-    from photoplan.cli.progress import progress
+    from photoplan.cli.telling import Telling
     from photoplan.products.dtm.visible import VisibleRequest, dtm_visible
 
-    found = dtm_visible(VisibleRequest(**options), lambda observers: progress(observers, quiet))
+    with Telling(quiet) as events:
+        found = dtm_visible(VisibleRequest(**options), events)
     if as_json:
         show_json(found.to_dict())
         return

@@ -32,10 +32,11 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     Cut is where A lies above B. Where one of the models has no height nothing is counted; that area is printed.
     """
-    from photoplan.cli.progress import progress
+    from photoplan.cli.telling import Telling
     from photoplan.products.dtm.volume import VolumeRequest, dtm_volume
 
-    found = dtm_volume(VolumeRequest(**options), lambda windows: progress(windows, quiet))
+    with Telling(quiet) as events:
+        found = dtm_volume(VolumeRequest(**options), events)
     if as_json:
         show_json(found.to_dict())
         return

@@ -39,7 +39,7 @@ def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any)
     IMAGE… are scans, with --camera FILE; or one project file, whose film images are measured and which receives the
     marks. An image that fails does not stop the others; they are listed at the end (exit code 4).
     """
-    from photoplan.cli.progress import progress
+    from photoplan.cli.telling import Telling
     from photoplan.io.names import unique_stems
     from photoplan.plain import plain
     from photoplan.products.fiducials.run import FiducialsRequest, locate_fiducials, scans_of
@@ -54,7 +54,8 @@ def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any)
         for name, stem in unique_stems(files).items():
             place = folder / f"{stem}.fiducials.png"
             pictures[name] = open_picture(place, [*scans, *files.values()], overwrite=overwrite)
-    report = locate_fiducials(request, lambda total: progress(total, quiet, "images"))
+    with Telling(quiet) as events:
+        report = locate_fiducials(request, events)
     drawn = {}
     for image in report.images:
         picture = pictures.get(image.name)

@@ -48,7 +48,7 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any
     if options["pattern"] is not None:
         run_patterns(images, as_json, quiet, options)
         return
-    from photoplan.cli.progress import progress
+    from photoplan.cli.telling import Telling
     from photoplan.products.mtf.result import group_lines
     from photoplan.products.mtf.run import MtfRequest, measure_mtf
     from photoplan.report.mtf.page import mtf_page
@@ -58,7 +58,8 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any
     inputs = [*images, options["linearisation"], options["lab"]]
     page = open_report(options.pop("report"), inputs, overwrite=options["overwrite"], table=options["csv"])
     request = MtfRequest(images, **edge_options(options))
-    report = measure_mtf(request, lambda total: progress(total, quiet, "tiles"), talk)
+    with Telling(quiet) as events:
+        report = measure_mtf(request, events)
     written = page.write(mtf_page(report, page.mpl)) if page is not None and report.images else None
     say_images(report, written, as_json, talk)
     if len(report.images) > 1:

@@ -41,7 +41,7 @@ def command(as_json: bool, quiet: bool, free: str | None, **options: Any) -> Non
     Writes center, angles and their standard deviations into PROJECT. An image that fails does not stop the others;
     they are listed at the end (exit code 4).
     """
-    from photoplan.cli.progress import progress
+    from photoplan.cli.telling import Telling
     from photoplan.products.resect.run import ResectRequest, resect_project
     from photoplan.report.page import open_report
     from photoplan.report.resect import resect_page
@@ -51,8 +51,9 @@ def command(as_json: bool, quiet: bool, free: str | None, **options: Any) -> Non
     overwrite, project = options.pop("overwrite"), options["project"]
     page = open_report(options.pop("report"), given, overwrite=overwrite, project=project)
     request = ResectRequest(free=parameters, **options)
-    with progress(0, quiet, "images") as advance:
-        result = resect_project(request, lambda _: advance(1, 0))
+    with Telling(quiet) as events:
+        events.begin("resection", 0, "images")
+        result = resect_project(request, events)
     report = None if page is None or not result.images else page.write(resect_page(result, page.mpl))
     if as_json:
         show_json(result, report=report)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from photoplan.cli.options import BYTES, json_option
-from photoplan.cli.output import end_with_failures, show, show_json, talking
+from photoplan.cli.output import end_with_failures, show, show_json
 from photoplan.cli.restore_options import filter_options, filter_request
 
 if TYPE_CHECKING:
@@ -46,43 +46,42 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
     camera, and the filter follows from it; it is kept as a file. Noise grows by the figure that is printed first. An
     image that fails does not stop the others (exit code 4). The same command continues a run that was interrupted.
     """
-    import psutil
-
-    from photoplan.cli.progress import progress
+    from photoplan.cli.telling import Telling
+    from photoplan.engine.cpus import available_cpus
     from photoplan.products.restore.filter import FILTER_NAME, keep_filter, requested_filter
     from photoplan.products.restore.run import RestoreRequest, plan_restoration, restore_images
     from photoplan.report.page import open_report
     from photoplan.report.restore.page import restore_page
 
-    talk = talking(quiet)
     if options["chromatic"] not in (None, "measure"):
         options["chromatic"] = Path(options["chromatic"])
     options["quicklook"] = not options.pop("no_quicklook")
-    options["workers"] = options["workers"] or psutil.cpu_count() or 1
+    options["workers"] = options["workers"] or available_cpus()
     asked = filter_request(images, options)
     kept = options.pop("save_filter")
     files = [path for path in (asked.file, options["chromatic"], options["fall_off"]) if isinstance(path, Path)]
     page = open_report(options.pop("report"), [*images, *files], overwrite=options["overwrite"])
-    found = requested_filter(asked, lambda total: progress(total, quiet, "tiles"), talk)
-    request = RestoreRequest(images, asked.file or found.filter, **options)
-    plan = plan_restoration(request)
-    for line in _before(plan):
-        talk(line)
-    if dry_run:
-        _show(plan, as_json)
-        end_with_failures(plan.failed, len(plan.jobs))
-        return
 
-    if asked.design is not None:
-        talk(f"filter: {keep_filter(kept or request.folder / FILTER_NAME, plan.filter, overwrite=request.overwrite)}")
-
-    def finished(image: RestoredImage) -> None:
+    def finished(image: Any) -> None:
         if not as_json:
             show(image.path)
         for line in _after(image):
-            talk(line)
+            events.talk(line)
 
-    report = restore_images(request, lambda total: progress(total, quiet), talk, finished)
+    with Telling(quiet, finished) as events:
+        found = requested_filter(asked, events)
+        request = RestoreRequest(images, asked.file or found.filter, **options)
+        plan = plan_restoration(request)
+        for line in _before(plan):
+            events.talk(line)
+        if dry_run:
+            _show(plan, as_json)
+            end_with_failures(plan.failed, len(plan.jobs))
+            return
+        if asked.design is not None:
+            path = keep_filter(kept or request.folder / FILTER_NAME, plan.filter, overwrite=request.overwrite)
+            events.talk(f"filter: {path}")
+        report = restore_images(request, events)
     written = None
     if page is not None and report.images:
         written = page.write(restore_page(found, plan.jobs, report, page.mpl))

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import click
-import psutil
 
 from photoplan.cli.telling import Telling
+from photoplan.engine.cpus import available_cpus
 from photoplan.errors import TilesFailed
 from photoplan.products.orthophoto.execution import ProductResult, Run, execute
 from photoplan.products.orthophoto.plan import OrthoPlan
@@ -33,7 +33,7 @@ class How:
     def from_options(cls, options: dict[str, Any]) -> How:
         """Take the options of `executing` out of the options of a verb."""
         return cls(
-            workers=options.pop("workers") or psutil.cpu_count() or 1,
+            workers=options.pop("workers") or available_cpus(),
             executor=options.pop("executor"),
             memory=options.pop("memory"),
             overwrite=options.pop("overwrite"),

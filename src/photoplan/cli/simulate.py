@@ -39,10 +39,11 @@ def command(scene: str, as_json: bool, quiet: bool, **options: Any) -> None:
     SCENE is an image file, or a pattern: flat, edge:ANGLE, bars:PERIOD,ANGLE, star:SECTORS, wedge:STEPS or
     discs:PITCH,DIAMETER.
     """
-    from photoplan.cli.progress import progress
+    from photoplan.cli.telling import Telling
     from photoplan.products.simulate.run import SimulateRequest, simulate
 
-    report = simulate(SimulateRequest(scene, **options), lambda total: progress(total, quiet, "images"))
+    with Telling(quiet) as events:
+        report = simulate(SimulateRequest(scene, **options), events)
     if as_json:
         show_json(report.to_dict())
     else:

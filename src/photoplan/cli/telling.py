@@ -43,6 +43,7 @@ class Telling:
         self._drawn = False
         self.results: list[object] = []
         """All results so far."""
+        self._last = self._clock()
         self.begin("")
 
     def __enter__(self) -> Telling:
@@ -57,7 +58,8 @@ class Telling:
         """A phase begins."""
         self._phase, self._units, self._unit = phase, units, unit
         self._finished = self._pixels = 0
-        self._began = self._last = self._clock()
+        self._began = self._clock()
+        self.done(0)
 
     def done(self, units: int = 1, pixels: int = 0) -> None:
         """Count what is done; tell it if that is due."""

@@ -36,9 +36,8 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     They are written as a table (point, image, column, row, standard deviations), which becomes an entry of
     [observations] in PROJECT. Images that hang together with no other are named.
     """
-    import psutil
-
-    from photoplan.cli.progress import progress
+    from photoplan.cli.telling import Telling
+    from photoplan.engine.cpus import available_cpus
     from photoplan.products.tie.run import TieRequest, find_ties
     from photoplan.report.drawing import has_matplotlib
     from photoplan.report.page import open_picture
@@ -46,12 +45,13 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     options["refine"] = not options.pop("no_refine")
     options["use_orientation"] = not options.pop("ignore_orientation")
-    options["workers"] = options["workers"] or psutil.cpu_count() or 1
+    options["workers"] = options["workers"] or available_cpus()
     wanted = not options.pop("no_picture") and not options["dry_run"] and has_matplotlib()
     request = TieRequest(**options)
     place = request.table.with_suffix(".png") if wanted else None
     drawing = open_picture(place, [request.project], overwrite=request.overwrite)
-    found = find_ties(request, lambda words, count: progress(count, quiet, words))
+    with Telling(quiet) as events:
+        found = find_ties(request, events)
     picture = None
     if drawing is not None and found.found is not None:
         picture = drawing.write(TiePlots(drawing.mpl).ties(found.sources, found.found))

@@ -27,6 +27,7 @@ from types import TracebackType
 from typing import Any
 
 from photoplan.errors import PhotoplanError, UsageError
+from photoplan.events import Map
 
 #: How often a tile is tried again after its worker died or an unforeseen error.
 RETRIES = 2
@@ -159,6 +160,21 @@ def _dask_executor(address: str) -> Executor:
     except (OSError, TimeoutError, ValueError) as error:
         raise UsageError(f"executor {address}: no usable Dask scheduler ({error})") from error
     return _DaskExecutor(client)
+
+
+@contextmanager
+def thread_map(workers: int) -> Iterator[Map]:
+    """A `map` over threads; what has not begun is dropped when an error or an interrupt comes."""
+    if workers == 1:
+        yield map
+        return
+    pool = ThreadPoolExecutor(workers, "photoplan")
+    try:
+        yield pool.map
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        raise
+    pool.shutdown()
 
 
 def call(work: Callable[[Any], Any], task: Any) -> Any:

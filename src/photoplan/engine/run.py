@@ -153,7 +153,8 @@ class Runner(Generic[T]):
     events : Events
         Told of tiles that are done, and of each product's result.
     excuse : callable
-        Gets a product and the error it ended with: returns its result, or raises the error to end the run.
+        Gets a product and the error it ended with: returns its result (None: it has none), or raises the error to end
+        the run.
     """
 
     def __init__(
@@ -161,7 +162,7 @@ class Runner(Generic[T]):
         workers: Workers,
         in_flight: int,
         events: Events,
-        excuse: Callable[[Work[T], PhotoplanError], T] | None = None,
+        excuse: Callable[[Work[T], PhotoplanError], T | None] | None = None,
     ) -> None:
         self.results: list[T] = []
         """In the order of the products; complete when the context ends."""
@@ -254,6 +255,7 @@ class Runner(Generic[T]):
 
     def _take(self) -> None:
         work, future = self._completing.popleft()
+        result: T | None
         try:
             result = future.result()
         except PhotoplanError as error:
@@ -261,12 +263,14 @@ class Runner(Generic[T]):
             result = self._excused(work, error)
         self._tell(result)
 
-    def _excused(self, work: Work[T], error: PhotoplanError) -> T:
+    def _excused(self, work: Work[T], error: PhotoplanError) -> T | None:
         if self._excuse is None:
             raise error
         return self._excuse(work, error)
 
-    def _tell(self, result: T) -> None:
+    def _tell(self, result: T | None) -> None:
+        if result is None:
+            return
         self.results.append(result)
         self._events.result(result)
 

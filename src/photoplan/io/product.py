@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
@@ -98,8 +99,9 @@ class ProductFile:
     dtype: np.dtype[Any]
     """uint8, uint16, int16 or float32."""
     _: KW_ONLY
-    run_key: str
-    """A digest of inputs, parameters and version: another key starts afresh."""
+    run_key: str | None
+    """A digest of inputs, parameters and version: another key starts afresh. None: no other run can go on with the
+    tiles, they are forgotten when the context ends."""
     nodata: Nodata = "auto"
     """A value, `mask` for a mask band, or `auto`: 0 for unsigned integers, -32768 for int16, NaN for float32. JPEG
     always takes a mask."""
@@ -156,8 +158,8 @@ class ProductFile:
             # The run before may have finished between the check and the lock.
             check_output(self.path, self.inputs, overwrite=self.overwrite)
             self._remove_parts()
-            key = f"{self.run_key} {self.placement} {self._coder}"
-            self._log = TileLog(self.path.with_name(f".{self.path.name}.tiles"), key)
+            key = f"{self.run_key or secrets.token_hex(16)} {self.placement} {self._coder}"
+            self._log = TileLog(self.log_path, key)
         except BaseException:
             self._lock.release()
             raise
@@ -166,6 +168,8 @@ class ProductFile:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if self.run_key is None:
+            self.discard()
         if self._log is not None:
             self._log.close()
             self._log = None
@@ -175,6 +179,11 @@ class ProductFile:
     def windows(self) -> tuple[Window, ...]:
         """The tiles, row by row; a tile's index is its place here."""
         return self._windows
+
+    @property
+    def log_path(self) -> Path:
+        """Where finished tiles are kept."""
+        return self.path.with_name(f".{self.path.name}.tiles")
 
     @property
     def finished(self) -> frozenset[int]:

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.adjustment.robust import MEDIAN_2D
+from photoplan.events import Map
 from photoplan.matching.grey import Grey
-from photoplan.matching.refine import Map, Matched, RefineSettings, disc, local_affines, match_between
+from photoplan.matching.refine import Matched, RefineSettings, disc, local_affines, match_between
 from photoplan.matching.tracks import Tracks
 
 #: Side of the squares that are dealt out, pixels. Noise of neighbouring pixels is alike: with squares of 4 pixels, a

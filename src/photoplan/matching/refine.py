@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from photoplan.events import Map
 from photoplan.kernels.patch_match import CONVERGED, CORRELATION, RESULTS, match_patches, spline_coefficients
 from photoplan.matching.grey import Grey, patches_at
 from photoplan.matching.tracks import Tracks
@@ -23,8 +23,6 @@ _NEARLY_FINEST = 0.8
 
 #: The mapping of a patch may change by this while it is matched, against the one it starts from: else it is another's.
 _BENT = 0.5
-
-Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
 
 
 @dataclass(frozen=True)

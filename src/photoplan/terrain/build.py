@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,6 +12,7 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
+from photoplan.events import SILENT, Events, Map
 from photoplan.surfaces.measured import MeasuredTerrain
 from photoplan.surfaces.mesh.faces import build_faces
 from photoplan.surfaces.mesh.lines import on_grid
@@ -34,9 +34,6 @@ _ROUND = (1.0, 1.25, 1.6, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
 _ADAPT = 0.25
 #: Units of a model at most: a wider spread of points needs a wider grid.
 _MOST_UNITS = 1_000_000
-
-Steps = Callable[[str, int], Callable[[int], None]]
-"""Called with the name of a step and its number of parts; returns what is called with the parts that are done."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,29 +128,29 @@ def _nice(width: float) -> float:
     return round(float(max(f * power for f in _ROUND if f * power <= width)), 12)
 
 
-def build(plan: BuildPlan, workers: int = 1, steps: Steps | None = None) -> Built:
+def build(plan: BuildPlan, run: Map = map, events: Events = SILENT) -> Built:
     """Compute a model: covariance functions, gross errors, lines, posts, triangles."""
-    steps = steps or (lambda name, parts: lambda done: None)
     settings, layout, seen = plan.settings, plan.layout, plan.seen
     local = replace(layout, left=layout.left - seen.origin[0], top=layout.top - seen.origin[1])
     count = layout.columns * layout.rows
-    found = fit(seen, local, settings, workers, steps("covariance functions and gross errors", 3 * count))
-    lines = predict_lines(found, workers)
+    events.begin("covariance functions and gross errors", 3 * count, "units")
+    found = fit(seen, local, settings, run, events)
+    lines = predict_lines(found, run)
     domain = _domain(plan)
-    report = steps("heights", count)
+    events.begin("heights", count, "units")
     meshes_of = settings.unit_meshes * _finer(plan, lines).ravel()
     posts = each(
         lambda u: _thinned(plan, predict_unit(found, u, domain, int(meshes_of[u]), plan.reach)),
         range(count),
-        workers,
-        report,
+        run,
+        events,
     )
     units = {(u % layout.columns, u // layout.columns): unit for u, unit in enumerate(posts) if unit is not None}
     meshes = np.zeros((layout.rows, layout.columns), np.int64)
     for (column, row), unit in units.items():
         meshes[row, column] = unit.meshes
     lines = [on_grid(line, layout, meshes) for line in lines]
-    units = _with_faces(plan, units, lines, workers, steps)
+    units = _with_faces(plan, units, lines, run, events)
     return Built(plan, found, units, tuple(lines), tuple(_figures(plan, found, units, lines)))
 
 
@@ -194,8 +191,8 @@ def _with_faces(
     plan: BuildPlan,
     units: dict[tuple[int, int], Unit],
     lines: list[LineElement],
-    workers: int,
-    steps: Steps,
+    run: Map,
+    events: Events,
 ) -> dict[tuple[int, int], Unit]:
     layout = plan.layout
     boxes = shapely.STRtree([shapely.LineString(line.xyz[:, :2]) for line in lines])
@@ -217,7 +214,8 @@ def _with_faces(
         faces = build_faces(unit, some, neighbours, plan.polygon)
         return replace(unit, faces=faces)
 
-    done = each(one, range(len(keys)), workers, steps("triangles", len(keys)))
+    events.begin("triangles", len(keys), "units")
+    done = each(one, range(len(keys)), run, events)
     assert layout.side > 0
     return dict(zip(keys, done))
 

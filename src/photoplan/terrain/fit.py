@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.events import SILENT, Events, Map
 from photoplan.kernels.patch_test import score_models, test_points
 from photoplan.surfaces.units import UnitLayout
 from photoplan.terrain.covariance import LADDER, Covariance, estimate_all, estimate_unit, ladder, near_lines
@@ -19,7 +18,6 @@ from photoplan.terrain.neighbours import Neighbours
 from photoplan.terrain.observations import Observations
 from photoplan.terrain.settings import BuildSettings
 
-Progress = Callable[[int], None]
 T = TypeVar("T")
 
 #: A patch reaches this many half sides from the middle of its leaf (see the weights in `photoplan.kernels.patch`).
@@ -69,19 +67,13 @@ class Fit:
         return np.stack([table[unit] for unit in self.leaves.unit[leaves].tolist()])
 
 
-def each(function: Callable[[int], T], items: Sequence[int], workers: int, progress: Progress | None = None) -> list[T]:
-    """`function` of every item, by threads; results in order."""
-    lock = threading.Lock()
-
-    def run(item: int) -> T:
-        result = function(item)
-        if progress is not None:
-            with lock:
-                progress(1)
-        return result
-
-    with ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(run, items))
+def each(function: Callable[[int], T], items: Sequence[int], run: Map = map, events: Events = SILENT) -> list[T]:
+    """`function` of every item, by workers; results in order."""
+    results = []
+    for result in run(function, items):
+        results.append(result)
+        events.done()
+    return results
 
 
 def patches_at(leaves: Leaves, some: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -90,11 +82,11 @@ def patches_at(leaves: Leaves, some: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def fit(
-    seen: Observations, layout: UnitLayout, settings: BuildSettings, workers: int, progress: Progress | None = None
+    seen: Observations, layout: UnitLayout, settings: BuildSettings, run: Map = map, events: Events = SILENT
 ) -> Fit:
     """Estimate the covariance functions, choose among them in every patch, and flag gross errors.
 
-    `progress` is called with 1 three times for each unit.
+    `events` are told of each unit three times.
     """
     vertices = seen.lines.xyz[:, :2]
     leaves = quadtree(np.vstack([seen.xyz[: seen.points, :2], vertices]), layout, settings.unit_meshes)
@@ -104,9 +96,7 @@ def fit(
     unit_of_point = _unit_of(seen.xyz[:, :2], layout)
     members = _members(unit_of_point[: seen.points], count)
     whole = estimate_all(seen, neighbours, members, settings)
-    units = each(
-        lambda u: estimate_unit(seen, neighbours, members[u], whole, settings), range(count), workers, progress
-    )
+    units = each(lambda u: estimate_unit(seen, neighbours, members[u], whole, settings), range(count), run, events)
     mass = np.array([unit.noise for unit in units])
     found = Fit(
         seen=seen,
@@ -121,10 +111,10 @@ def fit(
         spread=np.ones(count),
         members=tuple(members),
     )
-    each(lambda u: _choose(found, u), range(count), workers, progress)
-    each(lambda u: _test(found, leaves.of_unit(u)), range(count), workers, progress)
+    each(lambda u: _choose(found, u), range(count), run, events)
+    each(lambda u: _test(found, leaves.of_unit(u)), range(count), run, events)
     if settings.gross > 0:
-        _flag(found, settings.gross, workers)
+        _flag(found, settings.gross, run)
     return replace(found, spread=_spread(found))
 
 
@@ -192,7 +182,7 @@ def _test(found: Fit, some: NDArray[np.int64]) -> None:
     )
 
 
-def _flag(found: Fit, limit: float, workers: int) -> None:
+def _flag(found: Fit, limit: float, run: Map) -> None:
     """Flag the worst point of each neighbourhood, test the neighbourhood again, until none is left (data snooping).
 
     A point that fits no smooth surface may still show what the terrain is like: a ditch or a stone that no line
@@ -219,7 +209,7 @@ def _flag(found: Fit, limit: float, workers: int) -> None:
         found.noise[flagged] = -1.0
         touched = np.unique(found.neighbours.near[0].query(found.seen.xyz[flagged, :2]))
         leaves = np.unique(_leaf_of(found)[touched])
-        _test_again(found, leaves, workers)
+        _test_again(found, leaves, run)
 
 
 def _supported(found: Fit, suspect: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -232,9 +222,9 @@ def _supported(found: Fit, suspect: NDArray[np.int64]) -> NDArray[np.bool_]:
     return supported
 
 
-def _test_again(found: Fit, leaves: NDArray[np.int64], workers: int) -> None:
+def _test_again(found: Fit, leaves: NDArray[np.int64], run: Map) -> None:
     unit = found.leaves.unit[leaves]
-    each(lambda u: _test(found, leaves[unit == u]), np.unique(unit).tolist(), workers)
+    each(lambda u: _test(found, leaves[unit == u]), np.unique(unit).tolist(), run)
 
 
 def _leaf_of(found: Fit) -> NDArray[np.int64]:

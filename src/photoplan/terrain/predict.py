@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from photoplan.events import Map
 from photoplan.kernels.patch import predict
 from photoplan.surfaces.units import LineElement, Unit
 from photoplan.terrain.domain import Domain
-from photoplan.terrain.fit import REACH, Fit, Progress, each, lines_of, patches_at
+from photoplan.terrain.fit import REACH, Fit, each, lines_of, patches_at
 
 
 def heights_at(
@@ -118,7 +119,7 @@ def predict_unit(fit: Fit, unit: int, domain: Domain, meshes: int, reach: float)
     )
 
 
-def predict_lines(fit: Fit, workers: int, progress: Progress | None = None) -> list[LineElement]:
+def predict_lines(fit: Fit, run: Map = map) -> list[LineElement]:
     """Lines with filtered heights: at each vertex of a breakline the mean of what its two sides say, of a wall each.
 
     Vertices that lines share have one height.
@@ -141,7 +142,7 @@ def predict_lines(fit: Fit, workers: int, progress: Progress | None = None) -> l
         left[some] = np.column_stack([heights[:n], sigmas[:n]])
         right[some] = np.column_stack([heights[n:], sigmas[n:]])
 
-    each(one, np.unique(unit).tolist(), workers, progress)
+    each(one, np.unique(unit).tolist(), run)
     return _elements(fit, left, right)
 
 

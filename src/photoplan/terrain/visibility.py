@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
+from photoplan.events import Map
 from photoplan.kernels.visibility import height_pyramid, sight_rows
 
 #: Rows that one task of a thread computes.
@@ -79,7 +79,7 @@ def needed_heights(
     settings: SightSettings,
     *,
     only_whether: bool,
-    workers: int = 1,
+    run: Map = map,
 ) -> NDArray[np.float32]:
     """Height above ground from which every post of a grid can be seen.
 
@@ -98,8 +98,8 @@ def needed_heights(
     only_whether : bool
         Ask only whether targets of the given height are seen: where they are not, the result is infinite. Several
         times faster.
-    workers : int
-        Threads.
+    run : callable
+        A `map`, perhaps by threads.
 
     Returns
     -------
@@ -129,7 +129,6 @@ def needed_heights(
         rows_here = (first, min(first + ROWS, rows))
         sight_rows(relative, pyramid, eye, rows_here, float(settings.target_height), only_whether, out)
 
-    with ThreadPoolExecutor(workers, "photoplan") as pool:
-        # A list, so that an error of a thread is raised here.
-        list(pool.map(part, range(0, rows, ROWS)))
+    # A list, so that an error of a thread is raised here.
+    list(run(part, range(0, rows, ROWS)))
     return out

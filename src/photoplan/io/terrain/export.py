@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from photoplan import __version__
 from photoplan.errors import PhotoplanError
+from photoplan.events import SILENT, Events
 from photoplan.io.disk import disk_error, sync_file, sync_folder
 from photoplan.io.lock import FileLock
 from photoplan.io.product import check_output
@@ -23,7 +24,6 @@ from photoplan.io.terrain.export_mesh import MeshPart, mesh_parts
 from photoplan.surfaces.units import LineElement, Unit, UnitSource
 
 TIN_SUFFIXES = (".obj", ".ply", ".xml")
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def replacing(path: Path, inputs: Sequence[Path | str] = (), overwrite: bool = F
             raise disk_error(path, error) from error
 
 
-def write_tin(part: Path, kind: str, source: UnitSource, name: str, progress: Progress | None = None) -> ExportFigures:
+def write_tin(part: Path, kind: str, source: UnitSource, name: str, events: Events = SILENT) -> ExportFigures:
     """Write the triangulation of a model.
 
     Parameters
@@ -84,8 +84,8 @@ def write_tin(part: Path, kind: str, source: UnitSource, name: str, progress: Pr
         The units.
     name
         Name of the surface in the file.
-    progress
-        Called with 1 and the number of triangles for each unit.
+    events
+        Told of each unit.
     """
     counts = [0, 0, 0]
 
@@ -94,8 +94,7 @@ def write_tin(part: Path, kind: str, source: UnitSource, name: str, progress: Pr
             counts[0] += len(item.vertices)
             counts[1] += len(item.faces)
             counts[2] += len(item.walls)
-            if progress is not None:
-                progress(1, len(item.faces))
+            events.done()
             yield item
 
     {".obj": _write_obj, ".ply": _write_ply, ".xml": _write_landxml}[kind](part, parts(), name)
@@ -187,7 +186,7 @@ def _word(name: str) -> str:
 
 
 def write_points(
-    part: Path, kind: str, source: UnitSource, lines: Sequence[LineElement], progress: Progress | None = None
+    part: Path, kind: str, source: UnitSource, lines: Sequence[LineElement], events: Events = SILENT
 ) -> ExportFigures:
     """Write the posts and the vertices of the lines as text.
 
@@ -201,8 +200,8 @@ def write_points(
         The units; a post on the edge of two units is written once.
     lines
         Line elements; a two-sided breakline gives its left and then its right heights.
-    progress
-        Called with 1 and the number of posts for each unit.
+    events
+        Told of each unit.
     """
     posts = points = 0
     with part.open("wb") as file:
@@ -212,8 +211,7 @@ def write_points(
             form = "%.4f %.4f %.4f\n" if kind == ".xyz" else "%.4f,%.4f,%.4f,%.4f,post,,,\n"
             file.write(_text(form, rows[:, :3] if kind == ".xyz" else rows))
             posts += len(rows)
-            if progress is not None:
-                progress(1, len(rows))
+            events.done()
         for line in lines:
             for side, z in (("left", line.xyz[:, 2]), ("right", line.right)):
                 if z is None or (side == "left" and not np.isfinite(z).any()):

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rasterio.errors import RasterioError
 from rasterio.windows import Window as GdalWindow
 
+from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import Window
 from photoplan.io.gdal import gdal_settings
 from photoplan.io.terrain.model_tables import GrossError
@@ -129,7 +130,7 @@ def write_heights(
     meshes: int,
     unit: Callable[[int, int], Unit | None],
     crs: str,
-    progress: Callable[[int], None] | None = None,
+    events: Events = SILENT,
 ) -> None:
     """Layer `heights`: the posts as a raster of one grid width, in the extension for gridded coverages.
 
@@ -145,8 +146,8 @@ def write_heights(
         Gives the units.
     crs
         CRS of the layer.
-    progress
-        Called with 1 for each strip of tiles.
+    events
+        Told of each unit.
     """
     width, height = layout.columns * meshes + 1, layout.rows * meshes + 1
     step = layout.side / meshes
@@ -172,8 +173,7 @@ def write_heights(
                     rounded = np.round(posts / np.float32(HEIGHTS_STEP)) * np.float32(HEIGHTS_STEP)
                     stored = np.where(np.isnan(rounded), np.float32(HEIGHTS_NODATA), rounded)
                     file.write(stored, 1, window=GdalWindow(area.col, area.row, area.width, area.height))
-                if progress is not None:
-                    progress(1)
+                events.done()
     except TypeError:
         # rasterio stumbles over its own message where GDAL cannot write the place of a raster.
         raise RasterioError("GDAL could not place the raster of heights") from None

@@ -6,7 +6,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from photoplan.errors import UsageError
+from photoplan.events import SILENT, Events
 from photoplan.io.adjusted_points import write_point_layers, write_residuals
 from photoplan.io.disk import disk_error, write_atomically
 from photoplan.io.product import check_output
@@ -42,8 +43,6 @@ from photoplan.report.adjust.report import adjust_report
 
 #: Files of the output folder.
 OUTPUTS = ("report.html", "report.json", "points.gpkg", "image_points.csv")
-Talk = Callable[[str], None]
-Progress = Callable[[int, float], None]
 
 
 @dataclass(frozen=True)
@@ -89,18 +88,14 @@ class AdjustReport:
         return {"files": [str(path) for path in self.written], **self.data}
 
 
-def adjust_project(
-    request: AdjustRequest, talk: Talk = lambda text: None, progress: Progress = lambda number, rms: None
-) -> AdjustReport:
+def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustReport:
     """Adjust the block of a project and write the result into it.
 
     Parameters
     ----------
     request : AdjustRequest
-    talk : callable
-        Told what is used, before the adjustment.
-    progress : callable
-        Told after each iteration: its number and the root mean square of the weighted residuals.
+    events : Events
+        Told what is used, and of each iteration.
 
     Raises
     ------
@@ -125,11 +120,15 @@ def adjust_project(
     begun = time.perf_counter()
     inputs, starts = started(inputs)
     prepared = prepare(inputs, starts, free)
-    talk(_used(prepared))
+    events.talk(_used(prepared))
     settings = AdjustSettings(
         request.robust, request.critical, request.variance_components, correlation=request.correlation
     )
-    prepared, adjusted = adjust_prepared(prepared, settings, partial(adjust_block, progress=progress))
+
+    def iterated(number: int, rms: float) -> None:
+        events.begin(f"iteration {number} · weighted residuals {rms:.4g}")
+
+    prepared, adjusted = adjust_prepared(prepared, settings, partial(adjust_block, progress=iterated))
     result = map_result(prepared, adjusted)
     title = f"Bundle adjustment of {request.project.resolve().parent.name}"
     facts = build_facts(title, result, settings, time.perf_counter() - begun)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from photoplan.errors import InputError, ResourceError, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.io.disk import write_atomically
 from photoplan.io.named_table import write_named_table
 from photoplan.io.product import check_output
@@ -102,21 +102,17 @@ class CharacteriseReport:
         }
 
 
-def _unwatched(total: int) -> AbstractContextManager[Callable[[int, int], None]]:
-    return nullcontext(lambda parts, pixels: None)
-
-
 def characterise(
     request: CharacteriseRequest,
-    begin: Callable[[int], AbstractContextManager[Callable[[int, int], None]]] = _unwatched,
+    events: Events = SILENT,
 ) -> CharacteriseReport:
     """Run the analyses that a series allows; one that fails does not stop the others.
 
     Parameters
     ----------
     request : CharacteriseRequest
-    begin : callable
-        Gets the number of analyses; what it returns is entered, and called with (1, 0) after each.
+    events : Events
+        Told how far it is.
 
     Raises
     ------
@@ -133,13 +129,13 @@ def characterise(
     _refuse_missing(request, runs)
     if request.dry_run:
         return CharacteriseReport(series, tuple(runs), ())
-    with begin(sum(run.missing is None for run in runs)) as advance:
-        data = with_full_wells(with_grey_step(data))
-        series = data.series
-        for k, run in enumerate(runs):
-            if run.missing is None:
-                runs[k] = _run(run.analysis, data)
-                advance(1, 0)
+    events.begin("analyses", sum(run.missing is None for run in runs), "analyses")
+    data = with_full_wells(with_grey_step(data))
+    series = data.series
+    for k, run in enumerate(runs):
+        if run.missing is None:
+            runs[k] = _run(run.analysis, data)
+            events.done()
     notes = (*step_notes(data), *full_well_notes(data))
     written = _write_tables(request, series, runs)
     if request.report is not None and drawer is not None:

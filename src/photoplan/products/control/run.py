@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.observed import GroundPoints, ImagePoints
+from photoplan.engine.executors import thread_map
 from photoplan.errors import GeometryError, InputError, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.io.ground_points import write_ground_points
 from photoplan.io.image_points import write_image_points
@@ -24,7 +26,6 @@ from photoplan.io.project.model import Project, Terrain
 from photoplan.io.raster import RasterReader
 from photoplan.products.control.match import ImageControl, OrthoPatch, Settings, control_of_image
 from photoplan.products.control.patches import Ortho, choose_patches
-from photoplan.products.tie.work import Stage, threads, unwatched
 from photoplan.project.scene import input_files, open_scene
 
 
@@ -102,7 +103,7 @@ def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def propose_control(request: ControlRequest, stage: Stage = unwatched) -> ControlReport:
+def propose_control(request: ControlRequest, events: Events = SILENT) -> ControlReport:
     """Match patches of an orthophoto in the photos of a project.
 
     Raises
@@ -136,10 +137,11 @@ def propose_control(request: ControlRequest, stage: Stage = unwatched) -> Contro
         return control_of_image(names[k], scenes[k], patches, covariances, settings)
 
     images = []
-    with threads(request.workers) as run, stage("images", len(names)) as done:
+    events.begin("matching", len(names), "images")
+    with thread_map(request.workers) as run:
         for result in run(work, range(len(names))):
             images.append(result)
-            done(1, 0)
+            events.done()
     ground, points = _tables(patches, covariances, images)
     if not len(points):
         found = sum(i.matched for i in images)

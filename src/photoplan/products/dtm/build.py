@@ -6,7 +6,7 @@ import hashlib
 import json
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,9 @@ import numpy as np
 import psutil
 
 from photoplan import __version__
+from photoplan.engine.executors import thread_map
 from photoplan.errors import InputError, ResourceError, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import check_height_system, height_label
 from photoplan.io.product import check_output
@@ -26,7 +28,7 @@ from photoplan.io.terrain.model_write import ModelParts, ModelWriter
 from photoplan.io.terrain.options import ReadOptions
 from photoplan.plain import pick
 from photoplan.surfaces.measured import MeasuredTerrain
-from photoplan.terrain.build import BuildPlan, Built, Steps, build, plan_build
+from photoplan.terrain.build import BuildPlan, Built, build, plan_build
 from photoplan.terrain.clean.run import Finding, clean
 from photoplan.terrain.settings import BuildSettings
 
@@ -93,9 +95,7 @@ def load(request: BuildRequest) -> tuple[MeasuredTerrain, tuple[Finding, ...], s
     return measured, findings, raw.crs, system
 
 
-def dtm_build(
-    request: BuildRequest, steps: Steps | None = None, talk: Callable[[str], None] = lambda text: None
-) -> BuildReport:
+def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
     """Build a terrain model and write it, with its run record.
 
     Raises
@@ -115,11 +115,12 @@ def dtm_build(
     check_output(request.output, request.inputs, overwrite=request.overwrite)
     measured, findings, crs, system = load(request)
     plan = plan_build(measured, request.settings)
-    talk(describe_plan(plan, measured, crs, system))
+    events.talk(describe_plan(plan, measured, crs, system))
     facts = [input_facts(path) for path in request.inputs]
     key = _key(request, facts, plan, crs, system)
     with ModelWriter(request.output, plan.layout, key, request.overwrite, request.inputs) as writer:
-        built = build(plan, request.workers, steps)
+        with thread_map(request.workers) as run:
+            built = build(plan, run, events)
         gross = tuple(_gross(built, measured))
         done = writer.done()
         for of_unit in built.figures:

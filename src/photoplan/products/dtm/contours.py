@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import GeometryError, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.io.contour_file import ContourRow, LabelRow, contour_files, write_contours
 from photoplan.io.product import check_output
 from photoplan.plain import pick
@@ -139,18 +140,15 @@ class _Run:
             yield ContourRow(line.xy, line.height, line.index, line.depression)
 
 
-def make_contours(
-    request: ContourRequest, begin: Callable[[int], Callable[[int, int], None]] | None = None
-) -> ContourFacts:
+def make_contours(request: ContourRequest, events: Events = SILENT) -> ContourFacts:
     """Trace and write contours; memory does not grow with the terrain.
 
     Parameters
     ----------
     request
         What of, where to.
-    begin
-        Called with the number of parts of the terrain before the first one; returns what is called with the numbers of
-        parts and meshes that are finished.
+    events
+        Told of parts of the terrain.
 
     Raises
     ------
@@ -168,8 +166,8 @@ def make_contours(
     facts = ContourFacts([], sketch=ContourSketch(bounds) if request.sketch else None)
     run = _Run(facts, _labeller(request, bounds), request.label_all or request.options.index == 0)
     parts, count = _parts(terrain, request)
-    report = (lambda parts, meshes: None) if begin is None else begin(count)
-    lines = trace_contours(_counted(parts, report), request.options)
+    events.begin("contours", count, "parts")
+    lines = trace_contours(_counted(parts, events), request.options)
     labels = (lambda: facts.labels) if request.labels else None
     facts.files = write_contours(
         request.output, run.rows(lines), labels, terrain.crs, inputs=[request.model], overwrite=request.overwrite
@@ -215,7 +213,7 @@ def _parts(terrain: OpenTerrain, request: ContourRequest) -> tuple[Iterator[Surf
     return parts, -(-(columns - 1) // SIDE) * -(-(rows - 1) // SIDE)
 
 
-def _counted(parts: Iterable[SurfacePart], report: Callable[[int, int], None]) -> Iterator[SurfacePart]:
+def _counted(parts: Iterable[SurfacePart], events: Events) -> Iterator[SurfacePart]:
     for part in parts:
         yield part
-        report(1, (part.heights.shape[0] - 1) * (part.heights.shape[1] - 1))
+        events.done(1, (part.heights.shape[0] - 1) * (part.heights.shape[1] - 1))

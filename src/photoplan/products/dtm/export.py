@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.heights import crs_with_heights
-from photoplan.io.grid_writer import GridOptions, write_grid
 from photoplan.io.product import check_output
 from photoplan.io.terrain.export import TIN_SUFFIXES, replacing, write_points, write_tin
-from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
+from photoplan.products.dtm.raster import GridOptions, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.targets.map import MapTarget
@@ -26,8 +25,6 @@ POINTS = (".xyz", ".csv")
 EXPORTS = (*RASTERS, *TIN_SUFFIXES, *POINTS)
 """Suffixes that are written."""
 _TILE = 512
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -61,8 +58,8 @@ class ExportReport:
         return {"files": [str(path) for path in self.paths], **self.figures}
 
 
-def dtm_export(request: ExportRequest, progress: Progress | None = None) -> ExportReport:
-    """Write a terrain model in another format; `progress` is called with tiles or units, and pixels or triangles.
+def dtm_export(request: ExportRequest, events: Events = SILENT) -> ExportReport:
+    """Write a terrain model in another format.
 
     Raises
     ------
@@ -80,27 +77,19 @@ def dtm_export(request: ExportRequest, progress: Progress | None = None) -> Expo
         raise UsageError(f"{request.sigma}: heights and standard deviations need a file each")
     terrain = open_terrain(request.model, request.crs)
     if kind in RASTERS:
-        return _export_raster(request, terrain, progress)
+        return _export_raster(request, terrain, events)
     if terrain.model is None:
         raise UsageError(f"{request.model}: a raster has no triangles or lines; export it as .tif, or with gdal2xyz")
     reader = terrain.model
+    events.begin(request.output.name, sum(1 for _ in reader.units()), "units")
     with replacing(request.output, [request.model], request.overwrite) as part:
         if kind in POINTS:
-            figures = write_points(part, kind, reader, reader.lines(), progress)
+            figures = write_points(part, kind, reader, reader.lines(), events)
             counts = {"posts": figures.vertices, "line_points": figures.line_points}
         else:
-            figures = write_tin(part, kind, reader, request.model.stem, progress)
+            figures = write_tin(part, kind, reader, request.model.stem, events)
             counts = {"vertices": figures.vertices, "triangles": figures.faces, "wall_triangles": figures.walls}
     return ExportReport((request.output,), counts)
-
-
-def export_steps(request: ExportRequest) -> int:
-    """How often `progress` will be called with 1, for a bar."""
-    if _kind(request) not in RASTERS:
-        return sum(1 for _ in ModelReader(request.model, 0).units()) if is_terrain_model(request.model) else 1
-    grid = _grid(request, open_terrain(request.model, request.crs))
-    tiles = -(-grid.width // _TILE) * -(-grid.height // _TILE)
-    return tiles if request.sigma is None else 2 * tiles
 
 
 def _kind(request: ExportRequest) -> str:
@@ -129,10 +118,10 @@ def _grid(request: ExportRequest, terrain: OpenTerrain) -> MapGrid:
     return MapGrid(xmin - edge, ymax + edge, width, columns, rows, crs)
 
 
-def _export_raster(request: ExportRequest, terrain: OpenTerrain, progress: Progress | None) -> ExportReport:
+def _export_raster(request: ExportRequest, terrain: OpenTerrain, events: Events) -> ExportReport:
     grid, surface = _grid(request, terrain), terrain.surface
     target = MapTarget(grid)
-    options = GridOptions(tile=_TILE, overwrite=request.overwrite, inputs=[request.model], progress=progress)
+    options = GridOptions(tile=_TILE, overwrite=request.overwrite, inputs=[request.model], events=events)
 
     def heights(window: Window) -> NDArray[np.float32]:
         return surface.relief(target, window)[None]

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.io.grid_writer import GridOptions, write_grid
 from photoplan.io.polygons import label_polygons, read_features, write_features
 from photoplan.io.product import check_output
 from photoplan.io.xy_table import read_xy_table
+from photoplan.products.dtm.raster import GridOptions, write_grid
 from photoplan.products.dtm.visible import ROLES, own_grid, read_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.terrain.flow import CELL_BYTES, Flow, FlowMethod, flow_of, snapped

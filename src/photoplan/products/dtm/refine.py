@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import shapely
 
 from photoplan import __version__
 from photoplan.errors import HeightSystemError, InputError, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.heights import check_height_system, height_label
 from photoplan.io.polygons import read_features
@@ -63,7 +63,7 @@ class RefineReport:
         return {"model": str(self.path), **counts, "largest_change": largest}
 
 
-def dtm_refine(request: RefineRequest, progress: Callable[[int, int], None] | None = None) -> RefineReport:
+def dtm_refine(request: RefineRequest, events: Events = SILENT) -> RefineReport:
     """Write the coarse model with the fine one inside the polygons.
 
     Raises
@@ -96,7 +96,8 @@ def dtm_refine(request: RefineRequest, progress: Callable[[int, int], None] | No
         )
         if not units:
             raise InputError(f"{request.polygons}: the polygons touch no unit of {coarse.path}")
-        _add(writer, coarse, units, lines, progress)
+        events.begin("units", coarse.layout.rows * coarse.layout.columns, "units")
+        _add(writer, coarse, units, lines, events)
         reader = writer.finish(_parts(request, coarse, fine, system, polygons, width, lines))
     there = int(np.isfinite(reader.ranges[..., 0]).sum())
     return RefineReport(request.output, there, len(units), len(lines), _largest(coarse, units))
@@ -152,7 +153,7 @@ def _add(
     coarse: ModelReader,
     units: dict[tuple[int, int], Unit],
     lines: tuple[LineElement, ...],
-    progress: Callable[[int, int], None] | None,
+    events: Events,
 ) -> None:
     """All units into the new model."""
     done = writer.done()
@@ -166,8 +167,7 @@ def _add(
                 old, new = coarse.unit(column, row), units.get(at)
                 figures = known.get(at, empty_figures(column, row))
                 writer.add(new or old, figures if new is None else _figures(new, old, figures, boxes))
-            if progress is not None:
-                progress(1, 1)
+            events.done()
 
 
 def _figures(unit: Unit, old: Unit | None, before: UnitFigures, lines: shapely.STRtree) -> UnitFigures:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import UsageError
+from photoplan.events import SILENT, Events
 from photoplan.io.product import check_output
 from photoplan.io.terrain.export import replacing
 from photoplan.io.terrain.points import PointTable, PointTableFormat
@@ -70,7 +70,7 @@ class SampleReport:
         }
 
 
-def dtm_sample(request: SampleRequest, progress: Callable[[int, int], None] | None = None) -> SampleReport:
+def dtm_sample(request: SampleRequest, events: Events = SILENT) -> SampleReport:
     """Write the points' table with two more columns, part by part.
 
     Raises
@@ -90,6 +90,7 @@ def dtm_sample(request: SampleRequest, progress: Callable[[int, int], None] | No
     if taken:
         raise UsageError(f"{request.points}: has a column {taken[0]} already; name the new ones: `names` HEIGHT SIGMA")
     count = outside = known = 0
+    events.begin("points", 0, "points")
     low, high, squares = np.inf, -np.inf, 0.0
     delimiter = table.delimiter
     with (
@@ -109,8 +110,7 @@ def dtm_sample(request: SampleRequest, progress: Callable[[int, int], None] | No
                 low, high = min(low, float(heights[there].min())), max(high, float(heights[there].max()))
             good = sigmas[np.isfinite(sigmas)]
             known, squares = known + len(good), squares + float((good**2).sum())
-            if progress is not None:
-                progress(1, len(heights))
+            events.done(len(heights))
     sigma = float(np.sqrt(squares / known)) if known else np.nan
     if outside == count:
         low = high = np.nan

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from photoplan import __version__
 from photoplan.errors import GeometryError, InputError, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.fingerprint import fingerprint
-from photoplan.io.grid_writer import GridOptions, GridTile, write_grid
 from photoplan.io.product import ProductFacts, check_output
 from photoplan.io.quicklook import write_quicklook
 from photoplan.io.storage import Nodata
+from photoplan.products.dtm.raster import GridOptions, GridTile, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.terrain.shading import run as shading
 from photoplan.terrain.shading import tints as shading_tints
@@ -94,7 +95,7 @@ class ShadingFacts:
 def make_picture(
     request: PictureRequest,
     picture: Callable[[OpenTerrain, MapGrid], Picture],
-    begin: Callable[[int], Callable[[int, int], None]] | None = None,
+    events: Events = SILENT,
 ) -> ShadingFacts:
     """Write a picture of a terrain model; a run that was killed is continued by the same request.
 
@@ -104,9 +105,8 @@ def make_picture(
         What of, where to.
     picture
         Makes the kind of picture for the terrain and the grid: `shade_picture` and its like.
-    begin
-        Called with the number of tiles before the first one; returns what is called with the numbers of tiles and
-        pixels that are finished.
+    events
+        Told of tiles that are finished.
 
     Raises
     ------
@@ -131,7 +131,7 @@ def make_picture(
         workers=request.workers,
         overwrite=request.overwrite,
         inputs=inputs,
-        progress=None if begin is None else begin(sum(1 for _ in grid.window.tiles(GridOptions().tile))),
+        events=events,
         resampling=made.resampling,
         colours=made.colours,
         run_key=key,

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,14 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.engine.cpus import available_cpus
+from photoplan.engine.executors import thread_map
 from photoplan.errors import InputError, ResourceError, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.geometry.crs import same_crs, split_compound
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.local import earth_radius
-from photoplan.io.grid_writer import GridOptions, write_grid
 from photoplan.io.polygons import read_features
 from photoplan.io.product import check_output
 from photoplan.io.xy_table import read_xy_table
+from photoplan.products.dtm.raster import GridOptions, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.visibility import Observer, SightSettings, horizon, needed_heights
@@ -120,12 +121,8 @@ class VisibleReport:
         }
 
 
-def dtm_visible(
-    request: VisibleRequest, progress: Callable[[int], AbstractContextManager[Report]] | None = None
-) -> VisibleReport:
+def dtm_visible(request: VisibleRequest, events: Events = SILENT) -> VisibleReport:
     """Compute and write a visibility map.
-
-    `progress` is given the number of observers, and opens a display of them.
 
     Raises
     ------
@@ -145,8 +142,8 @@ def dtm_visible(
     grid = _grid(request, terrain, places)
     _check_memory(grid, len(places), request)
     heights = read_grid(terrain, grid)
-    with nullcontext() if progress is None else progress(len(places)) as report:
-        bands, rows = _look(request, terrain, grid, heights, places, sight, report)
+    events.begin("lines of sight", len(places), "observers")
+    bands, rows = _look(request, terrain, grid, heights, places, sight, events)
     names = [row.name for row in rows]
     if len(rows) > 1:
         names.insert(0, "least of all" if request.minimum_height else "count")
@@ -155,6 +152,7 @@ def dtm_visible(
         workers=request.workers,
         overwrite=request.overwrite,
         inputs=inputs,
+        events=events,
         resampling="average" if request.minimum_height else "nearest",
     )
 
@@ -259,7 +257,7 @@ def _look(
     heights: NDArray[np.float32],
     places: Sequence[Place],
     sight: SightSettings,
-    report: Report | None,
+    events: Events,
 ) -> tuple[NDArray[Any], list[VisibleRow]]:
     """Bands of the map (sum or least first if there are several observers), and figures."""
     several = len(places) > 1
@@ -272,16 +270,15 @@ def _look(
             raise InputError(f"observer {name} at {X:.10g} {Y:.10g}: {request.model} has no height there")
         column, row = grid.to_pixel((X, Y))
         observer = Observer(float(column), float(row), ground + above, name)
-        need = needed_heights(
-            heights, grid.resolution, observer, sight,
-            only_whether=not request.minimum_height, workers=request.workers or os.cpu_count() or 1,
-        )  # fmt: skip
+        with thread_map(available_cpus() if request.workers is None else request.workers) as run:
+            need = needed_heights(
+                heights, grid.resolution, observer, sight, only_whether=not request.minimum_height, run=run
+            )
         known = np.isfinite(need) | np.isposinf(need)
         seen = need <= request.height_target
         bands[i + several] = need if request.minimum_height else np.where(known, seen, 255)
         rows.append(_row(request, grid, heights, observer, known, seen, (X, Y)))
-        if report is not None:
-            report(1, heights.size)
+        events.done(1, heights.size)
     if several:
         each = bands[1:]
         if request.minimum_height:

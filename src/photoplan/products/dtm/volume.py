@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,11 +12,12 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import HeightSystemError, InputError, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.io.grid_writer import GridOptions, write_grid
 from photoplan.io.polygons import Feature, read_features
 from photoplan.io.product import check_output
+from photoplan.products.dtm.raster import GridOptions, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.targets.map import MapTarget
@@ -104,12 +104,8 @@ class VolumeReport:
         }
 
 
-def dtm_volume(
-    request: VolumeRequest, progress: Callable[[int], AbstractContextManager[Report]] | None = None
-) -> VolumeReport:
+def dtm_volume(request: VolumeRequest, events: Events = SILENT) -> VolumeReport:
     """Volumes from terrain A to terrain B.
-
-    `progress` is given the number of windows that are expected, and opens a display of them.
 
     Raises
     ------
@@ -134,13 +130,13 @@ def dtm_volume(
     settings = VolumeSettings(cell, 0.0 if request.resolution else request.tolerance)
     errors, notes = _errors(request, a, b)
     rows = []
-    with nullcontext() if progress is None else progress(_windows(items, cell)) as report:
-        for item in items:
-            volume = volume_between(a.surface, b.surface, item.geometry, settings, report)
-            sigma = None
-            if errors is not None:
-                sigma = volume_sigma(a.surface, b.surface, errors, item.geometry, cell, request.bias)
-            rows.append(VolumeRow(item.name, volume, sigma))
+    events.begin("volumes", _windows(items, cell), "windows")
+    for item in items:
+        volume = volume_between(a.surface, b.surface, item.geometry, settings, events.done)
+        sigma = None
+        if errors is not None:
+            sigma = volume_sigma(a.surface, b.surface, errors, item.geometry, cell, request.bias)
+        rows.append(VolumeRow(item.name, volume, sigma))
     notes += [note for row in rows for note in _notes(row)]
     if request.difference is not None:
         _write_difference(request, a, b, items, cell, inputs)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from photoplan.errors import InputError, PhotoplanError, ResourceError, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.io.camera.file import read_cameras
 from photoplan.io.camera.model import FilmCamera, FrameCamera
 from photoplan.io.project.edit import ProjectChanges, edit_project
@@ -54,13 +54,9 @@ class _Job:
     layout: MarkLayout
 
 
-def _unwatched(total: int) -> AbstractContextManager[Callable[[int, int], None]]:
-    return nullcontext(lambda images, pixels: None)
-
-
 def locate_fiducials(
     request: FiducialsRequest,
-    begin: Callable[[int], AbstractContextManager[Callable[[int, int], None]]] = _unwatched,
+    events: Events = SILENT,
 ) -> FiducialsReport:
     """Find the fiducial marks of all images; one that fails does not stop the others.
 
@@ -68,8 +64,8 @@ def locate_fiducials(
     ----------
     request : FiducialsRequest
         What is asked.
-    begin : callable
-        Gets the number of images; what it returns is entered, and called with (1, 0) after each image.
+    events : Events
+        Told how far it is.
 
     Raises
     ------
@@ -83,15 +79,15 @@ def locate_fiducials(
     pixel_mm = sum(parse_pitch(request.scan_resolution)) / 2 if request.scan_resolution else None
     results: list[ImageFiducials] = []
     failed: dict[str, str] = {}
-    with begin(len(jobs)) as advance:
-        for job in jobs:
-            try:
-                results.append(_locate(request, job, pixel_mm, project is not None))
-            except ResourceError:
-                raise
-            except PhotoplanError as error:
-                failed[job.name] = str(error)
-            advance(1, 0)
+    events.begin("fiducial marks", len(jobs), "images")
+    for job in jobs:
+        try:
+            results.append(_locate(request, job, pixel_mm, project is not None))
+        except ResourceError:
+            raise
+        except PhotoplanError as error:
+            failed[job.name] = str(error)
+        events.done()
     written = None
     if project is not None and results and not request.dry_run:
         written = request.images[0]

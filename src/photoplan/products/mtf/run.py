@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from photoplan.errors import PhotoplanError, ResourceError, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.io.mtf_file import read_mtf_table
 from photoplan.io.named_table import write_named_table
 from photoplan.products.mtf.groups import group_edges
@@ -58,24 +58,17 @@ class MtfRequest:
     overwrite: bool = False
 
 
-def _unwatched(total: int) -> AbstractContextManager[Callable[[int, int], None]]:
-    return nullcontext(lambda tiles, pixels: None)
-
-
 def measure_mtf(
     request: MtfRequest,
-    begin: Callable[[int], AbstractContextManager[Callable[[int, int], None]]] = _unwatched,
-    talk: Callable[[str], None] = lambda text: None,
+    events: Events = SILENT,
 ) -> MtfReport:
     """Measure the edges of all images; one that fails does not stop the others.
 
     Parameters
     ----------
     request : MtfRequest
-    begin : callable
-        Gets the number of tiles; what it returns is entered, and called with (tiles, pixels) as they are done.
-    talk : callable
-        Called with what a user should know while it goes on.
+    events : Events
+        Told how far it is.
 
     Returns
     -------
@@ -108,16 +101,16 @@ def measure_mtf(
     names = dict(zip(request.images, unique_names(request.images)))
     opened, failed = _opened(request, linearisation, names)
     if request.linearisation is None and any(image.reader.dtype == "uint8" for image in opened.values()):
-        talk(ENCODED)
+        events.talk(ENCODED)
     results: list[ImageMtf] = []
-    with begin(sum(measuring.steps(image) for image in opened.values())) as advance:
-        for path, image in opened.items():
-            try:
-                results.append(measure_image((names[path], path), image, measuring, advance))
-            except (ResourceError, UsageError):
-                raise
-            except PhotoplanError as error:
-                failed[names[path]] = str(error)
+    events.begin("edges", sum(measuring.steps(image) for image in opened.values()), "tiles")
+    for path, image in opened.items():
+        try:
+            results.append(measure_image((names[path], path), image, measuring, events.done))
+        except (ResourceError, UsageError):
+            raise
+        except PhotoplanError as error:
+            failed[names[path]] = str(error)
     done = bool(results)
     made = MtfReport(
         tuple(results),

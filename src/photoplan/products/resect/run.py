@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from photoplan.errors import PhotoplanError, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
@@ -66,14 +67,14 @@ class ResectResult:
         }
 
 
-def resect_project(request: ResectRequest, step: Callable[[str], None] = lambda name: None) -> ResectResult:
+def resect_project(request: ResectRequest, events: Events = SILENT) -> ResectResult:
     """Orient images by control and write the result into the project.
 
     Parameters
     ----------
     request : ResectRequest
-    step : callable
-        Called with the name of every image that is done.
+    events : Events
+        Told of every image.
 
     Raises
     ------
@@ -97,7 +98,7 @@ def resect_project(request: ResectRequest, step: Callable[[str], None] = lambda 
         except PhotoplanError as error:
             text = str(error)
             failed[name] = text if repr(name) in text else f"image {name!r}: {text}"
-        step(name)
+        events.done()
     written = bool(done) and not request.dry_run
     if written:
         edit_project(request.project, _changes(done))

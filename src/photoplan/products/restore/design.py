@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import Window
 from photoplan.products.mtf.image import LightImage
 from photoplan.products.mtf.result import ImageMtf, MtfReport
@@ -102,24 +102,17 @@ class MeasuredFilter:
     """What a user should know: edge enhancement, parts of the field without edges."""
 
 
-def _unwatched(total: int) -> AbstractContextManager[Callable[[int, int], None]]:
-    return nullcontext(lambda tiles, pixels: None)
-
-
 def design_restoration(
     request: DesignRequest,
-    begin: Callable[[int], AbstractContextManager[Callable[[int, int], None]]] = _unwatched,
-    talk: Callable[[str], None] = lambda text: None,
+    events: Events = SILENT,
 ) -> MeasuredFilter:
     """Measure the sharpness of images at their edges, all together, and design the filter that restores them.
 
     Parameters
     ----------
     request : DesignRequest
-    begin : callable
-        Gets the number of tiles; what it returns is entered, and called with (tiles, pixels) as they are done.
-    talk : callable
-        Called with what a user should know while it goes on.
+    events : Events
+        Told how far it is.
 
     Raises
     ------
@@ -137,7 +130,7 @@ def design_restoration(
         least_length=request.least_length,
         grid=1,
     )
-    mtf = measure_mtf(asked, begin, talk)
+    mtf = measure_mtf(asked, events)
     if not mtf.images:
         raise InputError("no image can be measured: " + "; ".join(mtf.failed.values()))
     size = _common_size(mtf.images)

@@ -1,27 +1,27 @@
-"""One image restored by tiles: workers, the log of finished tiles, the product and its record."""
+"""One image restored by tiles: what a tile is, the product and its record."""
 
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from photoplan import __version__
-from photoplan.engine.executors import Workers, executor_factory, run_tiles
+from photoplan.engine.run import Made, Tally, Work
 from photoplan.errors import PhotoplanError
+from photoplan.events import Events
 from photoplan.io.image_form import ImageForm, placement_of
 from photoplan.io.product import ProductFacts, ProductFile
 from photoplan.io.quicklook import write_quicklook
-from photoplan.io.run_record import peak_memory_bytes, record_path, versions, write_run_record
+from photoplan.io.run_record import peak_memory_bytes, record_path, run_times, versions, write_run_record
 from photoplan.io.storage import Nodata
-from photoplan.io.tile_log import TileLog
 from photoplan.plain import pick
+from photoplan.plan.product import Tile
 from photoplan.products.chromatic import model_figures, save_chromatic
 from photoplan.products.restore.request import RestoreRequest
 from photoplan.project.restored_reader import PART, RestoredReader
@@ -132,29 +132,33 @@ def earlier_result(job: Job, settings: dict[str, Any]) -> RestoredImage | None:
         return None
 
 
-def restore_one(
-    job: Job, how: RestoreRequest, in_flight: int, advance: Callable[[int, int], None], talk: Callable[[str], None]
-) -> RestoredImage:
-    """Restore an image, or what an earlier run has left of it.
+@dataclass(frozen=True, eq=False)
+class RestoreJob:
+    """What a worker is told once."""
+
+    reader: RestoredReader
+
+    def __call__(self, tile: Tile) -> Made:
+        """Restored pixels of a tile, and how many were clipped."""
+        pixels = self.reader.read_counted(tile.window)
+        record = {"below": [int(n) for n in pixels.below], "above": [int(n) for n in pixels.above]}
+        return Made(((pixels.values, pixels.valid),), record)
+
+
+def restoration(job: Job, how: RestoreRequest, events: Events) -> Work[RestoredImage | None]:
+    """What there is to do for an image, or for what an earlier run has left of it.
 
     Raises
     ------
-    InputError
-        The image is damaged.
-    PhotoplanError
-        A tile failed again and again; finished tiles are kept.
-    ResourceError
-        Disk or memory ran out; finished tiles are kept.
+    UsageError
+        Its pixels cannot be stored.
     """
-    started = time.perf_counter()
     reader = job.reader
     for note in reader.info.warnings:
-        talk(f"note: {note}")
+        events.talk(f"note: {note}")
     if not reader.restorer.is_compiled:
-        talk("compiling the filter kernels, once (some seconds)")
-    width, height = reader.size
-    counted = _Counted()
-    with ProductFile(
+        events.talk("compiling the filter kernels, once (some seconds)")
+    file = ProductFile(
         job.target,
         placement_of(reader.info),
         reader.bands,
@@ -167,78 +171,51 @@ def restore_one(
         inputs=job.inputs,
         threads=how.workers,
         form=job.form,
-    ) as file:
-        facts = _all_tiles(job, how, file, (in_flight, counted), advance, talk)
-    below, above = counted.sums(reader.bands)
+    )
+    tiles = tuple(Tile(i, window) for i, window in enumerate(file.windows))
+    return Work(
+        name=job.target.stem,
+        job=RestoreJob(reader),
+        tiles=tiles,
+        count=len(tiles),
+        sinks=(file,),
+        complete=partial(_complete, job, how, file, run_times()),
+    )
+
+
+def _complete(
+    job: Job, how: RestoreRequest, file: ProductFile, times: Callable[[], dict[str, Any]], tally: Tally
+) -> RestoredImage:
+    """Give the product its name, its record and its quick look."""
+    if tally.failed:
+        raise PhotoplanError(f"{job.target}: {tally.reasons[0]}; finished tiles are kept")
+    facts = file.complete(_tags(job))
+    reader = job.reader
     if how.chromatic == "measure" and reader.aligned is not None:
         save_chromatic(job.chromatic_file, reader.aligned.model)
+    ran = times()
+    nothing = [0] * reader.bands
     result = RestoredImage(
         reader.info.path.name,
         job.target,
         str(reader.dtype),
         reader.restorer.filter.noise_gain,
-        below,
-        above,
+        tuple(tally.totals.get("below", nothing)),
+        tuple(tally.totals.get("above", nothing)),
         facts.valid_share,
-        width * height,
+        reader.size[0] * reader.size[1],
         job.tiles,
-        counted.resumed,
-        time.perf_counter() - started,
+        tally.resumed,
+        ran["seconds"],
         job.picture if how.quicklook else None,
     )
     # The record first: a disk that is full for the picture does not leave a result without it.
-    write_run_record(record_path(job.target), _record(job, how, result, facts))
+    record = _record(job, how, result, facts)
+    record["run"] |= ran
+    write_run_record(record_path(job.target), record)
     if how.quicklook:
         write_quicklook(job.target, job.picture)
     return result
-
-
-@dataclass
-class _Counted:
-    tiles: dict[int, NDArray[np.int64]] = field(default_factory=dict)
-    resumed: int = 0
-
-    def sums(self, bands: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Clipped pixels of each band, below and above."""
-        total = np.sum(list(self.tiles.values()) or [np.zeros((2, bands), np.int64)], axis=0)
-        return tuple(map(int, total[0])), tuple(map(int, total[1]))
-
-
-def _all_tiles(
-    job: Job,
-    how: RestoreRequest,
-    file: ProductFile,
-    state: tuple[int, _Counted],
-    advance: Callable[[int, int], None],
-    talk: Callable[[str], None],
-) -> ProductFacts:
-    """Bring every tile into the product; those of an earlier run are there already."""
-    in_flight, counted = state
-    bands = job.reader.bands
-    # What was clipped is logged before the tile itself, so that every finished tile has its figures.
-    with TileLog(job.target.with_name(f".{job.target.name}.clipped"), job.key) as log:
-        finished = file.finished & log.finished
-        for index in finished:
-            counted.tiles[index] = np.frombuffer(log.read(index), np.int64).reshape(2, bands)
-        counted.resumed = len(finished)
-        if finished:
-            talk(f"{job.target.stem}: {len(finished)} of {job.tiles} tiles are finished already")
-            advance(len(finished), 0)
-        tasks = [(i, window) for i, window in enumerate(file.windows) if i not in finished]
-        with Workers(executor_factory("threads", how.workers)) as workers:
-            for outcome in run_tiles(tasks, lambda task: job.reader.read_counted(task[1]), workers, in_flight):
-                index, window = outcome.task
-                if outcome.error is not None:
-                    raise PhotoplanError(f"{job.target}: tile {index}: {outcome.error}; finished tiles are kept")
-                pixels = outcome.result
-                clipped = np.array([pixels.below, pixels.above], np.int64)
-                log.append(index, clipped.tobytes())
-                file.append(index, pixels.values, pixels.valid)
-                counted.tiles[index] = clipped
-                advance(1, window.size)
-        facts = file.complete(_tags(job))
-        log.remove()
-    return facts
 
 
 def _tags(job: Job) -> dict[str, str]:

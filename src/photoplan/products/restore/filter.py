@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
@@ -11,6 +9,7 @@ from typing import Literal, cast
 import numpy as np
 
 from photoplan.errors import UsageError
+from photoplan.events import SILENT, Events
 from photoplan.io.filter_file import filter_text
 from photoplan.products.restore.design import DesignRequest, MeasuredFilter, design_restoration
 from photoplan.project.filter_files import entries_of, load_filter, save_filter
@@ -52,18 +51,15 @@ class FoundFilter:
 
 def requested_filter(
     request: FilterRequest,
-    begin: Callable[[int], AbstractContextManager[Callable[[int, int], None]]],
-    talk: Callable[[str], None] = lambda text: None,
+    events: Events = SILENT,
 ) -> FoundFilter:
     """The filter that is asked for.
 
     Parameters
     ----------
     request : FilterRequest
-    begin : callable
-        Gets the number of tiles of a measurement; what it returns is entered, and called with (tiles, pixels).
-    talk : callable
-        Called with what was found, line by line.
+    events : Events
+        Told how far a measurement is, and what was found.
 
     Raises
     ------
@@ -79,9 +75,9 @@ def requested_filter(
     if request.aperture is not None:
         return FoundFilter(_for_aperture(request.aperture), f"the aperture of a scanner, {request.aperture}")
     assert request.design is not None
-    found = design_restoration(request.design, begin, talk)
+    found = design_restoration(request.design, events)
     for line in _lines(found):
-        talk(line)
+        events.talk(line)
     return FoundFilter(found.filter, "edges of the images", found)
 
 

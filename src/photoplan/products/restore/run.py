@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +12,10 @@ from typing import Any, Literal
 import numpy as np
 
 from photoplan import __version__
+from photoplan.engine.executors import Workers, executor_factory
+from photoplan.engine.run import Kept, Runner, Work, run_works, tiles_in_flight
 from photoplan.errors import InputError, PhotoplanError, ResourceError, RunLocked, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.io.filter_file import filter_text
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.image_form import ImageForm, form_of
@@ -24,7 +26,7 @@ from photoplan.io.run_record import record_path
 from photoplan.io.storage import Nodata
 from photoplan.plain import pick
 from photoplan.products.chromatic import load_chromatic, measured_once, model_figures
-from photoplan.products.restore.execute import Job, RestoredImage, earlier_result, memory_of_a_tile, restore_one
+from photoplan.products.restore.execute import Job, RestoredImage, earlier_result, memory_of_a_tile, restoration
 from photoplan.products.restore.request import RestoreRequest
 from photoplan.project.aligned_reader import AlignedReader
 from photoplan.project.fall_off_reader import FallOffFile, FallOffReader, load_fall_off
@@ -37,8 +39,6 @@ from photoplan.quality.restoration.filters import RestorationFilter
 
 #: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
 BASE_MEMORY = 416 * 2**20
-
-Begin = Callable[[int], AbstractContextManager[Callable[[int, int], None]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,39 +197,18 @@ def _check_outputs(job: Job, request: RestoreRequest) -> None:
 
 def _in_flight(request: RestoreRequest, jobs: list[Job]) -> int:
     wanted = request.workers if request.workers == 1 else 2 * request.workers
-    if request.memory is None or not jobs:
-        return wanted
-    each = max(memory_of_a_tile(job.reader) for job in jobs)
-    fits = (request.memory - BASE_MEMORY) // each
-    if fits < 1:
-        raise UsageError(
-            f"`memory` {request.memory / 2**20:.0f} MiB; at least {(BASE_MEMORY + each) / 2**20:.0f} MiB are needed "
-            "for one tile"
-        )
-    return int(min(wanted, fits))
+    each = max((memory_of_a_tile(job.reader) for job in jobs), default=0)
+    return tiles_in_flight(wanted, request.memory if jobs else None, BASE_MEMORY, each)
 
 
-def _unwatched(total: int) -> AbstractContextManager[Callable[[int, int], None]]:
-    return nullcontext(lambda tiles, pixels: None)
-
-
-def restore_images(
-    request: RestoreRequest,
-    begin: Begin = _unwatched,
-    talk: Callable[[str], None] = lambda text: None,
-    finished: Callable[[RestoredImage], None] = lambda image: None,
-) -> RestoreReport:
+def restore_images(request: RestoreRequest, events: Events = SILENT) -> RestoreReport:
     """Restore all images; one that cannot be used does not stop the others.
 
     Parameters
     ----------
     request : RestoreRequest
-    begin : callable
-        Gets the number of tiles; what it returns is entered, and called with (tiles, pixels) that are finished.
-    talk : callable
-        Called with a sentence that a user may want to read while it goes on.
-    finished : callable
-        Called with each image as soon as it is written.
+    events : Events
+        Told of tiles that are done, and of each image as soon as it is written.
 
     Raises
     ------
@@ -245,25 +224,29 @@ def restore_images(
         first = plan.jobs[0].target
         raise UsageError(f"{first}: exists already; choose another output or say `overwrite`")
     _make_folder(request.folder)
-    results, failed = [], dict(plan.failed)
-    with begin(plan.tiles) as advance:
+    failed = dict(plan.failed)
+
+    def works() -> Iterator[Work[RestoredImage | None] | Kept[RestoredImage | None]]:
         for job in plan.jobs:
-            name = job.reader.info.path.name
             found = kept.get(job.target)
             if found is not None:
-                talk(f"{name}: is restored already")
-                advance(job.tiles, 0)
-            else:
-                try:
-                    found = restore_one(job, request, plan.in_flight, advance, talk)
-                except (ResourceError, RunLocked):
-                    raise
-                except PhotoplanError as error:
-                    failed[name] = str(error)
-                    continue
-            results.append(found)
-            finished(found)
-    return RestoreReport(tuple(results), failed, plan.filter, request.folder)
+                events.talk(f"{found.image}: is restored already")
+                yield Kept(found, job.tiles)
+                continue
+            try:
+                yield restoration(job, request, events)
+            except PhotoplanError as error:
+                failed[job.reader.info.path.name] = str(error)
+
+    def excuse(work: Work[RestoredImage | None], error: PhotoplanError) -> None:
+        if isinstance(error, ResourceError | RunLocked):
+            raise error
+        failed[next(job.reader.info.path.name for job in plan.jobs if job.target.stem == work.name)] = str(error)
+
+    events.begin("restoring", plan.tiles)
+    with Workers(executor_factory("threads", request.workers)) as workers:
+        results = run_works(works(), Runner(workers, plan.in_flight, events, excuse))
+    return RestoreReport(tuple(r for r in results if r is not None), failed, plan.filter, request.folder)
 
 
 def _make_folder(folder: Path) -> None:

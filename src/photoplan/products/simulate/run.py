@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError, ResourceError, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import Window
 from photoplan.io.product import check_output
 from photoplan.io.raster import RasterReader
@@ -151,21 +151,17 @@ class FileScene:
         return np.pad(values, ((0, 0), (before[0], after[0]), (before[1], after[1])), mode="edge")
 
 
-def _unwatched(total: int) -> AbstractContextManager[Callable[[int, int], None]]:
-    return nullcontext(lambda images, pixels: None)
-
-
 def simulate(
     request: SimulateRequest,
-    begin: Callable[[int], AbstractContextManager[Callable[[int, int], None]]] = _unwatched,
+    events: Events = SILENT,
 ) -> SimulateReport:
     """Form images of a scene and write them.
 
     Parameters
     ----------
     request : SimulateRequest
-    begin : callable
-        Gets the number of frames; what it returns is entered, and called with (1, pixels) after each.
+    events : Events
+        Told how far it is.
 
     Raises
     ------
@@ -183,11 +179,11 @@ def simulate(
     if request.dry_run:
         images = [SimulatedImage(p, n, e, 1.0, {}) for n, (p, e) in enumerate(zip(paths, exposures))]
     else:
-        with begin(len(paths)) as advance:
-            for path, exposure, formed in zip(paths, exposures, _frames(model, scene, exposures)):
-                write_whole_image(path, formed.values.astype(dtype, copy=False), _tags(request, model, len(images)))
-                images.append(SimulatedImage(path, len(images), exposure, formed.gain, dict(formed.facts)))
-                advance(1, scene.size[0] * scene.size[1])
+        events.begin("images", len(paths), "images")
+        for path, exposure, formed in zip(paths, exposures, _frames(model, scene, exposures)):
+            write_whole_image(path, formed.values.astype(dtype, copy=False), _tags(request, model, len(images)))
+            images.append(SimulatedImage(path, len(images), exposure, formed.gain, dict(formed.facts)))
+            events.done(1, scene.size[0] * scene.size[1])
     mtf50 = (model_mtf50(model, 0.0), model_mtf50(model, 90.0))
     notes = tuple(_notes(scene, dtype, images))
     report = SimulateReport(tuple(images), scene.size, scene.bands, dtype, mtf50, notes, record)

@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 
 from photoplan.cameras.observed import ImagePoints
+from photoplan.engine.executors import thread_map
 from photoplan.errors import GeometryError, UsageError
+from photoplan.events import SILENT, Events, Map
 from photoplan.io.image_points import write_image_points
 from photoplan.io.product import check_output
 from photoplan.io.project.edit import ProjectChanges, edit_project
@@ -29,13 +31,9 @@ from photoplan.products.init.match import some
 from photoplan.products.tie.inputs import TieImage, chosen_pairs, open_images
 from photoplan.products.tie.work import (
     FeatureStore,
-    Map,
-    Stage,
     find_features,
     find_pairs,
     like_pairs,
-    threads,
-    unwatched,
 )
 from photoplan.project.scene import input_files
 
@@ -127,7 +125,7 @@ class TieReport:
         }
 
 
-def find_ties(request: TieRequest, stage: Stage = unwatched) -> TieReport:
+def find_ties(request: TieRequest, events: Events = SILENT) -> TieReport:
     """Find tie points between the images of a project.
 
     Features and matches are kept in a folder ``NAME.cache`` beside the output: a run that was interrupted continues.
@@ -135,8 +133,8 @@ def find_ties(request: TieRequest, stage: Stage = unwatched) -> TieReport:
     Parameters
     ----------
     request : TieRequest
-    stage : callable
-        Called with what is done next and the number of its parts; gives a context that counts them.
+    events : Events
+        Told what is done next, and how far it is.
 
     Raises
     ------
@@ -156,18 +154,18 @@ def find_ties(request: TieRequest, stage: Stage = unwatched) -> TieReport:
     store = FeatureStore(output.with_suffix(".cache"), tuple(images), FeatureSettings(request.features, factor))
     if request.dry_run:
         return _dry(names, pairs, chosen, factor, notes)
-    with threads(request.workers) as run:
-        with stage("features", len(images)) as done:
-            features = find_features(store, run, done)
+    with thread_map(request.workers) as run:
+        events.begin("features", len(images), "images")
+        features = find_features(store, run, events)
         pairs = like_pairs(store) if pairs is None else pairs
-        with stage("pairs", len(pairs)) as done:
-            verify = VerifySettings(threshold=2.0 * factor)
-            verified = [p for p in find_pairs(store, pairs, verify, run, done) if len(p)]
+        events.begin("matching", len(pairs), "pairs")
+        verify = VerifySettings(threshold=2.0 * factor)
+        verified = [p for p in find_pairs(store, pairs, verify, run, events) if len(p)]
         _refuse_nothing(request, verified, len(pairs), names)
         found = build_tracks(features, verified, same=1.5 * factor)
         sizes = [image.grey.size for image in images]
         spare = found.tracks.of_tracks(thin_tracks(found.tracks, sizes, round(_SPARE * request.per_image)))
-        tracks, refined, loops = _refine(request, spare, images, factor, run, stage)
+        tracks, refined, loops = _refine(request, spare, images, factor, run, events)
     tracks = tracks.of_tracks(thin_tracks(tracks, sizes, request.per_image))
     if not len(tracks):
         raise GeometryError("no tie point is left after refinement; look at the images, or give `refine=False`")
@@ -239,7 +237,7 @@ def _refuse_nothing(request: TieRequest, verified: Sequence[PairMatches], tried:
 
 
 def _refine(
-    request: TieRequest, tracks: Tracks, images: Sequence[TieImage], factor: int, run: Map, stage: Stage
+    request: TieRequest, tracks: Tracks, images: Sequence[TieImage], factor: int, run: Map, events: Events
 ) -> tuple[Tracks, Refined | None, Loops | None]:
     """Tracks with standard deviations; first at the scale of the features, then at full resolution."""
     if not request.refine:
@@ -247,14 +245,13 @@ def _refine(
         return replace(tracks, sigma=np.repeat(sigma[:, None], 2, axis=1)), None, None
     greys: list[Grey] = [image.grey for image in images]
     settings = RefineSettings()
-    with stage("images refined", 1) as done:
-        if factor > 1:
-            small: list[Grey] = [ReducedImage(image.grey, factor) for image in images]
-            rough = refine_tracks(_scaled(tracks, 1 / factor), small, replace(settings, sigma=np.inf), run=run)
-            tracks = _scaled(rough.tracks, factor)
-        loops = close_loops(tracks, reference_points(tracks, [g.size for g in greys]), greys, settings, run=run)
-        refined = refine_tracks(tracks, greys, settings, loops.factor, run)
-        done(1, 0)
+    events.begin("refining", 0)
+    if factor > 1:
+        small: list[Grey] = [ReducedImage(image.grey, factor) for image in images]
+        rough = refine_tracks(_scaled(tracks, 1 / factor), small, replace(settings, sigma=np.inf), run=run)
+        tracks = _scaled(rough.tracks, factor)
+    loops = close_loops(tracks, reference_points(tracks, [g.size for g in greys]), greys, settings, run=run)
+    refined = refine_tracks(tracks, greys, settings, loops.factor, run)
     return refined.tracks, refined, loops
 
 

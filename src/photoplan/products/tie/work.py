@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.events import Events, Map
 from photoplan.io.array_file import array_key, load_arrays, store_arrays
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.names import unique_stems
@@ -21,31 +19,11 @@ from photoplan.matching.pairs import match_features, pairs_by_likeness
 from photoplan.matching.verify import PairMatches, VerifySettings, verify_pair
 from photoplan.products.tie.inputs import TieImage, guide_of
 
-Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
-#: Called with what is done next and the number of its parts; gives a context with a function that counts them.
-Stage = Callable[[str, int], AbstractContextManager[Callable[[int, int], None]]]
 #: Changes when kept features or matches mean something else.
 _FORM = 1
 #: Images whose features are in memory with their descriptors.
 _IN_MEMORY = 64
 _FIELDS = ("xy", "scale", "angle", "strength", "descriptors")
-
-
-def unwatched(words: str, count: int) -> AbstractContextManager[Callable[[int, int], None]]:
-    """A stage that tells nobody how far it is."""
-    return nullcontext(lambda parts, pixels: None)
-
-
-@contextmanager
-def threads(workers: int) -> Iterator[Map]:
-    """A `map` over threads; what has not begun is dropped when an error or an interrupt comes."""
-    pool = ThreadPoolExecutor(max_workers=workers)
-    try:
-        yield pool.map
-    except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
-        raise
-    pool.shutdown()
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +62,12 @@ class FeatureStore:
         return Features(f.xy, f.scale, f.angle, f.strength, np.empty((len(f), 0), np.uint8))
 
 
-def find_features(store: FeatureStore, run: Map, done: Callable[[int, int], None]) -> list[Features]:
+def find_features(store: FeatureStore, run: Map, events: Events) -> list[Features]:
     """Features of all images, without descriptors."""
     found = []
     for k, features in enumerate(run(store.places, range(len(store.images)))):
         width, height = store.images[k].grey.size
-        done(1, width * height)
+        events.done(1, width * height)
         found.append(features)
     return found
 
@@ -108,7 +86,7 @@ def find_pairs(
     pairs: Sequence[tuple[int, int]],
     settings: VerifySettings,
     run: Map,
-    done: Callable[[int, int], None],
+    events: Events,
 ) -> list[PairMatches]:
     """Verified matches of the pairs; those that are not verified have none. Kept for each first image."""
     groups: dict[int, list[int]] = {}
@@ -121,7 +99,7 @@ def find_pairs(
     found: list[PairMatches] = []
     for (_, partners), part in zip(groups.items(), run(work, groups.items())):
         found += part
-        done(len(partners), 0)
+        events.done(len(partners))
     return found
 
 

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-import os
-import secrets
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.errors import ResourceError, UsageError
+from photoplan.engine.cpus import available_cpus
+from photoplan.engine.executors import Workers, executor_factory
+from photoplan.engine.run import Made, Runner, Tally, Work, run_works
+from photoplan.errors import ResourceError, TilesFailed, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import Placement, Window
 from photoplan.io.disk import free_megabytes
 from photoplan.io.product import ProductFacts, ProductFile, check_output
 from photoplan.io.storage import Nodata
+from photoplan.plan.product import Tile
 
 GridTile = NDArray[Any] | tuple[NDArray[Any], NDArray[np.bool_]] | None
 """Values (bands, h, w); or values and validity (h, w), True = valid; or None: nothing is valid."""
@@ -38,8 +41,8 @@ class GridOptions:
     """Replace an output that exists."""
     inputs: Sequence[Path | str] = ()
     """Files that must not be overwritten, also by a link."""
-    progress: Callable[[int, int], None] | None = None
-    """Called with the number of windows just finished and of their pixels."""
+    events: Events = SILENT
+    """Told of windows that are finished."""
     compress: str = "deflate"
     """`none`, `deflate`, `zstd`, `lzw` or `jpeg`."""
     overviews: bool = True
@@ -92,21 +95,21 @@ def write_grid(
         Another run is writing it.
     ResourceError
         The disk has too little space, before any window is computed; or it became full.
-    Exception
-        Whatever `tiles` raises; nothing stays under the name then.
+    TilesFailed
+        A window failed again and again; nothing stays under the name then.
     """
     path, dtype = Path(path), np.dtype(dtype)
     check_output(path, options.inputs, overwrite=options.overwrite)
-    workers = _workers(options.workers)
+    workers = available_cpus() if options.workers is None else options.workers
+    make = executor_factory("threads", workers)
     if options.colours is not None and (dtype != np.uint8 or bands != 1):
         raise UsageError(f"{path}: a colour table for {bands} bands of {dtype}; it needs one band of uint8")
-    key = options.run_key or secrets.token_hex(16)
-    with ProductFile(
+    file = ProductFile(
         path,
         placement,
         bands,
         dtype,
-        run_key=key,
+        run_key=options.run_key,
         nodata=nodata,
         compress=options.compress,
         overviews=options.overviews,
@@ -116,29 +119,49 @@ def write_grid(
         threads=workers,
         resampling=options.resampling,
         colours=options.colours,
-    ) as file:
-        try:
-            finished = file.finished
-            waiting = [i for i in range(len(file.windows)) if i not in finished]
-            _check_space(path, len(waiting) * options.tile**2 * bands * dtype.itemsize)
-            if options.progress is not None and len(waiting) < len(file.windows):
-                options.progress(len(file.windows) - len(waiting), 0)
-            for index, tile in _computed(file.windows, waiting, tiles, workers):
-                _append(file, index, tile, dtype)
-                if options.progress is not None:
-                    options.progress(1, file.windows[index].size)
-            return file.complete(dict(options.tags or {}))
-        except BaseException:
-            if options.run_key is None:
-                # Nobody could continue with these tiles: their key is known to this run alone.
-                file.discard()
-            raise
+    )
+    windows = tuple(Tile(i, window) for i, window in enumerate(file.windows))
+    kept = file.log_path.stat().st_size if file.log_path.exists() else 0
+    _check_space(path, max(0, len(windows) * options.tile**2 * bands * dtype.itemsize - kept))
+    work = Work(
+        name=path.stem,
+        job=GridJob(tiles, None if file.nodata_value is None else dtype.type(file.nodata_value)),
+        tiles=windows,
+        count=len(windows),
+        sinks=(file,),
+        complete=partial(_complete, file, dict(options.tags or {})),
+    )
+    options.events.begin(path.name, len(windows))
+    with Workers(make) as pool:
+        (facts,) = run_works([work], Runner(pool, 2 * workers if workers > 1 else 1, options.events))
+    return facts
 
 
-def _workers(wanted: int | None) -> int:
-    if wanted is not None and wanted < 1:
-        raise UsageError(f"{wanted} workers; at least one is needed")
-    return wanted or os.cpu_count() or 1
+@dataclass(frozen=True)
+class GridJob:
+    """Computes a window, and what of it is valid."""
+
+    tiles: GridTiles
+    nodata: Any
+    """Value of an invalid pixel; NaN: NaN; None: there is none."""
+
+    def __call__(self, tile: Tile) -> Made:
+        """Values and validity of a window."""
+        found = self.tiles(tile.window)
+        if found is None:
+            return Made((None,))
+        values, valid = found if isinstance(found, tuple) else (found, None)
+        if valid is None and self.nodata is not None:
+            missing = np.isnan(values) if values.dtype.kind == "f" else values == self.nodata
+            valid = np.asarray(~missing.all(axis=0))
+        return Made(((values, valid),))
+
+
+def _complete(file: ProductFile, tags: dict[str, str], tally: Tally) -> ProductFacts:
+    if tally.failed:
+        failed = ", ".join(map(str, sorted(tally.failed)))
+        raise TilesFailed(f"{file.path}: tiles {failed} could not be computed ({tally.reasons[0]}); nothing is written")
+    return file.complete(tags)
 
 
 def _check_space(path: Path, raw: int) -> None:
@@ -149,43 +172,3 @@ def _check_space(path: Path, raw: int) -> None:
             f"{path}: needs up to {2 * raw // 1_000_000} MB while it is made, {free} MB are free there; free some "
             "space, or choose a coarser resolution or smaller bounds"
         )
-
-
-def _computed(
-    windows: Sequence[Window], waiting: Sequence[int], tiles: GridTiles, workers: int
-) -> Iterator[tuple[int, GridTile]]:
-    """Index and content of windows as they are finished; no more than two for each worker under way."""
-    if workers == 1:
-        for index in waiting:
-            yield index, tiles(windows[index])
-        return
-    with ThreadPoolExecutor(workers, "photoplan") as pool:
-        running: dict[Future[GridTile], int] = {}
-        try:
-            for index in waiting:
-                running[pool.submit(tiles, windows[index])] = index
-                while len(running) >= 2 * workers:
-                    yield from _finished(running)
-            while running:
-                yield from _finished(running)
-        finally:
-            for future in running:
-                future.cancel()
-
-
-def _finished(running: dict[Future[GridTile], int]) -> Iterator[tuple[int, GridTile]]:
-    done, _ = wait(running, return_when=FIRST_COMPLETED)
-    # In the order of the windows, so that the file of a serial run and of this one grow alike.
-    for future in sorted(done, key=running.__getitem__):
-        yield running.pop(future), future.result()
-
-
-def _append(file: ProductFile, index: int, tile: GridTile, dtype: np.dtype[Any]) -> None:
-    if tile is None:
-        file.append_empty(index)
-        return
-    values, valid = tile if isinstance(tile, tuple) else (tile, None)
-    if valid is None and file.nodata_value is not None:
-        missing = np.isnan(values) if dtype.kind == "f" else values == dtype.type(file.nodata_value)
-        valid = np.asarray(~missing.all(axis=0))
-    file.append(index, values, valid)

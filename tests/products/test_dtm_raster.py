@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 import rasterio
+from tools.events import Told
 
-from photoplan.errors import ResourceError, UsageError
+from photoplan.errors import ResourceError, TilesFailed, UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io import disk
-from photoplan.io.grid_writer import GridOptions, write_grid
+from photoplan.products.dtm.raster import GridOptions, write_grid
 
 GRID = MapGrid(500_000.0, 5_200_000.0, 0.5, 700, 300, "EPSG:32633")
 PLACE = GRID.placement
@@ -31,7 +32,7 @@ def ramp(window: Window) -> np.ndarray:
 
 @pytest.mark.parametrize("workers", [1, 3])
 def test_values_come_back_with_holes(tmp_path: Path, workers: int) -> None:
-    calls: list[tuple[int, int]] = []
+    told = Told()
     facts = write_grid(
         tmp_path / "a.tif",
         PLACE,
@@ -39,7 +40,7 @@ def test_values_come_back_with_holes(tmp_path: Path, workers: int) -> None:
         1,
         "auto",
         ramp,
-        GridOptions(tile=128, workers=workers, progress=lambda n, p: calls.append((n, p)), tags={"A": "b"}),
+        GridOptions(tile=128, workers=workers, events=told, tags={"A": "b"}),
     )
     with rasterio.open(tmp_path / "a.tif") as file:
         np.testing.assert_array_equal(file.read(), ramp(GRID.window))
@@ -48,8 +49,8 @@ def test_values_come_back_with_holes(tmp_path: Path, workers: int) -> None:
         assert file.bounds == GRID.bounds
     assert list(tmp_path.iterdir()) == [tmp_path / "a.tif"]
     assert (facts.tiles, facts.empty_tiles) == (18, 1)
-    assert sum(n for n, _ in calls) == 18
-    assert sum(p for _, p in calls) == GRID.window.size
+    assert told.phases == [("a.tif", 18, "tiles")]
+    assert (told.units["a.tif"], told.pixels) == (18, GRID.window.size)
 
 
 def test_one_and_more_workers_write_the_same_bytes(tmp_path: Path) -> None:
@@ -124,7 +125,9 @@ def test_a_failed_window_leaves_nothing(tmp_path: Path, workers: int) -> None:
             raise RuntimeError("no luck")
         return ramp(window)
 
-    with pytest.raises(RuntimeError, match="no luck"):
+    with pytest.raises(
+        TilesFailed, match=r"a\.tif: tiles .* could not be computed \(tile \d+: RuntimeError: no luck\)"
+    ):
         write_grid(tmp_path / "a.tif", PLACE, "float32", 1, "auto", failing, GridOptions(tile=128, workers=workers))
     assert done.is_set()
     assert not list(tmp_path.iterdir())
@@ -143,7 +146,7 @@ def test_a_run_with_a_key_is_continued(tmp_path: Path) -> None:
         return ramp(window)
 
     options = GridOptions(tile=128, workers=1, run_key="same inputs")
-    with pytest.raises(RuntimeError):
+    with pytest.raises(TilesFailed):
         write_grid(tmp_path / "a.tif", PLACE, "float32", 1, "auto", halfway, options)
     write_grid(tmp_path / "a.tif", PLACE, "float32", 1, "auto", counting, options)
     assert {w.row for w in computed} == {256}
