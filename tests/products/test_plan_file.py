@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +46,27 @@ def test_a_plan_that_was_written_gives_the_same_bytes(planned: tuple[Path, Ortho
     execute(plan, tmp_path / "direct", QUIET)
     execute(again, folder, QUIET)
     assert products(folder) == products(tmp_path / "direct")
+
+
+def test_what_was_written_is_what_is_read(planned: tuple[Path, OrthoPlan], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is planned twice: no scene is opened, no image looked at."""
+    path, plan = planned
+    figures = compile_figures(plan)
+    from photoplan.products.orthophoto import plan as planning
+    from photoplan.project import scene
+
+    for module, name in ((planning, "cover"), (planning, "covered_tiles"), (scene, "_open")):
+        monkeypatch.setattr(module, name, None)
+    again, _ = read_plan(path)
+    assert (again.settings, again.blind, again.project) == (plan.settings, plan.blind, plan.project)
+    for read, wrote in zip(again.products, plan.products, strict=True):
+        assert (read.grid, read.gsd, read.key) == (wrote.grid, wrote.gsd, wrote.key)
+        # Tiles without a part of the image are left out: they stay empty either way.
+        mine = figures.index[(figures.product == wrote.plan.name) & (figures.cells_of_tile > 0)]
+        tiles = tuple(tile for tile in wrote.plan.tiles if tile.index in mine)
+        assert read.plan == replace(wrote.plan, tiles=tiles)
+        assert (read.coverage.bounds, read.coverage.on_surface) == (wrote.coverage.bounds, wrote.coverage.on_surface)
+        np.testing.assert_array_equal(read.coverage.outline, wrote.coverage.outline)
 
 
 def test_a_plan_moves_with_its_project(planned: tuple[Path, OrthoPlan], small: Block, tmp_path: Path) -> None:

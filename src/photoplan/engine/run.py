@@ -23,7 +23,7 @@ from photoplan.errors import PhotoplanError, UsageError
 from photoplan.events import Events
 from photoplan.plan.product import Tile
 
-Layer = tuple[NDArray[Any], NDArray[np.bool_] | None]
+Output = tuple[NDArray[Any], NDArray[np.bool_] | None]
 """Values of a tile, shape (bands, height, width), and their validity, (height, width); None: all are valid."""
 T = TypeVar("T")
 
@@ -32,7 +32,7 @@ T = TypeVar("T")
 class Made:
     """What became of one tile."""
 
-    layers: tuple[Layer | None, ...]
+    layers: tuple[Output | None, ...]
     """One for each sink; None: not one valid pixel."""
     record: Mapping[str, Any] = field(default_factory=dict)
     """Figures that the product adds up, kept with the tile: numbers and lists of numbers. Names that begin with

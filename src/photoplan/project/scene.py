@@ -46,6 +46,27 @@ class SceneAddress:
     digests: tuple[tuple[str, str], ...]
     """Path and content digest of each input file."""
 
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What moves a pixel: numbers of the description and contents of the files; no names, no places, no accuracy.
+
+        Two scenes of equal facts give the same pixels. What is not known to be idle counts.
+        """
+        project = json.loads(self.text)
+        (image,) = project.pop("images")
+        (camera,) = project.pop("cameras").values()
+        restored = image.pop("restore", None) or camera.get("restore")
+        camera.pop("restore", None)
+        for name in ("name", "file", "camera", "sigma_center", "sigma_angles"):
+            image.pop(name, None)
+        project["terrain"].pop("file", None)
+        table = None
+        if restored is not None:
+            # Of a filter and a table the content counts, which is among the digests.
+            table = restored["linearisation"] if restored["linearisation"] in ("linear", "srgb") else "table"
+        digests = [digest for _, digest in self.digests]
+        return {**project, "image": image, "camera": camera, "linearisation": table, "files": digests}
+
     def open(self) -> Scene:
         """The scene; kept for the next tile.
 
@@ -99,11 +120,6 @@ class Scene:
         """Input files."""
         return tuple(Path(path) for path, _ in self.address.digests)
 
-    @property
-    def facts(self) -> list[Any]:
-        """What identifies the scene in a product's key: description and contents, not places."""
-        return [self.address.text, [digest for _, digest in self.address.digests]]
-
 
 def input_files(project: Project) -> list[Path]:
     """All files that a project names; nothing that is written may replace one of them."""
@@ -125,6 +141,17 @@ def open_scene(project: Project, name: str) -> Scene:
         A file is missing or cannot be used, an image's size differs from its camera's, or height systems are not
         declared or cannot be joined exactly.
     """
+    return _open(scene_address(project, name))
+
+
+def scene_address(project: Project, name: str) -> SceneAddress:
+    """What the scene of an image is opened by; its files are looked at, but not opened.
+
+    Raises
+    ------
+    InputError
+        A file is missing.
+    """
     image = project.image(name)
     alone = project.model_copy(update={"images": (image,), "cameras": {image.camera: project.cameras[image.camera]}})
     files = [project.resolve(image.file)]
@@ -134,9 +161,8 @@ def open_scene(project: Project, name: str) -> Scene:
     if restoration is not None:
         files += [project.resolve(file) for file in restoration.files]
     digests = tuple((str(path), _digest(str(path), _stamp(path))) for path in files)
-    return _open(
-        SceneAddress(alone.model_dump_json(exclude={"ortho"}, exclude_none=True), str(project.folder), digests)
-    )
+    text = alone.model_dump_json(exclude={"ortho", "observations", "adjustment"}, exclude_none=True)
+    return SceneAddress(text, str(project.folder), digests)
 
 
 def _stamp(path: Path) -> tuple[int, int]:

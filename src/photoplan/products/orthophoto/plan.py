@@ -29,7 +29,7 @@ from photoplan.plan.coverage import Coverage, cover, covered_tiles, image_border
 from photoplan.plan.product import ProductPlan, Tile
 from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.reach import some_height
-from photoplan.project.scene import Scene, open_scene
+from photoplan.project.scene import Scene, SceneAddress, open_scene
 from photoplan.targets.map import MapTarget
 
 #: Tiles of a product: their list is kept in memory.
@@ -137,7 +137,7 @@ def plan_orthophotos(
         if plan is None:
             blind.append(f"{name}: sees {_extent(coverage.bounds)}; the bounds are {_extent(chosen.bounds)}")
         else:
-            products.append(OrthoProduct(plan, coverage, gsd, _key(scene, plan, chosen)))
+            products.append(OrthoProduct(plan, coverage, gsd, product_key(scene.address, plan, chosen)))
         events.done()
     if not products:
         where = "the terrain" if chosen.bounds is None else "terrain inside the bounds"
@@ -166,7 +166,12 @@ def _plan_one(
         return None
     radius = max(1, math.ceil(KERNELS[settings.kernel].taps / 2))
     rule = AnchorRule(settings.tolerance, radius, reduces=settings.kernel != "nearest")
-    return ProductPlan(f"{safe_stem(name)}_ortho", (name,), target, settings.tile, rule, tiles)
+    return ProductPlan(product_name(name), (name,), target, settings.tile, rule, tiles)
+
+
+def product_name(image: str) -> str:
+    """Name of an image's orthophoto, fit for a file in any system."""
+    return f"{safe_stem(image)}_ortho"
 
 
 def _check_storable(scene: Scene, name: str, grid: MapGrid, settings: OrthoSettings) -> None:
@@ -184,8 +189,11 @@ def _check_storable(scene: Scene, name: str, grid: MapGrid, settings: OrthoSetti
         )
 
 
-def _key(scene: Scene, plan: ProductPlan, settings: OrthoSettings) -> str:
-    """Hash of what decides a product's pixels: another key means that finished tiles are of no use."""
+def product_key(scene: SceneAddress, plan: ProductPlan, settings: OrthoSettings) -> str:
+    """Hash of what decides a product's pixels, and of nothing else.
+
+    Another key means that finished tiles are of no use.
+    """
     assert isinstance(plan.target, MapTarget)
     grid = plan.target.grid
     facts = {

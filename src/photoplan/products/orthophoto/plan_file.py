@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import sqlite3
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +15,18 @@ from numpy.typing import NDArray
 from photoplan import __version__
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
+from photoplan.geometry.grid import MapGrid
 from photoplan.io.disk import disk_error, free_megabytes
 from photoplan.io.plan_file import PlanTables, read_plan_tables, write_plan_tables
 from photoplan.io.product import check_output
 from photoplan.io.project.file import parse_project
-from photoplan.plan.product import compile_tile
-from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, plan_orthophotos
+from photoplan.plan.compile import AnchorRule
+from photoplan.plan.coverage import Coverage
+from photoplan.plan.product import ProductPlan, Tile, compile_tile
+from photoplan.products.orthophoto.plan import MOST_TILES, OrthoPlan, OrthoProduct, product_key, product_name
 from photoplan.products.orthophoto.settings import OrthoSettings
-from photoplan.project.scene import input_files, open_scene
+from photoplan.project.scene import input_files, open_scene, scene_address
+from photoplan.targets.map import MapTarget
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,10 +164,8 @@ def write_plan(path: Path, plan: OrthoPlan, figures: PlanFigures, output: Path, 
         "folder": os.path.relpath(plan.project.folder.resolve(), path.resolve().parent),
         "output": os.path.relpath(output.resolve(), path.resolve().parent),
         "settings": plan.settings.to_dict(),
-        "products": [
-            {"image": p.plan.image, "key": p.key, "tiles": int((there & (figures.product == p.plan.name)).sum())}
-            for p in plan.products
-        ],
+        "blind": list(plan.blind),
+        "products": [_product_header(p, int((there & (figures.product == p.plan.name)).sum())) for p in plan.products],
     }
     tiles = {
         "product": figures.product[there],
@@ -233,41 +235,69 @@ def read_plan(path: Path | str) -> tuple[OrthoPlan, Path]:
     path = Path(path)
     try:
         header, tiles = read_plan_tables(path)
-        plan, output = _plan_again(path, header)
-        counts = {p["image"]: (p["key"], int(p["tiles"])) for p in header["products"]}
-        changed = [p.plan.image for p in plan.products if counts.get(p.plan.image, ("", 0))[0] != p.key]
-        if changed or len(plan.products) != len(counts):
+        folder = (path.resolve().parent / header["folder"]).resolve()
+        project = parse_project(header["project"], folder, str(path))
+        settings = OrthoSettings.from_dict(header["settings"])
+        products = [_product(entry) for entry in header["products"]]
+        changed = [
+            p.plan.image
+            for p in products
+            if product_key(scene_address(project, p.plan.image), p.plan, settings) != p.key
+        ]
+        if changed:
             raise InputError(
-                f"{path}: inputs have changed since the plan was written ({', '.join(changed) or 'images are gone'}); "
-                "make the plan again with `photoplan ortho`"
+                f"{path}: inputs have changed since the plan was written ({', '.join(changed)}); make the plan again "
+                "with `photoplan ortho --plan`"
             )
-        chosen = _with_tiles(plan, tiles, {image: count for image, (_, count) in counts.items()})
+        counts = [int(entry["tiles"]) for entry in header["products"]]
+        chosen = [_with_tiles(product, tiles, count) for product, count in zip(products, counts)]
+        plan = OrthoPlan(project, settings, tuple(p for p in chosen if p.plan.tiles), tuple(header["blind"]))
     except (KeyError, TypeError, ValueError, UsageError) as error:
-        raise InputError(f"{path}: the plan is damaged ({error}); make it again with `photoplan ortho`") from error
-    if not chosen.products:
-        raise InputError(f"{path}: the plan has no tiles left; make it again with `photoplan ortho`")
-    return chosen, output
-
-
-def _plan_again(path: Path, header: dict[str, Any]) -> tuple[OrthoPlan, Path]:
-    """The plan that a header describes, made again, and its folder for products."""
-    folder = (path.resolve().parent / header["folder"]).resolve()
-    project = parse_project(header["project"], folder, str(path))
-    images = [p["image"] for p in header["products"]]
-    plan = plan_orthophotos(project, images, OrthoSettings.from_dict(header["settings"]))
+        raise InputError(
+            f"{path}: the plan is damaged ({error}); make it again with `photoplan ortho --plan`"
+        ) from error
+    if not plan.products:
+        raise InputError(f"{path}: the plan has no tiles left; make it again with `photoplan ortho --plan`")
     return plan, (path.resolve().parent / header["output"]).resolve()
 
 
-def _with_tiles(plan: OrthoPlan, tiles: dict[str, NDArray[Any]], planned: dict[str, int]) -> OrthoPlan:
-    """Keep the tiles that the layer lists. A person may have deleted some: the product is then another one."""
-    products = []
-    for product in plan.products:
-        listed = set(tiles["tile"][tiles["product"] == product.plan.name].tolist())
-        chosen = tuple(t for t in product.plan.tiles if t.index in listed)
-        if not chosen:
-            continue
-        key = product.key
-        if len(listed) != planned[product.plan.image]:
-            key = hashlib.sha256(f"{key} {[t.index for t in chosen]}".encode()).hexdigest()
-        products.append(replace(product, plan=replace(product.plan, tiles=chosen), key=key))
-    return replace(plan, products=tuple(products))
+def _product_header(product: OrthoProduct, tiles: int) -> dict[str, Any]:
+    """All of a product but its tiles, as plain values."""
+    plan, coverage = product.plan, product.coverage
+    return {
+        "image": plan.image,
+        "key": product.key,
+        "gsd": product.gsd,
+        "grid": asdict(product.grid),
+        "tile_side": plan.tile_side,
+        "rule": asdict(plan.rule),
+        "outline": coverage.outline.tolist(),
+        "bounds": coverage.bounds,
+        "on_surface": coverage.on_surface,
+        "tiles": tiles,
+    }
+
+
+def _product(entry: dict[str, Any]) -> OrthoProduct:
+    """What `_product_header` says; without tiles."""
+    grid = MapGrid(**entry["grid"])
+    side = int(entry["tile_side"])
+    if side < 1 or -(-grid.width // side) * -(-grid.height // side) > MOST_TILES:
+        raise ValueError(f"{grid.width} × {grid.height} pixels in tiles of {side}")
+    rule = AnchorRule(**entry["rule"])
+    plan = ProductPlan(product_name(entry["image"]), (entry["image"],), MapTarget(grid), side, rule, ())
+    outline = np.array(entry["outline"], float).reshape(-1, 3)
+    bounds = None if entry["bounds"] is None else tuple(entry["bounds"])
+    return OrthoProduct(plan, Coverage(outline, bounds, entry["on_surface"]), entry["gsd"], entry["key"])
+
+
+def _with_tiles(product: OrthoProduct, tiles: dict[str, NDArray[Any]], planned: int) -> OrthoProduct:
+    """The product with the tiles that the layer lists. A person may have deleted some: it is then another one."""
+    plan = product.plan
+    listed = set(tiles["tile"][tiles["product"] == plan.name].tolist())
+    windows = plan.target.window.tiles(plan.tile_side)
+    chosen = tuple(Tile(i, window) for i, window in enumerate(windows) if i in listed)
+    key = product.key
+    if len(chosen) != planned:
+        key = hashlib.sha256(f"{key} {[t.index for t in chosen]}".encode()).hexdigest()
+    return replace(product, plan=replace(plan, tiles=chosen), key=key)
