@@ -1,13 +1,17 @@
 """Least squares: against what is known in closed form, the same fit repeated, and simulated errors."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from scipy import stats
 
+from photoplan.adjustment.blocks import Kind, Layout
 from photoplan.adjustment.chances import chance_chi_square, chance_f, chance_gain, chance_normal, chance_t
 from photoplan.adjustment.iterate import levenberg
 from photoplan.adjustment.linear import Decomposed, solve
 from photoplan.adjustment.robust import bisquare, cauchy, geman_mcclure, huber, spread
+from photoplan.orientation.bundle.unknowns import Vectors
 
 RNG = np.random.default_rng(3)
 
@@ -106,3 +110,40 @@ def test_chances_are_those_of_the_distributions():
     assert chance_f(2.5, 3, 20) == pytest.approx(stats.f.sf(2.5, 3, 20))
     assert chance_gain(10.0, 8.0, 2, 30) == pytest.approx(stats.f.sf(1.0 / (8.0 / 30), 2, 30))
     assert chance_f(-0.1, 2, 5) == 1.0 and chance_t(np.inf, 3) == 0.0
+
+
+@dataclass(frozen=True)
+class Scales:
+    """A kind of unknowns that multiplies by its steps, as no kind of the package does."""
+
+    values: np.ndarray
+
+    def moved(self, step):
+        return Scales(self.values * np.exp(step[:, 0]))
+
+
+def test_blocks_stand_one_after_the_other_and_move_by_their_own_rules():
+    layout = Layout.of(
+        [
+            Kind("knots", ("a", "b", "c", "d"), ("X of {}", "Y of {}"), "knot"),
+            Kind("held", ("a",), ()),
+            Kind("scales", ("east", "west"), ("scale of {}",), "half"),
+        ]
+    )
+    assert layout.count == 10 and layout.get("held") is None
+    scales = layout.get("scales")
+    assert scales.at(np.array([1])) == [9] and layout.get("knots").columns(2).tolist() == [4, 5]
+    step = np.zeros(10)
+    step[5], step[9] = 2.0, np.log(3.0)
+    values = {"knots": Vectors(np.ones((4, 2))), "held": Vectors(np.ones((1, 1))), "scales": Scales(np.full(2, 5.0))}
+    moved = layout.moved(values, step)
+    assert moved["knots"].values[2].tolist() == [1.0, 3.0] and moved["held"] is values["held"]
+    assert np.allclose(moved["scales"].values, [5.0, 15.0])
+
+
+def test_undetermined_directions_are_spelled_by_names():
+    layout = Layout.of(
+        [Kind("knots", ("a", "b", "c", "d"), ("X of {}", "Y of {}"), "knot"), Kind("scale", ("",), ("scale",))]
+    )
+    direction = np.array([0.0, 0.5, 0.0, 0.5, 0.0, 0.5, 0.0, 0.5, 0.01])
+    assert layout.spelled(direction, np.full(9, 2.0)) == ("Y of knots 'a', 'b', 'c' and 1 more with scale (+0.02)")

@@ -12,9 +12,8 @@ from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.brown import Brown
 from photoplan.cameras.observed import GroundPoints, ImagePoints, ObservedAttitudes, ObservedPositions
 from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import rotation_opk
+from photoplan.geometry.rotation import rotation_opk, small_rotations
 from photoplan.orientation.bundle.block import Block, BlockCamera, BlockImage
-from photoplan.orientation.bundle.state import small_rotations
 
 SIZE = (4000, 3000)
 FOCAL = 3600.0

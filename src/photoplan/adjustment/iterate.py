@@ -85,7 +85,7 @@ def levenberg(
     now = Equations(start, *first)
     nothing, damping = _NOTHING * now.square, 0.0
     parts = Decomposed.of(now.A)
-    for _ in range(most):
+    for _ in range(most if math.isfinite(now.square) else 0):
         step = -parts.back(parts.along(now.v), damping)
         state = moved(now.state, step)
         found = None if state is None else equations(state)

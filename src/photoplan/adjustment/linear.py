@@ -31,7 +31,8 @@ class Decomposed:
     length: _Floats
     s: _Floats
     """Singular values, falling, (u,); 0: not determined."""
-    V: _Floats
+    half: _Floats
+    """V / s / length: a square root of the cofactors (u, u); 0 along what is not determined."""
 
     @classmethod
     def of(cls, A: _Floats) -> Decomposed:
@@ -44,7 +45,9 @@ class Decomposed:
         else:
             s, Vt = np.linalg.svd(A / length, full_matrices=False)[1:]
             V, least = Vt.T, ROUNDING
-        return cls(A, length, np.where(s > least * s.max(initial=0.0), s, 0.0), V)
+        known = s > least * s.max(initial=0.0)
+        inverse = np.where(known, 1.0 / np.where(known, s, 1.0), 0.0)
+        return cls(A, length, np.where(known, s, 0.0), V * inverse / length[:, None])
 
     @property
     def rank(self) -> int:
@@ -53,19 +56,18 @@ class Decomposed:
 
     def along(self, y: _Floats) -> _Floats:
         """Uᵀ y of right sides (n,) or (n, k)."""
-        s = np.where(self.s > 0.0, self.s, np.inf)
-        return np.asarray(((self.V / self.length[:, None]).T @ (self.A.T @ y)).T / s).T
+        return np.asarray(self.half.T @ (self.A.T @ y))
 
     def back(self, along: _Floats, damping: float = 0.0) -> _Floats:
         """Unknowns of `along`, with `damping` times the diagonal of the normal equations added to it (Marquardt)."""
-        part = np.where(self.s > 0.0, self.s / np.where(self.s > 0.0, self.s**2 + damping, 1.0), 0.0)
-        return np.asarray(((self.V @ (part * along.T).T).T / self.length).T)
+        if damping > 0.0:
+            along = (along.T * (self.s**2 / (self.s**2 + damping))).T
+        return np.asarray(self.half @ along)
 
     @property
     def cofactors(self) -> _Floats:
-        """Inverse of the normal equations (u, u); 0 along what is not determined."""
-        half = self.V / np.where(self.s > 0.0, self.s, np.inf) / self.length[:, None]
-        return np.asarray(half @ half.T)
+        """Inverse of the normal equations (u, u)."""
+        return np.asarray(self.half @ self.half.T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.rotation import opk_from_rotation, rotation_from_angles
 
+#: Unknowns of a pose, in the order of covariances: centre, and small rotations about the axes of the camera
+#: (R ← R · exp[δ]×).
+UNKNOWNS = ("X0", "Y0", "Z0", "rotation about x", "rotation about y", "rotation about z")
+
 
 @dataclass(frozen=True, eq=False)
 class Pose:

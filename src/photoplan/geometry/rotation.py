@@ -82,3 +82,30 @@ def angles_from_rotation(R_ground_camera: ArrayLike, order: str = "opk") -> NDAr
     P = np.eye(3)[axes]
     sign = np.linalg.det(P)
     return sign * opk_from_rotation(P @ np.asarray(R_ground_camera, float) @ P.T)
+
+
+def skew(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[v]× of vectors (..., 3), shape (..., 3, 3): [v]× w = v × w."""
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def small_rotations(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """exp([δ]×) of rotation vectors (n, 3), shape (n, 3, 3) (Rodrigues' formula)."""
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    K = skew(vectors)
+    safe = np.where(angle > 1e-9, angle, 1.0)
+    first = np.where(angle > 1e-9, np.sin(safe) / safe, 1.0)
+    second = np.where(angle > 1e-9, (1.0 - np.cos(safe)) / safe**2, 0.5)
+    return np.asarray(np.eye(3) + first * K + second * (K @ K))
+
+
+def rotation_vector(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation vectors (..., 3) of rotation matrices (..., 3, 3) that are not near half a turn."""
+    v = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1) / 2
+    sine = np.linalg.norm(v, axis=-1, keepdims=True)
+    cosine = ((np.trace(R, axis1=-2, axis2=-1) - 1.0) / 2.0)[..., None]
+    factor = np.where(sine > 1e-9, np.arctan2(sine, cosine) / np.where(sine > 1e-9, sine, 1.0), 1.0)
+    return np.asarray(v * factor)

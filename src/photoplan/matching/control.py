@@ -10,6 +10,7 @@ from scipy import fft, ndimage
 
 from photoplan.adjustment.robust import MEDIAN_2D, cauchy
 from photoplan.cameras.base import CentralCamera, project
+from photoplan.geometry.rotation import skew, small_rotations
 from photoplan.kernels.patch_match import CONVERGED, CORRELATION, RESULTS, match_patches, spline_coefficients
 
 Array = NDArray[np.float64]
@@ -228,25 +229,11 @@ def agree(camera: CentralCamera, XYZ: Array, xy: Array, covariances: tuple[Array
 
 def _moved(camera: CentralCamera, XYZ: Array, delta: Array) -> tuple[Array, Array]:
     """Points as a camera sees them that is moved by delta[:3] and turned by delta[3:], and ∂(x, y)/∂delta (n, 2, 6)."""
-    v = XYZ - camera.center - delta[:3]
-    angle = float(np.linalg.norm(delta[3:]))
-    if angle > 0:
-        axis = -delta[3:] / angle
-        c, s = np.cos(angle), np.sin(angle)
-        v = v * c + np.cross(axis, v) * s + np.outer(v @ axis, axis) * (1 - c)
+    v = (XYZ - camera.center - delta[:3]) @ small_rotations(delta[3:])
     moved = camera.center + v
     J = camera.derivatives(moved)
     # −ω × v = v × ω.
-    zero = np.zeros(len(v))
-    cross = np.stack(
-        [
-            np.stack([zero, -v[:, 2], v[:, 1]], axis=-1),
-            np.stack([v[:, 2], zero, -v[:, 0]], axis=-1),
-            np.stack([-v[:, 1], v[:, 0], zero], axis=-1),
-        ],
-        axis=-2,
-    )
-    return moved, np.concatenate([-J, J @ cross], axis=-1)
+    return moved, np.concatenate([-J, J @ skew(v)], axis=-1)
 
 
 def _factor(

@@ -12,6 +12,7 @@ from photoplan.adjustment.linear import solve
 from photoplan.adjustment.robust import cauchy
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
+from photoplan.geometry.rotation import skew
 from photoplan.matching.features import opencv
 
 
@@ -128,9 +129,9 @@ def _adjusted(
     step = 1e-6
     for _ in range(10):
         across = np.linalg.svd(base[None])[2][1:]
-        now = distances(_cross(base) @ R)
-        turned = [_cross(base) @ cv2.Rodrigues(step * axis)[0] @ R for axis in np.eye(3)]
-        moved = [_cross(base + step * side) @ R for side in across]
+        now = distances(skew(base) @ R)
+        turned = [skew(base) @ cv2.Rodrigues(step * axis)[0] @ R for axis in np.eye(3)]
+        moved = [skew(base + step * side) @ R for side in across]
         J = np.stack([(distances(m) - now) / step for m in (*turned, *moved)], axis=1)
         change = -solve(J, now, cauchy(now, 0.5 * threshold)).unknowns
         R = cv2.Rodrigues(change[:3])[0] @ R
@@ -138,13 +139,9 @@ def _adjusted(
         base /= np.linalg.norm(base)
         if np.abs(change).max() < 1e-7:
             break
-    better = _cross(base) @ R
+    better = skew(base) @ R
     fit = [int((np.abs(distances(m)) <= threshold).sum()) for m in (E, better)]
     return better if fit[1] >= fit[0] else E
-
-
-def _cross(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def _fundamental(xy: tuple[NDArray[np.float64], NDArray[np.float64]], threshold: float) -> NDArray[np.bool_]:

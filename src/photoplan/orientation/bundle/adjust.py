@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import GeometryError
-from photoplan.orientation.bundle.active import Active
-from photoplan.orientation.bundle.block import Adjusted, AdjustSettings, Block, Correlation
+from photoplan.orientation.bundle.block import Active, Adjusted, AdjustSettings, Block, Correlation
 from photoplan.orientation.bundle.correlation import correlation_of, effects_of_rows
 from photoplan.orientation.bundle.model import Model, build_model
 from photoplan.orientation.bundle.normal import reduce_normals
@@ -26,7 +25,7 @@ from photoplan.orientation.bundle.robust import first_taken_out, robust_weights,
 from photoplan.orientation.bundle.rows import linearise, residuals_of, whitened
 from photoplan.orientation.bundle.select import Selection, select, start_points
 from photoplan.orientation.bundle.solution import Solution, solution_of
-from photoplan.orientation.bundle.state import State, start_state
+from photoplan.orientation.bundle.unknowns import State, start_state
 
 #: Called after each iteration: its number, and the root mean square of the weighted residuals.
 Progress = Callable[[int, float], None]
@@ -73,7 +72,7 @@ def adjust_block(block: Block, settings: AdjustSettings | None = None, progress:
     active = Active.all_of(block)
     selection, XYZ, lost = _selected(block, active, frozenset())
     model = build_model(block, selection.images, selection.measured, selection.points)
-    state = start_state(model, [block.images[k].pose for k in selection.images], XYZ)
+    state = _started(model, XYZ)
     _check(model, state, active)
     if settings.robust:
         state = loop.run(model, state, weights_of(model, active), robust=True)
@@ -98,9 +97,9 @@ def _weighted(loop: _Loop, solution: Solution, active: Active, settings: AdjustS
     model, state = solution.model, solution.state
     correlations: tuple[Correlation, ...] = ()
     if settings.correlation and settings.covariance:
-        k = len(model.image)
-        used = solution.weight[: 2 * k : 2] > 0
-        correlations = correlation_of(model, solution.normalised()[: 2 * k].reshape(-1, 2), used)
+        image = model.parts.image
+        used = solution.weight[image][::2] > 0
+        correlations = correlation_of(model, solution.normalised()[image].reshape(-1, 2), used)
     effects = effects_of_rows(model, correlations, len(solution.e)) if correlations else None
     factors: _Floats | None = None
     for _ in range(_COMPONENTS):
@@ -145,13 +144,18 @@ def _rebuilt(
     Rays that are left may be parallel, so that points can be lost here too.
     """
     poses = dict(zip(model.image_names, state.poses()))
-    images = tuple(replace(b, pose=poses.get(b.name, b.pose)) for b in block.images)
-    selection, XYZ, lost = _selected(replace(block, images=images), active, lost)
+    block = replace(block, images=tuple(replace(b, pose=poses.get(b.name, b.pose)) for b in block.images))
+    selection, XYZ, lost = _selected(block, active, lost)
     made = build_model(block, selection.images, selection.measured, selection.points)
     before = {name: k for k, name in enumerate(model.point_names)}
     old = np.array([before.get(n, -1) for n in made.point_names], np.int64)
     XYZ[old >= 0] = state.XYZ[old[old >= 0]]
-    return made, state.carried(model, made, [images[k].pose for k in selection.images], XYZ), selection, lost
+    return made, state.carried(_started(made, XYZ)), selection, lost
+
+
+def _started(model: Model, XYZ: _Floats) -> State:
+    poses = [model.block.images[k].pose for k in model.image_rows]
+    return start_state(model.block, model.camera_names, model.strip_names, poses, XYZ)
 
 
 class _Loop:
@@ -181,7 +185,7 @@ class _Loop:
             while True:
                 reduced = reduce_normals(rows, len(model.point_names), damping)
                 step, points = reduced.solve()
-                moved = state.moved(model, step, points)
+                moved = state.moved(model.columns, step, points)
                 after = _cost(whitened(model, residuals_of(model, moved)), weight)
                 if after <= before * (1.0 + 1e-9) + 1e-12:
                     break

@@ -66,7 +66,7 @@ def effects_of_rows(model: Model, correlations: tuple[Correlation, ...], rows: i
     ground = set(model.block.ground.names)
     surveyed = np.array([name in ground for name in model.point_names], bool)
     effects = np.where(surveyed[model.point], 1.0, of_camera[model.camera_of[model.image]])
-    out[: 2 * len(model.image)] = np.repeat(effects, 2)
+    out[model.parts.image] = np.repeat(effects, 2)
     return out
 
 

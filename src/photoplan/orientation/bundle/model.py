@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import astuple, dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.blocks import Layout
 from photoplan.cameras.lenses.brown import Brown
 from photoplan.cameras.lenses.none import NoLens
 from photoplan.cameras.lenses.opencv import OpenCV
 from photoplan.cameras.plane import Affine2D, Bilinear2D
 from photoplan.errors import InputError, UsageError
 from photoplan.orientation.bundle.block import PARAMETERS, Block, BlockCamera
+from photoplan.orientation.bundle.unknowns import LEVER, CameraState, layout_of
 
 #: Standard deviation of coordinates that are held fixed, metres: small against anything that is measured, and large
 #: enough for the arithmetic.
@@ -21,19 +24,16 @@ FIXED = 1e-5
 _Index = NDArray[np.int64]
 
 
-@dataclass(frozen=True, eq=False)
-class Columns:
-    """Where the unknowns that are not points stand in the vector of unknowns: six of each image come first."""
+@dataclass(frozen=True)
+class Parts:
+    """Where the kinds of observations stand in the vector of rows."""
 
-    images: int
-    cameras: dict[str, int]
-    """First column of each camera with free parameters."""
-    lever: int
-    """First of three columns; −1: no unknown."""
-    boresight: int
-    strips: dict[str, int]
-    """First column of each strip: three for its shift and, where drift is linear, three for its rate."""
-    count: int
+    image: slice
+    ground: slice
+    position: slice
+    attitude: slice
+    known: slice
+    """What is known beforehand of unknowns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,12 +76,22 @@ class Model:
     epochs: NDArray[np.float64]
     attitude: _Index
     attitude_row: _Index
-    columns: Columns
+    columns: Layout
+    """The unknowns that are not points."""
+    known: tuple[tuple[str, int, float, float], ...]
+    """What is known beforehand: key and parameter of the unknown, value, standard deviation."""
+
+    @cached_property
+    def parts(self) -> Parts:
+        """Where the kinds of observations stand."""
+        sizes = (2 * len(self.image), len(self.ground), 3 * len(self.position), 3 * len(self.attitude), len(self.known))
+        ends = np.cumsum(sizes).tolist()
+        return Parts(*(slice(end - size, end) for end, size in zip(ends, sizes)))
 
     @property
-    def free(self) -> tuple[tuple[str, ...], ...]:
-        """Free parameters of each camera."""
-        return tuple(self.block.cameras[name].free for name in self.camera_names)
+    def observed(self) -> int:
+        """Rows of observations, without what is known beforehand."""
+        return int(self.parts.attitude.stop)
 
 
 def check_free(name: str, camera: BlockCamera) -> None:
@@ -136,6 +146,7 @@ def build_model(block: Block, images: list[int], measured: _Index, points: list[
     position, position_row = _observed(block.positions.images if block.positions else (), image_index)
     strips, strip_of, tau, epochs = _strips(block, position_row)
     attitude, attitude_row = _observed(block.attitudes.images if block.attitudes else (), image_index)
+    columns = layout_of(block, tuple(image_index), camera_names, strips)
     return Model(
         block=block,
         image_names=tuple(image_index),
@@ -161,7 +172,8 @@ def build_model(block: Block, images: list[int], measured: _Index, points: list[
         epochs=epochs,
         attitude=attitude,
         attitude_row=attitude_row,
-        columns=_columns(block, len(chosen), camera_names, strips, len(attitude) > 0),
+        columns=columns,
+        known=_known(block, columns),
     )
 
 
@@ -213,23 +225,14 @@ def _ground_rows(block: Block, point_index: dict[str, int]) -> tuple[_Index, _In
     return table[:, 0], table[:, 1], table[:, 2], np.array(white).reshape(-1, 3)
 
 
-def _columns(block: Block, images: int, cameras: tuple[str, ...], strips: tuple[str, ...], attitudes: bool) -> Columns:
-    at = 6 * images
-    of_cameras: dict[str, int] = {}
-    for name in cameras:
-        if block.cameras[name].free:
-            of_cameras[name] = at
-            at += len(block.cameras[name].free)
-    lever = boresight = -1
-    if block.positions is not None and block.lever_arm_sigma > 0:
-        lever, at = at, at + 3
-    if attitudes and block.boresight:
-        boresight, at = at, at + 3
-    of_strips: dict[str, int] = {}
-    width = {"none": 0, "shift": 3, "linear": 6}.get(block.drift)
-    if width is None:
-        raise UsageError(f"drift {block.drift!r}; allowed are none, shift, linear")
-    for name in strips if width else ():
-        of_strips[name] = at
-        at += width
-    return Columns(images, of_cameras, lever, boresight, of_strips, at)
+def _known(block: Block, columns: Layout) -> tuple[tuple[str, int, float, float], ...]:
+    known: list[tuple[str, int, float, float]] = []
+    for name, given in block.cameras.items():
+        if columns.get(f"camera {name}") is not None:
+            before = CameraState(given.c, *given.principal_point, given.lens)
+            for k, what in enumerate(given.free):
+                if what in given.prior_sigma:
+                    known.append((f"camera {name}", k, before.parameter(what), given.prior_sigma[what]))
+    if columns.get(LEVER) is not None:
+        known += [(LEVER, k, block.lever_arm[k], block.lever_arm_sigma) for k in range(3)]
+    return tuple(known)

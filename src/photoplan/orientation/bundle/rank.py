@@ -10,7 +10,7 @@ from scipy.sparse.linalg import ArpackError, LinearOperator, eigsh, splu
 from photoplan.errors import GeometryError
 from photoplan.orientation.bundle.model import Model
 from photoplan.orientation.bundle.normal import Reduced
-from photoplan.orientation.bundle.state import State
+from photoplan.orientation.bundle.unknowns import State
 
 _Floats = NDArray[np.float64]
 
@@ -35,7 +35,7 @@ def check_rank(model: Model, state: State, reduced: Reduced) -> None:
     # Back from scaled unknowns to metres, radians and the cameras' units.
     directions = vectors[:, null] * reduced.scale[:, None]
     names = _datum(model, state, directions, reduced.scale)
-    names = names or [_spelled(model, d, reduced.scale) for d in vectors[:, null].T]
+    names = names or [model.columns.spelled(d, reduced.scale) for d in vectors[:, null].T]
     raise GeometryError(
         f"the observations leave {int(null.sum())} direction{'s' if null.sum() > 1 else ''} of the unknowns free: "
         + "; ".join(dict.fromkeys(names))
@@ -62,70 +62,17 @@ def _smallest(reduced: Reduced) -> tuple[_Floats, _Floats]:
 
 def _datum(model: Model, state: State, directions: _Floats, reduced_scale: _Floats) -> list[str]:
     """Names of the block's motions among the undetermined directions; empty if there are others."""
-    n = model.columns.images
-    middle = state.centers.mean(axis=0)
-    away = state.centers - middle
-    size = max(1.0, float(np.abs(away).max()))
-    motions: dict[str, _Floats] = {}
-    for k, axis in enumerate("XYZ"):
-        move = np.zeros((n, 6))
-        move[:, k] = size
-        motions[f"position of the block in {axis}"] = move
-        turn = np.zeros((n, 6))
-        about = np.eye(3)[k]
-        turn[:, :3] = np.cross(about, away)
-        turn[:, 3:] = about @ state.rotations
-        motions[f"rotation of the block about {axis}"] = turn
-    grow = np.zeros((n, 6))
-    grow[:, :3] = away
-    motions["scale of the block"] = grow
-    part = directions[: 6 * n] / np.tile([size] * 3 + [1.0] * 3, n)[:, None]
-    basis, _ = np.linalg.qr(part)
+    size, motions = state.images.motions()
+    images = model.columns.kinds[0].part
+    unit = np.array([size] * 3 + [1.0] * 3)
+    basis, _ = np.linalg.qr(directions[images] / np.tile(unit, len(state.images.centers))[:, None])
     # A direction in which a camera, a lever arm or a drift changes too is no motion of the block.
-    if np.abs(directions[6 * n :] / reduced_scale[6 * n :, None]).max(initial=0.0) > 0.01:
+    if np.abs(directions[images.stop :] / reduced_scale[images.stop :, None]).max(initial=0.0) > 0.01:
         return []
     named = []
     for name, motion in motions.items():
-        v = (motion / ([size] * 3 + [1.0] * 3)).ravel()
+        v = (motion / unit).ravel()
         length = np.linalg.norm(v)
         if length > 0 and np.linalg.norm(basis.T @ v) > 0.98 * length:
             named.append(name)
     return named if len(named) >= directions.shape[1] else []
-
-
-def _spelled(model: Model, direction: _Floats, scale: _Floats) -> str:
-    """The unknowns with a part in a direction of scaled unknowns; those of images by their kind."""
-    images = model.columns.images
-    share = direction**2
-    of_images = share[: 6 * images].reshape(images, 6)
-    parts: list[tuple[float, str]] = []
-    for k, kind in enumerate(("X0", "Y0", "Z0", "rotation about x", "rotation about y", "rotation about z")):
-        total = float(of_images[:, k].sum())
-        if total > 0.02:
-            parts.append((total, f"{kind} of {_images(model, of_images[:, k])}"))
-    # Few against many: a camera's share is small, but it is the point.
-    for column in np.flatnonzero(share[6 * images :] > 1e-6) + 6 * images:
-        parts.append((1.0, f"{_name(model, int(column))} ({direction[column] * scale[column]:+.2g})"))
-    return " with ".join(text for _, text in sorted(parts, key=lambda p: -p[0]))
-
-
-def _images(model: Model, share: _Floats) -> str:
-    """The images with a large share, by name where they are few."""
-    large = np.flatnonzero(share > 0.1 * share.max())
-    names = ", ".join(repr(model.image_names[k]) for k in large[:3])
-    return f"image{'s' if len(large) > 1 else ''} {names}" + (f" and {len(large) - 3} more" if len(large) > 3 else "")
-
-
-def _name(model: Model, column: int) -> str:
-    """Name of an unknown that is not an image's."""
-    columns = model.columns
-    for name, first in columns.cameras.items():
-        free = model.block.cameras[name].free
-        if first <= column < first + len(free):
-            return f"{free[column - first]} of camera {name!r}"
-    if 0 <= columns.lever <= column < columns.lever + 3:
-        return f"lever arm {'xyz'[column - columns.lever]}"
-    if 0 <= columns.boresight <= column < columns.boresight + 3:
-        return f"boresight about {'xyz'[column - columns.boresight]}"
-    name, first = next((n, f) for n, f in columns.strips.items() if f <= column < f + 6)
-    return f"drift of strip {name!r} in {'XYZ'[(column - first) % 3]}"

@@ -7,13 +7,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.orientation.bundle.active import Active
-from photoplan.orientation.bundle.block import Adjusted, AdjustedCamera, AdjustedStrip, Block, Correlation, Group
+from photoplan.geometry.rotation import rotation_vector
+from photoplan.orientation.bundle.block import (
+    Active,
+    Adjusted,
+    AdjustedCamera,
+    AdjustedStrip,
+    Block,
+    Correlation,
+    Group,
+)
 from photoplan.orientation.bundle.robust import kinds_of, kinds_of_measurements
 from photoplan.orientation.bundle.rows import residuals_of_all
 from photoplan.orientation.bundle.select import Selection
 from photoplan.orientation.bundle.solution import Solution
-from photoplan.orientation.bundle.state import rotation_vector
+from photoplan.orientation.bundle.unknowns import BORESIGHT, DRIFT, IMAGES, LEVER
 
 _Floats = NDArray[np.float64]
 
@@ -39,11 +47,10 @@ def result_of(block: Block, selection: Selection, weighted: Weighted, active: Ac
     position_residuals, attitude_residuals = _of_direct(solution)
     sigma0 = solution.sigma0
     variance = sigma0**2 if np.isfinite(sigma0) else 1.0
-    columns = model.columns
     return Adjusted(
         images=model.image_names,
         poses=state.poses(),
-        pose_covariance=_blocks(solution, variance),
+        pose_covariance=_covariances(solution, IMAGES, variance),
         cameras=_cameras(solution, variance),
         points=model.point_names,
         XYZ=state.XYZ,
@@ -61,14 +68,14 @@ def result_of(block: Block, selection: Selection, weighted: Weighted, active: Ac
         position_rejected=~active.position,
         attitude_residuals=attitude_residuals,
         lever_arm=state.lever,
-        lever_arm_sigma=_sigma(solution, columns.lever, 3, variance),
+        lever_arm_sigma=_sigma(solution, LEVER, variance),
         boresight=rotation_vector(state.boresight),
-        boresight_sigma=_sigma(solution, columns.boresight, 3, variance),
+        boresight_sigma=_sigma(solution, BORESIGHT, variance),
         strips=_strips(solution, variance),
         groups=_groups(solution, weighted.factors),
         sigma0=sigma0,
         redundancy=solution.redundancy,
-        unknowns=columns.count + 3 * len(model.point_names),
+        unknowns=model.columns.count + 3 * len(model.point_names),
         iterations=iterations,
         correlations=weighted.correlations,
     )
@@ -77,11 +84,10 @@ def result_of(block: Block, selection: Selection, weighted: Weighted, active: Ac
 def _of_measurements(solution: Solution, residuals: _Floats) -> tuple[_Floats, _Floats]:
     """Redundancy numbers and normalised residuals of all measurements."""
     model = solution.model
-    k = len(model.image)
     redundancies = np.full_like(residuals, np.nan)
     normalised = np.full_like(residuals, np.nan)
-    redundancies[model.observation] = solution.redundancies[: 2 * k].reshape(-1, 2)
-    normalised[model.observation] = solution.normalised()[: 2 * k].reshape(-1, 2)
+    redundancies[model.observation] = solution.redundancies[model.parts.image].reshape(-1, 2)
+    normalised[model.observation] = solution.normalised()[model.parts.image].reshape(-1, 2)
     # What was taken out is judged against the scale of its group; it had no part in the result.
     out = np.isfinite(residuals[:, 0])
     out[model.observation] = False
@@ -99,8 +105,7 @@ def _of_ground(solution: Solution) -> tuple[_Floats, _Floats]:
     residuals = np.full((len(ground), 3), np.nan)
     residuals[at >= 0] = solution.state.XYZ[at[at >= 0]] - ground.XYZ[at >= 0]
     normalised = np.full((len(ground), 3), np.nan)
-    rows = slice(2 * len(model.image), 2 * len(model.image) + len(model.ground))
-    normalised[model.ground, model.ground_axis] = solution.normalised()[rows]
+    normalised[model.ground, model.ground_axis] = solution.normalised()[model.parts.ground]
     return residuals, normalised
 
 
@@ -113,48 +118,51 @@ def _of_direct(solution: Solution) -> tuple[_Floats, _Floats]:
     return position, attitude
 
 
-def _blocks(solution: Solution, variance: float) -> _Floats:
-    """Covariance of every image's six unknowns."""
-    n = solution.model.columns.images
-    out = np.full((n, 6, 6), np.nan)
-    if solution.inverse is not None:
-        for k in range(n):
-            out[k] = solution.inverse.block(np.arange(6 * k, 6 * k + 6)) * variance
+def _covariances(solution: Solution, key: str, variance: float) -> _Floats:
+    """Covariances of all blocks of a kind, (n, w, w); (0, 0, 0) where it is no unknown."""
+    kind = solution.model.columns.get(key)
+    if kind is None:
+        return np.empty((0, 0, 0))
+    out = np.full((len(kind.owners), kind.width, kind.width), np.nan)
+    for k in range(len(out) if solution.inverse is not None else 0):
+        assert solution.inverse is not None
+        out[k] = solution.inverse.block(kind.columns(k)) * variance
     return out
 
 
-def _sigma(solution: Solution, first: int, count: int, variance: float) -> _Floats:
-    if first < 0:
-        return np.zeros(count)
-    if solution.inverse is None:
-        return np.full(count, np.nan)
-    return np.sqrt(np.diag(solution.inverse.block(np.arange(first, first + count))) * variance)
+def _sigma(solution: Solution, key: str, variance: float) -> _Floats:
+    """Standard deviations of three unknowns; 0 where they are held fixed."""
+    found = _covariances(solution, key, variance)
+    return np.sqrt(np.diag(found[0])) if len(found) else np.zeros(3)
 
 
 def _cameras(solution: Solution, variance: float) -> tuple[AdjustedCamera, ...]:
-    model = solution.model
     found = []
-    for name, camera, free in zip(model.camera_names, solution.state.cameras, model.free):
-        covariance = np.full((len(free), len(free)), np.nan)
-        if free and solution.inverse is not None:
-            first = model.columns.cameras[name]
-            covariance = solution.inverse.block(np.arange(first, first + len(free))) * variance
-        point = (camera.x0, camera.y0)
-        found.append(AdjustedCamera(name, camera.c, point, camera.lens, free, covariance))
+    for name in solution.model.camera_names:
+        camera = solution.state.camera(name)
+        covariance = _covariances(solution, f"camera {name}", variance)
+        found.append(
+            AdjustedCamera(
+                name=name,
+                c=camera.c,
+                principal_point=(camera.x0, camera.y0),
+                lens=camera.lens,
+                free=camera.free,
+                covariance=covariance[0] if len(covariance) else np.empty((0, 0)),
+            )
+        )
     return tuple(found)
 
 
 def _strips(solution: Solution, variance: float) -> tuple[AdjustedStrip, ...]:
-    model, state = solution.model, solution.state
-    out = []
-    for k, name in enumerate(model.strip_names):
-        first = model.columns.strips.get(name, -1)
-        sigma = np.full(6, np.nan)
-        width = {"shift": 3, "linear": 6}.get(model.block.drift, 0)
-        if first >= 0:
-            sigma[:width] = _sigma(solution, first, width, variance)
-        out.append(AdjustedStrip(name, state.shifts[k], state.rates[k], float(model.epochs[k]), sigma))
-    return tuple(out)
+    model = solution.model
+    covariances = _covariances(solution, DRIFT, variance)
+    sigma = np.full((len(model.strip_names), 6), np.nan)
+    sigma[:, : covariances.shape[1]] = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)) if len(covariances) else 0.0
+    return tuple(
+        AdjustedStrip(name, row[:3], row[3:], float(epoch), s)
+        for name, row, epoch, s in zip(model.strip_names, solution.state.drift, model.epochs, sigma)
+    )
 
 
 def _groups(solution: Solution, factors: _Floats) -> tuple[Group, ...]:

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from photoplan.adjustment.robust import MEDIAN_1D, MEDIAN_2D, geman_mcclure, huber, spread
 from photoplan.errors import GeometryError
-from photoplan.orientation.bundle.active import Active
+from photoplan.orientation.bundle.block import Active
 from photoplan.orientation.bundle.model import Model
 from photoplan.orientation.bundle.rows import residuals_of, residuals_of_all, whitened
-from photoplan.orientation.bundle.state import State
+from photoplan.orientation.bundle.unknowns import State
 from photoplan.orientation.start.similarity import robust_similarity
 
 _Floats = NDArray[np.float64]
@@ -82,15 +82,12 @@ def kinds_of_measurements(model: Model) -> NDArray[np.int64]:
 
 def weights_of(model: Model, active: Active, factors: _Floats | None = None) -> _Floats:
     """Weights of all rows: 0 for what is taken out, 1 / factor² for its group's variance factor."""
-    _, of = kinds_of(model)
-    weight = np.ones(len(of))
+    weight = np.ones(model.parts.known.stop)
     if factors is not None:
-        weight = 1.0 / factors[of] ** 2
-    k, c, p = len(model.image), len(model.ground), len(model.position)
-    weight[2 * k : 2 * k + c] *= active.ground[model.ground, model.ground_axis]
-    if p:
-        weight[2 * k + c : 2 * k + c + 3 * p] *= np.repeat(active.position[model.position_row], 3)
-    return np.concatenate([weight, np.ones(_priors(model))])
+        weight[: model.observed] = 1.0 / factors[kinds_of(model)[1]] ** 2
+    weight[model.parts.ground] *= active.ground[model.ground, model.ground_axis]
+    weight[model.parts.position] *= np.repeat(active.position[model.position_row], 3)
+    return weight
 
 
 def softened(model: Model, state: State) -> _Floats:
@@ -98,22 +95,14 @@ def softened(model: Model, state: State) -> _Floats:
 
     A wrong control point of high weight would otherwise draw its image points along, and these would look wrong.
     """
-    out = np.ones(2 * len(model.image) + len(model.ground) + 3 * (len(model.position) + len(model.attitude)))
-    out = np.concatenate([out, np.ones(_priors(model))])
-    distance = np.linalg.norm(state.XYZ[model.point] - state.centers[model.image], axis=1)
+    out = np.ones(model.parts.known.stop)
+    distance = np.linalg.norm(state.XYZ[model.point] - state.images.centers[model.image], axis=1)
     pixel = np.sqrt(np.abs(model.plane[:, 0] * model.plane[:, 5] - model.plane[:, 1] * model.plane[:, 4]))
-    c = np.array([camera.c for camera in state.cameras])[model.camera_of] * pixel
+    c = np.array([state.camera(name).c for name in model.camera_names])[model.camera_of] * pixel
     blur = _SOFT * float(np.median(model.sigma.mean(axis=1) * distance / c[model.image]))
     sigma = 1.0 / np.linalg.norm(model.ground_white, axis=1)
-    k = 2 * len(model.image)
-    out[k : k + len(model.ground)] = sigma**2 / (sigma**2 + blur**2)
+    out[model.parts.ground] = sigma**2 / (sigma**2 + blur**2)
     return out
-
-
-def _priors(model: Model) -> int:
-    block = model.block
-    known = sum(p in block.cameras[n].prior_sigma for n in model.camera_names for p in block.cameras[n].free)
-    return known + (3 if model.columns.lever >= 0 else 0)
 
 
 def robust_scale(e: _Floats, kind: tuple[str, str]) -> float:
@@ -158,7 +147,7 @@ def robust_weights(model: Model, e: _Floats, turn: int) -> _Floats:
 
 def _stretch(model: Model) -> float:
     """How much longer errors are than residuals, in the mean: unknowns take a part of the errors."""
-    rows = 2 * len(model.image) + len(model.ground) + 3 * (len(model.position) + len(model.attitude))
+    rows = model.observed
     unknowns = model.columns.count + 3 * len(model.point_names)
     return float(np.sqrt(rows / max(rows - unknowns, 0.05 * rows)))
 
@@ -166,11 +155,8 @@ def _stretch(model: Model) -> float:
 def _sizes(model: Model, e: _Floats) -> _Floats:
     """Length of the whitened residual that each row is part of, in units of one coordinate's."""
     size = np.abs(e)
-    k, c, p = len(model.image), len(model.ground), len(model.position)
-    pairs = e[: 2 * k].reshape(-1, 2)
-    size[: 2 * k] = np.repeat(np.sqrt((pairs**2).mean(axis=1)), 2)
-    threes = e[2 * k + c : 2 * k + c + 3 * p].reshape(-1, 3)
-    size[2 * k + c : 2 * k + c + 3 * p] = np.repeat(np.sqrt((threes**2).mean(axis=1)), 3)
+    for part, n in ((model.parts.image, 2), (model.parts.position, 3)):
+        size[part] = np.repeat(np.sqrt((e[part].reshape(-1, n) ** 2).mean(axis=1)), n)
     return size
 
 
@@ -209,10 +195,9 @@ def _agreeing(
             point.append(int(model.ground_point[rows[0]]))
     if len(full) < _LEAST_CONTROL:
         return after
-    k = slice(2 * len(model.image), 2 * len(model.image) + len(model.ground))
     sigma = np.ones_like(ground.XYZ)
     white = np.linalg.norm(model.ground_white, axis=1)
-    sigma[model.ground, model.ground_axis] = 1.0 / (white * np.sqrt(softened(model, state)[k]))
+    sigma[model.ground, model.ground_axis] = 1.0 / (white * np.sqrt(softened(model, state)[model.parts.ground]))
     found, given = state.XYZ[point], ground.XYZ[full]
     try:
         moved, _ = robust_similarity(found, given, 0.5 * limit * float(np.median(sigma[full])))
@@ -233,12 +218,11 @@ def _agreement(fits: NDArray[np.bool_]) -> tuple[int, int]:
 
 def _without(model: Model, active: Active, bad: NDArray[np.bool_]) -> Active:
     """Take out the observations whose rows are bad."""
-    k, c, p = len(model.image), len(model.ground), len(model.position)
     image, ground, position = active.image.copy(), active.ground.copy(), active.position.copy()
-    image[model.observation[bad[: 2 * k].reshape(-1, 2).any(axis=1)]] = False
-    rows = np.flatnonzero(bad[2 * k : 2 * k + c])
+    image[model.observation[bad[model.parts.image].reshape(-1, 2).any(axis=1)]] = False
+    rows = np.flatnonzero(bad[model.parts.ground])
     ground[model.ground[rows], model.ground_axis[rows]] = False
-    position[model.position_row[bad[2 * k + c : 2 * k + c + 3 * p].reshape(-1, 3).any(axis=1)]] = False
+    position[model.position_row[bad[model.parts.position].reshape(-1, 3).any(axis=1)]] = False
     return Active(image, ground, position)
 
 
@@ -251,12 +235,12 @@ def snooped(model: Model, state: State, judged: Judged, active: Active, critical
     _, of = kinds_of(model)
     size = np.nan_to_num(np.abs(judged.normalised[: len(of)]))
     size[judged.weight[: len(of)] == 0] = 0.0
-    k, c = len(model.image), len(model.ground)
+    on = slice(0, model.parts.ground.stop)
     bad = size > critical
     point = np.concatenate([np.repeat(model.point, 2), model.ground_point])
     worst = np.zeros(len(model.point_names))
-    np.maximum.at(worst, point, size[: 2 * k + c])
-    bad[: 2 * k + c] &= size[: 2 * k + c] >= worst[point]
+    np.maximum.at(worst, point, size[on])
+    bad[on] &= size[on] >= worst[point]
     out = _without(model, active, bad)
     return _brought_back(model, state, judged, active, out, critical * _BACK)
 
@@ -272,12 +256,10 @@ def _brought_back(model: Model, state: State, judged: Judged, before: Active, af
         size = np.abs(residuals / block.observations.sigma).max(axis=1) / scales[kind]
     image |= ~before.image & (kind >= 0) & (np.nan_to_num(size, nan=np.inf) < limit)
     ground, position = after.ground.copy(), after.position.copy()
-    rows = np.arange(2 * len(model.image), 2 * len(model.image) + len(model.ground))
-    fits = np.abs(judged.e[rows]) / scales[of[rows]] < limit
+    off = np.abs(judged.e[: len(of)]) / scales[of]
+    fits = off[model.parts.ground] < limit
     out = ~before.ground[model.ground, model.ground_axis]
     ground[model.ground[fits & out], model.ground_axis[fits & out]] = True
-    if len(model.position):
-        rows = 2 * len(model.image) + len(model.ground) + np.arange(3 * len(model.position))
-        fits = (np.abs(judged.e[rows]) / scales[of[rows]]).reshape(-1, 3).max(axis=1) < limit
-        position[model.position_row[fits & ~before.position[model.position_row]]] = True
+    fits = off[model.parts.position].reshape(-1, 3).max(axis=1) < limit
+    position[model.position_row[fits & ~before.position[model.position_row]]] = True
     return Active(image, ground, position)

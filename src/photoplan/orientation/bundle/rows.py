@@ -8,12 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from photoplan.adjustment.blocks import Layout
 from photoplan.cameras.lenses.brown import Brown
 from photoplan.cameras.lenses.opencv import OpenCV
+from photoplan.geometry.rotation import rotation_vector, skew
 from photoplan.orientation.bundle.model import Model
-from photoplan.orientation.bundle.state import CameraState, State, parameter, rotation_vector, skew
+from photoplan.orientation.bundle.unknowns import BORESIGHT, DRIFT, IMAGES, LEVER, CameraState, State
 
 _Floats = NDArray[np.float64]
+_Index = NDArray[np.int64]
+_NONE = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,34 +102,35 @@ def _residuals(model: Model, state: State, rays: _Rays) -> Residuals:
     ground = (model.ground_white * off).sum(axis=1)
     position, attitude = np.empty((0, 3)), np.empty((0, 3))
     if block.positions is not None:
-        antenna = state.centers[model.position] + state.rotations[model.position] @ state.lever
-        drift = state.shifts[model.strip_of] + state.rates[model.strip_of] * model.tau[:, None]
+        antenna = state.images.centers[model.position] + state.images.rotations[model.position] @ state.lever
+        shift, rate = state.drift[model.strip_of, :3], state.drift[model.strip_of, 3:]
+        drift = shift + rate * model.tau[:, None]
         position = antenna + drift - block.positions.XYZ[model.position_row]
     if block.attitudes is not None:
         observed = block.attitudes.R_ground_camera[model.attitude_row]
-        turned = np.swapaxes(observed, 1, 2) @ state.rotations[model.attitude] @ state.boresight
+        turned = np.swapaxes(observed, 1, 2) @ state.images.rotations[model.attitude] @ state.boresight
         attitude = rotation_vector(turned)
-    return Residuals(image, ground, position, attitude, _priors(model, state)[0])
+    return Residuals(image, ground, position, attitude, _known(model, state))
 
 
 def linearise(model: Model, state: State, weight: _Floats) -> tuple[Rows, Residuals]:
     """Equations at a state; `weight` (rows,) is the square root of each row's robust weight."""
     rays = _project(model, state, derivatives=True)
     found = _residuals(model, state, rays)
-    entries = _Entries()
+    entries = _Entries(model.columns)
     on_points = _image_rows(model, state, rays, entries)
-    at = _direct_rows(model, state, found, entries)
-    prior, at_columns, prior_white = _priors(model, state)
-    entries.parts.append((prior_white, at + np.arange(len(prior)), at_columns))
-    k, c = 2 * len(model.image), len(model.ground)
-    point = np.full(at + len(prior), -1, np.int64)
-    point[:k] = np.repeat(model.point, 2)
-    point[k : k + c] = model.ground_point
+    _direct_rows(model, state, found, entries)
+    for at, (key, parameter, _, sigma) in enumerate(model.known, model.parts.known.start):
+        entries.put(np.array([[at]]), key, np.zeros(1, np.int64), np.array([[[1.0 / sigma]]]), parameter)
+    point = np.full(model.parts.known.stop, -1, np.int64)
+    point[model.parts.image] = np.repeat(model.point, 2)
+    point[model.parts.ground] = model.ground_point
     e = whitened(model, found)
     e = np.where(weight > 0, e, 0.0) * weight
     A_global = _matrix(entries.parts, weight, (len(point), model.columns.count))
-    row = np.repeat(np.arange(k + c), 3)
-    column = (3 * point[: k + c, None] + np.arange(3)).ravel()
+    on = model.parts.ground.stop
+    row = np.repeat(np.arange(on), 3)
+    column = (3 * point[:on, None] + np.arange(3)).ravel()
     values = np.concatenate([on_points, model.ground_white]).ravel()
     A_points = _matrix([(values, row, column)], weight, (len(point), 3 * len(model.point_names)))
     return Rows(e, A_global, A_points, point), found
@@ -134,12 +139,19 @@ def linearise(model: Model, state: State, weight: _Floats) -> tuple[Rows, Residu
 class _Entries:
     """Entries of a sparse matrix while it is filled: values, rows, columns."""
 
-    def __init__(self) -> None:
+    def __init__(self, columns: Layout) -> None:
         self.parts: list[tuple[_Floats, NDArray[np.int64], NDArray[np.int64]]] = []
+        self._columns = columns
 
-    def put(self, rows: NDArray[np.int64], first: NDArray[np.int64], values: _Floats) -> None:
-        """Blocks `values` (n, r, u) on rows (n, r); the u columns of each block begin at `first` (n,)."""
-        column = first[:, None, None] + np.arange(values.shape[2])
+    def put(self, rows: _Index, key: str, block: _Index, values: _Floats, skip: int = 0) -> None:
+        """Derivatives `values` (n, r, u) on rows (n, r) by the unknowns of blocks (n,), from parameter `skip` on.
+
+        Of a kind that is held fixed there are none.
+        """
+        kind = self._columns.get(key)
+        if kind is None:
+            return
+        column = kind.at(block)[:, None, None] + skip + np.arange(values.shape[2])
         row, column = np.broadcast_arrays(rows[:, :, None], column)
         self.parts.append((values.ravel(), row.ravel(), column.ravel()))
 
@@ -153,43 +165,38 @@ def _image_rows(model: Model, state: State, rays: _Rays, entries: _Entries) -> _
     by_p[:, 0, 0] = by_p[:, 1, 1] = -1.0 / z
     by_p[:, :, 2] = -rays.t / z[:, None]
     by_p = rays.outer @ rays.inner @ by_p
-    by_X = by_p @ np.swapaxes(state.rotations[model.image], 1, 2)
+    by_X = by_p @ np.swapaxes(state.images.rotations[model.image], 1, 2)
     rows = np.arange(2 * k).reshape(k, 2)
-    entries.put(rows, 6 * model.image, np.concatenate([-by_X, by_p @ skew(rays.p)], axis=2) * white)
-    for index, (name, free) in enumerate(zip(model.camera_names, model.free)):
-        mine = np.flatnonzero(model.camera_of[model.image] == index)
-        if free and len(mine):
-            J = _by_parameters(state.cameras[index], free, rays, mine) * white[mine]
-            entries.put(rows[mine], np.full(len(mine), model.columns.cameras[name]), J)
+    entries.put(rows, IMAGES, model.image, np.concatenate([-by_X, by_p @ skew(rays.p)], axis=2) * white)
+    for index, name in enumerate(model.camera_names):
+        camera = state.camera(name)
+        mine = np.flatnonzero(model.camera_of[model.image] == index) if camera.free else _NONE
+        if len(mine):
+            J = _by_parameters(camera, rays, mine) * white[mine]
+            entries.put(rows[mine], f"camera {name}", np.zeros(len(mine), np.int64), J)
     return (by_X * white).reshape(-1, 3)
 
 
-def _direct_rows(model: Model, state: State, found: Residuals, entries: _Entries) -> int:
-    """Rows of observed positions and attitudes; returned: the number of the row after them."""
-    block, columns = model.block, model.columns
-    at, n = 2 * len(model.image) + len(model.ground), len(model.position)
+def _direct_rows(model: Model, state: State, found: Residuals, entries: _Entries) -> None:
+    """Rows of observed positions and attitudes."""
+    block, n = model.block, len(model.position)
     if block.positions is not None and n:
-        rows = at + np.arange(3 * n).reshape(n, 3)
+        rows = model.parts.position.start + np.arange(3 * n).reshape(n, 3)
         white = 1.0 / block.positions.sigma[model.position_row][:, :, None]
-        R = state.rotations[model.position]
+        R = state.images.rotations[model.position]
         eye = np.broadcast_to(np.eye(3), R.shape)
-        entries.put(rows, 6 * model.position, np.concatenate([eye, -R @ skew(state.lever)], axis=2) * white)
-        if columns.lever >= 0:
-            entries.put(rows, np.full(n, columns.lever), R * white)
-        if columns.strips:
-            first = np.array([columns.strips[name] for name in model.strip_names], np.int64)[model.strip_of]
-            drift = eye if block.drift == "shift" else np.concatenate([eye, eye * model.tau[:, None, None]], axis=2)
-            entries.put(rows, first, drift * white)
-    at, n = at + 3 * n, len(model.attitude)
+        entries.put(rows, IMAGES, model.position, np.concatenate([eye, -R @ skew(state.lever)], axis=2) * white)
+        entries.put(rows, LEVER, np.zeros(n, np.int64), R * white)
+        drift = eye if block.drift == "shift" else np.concatenate([eye, eye * model.tau[:, None, None]], axis=2)
+        entries.put(rows, DRIFT, model.strip_of, drift * white)
+    n = len(model.attitude)
     if block.attitudes is not None and n:
-        rows = at + np.arange(3 * n).reshape(n, 3)
+        rows = model.parts.attitude.start + np.arange(3 * n).reshape(n, 3)
         white = 1.0 / block.attitudes.sigma[model.attitude_row][:, :, None]
         # log(exp(e) exp(δ)) = e + (1 + [e]× / 2) δ + …, and a rotation before the boresight is turned by it.
         by_turn = np.eye(3) + 0.5 * skew(found.attitude)
-        entries.put(rows, 6 * model.attitude + 3, by_turn @ state.boresight.T * white)
-        if columns.boresight >= 0:
-            entries.put(rows, np.full(n, columns.boresight), by_turn * white)
-    return at + 3 * n
+        entries.put(rows, IMAGES, model.attitude, by_turn @ state.boresight.T * white, 3)
+        entries.put(rows, BORESIGHT, np.zeros(n, np.int64), by_turn * white)
 
 
 def whitened(model: Model, found: Residuals) -> _Floats:
@@ -214,15 +221,15 @@ def _matrix(
 
 def _project(model: Model, state: State, derivatives: bool) -> _Rays:
     """Image points of all measurements, with what their derivatives need."""
-    p = state.XYZ[model.point] - state.centers[model.image]
-    p = (p[:, None, :] @ state.rotations[model.image])[:, 0]
+    p = state.XYZ[model.point] - state.images.centers[model.image]
+    p = (p[:, None, :] @ state.images.rotations[model.image])[:, 0]
     depth = np.where(p[:, 2] < 0, -p[:, 2], np.nan)
     t = p[:, :2] / depth[:, None]
     plane, real = np.empty_like(t), np.empty_like(t)
     inner = np.empty((len(t), 2, 2)) if derivatives else np.empty((0, 2, 2))
     of = model.camera_of[model.image]
-    for index, camera in enumerate(state.cameras):
-        mine = of == index
+    for index, name in enumerate(model.camera_names):
+        mine, camera = of == index, state.camera(name)
         real[mine] = camera.lens.distort(t[mine])
         plane[mine] = camera.c * real[mine] + (camera.x0, camera.y0)
         if derivatives:
@@ -242,11 +249,11 @@ def _project(model: Model, state: State, derivatives: bool) -> _Rays:
     return _Rays(p, t, real, inner, outer, px)
 
 
-def _by_parameters(camera: CameraState, free: tuple[str, ...], rays: _Rays, mine: NDArray[np.int64]) -> _Floats:
+def _by_parameters(camera: CameraState, rays: _Rays, mine: _Index) -> _Floats:
     """∂ pixel / ∂ free parameters of a camera, (n, 2, k)."""
     t = rays.t[mine]
-    J = np.zeros((len(mine), 2, len(free)))
-    for column, name in enumerate(free):
+    J = np.zeros((len(mine), 2, len(camera.free)))
+    for column, name in enumerate(camera.free):
         if name == "c":
             J[:, :, column] = rays.real[mine]
         elif name in ("x0", "y0"):
@@ -280,20 +287,7 @@ def _by_coefficient(camera: CameraState, name: str, t: _Floats, real: _Floats) -
     return d
 
 
-def _priors(model: Model, state: State) -> tuple[_Floats, NDArray[np.int64], _Floats]:
-    """Rows of what is known beforehand: whitened residual, column, 1 / standard deviation."""
-    rows: list[tuple[float, int, float]] = []
-    block, columns = model.block, model.columns
-    for name, now in zip(model.camera_names, state.cameras):
-        given = block.cameras[name]
-        before = CameraState(given.c, *given.principal_point, given.lens)
-        for k, what in enumerate(given.free):
-            sigma = given.prior_sigma.get(what)
-            if sigma is not None:
-                off = parameter(now, what) - parameter(before, what)
-                rows.append((off / sigma, columns.cameras[name] + k, 1.0 / sigma))
-    if columns.lever >= 0:
-        off_lever = (state.lever - block.lever_arm) / block.lever_arm_sigma
-        rows += [(float(off_lever[k]), columns.lever + k, 1.0 / block.lever_arm_sigma) for k in range(3)]
-    table = np.array(rows).reshape(-1, 3)
-    return table[:, 0], table[:, 1].astype(np.int64), table[:, 2]
+def _known(model: Model, state: State) -> _Floats:
+    """Whitened residuals of what is known beforehand."""
+    off = [(state.known(key).value(parameter) - value) / sigma for key, parameter, value, sigma in model.known]
+    return np.array(off, float)

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.adjustment.robust import geman_mcclure
-from photoplan.orientation.bundle.active import Active
-from photoplan.orientation.bundle.block import Block
+from photoplan.orientation.bundle.block import Active, Block
 
 _Floats = NDArray[np.float64]
 _Index = NDArray[np.int64]

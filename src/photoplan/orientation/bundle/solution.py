@@ -11,7 +11,7 @@ from photoplan.orientation.bundle.model import Model
 from photoplan.orientation.bundle.normal import Inverse, Reduced, reduce_normals
 from photoplan.orientation.bundle.robust import Judged, kinds_of, robust_scale
 from photoplan.orientation.bundle.rows import Residuals, linearise, whitened
-from photoplan.orientation.bundle.state import State
+from photoplan.orientation.bundle.unknowns import State
 
 _Floats = NDArray[np.float64]
 
@@ -135,6 +135,6 @@ def solution_of(
         inverse = Inverse(reduced)
         points, variance = inverse.variances()
         points = points - reduced.V_inverse + own
-        others = slice(2 * len(model.image), None)
+        others = slice(model.parts.image.stop, None)
         redundancies[others] = np.clip(1.0 - variance[others], 0.0, 1.0)
     return Solution(model, state, reduced, found, e, weight, inverse, redundancies, points)

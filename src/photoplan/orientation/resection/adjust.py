@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.iterate import levenberg
 from photoplan.adjustment.robust import spread
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
@@ -214,29 +215,14 @@ def _equations(task: _Task, state: _State) -> _Equations:
 
 
 def _adjusted(task: _Task, state: _State, use: NDArray[np.bool_]) -> tuple[_State, _Equations]:
-    """Least squares over the points `use` (Levenberg and Marquardt's method)."""
-    equations = _equations(task, state)
-    damping = 0.0
-    for _ in range(_ITERATIONS):
-        u = equations.A.shape[2]
-        A = (equations.A[use] * equations.units).reshape(-1, u)
-        rhs = -equations.v[use].ravel()
-        if damping > 0:
-            A = np.concatenate([A, np.sqrt(damping) * np.diag(np.linalg.norm(A, axis=0) + 1e-300)])
-            rhs = np.concatenate([rhs, np.zeros(u)])
-        step = np.linalg.lstsq(A, rhs, rcond=1e-13)[0]
-        trial = _stepped(task, state, step * equations.units)
-        after = None if trial is None else _equations(task, trial)
-        square = _square(equations, use)
-        if trial is None or after is None or not _square(after, use) <= square * (1.0 + 1e-9) + 1e-18:
-            if np.abs(step).max() < 1e-9 or damping > 1e6:
-                break
-            damping = max(1e-3, 10.0 * damping)
-            continue
-        state, equations, damping = trial, after, (damping / 10.0 if damping > 1e-6 else 0.0)
-        if np.abs(step).max() < 1e-13:
-            break
-    return state, equations
+    """Least squares over the points `use`."""
+
+    def equations(state: _State) -> tuple[Array, Array]:
+        found = _equations(task, state)
+        return found.A[use].reshape(-1, found.A.shape[2]), found.v[use].ravel()
+
+    state = levenberg(state, equations, lambda state, step: _stepped(task, state, step), _ITERATIONS).state
+    return state, _equations(task, state)
 
 
 def _stepped(task: _Task, state: _State, step: Array) -> _State | None:
@@ -250,11 +236,6 @@ def _stepped(task: _Task, state: _State, step: Array) -> _State | None:
     if task.settings.free:
         interior = replace(interior, c=values["c"], principal_point=(values["x0"], values["y0"]))
     return _State(moved(state.pose, step), interior)
-
-
-def _square(equations: _Equations, use: NDArray[np.bool_]) -> float:
-    v = equations.v[use]
-    return float((v * v).sum()) if np.isfinite(v).all() else np.inf
 
 
 def _cleaned(task: _Task, state: _State, use: NDArray[np.bool_]) -> Resected:

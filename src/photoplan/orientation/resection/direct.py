@@ -8,11 +8,11 @@ from math import comb
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
+from photoplan.adjustment.iterate import levenberg
 from photoplan.errors import GeometryError
 from photoplan.geometry.pose import Pose
+from photoplan.geometry.rotation import skew, small_rotations
 from photoplan.orientation.resection.p3p import three_point_poses
 
 Array = NDArray[np.float64]
@@ -187,7 +187,7 @@ def _best(R: Array, centers: Array, points: tuple[Array, Array], scale: float, n
     fitting = [pose for _, fits, pose in kept if fits] if few and sure else []
     if fitting and near is not None:
         # Where the camera lies on the cylinder about three points, noise may leave no closed solution there.
-        there = _settled(near, t, X, size)
+        there = _settled(near, t, X)
         if (_distances(there.R_ground_camera[None], there.center[None], t, X)[0] / (3.0 * scale) < _FITS).all():
             fitting.append(there)
     if len(fitting) < 2:
@@ -200,16 +200,9 @@ def _best(R: Array, centers: Array, points: tuple[Array, Array], scale: float, n
     return min(fitting, key=lambda pose: _apart(pose, near, size))
 
 
-def _settled(pose: Pose, t: Array, X: Array, size: float) -> Pose:
+def _settled(pose: Pose, t: Array, X: Array) -> Pose:
     """The minimum next to a pose, also where the points hardly determine it (Levenberg and Marquardt's method)."""
-    unit = np.array([size] * 3 + [1.0] * 3)
-
-    def residuals(step: Array) -> Array:
-        there = moved(pose, step * unit)
-        r = reprojected(there.R_ground_camera[None], there.center[None], X)[0] - t
-        return np.where(np.isfinite(r), r, 1e3).ravel()
-
-    return moved(pose, least_squares(residuals, np.zeros(6), method="lm").x * unit)
+    return polished_pose(pose, t, X, np.ones(len(t), bool), 200)
 
 
 def _apart(a: Pose, b: Pose, size: float) -> float:
@@ -246,11 +239,8 @@ def tangent_derivatives(pose: Pose, X: Array) -> tuple[Array, Array, Array, Arra
     by_p[:, 0, 0] = by_p[:, 1, 1] = 1.0
     by_p[:, :, 2] = t
     by_p /= depth[:, None, None]
-    x, y, z = p.T
-    o = np.zeros_like(x)
-    cross = np.stack([np.stack([o, -z, y], -1), np.stack([z, o, -x], -1), np.stack([-y, x, o], -1)], axis=1)
     by_X = by_p @ R.T
-    return t, np.concatenate([-by_X, by_p @ cross], axis=2), by_X, depth
+    return t, np.concatenate([-by_X, by_p @ skew(p)], axis=2), by_X, depth
 
 
 def polished_pose(pose: Pose, t: Array, X: Array, use: NDArray[np.bool_], iterations: int = 8) -> Pose:
@@ -269,26 +259,14 @@ def polished_pose(pose: Pose, t: Array, X: Array, use: NDArray[np.bool_], iterat
         Most steps.
     """
     t, X = t[use], X[use]
-    size = float(np.linalg.norm(X - pose.center, axis=1).mean())
-    unit = np.array([size] * 3 + [1.0] * 3)
-    best = _square(pose, t, X)
-    for _ in range(iterations):
-        computed, A, _, _ = tangent_derivatives(pose, X)
-        step = np.linalg.lstsq((A * unit).reshape(-1, 6), (t - computed).ravel(), rcond=1e-12)[0]
-        changed = moved(pose, step * unit)
-        square = _square(changed, t, X)
-        if not square < best:
-            break
-        gain, best, pose = best - square, square, changed
-        if gain <= 1e-6 * best:
-            break
-    return pose
+
+    def equations(pose: Pose) -> tuple[Array, Array] | None:
+        computed, A, _, depth = tangent_derivatives(pose, X)
+        return (A.reshape(-1, 6), (computed - t).ravel()) if (depth > 0).all() else None
+
+    return levenberg(pose, equations, moved, iterations).state if equations(pose) is not None else pose
 
 
 def moved(pose: Pose, step: Array) -> Pose:
     """Pose after a step (6,): centre, then small rotations about the camera's axes."""
-    return Pose(pose.center + step[:3], pose.R_ground_camera @ Rotation.from_rotvec(step[3:6]).as_matrix())
-
-
-def _square(pose: Pose, t: Array, X: Array) -> float:
-    return float((_distances(pose.R_ground_camera[None], pose.center[None], t, X) ** 2).sum())
+    return Pose(pose.center + step[:3], pose.R_ground_camera @ small_rotations(step[3:6]))

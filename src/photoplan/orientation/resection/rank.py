@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import GeometryError
+from photoplan.geometry.pose import UNKNOWNS
 
 Array = NDArray[np.float64]
 
@@ -16,7 +17,6 @@ Array = NDArray[np.float64]
 UNDETERMINED = 0.1
 #: Smaller singular values than this part of the largest are rounding.
 _ROUNDING = 1e-10
-NAMES = ("X0", "Y0", "Z0", "rotation about x", "rotation about y", "rotation about z")
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ def _spelled(direction: Array, singular: float, unknowns: Unknowns) -> str:
     """A combination of unknowns that leaves the image as it is, in numbers."""
     share = np.abs(direction)
     parts = [int(k) for k in np.argsort(-share) if share[k] > 0.1 * share.max()]
-    names = [*NAMES, *unknowns.free]
+    names = [*UNKNOWNS, *unknowns.free]
     # One percent of the natural size of what changes most.
     step = direction * (0.01 / direction[parts[0]])
     said = [_change(names[k], float(step[k] * unknowns.units[k]), k, len(unknowns.free)) for k in parts]

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from photoplan.adjustment.linear import solve
 from photoplan.adjustment.robust import huber
 from photoplan.errors import GeometryError
 from photoplan.geometry.pose import Pose
+from photoplan.geometry.rotation import small_rotations
 from photoplan.orientation.intersection import Rays, intersect
 from photoplan.orientation.start.five_point import five_point_essentials
 
@@ -168,7 +168,7 @@ def _refined(pose: Pose, a: Array, b: Array, limit: float) -> Pose:
     def stepped(p: Pose, step: Array) -> Pose:
         side = np.linalg.svd(p.center[None])[2][1:]
         base = p.center + step[:2] @ side
-        turn = Rotation.from_rotvec(step[2:]).as_matrix()
+        turn = small_rotations(step[2:])
         return Pose(base / np.linalg.norm(base), p.R_ground_camera @ turn)
 
     now = signed(pose)

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, special
 
+from photoplan.adjustment.iterate import Equations, levenberg
+from photoplan.adjustment.linear import solve
 from photoplan.errors import InputError
 
 _Array = NDArray[np.float64]
@@ -208,26 +210,11 @@ class _Fit:
 
     def run(self, start: tuple[float, float, float], settings: DiscSettings) -> Disc | str:
         """The disc, or why it is none."""
-        shape = np.array([0.0, 0.0, np.log(start[2]), 0.0, 0.0, np.log(0.08 * start[2] + 0.5)])
-        damping, best = 1e-3, self._linear(shape)[2]
-        for _ in range(_ROUNDS):
-            levels, cover, _ = self._linear(shape)
-            jacobian, residual = self._jacobian(shape, levels, cover)
-            normal = jacobian.T @ jacobian
-            step = _solved(normal + damping * np.diag(np.diag(normal)), jacobian.T @ residual)
-            step[:6] = np.clip(step[:6], -0.3 * start[2], 0.3 * start[2])
-            trial = shape + np.clip(step[:6], *_bounds(start[2]))
-            left = self._linear(trial)[2]
-            if left <= best * (1.0 + 1e-12):
-                small = float(np.abs(step[:2]).max()) < 1e-4
-                shape, best, damping = trial, left, damping / 5.0
-                if small:
-                    break
-            else:
-                damping *= 8.0
-                if damping > 1e6:
-                    break
-        return self._disc(shape, start, settings)
+        first = np.array([0.0, 0.0, np.log(start[2]), 0.0, 0.0, np.log(0.08 * start[2] + 0.5)])
+        found = levenberg(
+            first, self._equations, lambda shape, step: shape + np.clip(step[:6], *_bounds(start[2])), _ROUNDS
+        )
+        return self._disc(found, start, settings)
 
     def _cover(self, shape: _Array) -> _Array:
         """Share of the disc in each pixel: the normal distribution of the distance from the ellipse."""
@@ -246,34 +233,25 @@ class _Fit:
         # Light that falls unevenly is as uneven inside the disc; a share of a slope there is left to the noise.
         return np.concatenate([ground, slopes * (1.0 - cover)[:, None], ground * cover[:, None]], 1)
 
-    def _linear(self, shape: _Array) -> tuple[_Array, _Array, float]:
-        """Grey values that fit best to a shape, the cover, and the sum of squares left."""
-        cover = self._cover(shape)
-        basis = self._basis(cover)
-        levels = _solved(basis.T @ basis, basis.T @ self.grey)
-        residual = self.grey - basis @ levels
-        return levels, cover, float(residual @ residual)
-
-    def _jacobian(self, shape: _Array, levels: _Array, cover: _Array) -> tuple[_Array, _Array]:
-        basis = self._basis(cover)
+    def _equations(self, shape: _Array) -> tuple[_Array, _Array]:
+        """Derivatives by the shape and by the grey values that fit best to it, and residuals."""
+        basis = self._basis(self._cover(shape))
+        fit = solve(basis, self.grey)
         columns = []
         for k in range(6):
             moved = shape.copy()
             moved[k] += 1e-5
-            columns.append((self._basis(self._cover(moved)) @ levels - basis @ levels) / 1e-5)
-        return np.column_stack([*columns, basis]), self.grey - basis @ levels
+            columns.append((self._basis(self._cover(moved)) - basis) @ fit.unknowns / 1e-5)
+        return np.column_stack([*columns, basis]), fit.residuals
 
-    def _disc(self, shape: _Array, start: tuple[float, float, float], settings: DiscSettings) -> Disc | str:
-        levels, cover, left = self._linear(shape)
-        jacobian, _ = self._jacobian(shape, levels, cover)
-        free = self.grey.size - jacobian.shape[1]
-        if free < 10:
+    def _disc(self, found: Equations[_Array], start: tuple[float, float, float], settings: DiscSettings) -> Disc | str:
+        shape, noise = found.state, found.sigma0
+        if found.redundancy < 10:
             return "too few pixels"
-        noise = float(np.sqrt(left / free))
-        try:
-            cofactors = np.linalg.inv(jacobian.T @ jacobian)
-        except np.linalg.LinAlgError:
+        cofactors = found.cofactors()
+        if cofactors is None:
             return "not determined"
+        levels = solve(self._basis(self._cover(shape)), self.grey).unknowns
         sigma = noise * np.sqrt(np.maximum(np.diag(cofactors)[:2], 0.0))
         steps = -levels[-self.planes :]
         contrast = float(steps[np.argmax(np.abs(steps))])
@@ -291,13 +269,6 @@ class _Fit:
             return "centre too uncertain"
         x, y = start[0] + float(shape[0]), start[1] + float(shape[1])
         return Disc(x, y, float(sigma[0]), float(sigma[1]), radius, float(np.exp(shape[5])), contrast, noise)
-
-
-def _solved(normal: _Array, right: _Array) -> _Array:
-    """Solution of normal equations, scaled to ones on the diagonal; a little is added so that there always is one."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    inside = normal * np.multiply.outer(scale, scale) + 1e-11 * np.eye(scale.size)
-    return np.asarray(scale * np.linalg.solve(inside, scale * right), np.float64)
 
 
 def _whole(grey: _Array) -> bool:

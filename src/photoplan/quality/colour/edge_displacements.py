@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from photoplan.adjustment.iterate import levenberg
+from photoplan.adjustment.linear import Fit, solve
 from photoplan.errors import InputError
 from photoplan.quality.colour.model import Displacements
 from photoplan.quality.edges.find import EdgeRegion
@@ -77,57 +79,33 @@ def edge_displacements(
 
 def _step(along: _Array, across: _Array, grey: _Array, slope: float | None) -> tuple[float, float, float] | None:
     """Position of a blurred step across, its standard deviation, and the slope of its line; None: no clear step."""
-    free = np.array([0.0, np.log(1.0), 0.0 if slope is None else slope])
     unknown = 3 if slope is None else 2
 
     def shares(at: _Array) -> _Array:
         return np.asarray(special.ndtr((across - at[0] - at[2] * along) / np.exp(at[1])))
 
-    def linear(at: _Array) -> tuple[_Array, _Array, float]:
-        basis = np.stack([np.ones(grey.size), shares(at)], 1)
-        levels = np.asarray(np.linalg.lstsq(basis, grey, rcond=None)[0], np.float64)
-        left = grey - basis @ levels
-        return levels, left, float(left @ left)
+    def levels(at: _Array) -> Fit:
+        return solve(np.stack([np.ones(grey.size), shares(at)], 1), grey)
 
-    damping = 1e-3
-    levels, left, best = linear(free)
-    for _ in range(_ROUNDS):
-        jacobian = _jacobian(shares, free, levels, unknown)
-        normal = jacobian.T @ jacobian
-        step = np.linalg.lstsq(normal + damping * np.diag(np.diag(normal) + 1e-12), jacobian.T @ left, rcond=None)[0]
-        trial = free.copy()
-        trial[:unknown] += np.clip(step[:unknown], -1.0, 1.0)
-        if abs(trial[1]) > 4.0:
-            return None
-        new_levels, new_left, value = linear(trial)
-        if value <= best * (1.0 + 1e-12):
-            free, levels, left, best, damping = trial, new_levels, new_left, value, damping / 5.0
-            if abs(step[0]) < 1e-6:
-                break
-        else:
-            damping *= 8.0
-            if damping > 1e8:
-                break
-    noise = np.sqrt(best / max(grey.size - unknown - 2, 1))
-    jacobian = _jacobian(shares, free, levels, unknown)
-    try:
-        sigma = noise * np.sqrt(np.linalg.inv(jacobian.T @ jacobian)[0, 0])
-    except np.linalg.LinAlgError:
+    def equations(at: _Array) -> tuple[_Array, _Array]:
+        """Derivatives of the grey values by position, blur, slope of the line and both levels, and residuals."""
+        fit = levels(at)
+        moved = [at + 1e-5 * np.eye(3)[k] for k in range(unknown)]
+        columns = [fit.unknowns[1] * (shares(there) - fit.A[:, 1]) / 1e-5 for there in moved]
+        return np.column_stack([*columns, fit.A]), fit.residuals
+
+    def moved(at: _Array, step: _Array) -> _Array | None:
+        trial = at + np.pad(np.clip(step[:unknown], -1.0, 1.0), (0, 3 - unknown))
+        return trial if abs(trial[1]) <= 4.0 else None
+
+    found = levenberg(np.array([0.0, 0.0, slope or 0.0]), equations, moved, _ROUNDS)
+    free, noise, cofactors = found.state, found.sigma0, found.cofactors()
+    if cofactors is None:
         return None
+    sigma = noise * float(np.sqrt(cofactors[0, 0]))
     reach = float(np.abs(across).max())
     if not np.isfinite([sigma, *free]).all() or abs(free[0]) > 0.6 * reach or np.exp(free[1]) > 0.5 * reach:
         return None
-    if abs(levels[1]) < _LEAST_SNR * noise or sigma > 0.3:
+    if abs(levels(free).unknowns[1]) < _LEAST_SNR * noise or sigma > 0.3:
         return None
-    return float(free[0]), float(sigma), float(free[2])
-
-
-def _jacobian(shares: Callable[[_Array], _Array], at: _Array, levels: _Array, unknown: int) -> _Array:
-    """Derivatives of the grey values: position, blur, slope of the line, both levels."""
-    basis = np.stack([np.ones(shares(at).size), shares(at)], 1)
-    columns = []
-    for k in range(unknown):
-        moved = at.copy()
-        moved[k] += 1e-5
-        columns.append(levels[1] * (shares(moved) - basis[:, 1]) / 1e-5)
-    return np.column_stack([*columns, basis])
+    return float(free[0]), sigma, float(free[2])

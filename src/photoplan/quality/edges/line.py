@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from photoplan.adjustment.iterate import levenberg
+from photoplan.adjustment.linear import solve
 from photoplan.errors import InputError
 from photoplan.quality.edges.model import LEAST_BLUR, PixelEdge
 
 #: Standard deviation in pixels of the smoothing with which an edge is first found.
 SMOOTHING = 1.5
-#: Steps of the fit; each halves the error at least, so what has not settled by then is not one edge.
+#: Steps of the fit; what has not settled by then is not one edge.
 MOST_STEPS = 25
 
 
@@ -135,7 +137,7 @@ def find_line(image: NDArray[np.float64], valid: NDArray[np.bool_]) -> EdgeLine:
 
 
 def fit_line(
-    pixels: EdgePixels, line: EdgeLine, curve: int, shading: bool, settled: float = 1e-4
+    pixels: EdgePixels, line: EdgeLine, curve: int, shading: bool, most: int = MOST_STEPS
 ) -> tuple[EdgeLine, PixelEdge, NDArray[np.float64]]:
     """Line and blur of least squares for the pixels of an edge, by the profile of a Gaussian and the pixel.
 
@@ -149,37 +151,22 @@ def fit_line(
         Degree of the line, 1 or 2.
     shading
         Whether both levels may change along the edge.
-    settled
-        Change of place and blur, in pixels, at which the fit ends.
+    most
+        Steps of the fit at most.
 
     Returns
     -------
     line, model, levels
         Levels: dark, step, then the slopes of the dark and of the bright side along the edge.
     """
-    blur = _first_blur(pixels, line)
-    damping, cost = 1e-3, np.inf
-    state = _State(line, blur)
-    best = _linearised(pixels, state, curve, shading)
-    for _ in range(MOST_STEPS):
-        design, residual, _ = best
-        cost = float(residual @ residual)
-        normal = design.T @ design
-        right = design.T @ residual
-        step = np.asarray(np.linalg.lstsq(normal + damping * np.diag(np.diag(normal)), right, rcond=1e-12)[0], float)
-        trial = state.moved(step[: curve + 2], curve)
-        following = _linearised(pixels, trial, curve, shading)
-        if float(following[1] @ following[1]) <= cost:
-            done = bool(np.abs(step[[0, curve + 1]]).max() < settled)
-            state, best, damping = trial, following, damping / 10.0
-            if done:
-                break
-        else:
-            damping *= 10.0
-            if damping > 1e6:
-                break
-    model = PixelEdge(state.blur, state.line.angle)
-    return state.line, model, best[2]
+    start = _State(line, _first_blur(pixels, line))
+    state = levenberg(
+        start,
+        lambda state: _linearised(pixels, state, curve, shading)[:2],
+        lambda state, step: state.moved(step[: curve + 2], curve),
+        most,
+    ).state
+    return state.line, PixelEdge(state.blur, state.line.angle), _linearised(pixels, state, curve, shading)[2]
 
 
 @dataclass(frozen=True)
@@ -199,7 +186,7 @@ class _State:
 def _linearised(
     pixels: EdgePixels, state: _State, curve: int, shading: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Design matrix (n, unknowns) with the levels projected into it, residuals (n,) and levels of a state."""
+    """Design matrix (n, unknowns) with the levels in it, residuals (n,) computed minus observed, levels of a state."""
     line = state.line
     t = pixels.along - line.middle
     distance = line.distance(pixels.across, pixels.along)
@@ -208,8 +195,8 @@ def _linearised(
     if shading:
         columns += [t * (1.0 - rise), t * rise]
     linear = np.stack(columns, axis=1)
-    levels = np.linalg.lstsq(linear.T @ linear, linear.T @ pixels.light, rcond=1e-12)[0]
-    residual = pixels.light - linear @ levels
+    fit = solve(linear, pixels.light)
+    levels, residual = fit.unknowns, fit.residuals
     shift = -line.rising * spread * levels[1] / line.length_of_normal
     moving = [shift, shift * t] + ([shift * t * t] if curve > 1 else [])
     moving.append(state.blur * tilt * levels[1])

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.linear import solve
 from photoplan.errors import InputError
 from photoplan.quality.edges.checks import (
     EdgeSettings,
@@ -28,6 +29,8 @@ from photoplan.quality.mtf_curve import MtfCurve
 
 #: Distance between the lines of the profile that is handed out, pixels.
 SPACING = 0.125
+#: Steps of the first fit, to all pixels, which only tells those that are near.
+_FIRST_STEPS = 8
 #: Pixels beyond which those far from the edge are left out at once.
 MANY = 50_000
 #: Largest distance between neighbouring samples in the edge, pixels, at which it counts as super-sampled.
@@ -166,7 +169,7 @@ def measure_edge(
     every = EdgePixels.of(image, mask, line.direction)
     if every.light.size > MANY:
         every = every.where(np.abs(line.distance(every.across, every.along)) <= max(4.0 * chosen.reach, 64.0))
-    line, model, levels = fit_line(every, line, chosen.curve, chosen.shading != "none", 1e-2)
+    line, model, levels = fit_line(every, line, chosen.curve, chosen.shading != "none", _FIRST_STEPS)
     near = np.abs(line.distance(every.across, every.along)) < 2.5 * model.total
     if np.count_nonzero(near) > 40:
         line, model, levels = fit_line(every.where(near), line, chosen.curve, False)
@@ -242,8 +245,7 @@ def _weights(
     """
     rise = model.profile(distance)[0]
     design = np.concatenate([rise[:, None], _levels(pixels, distance, line, rise, settings)], axis=1)
-    levels = np.linalg.lstsq(design.T @ design, design.T @ pixels.light, rcond=1e-12)[0]
-    residual = pixels.light - design @ levels
+    residual = -solve(design, pixels.light).residuals
     dark, bright = residual[distance < -2.0 * model.total], residual[distance > 2.0 * model.total]
     if min(dark.size, bright.size) < 30:
         return np.ones_like(distance), float(residual.std())
