@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-
-@dataclass(frozen=True)
-class Breaks:
-    """Where a mapping is continuous but bent: no interpolation may cross these places unnoticed."""
-
-    columns: tuple[float, ...] = ()
-    """x of ideal image positions, increasing, pixels."""
-    rows: tuple[float, ...] = ()
-    """y of ideal image positions, increasing, pixels."""
+from photoplan.geometry.breaks import Breaks
 
 
 class ImageField(Protocol):
@@ -28,7 +19,7 @@ class ImageField(Protocol):
 
     @property
     def breaks(self) -> Breaks | None:
-        """Where it is bent; None: nowhere."""
+        """Where it is bent, by ideal positions; None: nowhere."""
         ...
 
     def __call__(self, xy: ArrayLike) -> NDArray[np.float64]:

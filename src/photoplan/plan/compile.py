@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,18 +13,19 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.base import Projection
 from photoplan.errors import UsageError
+from photoplan.geometry.breaks import Breaks
 from photoplan.geometry.grid import Window
 from photoplan.kernels.extent import height_ranges
 from photoplan.plan.anchors import Anchors
-from photoplan.plan.field import FieldGrid, FieldTable, field_grid
+from photoplan.plan.bends import bend_errors
+from photoplan.plan.field import FieldGrid, field_grid
+from photoplan.plan.source_window import bend_beyond, blocks_of, scales_of, source_window
 from photoplan.targets.base import Target
 
 #: A rectangle that still reaches behind the camera at this side is left out, pixels.
 SMALLEST_BEHIND = 4
 #: More layers than this over one rectangle do not pay; the residual that is left is reported.
 MOST_LAYERS = 64
-#: Side of the blocks with heights of their own from which the source window is found, target pixels.
-BLOCK = 64
 
 # The 3 × 3 × 3 lattice of a box in (h, v, u): eight corners, and the nineteen probes between them.
 _LATTICE = np.array(list(itertools.product((0.0, 0.5, 1.0), repeat=3)))
@@ -85,6 +87,31 @@ class _Image:
         return (-0.5, -0.5, self.size[0] - 0.5, self.size[1] - 0.5) if self.grid is None else self.grid.bounds
 
 
+@dataclass(frozen=True)
+class _Mapping:
+    """From places in boxes to the image."""
+
+    projection: Projection
+    target: Target
+    window: Window
+
+    def at(
+        self, rects: NDArray[np.int32], heights: NDArray[np.float64], fractions: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Strict homogeneous positions of places (..., 3) in (h, v, u), 0 to 1, of boxes (..., 4) and (..., 2)."""
+        fh, fv, fu = np.moveaxis(fractions, -1, 0)
+        u = rects[..., 0] - 0.5 + fu * (rects[..., 2] - rects[..., 0]) + self.window.col
+        v = rects[..., 1] - 0.5 + fv * (rects[..., 3] - rects[..., 1]) + self.window.row
+        h = heights[..., 0] + fh * (heights[..., 1] - heights[..., 0])
+        return self.projection.project_homogeneous(self.target.to_ground(np.stack([u, v, h], axis=-1)))
+
+    def places(
+        self, rects: NDArray[np.int32], heights: NDArray[np.float64]
+    ) -> Callable[[NDArray[np.int64], NDArray[np.float64]], NDArray[np.float64]]:
+        """The same of places (k, 3) in the boxes numbered (k,) of some."""
+        return lambda box, fractions: self.at(rects[box], heights[box], fractions)
+
+
 def compile_anchors(
     projection: Projection, target: Target, window: Window, relief: NDArray[np.float32], rule: AnchorRule
 ) -> Anchors | None:
@@ -101,7 +128,7 @@ def compile_anchors(
     relief : ndarray, shape (height, width), float32
         h of every pixel of the tile; NaN where there is no surface.
     rule : AnchorRule
-        Tolerance and kernel radius. With a field, half of the tolerance is the field's.
+        Tolerance and kernel radius. A field gets half of the tolerance; what it leaves is the anchors'.
 
     Returns
     -------
@@ -111,14 +138,18 @@ def compile_anchors(
     image = _Image(projection.size, None, rule.tolerance)
     if projection.field is not None:
         grid = field_grid(projection.field, projection.size, rule.tolerance / 2)
-        image = _Image(projection.size, grid, rule.tolerance / 2 / grid.stretch)
-    work = _with_heights(np.array([[0, 0, window.width, window.height]], np.int32), relief)
+        image = _Image(projection.size, grid, (rule.tolerance - min(grid.miss, rule.tolerance / 2)) / grid.stretch)
+    mapping = _Mapping(projection, target, window)
+    work = _with_heights(_first_rects(window, target.breaks), relief)
     done: list[tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]] = []
     residual = 0.0
     while len(work.rects):
-        lattice, owner, bounds = _project(projection, target, window, work)
+        lattice, owner, bounds = _project(mapping, work)
         keep, behind = _in_front(lattice, owner, len(work.rects))
         errors = _errors(lattice, owner, len(work.rects))
+        if projection.breaks is not None:
+            bends = bend_errors(projection.breaks, lattice[:, _IS_CORNER], mapping.places(work.rects[owner], bounds))
+            np.maximum.at(errors, owner, bends)
         keep &= _touches_image(image, lattice, owner, rule.radius + 2 * errors[:, 3]) | behind
         errors[behind] = np.inf
         split_u, split_v, thin = _verdict(errors, work, image.tolerance, behind)
@@ -138,6 +169,17 @@ def compile_anchors(
     return _assemble(image, done, relief, residual, rule.radius) if done else None
 
 
+def _first_rects(window: Window, breaks: Breaks | None) -> NDArray[np.int32]:
+    """The tile, cut where its target is bent: a pixel that a break crosses is alone between smooth rectangles."""
+    places = ((), ()) if breaks is None else (breaks.columns, breaks.rows)
+    cuts = []
+    for at, first, count in zip(places, (window.col, window.row), (window.width, window.height)):
+        edges = np.asarray(at, float) + 0.5 - first
+        cuts.append(np.unique(np.clip(np.r_[0, np.floor(edges), np.ceil(edges), count], 0, count)).astype(np.int32))
+    (c0, r0), (c1, r1) = (np.meshgrid(*(cut[part] for cut in cuts)) for part in (slice(-1), slice(1, None)))
+    return np.stack([c0.ravel(), r0.ravel(), c1.ravel(), r1.ravel()], axis=1)
+
+
 def _with_heights(
     rects: NDArray[np.int32], relief: NDArray[np.float32], layers: NDArray[np.int64] | None = None
 ) -> _Work:
@@ -152,9 +194,7 @@ def _with_heights(
     return _Work(rects[there], heights, count[there])
 
 
-def _project(
-    projection: Projection, target: Target, window: Window, work: _Work
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+def _project(mapping: _Mapping, work: _Work) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
     """Strict homogeneous projection of every box's lattice: (boxes, 27, 3), its rectangle, its heights."""
     owner = np.repeat(np.arange(len(work.rects)), work.layers)
     layer = np.arange(len(owner)) - np.repeat(np.cumsum(work.layers) - work.layers, work.layers)
@@ -163,13 +203,8 @@ def _project(
     bottom = low + layer * step
     # The last layer ends exactly where the rectangle does.
     top = np.where(layer == work.layers[owner] - 1, high, bottom + step)
-    rect = work.rects[owner].astype(float)
-    fh, fv, fu = _LATTICE.T
-    u = rect[:, :1] - 0.5 + fu * (rect[:, 2:3] - rect[:, :1]) + window.col
-    v = rect[:, 1:2] - 0.5 + fv * (rect[:, 3:] - rect[:, 1:2]) + window.row
-    h = bottom[:, None] + fh * (top - bottom)[:, None]
-    lattice = projection.project_homogeneous(target.to_ground(np.stack([u, v, h], axis=-1)))
-    return lattice, owner, np.stack([bottom, top], axis=1)
+    bounds = np.stack([bottom, top], axis=1)
+    return mapping.at(work.rects[owner][:, None], bounds[:, None], _LATTICE), owner, bounds
 
 
 def _any_per_rect(flags: Any, owner: NDArray[np.int64], n: int) -> NDArray[np.bool_]:
@@ -283,22 +318,22 @@ def _assemble(
     order = np.lexsort((box_heights[:, 0], box_rects[:, 0], box_rects[:, 1]))
     box_rects, box_heights, corners = box_rects[order], box_heights[order], corners[order]
     first = np.flatnonzero(np.r_[True, (np.diff(box_rects, axis=0) != 0).any(axis=1)])
-    blocks, block_corners = _blocks(box_rects, box_heights, corners, relief)
+    blocks, block_corners = blocks_of(box_rects, box_heights, corners, relief)
     inside = _touches_image(image, block_corners, np.arange(len(blocks)), np.full(len(blocks), radius + 2 * residual))
     if not inside.any():
         return None
     xy = block_corners[inside, :, :2] / block_corners[inside, :, 2:]
-    scales = _scales(blocks[inside], block_corners[inside])
+    scales = scales_of(blocks[inside], block_corners[inside])
     table, origin, frame = None, np.zeros(2), np.zeros(5)
     slack = 0.0
     if image.grid is not None:
         table = image.grid.table(xy.min(axis=(0, 1)), xy.max(axis=(0, 1)))
         scales = scales[0] * max(0.0, 2.0 - image.grid.stretch), scales[1] * image.grid.stretch
         residual = residual * image.grid.stretch + table.residual
-        slack = _bend(image.grid, table, xy)
+        slack = bend_beyond(image.grid, table, xy)
         xy = image.grid.field(xy)
         origin = table.origin
-    source = _source_window(xy, slack + radius * max(1.0, scales[1]), image.size)
+    source = source_window(xy, slack + radius * max(1.0, scales[1]), image.size)
     origin = np.array([source.col, source.row]) - origin
     if table is not None and image.grid is not None:
         frame = np.array([*(table.first - origin), *(1.0 / np.array(image.grid.spacing)), image.grid.stretch])
@@ -315,70 +350,3 @@ def _assemble(
         source_window=source,
         scales=scales,
     )
-
-
-def _blocks(
-    rects: NDArray[np.int32], heights: NDArray[np.float64], corners: NDArray[np.float64], relief: NDArray[np.float32]
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Boxes cut into blocks that have heights of their own: rectangles (m, 4), and corners (m, 8, 3) by the boxes.
-
-    A tile may be one box, but what it needs of the source is what its surface needs, not its box.
-    """
-    large = ((rects[:, 2:] - rects[:, :2]) > BLOCK).any(axis=1)
-    parts = [_parts(rect, BLOCK) for rect in rects[large]]
-    parent = np.r_[np.flatnonzero(~large), np.repeat(np.flatnonzero(large), [len(part) for part in parts])]
-    blocks = np.concatenate([rects[~large], *parts])
-    own = height_ranges(relief, blocks)
-    low, high = np.maximum(own[:, 0], heights[parent, 0]), np.minimum(own[:, 1], heights[parent, 1])
-    there = low <= high
-    parent, blocks, low, high = parent[there], blocks[there], low[there], high[there]
-    start, side = rects[parent, :2, None], rects[parent, 2:, None] - rects[parent, :2, None]
-    fu, fv = np.moveaxis((blocks.reshape(-1, 2, 2).transpose(0, 2, 1) - start) / side, 1, 0)
-    bottom, top = heights[parent].T
-    fh = (np.stack([low, high], axis=1) - bottom[:, None]) / (top - bottom)[:, None]
-    found = corners[parent].reshape(-1, 2, 2, 2, 3)
-    for axis, f in ((1, fh), (2, fv), (3, fu)):
-        a, b = (np.take(found, [i], axis=axis) for i in (0, 1))
-        shape = [len(f), 1, 1, 1, 1]
-        shape[axis] = 2
-        found = a + f.reshape(shape) * (b - a)
-    return blocks, found.reshape(-1, 8, 3)
-
-
-def _parts(rect: NDArray[np.int32], side: int) -> NDArray[np.int32]:
-    """A rectangle cut into smaller ones."""
-    c, r = (g.ravel() for g in np.meshgrid(np.arange(rect[0], rect[2], side), np.arange(rect[1], rect[3], side)))
-    return np.stack([c, r, np.minimum(c + side, rect[2]), np.minimum(r + side, rect[3])], axis=1).astype(np.int32)
-
-
-def _bend(grid: FieldGrid, table: FieldTable, xy: NDArray[np.float64]) -> float:
-    """By how much the field can bend a block's edges beyond its corners, pixels.
-
-    Linear interpolation misses a smooth function by the square of the distance, a bent one by the distance.
-    """
-    reach = np.ptp(xy, axis=1).max(axis=0) / np.array(grid.spacing)
-    return table.residual * max(1.0, float(reach.max())) ** 2
-
-
-def _source_window(xy: NDArray[np.float64], margin: float, size: tuple[int, int]) -> Window:
-    """Whole pixels that hold the positions with a margin, cut at the image's border."""
-    around = int(np.ceil(min(margin, 1e6))) + 2
-    # Clipped before the conversion: far outside the image a position may exceed any integer.
-    col0, row0 = (int(np.clip(np.floor(a) - around, 0, s)) for a, s in zip(np.nanmin(xy, axis=(0, 1)), size))
-    col1, row1 = (int(np.clip(np.ceil(a) + around + 1, 0, s)) for a, s in zip(np.nanmax(xy, axis=(0, 1)), size))
-    return Window(col0, row0, max(0, col1 - col0), max(0, row1 - row0))
-
-
-def _scales(rects: NDArray[np.int32], corners: NDArray[np.float64]) -> tuple[float, float]:
-    """Smallest and largest length of (∂x/∂u, ∂x/∂v) and (∂y/∂u, ∂y/∂v) at the corners, pixels per pixel."""
-    c = corners.reshape(-1, 2, 2, 2, 3)
-    width = (rects[:, 2] - rects[:, 0]).astype(float)[:, None, None, None]
-    height = (rects[:, 3] - rects[:, 1]).astype(float)[:, None, None, None]
-    du = np.repeat(np.diff(c, axis=3), 2, axis=3) / width[..., None]
-    dv = np.repeat(np.diff(c, axis=2), 2, axis=2) / height[..., None]
-    w = c[..., 2:]
-    xy = c[..., :2] / w
-    slope_u = (du[..., :2] - xy * du[..., 2:]) / w
-    slope_v = (dv[..., :2] - xy * dv[..., 2:]) / w
-    lengths = np.hypot(slope_u, slope_v)
-    return float(lengths.min()), float(lengths.max())

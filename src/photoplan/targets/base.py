@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from photoplan.geometry.breaks import Breaks
 from photoplan.geometry.grid import Window
 
 
@@ -16,6 +17,11 @@ class Target(Protocol):
     @property
     def window(self) -> Window:
         """All pixels of the product."""
+        ...
+
+    @property
+    def breaks(self) -> Breaks | None:
+        """Columns and rows, in pixels, at which `to_ground` is bent (facets of a profile); None: nowhere."""
         ...
 
     def to_ground(self, uvh: ArrayLike) -> NDArray[np.float64]:

@@ -21,6 +21,11 @@ class MapTarget:
         """All pixels of the product."""
         return self.grid.window
 
+    @property
+    def breaks(self) -> None:
+        """A map is nowhere bent."""
+        return None
+
     def to_ground(self, uvh: ArrayLike) -> NDArray[np.float64]:
         """(u, v, h) of shape (..., 3) to X, Y, Z."""
         uvh = np.asarray(uvh, float)
