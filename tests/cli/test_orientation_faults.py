@@ -511,13 +511,13 @@ class TestInterruption:
         self, photoplan: Here, block: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         """Results are entered into the file as it is when they are there, not as it was."""
-        path, facts = block / "project.toml", adjust.build_facts
+        path, facts = block / "project.toml", adjust.summarise
 
         def meanwhile(*given: object) -> object:
             edit(path, "# a remark that stays", "# a remark that was changed\n# and another one")
             return facts(*given)
 
-        monkeypatch.setattr(adjust, "build_facts", meanwhile)
+        monkeypatch.setattr(adjust, "summarise", meanwhile)
         assert photoplan("adjust", path).code == 0
         text = path.read_text()
         assert "# a remark that was changed\n# and another one" in text and "sigma_center" in text
@@ -525,13 +525,13 @@ class TestInterruption:
     def test_a_project_that_vanishes_meanwhile(
         self, photoplan: Here, block: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        path, facts = block / "project.toml", adjust.build_facts
+        path, facts = block / "project.toml", adjust.summarise
 
         def meanwhile(*given: object) -> object:
             path.rename(block / "elsewhere.toml")
             return facts(*given)
 
-        monkeypatch.setattr(adjust, "build_facts", meanwhile)
+        monkeypatch.setattr(adjust, "summarise", meanwhile)
         said = photoplan("adjust", path)
         assert said.code in (2, 3), said
         assert "project.toml" in said.err

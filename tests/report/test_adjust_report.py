@@ -9,21 +9,23 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from photoplan.report.adjust.facts import (
-    AdjustFacts,
-    CalibrationFacts,
-    GroundFacts,
-    GroupFacts,
-    ImageFacts,
-    MeasurementFacts,
+from photoplan.orientation.bundle.block import Group
+from photoplan.orientation.check_points import check_accuracy
+from photoplan.products.adjust.cameras import Calibrated
+from photoplan.products.adjust.figures import (
+    AdjustFigures,
+    GroundFigures,
+    ImageFigures,
+    NamedMeasurement,
     ResidualField,
-    StripFacts,
+    StripFigures,
 )
+from photoplan.report.adjust.page import adjust_page
 from photoplan.report.adjust.plots import AdjustPlots
-from photoplan.report.adjust.report import adjust_report
-from photoplan.report.check_points import check_accuracy
+from photoplan.report.drawing import load_matplotlib
 
 pytest.importorskip("matplotlib")
+MPL = load_matplotlib("a report")
 
 HOSTILE = '<script>alert("1")</script><img src=x onerror=alert(1)>\u202e $\\frac{1}{0}$ ]]>'
 NAN = float("nan")
@@ -47,11 +49,11 @@ class Page(HTMLParser):
         self.words.append(data)
 
 
-def facts(name: str = "p") -> AdjustFacts:
+def facts(name: str = "p") -> AdjustFigures:
     """A made-up block: twelve images in two strips, nine ground points of which four are checked."""
     random = np.random.default_rng(1)
     images = tuple(
-        ImageFacts(
+        ImageFigures(
             f"{name}{k}",
             "ab"[k // 6],
             50,
@@ -66,7 +68,7 @@ def facts(name: str = "p") -> AdjustFacts:
         for k in range(12)
     )
     ground = tuple(
-        GroundFacts(
+        GroundFigures(
             f"{name} G{k}",
             k >= 5,
             6 if k else 0,
@@ -80,7 +82,7 @@ def facts(name: str = "p") -> AdjustFacts:
         for k in range(9)
     )
     check = [g for g in ground if g.check]
-    return AdjustFacts(
+    return AdjustFigures(
         title=f"Block {name}",
         crs="EPSG:25832",
         sigma0=1.02,
@@ -95,33 +97,32 @@ def facts(name: str = "p") -> AdjustFacts:
         mean_rays=4.2,
         angle_unit="gon",
         groups=(
-            GroupFacts(f"image points, camera {name}", 1200, 850.0, 0.28, "px", 1.01),
-            GroupFacts("observed attitudes", 36, 9.0, np.pi / 200, "rad", 0.9),
+            Group(f"image points, camera {name}", 1200, 850.0, 0.28, "px", 1.01),
+            Group("observed attitudes", 36, 9.0, np.pi / 200, "rad", 0.9),
         ),
         images=images,
         ground=ground,
         check=check_accuracy(np.array([g.residual for g in check]), np.array([g.stated for g in check])),
         cameras=(
-            CalibrationFacts(
+            Calibrated(
                 name,
                 ("c", "x0"),
                 ("mm", "mm"),
                 np.array([153.0, 0.0]),
                 np.array([153.0123, 0.0042]),
-                np.array([0.0021, 0.0013]),
-                np.array([[1.0, 0.93], [0.93, 1.0]]),
+                np.outer((0.0021, 0.0013), (0.0021, 0.0013)) * np.array([[1.0, 0.93], [0.93, 1.0]]),
             ),
         ),
         strips=(
-            StripFacts(
+            StripFigures(
                 name, 6, 1, (0.0, 0.0, 0.01), (0.05, 0.04, 0.06), (0.1, 0.2, -0.3), (0.0, 0.0, 0.0), (0.01,) * 3
             ),
-            StripFacts("b", 6, 0, (0.0, 0.0, 0.0), (0.05, 0.04, 0.06), (NAN,) * 3, (NAN,) * 3, (NAN,) * 3),
+            StripFigures("b", 6, 0, (0.0, 0.0, 0.0), (0.05, 0.04, 0.06), (NAN,) * 3, (NAN,) * 3, (NAN,) * 3),
         ),
         lever_arm=((0.1, 0.2, 1.3), (0.01, 0.01, 0.02)),
         boresight=((0.1, 0.2, 0.3), (0.01, 0.01, 0.02)),
-        gross=(MeasurementFacts(f"point {name!r} in image 'a'", "+3.00 -1.00 px", 9.5, True),),
-        worst=(MeasurementFacts("point 'k' in image 'a'", "+0.80 -0.10 px", 3.6, False),),
+        gross=(NamedMeasurement(f"point {name!r} in image 'a'", "+3.00 -1.00 px", 9.5, True),),
+        worst=(NamedMeasurement("point 'k' in image 'a'", "+0.80 -0.10 px", 3.6, False),),
         left_out=((name, "point seen in one image only"),),
         normalised=random.normal(size=1200),
         critical=4.0,
@@ -146,7 +147,7 @@ def facts(name: str = "p") -> AdjustFacts:
 
 
 def test_it_holds_everything_and_reaches_for_nothing() -> None:
-    document = adjust_report(facts(), AdjustPlots())
+    document = adjust_page(facts(), MPL)
     page = Page(document)
     assert all(address and address.startswith("data:image/png;base64,") for address in page.addresses)
     assert page.tags.count("img") == 6
@@ -165,13 +166,13 @@ def test_gross_errors_of_control_do_not_set_the_scale_in_which_the_others_are_dr
     given = facts()
     wrong = replace(given.ground[2], residual=(2.0, -1.5, 2.5), rejected=(True, True, True))
     changed = replace(given, ground=(*given.ground[:2], wrong, *given.ground[3:]))
-    plots = AdjustPlots()
+    plots = AdjustPlots(MPL)
     assert plots.control(changed, check=False)[1] == plots.control(given, check=False)[1]
-    assert "What was taken out as a gross error has no arrow." in " ".join(Page(adjust_report(changed, plots)).words)
+    assert "What was taken out as a gross error has no arrow." in " ".join(Page(adjust_page(changed, MPL)).words)
 
 
 def test_fault_11_hostile_names_are_shown_and_not_obeyed() -> None:
-    document = adjust_report(facts(HOSTILE), AdjustPlots())
+    document = adjust_page(facts(HOSTILE), MPL)
     page = Page(document)
     assert "script" not in page.tags
     assert page.tags.count("img") == 6
@@ -199,12 +200,12 @@ def test_a_block_with_nothing_but_images() -> None:
         point_sigma=(NAN,) * 3,
         images=tuple(replace(i, sigma_center=(NAN,) * 3, sigma_angles=(NAN,) * 3, worst=NAN) for i in facts().images),
     )
-    document = adjust_report(poor, AdjustPlots())
+    document = adjust_page(poor, MPL)
     assert "nan" not in " ".join(Page(document).words).lower()
     assert "Check points" not in document
     assert "None was found." in document
     one = replace(poor, images=poor.images[:1])
-    assert adjust_report(one, AdjustPlots())
+    assert adjust_page(one, MPL)
 
 
 def test_check_points_after_the_standard() -> None:

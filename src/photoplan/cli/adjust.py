@@ -41,15 +41,24 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """
     from photoplan.cli.telling import Telling
     from photoplan.products.adjust.run import AdjustRequest, adjust_project
+    from photoplan.report.adjust.page import adjust_page
+    from photoplan.report.page import open_report
 
     for name in ("robust", "variance_components", "correlation"):
         options[name] = not options.pop(f"no_{name}")
+    request, page = AdjustRequest(**options), None
+    if not request.dry_run:
+        place = request.folder / "report.html"
+        page = open_report(place, (), overwrite=request.overwrite, project=request.project)
     with Telling(quiet) as events:
-        report = adjust_project(AdjustRequest(**options), events)
+        report = adjust_project(request, events)
+    written = report.written
+    if page is not None:
+        written = (page.write(adjust_page(report.figures, page.mpl)), *written)
     if as_json:
-        show_json(report.to_dict())
+        show_json(report, files=written)
     else:
-        for path in report.written:
+        for path in written:
             show(path)
         for line in _figures(report):
             show(line)
@@ -58,7 +67,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
 
 def _figures(report: AdjustReport) -> list[str]:
-    f = report.facts
+    f = report.figures
     lines = [
         f"sigma0 {f.sigma0:.3f} · image residuals {f.rms_pixels:.3f} px rms · redundancy {f.redundancy} · "
         f"{f.unknowns} unknowns · {f.iterations} iterations · {f.seconds:.1f} s",
@@ -85,7 +94,7 @@ def _sigmas(normalised: float) -> str:
 
 
 def _talk(report: AdjustReport) -> list[str]:
-    f = report.facts
+    f = report.figures
     lines = [f"gross error: {m.what}: {m.residual}{_sigmas(m.normalised)}" for m in f.gross[:_SHOWN]]
     if len(f.gross) > _SHOWN:
         lines.append(f"and {len(f.gross) - _SHOWN} more gross errors; all are in report.json")

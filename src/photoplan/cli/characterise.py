@@ -30,21 +30,29 @@ def command(series: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     exposed. Every analysis that they allow is made; the others are listed with what is missing.
     """
     from photoplan.cli.telling import Telling
+    from photoplan.io.series.file import read_series
     from photoplan.products.characterise.run import CharacteriseRequest, characterise
+    from photoplan.report.characterise.page import characterise_page
+    from photoplan.report.page import open_report
 
-    request = CharacteriseRequest(series, **options)
+    place = options.pop("report")
+    inputs = () if place is None else read_series(series).inputs
+    page = open_report(place, inputs, overwrite=options["overwrite"])
     with Telling(quiet) as events:
-        report = characterise(request, events)
+        report = characterise(CharacteriseRequest(series, **options), events)
+    written = report.written
+    if page is not None and not options["dry_run"]:
+        written = (page.write(characterise_page(report, page.mpl)), *written)
     if as_json:
-        show_json(report.to_dict())
+        show_json(report, written=written)
     else:
-        _print(report)
+        _print(report, written)
     if not quiet:
         _talk(report, options["dry_run"])
     end_with_failures(report.failed, sum(run.outcome is not None for run in report.runs), "analyses failed")
 
 
-def _print(report: CharacteriseReport) -> None:
+def _print(report: CharacteriseReport, written: tuple[Path, ...]) -> None:
     """Figures, refusals and paths on stdout."""
     for run in report.runs:
         if run.state == "possible":
@@ -55,7 +63,7 @@ def _print(report: CharacteriseReport) -> None:
                 show(f"  {figure}")
             for what, why in run.outcome.refused.items():
                 show(f"  not known: {what}: {why}")
-    for path in report.written:
+    for path in written:
         show(path)
 
 

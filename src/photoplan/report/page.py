@@ -191,9 +191,10 @@ def open_report(
         return None
     if table is not None and table.resolve() == path.resolve():
         raise UsageError(f"{path}: report and table are the same file; give two names")
+    opened = open_picture(path, inputs, overwrite=overwrite, project=project, what="a report")
     if path.suffix.lower() not in (".html", ".htm"):
         raise UsageError(f"{path}: a report is written as HTML; give a name that ends in .html")
-    return open_picture(path, inputs, overwrite=overwrite, project=project, what="a report")
+    return opened
 
 
 def open_picture(

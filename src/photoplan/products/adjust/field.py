@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from photoplan.io.project.cameras import image_size
 from photoplan.orientation.bundle.block import BlockImage
 from photoplan.products.adjust.block import MapResult
-from photoplan.report.adjust.facts import ResidualField
+from photoplan.products.adjust.figures import ResidualField
 
 _Floats = NDArray[np.float64]
 #: Measurements in a cell on average, and cells along the longer side at least and at most.

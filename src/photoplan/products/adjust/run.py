@@ -1,8 +1,7 @@
-"""Bundle adjustment of a project: its measurements in, its orientations and cameras changed, a report beside it."""
+"""Bundle adjustment of a project: its measurements in, its orientations and cameras changed, its figures beside it."""
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import time
@@ -24,6 +23,7 @@ from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
 from photoplan.orientation.bundle.adjust import adjust_block
 from photoplan.orientation.bundle.block import AdjustSettings
+from photoplan.plain import json_text
 from photoplan.products.adjust.block import (
     MapResult,
     Prepared,
@@ -32,17 +32,15 @@ from photoplan.products.adjust.block import (
     prepare,
 )
 from photoplan.products.adjust.cameras import Free, camera_entries, parse_calibrate
+from photoplan.products.adjust.figures import AdjustFigures
 from photoplan.products.adjust.inputs import AdjustInputs, read_inputs
-from photoplan.products.adjust.json import facts_json
-from photoplan.products.adjust.report import build_facts, point_layers
+from photoplan.products.adjust.json import block_json
 from photoplan.products.adjust.start import started
+from photoplan.products.adjust.summary import point_layers, summarise
 from photoplan.project.scene import input_files
-from photoplan.report.adjust.facts import AdjustFacts
-from photoplan.report.adjust.plots import AdjustPlots
-from photoplan.report.adjust.report import adjust_report
 
 #: Files of the output folder.
-OUTPUTS = ("report.html", "report.json", "points.gpkg", "image_points.csv")
+OUTPUTS = ("report.json", "points.gpkg", "image_points.csv")
 
 
 @dataclass(frozen=True)
@@ -78,14 +76,14 @@ class AdjustReport:
 
     written: tuple[Path, ...]
     """Empty after a dry run."""
-    facts: AdjustFacts
+    figures: AdjustFigures
     orientations: int
     """Images whose orientation was written into the project."""
     data: dict[str, Any]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`: those of ``report.json``, with the files."""
-        return {"files": [str(path) for path in self.written], **self.data}
+    def json_fields(self) -> dict[str, Any]:
+        """Those of ``report.json``, with the files."""
+        return {"files": self.written, **self.data}
 
 
 def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustReport:
@@ -100,7 +98,7 @@ def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustRep
     Raises
     ------
     UsageError
-        An output exists or is an input, matplotlib is not installed, or an option makes no sense.
+        An output exists or is an input, or an option makes no sense.
     InputError
         The project or its measurements cannot be used.
     GeometryError
@@ -113,9 +111,10 @@ def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustRep
     project = load_project(request.project)
     free = _free(project, request.calibrate)
     names = project.select(request.images or None)
-    plots = None if request.dry_run else _prepare_outputs(request, project)
+    if not request.dry_run:
+        _check_outputs(request, project)
     inputs = read_inputs(project, names)
-    if plots is not None:
+    if not request.dry_run:
         _refuse_inputs(request, inputs.files)
     begun = time.perf_counter()
     inputs, starts = started(inputs)
@@ -131,11 +130,11 @@ def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustRep
     prepared, adjusted = adjust_prepared(prepared, settings, partial(adjust_block, progress=iterated))
     result = map_result(prepared, adjusted)
     title = f"Bundle adjustment of {request.project.resolve().parent.name}"
-    facts = build_facts(title, result, settings, time.perf_counter() - begun)
-    data = facts_json(facts, result)
-    if plots is None:
-        return AdjustReport((), facts, 0, data)
-    return _write(request, result, facts, data, plots)
+    figures = summarise(title, result, settings, time.perf_counter() - begun)
+    data = block_json(figures, result)
+    if request.dry_run:
+        return AdjustReport((), figures, 0, data)
+    return _write(request, result, figures, data)
 
 
 def _free(project: Project, options: Sequence[str]) -> Free:
@@ -146,8 +145,8 @@ def _free(project: Project, options: Sequence[str]) -> Free:
     return {name: {p: known.get(name, {}).get(p) for p in parameters} for name, parameters in stated if parameters}
 
 
-def _prepare_outputs(request: AdjustRequest, project: Project) -> AdjustPlots:
-    """What draws the report; outputs that exist are refused before any work."""
+def _check_outputs(request: AdjustRequest, project: Project) -> None:
+    """Refuse outputs that exist or cannot be written before any work."""
     if request.folder.exists() and not request.folder.is_dir():
         raise UsageError(f"{request.folder}: is no folder; reports go into a folder")
     there = next(
@@ -156,7 +155,6 @@ def _prepare_outputs(request: AdjustRequest, project: Project) -> AdjustPlots:
     if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
         raise UsageError(f"{request.folder}: cannot be made, as {there} cannot be written into; give another `output`")
     _refuse_inputs(request, [request.project, *input_files(project)])
-    return AdjustPlots()
 
 
 def _refuse_inputs(request: AdjustRequest, inputs: Sequence[Path]) -> None:
@@ -177,17 +175,14 @@ def _used(prepared: Prepared) -> str:
     )
 
 
-def _write(
-    request: AdjustRequest, result: MapResult, facts: AdjustFacts, data: dict[str, Any], plots: AdjustPlots
-) -> AdjustReport:
+def _write(request: AdjustRequest, result: MapResult, figures: AdjustFigures, data: dict[str, Any]) -> AdjustReport:
     folder, adjusted = request.folder, result.adjusted
-    html = adjust_report(facts, plots).encode("utf-8", errors="replace")
     changes = _changes(result)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise disk_error(folder, error) from error
-    write_point_layers(folder / "points.gpkg", point_layers(result, facts), result.prepared.frame.crs)
+    write_point_layers(folder / "points.gpkg", point_layers(result, figures), result.prepared.frame.crs)
     write_residuals(
         folder / "image_points.csv",
         result.prepared.inputs.points,
@@ -196,11 +191,9 @@ def _write(
         adjusted.redundancies,
         adjusted.rejected,
     )
-    text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
-    write_atomically(folder / "report.json", text.encode())
-    write_atomically(folder / "report.html", html)
+    write_atomically(folder / "report.json", json_text(data, indent=1).encode())
     edit_project(request.project, changes)
-    return AdjustReport(tuple(folder / name for name in OUTPUTS), facts, len(adjusted.images), data)
+    return AdjustReport(tuple(folder / name for name in OUTPUTS), figures, len(adjusted.images), data)
 
 
 def _changes(result: MapResult) -> ProjectChanges:

@@ -8,11 +8,11 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.io.series.pixels import Plane
+from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.common import Run, black_of, exposure_runs, prefix, tried
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.result import Figure, Outcome, Table, joined
 from photoplan.quality.camera.blooming import Blooming, find_blooming
-from photoplan.report.characterise_charts import Chart, Curve
 
 _LEAST = 4
 #: Pixels of all mean images that are held at once.
@@ -110,7 +110,7 @@ def _plane(data: SeriesData, run: Run, plane: Plane, images: list[np.ndarray]) -
         refused,
         {"neighbours": Table(head, rows, "Neighbours of the bright object")},
         (_plot(found, prefix("Blooming", plane.name, run.label)),),
-        details={prefix("blooming", plane.name, run.label).replace(" ", "_"): found.to_dict()},
+        details={prefix("blooming", plane.name, run.label).replace(" ", "_"): found},
     )
 
 

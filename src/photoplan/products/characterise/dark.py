@@ -8,12 +8,12 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.io.series.pixels import Plane
+from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.common import MOST_SATURATED, prefix, tried
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.result import Figure, Outcome, Table, joined
 from photoplan.quality.camera.dark_signal import DarkCurrent, dark_current, doubling_temperature
 from photoplan.quality.camera.frame_statistics import Level
-from photoplan.report.characterise_charts import Chart, Curve
 
 _LEAST = 3
 Currents = dict[float | None, DarkCurrent]
@@ -101,7 +101,7 @@ def _current(
         tables={"levels": Table(head, rows, "Dark frames")},
         plots=(chart,),
         notes=tuple(f"{settings[k].label}: saturated, not used" for k in full),
-        details={prefix("dark_current", name, at[1]).replace(" ", "_"): found.to_dict()},
+        details={prefix("dark_current", name, at[1]).replace(" ", "_"): found},
     )
 
 
@@ -138,4 +138,4 @@ def _doubling(currents: Currents, name: str, stated: int) -> Outcome:
     figure = Figure(
         "doubling_temperature_k", found.doubling_k, found.doubling_k_sigma, "doubling temperature", "K", name
     )
-    return Outcome((figure,), plots=(chart,), details={prefix("doubling", name).replace(" ", "_"): found.to_dict()})
+    return Outcome((figure,), plots=(chart,), details={prefix("doubling", name).replace(" ", "_"): found})

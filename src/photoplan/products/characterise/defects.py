@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.series.pixels import Plane
+from photoplan.products.characterise.charts import Chart, Curve, Picture, shrunk
 from photoplan.products.characterise.common import MOST_SATURATED, prefix, tried
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.result import Figure, Outcome, Table, joined
 from photoplan.quality.camera.defects import Defect, DefectList, find_blinking, find_defects, find_lines, log_histogram
 from photoplan.quality.camera.frame_statistics import FrameStack
 from photoplan.quality.camera.photon_transfer import is_clipped_dark
-from photoplan.report.characterise_charts import Chart, Curve, Picture, shrunk
 
 #: Hot pixels whose growth with the exposure is followed, and whose places are drawn.
 _FOLLOWED = 40

@@ -12,6 +12,7 @@ from photoplan.io.series.pixels import Plane
 from photoplan.io.series.statistics import ReducedPoint
 from photoplan.products.characterise import dark as characterise_dark
 from photoplan.products.characterise import pattern as characterise_pattern
+from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.common import Run, exposure_runs, of_one_temperature, prefix, tried
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.result import Figure, Outcome, Table, joined
@@ -20,7 +21,6 @@ from photoplan.quality.camera.dark_signal import dark_current
 from photoplan.quality.camera.emva import EmvaPoints, EmvaSheet, emva_sheet
 from photoplan.quality.camera.frame_statistics import Level
 from photoplan.quality.camera.photon_transfer import is_clipped_dark
-from photoplan.report.characterise_charts import Chart, Curve
 
 _LEAST = 5
 #: Figures of other analyses that belong to the sheet: name there, name here, words, unit, and whether K divides them.
@@ -186,7 +186,7 @@ def _sheet(bright: list[_Point], dark: list[_Point], of: tuple[str, str], step: 
         {"points": Table(head, tuple(rows), "Levels of the sheet")},
         _plots(found, p, prefix("EMVA 1288", plane, label)),
         tuple(notes),
-        {prefix("sheet", plane, label).replace(" ", "_"): found.to_dict()},
+        {prefix("sheet", plane, label).replace(" ", "_"): found},
     )
 
 

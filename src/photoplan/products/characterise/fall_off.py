@@ -13,6 +13,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.fall_off_file import FallOffEntry, TermEntry, fall_off_text
 from photoplan.io.series.pixels import Plane
+from photoplan.products.characterise.charts import Chart, Curve, Picture
 from photoplan.products.characterise.common import black_of, of_one_temperature
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.groups import FrameGroup
@@ -20,7 +21,6 @@ from photoplan.products.characterise.result import Figure, Outcome, Table, joine
 from photoplan.quality.camera.fall_off import FallOff, fit_fall_off
 from photoplan.quality.camera.fall_off_adjust import FallOffSettings
 from photoplan.quality.camera.fall_off_model import FallOffModel, gain_image
-from photoplan.report.characterise_charts import Chart, Curve, Picture
 
 _SATURATED = 1e-3
 #: Longer side of the gain image that is written.

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.jitter_edge import Edge
-from photoplan.report.characterise_charts import Chart, Curve
 
 
 def jitter_charts(edges: Sequence[Edge]) -> list[Chart]:

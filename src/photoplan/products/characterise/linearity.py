@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.series.pixels import Plane
+from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.common import (
     MOST_SATURATED,
     Run,
@@ -24,7 +25,6 @@ from photoplan.quality.camera.frame_statistics import Level, check_level
 from photoplan.quality.camera.linearity import HIGH, Linearity, linearity
 from photoplan.quality.camera.photon_transfer import is_clipped_dark
 from photoplan.quality.camera.saturation import find_saturation
-from photoplan.report.characterise_charts import Chart, Curve
 
 _KINDS = ("flat", "scene")
 _LEAST = 3
@@ -83,7 +83,7 @@ def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
         tables={"levels": _table(found, run, plane.name)},
         plots=_plots(found, run, plane.name, full),
         notes=tuple(f"{prefix(plane.name, run.label)}: {rule}".lstrip(": ") for rule in rules if "cut off" in rule),
-        details={prefix("linearity", plane.name, run.label).replace(" ", "_"): found.to_dict()},
+        details={prefix("linearity", plane.name, run.label).replace(" ", "_"): found},
     )
 
 

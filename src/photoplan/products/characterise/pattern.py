@@ -9,6 +9,8 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.io.series.pixels import Plane
+from photoplan.plain import plain
+from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.common import black_of, of_one_temperature, prefix, tried
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.result import Figure, Outcome, Table, joined
@@ -22,7 +24,6 @@ from photoplan.quality.camera.fixed_pattern import (
 )
 from photoplan.quality.camera.frame_statistics import FrameStack, check_level
 from photoplan.quality.camera.photon_transfer import is_clipped_dark
-from photoplan.report.characterise_charts import Chart, Curve
 
 #: Share of saturation that the standard asks of bright frames.
 _HALF = 0.5
@@ -156,7 +157,7 @@ def _parts(found: PatternVariance, key: str, words: str, plane: str, unit: str, 
         what = f"{words}, {part}s" if part else words
         remark = "not above zero" if variance <= 0 else ""
         figures.append(Figure(name, value * factor, of_value * factor, what, unit, plane, remark=remark))
-    return Outcome(tuple(figures), details={prefix(key, plane).replace(" ", "_"): found.to_dict() | {"setting": label}})
+    return Outcome(tuple(figures), details={prefix(key, plane).replace(" ", "_"): {**plain(found), "setting": label}})
 
 
 def _spectra(stack: FrameStack, of: Plane, title: str) -> Outcome:

@@ -9,8 +9,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from photoplan.products.plain_values import plain
-from photoplan.report.characterise_charts import Chart, Picture
+from photoplan.plain import pick
+from photoplan.products.characterise.charts import Chart, Picture
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,10 @@ class Figure:
         """Value, standard deviation (empty: none) and unit as they are printed."""
         return _short(self.value, self.sigma), _plain(self.sigma, 2) if math.isfinite(self.sigma) else "", self.unit
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values; keys that say nothing are left out."""
-        found = {"name": self.name, "value": self.value, "sigma": self.sigma, "unit": self.unit}
-        more = {"plane": self.plane, "at": self.at, "remark": self.remark, "label": self.label}
-        return dict(plain(found | {key: value for key, value in more.items() if value}))
+    def json_fields(self) -> dict[str, Any]:
+        """Keys that say nothing are left out."""
+        more = {key: value for key, value in pick(self, "plane", "at", "remark", "label").items() if value}
+        return {**pick(self, "name", "value", "sigma", "unit"), **more}
 
 
 def _short(value: float, sigma: float = math.nan) -> str:
@@ -94,15 +93,6 @@ class Outcome:
     """More plain values for JSON."""
     files: Mapping[str, bytes | NDArray[Any]] = field(default_factory=dict)
     """More files by name, written beside the tables: contents, or an image of type float32."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        return {
-            "figures": [figure.to_dict() for figure in self.figures],
-            "refused": dict(self.refused),
-            "notes": list(self.notes),
-            "details": plain(dict(self.details)),
-        }
 
 
 def joined(outcomes: Sequence[Outcome]) -> Outcome:

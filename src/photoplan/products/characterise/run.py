@@ -14,14 +14,12 @@ from photoplan.io.named_table import write_named_table
 from photoplan.io.product import check_output
 from photoplan.io.series.file import Series, read_series
 from photoplan.io.whole_image import write_whole_image
+from photoplan.plain import pick, plain
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.full_well import full_well_notes, with_full_wells
 from photoplan.products.characterise.registry import ANALYSES, Analysis
 from photoplan.products.characterise.result import Figure, Outcome, Table
 from photoplan.products.characterise.steps import step_notes, with_grey_step
-from photoplan.products.plain_values import plain
-from photoplan.report.characterise_charts import ChartDrawer
-from photoplan.report.characterise_page import AnalysisPart, SeriesFacts, characterise_page
 
 
 @dataclass(frozen=True)
@@ -31,8 +29,6 @@ class CharacteriseRequest:
     series: Path
     only: tuple[str, ...] = ()
     """Names of analyses; all that the series allows if empty."""
-    report: Path | None = None
-    """HTML."""
     csv: Path | None = None
     """Folder for the tables."""
     overwrite: bool = False
@@ -58,16 +54,13 @@ class AnalysisRun:
             return "missing"
         return "failed" if self.failed is not None else "possible" if self.outcome is None else "done"
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        found: dict[str, Any] = {"name": self.analysis.name, "title": self.analysis.title, "state": self.state}
+    def json_fields(self) -> dict[str, Any]:
+        """Without plots and files."""
+        found: dict[str, Any] = {**pick(self.analysis, "name", "title"), "state": self.state}
         found |= {"reason": self.missing or self.failed} if self.missing or self.failed else {}
         if self.outcome is not None:
-            found |= self.outcome.to_dict()
-            found["tables"] = {
-                name: {"head": list(table.head), "rows": plain(table.rows)}
-                for name, table in self.outcome.tables.items()
-            }
+            found |= pick(self.outcome, "figures", "refused", "notes", "details")
+            found["tables"] = {name: pick(table, "head", "rows") for name, table in self.outcome.tables.items()}
         return found
 
 
@@ -78,27 +71,26 @@ class CharacteriseReport:
     series: Series
     runs: tuple[AnalysisRun, ...]
     written: tuple[Path, ...]
-    """Report, tables and what goes with them."""
+    """Tables and what goes with them."""
     notes: tuple[str, ...] = ()
     """What concerns all analyses."""
+    levels: tuple[float, ...] = ()
+    """Grey value at which each plane saturates."""
 
     @property
     def failed(self) -> dict[str, str]:
         """Analyses that stopped, with the reason."""
         return {run.analysis.name: f"{run.analysis.name}: {run.failed}" for run in self.runs if run.failed is not None}
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
+    def json_fields(self) -> dict[str, Any]:
+        """The series by its facts."""
         series = self.series
         return {
-            "series": str(series.path),
+            "series": series.path,
             "camera": series.camera.model_dump(exclude_none=True),
             "frames": len(series.frames),
-            "size": None if series.size is None else list(series.size),
-            "saturation_dn": plain(series.saturation_dn),
-            "notes": list(self.notes),
-            "analyses": [run.to_dict() for run in self.runs],
-            "written": [str(path) for path in self.written],
+            **pick(series, "size", "saturation_dn"),
+            **pick(self, "notes", "written", analyses="runs"),
         }
 
 
@@ -117,13 +109,13 @@ def characterise(
     Raises
     ------
     UsageError
-        An analysis is unknown, or an output exists or cannot be drawn because matplotlib is missing.
+        An analysis is unknown, or an output exists.
     InputError
         The series cannot be used, or lacks what an analysis that was named needs.
     """
     chosen = _chosen(request.only)
     series = read_series(request.series)
-    drawer = _check_outputs(request, series)
+    _check_outputs(request, series)
     data = SeriesData(series)
     runs = [AnalysisRun(analysis, missing=analysis.missing(data)) for analysis in chosen]
     _refuse_missing(request, runs)
@@ -138,12 +130,9 @@ def characterise(
             events.done()
     notes = (*step_notes(data), *full_well_notes(data))
     written = _write_tables(request, series, runs)
-    if request.report is not None and drawer is not None:
-        text = characterise_page(_facts(data, notes), [_part(run) for run in runs], drawer)
-        request.report.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(request.report, text.encode("utf-8"))
-        written = [request.report, *written]
-    return CharacteriseReport(series, tuple(runs), tuple(written), notes)
+    wells = [data.wells.get(plane.name) for plane in data.planes]
+    levels = tuple(series.saturation_dn if well is None else well.level_dn for well in wells)
+    return CharacteriseReport(series, tuple(runs), tuple(written), notes, levels)
 
 
 def _chosen(only: Sequence[str]) -> list[Analysis]:
@@ -174,7 +163,7 @@ def _run(analysis: Analysis, data: SeriesData) -> AnalysisRun:
         return AnalysisRun(analysis, failed=str(error))
 
 
-def _check_outputs(request: CharacteriseRequest, series: Series) -> ChartDrawer | None:
+def _check_outputs(request: CharacteriseRequest, series: Series) -> None:
     """Refuse outputs that exist or are inputs, before any work."""
     if request.csv is not None:
         folder = request.csv
@@ -185,10 +174,6 @@ def _check_outputs(request: CharacteriseRequest, series: Series) -> ChartDrawer 
         for path in folder.glob("*.csv"):
             if path.resolve() in {p.resolve() for p in series.inputs}:
                 raise UsageError(f"{path}: is an input of the series; give another `csv`")
-    if request.report is None:
-        return None
-    check_output(request.report, list(series.inputs), overwrite=request.overwrite)
-    return ChartDrawer()
 
 
 def _write_tables(request: CharacteriseRequest, series: Series, runs: Sequence[AnalysisRun]) -> list[Path]:
@@ -228,33 +213,3 @@ def _figure_table(figures: Sequence[tuple[str, Figure]]) -> Table:
     head = ("analysis", "name", "plane", "at", "value", "sigma", "unit", "remark")
     rows = [(name, f.name, f.plane, f.at, plain(f.value), plain(f.sigma), f.unit, f.remark) for name, f in figures]
     return Table(head, tuple(tuple("" if v is None else v for v in row) for row in rows))
-
-
-def _facts(data: SeriesData, notes: tuple[str, ...]) -> SeriesFacts:
-    series, camera = data.series, data.series.camera
-    wells = [data.wells.get(plane.name) for plane in data.planes]
-    levels = [series.saturation_dn if well is None else well.level_dn for well in wells]
-    kinds = dict.fromkeys(frame.kind for frame in series.frames)
-    return SeriesFacts(
-        name=camera.name or series.path.stem,
-        file=series.path.name,
-        frames=", ".join(f"{len(series.of(kind))} {kind}" for kind in kinds)
-        or f"{len(series.reduced)} reduced figures",
-        size="" if series.size is None else f"{series.size[0]} × {series.size[1]} px, {series.dtype}",
-        saturation=", ".join(dict.fromkeys(f"{full:.4g}" for full in levels)),
-        notes=notes,
-    )
-
-
-def _part(run: AnalysisRun) -> AnalysisPart:
-    outcome = run.outcome or Outcome()
-    return AnalysisPart(
-        run.analysis.title,
-        run.state,
-        run.missing or run.failed or "",
-        tuple((f.label, " ".join(filter(None, [f.plane, f.at])), *f.texts, f.remark) for f in outcome.figures),
-        tuple(f"{what}: {why}" for what, why in outcome.refused.items()),
-        tuple((table.caption or name, table.head, table.rows) for name, table in outcome.tables.items()),
-        outcome.plots,
-        outcome.notes,
-    )

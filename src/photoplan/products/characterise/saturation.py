@@ -7,12 +7,12 @@ from math import isfinite, nan
 import numpy as np
 
 from photoplan.io.series.pixels import Plane
+from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.common import MOST_SATURATED, Run, black_if_known, exposure_runs, prefix, tried
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.result import Figure, Outcome, joined
 from photoplan.quality.camera.frame_statistics import check_level
 from photoplan.quality.camera.saturation import find_saturation
-from photoplan.report.characterise_charts import Chart, Curve
 
 _KINDS = ("flat", "scene")
 _LEAST = 4
@@ -86,4 +86,4 @@ def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
         log_x=True,
         marks=((found.first_saturated, "saturated"),),
     )
-    return Outcome(tuple(figures), plots=(chart,), details={key.replace(" ", "_"): found.to_dict()})
+    return Outcome(tuple(figures), plots=(chart,), details={key.replace(" ", "_"): found})

@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
+from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
 from photoplan.products.characterise.result import Figure, Outcome, Table, joined
 from photoplan.products.characterise.targets import locate_targets
 from photoplan.quality.camera.stage import LEAST_POINTS, StageCalibration, b4_lines, stage_calibration
-from photoplan.report.characterise_charts import Chart, Curve
-from photoplan.report.drawing import round_down
 
 _GON = 200.0 / math.pi
 
@@ -155,16 +154,11 @@ def _notes(found: StageCalibration, at: str) -> list[str]:
 def _chart(found: StageCalibration, at: str) -> Chart:
     """Residual vectors (Behr 1989, figs. B.2 and B.3), enlarged."""
     x, y = found.measured.T
-    largest = float(np.linalg.norm(found.residuals, axis=1).max()) or 1.0
-    factor = round_down(0.1 * float(np.ptp(found.measured)) / largest)
-    ends = found.measured + factor * found.residuals
-    gap = np.full(len(x), np.nan)
-    lines = np.column_stack([x, ends[:, 0], gap]).ravel(), np.column_stack([y, ends[:, 1], gap]).ravel()
     return Chart(
         f"Residuals, {at}",
-        f"Measured minus transformed, enlarged {factor:g} times; mean errors {found.sigma[0]:.2f} and "
+        f"Measured minus transformed, enlarged as the legend says; mean errors {found.sigma[0]:.2f} and "
         f"{found.sigma[1]:.2f} px (Behr 1989, figs. B.2 and B.3).",
         "column px",
         "row px (upwards in the figure)",
-        (Curve(x, y, "points", "points"), Curve(*lines, f"residuals × {factor:g}", "line")),
+        (Curve(x, y, "points", "points"), Curve(x, y, "residuals", vectors=found.residuals)),
     )

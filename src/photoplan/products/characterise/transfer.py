@@ -6,12 +6,12 @@ import numpy as np
 
 from photoplan.io.series.pixels import Plane
 from photoplan.io.series.statistics import ReducedPoint
+from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.common import dark_levels, prefix, tried
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.result import Figure, Outcome, Table, joined
 from photoplan.quality.camera.frame_statistics import Level
 from photoplan.quality.camera.photon_transfer import PhotonTransfer, photon_transfer
-from photoplan.report.characterise_charts import Chart, Curve
 
 _LEAST = 3
 
@@ -96,7 +96,7 @@ def _plane(name: str, bright: list[Level], dark: tuple[list[Level], list[float]]
         refused,
         {"levels": Table(("plane", "mean_dn", "variance_dn2", "used"), rows, "Levels and whether the line uses them")},
         _plots(found, name, data.step),
-        details={f"photon_transfer{name and f'_{name}'}": found.to_dict()},
+        details={f"photon_transfer{name and f'_{name}'}": found},
     )
 
 

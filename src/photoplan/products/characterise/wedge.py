@@ -11,12 +11,12 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.series.file import Frame
 from photoplan.io.series.pixels import Plane, plane_pixels
+from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.common import black_of, prefix, saturation_of, tried
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.result import Figure, Outcome, Table, joined
 from photoplan.quality.camera.frame_statistics import Level, StackSums
 from photoplan.quality.camera.grey_wedge import GreyWedge, grey_wedge
-from photoplan.report.characterise_charts import Chart, Curve
 
 _LEAST = 3
 
@@ -109,7 +109,7 @@ def _curve(data: SeriesData, patches: list[_Patch], plane: Plane, label: str) ->
         figures,
         tables={"patches": Table(head, rows, "Patches of the wedge")},
         plots=(_plot(found, prefix("Grey wedge", plane.name, label)),),
-        details={prefix("wedge", plane.name, label).replace(" ", "_"): found.to_dict()},
+        details={prefix("wedge", plane.name, label).replace(" ", "_"): found},
     )
 
 

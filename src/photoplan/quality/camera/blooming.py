@@ -8,7 +8,7 @@ object has there is the onset.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from math import nan, sqrt
 from typing import Any
@@ -55,10 +55,6 @@ class Blooming:
     """Excess from which on a pixel counts as lifted."""
     object_pixels: int
     neighbour_pixels: int
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(self).items()}
 
 
 def find_blooming(

@@ -7,9 +7,8 @@ degrees: I(T) = I₀ 2^((T − T₀)/T_d) (EMVA 1288 release 4 linear, sections 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from math import log, sqrt
-from typing import Any
 
 import numpy as np
 
@@ -31,10 +30,6 @@ class DarkCurrent:
     current_dn_s_sigma: float
     line: StraightLine
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class DoublingTemperature:
@@ -47,10 +42,6 @@ class DoublingTemperature:
     current_at_reference: float
     """In the unit that was given."""
     current_at_reference_sigma: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return asdict(self)
 
 
 def dark_current(exposures_ms: Sequence[float], levels: Sequence[Level]) -> DarkCurrent:

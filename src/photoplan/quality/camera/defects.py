@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import sqrt
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -221,10 +221,6 @@ class LogHistogram:
     count: NDArray[np.int64]
     model: NDArray[np.float64]
     """Expected counts of a Gaussian with the robust scatter."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return {name: getattr(self, name).tolist() for name in ("deviation", "count", "model")}
 
 
 def log_histogram(deviation: NDArray[np.float64], scatter: float) -> LogHistogram:

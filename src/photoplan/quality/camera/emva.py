@@ -14,9 +14,8 @@ photon transfer then gives another gain, 1.1 % less in that package's own exampl
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from math import isfinite, log10, nan, sqrt
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -91,12 +90,6 @@ class EmvaSheet:
     used: NDArray[np.bool_]
     """Levels between 0 and 70 % of saturation."""
     refused: Mapping[str, str]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        found = asdict(self)
-        found["linearity"] = None if self.linearity is None else self.linearity.to_dict()
-        return found | {"used": self.used.tolist(), "refused": dict(self.refused)}
 
 
 def emva_sheet(points: EmvaPoints, step: float = 1.0) -> EmvaSheet:

@@ -9,9 +9,8 @@ whether a mean image is filtered is the caller's choice here.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from math import nan, sqrt
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,10 +41,6 @@ class PatternVariance:
     """Temporal variance of the mean image, which was taken out."""
     filtered: bool
     """Whether the slow variation was taken out."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return asdict(self)
 
 
 def pattern_variance(
@@ -155,10 +150,6 @@ class Spectrogram:
     """Whole power over that of the white part; 1 for white noise."""
     peak_frequency: float
     """Frequency of the largest peak that stands out (5 times its neighbourhood); NaN: there is none."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(self).items()}
 
 
 def spectrogram(mean: NDArray[np.float64], axis: int) -> Spectrogram:

@@ -6,8 +6,7 @@ of the scale of grey values stays unused. Transmission is 10^−D.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,10 +35,6 @@ class GreyWedge:
     """Largest deviation from that line, % of the largest signal used."""
     used_range_percent: float
     """Part of the scale up to saturation that the brightest patch takes."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(self).items()}
 
 
 def grey_wedge(density: ArrayLike, signal: ArrayLike, sigma: ArrayLike, saturation: float) -> GreyWedge:

@@ -7,8 +7,7 @@ response between neighbouring levels shows where a curve bends (Behr 1989, §4.2
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -49,10 +48,6 @@ class Linearity:
     error_min_percent: float
     """Largest negative deviation of the used levels."""
     error_max_percent: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(self).items()}
 
 
 def linearity(

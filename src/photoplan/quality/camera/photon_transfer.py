@@ -9,9 +9,8 @@ the same line.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from math import nan, sqrt
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,12 +58,6 @@ class PhotonTransfer:
     variance: NDArray[np.float64]
     used: NDArray[np.bool_]
     """Levels that the line was fitted to."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        found = asdict(self)
-        found["line"] = asdict(self.line)
-        return found | {name: getattr(self, name).tolist() for name in ("mean", "variance", "used")}
 
 
 def is_clipped_dark(level: Level) -> bool:

@@ -7,9 +7,8 @@ section 6.6).
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from math import inf, isfinite, nan, pi, sqrt
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -42,10 +41,6 @@ class Saturation:
     exposure: float
     """Exposure at which the line of the darker levels reaches `level_dn`; NaN if it lies not between the two."""
     exposure_sigma: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return asdict(self)
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.report.adjust.facts import AdjustFacts, GroundFacts, ResidualField
+from photoplan.products.adjust.figures import AdjustFigures, GroundFigures, ResidualField
 from photoplan.report.drawing import (
     BLUE,
     GREEN,
@@ -19,7 +20,6 @@ from photoplan.report.drawing import (
     SKY,
     SOFT,
     STYLE,
-    load_matplotlib,
     png,
     round_down,
 )
@@ -34,21 +34,15 @@ _DOTS = 20_000
 _STRIPS = (BLUE, GREEN, PURPLE, SKY, "#7a5c00", INK)
 
 
+@dataclass(frozen=True, eq=False)
 class AdjustPlots:
-    """Draws; made before any work, so that a missing library is known at once.
+    """Draws network, residuals and accuracy of stations."""
 
-    Raises
-    ------
-    UsageError
-        When made: matplotlib is not installed.
-    """
+    mpl: Any
 
-    def __init__(self) -> None:
-        self._mpl = load_matplotlib("a report", "say `dry_run`")
-
-    def network(self, facts: AdjustFacts) -> bytes:
+    def network(self, facts: AdjustFigures) -> bytes:
         """Image centres by strip, tie points, control and check points."""
-        with self._mpl.rc_context(STYLE):
+        with self.mpl.rc_context(STYLE):
             fig, axes = self._map(facts)
             step = max(1, -(-len(facts.tie_XY) // _DOTS))
             dots = facts.tie_XY[::step]
@@ -72,13 +66,13 @@ class AdjustPlots:
             _legend(fig)
             return png(fig)
 
-    def control(self, facts: AdjustFacts, check: bool) -> tuple[bytes, str]:
+    def control(self, facts: AdjustFigures, check: bool) -> tuple[bytes, str]:
         """Residual vectors of control or check points with the 95 % ellipses of the adjusted points, and the scale.
 
         What was taken out has no arrow: its residual would set the scale, and the others could not be seen.
         """
         some = [g for g in facts.ground if g.check == check and np.isfinite(g.residual).any()]
-        with self._mpl.rc_context(STYLE):
+        with self.mpl.rc_context(STYLE):
             fig, axes = self._map(facts)
             centers = np.array([image.center[:2] for image in facts.images])
             axes.scatter(*centers.T, s=2, marker="s", color="#d3dbe0", linewidths=0)
@@ -102,18 +96,18 @@ class AdjustPlots:
                     _arrow(axes, x, y, 0.0, dz, BLUE)
             self._ground(axes, [g for g in facts.ground if g.check == check], 9.0)
             handles = [
-                _key(self._mpl, RED, "horizontal residual"),
-                _key(self._mpl, BLUE, "height residual (up: too high)"),
-                _key(self._mpl, ORANGE, "95 % ellipse"),
+                _key(self.mpl, RED, "horizontal residual"),
+                _key(self.mpl, BLUE, "height residual (up: too high)"),
+                _key(self.mpl, ORANGE, "95 % ellipse"),
             ]
             fig.legend(handles=handles, loc="outside lower center", ncols=3)
             _scale_bar(axes, scale, largest)
             return png(fig), f"{scale:g}".replace("e+0", "e")
 
-    def sigmas(self, facts: AdjustFacts) -> bytes:
+    def sigmas(self, facts: AdjustFigures) -> bytes:
         """Standard deviations of the projection centres: in the horizontal, and of the height."""
-        with self._mpl.rc_context(STYLE):
-            fig = self._mpl.figure.Figure(figsize=(_WIDTH, self._height(facts, half=True) + 0.9), layout="constrained")
+        with self.mpl.rc_context(STYLE):
+            fig = self.mpl.figure.Figure(figsize=(_WIDTH, self._height(facts, half=True) + 0.9), layout="constrained")
             panels = fig.subplots(1, 2, sharex=True, sharey=True)
             at = np.array([image.center for image in facts.images])
             sigma = np.array([image.sigma_center for image in facts.images])
@@ -122,10 +116,10 @@ class AdjustPlots:
             for axes, value, name in zip(panels, values, ("horizontal", "height")):
                 self._frame(axes, facts)
                 low, high = _limits(value)
-                norm = self._mpl.colors.Normalize(low, high)
+                norm = self.mpl.colors.Normalize(low, high)
                 axes.scatter(at[:, 0], at[:, 1], c=value, cmap="viridis_r", norm=norm, s=side, marker="s", linewidths=0)
                 axes.set_title(name)
-                tints = self._mpl.cm.ScalarMappable(norm, "viridis_r")
+                tints = self.mpl.cm.ScalarMappable(norm, "viridis_r")
                 bar = fig.colorbar(tints, ax=axes, orientation="horizontal", shrink=0.85, aspect=30, pad=0.02)
                 bar.set_label("standard deviation m")
                 bar.outline.set_visible(False)
@@ -134,8 +128,8 @@ class AdjustPlots:
 
     def normalised(self, values: NDArray[np.float64], limit: float) -> bytes:
         """Histogram of normalised residuals with the normal curve, on a linear and on a logarithmic scale."""
-        with self._mpl.rc_context(STYLE):
-            fig = self._mpl.figure.Figure(figsize=(_WIDTH, 2.9), layout="constrained")
+        with self.mpl.rc_context(STYLE):
+            fig = self.mpl.figure.Figure(figsize=(_WIDTH, 2.9), layout="constrained")
             panels = fig.subplots(1, 2)
             z = values[np.isfinite(values)]
             edge = max(5.0, limit + 0.5)
@@ -157,21 +151,21 @@ class AdjustPlots:
                 panels[0].text(0.02, 0.96, said, transform=panels[0].transAxes, va="top", fontsize=8)
             floor = 0.5 / max(1, len(z)) / (bins[1] - bins[0])
             panels[1].set_yscale("log")
-            panels[1].yaxis.set_major_formatter(self._mpl.ticker.FuncFormatter(lambda v, _: f"{v:g}"))
-            panels[1].yaxis.set_minor_formatter(self._mpl.ticker.NullFormatter())
+            panels[1].yaxis.set_major_formatter(self.mpl.ticker.FuncFormatter(lambda v, _: f"{v:g}"))
+            panels[1].yaxis.set_minor_formatter(self.mpl.ticker.NullFormatter())
             panels[1].set(ylim=(floor, 1.0), title="the same, logarithmic")
             return png(fig)
 
     def field(self, field: ResidualField) -> tuple[bytes, str]:
         """Mean residual vectors over the image format, and how many times they are enlarged."""
-        with self._mpl.rc_context(STYLE):
+        with self.mpl.rc_context(STYLE):
             xmin, ymin, xmax, ymax = field.frame
             ratio = (ymax - ymin) / (xmax - xmin)
-            fig = self._mpl.figure.Figure(
+            fig = self.mpl.figure.Figure(
                 figsize=(_WIDTH, float(np.clip(5.6 * ratio, 2.4, 7.0)) + 0.8), layout="constrained"
             )
             axes = fig.subplots()
-            axes.add_patch(self._mpl.patches.Rectangle((xmin, ymin), xmax - xmin, ymax - ymin, fill=False, ec=SOFT))
+            axes.add_patch(self.mpl.patches.Rectangle((xmin, ymin), xmax - xmin, ymax - ymin, fill=False, ec=SOFT))
             margin = 0.04 * (xmax - xmin)
             axes.set(xlim=(xmin - margin, xmax + margin), ylim=(ymin - margin, ymax + margin), aspect="equal")
             axes.set(xlabel=f"x {field.unit}", ylabel=f"y {field.unit}")
@@ -206,7 +200,7 @@ class AdjustPlots:
             _legend(fig)
             return png(fig), f"{key:g} px"
 
-    def _ground(self, axes: Any, ground: Sequence[GroundFacts], size: float = 38.0) -> None:
+    def _ground(self, axes: Any, ground: Sequence[GroundFigures], size: float = 38.0) -> None:
         kinds = ((False, "^", RED, "control"), (True, "o", ORANGE, "check points"))
         for check, marker, colour, name in kinds:
             for seen, word in ((True, name), (False, f"{name}, not measured")):
@@ -244,10 +238,10 @@ class AdjustPlots:
         values, vectors = np.linalg.eigh(covariance)
         width, height = (2 * _ELLIPSE_95 * scale * float(np.sqrt(max(v, 0.0))) for v in values[::-1])
         angle = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
-        patch = self._mpl.patches.Ellipse(at, width, height, angle=angle, fill=False, ec=ORANGE, lw=1.2, zorder=4)
+        patch = self.mpl.patches.Ellipse(at, width, height, angle=angle, fill=False, ec=ORANGE, lw=1.2, zorder=4)
         axes.add_patch(patch)
 
-    def _bounds(self, facts: AdjustFacts) -> tuple[float, float, float, float]:
+    def _bounds(self, facts: AdjustFigures) -> tuple[float, float, float, float]:
         XY = [np.array([image.center[:2] for image in facts.images]).reshape(-1, 2), facts.tie_XY]
         XY.append(np.array([g.XYZ[:2] for g in facts.ground]).reshape(-1, 2))
         every = np.concatenate(XY)
@@ -256,24 +250,24 @@ class AdjustPlots:
         margin = 0.05 * max(float((high - low).max()), 1.0)
         return float(low[0]) - margin, float(low[1]) - margin, float(high[0]) + margin, float(high[1]) + margin
 
-    def _height(self, facts: AdjustFacts, half: bool = False) -> float:
+    def _height(self, facts: AdjustFigures, half: bool = False) -> float:
         left, bottom, right, top = self._bounds(facts)
         width = 3.0 if half else 6.2
         return float(np.clip(width * (top - bottom) / (right - left), 1.6 if half else 2.2, 4.2 if half else 6.4))
 
-    def _map(self, facts: AdjustFacts) -> tuple[Any, Any]:
-        fig = self._mpl.figure.Figure(figsize=(_WIDTH, self._height(facts) + 0.8), layout="constrained")
+    def _map(self, facts: AdjustFigures) -> tuple[Any, Any]:
+        fig = self.mpl.figure.Figure(figsize=(_WIDTH, self._height(facts) + 0.8), layout="constrained")
         axes = fig.subplots()
         self._frame(axes, facts)
         return fig, axes
 
-    def _frame(self, axes: Any, facts: AdjustFacts) -> None:
+    def _frame(self, axes: Any, facts: AdjustFigures) -> None:
         left, bottom, right, top = self._bounds(facts)
         axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="X m", ylabel="Y m")
         axes.grid(False)
         for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_locator(self._mpl.ticker.MaxNLocator(4, steps=[1, 2, 5, 10]))
-            axis.set_major_formatter(self._mpl.ticker.FuncFormatter(lambda v, _: f"{v:.12g}"))
+            axis.set_major_locator(self.mpl.ticker.MaxNLocator(4, steps=[1, 2, 5, 10]))
+            axis.set_major_formatter(self.mpl.ticker.FuncFormatter(lambda v, _: f"{v:.12g}"))
 
 
 def _arrow(axes: Any, x: float, y: float, dx: float, dy: float, colour: str) -> None:

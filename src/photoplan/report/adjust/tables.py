@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from photoplan.report.adjust.facts import AdjustFacts, CalibrationFacts, GroundFacts, MeasurementFacts
+from photoplan.products.adjust.figures import AdjustFigures, Calibrated, GroundFigures, NamedMeasurement
 from photoplan.report.page import Cell, table, text
 
 #: Rows of a list at most; more are counted, and are in the JSON.
@@ -16,7 +16,7 @@ _HIGH = 0.8
 Row = list[str | Cell]
 
 
-def measurement_table(some: Sequence[MeasurementFacts]) -> str:
+def measurement_table(some: Sequence[NamedMeasurement]) -> str:
     """Observations with their residuals."""
     rows: list[Row] = [
         [m.what, cell(m.residual.replace("-", "−")), cell(plain(m.normalised, 1, sign=True))] for m in some[:MOST_ROWS]
@@ -25,7 +25,7 @@ def measurement_table(some: Sequence[MeasurementFacts]) -> str:
     return table(["observation", "residual", "normalised"], rows) + more
 
 
-def ground_table(ground: Sequence[GroundFacts], normalised: bool) -> str:
+def ground_table(ground: Sequence[GroundFigures], normalised: bool) -> str:
     """Residuals and standard deviations of control or check points."""
     rows: list[Row] = []
     for g in ground[:MOST_ROWS]:
@@ -43,7 +43,7 @@ def ground_table(ground: Sequence[GroundFacts], normalised: bool) -> str:
     return table([*head, "normalised"] if normalised else head, rows) + _more(len(ground)) + note
 
 
-def camera_parts(camera: CalibrationFacts) -> list[str]:
+def camera_parts(camera: Calibrated) -> list[str]:
     """Calibrated parameters of a camera and their correlations."""
     rows: list[Row] = []
     for k, name in enumerate(camera.parameters):
@@ -84,7 +84,7 @@ def camera_parts(camera: CalibrationFacts) -> list[str]:
     return parts
 
 
-def position_parts(facts: AdjustFacts) -> list[str]:
+def position_parts(facts: AdjustFigures) -> list[str]:
     """Residuals of observed positions by strip; drift, lever arm, boresight."""
     rows: list[Row] = []
     for s in facts.strips[:MOST_ROWS]:
@@ -114,7 +114,7 @@ def position_parts(facts: AdjustFacts) -> list[str]:
     return parts
 
 
-def image_parts(facts: AdjustFacts) -> list[str]:
+def image_parts(facts: AdjustFigures) -> list[str]:
     """Residuals and standard deviations image by image."""
     order = sorted(facts.images, key=lambda i: -_or_zero(float(np.hypot(*i.rms))))
     rows: list[Row] = []
@@ -155,7 +155,7 @@ def image_parts(facts: AdjustFacts) -> list[str]:
     ]
 
 
-def left_out_parts(facts: AdjustFacts) -> list[str]:
+def left_out_parts(facts: AdjustFigures) -> list[str]:
     """What could not take part, by reason."""
     reasons: dict[str, list[str]] = {}
     for name, reason in facts.left_out:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from photoplan.report.adjust.facts import AdjustFacts
+from photoplan.orientation.check_points import CheckAccuracy
+from photoplan.products.adjust.figures import AdjustFigures
 from photoplan.report.adjust.plots import AdjustPlots
 from photoplan.report.adjust.tables import (
     Row,
@@ -22,15 +25,15 @@ from photoplan.report.adjust.tables import (
     to_unit,
     warning,
 )
-from photoplan.report.check_points import CheckAccuracy
 from photoplan.report.page import figure, headline, page, section, table
 
 
-def adjust_report(facts: AdjustFacts, plots: AdjustPlots) -> str:
+def adjust_page(facts: AdjustFigures, mpl: Any) -> str:
     """The report as one HTML document without links to anything outside it.
 
     Names and texts are escaped; what they contain is shown and never obeyed.
     """
+    plots = AdjustPlots(mpl)
     parts = [headline(_headline(facts))]
     if facts.notes:
         parts.append("".join(paragraph(note) for note in facts.notes))
@@ -54,7 +57,7 @@ def adjust_report(facts: AdjustFacts, plots: AdjustPlots) -> str:
     return page(facts.title, facts.crs, parts)
 
 
-def _headline(facts: AdjustFacts) -> list[tuple[str, str, str]]:
+def _headline(facts: AdjustFigures) -> list[tuple[str, str, str]]:
     control = [g for g in facts.ground if not g.check]
     sigma = np.array([image.sigma_center for image in facts.images])
     mean = np.sqrt(np.mean(sigma**2, axis=0)) if len(sigma) else np.full(3, np.nan)
@@ -98,7 +101,7 @@ def _headline(facts: AdjustFacts) -> list[tuple[str, str, str]]:
     return boxes
 
 
-def _network(facts: AdjustFacts, plots: AdjustPlots) -> list[str]:
+def _network(facts: AdjustFigures, plots: AdjustPlots) -> list[str]:
     control = [g for g in facts.ground if not g.check]
     check = len(facts.ground) - len(control)
     return [
@@ -116,7 +119,7 @@ def _network(facts: AdjustFacts, plots: AdjustPlots) -> list[str]:
     ]
 
 
-def _groups(facts: AdjustFacts, plots: AdjustPlots) -> list[str]:
+def _groups(facts: AdjustFigures, plots: AdjustPlots) -> list[str]:
     rows: list[Row] = []
     for g in facts.groups:
         share = g.redundancy / g.count if g.count else np.nan
@@ -151,7 +154,7 @@ def _groups(facts: AdjustFacts, plots: AdjustPlots) -> list[str]:
     ]
 
 
-def _gross(facts: AdjustFacts) -> list[str]:
+def _gross(facts: AdjustFigures) -> list[str]:
     parts: list[str] = []
     if facts.gross:
         parts.append(
@@ -169,7 +172,7 @@ def _gross(facts: AdjustFacts) -> list[str]:
     return parts
 
 
-def _control(facts: AdjustFacts, plots: AdjustPlots) -> list[str]:
+def _control(facts: AdjustFigures, plots: AdjustPlots) -> list[str]:
     picture, scale = plots.control(facts, check=False)
     out = any(any(g.rejected) for g in facts.ground if not g.check)
     return [
@@ -183,7 +186,7 @@ def _control(facts: AdjustFacts, plots: AdjustPlots) -> list[str]:
     ]
 
 
-def _check(facts: AdjustFacts, check: CheckAccuracy, plots: AdjustPlots) -> list[str]:
+def _check(facts: AdjustFigures, check: CheckAccuracy, plots: AdjustPlots) -> list[str]:
     rows: list[Row] = []
     for name, k in (("X", 0), ("Y", 1), ("Z", 2)):
         count = check.vertical if k == 2 else check.horizontal
@@ -213,7 +216,7 @@ def _check(facts: AdjustFacts, check: CheckAccuracy, plots: AdjustPlots) -> list
     ]
 
 
-def _fields(facts: AdjustFacts, plots: AdjustPlots) -> list[str]:
+def _fields(facts: AdjustFigures, plots: AdjustPlots) -> list[str]:
     parts = [
         paragraph(
             "Mean residuals (computed minus measured) of all images in cells of the image format. A pattern that hangs "
@@ -235,7 +238,7 @@ def _fields(facts: AdjustFacts, plots: AdjustPlots) -> list[str]:
     return parts
 
 
-def _record(facts: AdjustFacts) -> list[str]:
+def _record(facts: AdjustFigures) -> list[str]:
     return [
         table(["input", ""], [list(row) for row in facts.inputs]),
         table(["setting", "value"], [list(row) for row in facts.settings]),

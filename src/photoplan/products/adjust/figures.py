@@ -1,4 +1,4 @@
-"""What the report of a bundle adjustment shows, as plain values."""
+"""The figures of an adjusted block, in metres and in the units of the project."""
 
 from __future__ import annotations
 
@@ -7,26 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.report.check_points import CheckAccuracy
+from photoplan.orientation.bundle.block import Group
+from photoplan.orientation.check_points import CheckAccuracy
+from photoplan.products.adjust.cameras import Calibrated
 
 _Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class GroupFacts:
-    """Observations of one kind."""
-
-    name: str
-    count: int
-    redundancy: float
-    rms: float
-    unit: str
-    factor: float
-    """Standard deviation found divided by the stated one."""
-
-
 @dataclass(frozen=True, eq=False)
-class ImageFacts:
+class ImageFigures:
     """One image."""
 
     name: str
@@ -48,7 +37,7 @@ class ImageFacts:
 
 
 @dataclass(frozen=True, eq=False)
-class GroundFacts:
+class GroundFigures:
     """One control or check point."""
 
     name: str
@@ -67,7 +56,7 @@ class GroundFacts:
 
 
 @dataclass(frozen=True)
-class MeasurementFacts:
+class NamedMeasurement:
     """One measurement of a point in an image, or a coordinate of control, that is to be named."""
 
     what: str
@@ -77,20 +66,7 @@ class MeasurementFacts:
 
 
 @dataclass(frozen=True, eq=False)
-class CalibrationFacts:
-    """Parameters of a camera that were unknowns."""
-
-    name: str
-    parameters: tuple[str, ...]
-    units: tuple[str, ...]
-    before: _Floats
-    after: _Floats
-    sigma: _Floats
-    correlation: _Floats
-
-
-@dataclass(frozen=True, eq=False)
-class StripFacts:
+class StripFigures:
     """Observed positions of one strip."""
 
     name: str
@@ -124,8 +100,8 @@ class ResidualField:
 
 
 @dataclass(frozen=True, eq=False)
-class AdjustFacts:
-    """All that the report shows."""
+class AdjustFigures:
+    """All figures of a block."""
 
     title: str
     crs: str
@@ -142,19 +118,19 @@ class AdjustFacts:
     points: int
     mean_rays: float
     angle_unit: str
-    groups: tuple[GroupFacts, ...]
-    images: tuple[ImageFacts, ...]
-    ground: tuple[GroundFacts, ...]
+    groups: tuple[Group, ...]
+    images: tuple[ImageFigures, ...]
+    ground: tuple[GroundFigures, ...]
     check: CheckAccuracy | None
-    cameras: tuple[CalibrationFacts, ...]
-    strips: tuple[StripFacts, ...]
+    cameras: tuple[Calibrated, ...]
+    strips: tuple[StripFigures, ...]
     lever_arm: tuple[tuple[float, float, float], tuple[float, float, float]] | None
     """Value and standard deviation, metres; None: no positions."""
     boresight: tuple[tuple[float, float, float], tuple[float, float, float]] | None
     """In the unit of the project; None: no unknown."""
-    gross: tuple[MeasurementFacts, ...]
+    gross: tuple[NamedMeasurement, ...]
     """Gross errors, largest first."""
-    worst: tuple[MeasurementFacts, ...]
+    worst: tuple[NamedMeasurement, ...]
     """Largest normalised residuals of what was kept."""
     left_out: tuple[tuple[str, str], ...]
     normalised: _Floats

@@ -1,4 +1,4 @@
-"""From an adjusted block to what its report, its JSON and its layers say."""
+"""From an adjusted block to its figures and the layers of its points."""
 
 from __future__ import annotations
 
@@ -13,19 +13,17 @@ from photoplan.geometry.heights import height_label
 from photoplan.io.adjusted_points import PointLayer
 from photoplan.io.project.model import ANGLE_UNITS
 from photoplan.orientation.bundle.block import AdjustSettings
+from photoplan.orientation.check_points import CheckAccuracy, check_accuracy
 from photoplan.products.adjust.block import MapResult
 from photoplan.products.adjust.field import residual_fields
-from photoplan.products.init.match import some
-from photoplan.report.adjust.facts import (
-    AdjustFacts,
-    CalibrationFacts,
-    GroundFacts,
-    GroupFacts,
-    ImageFacts,
-    MeasurementFacts,
-    StripFacts,
+from photoplan.products.adjust.figures import (
+    AdjustFigures,
+    GroundFigures,
+    ImageFigures,
+    NamedMeasurement,
+    StripFigures,
 )
-from photoplan.report.check_points import CheckAccuracy, check_accuracy
+from photoplan.products.init.match import some
 
 _Floats = NDArray[np.float64]
 Triple = tuple[float, float, float]
@@ -35,8 +33,8 @@ _WORST = 15
 _SOUND, _CONTRADICTED = 30.0, 1.4
 
 
-def build_facts(title: str, result: MapResult, settings: AdjustSettings, seconds: float) -> AdjustFacts:
-    """What the report shows.
+def summarise(title: str, result: MapResult, settings: AdjustSettings, seconds: float) -> AdjustFigures:
+    """The figures of a block.
 
     Parameters
     ----------
@@ -56,7 +54,7 @@ def build_facts(title: str, result: MapResult, settings: AdjustSettings, seconds
     sigma = np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2))
     system = project.orientation.height_system
     residuals = adjusted.residuals[used]
-    return AdjustFacts(
+    return AdjustFigures(
         title=title,
         crs=f"{crs_label(project.crs)} · heights {height_label(system)} · earth curvature "
         f"{project.orientation.earth_curvature}",
@@ -71,11 +69,11 @@ def build_facts(title: str, result: MapResult, settings: AdjustSettings, seconds
         points=len(adjusted.points),
         mean_rays=float(adjusted.rays.mean()) if len(adjusted.rays) else float("nan"),
         angle_unit=project.orientation.angle_unit,
-        groups=tuple(GroupFacts(g.name, g.count, g.redundancy, g.rms, g.unit, g.factor) for g in adjusted.groups),
+        groups=tuple(adjusted.groups),
         images=_images(result, used),
         ground=ground,
         check=_check(ground),
-        cameras=_cameras(result),
+        cameras=tuple(result.cameras),
         strips=_strips(result),
         lever_arm=None
         if inputs.positions is None
@@ -141,18 +139,11 @@ def _control_out(result: MapResult) -> list[str]:
     return out
 
 
-def _check(ground: Sequence[GroundFacts]) -> CheckAccuracy | None:
+def _check(ground: Sequence[GroundFigures]) -> CheckAccuracy | None:
     check = [g for g in ground if g.check and np.isfinite(g.residual).any()]
     if not check:
         return None
     return check_accuracy(np.array([g.residual for g in check]), np.array([g.stated for g in check]))
-
-
-def _cameras(result: MapResult) -> tuple[CalibrationFacts, ...]:
-    return tuple(
-        CalibrationFacts(c.name, c.parameters, c.units, c.before, c.after, c.sigma, c.correlation)
-        for c in result.cameras
-    )
 
 
 def _triple(values: _Floats) -> Triple:
@@ -160,7 +151,7 @@ def _triple(values: _Floats) -> Triple:
     return a, b, c
 
 
-def _images(result: MapResult, used: NDArray[np.bool_]) -> tuple[ImageFacts, ...]:
+def _images(result: MapResult, used: NDArray[np.bool_]) -> tuple[ImageFigures, ...]:
     adjusted, points = result.adjusted, result.prepared.inputs.points
     positions = result.prepared.inputs.positions
     strip = {} if positions is None else dict(zip(positions.images, positions.strip))
@@ -175,7 +166,7 @@ def _images(result: MapResult, used: NDArray[np.bool_]) -> tuple[ImageFacts, ...
         r, w = adjusted.residuals[mine], np.abs(adjusted.normalised[mine])
         none = not len(mine)
         out.append(
-            ImageFacts(
+            ImageFigures(
                 name,
                 strip.get(name, ""),
                 len(mine),
@@ -195,7 +186,7 @@ def _rms(values: _Floats) -> float:
     return float(np.sqrt((values**2).mean())) if values.size else float("nan")
 
 
-def ground_facts(result: MapResult) -> tuple[GroundFacts, ...]:
+def ground_facts(result: MapResult) -> tuple[GroundFigures, ...]:
     """Control and check points, in the order of their files."""
     ground, adjusted = result.prepared.inputs.ground, result.adjusted
     row = {name: k for k, name in enumerate(adjusted.points)}
@@ -206,7 +197,7 @@ def ground_facts(result: MapResult) -> tuple[GroundFacts, ...]:
         at = row.get(name)
         a, b, c = (bool(v) for v in adjusted.ground_rejected[k])
         out.append(
-            GroundFacts(
+            GroundFigures(
                 name,
                 bool(ground.check[k]),
                 0 if at is None else int(adjusted.rays[at]),
@@ -221,7 +212,7 @@ def ground_facts(result: MapResult) -> tuple[GroundFacts, ...]:
     return tuple(out)
 
 
-def _strips(result: MapResult) -> tuple[StripFacts, ...]:
+def _strips(result: MapResult) -> tuple[StripFigures, ...]:
     positions = result.prepared.inputs.positions
     if positions is None:
         return ()
@@ -239,7 +230,7 @@ def _strips(result: MapResult) -> tuple[StripFacts, ...]:
         nothing = np.full(3, np.nan)
         known = found is not None and bool(np.isfinite(found.sigma[:3]).any())
         out.append(
-            StripFacts(
+            StripFigures(
                 str(name),
                 int(mine.sum()),
                 int(adjusted.position_rejected[mine].sum()),
@@ -261,7 +252,7 @@ def _boresight(result: MapResult) -> tuple[Triple, Triple] | None:
     return _triple(adjusted.boresight * factor), _triple(adjusted.boresight_sigma * factor)
 
 
-def _gross(result: MapResult) -> tuple[MeasurementFacts, ...]:
+def _gross(result: MapResult) -> tuple[NamedMeasurement, ...]:
     """All gross errors, the largest first."""
     adjusted, inputs = result.adjusted, result.prepared.inputs
     out = [_measurement(result, int(k), True) for k in np.flatnonzero(adjusted.rejected)]
@@ -269,30 +260,30 @@ def _gross(result: MapResult) -> tuple[MeasurementFacts, ...]:
         d = result.ground_residuals[k, axis]
         what = f"control point {inputs.ground.names[k]!r}, {'XYZ'[axis]}"
         text = f"{d:+.3f} m" if np.isfinite(d) else "too few of its image points are left"
-        out.append(MeasurementFacts(what, text, float(adjusted.ground_normalised[k, axis]), True))
+        out.append(NamedMeasurement(what, text, float(adjusted.ground_normalised[k, axis]), True))
     if inputs.positions is not None:
         for k in np.flatnonzero(adjusted.position_rejected):
             d = result.position_residuals[k]
             size = np.abs(d) / inputs.positions.sigma[k]
             what = f"observed position of image {inputs.positions.images[k]!r}"
-            out.append(MeasurementFacts(what, " ".join(f"{v:+.3f}" for v in d) + " m", float(size.max()), True))
+            out.append(NamedMeasurement(what, " ".join(f"{v:+.3f}" for v in d) + " m", float(size.max()), True))
     return tuple(sorted(out, key=lambda m: -abs(m.normalised) if np.isfinite(m.normalised) else 0.0))
 
 
-def _worst(result: MapResult, used: NDArray[np.bool_]) -> tuple[MeasurementFacts, ...]:
+def _worst(result: MapResult, used: NDArray[np.bool_]) -> tuple[NamedMeasurement, ...]:
     w = np.abs(result.adjusted.normalised).max(axis=1)
     w[~used | ~np.isfinite(w)] = -1.0
     order = np.argsort(-w)[:_WORST]
     return tuple(_measurement(result, int(k), False) for k in order if w[k] > 0)
 
 
-def _measurement(result: MapResult, k: int, rejected: bool) -> MeasurementFacts:
+def _measurement(result: MapResult, k: int, rejected: bool) -> NamedMeasurement:
     adjusted = result.adjusted
     dx, dy = adjusted.residuals[k]
     normalised = adjusted.normalised[k]
     axis = int(np.argmax(np.abs(np.nan_to_num(normalised))))
     text = f"{dx:+.2f} {dy:+.2f} px" if np.isfinite([dx, dy]).all() else "without it, one image sees the point"
-    return MeasurementFacts(result.prepared.inputs.points.label(k), text, float(normalised[axis]), rejected)
+    return NamedMeasurement(result.prepared.inputs.points.label(k), text, float(normalised[axis]), rejected)
 
 
 def _inputs(files: Sequence[Path]) -> tuple[tuple[str, str], ...]:
@@ -320,7 +311,7 @@ def _settings(result: MapResult, settings: AdjustSettings, seconds: float) -> tu
     )
 
 
-def point_layers(result: MapResult, facts: AdjustFacts) -> list[PointLayer]:
+def point_layers(result: MapResult, facts: AdjustFigures) -> list[PointLayer]:
     """Layers of the GeoPackage: adjusted points, projection centres, and residuals of control and check points."""
     adjusted = result.adjusted
     role = {g.name: "check" if g.check else "control" for g in facts.ground}

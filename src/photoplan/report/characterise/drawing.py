@@ -1,73 +1,22 @@
-"""Plots of a camera's characterisation as plain values, and how they are drawn.
-
-An analysis describes its plots with these values; only drawing needs matplotlib.
-"""
+"""Plots of a camera's characterisation: how charts and pictures are drawn."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.report.drawing import BLUE, GREEN, ORANGE, PURPLE, RED, SKY, SOFT, STYLE, load_matplotlib, png
+from photoplan.products.characterise.charts import MOST_PIXELS, Chart, Curve, Picture, block_means
+from photoplan.report.drawing import BLUE, GREEN, ORANGE, PURPLE, RED, SKY, SOFT, STYLE, png, round_down
+
+Array = NDArray[np.float64]
 
 COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
 _SIZE = (6.6, 3.6)
 #: Letters that fit side by side in a legend, and those that the sign of a curve takes.
 _LEGEND, _HANDLE = 84, 7
-#: Side of a picture, pixels, to which larger ones are reduced.
-_SIDE = 900
-
-
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """One series of a chart."""
-
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    label: str = ""
-    style: Literal["points", "line", "line and points", "dashed", "steps"] = "points"
-    sigma: NDArray[np.float64] | None = None
-    """Standard deviation of y, drawn as bars."""
-    colour: int | None = None
-    """Number of a colour; None: the next."""
-
-
-@dataclass(frozen=True, eq=False)
-class Chart:
-    """Curves over one axis."""
-
-    title: str
-    caption: str
-    x_label: str
-    y_label: str
-    curves: tuple[Curve, ...]
-    log_x: bool = False
-    log_y: bool = False
-    marks: tuple[tuple[float, str], ...] = ()
-    """Vertical lines: where, and what they mean."""
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """An image with a scale, and positions in it."""
-
-    title: str
-    caption: str
-    values: NDArray[Any]
-    """Shape (h, w)."""
-    label: str
-    """Of the scale."""
-    points: tuple[tuple[float, float], ...] = ()
-    """(x, y) in pixels of `values`; drawn as circles."""
-    limits: tuple[float, float] | None = None
-    """Of the scale; None: 0.5 % and 99.5 % of the values."""
-    factor: int = 1
-    """Side of the block of pixels of which each value is the mean, see `shrunk`; positions count whole pixels."""
-    extent: tuple[float, float, float, float] | None = field(default=None)
-    """Left, right, bottom, top of the axes where they are no pixels of `values`."""
 
 
 def _columns(labels: list[str]) -> int:
@@ -76,25 +25,19 @@ def _columns(labels: list[str]) -> int:
     return len(labels) if sum(wide) <= _LEGEND else max(1, min(4, len(labels), _LEGEND // max(wide)))
 
 
+@dataclass(frozen=True, eq=False)
 class ChartDrawer:
-    """Draws; made before any work, so that a missing library is known at once.
+    """Draws charts and pictures."""
 
-    Raises
-    ------
-    UsageError
-        When made: matplotlib is not installed.
-    """
-
-    def __init__(self) -> None:
-        self._mpl = load_matplotlib("a report", "leave `report` out")
+    mpl: Any
 
     def draw(self, plot: Chart | Picture) -> bytes:
         """A plot as PNG."""
-        with self._mpl.rc_context(STYLE):
+        with self.mpl.rc_context(STYLE):
             return self._chart(plot) if isinstance(plot, Chart) else self._picture(plot)
 
     def _chart(self, chart: Chart) -> bytes:
-        fig = self._mpl.figure.Figure(figsize=_SIZE, layout="constrained")
+        fig = self.mpl.figure.Figure(figsize=_SIZE, layout="constrained")
         axes = fig.subplots()
         for k, curve in enumerate(chart.curves):
             _draw_curve(axes, curve, COLOURS[(k if curve.colour is None else curve.colour) % len(COLOURS)])
@@ -121,21 +64,21 @@ class ChartDrawer:
         low, high = getattr(axes, f"get_{name}lim")()
         axis = getattr(axes, f"{name}axis")
         steps = (1.0, 2.0, 5.0) if high < 400 * low else (1.0,)
-        ticker = self._mpl.ticker
+        ticker = self.mpl.ticker
         axis.set_major_locator(ticker.LogLocator(base=10.0, subs=steps))
         axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
         axis.set_minor_formatter(ticker.NullFormatter())
 
     def _picture(self, picture: Picture) -> bytes:
         values = np.asarray(picture.values, np.float64)
-        factor = max(1, -(-max(values.shape) // _SIDE))
+        factor = max(1, -(-max(values.shape) // MOST_PIXELS))
         known = values[np.isfinite(values)]
         low, high = picture.limits or _limits(known)
-        small = _reduced(values, factor)
+        small = block_means(values, factor)
         height, width = values.shape[0] * picture.factor, values.shape[1] * picture.factor
         left, right, bottom, top = picture.extent or (-0.5, width - 0.5, height - 0.5, -0.5)
         tall = float(np.clip((_SIZE[0] - 1.6) * height / width, 1.2, 7.0)) if picture.extent is None else 3.6
-        fig = self._mpl.figure.Figure(figsize=(_SIZE[0], tall + 0.6), layout="constrained")
+        fig = self.mpl.figure.Figure(figsize=(_SIZE[0], tall + 0.6), layout="constrained")
         axes = fig.subplots()
         aspect = "equal" if picture.extent is None else "auto"
         options = {"cmap": "gray", "vmin": low, "vmax": high, "interpolation": "nearest"}
@@ -148,17 +91,12 @@ class ChartDrawer:
         return png(fig)
 
 
-def shrunk(values: NDArray[Any]) -> tuple[NDArray[np.float64], int]:
-    """An image as small as a picture of the report shows it anyway, and the side of the blocks it was averaged over."""
-    image = np.asarray(values, np.float64)
-    factor = max(1, -(-max(image.shape) // _SIDE))
-    return np.array(_reduced(image, factor)), factor
-
-
 def _draw_curve(axes: Any, curve: Curve, colour: str) -> None:
     x, y = np.asarray(curve.x, float), np.asarray(curve.y, float)
     options: dict[str, Any] = {"color": colour, "label": curve.label or None}
-    if curve.style == "steps":
+    if curve.vectors is not None:
+        _draw_vectors(axes, x, y, curve, options)
+    elif curve.style == "steps":
         axes.step(x, y, where="mid", linewidth=1.2, **options)
     elif curve.style == "dashed":
         axes.plot(x, y, linestyle="--", linewidth=1.1, **options)
@@ -171,6 +109,16 @@ def _draw_curve(axes: Any, curve: Curve, colour: str) -> None:
         axes.errorbar(x, y, yerr=curve.sigma, fmt="none", ecolor=colour, elinewidth=0.9, capsize=2)
 
 
+def _draw_vectors(axes: Any, x: Array, y: Array, curve: Curve, options: dict[str, Any]) -> None:
+    """Lines from the points, by a round factor longer than they are, so that the longest is a tenth of the extent."""
+    vectors = np.asarray(curve.vectors, float)
+    largest = float(np.linalg.norm(vectors, axis=1).max()) or 1.0
+    factor = round_down(0.1 * float(np.ptp(np.stack([x, y]))) / largest)
+    gap = np.full(len(x), np.nan)
+    ends = [np.column_stack([at, at + factor * v, gap]).ravel() for at, v in zip((x, y), vectors.T)]
+    axes.plot(*ends, linewidth=1.4, **{**options, "label": f"{curve.label} × {factor:g}"})
+
+
 def _limits(known: NDArray[np.float64]) -> tuple[float, float]:
     """What a scale shows: nearly all values; where nearly all are equal, all."""
     if not known.size:
@@ -179,12 +127,3 @@ def _limits(known: NDArray[np.float64]) -> tuple[float, float]:
     if high - low < 1e-9 * max(abs(high), 1.0):
         low, high = float(known.min()), float(known.max())
     return low, high if high > low else low + 1.0
-
-
-def _reduced(values: NDArray[np.float64], factor: int) -> NDArray[np.float64]:
-    """Means of blocks, which a picture of the report's size would show anyway."""
-    if factor == 1:
-        return values
-    height, width = values.shape[0] // factor * factor, values.shape[1] // factor * factor
-    blocks = values[:height, :width].reshape(height // factor, factor, width // factor, factor)
-    return np.asarray(blocks.mean(axis=(1, 3)))

@@ -1,0 +1,1 @@
+"""Report of what a series of images tells of a camera."""
