@@ -126,7 +126,7 @@ def test_over_a_raster(photoplan: Here, tmp_path: Path) -> None:
     [
         ("x,y\n1,2\n", (), 3, "line '1' has fewer than two different points"),
         ("line,x,y\na,1,2\nb,3,4\nb,5,6\n", (), 3, "line 'a' has fewer than two"),
-        ("x,y\n1,2\n3,x\n", (), 3, "l.csv:3: y = 'x' is not a finite number"),
+        ("x,y\n1,2\n3,x\n", (), 3, "l.csv:3: y = 'x' is not a number"),
         ("x,y\n1,2\n3,4\n", ("--line", "road"), 3, "no column 'road'; the columns are x, y"),
         ("x,y\n1,2\n3,4\n", ("-o", "o.doc"), 2, "profiles are written as .csv and .png"),
     ],

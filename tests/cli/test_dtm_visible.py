@@ -87,7 +87,7 @@ def test_wrong_use(walled, tmp_path, photoplan):
     ("content", "text"),
     [
         ("x,y\n", "no point"),
-        ("a,b\n1,2\n", "must name"),
+        ("a,b\n1,2\n", "no column called"),
         ("x,y\n1,2\n3\n", ":3:"),
         ("x;y\n1;2\n3;nan\n", ":3:"),
         ("x;y\n400020,5;450050\n", "with a point"),

@@ -55,6 +55,8 @@ def test_parameters_become_options_that_the_verb_has(name: str, words: list[tupl
         ("ortho", "give `overwrite` to replace it", "give --overwrite to replace it"),
         ("dtm build", "or `report=False`", "or --no-report"),
         ("tie", "or give `refine=False`", "or give --no-refine"),
+        ("dtm sample", "a point (`decimal_comma` declares commas)", "a point (--decimal-comma declares commas)"),
+        ("monoplot", "a point (`decimal_comma` declares commas)", "a point"),
         ("dtm visible", "give `points` X Y", "give --from X Y"),
         ("interior", "leave `report` out, and `with` alone", "leave --report out, and `with` alone"),
         ("check", "give `overwrite`; run `photoplan ortho`", "give `overwrite`; run `photoplan ortho`"),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError, UsageError
+from photoplan.io.tables import Dialect
 from photoplan.io.terrain.files import read_measured
 from photoplan.io.terrain.options import CodeClass, CodeTable, ReadOptions, read_code_table
 from photoplan.surfaces.measured import MeasuredTerrain
@@ -47,26 +48,26 @@ THREE = [[1.5, 2.25, 3.0], [4.0, 5.0, -6.5], [7.0, 8.0, 9.0]]
         ("1.5\t2.25\t3\r4\t5\t-6.5\r7\t8\t9", ReadOptions()),
         ("\ufeffX,Y,Z\n1.5,2.25,3\n\n# remark\n4,5,-6.5\n7,8,9\n", ReadOptions()),
         ("# x y z\n1.5 2.25 3\n4 5 -6.5\n7 8 9\n", ReadOptions()),
-        ("1,5;2,25;3\n4;5;-6,5\n7;8;9\n", ReadOptions(decimal_comma=True)),
-        ("1,5 2,25 3\n4 5 -6,5\n7 8 9\n", ReadOptions(decimal_comma=True)),
+        ("1,5;2,25;3\n4;5;-6,5\n7;8;9\n", ReadOptions(dialect=Dialect(decimal_comma=True))),
+        ("1,5 2,25 3\n4 5 -6,5\n7 8 9\n", ReadOptions(dialect=Dialect(decimal_comma=True))),
         ("nr;hoch;rechts;z;art\n1;2,25;1,5;3;g,h\n2;5;4;-6,5;g\n3;8;7;9;g\n", "names"),
-        ("a 2.25 1.5 99 3\nb 5 4 99 -6.5\nc 8 7 99 9\n", ReadOptions(columns="name,y,x,-,z")),
+        ("a 2.25 1.5 99 3\nb 5 4 99 -6.5\nc 8 7 99 9\n", ReadOptions(dialect=Dialect(columns="name,y,x,-,z"))),
         ("height,east,north\n3,1.5,2.25\n-6.5,4,5\n9,7,8\n", ReadOptions()),
         ('"1.5","2.25","3"\n"4","5","-6.5"\n7,8,9\n', ReadOptions()),
     ],
 )
 def test_fault_18_points_are_read_however_they_are_written(write: Write, text: str, options: ReadOptions | str) -> None:
     if isinstance(options, str):
-        options = ReadOptions(columns="x=rechts,y=hoch,z=z,code=art", decimal_comma=True)
+        options = ReadOptions(dialect=Dialect(columns="x=rechts,y=hoch,z=z,code=art", decimal_comma=True))
     assert xyz(read_measured([write(text)], options)) == THREE
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("1 2 3\n4 nan 6\n", r"p\.csv:2: y = 'nan' is not a number; give the number"),
+        ("1 2 3\n4 nan 6\n", r"p\.csv:2: y = 'nan' is not a number; give it"),
         ("1 2 3\n\n4 5 inf\n", r"p\.csv:3: z = 'inf'"),
-        ("1 2 3\n4 5\n", r"p\.csv:2: 2 columns, the lines before have 3"),
+        ("1 2 3\n4 5\n", r"p\.csv:2: 2 columns, the first line has 3"),
         ("1,2,3\n4,5,6\n7,8,9,1\n", r"p\.csv:3: 4 columns.*decimal sign"),
         ("x,y,z\n1,2,3\n4,,6\n", r"p\.csv:3: y = '' is not a number"),
         ("x,y,z\n", "only a header"),
@@ -74,15 +75,18 @@ def test_fault_18_points_are_read_however_they_are_written(write: Write, text: s
         ("1,5 2,5 3,5\n1,5 2,5 3,5\n", r"p\.csv:1: .*decimal commas"),
         ("1;2;3\n4;5;6,5\n", r"p\.csv:2: z = '6,5'.*`decimal_comma`"),
         ("a b c\n1 2 3\n", "neither a record nor a header"),
-        ("1 2\n3 4\n", "fewer than three columns"),
-        ("1 2 3 code 0.1 n l 4 5\n1 2 3 code 0.1 n l 4 5\n", "9 columns without a header"),
+        ("1 2\n3 4\n", "fewer than 3 columns"),
+        (
+            "1 2 3 code 0.1 n l 4 5\n1 2 3 code 0.1 n l 4 5\n",
+            "what the 9 columns mean is not guessed",
+        ),
         ("x y z sigma\n1 2 3 0.1\n1 2 3 -1\n", r"p\.csv:3: sigma = '-1'"),
         (b"x,y,z\n1,2,3\n1,2,\xff\n", r"p\.csv:3: not UTF-8"),
         (b"\xff\xfe1\x00 \x002\x00", "UTF-16"),
         (b"1 2 3\n4 5 6 \x00\n", "not a format of measured terrain"),
         ("x,y,z\n1,2,-9999\n4,5,6\n", "nodata"),
         ("x,y,z\n1,2,30000\n4,5,6\n", "record 2.*height 30000"),
-        ("x,x,y,z\n1,1,2,3\n", "2 columns for x"),
+        ("x,x,y,z\n1,1,2,3\n", "2 columns called x"),
         ("7 2.5 3.5 9.5\n8 2.6 3.6 9.6\n9 2.7 3.7 9.7\n", r"p\.csv:1: the first column counts"),
     ],
 )
@@ -102,8 +106,8 @@ def test_numbers_keep_all_their_digits(write: Write) -> None:
     rng = np.random.default_rng(8)
     table = np.column_stack([rng.uniform(2e7, 2.1e7, 500), rng.normal(0, 1e-5, 500), rng.uniform(-1e3, 8e3, 500)])
     text = "\n".join(" ".join(map(repr, row)) for row in table.tolist())
-    for options in (ReadOptions(), ReadOptions(decimal_comma=True)):
-        written = text.replace(".", ",") if options.decimal_comma else text
+    for options in (ReadOptions(), ReadOptions(dialect=Dialect(decimal_comma=True))):
+        written = text.replace(".", ",") if options.dialect.decimal_comma else text
         np.testing.assert_array_equal(read_measured([write(written)], options).points[0].xyz, table)
 
 
@@ -204,8 +208,8 @@ def test_code_tables_from_toml_and_csv_say_the_same(write: Write) -> None:
         ("c.toml", '1 = { kind = "spot", sigma = -1 }', "sigma -1"),
         ("c.csv", "121,breakline\n121,spot\n", r"c\.csv:2: code '121' is given twice"),
         ("c.csv", "121,breakline,wide\n", r"c\.csv:1: sigma 'wide'"),
-        ("c.csv", "121\n", r"c\.csv:1: 1 columns"),
-        ("c.csv", "# nothing\n", "holds no code"),
+        ("c.csv", "121\n", r"c\.csv:1: '121' has fewer than 2 columns"),
+        ("c.csv", "# nothing\n", "holds no line with data"),
     ],
 )
 def test_bad_code_tables_are_named_with_line_or_code(write: Write, name: str, text: str, message: str) -> None:
@@ -215,6 +219,6 @@ def test_bad_code_tables_are_named_with_line_or_code(write: Write, name: str, te
 
 def test_options_that_cannot_be_meant_are_refused() -> None:
     with pytest.raises(UsageError):
-        ReadOptions(delimiter=",", decimal_comma=True)
+        ReadOptions(dialect=Dialect(delimiter=",", decimal_comma=True))
     with pytest.raises(UsageError):
         read_measured([])

@@ -11,10 +11,10 @@ from tools.dem_file import write_geojson
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import MapGrid
 from photoplan.io.polygons import label_polygons, read_features, write_features
-from photoplan.io.xy_table import read_xy_table
+from photoplan.io.tables import Columns, read_table
 
 CRS = "EPSG:31287"
-ROLES = {"x": ("x", "east"), "y": ("y", "north"), "h": ("h",), "name": ("name",)}
+COLUMNS = Columns(roles={"x": ("x", "east"), "y": ("y", "north"), "h": ("h",), "name": ("name",)}, needed=("x", "y"))
 
 
 @pytest.mark.parametrize("kind", ["Polygon", "MultiPolygon", "LineString Z", "Point Z"])
@@ -81,11 +81,12 @@ def test_tables_of_points(tmp_path, mark):
     path = tmp_path / "t.csv"
     rows = [["Name", "East", "North", "h"], ["a", "1.5", "-2e3", "7"], ["b", "3", "4", "8"]]
     path.write_text("# talk\n" + "\n".join(mark.join(row) for row in rows) + "\n\n")
-    table = read_xy_table(path, ROLES)
-    np.testing.assert_array_equal(table.xy, [[1.5, -2000], [3, 4]])
-    np.testing.assert_array_equal(table.column("h"), [7, 8])
+    table = read_table(path, COLUMNS)
+    np.testing.assert_array_equal(table.numbers("x", "y"), [[1.5, -2000], [3, 4]])
+    np.testing.assert_array_equal(table.numbers("h"), [7, 8])
     assert table.texts("name") == ["a", "b"] and list(table.lines) == [3, 4]
     if mark != " ":
         path.write_text(mark.join("xyh") + "\n" + mark.join(["1", "2", ""]) + "\n")
-        assert np.isnan(read_xy_table(path, ROLES).column("h")).all()
-    assert read_xy_table(path, ROLES).texts("z") is None
+        assert np.isnan(read_table(path, COLUMNS).numbers("h", empty=True)).all()
+    table = read_table(path, COLUMNS)
+    assert table.labels("z", "line {line}") == [f"line {n}" for n in table.lines]

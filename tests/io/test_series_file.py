@@ -230,7 +230,7 @@ TABLES = {
     "no file column": ("name,exposure_ms\na.tif,1\n", "must be called file"),
     "not a number": ("file,exposure_ms\nd1_500nm_25ms_a.tif,nan\n", ":2: exposure_ms"),
     "decimal comma": ("file,exposure_ms\nd1_500nm_25ms_a.tif,1,5\n", "decimal commas"),
-    "ragged": ("file,exposure_ms\nd1_500nm_25ms_a.tif\n", ":2: 1 fields"),
+    "ragged": ("file,exposure_ms\nd1_500nm_25ms_a.tif\n", ":2: 1 columns"),
     "twice": ("file,exposure_ms\nd1_500nm_25ms_a.tif,1\nd1_500nm_25ms_a.tif,2\n", ":3: file"),
     "column twice": ("file,exposure_ms,exposure_ms\nd1_500nm_25ms_a.tif,1,2\n", "stands twice"),
     "no line for a frame": ("file,exposure_ms\nb.tif,1\n", "no line for d1_500nm_25ms_a.tif"),

@@ -95,6 +95,7 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
 
 def _request(options: dict[str, Any]) -> BuildRequest:
     from photoplan.engine.cpus import available_cpus
+    from photoplan.io.tables import Dialect
     from photoplan.io.terrain.options import CodeTable, ReadOptions, read_code_table
     from photoplan.products.dtm.build import BuildRequest
     from photoplan.terrain.settings import BuildSettings
@@ -102,9 +103,11 @@ def _request(options: dict[str, Any]) -> BuildRequest:
     codes = options.pop("codes")
     delimiter = options.pop("delimiter")
     reading = ReadOptions(
-        columns=options.pop("columns"),
-        delimiter={"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}.get(delimiter, delimiter),
-        decimal_comma=options.pop("decimal_comma"),
+        dialect=Dialect(
+            options.pop("columns"),
+            {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}.get(delimiter, delimiter),
+            options.pop("decimal_comma"),
+        ),
         codes=read_code_table(codes) if codes else CodeTable(),
         attribute=options.pop("attribute"),
         layers=options.pop("layers") or None,

@@ -39,6 +39,7 @@ def command(
 
     There is a point wherever the surface bends: at grid lines, breaklines and edges of triangles; at a wall two.
     """
+    from photoplan.io.tables import Dialect
     from photoplan.io.terrain.points import PointTableFormat
     from photoplan.products.dtm.profile import ProfileRequest, dtm_profile
     from photoplan.report.dtm.profile import profile_picture
@@ -48,7 +49,8 @@ def command(
     tables = tuple(path for path in outputs if path not in pictures)
     inputs, overwrite = [options["model"], options["lines"]], options["overwrite"]
     drawings = [open_picture(path, inputs, overwrite=overwrite) for path in pictures]
-    found = dtm_profile(ProfileRequest(outputs=tables, form=PointTableFormat(x, y, None, decimal_comma), **options))
+    form = PointTableFormat(x, y, Dialect(decimal_comma=decimal_comma))
+    found = dtm_profile(ProfileRequest(outputs=tables, form=form, **options))
     for drawing in drawings:
         if drawing is not None:
             drawing.write(profile_picture(found, drawing.mpl))

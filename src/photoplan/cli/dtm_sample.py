@@ -43,11 +43,13 @@ def command(
     """
     from photoplan.geometry.crs import crs_label
     from photoplan.geometry.heights import height_label
+    from photoplan.io.tables import Dialect
     from photoplan.io.terrain.points import PointTableFormat
     from photoplan.products.dtm.sample import SampleRequest, dtm_sample
 
     spelled = {"comma": ",", "semicolon": ";", "tab": "\t", "\\t": "\t", "space": " "}
-    form = PointTableFormat(x, y, spelled.get(delimiter or "", delimiter), decimal_comma, not no_header)
+    dialect = Dialect(delimiter=spelled.get(delimiter or "", delimiter), decimal_comma=decimal_comma)
+    form = PointTableFormat(x, y, dialect, not no_header)
     found = dtm_sample(SampleRequest(form=form, **options))
     if as_json:
         show_json(found.to_dict())

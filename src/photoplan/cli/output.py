@@ -14,6 +14,7 @@ import click
 from photoplan.errors import InputError, TilesFailed
 
 _PARAMETER = re.compile(r"`([a-z][a-z0-9_]*)(=False)?`")
+_REMARK = re.compile(r" \(`[a-z][a-z0-9_]*`[^()`]*\)")
 
 
 def spelled(text: str, verb: click.Command | None, group: click.Command | None = None) -> str:
@@ -31,7 +32,7 @@ def spelled(text: str, verb: click.Command | None, group: click.Command | None =
     Returns
     -------
     str
-        Parameters that none of the verbs has stay as they are.
+        Parameters that none of the verbs has stay as they are; remarks in parentheses that begin with one are left out.
     """
     if "`" not in text or verb is None:
         return text
@@ -44,7 +45,7 @@ def spelled(text: str, verb: click.Command | None, group: click.Command | None =
     def option(found: re.Match[str]) -> str:
         return spellings.get("--" + "no-" * bool(found[2]) + found[1].replace("_", "-"), found[0])
 
-    return _PARAMETER.sub(option, text)
+    return _REMARK.sub("", _PARAMETER.sub(option, text))
 
 
 def _named(text: str, group: click.Command | None) -> list[click.Command]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.observed import ImagePoints
 from photoplan.io.geopackage import VectorLayer, write_geopackage
-from photoplan.io.named_table import write_named_table
+from photoplan.io.tables import write_table
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,4 +78,4 @@ def write_residuals(
             numbers += ["" if not np.isfinite(v) else f"{v:.4f}" for v in values]
         state = "rejected" if rejected[k] else "yes" if used[k] else "no"
         rows.append([points.points[points.point[k]], points.images[points.image[k]], *numbers, state])
-    write_named_table(path, ["point", "image", "x", "y", "sigma_x", "sigma_y", *names, "used"], rows)
+    write_table(path, ["point", "image", "x", "y", "sigma_x", "sigma_y", *names, "used"], rows)

@@ -23,7 +23,7 @@ from photoplan.geometry.crs import canonical_crs, crs_label, crs_step, parse_crs
 from photoplan.io.disk import write_atomically
 from photoplan.io.names import match_key
 from photoplan.io.plain_files import read_text
-from photoplan.io.text_columns import NUMBER
+from photoplan.io.table_lines import NUMBER
 
 MAX_BYTES = 100_000_000
 _UTM = re.compile(r"WGS\s*84\s+UTM\s+(\d{1,2})\s*([NS])", re.I)

@@ -23,8 +23,8 @@ from photoplan.cameras.observed import GroundPoints
 from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_label, same_crs, split_compound
 from photoplan.io.checks import check_plain_file
-from photoplan.io.named_table import TableColumns, read_named_table, write_named_table
 from photoplan.io.prj_file import crs_beside
+from photoplan.io.tables import Columns, Dialect, read_table, write_table
 
 _ROLES = {
     "name": ("name", "point", "id", "label", "gcp", "point_id", "marker"),
@@ -73,9 +73,9 @@ def read_ground_points(
         return _from_layer(path, crs)
     beside = crs_beside(path)
     _check_crs(path, None if beside is None else beside.crs, crs)
-    table = read_named_table(path, TableColumns(_ROLES, _NEEDED, (), columns, decimal_comma))
+    table = read_table(path, Columns(roles=_ROLES, needed=_NEEDED), Dialect(columns, decimal_comma=decimal_comma))
     names = table.names("name")
-    XYZ = np.stack([table.numbers(axis, empty=True) for axis in ("x", "y", "z")], axis=1)
+    XYZ = table.numbers("x", "y", "z", empty=True)
     return _points(names, XYZ, lambda role: table.numbers(role, empty=True), table.texts("role"), table.where)
 
 
@@ -187,4 +187,4 @@ def write_ground_points(path: Path, points: GroundPoints) -> None:
         numbers = ["" if np.isnan(v) else f"{v:.4f}" for v in points.XYZ[k]]
         numbers += ["" if np.isnan(v) else f"{v:.6g}" for v in points.sigma[k]]
         rows.append([name, *numbers, "check" if points.check[k] else "control"])
-    write_named_table(path, [*_NEEDED, "sigma_x", "sigma_y", "sigma_z", "role"], rows)
+    write_table(path, [*_NEEDED, "sigma_x", "sigma_y", "sigma_z", "role"], rows)

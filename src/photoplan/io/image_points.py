@@ -13,8 +13,8 @@ import numpy as np
 
 from photoplan.cameras.observed import ImagePoints
 from photoplan.errors import InputError
-from photoplan.io.named_table import NamedTable, TableColumns, read_named_table, write_named_table
 from photoplan.io.names import match_key
+from photoplan.io.tables import Columns, Dialect, Table, read_table, write_table
 
 _ROLES = {
     "point": ("point", "name", "point_id", "id", "gcp", "track"),
@@ -26,7 +26,9 @@ _ROLES = {
     "sigma_y": ("sigma_y", "sigma_row", "sigma_line"),
 }
 _NEEDED = ("point", "image", "x", "y")
-_ORDERS = (_NEEDED, (*_NEEDED, "sigma"), (*_NEEDED, "sigma_x", "sigma_y"))
+_COLUMNS = Columns(
+    roles=_ROLES, needed=_NEEDED, orders=(_NEEDED, (*_NEEDED, "sigma"), (*_NEEDED, "sigma_x", "sigma_y"))
+)
 
 
 def read_image_points(path: Path, *, columns: str | None = None, decimal_comma: bool = False) -> ImagePoints:
@@ -50,7 +52,7 @@ def read_image_points(path: Path, *, columns: str | None = None, decimal_comma: 
     InputError
         A line cannot be read, or a point is measured twice in an image; the message names the line.
     """
-    table = read_named_table(Path(path), TableColumns(_ROLES, _NEEDED, _ORDERS, columns, decimal_comma))
+    table = read_table(Path(path), _COLUMNS, Dialect(columns, decimal_comma=decimal_comma))
     points, images = table.names("point"), table.names("image")
     keys = [match_key(name) for name in images]
     spelled: dict[str, str] = {}
@@ -61,13 +63,12 @@ def read_image_points(path: Path, *, columns: str | None = None, decimal_comma: 
     image = np.array([image_at[key] for key in keys], np.int64)
     point = np.array([point_at[name] for name in points], np.int64)
     _refuse_twice(table, image * len(point_at) + point, points, images)
-    xy = np.stack([table.numbers("x"), table.numbers("y")], axis=1)
-    return ImagePoints(tuple(spelled.values()), tuple(point_at), image, point, xy, _sigma(table))
+    return ImagePoints(tuple(spelled.values()), tuple(point_at), image, point, table.numbers("x", "y"), _sigma(table))
 
 
-def _sigma(table: NamedTable) -> np.ndarray:
+def _sigma(table: Table) -> np.ndarray:
     both = table.numbers("sigma", empty=True)
-    sigma = np.stack([table.numbers("sigma_x", empty=True), table.numbers("sigma_y", empty=True)], axis=1)
+    sigma = table.numbers("sigma_x", "sigma_y", empty=True)
     sigma = np.where(np.isnan(sigma), both[:, None], sigma)
     bad = np.flatnonzero((sigma <= 0).any(axis=1))
     if len(bad):
@@ -76,7 +77,7 @@ def _sigma(table: NamedTable) -> np.ndarray:
     return np.asarray(sigma, float)
 
 
-def _refuse_twice(table: NamedTable, key: np.ndarray, points: Sequence[str], images: Sequence[str]) -> None:
+def _refuse_twice(table: Table, key: np.ndarray, points: Sequence[str], images: Sequence[str]) -> None:
     order = np.argsort(key, kind="stable")
     same = np.flatnonzero(np.diff(key[order]) == 0)
     if len(same):
@@ -123,4 +124,4 @@ def write_image_points(path: Path, points: ImagePoints) -> None:
         if stated:
             row += ["" if np.isnan(v) else f"{v:.6g}" for v in points.sigma[k]]
         rows.append(row)
-    write_named_table(path, [*_NEEDED, *(("sigma_x", "sigma_y") if stated else ())], rows)
+    write_table(path, [*_NEEDED, *(("sigma_x", "sigma_y") if stated else ())], rows)

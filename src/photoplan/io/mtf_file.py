@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.io.named_table import TableColumns, read_named_table
 from photoplan.io.plain_files import read_head
+from photoplan.io.tables import Columns, read_table
 
 _FREQUENCY = {
     "px": ("cycles_per_px", "cycles_per_pixel", "cycles/px", "cycles/pixel", "cy/px", "lp/px"),
@@ -63,9 +63,9 @@ def read_mtf_table(path: Path) -> MtfTable:
     unit: Literal["px", "mm"] = "mm" if any(name in words for name in _FREQUENCY["mm"]) else "px"
     if unit == "mm" and any(name in words for name in _FREQUENCY["px"]):
         unit = "px"
-    table = read_named_table(
-        path, TableColumns({"frequency": _FREQUENCY[unit], "modulation": _MODULATION}, ("frequency", "modulation"))
-    )
+    needed = ("frequency", "modulation")
+    roles = {"frequency": _FREQUENCY[unit], "modulation": _MODULATION}
+    table = read_table(path, Columns(roles=roles, needed=needed, numbers=frozenset(needed)))
     frequency, modulation = table.numbers("frequency"), table.numbers("modulation")
     for k in range(len(frequency)):
         if frequency[k] < 0.0:

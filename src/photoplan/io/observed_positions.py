@@ -20,13 +20,13 @@ from photoplan.cameras.observed import ObservedAttitudes, ObservedPositions
 from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.rotation import rotation_from_angles
-from photoplan.io.named_table import NamedTable, TableColumns, read_named_table
 from photoplan.io.names import match_key
 from photoplan.io.orientation.exif import map_positions, read_folder
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.orientation.table import TableFormat, angle_in_radians
 from photoplan.io.prj_file import crs_beside
 from photoplan.io.project.model import ANGLE_UNITS
+from photoplan.io.tables import Columns, Dialect, Table, read_table
 
 _ROLES = {
     "name": ("name", "nom", "image", "image_name", "filename", "file", "photo", "label", "id"),
@@ -127,7 +127,9 @@ def read_observed_positions(
     beside = None if crs is None else crs_beside(path)
     if beside is not None and crs is not None:
         _same(path, beside.crs, crs)
-    table = read_named_table(path, TableColumns(_ROLES, _NEEDED, (), columns, form.decimal_comma))
+    table = read_table(
+        path, Columns(roles=_ROLES, needed=_NEEDED), Dialect(columns, form.delimiter, form.decimal_comma)
+    )
     names = table.names("name")
     first: dict[str, int] = {}
     for k, name in enumerate(names):
@@ -136,7 +138,7 @@ def read_observed_positions(
             raise InputError(
                 f"{table.where(k)}: image {name!r} is given in line {table.lines[at]} already; keep one of the lines"
             )
-    XYZ = np.stack([table.numbers(axis) for axis in ("x", "y", "z")], axis=1)
+    XYZ = table.numbers("x", "y", "z")
     strips = tuple(text or "all" for text in table.texts("strip"))
     sigma_angle = angle_in_radians(table.numbers("sigma_angle", empty=True), form.angle_unit)
     _positive(table, "sigma_angle", sigma_angle)
@@ -145,7 +147,7 @@ def read_observed_positions(
     )
 
 
-def _sigma(table: NamedTable) -> NDArray[np.float64]:
+def _sigma(table: Table) -> NDArray[np.float64]:
     every, plane = (table.numbers(role, empty=True) for role in ("sigma", "sigma_xy"))
     out = []
     for role in ("sigma_x", "sigma_y", "sigma_z"):
@@ -157,13 +159,13 @@ def _sigma(table: NamedTable) -> NDArray[np.float64]:
     return np.stack(out, axis=1)
 
 
-def _positive(table: NamedTable, role: str, values: NDArray[np.float64]) -> None:
+def _positive(table: Table, role: str, values: NDArray[np.float64]) -> None:
     bad = np.flatnonzero(values <= 0)
     if len(bad):
         raise InputError(f"{table.where(int(bad[0]))}: {role} = {values[bad[0]]:g}; it must be positive")
 
 
-def _rotations(table: NamedTable, form: TableFormat) -> NDArray[np.float64] | None:
+def _rotations(table: Table, form: TableFormat) -> NDArray[np.float64] | None:
     roles = ("omega", "phi", "kappa")
     there = [role for role in roles if role in table.roles]
     if not there:
@@ -183,7 +185,7 @@ def _rotations(table: NamedTable, form: TableFormat) -> NDArray[np.float64] | No
     return R if form.direction == "camera-to-ground" else np.swapaxes(R, 1, 2)
 
 
-def _times(table: NamedTable) -> NDArray[np.float64]:
+def _times(table: Table) -> NDArray[np.float64]:
     if "time" not in table.roles:
         return np.arange(len(table.rows), dtype=float)
     texts = table.texts("time")

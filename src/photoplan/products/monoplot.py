@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles
-from photoplan.io.named_table import write_named_table
 from photoplan.io.orientation.table import angle_in_radians
 from photoplan.io.polygons import read_features, write_features
 from photoplan.io.product import check_output
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
-from photoplan.io.xy_table import read_xy_table
+from photoplan.io.tables import Columns, read_table, write_table
 from photoplan.project.open_terrain import open_terrain
 from photoplan.project.scene import Scene, input_files, open_scene, pose_of
 from photoplan.surfaces.hybrid import HybridSurface
@@ -182,9 +181,9 @@ def _axes(R_ground_camera: NDArray[np.float64], order: str) -> NDArray[np.float6
 def _read(request: MonoplotRequest) -> _Given:
     """Image points of a table, or of all vertices of a vector file."""
     if request.points.suffix.lower() in (".csv", ".txt", ".tsv", ".dat"):
-        table = read_xy_table(request.points, ROLES)
-        names = table.texts("name") or [str(i + 1) for i in range(len(table.rows))]
-        return _Given(table.xy, table.header, table.rows, None, tuple(names))
+        table = read_table(request.points, Columns(roles=ROLES, needed=("x", "y"), row="point"))
+        labels = tuple(table.labels("name", "{row}"))
+        return _Given(table.numbers("x", "y"), table.layout.names, table.rows, None, labels)
     items = read_features(request.points, "Point", "LineString").items
     kinds = {"Line" in item.geometry.geom_type for item in items}
     if len(kinds) > 1:
@@ -205,7 +204,7 @@ def _write_table(path: Path, given: _Given, found: GroundPoints) -> None:
     for i, row in enumerate(given.rows):
         numbers = [_text(v, 4) for v in (*found.XYZ[i], *found.sigmas[i])]
         rows.append([*row, *numbers, _text(degrees[i], 2), _remark(found, i)])
-    write_named_table(path, [*given.header, *COLUMNS], rows)
+    write_table(path, [*given.header, *COLUMNS], rows)
 
 
 def _text(value: float, digits: int) -> str:

@@ -17,10 +17,9 @@ from photoplan.io.camera.model import Entry
 from photoplan.io.names import resolve_input
 from photoplan.io.raster import RasterReader
 from photoplan.io.series.model import CONDITIONS, CameraFacts, FramesEntry, SeriesEntry
-from photoplan.io.series.names import Values, find_files, number_of_time
+from photoplan.io.series.names import Values, find_files, number_of_time, read_conditions
 from photoplan.io.series.positions import MeasuredPositions, read_positions
 from photoplan.io.series.statistics import ReducedPoint, read_statistics
-from photoplan.io.series.table import read_conditions
 from photoplan.io.toml_entries import read_entries
 
 #: A series of a hundred thousand frames is far below this.

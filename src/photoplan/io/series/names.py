@@ -1,4 +1,4 @@
-"""Patterns of file names with named fields, such as ``dark_{exposure_ms}ms_*.tif``."""
+"""Conditions of frames: in names of files with named fields, such as ``dark_{exposure_ms}ms_*.tif``, or in tables."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 from photoplan.io.names import check_input_name, resolve_input
-from photoplan.io.text_columns import NUMBER
+from photoplan.io.table_lines import NUMBER, decimal
+from photoplan.io.tables import Columns, read_table
 
 Values = dict[str, float | str]
 
@@ -33,6 +34,7 @@ FIELDS: dict[str, tuple[str, float]] = {
 }
 _TIMES = ("time", "time_s")
 _MAX_ENTRIES = 1_000_000
+_MAX_BYTES = 100_000_000
 _NUMBER = "[-+]?[0-9]*[.]?[0-9]+"
 #: Parts of a time of fixed length, as ``strptime`` knows them.
 _DIGITS = {"%Y": "[0-9]{4}", "%j": "[0-9]{3}"} | {f"%{c}": "[0-9]{2}" for c in "mdHMSyI"} | {"%%": "%"}
@@ -55,6 +57,47 @@ def condition(name: str, text: str, where: str) -> tuple[str, float | str]:
         hint = "; write decimals with a point" if "," in text else ""
         raise InputError(f"{where}: {name} is {text[:40]!r}; a number is needed{hint}")
     return key, float(text) * factor
+
+
+def read_records(path: Path) -> tuple[tuple[str, ...], list[tuple[str, dict[str, str]]]]:
+    """Header (small letters) of a table, and place and fields by it of each line.
+
+    Where the delimiter is no comma, decimal commas are read.
+
+    Raises
+    ------
+    InputError
+        There is no line of data, or a line has another number of fields than the header.
+    """
+    table = read_table(path, Columns(roles={}, needed=(), every=True), max_bytes=_MAX_BYTES)
+    commas = table.layout.delimiter != ","
+
+    def pointed(field: str) -> str:
+        value = decimal(field, True) if commas and field.count(",") == 1 else None
+        return field if value is None else repr(value)
+
+    header = tuple(table.roles)
+    return header, [(table.where(k), dict(zip(header, map(pointed, row)))) for k, row in enumerate(table.rows)]
+
+
+def read_conditions(path: Path) -> dict[str, Values]:
+    """Conditions of each file by its name, from a table; empty fields state nothing.
+
+    Raises
+    ------
+    InputError
+        There is no column ``file``, a file stands twice, or a condition is no number; the message names the line.
+    """
+    header, records = read_records(path)
+    if "file" not in header:
+        raise InputError(f"{path}: columns {', '.join(header)} given; one must be called file")
+    found: dict[str, Values] = {}
+    for where, values in records:
+        name = values.pop("file")
+        if not name or name in found:
+            raise InputError(f"{where}: file {name!r} {'stands twice' if name else 'is empty'}")
+        found[name] = dict(condition(key, text, where) for key, text in values.items() if text)
+    return found
 
 
 def number_of_time(value: float | str, where: str) -> float:

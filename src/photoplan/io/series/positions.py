@@ -9,8 +9,7 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 from photoplan.io.series.model import PositionsEntry
-from photoplan.io.series.names import number_of_time
-from photoplan.io.series.table import read_columns
+from photoplan.io.series.names import number_of_time, read_records
 
 _NEEDED = {"stage": ("x", "y", "stage_x", "stage_y"), "target": ("x", "y", "time_s")}
 _MOST = 100_000
@@ -51,19 +50,17 @@ def read_positions(path: Path, entry: PositionsEntry) -> MeasuredPositions:
     InputError
         A column is missing, or a field is no number; the message names the line.
     """
-    header, rows = read_columns(path)
+    header, records = read_records(path)
     missing = [name for name in _NEEDED[entry.kind] if name not in header]
     if missing:
         raise InputError(
             f"{path}: columns {', '.join(header)} given; positions of kind {entry.kind} also need {', '.join(missing)}"
         )
-    if len(rows) > _MOST:
-        raise InputError(f"{path}: {len(rows)} lines; at most {_MOST} are read")
+    if len(records) > _MOST:
+        raise InputError(f"{path}: {len(records)} lines; at most {_MOST} are read")
     label = "name" if entry.kind == "stage" else "target"
-    return MeasuredPositions(
-        entry, path, tuple(_line(f"{path}:{line}", dict(zip(header, fields)), label, k) for k, (line, fields) in
-                           enumerate(rows, 1))
-    )  # fmt: skip
+    lines = tuple(_line(where, fields, label, k) for k, (where, fields) in enumerate(records, 1))
+    return MeasuredPositions(entry, path, lines)
 
 
 def _line(where: str, fields: dict[str, str], label: str, number: int) -> MeasuredPosition:

@@ -13,8 +13,7 @@ from typing import Any
 from photoplan.errors import InputError
 from photoplan.io.plain_files import read_text
 from photoplan.io.series.model import StatisticsEntry
-from photoplan.io.series.names import condition
-from photoplan.io.series.table import read_columns
+from photoplan.io.series.names import condition, read_records
 
 _MAX_BYTES = 50_000_000
 
@@ -55,16 +54,15 @@ _NEEDED = ("kind", "mean", "variance")
 
 
 def _csv(path: Path, entry: StatisticsEntry) -> list[ReducedPoint]:
-    header, rows = read_columns(path)
+    header, records = read_records(path)
     missing = [name for name in _NEEDED if name not in header]
     if missing:
         raise InputError(f"{path}: columns {', '.join(header)} given; {', '.join(missing)} needed")
     if entry.pixels is None and "pixels" not in header:
         raise InputError(f"{path}: states no number of pixels; add a column pixels, or the entry pixels")
     points = []
-    for line, fields in rows:
-        where = f"{path}:{line}"
-        texts = {key: text for key, text in zip(header, fields) if text}
+    for where, fields in records:
+        texts = {key: text for key, text in fields.items() if text}
         kind = texts.pop("kind", "")
         if kind not in ("flat", "dark"):
             raise InputError(f"{where}: kind {kind!r}; allowed are flat and dark")

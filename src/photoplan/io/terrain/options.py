@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io.plain_files import read_text
+from photoplan.io.table_lines import decimal
+from photoplan.io.tables import Columns, Dialect, read_table
 from photoplan.io.toml_file import read_toml
 from photoplan.surfaces.measured import LINE_KINDS, POINT_KINDS
 
@@ -71,14 +71,9 @@ class CodeTable:
 class ReadOptions:
     """How files of measured terrain are to be read; checked at birth."""
 
-    columns: str | None = None
-    """Columns of text files. None: a header names them, or they are ``x,y,z,code,sigma,name,line,z_right`` as far as
-    there are columns. ``"x=East,y=North,z=Height,code=Art"``: roles and header names. ``"name,x,y,z,-,code"``: roles of
-    the columns in their order, ``-`` for one that is not used."""
-    delimiter: Literal[",", ";", "\t", " "] | None = None
-    """Of text files; None: the one that splits the first lines equally."""
-    decimal_comma: bool = False
-    """Whether numbers of text files are written 1,5 instead of 1.5."""
+    dialect: Dialect = field(default_factory=Dialect)
+    """Of text files. Columns that neither a header nor this names are ``x,y,z,code,sigma,name,line,z_right`` as far as
+    there are columns."""
     codes: CodeTable = field(default_factory=CodeTable)
     """What the codes mean."""
     attribute: str | None = None
@@ -95,10 +90,6 @@ class ReadOptions:
     """CRS of all files, declared; files that state another one are refused."""
 
     def __post_init__(self) -> None:
-        if self.delimiter not in (None, ",", ";", "\t", " "):
-            raise UsageError(f"delimiter {self.delimiter!r}; allowed are comma, semicolon, tab and space")
-        if self.delimiter == "," and self.decimal_comma:
-            raise UsageError("a comma cannot be both delimiter and decimal sign")
         if self.las_classes is not None and not all(0 <= c <= 255 for c in self.las_classes):
             raise UsageError(f"LAS classes {self.las_classes}; allowed are numbers from 0 to 255")
 
@@ -138,31 +129,24 @@ def _of_toml(value: Any, where: str) -> CodeClass:
     return _class(kind, sigma, where)
 
 
+_COLUMNS = Columns(
+    roles={"code": ("code",), "kind": ("kind", "class"), "sigma": ("sigma",)},
+    needed=("code", "kind"),
+    orders=(("code", "kind"), ("code", "kind", "sigma")),
+    row="code",
+)
+
+
 def _of_csv(path: Path) -> dict[str, CodeClass]:
+    table = read_table(path, _COLUMNS, max_bytes=MAX_BYTES)
     classes: dict[str, CodeClass] = {}
-    lines = read_text(path, MAX_BYTES).split("\n")
-    delimiter = next((d for d in (";", "\t", ",") if any(d in line for line in lines)), ",")
-    try:
-        rows = list(csv.reader(lines, delimiter=delimiter, skipinitialspace=True))
-    except csv.Error as error:
-        raise InputError(f"{path}: cannot be split into columns ({error})") from None
-    for number, row in enumerate(rows, 1):
-        fields = [f.strip() for f in row]
-        if not any(fields) or fields[0].startswith("#"):
-            continue
-        where = f"{path}:{number}"
-        if len(fields) not in (2, 3):
-            raise InputError(f"{where}: {len(fields)} columns; code, kind and, if wanted, sigma are needed")
-        if not classes and fields[1].casefold() in ("kind", "class"):
-            continue
-        if fields[0] in classes:
-            raise InputError(f"{where}: code {fields[0]!r} is given twice; keep one of them")
-        text = fields[2].replace(",", ".") if len(fields) == 3 else ""
-        try:
-            sigma = float(text) if text else None
-        except ValueError:
-            raise InputError(f"{where}: sigma {text!r} is not a number; metres are needed") from None
-        classes[fields[0]] = _class(fields[1], sigma, where)
+    for k, (code, kind, sigma) in enumerate(zip(*(table.texts(role) for role in _COLUMNS.roles))):
+        if code in classes:
+            raise InputError(f"{table.where(k)}: code {code!r} is given twice; keep one of them")
+        value = decimal(sigma, decimal_comma=True) if sigma else None
+        if sigma and value is None:
+            raise InputError(f"{table.where(k)}: sigma {sigma!r} is not a number; metres are needed")
+        classes[code] = _class(kind, value, table.where(k))
     return classes
 
 

@@ -10,7 +10,7 @@ for border lines and holes. A file of the same name with the suffix ``.prj`` sta
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,15 +20,12 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.prj_file import crs_beside
-from photoplan.io.terrain.columns import Block, Layout, find_layout, parse_block
+from photoplan.io.table_lines import line_blocks
+from photoplan.io.tables import Layout
+from photoplan.io.terrain.columns import Block, parse_block, points_layout
 from photoplan.io.terrain.groups import CodeIndex, PointColumns, class_of, is_line, make_groups
 from photoplan.io.terrain.options import CodeClass, ReadOptions
 from photoplan.surfaces.measured import LineKind, MeasuredLine, MeasuredTerrain
-
-BLOCK = 8 << 20
-"""Bytes that are parsed at once."""
-MAX_LINE = 1 << 20
-"""Bytes of one line at most."""
 
 
 @dataclass
@@ -59,60 +56,18 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
     def look_up(code: str, line: int) -> CodeClass:
         return class_of(code, options, "mass", f"{path}:{line}")
 
-    for first, lines in _blocks(path):
+    for first, lines in line_blocks(path):
         if layout is None:
-            layout = find_layout(path, lines, options)
-        block = None if layout is None else parse_block(path, layout, first, lines, look_up)
+            layout = points_layout(path, lines, options.dialect)
+        block = None
+        if layout is not None:
+            block = parse_block(path, layout, first, lines, look_up, options.dialect.decimal_comma)
         if block is not None:
             _append(out, block, codes, ids)
             _learn(classes, codes, block, look_up)
     if layout is None or not out.xyz:
         raise InputError(f"{path}: holds no line with data" + ("" if layout is None else ", only a header"))
     return _terrain(path, layout, out, codes, ids, classes)
-
-
-def _blocks(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Number of the first line, and whole lines, of one part of the file after the other."""
-    number, rest = 1, b""
-    try:
-        with path.open("rb") as file:
-            while raw := file.read(BLOCK):
-                if number == 1 and not rest and raw.startswith((b"\xff\xfe", b"\xfe\xff")):
-                    raise InputError(f"{path}: UTF-16 text; save the file as UTF-8")
-                raw = rest + raw
-                cut = max(raw.rfind(b"\n"), raw.rfind(b"\r", 0, -1)) + 1
-                if not cut and len(raw) > MAX_LINE:
-                    raise InputError(
-                        f"{path}:{number}: a line of more than {MAX_LINE} bytes; this is no table of points"
-                    )
-                rest = raw[cut:]
-                if cut:
-                    lines = _lines(path, number, raw[:cut])
-                    yield number, lines
-                    number += len(lines)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-    if rest:
-        yield number, _lines(path, number, rest)
-
-
-def _lines(path: Path, number: int, raw: bytes) -> list[str]:
-    if number == 1:
-        raw = raw.removeprefix(b"\xef\xbb\xbf")
-    try:
-        text = raw.decode("utf-8")
-    except UnicodeDecodeError as error:
-        at = number + raw[: error.start].count(b"\n")
-        raise InputError(f"{path}:{at}: not UTF-8 (byte {raw[error.start]:#04x}); save the file as UTF-8") from None
-    if "\0" in text:
-        at = number + text[: text.index("\0")].count("\n")
-        raise InputError(f"{path}:{at}: holds a zero byte; this is not a text file")
-    if "\r" in text:
-        text = text.replace("\r\n", "\n").replace("\r", "\n")
-    lines = text.split("\n")
-    if not lines[-1]:
-        lines.pop()
-    return lines
 
 
 def _append(out: _Columns, block: Block, codes: CodeIndex, ids: CodeIndex) -> None:
@@ -157,7 +112,9 @@ def _terrain(
         on_line = by_class[number] if number is not None else line > 0
         if number is not None and line is not None:
             on_line |= (line > 0) & (number == 0)
-    notes = list(layout.notes)
+    notes = []
+    if layout.by_order and layout.width > 3:
+        notes.append(f"{path.name}: no header; columns taken as {', '.join(layout.roles)}")
     lines: list[MeasuredLine] = []
     alone = np.empty(0, np.int64)
     if on_line.any():

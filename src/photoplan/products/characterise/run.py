@@ -10,9 +10,9 @@ from typing import Any
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.disk import write_atomically
-from photoplan.io.named_table import write_named_table
 from photoplan.io.product import check_output
 from photoplan.io.series.file import Series, read_series
+from photoplan.io.tables import write_table
 from photoplan.io.whole_image import write_whole_image
 from photoplan.plain import pick, plain
 from photoplan.products.characterise.data import SeriesData
@@ -188,7 +188,7 @@ def _write_tables(request: CharacteriseRequest, series: Series, runs: Sequence[A
     written = []
     for name, table in tables.items():
         path = request.csv / f"{name}.csv"
-        write_named_table(path, table.head, table.rows)
+        write_table(path, table.head, table.rows)
         written.append(path)
     return written + _write_files(request, series, done)
 

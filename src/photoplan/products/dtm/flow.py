@@ -17,9 +17,9 @@ from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.polygons import label_polygons, read_features, write_features
 from photoplan.io.product import check_output
-from photoplan.io.xy_table import read_xy_table
+from photoplan.io.tables import read_table
 from photoplan.products.dtm.raster import GridOptions, write_grid
-from photoplan.products.dtm.visible import ROLES, own_grid, read_grid
+from photoplan.products.dtm.visible import COLUMNS, own_grid, read_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.terrain.flow import CELL_BYTES, Flow, FlowMethod, flow_of, snapped
 
@@ -156,9 +156,9 @@ def dtm_flow(request: FlowRequest) -> FlowReport:
 def _points(path: Path, terrain: OpenTerrain) -> list[tuple[str, float, float]]:
     """Name, X and Y of the outlets."""
     if path.suffix.lower() in (".csv", ".txt", ".tsv", ".xyz", ".dat"):
-        table = read_xy_table(path, ROLES)
-        names = table.texts("name") or [f"line {line}" for line in table.lines]
-        return [(name, float(x), float(y)) for name, (x, y) in zip(names, table.xy)]
+        table = read_table(path, COLUMNS)
+        names = table.labels("name", "line {line}")
+        return [(name, float(x), float(y)) for name, (x, y) in zip(names, table.numbers("x", "y"))]
     read = read_features(path, "Point")
     if read.crs is not None and not same_crs(read.crs, terrain.crs):
         raise InputError(

@@ -131,4 +131,4 @@ def _texts(values: NDArray[np.float64], request: SampleRequest, delimiter: str) 
     # A field of spaces between spaces would vanish.
     if delimiter == " ":
         texts = [text or "nan" for text in texts]
-    return [text.replace(".", ",") for text in texts] if request.form.decimal_comma else texts
+    return [text.replace(".", ",") for text in texts] if request.form.dialect.decimal_comma else texts

@@ -20,7 +20,7 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.local import earth_radius
 from photoplan.io.polygons import read_features
 from photoplan.io.product import check_output
-from photoplan.io.xy_table import read_xy_table
+from photoplan.io.tables import Columns, read_table
 from photoplan.products.dtm.raster import GridOptions, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.targets.map import MapTarget
@@ -29,12 +29,16 @@ from photoplan.terrain.visibility import Observer, SightSettings, horizon, neede
 TILE = 512
 #: Bytes of one post while one observer is looked at: heights, those relative to the eye, pyramid, result.
 POST_BYTES = 28
-ROLES = {
-    "x": ("x", "e", "east", "easting"),
-    "y": ("y", "n", "north", "northing"),
-    "h": ("h", "height", "eye"),
-    "name": ("name", "id", "point"),
-}
+COLUMNS = Columns(
+    roles={
+        "x": ("x", "e", "east", "easting"),
+        "y": ("y", "n", "north", "northing"),
+        "h": ("h", "height", "eye"),
+        "name": ("name", "id", "point"),
+    },
+    needed=("x", "y"),
+    row="point",
+)
 
 
 Report = Callable[[int, int], None]
@@ -195,13 +199,11 @@ def _places(request: VisibleRequest, terrain: OpenTerrain) -> list[Place]:
 
 def _from_file(path: Path, height: float, terrain: OpenTerrain) -> list[Place]:
     if path.suffix.lower() in (".csv", ".txt", ".tsv", ".xyz", ".dat"):
-        table = read_xy_table(path, ROLES)
-        eyes, names = table.column("h"), table.texts("name")
-        own = [height if eyes is None or math.isnan(eyes[i]) else float(eyes[i]) for i in range(len(table.rows))]
-        return [
-            (names[i] if names else f"line {table.lines[i]}", float(x), float(y), own[i])
-            for i, (x, y) in enumerate(table.xy)
-        ]
+        table = read_table(path, COLUMNS)
+        eyes, xy = table.numbers("h", empty=True), table.numbers("x", "y")
+        own = np.where(np.isnan(eyes), height, eyes)
+        names = table.labels("name", "line {line}")
+        return [(name, float(x), float(y), float(h)) for name, (x, y), h in zip(names, xy, own)]
     read = read_features(path, "Point")
     if read.crs is not None and not same_crs(read.crs, terrain.crs):
         raise InputError(f"{path}: points in {read.crs}, the model is in {terrain.crs}; reproject them")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, PhotoplanError, ResourceError, UsageError
 from photoplan.geometry.grid import Window
-from photoplan.io.named_table import write_named_table
+from photoplan.io.tables import write_table
 from photoplan.products.mtf.image import LUMINANCE, LightImage
 from photoplan.products.mtf.pattern_result import ImagePattern, PatternReport, PatternResult
 from photoplan.products.mtf.request import ENCODED, check_files, unique_names
@@ -95,7 +95,7 @@ def measure_patterns(request: PatternRequest, talk: Callable[[str], None] = lamb
         request.csv if done else None,
     )
     if made.csv is not None:
-        write_named_table(made.csv, *made.csv_rows)
+        write_table(made.csv, *made.csv_rows)
     return made
 
 

@@ -10,7 +10,7 @@ from typing import Literal
 from photoplan.errors import PhotoplanError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.mtf_file import read_mtf_table
-from photoplan.io.named_table import write_named_table
+from photoplan.io.tables import write_table
 from photoplan.products.mtf.groups import group_edges
 from photoplan.products.mtf.image import LightImage
 from photoplan.products.mtf.measure import Measuring, measure_image
@@ -122,7 +122,7 @@ def measure_mtf(
         request.csv if done else None,
     )
     if made.csv is not None:
-        write_named_table(made.csv, *made.csv_rows)
+        write_table(made.csv, *made.csv_rows)
     return made
 
 
