@@ -207,11 +207,11 @@ def test_an_input_that_changes_after_planning_is_refused(small: Block) -> None:
 class TestFault06Memory:
     @pytest.mark.parametrize(("workers", "most"), [(1, 1), (2, 4), (8, 16)])
     def test_tiles_in_flight(self, workers: int, most: int) -> None:
-        assert Run(workers).in_flight == most
-        assert Run(workers, memory=10**12).in_flight == most
+        assert Run(workers).in_flight() == most
+        assert Run(workers, memory=10**12).in_flight() == most
 
     def test_less_memory_means_fewer_tiles(self) -> None:
-        counts = [Run(8, memory=m * 2**20).in_flight for m in (500, 700, 1000, 2000)]
+        counts = [Run(8, memory=m * 2**20).in_flight() for m in (500, 700, 1000, 2000)]
         assert counts == sorted(counts)
         assert counts[0] == 1
         assert counts[-1] > 8

@@ -147,13 +147,13 @@ def test_a_filter_that_changes_makes_another_product(small: Block, filter_file: 
     add_to_image(small, 'restore = "sharper.toml"')
     project = load_project(small.project)
     scene = open_scene(project, "one")
-    before = scene.facts
+    before = scene.address.facts
     save_filter(filter_file, RestorationFilter((FilterKernel(np.full((1, 3), 1 / 3)),)), overwrite=True)
     # Another process, which has not opened it yet, would not take it.
     scenes._open.cache_clear()
     with pytest.raises(InputError, match=r"sharper.toml: has changed since the run was planned"):
         scene.address.open()
-    assert open_scene(project, "one").facts != before
+    assert open_scene(project, "one").address.facts != before
 
 
 def test_a_product_does_not_replace_the_filter(small: Block, filter_file: Path, tmp_path: Path) -> None:

@@ -23,11 +23,13 @@ from concurrent.futures import (
 )
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from photoplan.errors import PhotoplanError, UsageError
-from photoplan.events import Map
+from photoplan.engine.cluster import Cluster, Question
+from photoplan.errors import PhotoplanError, ResourceError, UsageError
+from photoplan.events import Events, Map
 
 #: How often a tile is tried again after its worker died or an unforeseen error.
 RETRIES = 2
@@ -82,7 +84,7 @@ def executor_factory(kind: str, workers: int) -> Callable[[], Executor]:
     if kind == "processes":
         return lambda: _ProcessExecutor(workers)
     if "://" in kind:
-        return lambda: _dask_executor(kind)
+        return lambda: Cluster(kind, RETRIES)
     raise UsageError(f"executor {kind!r}; allowed are threads, processes or a Dask scheduler's address tcp://host:port")
 
 
@@ -130,38 +132,6 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-class _DaskExecutor(Executor):
-    """Tiles on a Dask cluster; it is the cluster that tries a tile again when its worker dies."""
-
-    def __init__(self, client: Any) -> None:
-        self._client = client
-        self._inner = client.get_executor(retries=RETRIES, pure=False)
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Submit to the cluster."""
-        return self._inner.submit(fn, *args, **kwargs)
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Leave the cluster; the cluster itself goes on."""
-        self._inner.shutdown(wait=wait and not cancel_futures)
-        self._client.close()
-
-
-def _dask_executor(address: str) -> Executor:
-    try:
-        from distributed import Client  # noqa: PLC0415  (an optional package)
-    except ImportError as error:
-        raise UsageError(
-            f"executor {address}: Dask is not installed; install it with: pip install 'photoplan[cluster]'"
-        ) from error
-    try:
-        client = Client(address, timeout="10s", set_as_default=False)
-        client.get_versions(check=True)
-    except (OSError, TimeoutError, ValueError) as error:
-        raise UsageError(f"executor {address}: no usable Dask scheduler ({error})") from error
-    return _DaskExecutor(client)
-
-
 @contextmanager
 def thread_map(workers: int) -> Iterator[Map]:
     """A `map` over threads; what has not begun is dropped when an error or an interrupt comes."""
@@ -182,6 +152,26 @@ def call(work: Callable[[Any], Any], task: Any) -> Any:
     return work(task)
 
 
+def open_workers(kind: str, workers: int, question: Question, events: Events) -> Workers:
+    """The workers that a user asked for; those of a cluster are asked who they are.
+
+    Raises
+    ------
+    UsageError, InputError, ResourceError
+        See `executor_factory`, `Cluster` and `judge`.
+    """
+    make = executor_factory(kind, workers)
+    if "://" not in kind:
+        return Workers(make, workers)
+    cluster = Cluster(kind, RETRIES)
+    try:
+        cluster.ask(question, events)
+    except BaseException:
+        cluster.shutdown(cancel_futures=True)
+        raise
+    return Workers(make, cluster.threads, cluster)
+
+
 class Workers:
     """The executor of a whole run, a context manager: made when first needed, and anew when its workers died.
 
@@ -189,11 +179,41 @@ class Workers:
     ----------
     make : callable
         Makes an executor, see `executor_factory`.
+    threads : int
+        Tasks that it works at at once.
+    cluster : Cluster, optional
+        The executor, where it is one that has been asked already.
     """
 
-    def __init__(self, make: Callable[[], Executor]) -> None:
+    def __init__(self, make: Callable[[], Executor], threads: int = 1, cluster: Cluster | None = None) -> None:
         self._make = make
-        self._executor: Executor | None = None
+        self._executor: Executor | None = cluster
+        self._cluster = cluster
+        self.threads = threads
+
+    @property
+    def versions(self) -> list[dict[str, str]] | None:
+        """Versions on a cluster's workers; None: they are those of this process."""
+        return None if self._cluster is None else self._cluster.versions
+
+    def prepared(self, job: Callable[[Any], Any], folder: Path | None) -> Callable[[Any], Any]:
+        """A job as the workers get it; a cluster may leave results in the folder."""
+        return job if self._cluster is None else self._cluster.prepared(job, folder)
+
+    def check(self) -> None:
+        """Make sure that somebody works.
+
+        Raises
+        ------
+        ResourceError
+            A cluster is gone, or has no workers.
+        """
+        if self._cluster is not None:
+            self._cluster.check()
+
+    def lost(self) -> PhotoplanError:
+        """What to say of tasks that were taken back."""
+        return ResourceError("tasks were cancelled") if self._cluster is None else self._cluster.lost()
 
     def __enter__(self) -> Workers:
         return self
@@ -264,7 +284,10 @@ def run_tiles(
                     continue
             done, _ = wait(pending, PULSE, FIRST_COMPLETED)
             if not done:
+                workers.check()
                 pulse()
+            if any(f.cancelled() for f in done):
+                raise workers.lost()
             broken = [f for f in done if isinstance(f.exception(), BrokenExecutor)]
             if broken:
                 lost, pending = list(pending.values()), {}

@@ -7,17 +7,20 @@ file assembled, compared and named), the tiles of the next one are computed.
 
 from __future__ import annotations
 
+import shutil
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.engine.cluster import opened
 from photoplan.engine.executors import PULSE, Workers, run_tiles
 from photoplan.errors import PhotoplanError, UsageError
 from photoplan.events import Events
@@ -104,6 +107,8 @@ class Work(Generic[T]):
     sinks: Sequence[Sink]
     complete: Callable[[Tally], T]
     """Called when all tiles are there or have failed, with the sinks still open; in a thread of its own."""
+    scratch: Path | None = None
+    """A folder beside the outputs that is this product's while its sinks are open, for results on their way."""
 
 
 @dataclass(frozen=True)
@@ -196,10 +201,10 @@ class Runner(Generic[T]):
             future.set_result(work.result)
             self._events.done(work.tiles)
         else:
-            with ExitStack() as opened:
+            with ExitStack() as stack:
                 try:
                     for sink in work.sinks:
-                        opened.enter_context(sink)
+                        stack.enter_context(sink)
                     tally = self._compute(work)
                 except PhotoplanError as error:
                     self._settle(0)
@@ -207,7 +212,7 @@ class Runner(Generic[T]):
                     return
                 # Files of one product are assembled at a time; that of the next one is already computed.
                 self._settle(0)
-                future = self._pool.submit(_complete, work, tally, opened.pop_all())
+                future = self._pool.submit(_complete, work, tally, stack.pop_all())
         self._completing.append((work, future))
         self._settle_done()
 
@@ -226,16 +231,20 @@ class Runner(Generic[T]):
             for sink in work.sinks:
                 sink.append_empty(index)
         waiting = [tile for tile in work.tiles if tile.index not in finished]
-        for outcome in run_tiles(waiting, work.job, self._workers, self._in_flight, self._pulse):
+        job = self._workers.prepared(work.job, work.scratch)
+        for outcome in run_tiles(waiting, job, self._workers, self._in_flight, self._pulse):
             tile = outcome.task
             if outcome.error is None:
-                _store(work.sinks, tile.index, outcome.result)
-                tally.add(outcome.result.record)
+                made: Made = opened(outcome.result)
+                _store(work.sinks, tile.index, made)
+                tally.add(made.record)
             else:
                 tally.failed.append(tile.index)
                 tally.reasons.append(f"tile {tile.index}: {outcome.error}")
             self._events.done(1, tile.window.size)
             self._settle_done()
+        if work.scratch is not None:
+            shutil.rmtree(work.scratch, ignore_errors=True)
         return tally
 
     def _pulse(self) -> None:
@@ -283,8 +292,8 @@ def _store(sinks: Sequence[Sink], index: int, made: Made) -> None:
             sink.append(index, *layer, made.record)
 
 
-def _complete(work: Work[T], tally: Tally, opened: ExitStack) -> T:
-    with opened:
+def _complete(work: Work[T], tally: Tally, stack: ExitStack) -> T:
+    with stack:
         return work.complete(tally)
 
 

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from photoplan import __version__
+from photoplan.engine.cluster import Question
 from photoplan.engine.execute import MOST_SOURCE_BYTES
-from photoplan.engine.executors import Workers, executor_factory
+from photoplan.engine.executors import Workers, executor_factory, open_workers
 from photoplan.engine.run import Kept, Made, Runner, Tally, Work, run_works, tiles_in_flight
 from photoplan.errors import TilesFailed, UsageError
 from photoplan.events import SILENT, Events
@@ -23,7 +24,7 @@ from photoplan.plan.product import ProductPlan, Tile
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, render_tile
 from photoplan.products.orthophoto.results import ProductResult, finished_products, product_path
 from photoplan.project.restored_reader import RestoredReader
-from photoplan.project.scene import Scene, SceneAddress, input_files, open_scene
+from photoplan.project.scene import Scene, SceneAddress, input_files, open_scene, scene_address
 
 #: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
 BASE_MEMORY = 320 * 2**20
@@ -46,16 +47,32 @@ class Run:
     events: Events = SILENT
     """Told of tiles that are done, and of each product's result, also if some of its tiles failed."""
 
-    @property
-    def in_flight(self) -> int:
+    def check(self) -> None:
+        """Refuse what cannot work, before any work.
+
+        Raises
+        ------
+        UsageError
+            An unknown executor, less than one worker, or too little memory for one tile.
+        """
+        executor_factory(self.executor, self.workers)
+        self.in_flight()
+
+    def in_flight(self, threads: int | None = None) -> int:
         """Tiles that may be under way at once.
+
+        Parameters
+        ----------
+        threads : int, optional
+            Those of a cluster; the workers of this machine if it is None.
 
         Raises
         ------
         UsageError
             `memory` does not suffice for one tile.
         """
-        wanted = self.workers if self.workers == 1 else 2 * self.workers
+        workers = threads or self.workers
+        wanted = workers if workers == 1 else 2 * workers
         # A tile holds its source window as read and as packed for the kernel, relief, anchors and result.
         return tiles_in_flight(wanted, self.memory, BASE_MEMORY, 3 * MOST_SOURCE_BYTES)
 
@@ -107,7 +124,7 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     """
     run = run or Run()
     folder = Path(output)
-    in_flight, make = run.in_flight, executor_factory(run.executor, run.workers)
+    run.check()
     picture = folder / "overview.png"
     _refuse_inputs(plan, [*(product_path(folder, p) for p in plan.products), *([picture] if run.quicklook else [])])
     kept = finished_products(plan, folder, run.overwrite)
@@ -115,10 +132,11 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     if kept:
         run.events.talk(f"{len(kept)} of {len(plan.products)} products are finished already")
     run.events.begin("tiles", sum(len(p.plan.tiles) for p in plan.products))
-    with Workers(make) as workers:
+    question = Question(versions, tuple(str(path.resolve()) for path in _pixel_files(plan)), str(folder.resolve()))
+    with open_workers(run.executor, run.workers, question, run.events) as workers:
         results = run_works(
-            (_work(plan, p, folder, run, kept.get(p.plan.name)) for p in plan.products),
-            Runner(workers, in_flight, run.events),
+            (_work(plan, p, folder, run, kept.get(p.plan.name), workers) for p in plan.products),
+            Runner(workers, run.in_flight(workers.threads), run.events),
         )
     if run.quicklook:
         write_overview([r.path for r in results if not r.failed], picture)
@@ -156,7 +174,7 @@ def _make_folder(folder: Path) -> None:
 
 
 def _work(
-    plan: OrthoPlan, product: OrthoProduct, folder: Path, run: Run, kept: ProductResult | None
+    plan: OrthoPlan, product: OrthoProduct, folder: Path, run: Run, kept: ProductResult | None, workers: Workers
 ) -> Work[ProductResult] | Kept[ProductResult]:
     """What there is to do for a product."""
     if kept is not None:
@@ -186,8 +204,21 @@ def _work(
         tiles=product.plan.tiles,
         count=product.plan.tile_count,
         sinks=(file,),
-        complete=partial(_complete, plan, product, scene, run, file, run_times()),
+        complete=partial(_complete, plan, product, scene, run, file, _clock(workers)),
+        scratch=file.path.with_name(f".{file.path.name}.parcels"),
     )
+
+
+def _pixel_files(plan: OrthoPlan) -> list[Path]:
+    """Files that workers open."""
+    addresses = (scene_address(plan.project, p.plan.image) for p in plan.products)
+    return [Path(path) for path in dict.fromkeys(path for a in addresses for path, _ in a.digests)]
+
+
+def _clock(workers: Workers) -> Callable[[], dict[str, Any]]:
+    """Gives times and the workers' versions when a product is complete."""
+    times = run_times()
+    return lambda: {**times(), "workers_versions": workers.versions}
 
 
 def _complete(
