@@ -11,9 +11,10 @@ import rasterio
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from tools.arrays import ArrayReader, noise, product
+from tools.arrays import noise, product
 from tools.pinhole import Pinhole
 
+from photoplan.engine.arrays import ArrayReader
 from photoplan.engine.base import Source
 from photoplan.engine.execute import render
 from photoplan.engine.twin import strict_positions, strict_scales, twin_reduce, twin_resample

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
-from tools.arrays import ArrayReader, noise, product
+from tools.arrays import noise, product
 from tools.pinhole import Pinhole
 
+from photoplan.engine.arrays import ArrayReader
 from photoplan.engine.base import Source
 from photoplan.engine.execute import render
 from photoplan.engine.twin import TwinSource, twin_compose

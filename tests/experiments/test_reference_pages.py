@@ -122,3 +122,12 @@ def test_toml_on_the_pages_is_toml():
     assert len(blocks) >= 4
     for block in blocks:
         tomllib.loads(block)
+
+
+def test_the_page_on_arrays_runs(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("xarray", reason="xarray is not installed")
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"^```python\n(.*?)^```", (DOCS / "howto" / "arrays.md").read_text("utf-8"), re.M | re.S)
+    exec(compile("\n".join(blocks), "arrays.md", "exec"), {"__name__": "arrays"})
+    assert (tmp_path / "ortho.tif").exists()
+    assert "% valid, worst residual 0.0" in capsys.readouterr().out

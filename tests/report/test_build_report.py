@@ -17,7 +17,7 @@ from photoplan.report.dtm.page import build_page, open_build_report
 from photoplan.report.dtm.plots import Plots
 from photoplan.report.page import ReportFile, text
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
-from photoplan.terrain.build import build, plan_build
+from photoplan.terrain.build import build_terrain, plan_build
 from photoplan.terrain.clean.run import Finding, clean
 from photoplan.terrain.settings import FAMILIES, BuildSettings
 
@@ -63,7 +63,7 @@ def measured():
 
 @pytest.fixture(scope="module")
 def built(measured):
-    return build(plan_build(measured, BuildSettings(unit_meshes=16)), 2)
+    return build_terrain(plan_build(measured, BuildSettings(unit_meshes=16)), 2)
 
 
 @pytest.fixture(scope="module")

@@ -2,44 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.geometry.grid import MapGrid, Window
-from photoplan.geometry.levels import reduced
+from photoplan.geometry.grid import MapGrid
 from photoplan.plan.compile import AnchorRule
 from photoplan.plan.product import ProductPlan, Tile
 from photoplan.targets.map import MapTarget
-
-
-@dataclass(frozen=True, eq=False)
-class ArrayReader:
-    """A source image in memory; counts nothing, keeps nothing."""
-
-    image: NDArray[Any]
-    valid: NDArray[np.bool_] | None = None
-
-    @property
-    def size(self) -> tuple[int, int]:
-        return self.image.shape[2], self.image.shape[1]
-
-    @property
-    def bands(self) -> int:
-        return int(self.image.shape[0])
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        return self.image.dtype
-
-    def read(self, window: Window, level: int = 0) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
-        if level:
-            return reduced(self, window, level)
-        assert window & Window(0, 0, *self.size) == window, "read outside the image"
-        part = np.s_[window.row : window.stop[1], window.col : window.stop[0]]
-        return self.image[:, part[0], part[1]], None if self.valid is None else self.valid[part]
 
 
 def product(

@@ -11,7 +11,7 @@ from photoplan.engine.executors import thread_map
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
 from photoplan.surfaces.memory_units import MemoryUnits
-from photoplan.terrain.build import Built, build, plan_build
+from photoplan.terrain.build import Built, build_terrain, plan_build
 from photoplan.terrain.predict import heights_at
 from photoplan.terrain.settings import BuildSettings
 
@@ -30,7 +30,7 @@ def line(xyz: ArrayLike, kind: Any = "breakline", name: str = "line", **more: An
 
 def built(measured: MeasuredTerrain, workers: int = 2, **settings: Any) -> Built:
     with thread_map(workers) as run:
-        return build(plan_build(measured, BuildSettings(**settings)), run)
+        return build_terrain(plan_build(measured, BuildSettings(**settings)), run)
 
 
 def surface_of(model: Built) -> HybridSurface:

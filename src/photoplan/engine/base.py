@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from photoplan.cameras.base import Projection
 from photoplan.geometry.grid import Window
 
 
+@runtime_checkable
 class Reader(Protocol):
     """A source image that is read by windows; safe to call from several threads."""
 

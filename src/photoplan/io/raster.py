@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rasterio.io
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
@@ -85,6 +86,17 @@ class RasterReader:
             pixels, opaque = _expand(self.info, pixels[0])
             valid = both(valid, opaque)
         return pixels, valid
+
+
+def pixels_of_dataset(source: Any) -> RasterReader | np.ma.MaskedArray[Any, Any] | None:
+    """A dataset that is open in rasterio, read by windows from its file, or whole where it lives in memory.
+
+    None: it is no dataset.
+    """
+    if not isinstance(source, rasterio.io.DatasetReader):
+        return None
+    path = Path(source.name)
+    return RasterReader(path) if path.is_file() else source.read(masked=True)
 
 
 def _check_image(info: RasterInfo) -> None:

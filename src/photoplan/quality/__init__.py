@@ -1,1 +1,20 @@
 """Image quality: spread functions and MTF measured, images restored, cameras characterised. Values only, no files."""
+
+from photoplan.public import public
+
+__getattr__, __dir__, __all__ = public(
+    __name__,
+    {
+        "quality.edges.response": "measure_edge",
+        "quality.edges.find": "find_edges",
+        "quality.spread": "SpreadFunction",
+        "quality.mtf_curve": "MtfCurve",
+        "quality.linearise": "Linearisation",
+        "quality.patterns.siemens": "measure_star",
+        "quality.patterns.bars": "measure_bars",
+        "quality.patterns.usaf": "measure_usaf",
+        "quality.restoration.inverse": "exact_inverse",
+        "quality.restoration.regularised": "regularised_filter",
+        "quality.camera.photon_transfer": "photon_transfer",
+    },
+)

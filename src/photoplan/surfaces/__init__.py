@@ -1,1 +1,15 @@
 """Where the object is: a depth for every pixel of a target."""
+
+from photoplan.public import public
+
+__getattr__, __dir__, __all__ = public(
+    __name__,
+    {
+        "surfaces.base": "Surface",
+        "surfaces.level": "LevelSurface",
+        "surfaces.raster": "RasterSurface",
+        "surfaces.hybrid": "HybridSurface",
+        "surfaces.shifted": "ShiftedSurface",
+        "surfaces.measured": "MeasuredLine MeasuredTerrain PointGroup Tin",
+    },
+)

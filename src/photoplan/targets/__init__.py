@@ -1,1 +1,12 @@
 """Products' own coordinates and where they are on the ground."""
+
+from photoplan.public import public
+
+__getattr__, __dir__, __all__ = public(
+    __name__,
+    {
+        "targets.base": "Target",
+        "targets.map": "MapTarget",
+        "geometry.grid": "MapGrid Placement Window",
+    },
+)

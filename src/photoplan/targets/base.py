@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.geometry.breaks import Breaks
-from photoplan.geometry.grid import Window
+from photoplan.geometry.grid import Placement, Window
 
 
 class Target(Protocol):
@@ -22,6 +22,11 @@ class Target(Protocol):
     @property
     def breaks(self) -> Breaks | None:
         """Columns and rows, in pixels, at which `to_ground` is bent (facets of a profile); None: nowhere."""
+        ...
+
+    @property
+    def placement(self) -> Placement:
+        """Where they lie in the product's own plane: on the map, on a wall; what its file states."""
         ...
 
     def to_ground(self, uvh: ArrayLike) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.geometry.grid import MapGrid, Window
+from photoplan.geometry.grid import MapGrid, Placement, Window
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,11 @@ class MapTarget:
     def breaks(self) -> None:
         """A map is nowhere bent."""
         return None
+
+    @property
+    def placement(self) -> Placement:
+        """The grid's."""
+        return self.grid.placement
 
     def to_ground(self, uvh: ArrayLike) -> NDArray[np.float64]:
         """(u, v, h) of shape (..., 3) to X, Y, Z."""

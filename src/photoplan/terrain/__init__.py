@@ -1,1 +1,14 @@
 """Terrain models: linear prediction from measured points and lines, and what is derived from models."""
+
+from photoplan.public import public
+
+__getattr__, __dir__, __all__ = public(
+    __name__,
+    {
+        "terrain.build": "BuildPlan Built build_terrain plan_build",
+        "terrain.settings": "BuildSettings",
+        "terrain.shading.run": "Light aspect hillshade slope_degrees surface_slopes",
+        "terrain.volume.run": "volume_between",
+        "terrain.flow": "flow_of",
+    },
+)

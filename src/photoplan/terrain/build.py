@@ -128,7 +128,7 @@ def _nice(width: float) -> float:
     return round(float(max(f * power for f in _ROUND if f * power <= width)), 12)
 
 
-def build(plan: BuildPlan, run: Map = map, events: Events = SILENT) -> Built:
+def build_terrain(plan: BuildPlan, run: Map = map, events: Events = SILENT) -> Built:
     """Compute a model: covariance functions, gross errors, lines, posts, triangles."""
     settings, layout, seen = plan.settings, plan.layout, plan.seen
     local = replace(layout, left=layout.left - seen.origin[0], top=layout.top - seen.origin[1])

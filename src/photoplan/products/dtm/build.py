@@ -28,7 +28,7 @@ from photoplan.io.terrain.model_write import ModelParts, ModelWriter
 from photoplan.io.terrain.options import ReadOptions
 from photoplan.plain import pick
 from photoplan.surfaces.measured import MeasuredTerrain
-from photoplan.terrain.build import BuildPlan, Built, build, plan_build
+from photoplan.terrain.build import BuildPlan, Built, build_terrain, plan_build
 from photoplan.terrain.clean.run import Finding, clean
 from photoplan.terrain.settings import BuildSettings
 
@@ -120,7 +120,7 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
     key = _key(request, facts, plan, crs, system)
     with ModelWriter(request.output, plan.layout, key, request.overwrite, request.inputs) as writer:
         with thread_map(request.workers) as run:
-            built = build(plan, run, events)
+            built = build_terrain(plan, run, events)
         gross = tuple(_gross(built, measured))
         done = writer.done()
         for of_unit in built.figures:

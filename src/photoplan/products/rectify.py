@@ -1,0 +1,274 @@
+"""Any image onto any target, from arrays or files into an array: the whole chain as one function."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.cameras.base import Camera
+from photoplan.engine.arrays import ArrayReader
+from photoplan.engine.base import Reader, Source
+from photoplan.engine.execute import Pixels, render
+from photoplan.engine.executors import Workers, executor_factory, run_tiles
+from photoplan.errors import PhotoplanError, UsageError
+from photoplan.geometry.crs import parse_crs
+from photoplan.geometry.grid import MapGrid, Placement
+from photoplan.io.product import ProductFile
+from photoplan.io.raster import RasterReader, pixels_of_dataset
+from photoplan.io.storage import Nodata
+from photoplan.kernels.weights import KERNELS
+from photoplan.plan.compile import AnchorRule
+from photoplan.plan.owner import GivenOwners
+from photoplan.plan.product import ProductPlan, Tile
+from photoplan.project.open_terrain import open_terrain
+from photoplan.surfaces.base import Surface
+from photoplan.surfaces.level import LevelSurface
+from photoplan.targets.base import Target
+from photoplan.targets.map import MapTarget
+
+_SAVED_TILE = 512
+
+
+@dataclass(frozen=True, eq=False)
+class Raster:
+    """Pixels in memory, which of them are valid, and where they lie."""
+
+    values: NDArray[Any]
+    """(bands, height, width); 0 where invalid."""
+    valid: NDArray[np.bool_]
+    """(height, width), True = valid."""
+    placement: Placement
+    """Size and place; `placement.affine` and `placement.crs` are what other packages ask for."""
+    owner: NDArray[np.uint16] | None = None
+    """(height, width): number of the source, from one, that painted each pixel, 0 = none; None: there is one source."""
+    residual: float = 0.0
+    """Worst difference to the strict projection, pixels of the source."""
+
+    def __post_init__(self) -> None:
+        width, height = self.placement.size
+        if self.values.ndim != 3 or self.values.shape[1:] != (height, width) or self.valid.shape != (height, width):
+            raise UsageError(
+                f"values of shape {self.values.shape}, validity of shape {self.valid.shape}; needed are "
+                f"(bands, {height}, {width}) and ({height}, {width}), the size of the placement"
+            )
+
+    def to_xarray(self) -> Any:
+        """An `xarray.DataArray` (band, y, x) of floats with NaN where invalid, with coordinates of the pixel centres.
+
+        The placement's CRS stands in its attributes, and as `spatial_ref` in the way of the CF conventions.
+
+        Raises
+        ------
+        UsageError
+            xarray is not installed, or the raster is turned in its plane, so that rows and columns have no coordinates.
+        """
+        try:
+            import xarray  # noqa: PLC0415  (an optional package)
+        except ImportError as error:
+            raise UsageError("xarray is not installed; install it with: pip install 'photoplan[arrays]'") from error
+        _, b, _, d, _, _ = self.placement.coefficients
+        if b or d:
+            raise UsageError(f"a raster with the transform {self.placement.coefficients} is turned; save it instead")
+        width, height = self.placement.size
+        x = self.placement.to_plane(np.stack([np.arange(width), np.zeros(width)], axis=-1))[:, 0]
+        y = self.placement.to_plane(np.stack([np.zeros(height), np.arange(height)], axis=-1))[:, 1]
+        kept = self.values.astype(np.result_type(self.values, np.float32), copy=False)
+        array = xarray.DataArray(
+            np.where(self.valid, kept, np.nan),
+            coords={"band": np.arange(1, len(kept) + 1), "y": y, "x": x},
+            dims=("band", "y", "x"),
+            attrs={"crs": self.placement.crs or "", "unit": self.placement.unit},
+        )
+        crs = {} if self.placement.crs is None else {"crs_wkt": parse_crs(self.placement.crs).to_wkt()}
+        return array.assign_coords(spatial_ref=((), 0, crs))
+
+    def save(
+        self, path: Path | str, *, nodata: Nodata = "auto", compress: str = "deflate", overwrite: bool = False
+    ) -> Path:
+        """Write a cloud-optimised GeoTIFF.
+
+        Parameters
+        ----------
+        path : path
+        nodata : float, ``"mask"`` or ``"auto"``
+            See `photoplan.io.product.ProductFile`.
+        compress : str
+            ``none``, ``deflate``, ``zstd``, ``lzw`` or ``jpeg``.
+        overwrite : bool
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        UsageError
+            The file exists, or type or options are not allowed.
+        ResourceError
+            The disk is full.
+        """
+        file = ProductFile(
+            Path(path),
+            self.placement,
+            len(self.values),
+            self.values.dtype,
+            run_key="saved from memory",
+            nodata=nodata,
+            compress=compress,
+            tile=_SAVED_TILE,
+            overwrite=overwrite,
+        )
+        with file:
+            for index, window in enumerate(file.windows):
+                part = np.s_[window.row : window.stop[1], window.col : window.stop[0]]
+                file.append(index, np.ascontiguousarray(self.values[:, part[0], part[1]]), self.valid[part])
+            file.complete()
+        return Path(path)
+
+
+def rectify(
+    source: Any,
+    camera: Camera | Sequence[Camera],
+    target: Target | MapGrid,
+    surface: Surface | Path | str | float,
+    *,
+    owner: ArrayLike | None = None,
+    kernel: str = "bicubic",
+    tolerance: float = 0.02,
+    tile: int = 512,
+    workers: int = 1,
+) -> Raster:
+    """Resample an image, or several, onto a target.
+
+    Parameters
+    ----------
+    source : array, path, rasterio dataset or reader, or a list of them
+        Arrays have the shape (height, width) or (bands, height, width) and the type uint8, uint16, int16 or float32;
+        a masked array's mask and NaN are invalid. Files are read by windows, in overviews where the target is coarse.
+        Images of one call have the same bands and type.
+    camera : Camera, or a list of them
+        One for each source, for images of its size.
+    target : Target or MapGrid
+        Where the pixels of the result lie: for an orthophoto a `MapGrid`, or any object with `window`,
+        `to_ground` and `placement`.
+    surface : Surface, path or number
+        What gives the depth h of the target's pixels; a path is a height raster or terrain model, whose heights are
+        taken as they are; a number is a level.
+    owner : array of integers, optional
+        Number of the source, from one, that paints each pixel, shape (height, width) of the target; 0: none. Needed
+        with several sources.
+    kernel : str
+        ``nearest``, ``bilinear``, ``bicubic`` (a = −0.5), ``bicubic-1`` (a = −1) or ``lanczos3``.
+    tolerance : float
+        Largest difference to the strict projection, pixels of the source.
+    tile : int
+        Side of the parts that are computed at once, pixels.
+    workers : int
+        Threads.
+
+    Returns
+    -------
+    Raster
+        0 and not valid where no source shows the surface.
+
+    Raises
+    ------
+    UsageError
+        Arguments that do not fit each other.
+    InputError
+        A file cannot be used.
+    """
+    if kernel not in KERNELS:
+        raise UsageError(f"kernel {kernel!r}; allowed are {', '.join(KERNELS)}")
+    sources = _sources(source, camera)
+    place = MapTarget(target) if isinstance(target, MapGrid) else target
+    names = tuple(f"source {k}" for k in range(1, len(sources) + 1))
+    windows = enumerate(place.window.tiles(tile))
+    plan = ProductPlan(
+        name="rectified",
+        sources=names,
+        target=place,
+        tile_side=tile,
+        rule=AnchorRule(tolerance, max(1, math.ceil(KERNELS[kernel].taps / 2)), tile, reduces=kernel != "nearest"),
+        tiles=tuple(Tile(i, window, tuple(range(len(names)))) for i, window in windows),
+        owners=None if owner is None else GivenOwners(_owners(owner, len(names))),
+    )
+    work = partial(render, plan, sources=sources, surface=_surface(surface, place.placement.crs), kernel=kernel)
+    return _collected(plan, sources[0].reader, work, workers)
+
+
+def _collected(plan: ProductPlan, reader: Reader, work: Any, workers: int) -> Raster:
+    width, height = plan.size
+    values = np.zeros((reader.bands, height, width), reader.dtype)
+    valid = np.zeros((height, width), bool)
+    owner = None if plan.owners is None else np.zeros((height, width), np.uint16)
+    residual = 0.0
+    with Workers(executor_factory("threads", workers)) as pool:
+        for outcome in run_tiles(plan.tiles, work, pool, 2 * workers):
+            if outcome.error is not None:
+                raise PhotoplanError(f"tile {outcome.task.index}: {outcome.error}")
+            window, pixels = outcome.task.window, outcome.result
+            assert isinstance(pixels, Pixels)
+            residual = max(residual, pixels.residual)
+            if pixels.values is None or pixels.valid is None:
+                continue
+            part = np.s_[window.row : window.stop[1], window.col : window.stop[0]]
+            values[:, part[0], part[1]], valid[part] = pixels.values, pixels.valid
+            if owner is not None and pixels.owner is not None:
+                owner[part] = pixels.owner
+    return Raster(values, valid, plan.target.placement, owner, residual)
+
+
+def _sources(source: Any, camera: Camera | Sequence[Camera]) -> list[Source]:
+    cameras = list(camera) if isinstance(camera, Sequence) else [camera]
+    given = list(source) if isinstance(camera, Sequence) else [source]
+    if not cameras or len(given) != len(cameras):
+        raise UsageError(f"{len(given)} sources and {len(cameras)} cameras; each source needs its own camera")
+    sources = [Source(c, _reader(s)) for s, c in zip(given, cameras)]
+    for number, each in enumerate(sources, 1):
+        if tuple(each.reader.size) != tuple(each.camera.size):
+            raise UsageError(
+                f"source {number} has {each.reader.size[0]} × {each.reader.size[1]} pixels, its camera has "
+                f"{each.camera.size[0]} × {each.camera.size[1]}; a cropped or scaled image needs a camera of its own"
+            )
+        first = sources[0].reader
+        if (each.reader.bands, each.reader.dtype) != (first.bands, first.dtype):
+            raise UsageError(
+                f"source {number} has {each.reader.bands} bands of {each.reader.dtype}, the first {first.bands} of "
+                f"{first.dtype}; images of one result must be alike"
+            )
+    return sources
+
+
+def _reader(source: Any) -> Reader:
+    """What the engine reads, from whatever holds pixels."""
+    if isinstance(source, Path | str):
+        return RasterReader(Path(source))
+    pixels = source if isinstance(source, np.ndarray) else pixels_of_dataset(source)
+    if isinstance(pixels, np.ndarray):
+        return ArrayReader.of(pixels)
+    if pixels is not None:
+        return pixels
+    if isinstance(source, Reader):
+        return source
+    raise UsageError(f"source of type {type(source).__name__}; give an array, a path, a rasterio dataset or a reader")
+
+
+def _owners(owner: ArrayLike, count: int) -> NDArray[np.uint16]:
+    numbers = np.asarray(owner)
+    if numbers.dtype.kind not in "iub" or (numbers.size and not (numbers.min() >= 0 and numbers.max() <= count)):
+        raise UsageError(f"owners of type {numbers.dtype}; whole numbers from 0 to {count}, the number of sources")
+    return numbers.astype(np.uint16)
+
+
+def _surface(surface: Surface | Path | str | float, crs: str | None) -> Surface:
+    if isinstance(surface, int | float):
+        return LevelSurface(float(surface))
+    if isinstance(surface, Path | str):
+        terrain = open_terrain(Path(surface), crs)
+        return (terrain if crs is None else terrain.in_crs(crs)[0]).surface
+    return surface
