@@ -68,7 +68,7 @@ def seconds(count: int) -> float:
     tile = Tile(0, grid.window, tuple(range(count)))
     rule = GivenOwners(owners(count)) if count > 1 else None
     names = tuple(f"image {k}" for k in range(count))
-    plan = ProductPlan("tile", names, MapTarget(grid), SIDE, AnchorRule(0.02, 2, SIDE), (tile,), rule)
+    plan = ProductPlan("tile", names, MapTarget(grid), SIDE, AnchorRule(0.02, 2), (tile,), rule)
     best = np.inf
     for _ in range(ROUNDS):
         start = time.process_time()

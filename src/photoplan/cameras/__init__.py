@@ -5,7 +5,7 @@ from photoplan.public import public
 __getattr__, __dir__, __all__ = public(
     __name__,
     {
-        "cameras.base": "Camera project",
+        "cameras.base": "Camera CentralCamera Projection project",
         "cameras.frame": "FrameCamera",
         "cameras.interior": "Interior",
         "cameras.plane": "Affine2D Bilinear2D",

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.cameras.base import Camera
+from photoplan.cameras.base import Projection
 from photoplan.engine.arrays import ArrayReader
 from photoplan.engine.base import Reader, Source
 from photoplan.engine.execute import Pixels, render
@@ -132,7 +132,7 @@ class Raster:
 
 def rectify(
     source: Any,
-    camera: Camera | Sequence[Camera],
+    camera: Projection | Sequence[Projection],
     target: Target | MapGrid,
     surface: Surface | Path | str | float,
     *,
@@ -150,7 +150,7 @@ def rectify(
         Arrays have the shape (height, width) or (bands, height, width) and the type uint8, uint16, int16 or float32;
         a masked array's mask and NaN are invalid. Files are read by windows, in overviews where the target is coarse.
         Images of one call have the same bands and type.
-    camera : Camera, or a list of them
+    camera : Projection, or a list of them
         One for each source, for images of its size.
     target : Target or MapGrid
         Where the pixels of the result lie: for an orthophoto a `MapGrid`, or any object with `window`,
@@ -193,7 +193,7 @@ def rectify(
         sources=names,
         target=place,
         tile_side=tile,
-        rule=AnchorRule(tolerance, max(1, math.ceil(KERNELS[kernel].taps / 2)), tile, reduces=kernel != "nearest"),
+        rule=AnchorRule(tolerance, max(1, math.ceil(KERNELS[kernel].taps / 2)), reduces=kernel != "nearest"),
         tiles=tuple(Tile(i, window, tuple(range(len(names)))) for i, window in windows),
         owners=None if owner is None else GivenOwners(_owners(owner, len(names))),
     )
@@ -223,7 +223,7 @@ def _collected(plan: ProductPlan, reader: Reader, work: Any, workers: int) -> Ra
     return Raster(values, valid, plan.target.placement, owner, residual)
 
 
-def _sources(source: Any, camera: Camera | Sequence[Camera]) -> list[Source]:
+def _sources(source: Any, camera: Projection | Sequence[Projection]) -> list[Source]:
     cameras = list(camera) if isinstance(camera, Sequence) else [camera]
     given = list(source) if isinstance(camera, Sequence) else [source]
     if not cameras or len(given) != len(cameras):
