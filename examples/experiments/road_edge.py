@@ -36,7 +36,7 @@ from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGrou
 from photoplan.surfaces.memory_units import MemoryUnits
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.targets.map import MapTarget
-from photoplan.terrain.build import Built, build, plan_build
+from photoplan.terrain.build import Built, build_terrain, plan_build
 from photoplan.terrain.clean.run import clean
 from photoplan.terrain.settings import BuildSettings
 
@@ -124,7 +124,7 @@ def measure(seed: int = 0, line_sigma: float = LINE_SIGMA) -> MeasuredTerrain:
 
 def model(measured: MeasuredTerrain, width: float | None) -> Built:
     """The terrain model; all units have the same grid width, so that its grid alone is one raster."""
-    return build(plan_build(measured, BuildSettings(grid_width=width, adapt=0.0, unit_meshes=16)), 2)
+    return build_terrain(plan_build(measured, BuildSettings(grid_width=width, adapt=0.0, unit_meshes=16)))
 
 
 def hybrid(built: Built) -> HybridSurface:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tools.arrays import ArrayReader, noise, product
+from tools.arrays import noise, product
 
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
@@ -18,6 +18,7 @@ from photoplan.cameras.lenses.none import NoLens
 from photoplan.cameras.lenses.radial_table import RadialTable
 from photoplan.cameras.lenses.reversed import Reversed
 from photoplan.cameras.plane import Bilinear2D
+from photoplan.engine.arrays import ArrayReader
 from photoplan.engine.base import Source
 from photoplan.engine.execute import render
 from photoplan.engine.twin import TwinSource, twin_compose
