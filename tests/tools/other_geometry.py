@@ -20,6 +20,7 @@ class Wall:
     """Unit vector of u; v goes straight down."""
     pixel: float
     size: tuple[int, int]
+    breaks = None
 
     @property
     def window(self) -> Window:
@@ -46,6 +47,7 @@ class Cylinder:
     radius: float
     pixel: float
     size: tuple[int, int]
+    breaks = None
 
     @property
     def window(self) -> Window:
