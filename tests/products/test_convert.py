@@ -1,6 +1,5 @@
 """Conversion of orientation files: poses and pixels stay, what is lost is said or refused."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from photoplan.io.camera.model import FilmCamera
 from photoplan.io.orientation.file import FORMATS, orientation_format, read_orientation_block, write_orientation
 from photoplan.io.orientation.table import TableFormat
 from photoplan.orientation.readings import Reading
+from photoplan.plain import json_text, plain
 from photoplan.products.convert.readings import list_readings
 from photoplan.products.convert.run import ConvertRequest, convert_orientation
 
@@ -42,7 +42,7 @@ def test_there_and_back_every_pixel_stays(tmp_path, toml, target):
     again = read_orientation_block(back).table
     assert [i.name for i in again.images] == list(NAMES)
     np.testing.assert_allclose(our_pixels(again), our_pixels(block().table), atol=2e-3)
-    assert json.dumps(done.to_dict())
+    assert json_text(done)
 
 
 def test_without_a_name_the_file_lies_beside(toml):
@@ -213,7 +213,7 @@ def test_fault_14_readings_of_a_table_and_the_options_to_give(tmp_path, toml, me
     assert options == f"`angle_unit` {unit} `rotation` kpo `rotation_direction` ground-to-camera"
     assert len(found.fitting) == 1 and len(found.others) == 5
     assert found.fitting[0].median < 0.02
-    assert found.to_dict()["fitting"][0]["options"] == options
+    assert plain(found)["fitting"][0]["options"] == options
 
 
 def test_fault_14_readings_of_matrices(tmp_path, toml, measured):

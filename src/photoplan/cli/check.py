@@ -25,7 +25,7 @@ def command(project: Path, images: tuple[str, ...], as_json: bool) -> None:
 
     found = check_project(load_project(project), images or None)
     if as_json:
-        show_json(found.to_dict())
+        show_json(found)
     else:
         show(found)
     if found.implausible or found.alternative is not None:

@@ -53,7 +53,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     with Telling(quiet) as events:
         found = propose_control(request, events)
     if as_json:
-        show_json(found.to_dict())
+        show_json(found)
         return
     if found.output is None:
         show(f"{found.patches} patches at {found.resolution:g} m")

@@ -78,7 +78,7 @@ def _convert(request: Any, as_json: bool, quiet: bool) -> None:
 
     done = convert_orientation(request)
     if as_json:
-        show_json(done.to_dict())
+        show_json(done)
     else:
         for file in done.files:
             show(file)
@@ -95,7 +95,7 @@ def _list(request: Any, image_points: Path, control: Path, as_json: bool, quiet:
 
     found = list_readings(request, image_points, control)
     if as_json:
-        show_json(found.to_dict())
+        show_json(found)
     else:
         for fits, readings in (("fits", found.fitting), ("", found.others)):
             for r in readings:

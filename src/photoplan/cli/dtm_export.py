@@ -33,7 +33,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     with Telling(quiet) as events:
         found = dtm_export(request, events)
     if as_json:
-        show_json(found.to_dict())
+        show_json(found)
         return
     for path in found.paths:
         show(path)

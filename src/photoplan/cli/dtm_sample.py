@@ -52,7 +52,7 @@ def command(
     form = PointTableFormat(x, y, dialect, not no_header)
     found = dtm_sample(SampleRequest(form=form, **options))
     if as_json:
-        show_json(found.to_dict())
+        show_json(found)
         return
     show(found.path)
     if not quiet:

@@ -72,7 +72,7 @@ def report_picture(make: Callable[[Any], ShadingFacts], as_json: bool, quiet: bo
     with Telling(quiet) as events:
         facts = make(events)
     if as_json:
-        show_json(facts.to_dict())
+        show_json(facts)
         return
     show(facts.path)
     if facts.preview is not None:

@@ -41,7 +41,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     with Telling(quiet) as events:
         found = dtm_visible(VisibleRequest(**options), events)
     if as_json:
-        show_json(found.to_dict())
+        show_json(found)
         return
     show(found.path)
     for row in found.rows:

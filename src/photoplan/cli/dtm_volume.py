@@ -38,7 +38,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     with Telling(quiet) as events:
         found = dtm_volume(VolumeRequest(**options), events)
     if as_json:
-        show_json(found.to_dict())
+        show_json(found)
         return
     width = max(7, *(len(row.name) for row in found.rows))
     show(f"{'polygon':<{width}}  {'cut m³':>14} {'fill m³':>14} {'net m³':>14} {'area m²':>13} {'no model m²':>13}")

@@ -35,7 +35,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     found = monoplot_file(MonoplotRequest(**options))
     if as_json:
-        show_json(found.to_dict())
+        show_json(found)
         return
     show(found.output)
     if found.vectors is not None:

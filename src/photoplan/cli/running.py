@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 import click
 
+from photoplan.cli.output import show_json
 from photoplan.cli.telling import Telling
 from photoplan.engine.cpus import available_cpus
 from photoplan.errors import TilesFailed
@@ -73,8 +73,7 @@ def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling)
     seconds = time.perf_counter() - started
     results = [value for value in events.results if isinstance(value, ProductResult)]
     if how.as_json:
-        products = [r.to_dict() for r in results]
-        click.echo(json.dumps({"products": products, "seconds": round(seconds, 3), "folder": str(folder)}, indent=2))
+        show_json({"products": results, "seconds": seconds, "folder": folder})
     if failed is not None:
         raise failed
     events.talk(_summary(results, plan, seconds))

@@ -19,7 +19,7 @@ def show_plan(plan: OrthoPlan, folder: Path, plan_file: Path | None, how: How, e
     if plan_file is not None:
         write_plan(plan_file, plan, figures, folder, how.overwrite)
     if how.as_json:
-        show_json({"plan": plan_file and str(plan_file), **figures.to_dict(plan)})
+        show_json(figures.json_of(plan), plan=plan_file)
         return
     show(plan)
     show(_sums(plan, figures))

@@ -45,7 +45,7 @@ def command(scene: str, as_json: bool, quiet: bool, **options: Any) -> None:
     with Telling(quiet) as events:
         report = simulate(SimulateRequest(scene, **options), events)
     if as_json:
-        show_json(report.to_dict())
+        show_json(report)
     else:
         for image in report.images:
             show(image.path)

@@ -20,6 +20,7 @@ from photoplan.io.product import check_output
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
 from photoplan.io.tables import Columns, read_table, write_table
+from photoplan.plain import pick
 from photoplan.project.open_terrain import open_terrain
 from photoplan.project.scene import Scene, input_files, open_scene, pose_of
 from photoplan.surfaces.hybrid import HybridSurface
@@ -71,20 +72,10 @@ class MonoplotReport:
     height_system: str
     notes: tuple[str, ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        return {
-            "output": str(self.output),
-            "vectors": self.vectors and str(self.vectors),
-            "points": self.points,
-            "met": self.met,
-            "without_ground_point": self.reasons,
-            "grazing": self.grazing,
-            "through_holes": self.through_holes,
-            "median_sigma": self.median_sigma,
-            "height_system": self.height_system,
-            "notes": list(self.notes),
-        }
+    def json_fields(self) -> dict[str, Any]:
+        """Reasons by how many points have them."""
+        counts = pick(self, "points", "met", "grazing", "through_holes", without_ground_point="reasons")
+        return {**pick(self, "output", "vectors", "median_sigma", "height_system", "notes"), **counts}
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from photoplan.geometry.grid import Window
 from photoplan.geometry.levels import reduced
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.raster import RasterReader
+from photoplan.plain import pick
 from photoplan.project.derived_reader import DerivedReader
 from photoplan.project.fall_off_correction import read_fall_off
 from photoplan.quality.camera.fall_off_model import FallOffModel, correct_fall_off, largest_gain
@@ -31,17 +32,18 @@ class FallOffFile:
     """The largest in the image: noise grows by it there."""
     digest: str
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON and records."""
+    def json_fields(self) -> dict[str, Any]:
+        """The model by its entries."""
         model = self.model
         return {
-            "path": str(self.path),
-            "sampled_sha256": self.digest,
-            "size": list(model.size),
-            "largest_gain": self.gain,
-            "principal_point_px": list(model.principal_point),
-            "camera_constant_px": model.camera_constant,
-            "dark_dn": model.dark,
+            **pick(self, "path", sampled_sha256="digest", largest_gain="gain"),
+            **pick(
+                model,
+                "size",
+                principal_point_px="principal_point",
+                camera_constant_px="camera_constant",
+                dark_dn="dark",
+            ),
             "terms": [[n, m, value] for (n, m), value in zip(model.terms, model.coefficients)],
         }
 

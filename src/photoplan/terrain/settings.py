@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -57,7 +57,3 @@ class BuildSettings:
                 raise UsageError(f"filter value {sigma} for {kind}; metres, zero or more, are needed")
         if not (np.isfinite(self.gross) and self.gross >= 0):
             raise UsageError(f"limit of gross errors {self.gross}; zero or more is needed")
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for records and keys."""
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}

@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from photoplan.errors import InputError, UsageError
+from photoplan.errors import InputError
 from photoplan.io.fingerprint import fingerprint
+from photoplan.plain import json_text
 from photoplan.surfaces.units import UnitFigures, UnitLayout
 
 FORMAT = 1
@@ -106,8 +105,7 @@ def header_to_json(header: ModelHeader) -> str:
     UsageError
         A setting or figure is nothing that JSON can say.
     """
-    content = {f.name: getattr(header, f.name) for f in fields(header)} | {"layout": asdict(header.layout)}
-    return json.dumps(_plain(content), ensure_ascii=False, allow_nan=False)
+    return json_text(header, "header", indent=None)
 
 
 def header_from_json(text: str, path: Path) -> ModelHeader:
@@ -143,20 +141,3 @@ def header_from_json(text: str, path: Path) -> ModelHeader:
     if not all(isinstance(text, str) for text in texts) or not header.crs:
         raise InputError(f"{path}: header of the terrain model: no CRS, or no text where one is needed")
     return header
-
-
-def _plain(value: Any) -> Any:
-    """What JSON can say of a value: NaN becomes null, paths become names."""
-    if value is None or isinstance(value, str | bool | int):
-        return value
-    if isinstance(value, float | np.floating):
-        return float(value) if math.isfinite(value) else None
-    if isinstance(value, np.integer | np.bool_):
-        return value.item()
-    if isinstance(value, Path):
-        return value.as_posix()
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(item) for item in value]
-    raise UsageError(f"header of a terrain model: {type(value).__name__} given; numbers, texts and lists are needed")

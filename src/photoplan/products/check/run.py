@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from photoplan.geometry.crs import crs_label
 from photoplan.io.project.model import Project
+from photoplan.plain import pick
 from photoplan.plan.coverage import Coverage, cover
 from photoplan.products.check.plausibility import assess, view_of
 from photoplan.products.orthophoto.plan import mean_gsd, two_figures
-from photoplan.products.plain_values import plain
 from photoplan.project.scene import Scene, ground_of, open_scene, pose_of
 
 EARTH_RADIUS = 6_380_000.0
@@ -66,16 +66,11 @@ class ProjectCheck:
         """Images with a fault, and what it is."""
         return tuple(f"{i.image}: {i.fault}" for i in self.images if i.fault is not None)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`; NaN becomes null."""
-        return {
-            "images": [plain(asdict(i)) for i in self.images],
-            "sensible_resolution": plain(self.sensible_resolution),
-            "height_systems": dict(zip(("terrain", "orientation", "working"), self.heights)),
-            "crs": self.crs,
-            "alternative": self.alternative,
-            "advice": list(self.advice),
-        }
+    def json_fields(self) -> dict[str, Any]:
+        """Height systems by what has them."""
+        systems = dict(zip(("terrain", "orientation", "working"), self.heights))
+        own = pick(self, "images", "sensible_resolution", "crs", "alternative", "advice")
+        return {**own, "height_systems": systems}
 
     def __str__(self) -> str:
         width = max(5, *(len(i.image) for i in self.images))

@@ -24,6 +24,7 @@ from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project, Terrain
 from photoplan.io.raster import RasterReader
+from photoplan.plain import pick
 from photoplan.products.control.match import ImageControl, OrthoPatch, Settings, control_of_image
 from photoplan.products.control.patches import Ortho, choose_patches
 from photoplan.project.scene import input_files, open_scene
@@ -74,29 +75,12 @@ class ControlReport:
     sigma: tuple[float, float, float]
     """Standard deviations of the ground points: horizontal, height (metres, medians), image (pixels, median)."""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        return {
-            "output": None if self.output is None else str(self.output),
-            "image_points": None if self.image_points is None else str(self.image_points),
-            "patches": self.patches,
-            "resolution": self.resolution,
-            "points": self.points,
-            "sigma": dict(zip(("plane", "height", "image"), (_number(s) for s in self.sigma))),
-            "images": [
-                {
-                    "image": i.name,
-                    "tried": i.tried,
-                    "matched": i.matched,
-                    "kept": len(i.points),
-                    "shift": [_number(v) for v in i.shift],
-                    "rms": _number(i.rms),
-                    "factor": i.factor,
-                    "reasons": i.reasons,
-                }
-                for i in self.images
-            ],
-        }
+    def json_fields(self) -> dict[str, Any]:
+        """Every image with its counts."""
+        own = ("output", "image_points", "patches", "resolution", "points")
+        of_image = ("tried", "matched", "shift", "rms", "factor", "reasons")
+        images = [{**pick(i, *of_image, image="name"), "kept": len(i.points)} for i in self.images]
+        return {**pick(self, *own), "sigma": dict(zip(("plane", "height", "image"), self.sigma)), "images": images}
 
 
 def _number(value: float) -> float | None:

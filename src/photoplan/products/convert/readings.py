@@ -26,6 +26,7 @@ from photoplan.orientation.readings import (
     judge_readings,
     sights_of,
 )
+from photoplan.plain import pick
 from photoplan.products.convert.run import ConvertRequest, read_block, with_cameras
 
 #: Readings that are listed besides those that fit.
@@ -62,31 +63,21 @@ class ReadingsReport:
             words.append("and mirror the images (film: mirrored = true)")
         return " ".join(words)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-
-        def plain(found: FittedReading) -> dict[str, Any]:
-            r = found.reading
-            stated = {} if self.matrices else {"angle_unit": r.angle_unit, "rotation": r.rotation}
-            return {
-                **stated,
-                "rotation_direction": r.direction,
-                "camera_axes": r.camera_axes,
-                "image_turned": r.turned,
-                "mirrored": r.mirrored,
-                "swapped": r.swapped,
-                "median_px": found.median if np.isfinite(found.median) else None,
-                "options": self.options(r),
-            }
-
+    def json_fields(self) -> dict[str, Any]:
+        """Readings with the options that declare them."""
         return {
-            "format": self.format,
-            "points": self.points,
-            "images": self.images,
-            "fitting": [plain(r) for r in self.fitting],
-            "others": [plain(r) for r in self.others],
-            "notes": list(self.notes),
+            **pick(self, "format", "points", "images", "notes"),
+            "fitting": [self._fields(found) for found in self.fitting],
+            "others": [self._fields(found) for found in self.others],
         }
+
+    def _fields(self, found: FittedReading) -> dict[str, Any]:
+        reading = found.reading
+        stated = {} if self.matrices else pick(reading, "angle_unit", "rotation")
+        axes = pick(
+            reading, "camera_axes", "mirrored", "swapped", rotation_direction="direction", image_turned="turned"
+        )
+        return {**stated, **axes, "median_px": found.median, "options": self.options(reading)}
 
 
 def list_readings(request: ConvertRequest, image_points: Path, control: Path) -> ReadingsReport:

@@ -25,6 +25,7 @@ from photoplan.io.orientation.file import (
 from photoplan.io.orientation.table import Direction, OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.product import check_output
 from photoplan.orientation.readings import turn_matrix
+from photoplan.plain import pick
 from photoplan.products.init.match import camera_name
 from photoplan.products.init.run import placed
 
@@ -73,18 +74,10 @@ class ConvertReport:
     lost: tuple[Loss, ...]
     """What the target format cannot hold."""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        return {
-            "files": [str(file) for file in self.files],
-            "from": self.source_format,
-            "to": self.target_format,
-            "images": self.images,
-            "cameras": list(self.cameras),
-            "crs": self.crs,
-            "notes": list(self.notes),
-            "lost": [{"kind": loss.kind, "text": loss.text} for loss in self.lost],
-        }
+    def json_fields(self) -> dict[str, Any]:
+        """Formats as from and to."""
+        own = pick(self, "files", "images", "cameras", "crs", "notes", "lost")
+        return {**own, "from": self.source_format, "to": self.target_format}
 
 
 def convert_orientation(request: ConvertRequest) -> ConvertReport:

@@ -7,7 +7,7 @@ import json
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -130,7 +130,7 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
                 writer.add(unit, of_unit if unit is not None else empty_figures(*place))
         totals = _totals(built, measured, findings, len(gross))
         header = ModelHeader(
-            crs, system, plan.layout, request.settings.to_dict(), tuple(facts), built.fit.whole.name, totals
+            crs, system, plan.layout, asdict(request.settings), tuple(facts), built.fit.whole.name, totals
         )
         writer.finish(ModelParts(header, built.lines, gross, plan.polygon))
     seconds = time.perf_counter() - started
@@ -138,7 +138,7 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
     report = BuildReport(request.output, figures, gross, findings, built, measured)
     record = {"product": request.output.name, "kind": "terrain model", **report.json_fields()}
     del record["findings"]
-    record |= {"inputs": facts, "settings": request.settings.to_dict(), "versions": versions()}
+    record |= {"inputs": facts, "settings": request.settings, "versions": versions()}
     record |= {"finding_counts": dict(Counter(f.kind for f in findings)), "peak_memory_bytes": peak_memory_bytes()}
     write_run_record(record_path(request.output), record)
     return report
@@ -205,7 +205,7 @@ def _check_memory(measured: MeasuredTerrain) -> None:
 
 def _key(request: BuildRequest, facts: Sequence[dict[str, Any]], plan: BuildPlan, crs: str, system: str | None) -> str:
     text = json.dumps(
-        [facts, request.settings.to_dict(), repr(request.options), repr(plan.layout), crs, system, __version__],
+        [facts, asdict(request.settings), repr(request.options), repr(plan.layout), crs, system, __version__],
         sort_keys=True,
         default=str,
     )

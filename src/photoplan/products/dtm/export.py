@@ -53,9 +53,9 @@ class ExportReport:
     figures: dict[str, Any]
     """Counts, or size and resolution of the raster."""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        return {"files": [str(path) for path in self.paths], **self.figures}
+    def json_fields(self) -> dict[str, Any]:
+        """Figures beside the files."""
+        return {"files": self.paths, **self.figures}
 
 
 def dtm_export(request: ExportRequest, events: Events = SILENT) -> ExportReport:

@@ -18,6 +18,7 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.polygons import label_polygons, read_features, write_features
 from photoplan.io.product import check_output
 from photoplan.io.tables import read_table
+from photoplan.plain import pick
 from photoplan.products.dtm.raster import GridOptions, write_grid
 from photoplan.products.dtm.visible import COLUMNS, own_grid, read_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
@@ -65,16 +66,10 @@ class OutletRow:
     longest: float
     """Length of the longest way to it, metres."""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        return {
-            "outlet": self.name,
-            "x": self.X,
-            "y": self.Y,
-            "upstream_area": self.area,
-            "own_area": self.own,
-            "longest_way": self.longest,
-        }
+    def json_fields(self) -> dict[str, Any]:
+        """Areas in m², the way in metres."""
+        places = {"outlet": "name", "x": "X", "y": "Y"}
+        return pick(self, **places, upstream_area="area", own_area="own", longest_way="longest")
 
 
 @dataclass(frozen=True)
@@ -94,19 +89,10 @@ class FlowReport:
     """Volume of the filling, m³."""
     rows: tuple[OutletRow, ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        return {
-            "path": str(self.path),
-            "catchments": self.catchments and str(self.catchments),
-            "bands": list(BANDS),
-            "resolution": self.resolution,
-            "area": self.area,
-            "outflow_area": self.outflow,
-            "filled_area": self.pits,
-            "filled_volume": self.pit_volume,
-            "outlets": [row.to_dict() for row in self.rows],
-        }
+    def json_fields(self) -> dict[str, Any]:
+        """Areas in m², the volume in m³."""
+        more = {"outflow_area": "outflow", "filled_area": "pits", "filled_volume": "pit_volume", "outlets": "rows"}
+        return {**pick(self, "path", "catchments", "resolution", "area", **more), "bands": BANDS}
 
 
 def dtm_flow(request: FlowRequest) -> FlowReport:

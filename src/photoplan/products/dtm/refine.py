@@ -21,6 +21,7 @@ from photoplan.io.product import check_output
 from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
 from photoplan.io.terrain.model_tables import ModelHeader, empty_figures, input_facts
 from photoplan.io.terrain.model_write import ModelParts, ModelWriter
+from photoplan.plain import pick
 from photoplan.surfaces.memory_units import unit_range
 from photoplan.surfaces.refined_units import LinedUnits, refine_units
 from photoplan.surfaces.units import LineElement, Unit, UnitFigures
@@ -56,11 +57,9 @@ class RefineReport:
     largest: float
     """Largest change of a post that both have, metres; NaN: there is none."""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        largest = self.largest if math.isfinite(self.largest) else None
-        counts = {"units": self.units, "changed": self.changed, "lines": self.lines}
-        return {"model": str(self.path), **counts, "largest_change": largest}
+    def json_fields(self) -> dict[str, Any]:
+        """Counts, and the largest change in metres."""
+        return pick(self, "units", "changed", "lines", model="path", largest_change="largest")
 
 
 def dtm_refine(request: RefineRequest, events: Events = SILENT) -> RefineReport:

@@ -15,6 +15,7 @@ from photoplan.events import SILENT, Events
 from photoplan.io.product import check_output
 from photoplan.io.terrain.export import replacing
 from photoplan.io.terrain.points import PointTable, PointTableFormat
+from photoplan.plain import pick
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.surfaces.hybrid import HybridSurface
 
@@ -57,17 +58,10 @@ class SampleReport:
     crs: str
     height_system: str | None
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        figures = {"low": self.low, "high": self.high, "sigma": self.sigma}
-        return {
-            "file": str(self.path),
-            "points": self.points,
-            "outside": self.outside,
-            **{name: value if np.isfinite(value) else None for name, value in figures.items()},
-            "crs": self.crs,
-            "height_system": self.height_system,
-        }
+    def json_fields(self) -> dict[str, Any]:
+        """The path as file."""
+        own = ("points", "outside", "low", "high", "sigma", "crs", "height_system")
+        return pick(self, *own, file="path")
 
 
 def dtm_sample(request: SampleRequest, events: Events = SILENT) -> SampleReport:

@@ -19,6 +19,7 @@ from photoplan.io.fingerprint import fingerprint
 from photoplan.io.product import ProductFacts, check_output
 from photoplan.io.quicklook import write_quicklook
 from photoplan.io.storage import Nodata
+from photoplan.plain import pick
 from photoplan.products.dtm.raster import GridOptions, GridTile, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.terrain.shading import run as shading
@@ -76,20 +77,10 @@ class ShadingFacts:
     """Share of pixels with terrain, 0 to 1."""
     bytes: int
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        return {
-            "path": str(self.path),
-            "preview": self.preview and str(self.preview),
-            "kind": self.kind,
-            **self.settings,
-            "resolution": self.grid.resolution,
-            "width": self.grid.width,
-            "height": self.grid.height,
-            "bounds": list(self.grid.bounds),
-            "valid_share": self.valid_share,
-            "bytes": self.bytes,
-        }
+    def json_fields(self) -> dict[str, Any]:
+        """Settings and grid flat."""
+        own = pick(self, "path", "preview", "kind", "valid_share", "bytes")
+        return {**own, **self.settings, **pick(self.grid, "resolution", "width", "height", "bounds")}
 
 
 def make_picture(

@@ -21,6 +21,7 @@ from photoplan.geometry.local import earth_radius
 from photoplan.io.polygons import read_features
 from photoplan.io.product import check_output
 from photoplan.io.tables import Columns, read_table
+from photoplan.plain import pick
 from photoplan.products.dtm.raster import GridOptions, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.targets.map import MapTarget
@@ -88,17 +89,10 @@ class VisibleRow:
     missing: float
     """Area inside the radius and the map without heights, m²: it blocks nothing, and nothing is said about it."""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        return {
-            "observer": self.name,
-            "x": self.X,
-            "y": self.Y,
-            "eye_height": self.eye,
-            "visible_area": self.visible,
-            "area": self.looked_at,
-            "area_without_model": self.missing,
-        }
+    def json_fields(self) -> dict[str, Any]:
+        """Areas in m²."""
+        places = {"observer": "name", "x": "X", "y": "Y", "eye_height": "eye"}
+        return pick(self, **places, visible_area="visible", area="looked_at", area_without_model="missing")
 
 
 @dataclass(frozen=True)
@@ -113,16 +107,9 @@ class VisibleReport:
     """Distance of the horizon of a smooth earth for the first observer, metres."""
     rows: tuple[VisibleRow, ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`; an infinite horizon (flat earth) is null."""
-        return {
-            "path": str(self.path),
-            "bands": list(self.bands),
-            "resolution": self.resolution,
-            "earth_radius": self.earth_radius,
-            "horizon": self.horizon if math.isfinite(self.horizon) else None,
-            "observers": [row.to_dict() for row in self.rows],
-        }
+    def json_fields(self) -> dict[str, Any]:
+        """An infinite horizon (flat earth) becomes null."""
+        return pick(self, "path", "bands", "resolution", "earth_radius", "horizon", observers="rows")
 
 
 def dtm_visible(request: VisibleRequest, events: Events = SILENT) -> VisibleReport:

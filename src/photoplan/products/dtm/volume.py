@@ -17,6 +17,7 @@ from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.polygons import Feature, read_features
 from photoplan.io.product import check_output
+from photoplan.plain import pick
 from photoplan.products.dtm.raster import GridOptions, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.surfaces.hybrid import HybridSurface
@@ -63,25 +64,15 @@ class VolumeRow:
     volume: Volume
     sigma: VolumeSigma | None
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`: m³, m², metres."""
+    def json_fields(self) -> dict[str, Any]:
+        """m³, m², metres."""
         v, s = self.volume, self.sigma
-        return {
-            "polygon": self.name,
-            "cut": v.cut,
-            "fill": v.fill,
-            "net": v.net,
-            "area": v.area,
-            "area_without_model": v.missing,
-            "cell": v.cell,
-            "integration_error_cut": v.error_cut,
-            "integration_error_fill": v.error_fill,
-            "integration_error_net": v.error_net,
-            "within_tolerance": v.settled,
-            "sigma_cut": s and s.cut,
-            "sigma_fill": s and s.fill,
-            "sigma_net": s and s.net,
-        }
+        errors = {f"integration_error_{name}": f"error_{name}" for name in ("cut", "fill", "net")}
+        sigmas = {f"sigma_{name}": None if s is None else getattr(s, name) for name in ("cut", "fill", "net")}
+        own = pick(
+            v, "cut", "fill", "net", "area", "cell", area_without_model="missing", within_tolerance="settled", **errors
+        )
+        return {"polygon": self.name, **own, **sigmas}
 
 
 @dataclass(frozen=True)
@@ -94,14 +85,9 @@ class VolumeReport:
     """What a reader of the figures must know."""
     difference: Path | None
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        return {
-            "volumes": [row.to_dict() for row in self.rows],
-            "height_system": self.height_system,
-            "difference": self.difference and str(self.difference),
-            "notes": list(self.notes),
-        }
+    def json_fields(self) -> dict[str, Any]:
+        """The rows as volumes."""
+        return pick(self, "height_system", "difference", "notes", volumes="rows")
 
 
 def dtm_volume(request: VolumeRequest, events: Events = SILENT) -> VolumeReport:

@@ -268,14 +268,14 @@ def _record(plan: OrthoPlan, product: OrthoProduct, scene: Scene, run: Run, resu
     """The run record: what a person needs to answer for the product, and to make it again."""
     center = scene.camera.center
     return {
-        "product": result.to_dict(),
+        "product": result,
         "key": product.key,
         "inputs": [
             {"path": path, "sampled_sha256": digest, "size": Path(path).stat().st_size}
             for path, digest in scene.address.digests
         ],
         "project": json.loads(scene.address.text),
-        "settings": plan.settings.to_dict(),
+        "settings": plan.settings,
         "grid": {
             "crs": product.grid.crs,
             "bounds": product.grid.bounds,

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -116,7 +116,7 @@ def plan_orthophotos(
     """
     chosen = settings or project_settings(project)
     if changes:
-        chosen = OrthoSettings.from_dict({**chosen.to_dict(), **changes})
+        chosen = OrthoSettings.from_dict({**asdict(chosen), **changes})
     looks = []
     blind: list[str] = []
     names = project.select(images)

@@ -20,6 +20,7 @@ from photoplan.io.disk import disk_error, free_megabytes
 from photoplan.io.plan_file import PlanTables, read_plan_tables, write_plan_tables
 from photoplan.io.product import check_output
 from photoplan.io.project.file import parse_project
+from photoplan.plain import pick
 from photoplan.plan.compile import AnchorRule
 from photoplan.plan.coverage import Coverage
 from photoplan.plan.product import ProductPlan, Tile, compile_tile
@@ -60,31 +61,23 @@ class PlanFigures:
         """Worst residual of the anchors, pixels."""
         return float(self.residual_of_tile.max(initial=0.0))
 
-    def to_dict(self, plan: OrthoPlan) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        products = []
-        for p in plan.products:
-            mine = self.product == p.plan.name
-            products.append(
-                {
-                    "name": p.plan.name,
-                    "image": p.plan.image,
-                    "width": p.grid.width,
-                    "height": p.grid.height,
-                    "resolution": p.grid.resolution,
-                    "bounds": p.grid.bounds,
-                    "gsd": p.gsd,
-                    "tiles": int((self.cells_of_tile[mine] > 0).sum()),
-                    "cells": int(self.cells_of_tile[mine].sum()),
-                    "worst_anchor_residual_px": float(self.residual_of_tile[mine].max(initial=0.0)),
-                }
-            )
+    def json_of(self, plan: OrthoPlan) -> dict[str, Any]:
+        """Figures of a plan and of each of its products."""
         return {
-            "products": products,
-            "tiles": self.tiles,
-            "cells": self.cells,
-            "worst_anchor_residual_px": self.residual,
-            "blind": list(plan.blind),
+            **pick(self, "tiles", "cells", worst_anchor_residual_px="residual"),
+            "products": [self._product(product) for product in plan.products],
+            "blind": plan.blind,
+        }
+
+    def _product(self, product: OrthoProduct) -> dict[str, Any]:
+        mine = self.product == product.plan.name
+        return {
+            **pick(product.plan, "name", "image"),
+            **pick(product.grid, "width", "height", "resolution", "bounds"),
+            "gsd": product.gsd,
+            "tiles": (self.cells_of_tile[mine] > 0).sum(),
+            "cells": self.cells_of_tile[mine].sum(),
+            "worst_anchor_residual_px": self.residual_of_tile[mine].max(initial=0.0),
         }
 
 
@@ -163,7 +156,7 @@ def write_plan(path: Path, plan: OrthoPlan, figures: PlanFigures, output: Path, 
         "project": plan.project.model_dump(mode="json", exclude_none=True),
         "folder": os.path.relpath(plan.project.folder.resolve(), path.resolve().parent),
         "output": os.path.relpath(output.resolve(), path.resolve().parent),
-        "settings": plan.settings.to_dict(),
+        "settings": asdict(plan.settings),
         "blind": list(plan.blind),
         "products": [_product_header(p, int((there & (figures.product == p.plan.name)).sum())) for p in plan.products],
     }

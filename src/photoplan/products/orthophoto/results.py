@@ -9,6 +9,7 @@ from typing import Any
 
 from photoplan.errors import UsageError
 from photoplan.io.run_record import record_path
+from photoplan.plain import pick
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct
 from photoplan.products.orthophoto.settings import OrthoSettings
 
@@ -35,19 +36,11 @@ class ProductResult:
     reason: str = ""
     """Why the first of them failed."""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
-        return {
-            "path": str(self.path),
-            "image": self.image,
-            "seconds": round(self.seconds, 3),
-            "valid_share": round(self.valid_share, 6),
-            "worst_anchor_residual_px": self.residual,
-            "cells": self.cells,
-            "tiles": self.tiles,
-            "resumed_tiles": self.resumed,
-            "failed_tiles": list(self.failed),
-        }
+    def json_fields(self) -> dict[str, Any]:
+        """Figures without the reason of a failure."""
+        own = ("path", "image", "seconds", "valid_share", "cells", "tiles")
+        more = {"worst_anchor_residual_px": "residual", "resumed_tiles": "resumed", "failed_tiles": "failed"}
+        return pick(self, *own, **more)
 
 
 def product_path(folder: Path, product: OrthoProduct) -> Path:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args
 
 from photoplan.errors import UsageError
@@ -54,10 +54,6 @@ class OrthoSettings:
     def nodata_value(self) -> float | Literal["auto", "mask"]:
         """`nodata` as the product's writer takes it."""
         return self.nodata if self.nodata in ("auto", "mask") else float(self.nodata)  # type: ignore[return-value]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for plan and run record."""
-        return asdict(self)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> OrthoSettings:

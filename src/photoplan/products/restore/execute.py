@@ -240,7 +240,7 @@ def _record(job: Job, how: RestoreRequest, result: RestoredImage, facts: Product
         "settings": how.settings,
         "linearisation": restorer.linearisation.describe(),
         "chromatic": None if job.reader.aligned is None else model_figures(job.reader.aligned.model),
-        "fall_off": None if job.reader.lit is None else job.reader.lit.fall_off.to_dict(),
+        "fall_off": job.reader.lit and job.reader.lit.fall_off,
         "filter": {
             "description": restorer.filter.description,
             "image_size": restorer.filter.image_size,

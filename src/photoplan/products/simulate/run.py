@@ -19,6 +19,7 @@ from photoplan.io.raster import RasterReader
 from photoplan.io.run_record import record_path, versions, write_run_record
 from photoplan.io.simulation_file import read_simulation
 from photoplan.io.whole_image import write_whole_image
+from photoplan.plain import pick
 from photoplan.products.simulate.model import model_of
 from photoplan.quality.formation.model import MOST_PIXELS, FormedImage, ImageModel, form_series
 from photoplan.quality.formation.scenes import PATTERNS, PatternScene, Scene, parse_pattern
@@ -83,21 +84,14 @@ class SimulateReport:
     notes: tuple[str, ...]
     record: Path | None
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        images = [
-            {"path": str(i.path), "frame": i.frame, "exposure": i.exposure, "automatic_gain": i.gain, **i.facts}
-            for i in self.images
-        ]
-        mtf50 = {axis: value if np.isfinite(value) else None for axis, value in zip("xy", self.mtf50)}
+    def json_fields(self) -> dict[str, Any]:
+        """The images with what is known of each."""
+        images = [{**pick(i, "path", "frame", "exposure", automatic_gain="gain"), **i.facts} for i in self.images]
+        mtf50 = dict(zip("xy", self.mtf50))
         return {
+            **pick(self, "size", "bands", "dtype", "notes", run_record="record"),
             "images": images,
-            "size": list(self.size),
-            "bands": self.bands,
-            "dtype": self.dtype,
             "model_mtf50": mtf50,
-            "notes": list(self.notes),
-            "run_record": str(self.record) if self.record else None,
         }
 
 
@@ -190,7 +184,7 @@ def simulate(
     if request.dry_run:
         return dataclasses.replace(report, record=None)
     stated = {"model": dataclasses.asdict(model), "scene": request.scene, "oversampling": scene.oversampling}
-    write_run_record(record, {"command": "simulate", **stated, **report.to_dict(), "versions": versions()})
+    write_run_record(record, {"command": "simulate", **stated, **report.json_fields(), "versions": versions()})
     return report
 
 
