@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from photoplan.geometry.grid import Window
-from photoplan.project.scan_image import ScanImage
+from photoplan.project.camera_marks import ScanImage
 
 POSITIONS = Path(__file__).resolve().parents[2] / "tests" / "real" / "usgs_marks" / "positions.csv"
 HALF = {"nagap_triangle": 150, "nagap_notch": 105}

@@ -88,7 +88,7 @@ def test_example_is_understood(verb, arguments):
 
 
 def test_figures_of_linear_prediction_on_the_pages_are_those_of_the_code():
-    from photoplan.terrain import build, covariance, leaves, neighbours
+    from photoplan.terrain import build, covariance, leaves
     from photoplan.terrain.settings import SHARE, BuildSettings
 
     page = " ".join((DOCS / "explanation" / "linear-prediction.md").read_text("utf-8").split())
@@ -96,7 +96,7 @@ def test_figures_of_linear_prediction_on_the_pages_are_those_of_the_code():
     (share,) = set(SHARE.values()) - {1.0}
     assert f"get {share:g} of it" in page and f"other classes: {share:g} of it" in table
     assert f"at most {leaves.CAPACITY} points" in page
-    assert f"{neighbours.POINTS} nearest points and {neighbours.LINES} nearest line points" in page
+    assert f"{covariance.POINTS} nearest points and {covariance.LINES} nearest line points" in page
     assert f"g = {min(covariance.GAPS):g} to {max(covariance.GAPS):g} half-value distances" in page
     assert f"`--gross` ({BuildSettings().gross:g})" in page
     assert f"| {build._REACH:g} spacings |" in table and build._WIDTH == 0.5  # "half the spacing"

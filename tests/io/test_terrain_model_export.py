@@ -14,9 +14,8 @@ from photoplan.errors import UsageError
 from photoplan.io.terrain.export import replacing, write_points, write_tin
 from photoplan.io.terrain.export_mesh import mesh_parts
 from photoplan.surfaces.hybrid import HybridSurface
-from photoplan.surfaces.memory_units import MemoryUnits
 from photoplan.surfaces.mesh.faces import build_faces
-from photoplan.surfaces.units import Unit, UnitLayout
+from photoplan.surfaces.units import MemoryUnits, Unit, UnitLayout
 
 
 def small() -> MemoryUnits:

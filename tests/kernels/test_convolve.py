@@ -8,8 +8,7 @@ import pytest
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.convolve import round_clipped
-from photoplan.quality.restoration.borders import Margin
-from photoplan.quality.restoration.convolution import LEFT, RIGHT, Convolution
+from photoplan.quality.restoration.borders import LEFT, RIGHT, Convolution, Margin
 from photoplan.quality.restoration.filters import FilterKernel
 
 NONE = np.empty((0, 0), bool)

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.matching.features import Features
-from photoplan.matching.thin import CELLS, GRUBER, thin_tracks
-from photoplan.matching.tracks import Tracks, build_tracks, connected_parts
+from photoplan.matching.tracks import CELLS, GRUBER, Tracks, build_tracks, connected_parts, thin_tracks
 from photoplan.matching.verify import PairMatches
 
 EMPTY = np.empty((0, 0), np.uint8)

@@ -20,7 +20,7 @@ from photoplan.products.chromatic import (
     model_lines,
     save_chromatic,
 )
-from photoplan.project.aligned_reader import AlignedReader
+from photoplan.project.restored_reader import AlignedReader
 from photoplan.quality.colour.model import BandModel, ChromaticModel
 from photoplan.quality.formation.model import ImageModel, form_image
 from photoplan.quality.formation.optics_parts import Lateral, Spread

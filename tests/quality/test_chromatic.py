@@ -5,8 +5,7 @@ import pytest
 from scipy import ndimage
 
 from photoplan.errors import GeometryError, InputError
-from photoplan.quality.colour.disc_displacements import disc_displacements
-from photoplan.quality.colour.discs import DiscSettings, find_discs
+from photoplan.quality.colour.discs import DiscSettings, disc_displacements, find_discs
 from photoplan.quality.colour.edge_displacements import edge_displacements
 from photoplan.quality.colour.model import BandModel, ChromaticModel, Displacements, fit_band
 from photoplan.quality.colour.patch_displacements import patch_displacements

@@ -5,7 +5,7 @@ import pytest
 
 from photoplan.errors import InputError
 from photoplan.quality.restoration.aperture import aperture_filter
-from photoplan.quality.restoration.filter_design import point_spread, radial_filter, separable_filter
+from photoplan.quality.restoration.design import point_spread, radial_filter, separable_filter
 from photoplan.quality.restoration.filters import FilterKernel
 from photoplan.quality.restoration.inverse import band_matrix, condition_of, exact_inverse, spread_of_inverse
 from photoplan.quality.spread import SpreadFunction, gaussian_modulation

@@ -11,7 +11,7 @@ from tools.patterns import bars, star, three_bars, usaf_chart
 from photoplan.errors import InputError
 from photoplan.quality.patterns.pixels import clipped_pixels
 from photoplan.quality.patterns.usaf import UsafRules, measure_usaf
-from photoplan.quality.patterns.usaf_layout import usaf_frequency
+from photoplan.quality.patterns.usaf_find import usaf_frequency
 
 SCALE, ORIGIN, SHAPE = 22.3, (230.4, 205.7), (420, 440)
 

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from photoplan.quality.colour.disc_displacements import disc_displacements
-from photoplan.quality.colour.discs import find_discs
+from photoplan.quality.colour.discs import disc_displacements, find_discs
 from photoplan.quality.colour.model import ChromaticModel, fit_band
 
 SIZE = (408, 344)

@@ -21,8 +21,7 @@ from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
 from photoplan.geometry.grid import Window
 from photoplan.io.mark_model import Mark
 from photoplan.orientation.marks.alone import AloneMark, find_mark
-from photoplan.project.camera_marks import mark_pattern
-from photoplan.project.scan_image import ScanImage
+from photoplan.project.camera_marks import ScanImage, mark_pattern
 
 HERE = Path(__file__).resolve().parent / "usgs_marks"
 LIMIT = 1.5

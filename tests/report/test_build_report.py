@@ -129,7 +129,7 @@ def test_headline_figures(facts, document):
 
 def test_the_map_lies_where_the_points_are(facts, built):
     from photoplan.surfaces.hybrid import HybridSurface
-    from photoplan.surfaces.memory_units import MemoryUnits
+    from photoplan.surfaces.units import MemoryUnits
 
     area = facts.map
     left, right, bottom, top = area.extent

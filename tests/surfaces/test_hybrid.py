@@ -14,8 +14,7 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import crs_step
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.surfaces.hybrid import HybridSurface
-from photoplan.surfaces.memory_units import MemoryUnits, unit_range
-from photoplan.surfaces.units import UnitLayout
+from photoplan.surfaces.units import MemoryUnits, UnitLayout, unit_range
 from photoplan.targets.map import MapTarget
 
 CRS = "EPSG:32633"

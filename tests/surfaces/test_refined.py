@@ -13,10 +13,9 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import MapGrid
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.level import LevelSurface
-from photoplan.surfaces.memory_units import MemoryUnits
 from photoplan.surfaces.refined import RefinedSurface
 from photoplan.surfaces.refined_units import LinedUnits, clip_line, refine_units
-from photoplan.surfaces.units import UnitLayout
+from photoplan.surfaces.units import MemoryUnits, UnitLayout
 from photoplan.targets.map import MapTarget
 
 COARSE = UnitLayout(0.0, 100.0, 20.0, 5, 5)

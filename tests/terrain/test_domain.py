@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import shapely
 
-from photoplan.terrain.domain import Domain
+from photoplan.terrain.predict import Domain
 
 X, Y = np.meshgrid(np.arange(0.5, 60), np.arange(0.5, 40))
 XY = np.column_stack([X.ravel(), Y.ravel()])

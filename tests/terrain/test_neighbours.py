@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from photoplan.terrain.neighbours import LINES, POINTS, Neighbours
+from photoplan.terrain.covariance import LINES, POINTS, Neighbours
 
 XY = np.random.default_rng(1).uniform(0, 100, (3000, 2))
 

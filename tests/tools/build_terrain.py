@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.engine.executors import thread_map
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
-from photoplan.surfaces.memory_units import MemoryUnits
+from photoplan.surfaces.units import MemoryUnits
 from photoplan.terrain.build import Built, build_terrain, plan_build
 from photoplan.terrain.predict import heights_at
 from photoplan.terrain.settings import BuildSettings

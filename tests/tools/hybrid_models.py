@@ -11,10 +11,9 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.surfaces.hybrid import HybridSurface
-from photoplan.surfaces.memory_units import MemoryUnits
 from photoplan.surfaces.mesh.faces import build_faces
 from photoplan.surfaces.mesh.lines import on_grid
-from photoplan.surfaces.units import LineElement, Unit, UnitLayout
+from photoplan.surfaces.units import LineElement, MemoryUnits, Unit, UnitLayout
 
 Height = Callable[[Any, Any], Any]
 

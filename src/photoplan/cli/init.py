@@ -7,8 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option
-from photoplan.cli.orientation_options import reading_options, table_format
+from photoplan.cli.options import json_option, reading_options, table_format
 from photoplan.cli.output import show, show_json, talking
 
 _FILE = click.Path(path_type=Path)

@@ -14,8 +14,10 @@ import shapely
 from numpy.typing import NDArray
 from pyogrio.errors import DataSourceError
 
+from photoplan.cameras.observed import ImagePoints
 from photoplan.errors import UsageError
 from photoplan.io.disk import disk_error, sync_file, sync_folder
+from photoplan.io.tables import write_table
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,3 +69,68 @@ def write_geopackage(path: Path, layers: Sequence[VectorLayer], crs: str) -> Non
         raise UsageError(f"{path}: cannot be written ({error}); choose a folder that can be written") from error
     except OSError as error:
         raise disk_error(path, error) from error
+
+
+@dataclass(frozen=True, eq=False)
+class PointLayer:
+    """A layer of points in space."""
+
+    name: str
+    XYZ: NDArray[np.float64]
+    """(n, 3), metres."""
+    columns: Mapping[str, NDArray[Any]]
+    """Values of each field, (n,)."""
+
+
+def write_point_layers(path: Path, layers: Sequence[PointLayer], crs: str) -> None:
+    """Write layers of points as one GeoPackage, which appears complete or not at all and replaces an older one.
+
+    Layers without points are left out.
+
+    Raises
+    ------
+    UsageError
+        The folder cannot be written to.
+    ResourceError
+        The disk is full.
+    """
+    vectors = [
+        VectorLayer(item.name, "Point Z", shapely.points(item.XYZ), item.columns) for item in layers if len(item.XYZ)
+    ]
+    write_geopackage(path, vectors, crs)
+
+
+def write_residuals(
+    path: Path,
+    points: ImagePoints,
+    residuals: NDArray[np.float64],
+    normalised: NDArray[np.float64],
+    redundancies: NDArray[np.float64],
+    rejected: NDArray[np.bool_],
+) -> None:
+    """Write measurements with their residuals as a table that `photoplan adjust` reads again as image points.
+
+    Parameters
+    ----------
+    path : Path
+    points : ImagePoints
+    residuals, normalised, redundancies : ndarray, shape (n, 2)
+        Columns and rows; NaN, an empty field, where a measurement was not used.
+    rejected : ndarray, shape (n,)
+
+    Raises
+    ------
+    ResourceError, UsageError
+        The disk is full, or the folder cannot be written to.
+    """
+    pairs = ("residual", "normalised", "redundancy")
+    names = [f"{name}_{axis}" for name in pairs for axis in "xy"]
+    rows = []
+    used: NDArray[np.bool_] = np.asarray(np.isfinite(residuals).all(axis=1))
+    for k in range(len(points)):
+        numbers = [*(f"{v:.10g}" for v in points.xy[k]), *(f"{v:.6g}" for v in points.sigma[k])]
+        for values in (residuals[k], normalised[k], redundancies[k]):
+            numbers += ["" if not np.isfinite(v) else f"{v:.4f}" for v in values]
+        state = "rejected" if rejected[k] else "yes" if used[k] else "no"
+        rows.append([points.points[points.point[k]], points.images[points.image[k]], *numbers, state])
+    write_table(path, ["point", "image", "x", "y", "sigma_x", "sigma_y", *names, "used"], rows)

@@ -23,7 +23,7 @@ from photoplan.cameras.observed import GroundPoints
 from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_label, same_crs, split_compound
 from photoplan.io.checks import check_plain_file
-from photoplan.io.prj_file import crs_beside
+from photoplan.io.plain_files import crs_beside
 from photoplan.io.tables import Columns, Dialect, read_table, write_table
 
 _ROLES = {

@@ -24,7 +24,7 @@ from photoplan.io.names import match_key
 from photoplan.io.orientation.exif import map_positions, read_folder
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.orientation.table import TableFormat, angle_in_radians
-from photoplan.io.prj_file import crs_beside
+from photoplan.io.plain_files import crs_beside
 from photoplan.io.project.model import ANGLE_UNITS
 from photoplan.io.tables import Columns, Dialect, Table, read_table
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -12,6 +13,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from photoplan.errors import InputError
+from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.io.project.errors import explain
 
 #: Levels of nesting that any of our formats could need.
@@ -163,3 +165,33 @@ def finite(value: Any, where: str, count: int | None = None) -> Any:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise InputError(f"{where}: {value!r} given; a finite number is needed")
     return float(value)
+
+
+_MAX_BYTES = 100_000
+
+
+@dataclass(frozen=True)
+class StatedCrs:
+    """What such a file states."""
+
+    file: Path
+    crs: str
+    """Horizontal CRS."""
+    height_system: str | None
+    """None: it states a horizontal CRS alone."""
+
+
+def crs_beside(path: Path) -> StatedCrs | None:
+    """CRS (EPSG code, WKT or PROJ string) in the file of the same name with the suffix ``.prj``; None: there is none.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or states no CRS that is known.
+    """
+    side = next((p for p in (path.with_suffix(".prj"), path.with_suffix(".PRJ")) if p.is_file()), None)
+    if side is None:
+        return None
+    text = read_text(side, _MAX_BYTES).strip()
+    parse_crs(text, str(side))
+    return StatedCrs(side, *split_compound(text))

@@ -17,14 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import PhotoplanError, ResourceError, UsageError
 from photoplan.geometry.grid import Placement, Window
-from photoplan.io.cog import CogOptions, write_cog
 from photoplan.io.disk import disk_error, free_megabytes, sync_file, sync_folder
 from photoplan.io.gdal import GDAL_ERRORS, first_cause
 from photoplan.io.image_form import ImageForm, dress
 from photoplan.io.lock import FileLock
 from photoplan.io.plain_tiff import write_plain_tiff
 from photoplan.io.product_check import check_product
-from photoplan.io.storage import PRODUCT_TYPES, BlockCoder, Nodata, nodata_for
+from photoplan.io.storage import PRODUCT_TYPES, BlockCoder, CogOptions, Nodata, nodata_for, write_cog
 from photoplan.io.tile_log import TileLog
 
 _SAMPLES = 12

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,28 @@ from photoplan.io.checks import (
     raster_driver,
 )
 from photoplan.io.gdal import gdal_settings, open_raster, warnings_of_gdal
-from photoplan.io.png_chunks import check_png_complete
 from photoplan.io.tiff_layout import TiffLayout, read_tiff_layout
+
+
+def check_png_complete(path: Path) -> None:
+    """Follow the chunks to the end chunk; the decoder itself would deliver a cut-off picture without a word.
+
+    Raises
+    ------
+    InputError
+        If the file ends before its end chunk.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        position = 8
+        while position + 12 <= size:
+            file.seek(position)
+            length, kind = struct.unpack(">I4s", file.read(8))
+            position += 12 + length
+            if kind == b"IEND" and position <= size:
+                return
+    raise InputError(f"{path}: the PNG is cut off (its end chunk is missing, {size} bytes); get a fresh copy")
+
 
 _METRES = {"m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0}
 _METRES |= dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048)

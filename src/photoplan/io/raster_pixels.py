@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import os
 import re
-from functools import partial
+import tempfile
+import threading
+import zlib
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import rasterio.windows
@@ -15,12 +21,161 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io.checks import DRIVER_NAMES
-from photoplan.io.decoded import SEQUENTIAL, DecodedPicture, decoded_picture
-from photoplan.io.deflate_check import damaged_block
+from photoplan.io.disk import disk_error, write_all
 from photoplan.io.gdal import GDAL_ERRORS, all_causes, close_handles, damage_in, gdal_settings, handle, warnings_of_gdal
 from photoplan.io.raster_info import RasterInfo
-from photoplan.io.tiff_layout import read_tiff_layout
+from photoplan.io.tiff_layout import TiffLayout, read_tiff_layout
 from photoplan.io.validity import MissingBlocks, finite, not_nodata
+
+#: Codes of the two DEFLATE compressions of TIFF.
+_DEFLATE = (8, 32946)
+#: Bytes that are decoded at once while a block is checked.
+_PIECE = 1 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """The blocks of one file."""
+
+    layout: TiffLayout
+    todo: NDArray[np.bool_]
+    """Which blocks have not been checked, (planes, rows, columns). Two threads may check one block: no harm."""
+
+
+@lru_cache(maxsize=256)
+def _blocks(path: Path, mtime_ns: int, inode: int) -> _Blocks | None:
+    """State of a file as it is now; None if its blocks carry no checksum."""
+    layout = read_tiff_layout(path)
+    return _Blocks(layout, layout.present.copy()) if layout.compression in _DEFLATE else None
+
+
+def damaged_block(path: Path, window: Window) -> str | None:
+    """What is wrong with the first damaged block under a window of a TIFF; None if all are whole.
+
+    Each block is decoded once per process for this, and not kept. Files with another compression have no checksum and
+    pass.
+
+    Raises
+    ------
+    InputError
+        The directory of the file contradicts itself.
+    """
+    state = path.stat()
+    blocks = _blocks(path, state.st_mtime_ns, state.st_ino)
+    if blocks is None:
+        return None
+    layout = blocks.layout
+    width, height = layout.block
+    right, bottom = window.stop
+    rows, cols = slice(window.row // height, -(-bottom // height)), slice(window.col // width, -(-right // width))
+    todo = np.argwhere(blocks.todo[:, rows, cols]) + np.array([0, rows.start, cols.start])
+    if not len(todo):
+        return None
+    across, down = layout.grid
+    with path.open("rb") as file:
+        for plane, row, col in todo.tolist():
+            index = (plane * down + row) * across + col
+            file.seek(int(layout.offsets[index]))
+            if not _whole(file.read(int(layout.counts[index]))):
+                band = f" of band {plane + 1}" if layout.planar else ""
+                return f"the block at column {col * width}, row {row * height}{band} does not agree with its checksum"
+            blocks.todo[plane, row, col] = False
+    return None
+
+
+def _whole(stored: bytes) -> bool:
+    """Whether a zlib stream decodes to its end and agrees with its checksum."""
+    stream = zlib.decompressobj()
+    try:
+        piece = stream.decompress(stored, _PIECE)
+        while piece and not stream.eof:
+            piece = stream.decompress(stream.unconsumed_tail, _PIECE)
+    except zlib.error:
+        return False
+    return stream.eof
+
+
+SEQUENTIAL = ("JPEG", "PNG")
+"""Formats that are decoded from the top."""
+_KEPT = 2
+_CHUNK = 8 << 20
+
+
+class DecodedPicture:
+    """Pixels of a picture in a temporary file that has no name and ends with its last user.
+
+    Parameters
+    ----------
+    size
+        Width and height in pixels.
+    bands
+        Number of bands.
+    dtype
+        Type of the pixels.
+    read
+        Reads a window of whole rows, shape (bands, height, width).
+
+    Raises
+    ------
+    ResourceError
+        If the folder for temporary files is full.
+    """
+
+    def __init__(
+        self, size: tuple[int, int], bands: int, dtype: np.dtype[Any], read: Callable[[Window], NDArray[Any]]
+    ) -> None:
+        self._size, self._bands, self._dtype = size, bands, dtype
+        self._file: IO[bytes] = tempfile.TemporaryFile(prefix="photoplan-", buffering=0)  # noqa: SIM115
+        width, height = size
+        rows = max(1, _CHUNK // (width * bands * dtype.itemsize))
+        try:
+            for row in range(0, height, rows):
+                pixels = read(Window(0, row, width, min(rows, height - row)))
+                block = np.empty((pixels.shape[1], width, bands), dtype)
+                for band in range(bands):
+                    block[..., band] = pixels[band]
+                write_all(self._file.fileno(), block.data)
+        except OSError as error:
+            raise disk_error(Path(tempfile.gettempdir()) / "photoplan", error) from error
+
+    def read(self, window: Window) -> NDArray[Any]:
+        """Pixels of a window inside the picture, shape (bands, height, width)."""
+        pixel = self._bands * self._dtype.itemsize
+        block = np.empty((window.height, window.width, self._bands), self._dtype)
+        for i in range(window.height):
+            start = ((window.row + i) * self._size[0] + window.col) * pixel
+            os.preadv(self._file.fileno(), [block[i].data], start)
+        pixels = np.empty((self._bands, window.height, window.width), self._dtype)
+        for band in range(self._bands):
+            pixels[band] = block[..., band]
+        return pixels
+
+
+_lock = threading.Lock()
+_pictures: OrderedDict[tuple[Any, ...], DecodedPicture] = OrderedDict()
+_busy: dict[tuple[Any, ...], threading.Lock] = {}
+
+
+def decoded_picture(key: tuple[Any, ...], make: Callable[[], DecodedPicture]) -> DecodedPicture:
+    """The decoded picture of a key; made once, while other threads that want it wait.
+
+    The two used last are kept; one that falls out lives on until its readers are done.
+    """
+    with _lock:
+        busy = _busy.setdefault(key, threading.Lock())
+    with busy:
+        with _lock:
+            found = _pictures.get(key)
+            if found is not None:
+                _pictures.move_to_end(key)
+                return found
+        found = make()
+        with _lock:
+            _pictures[key] = found
+            while len(_pictures) > _KEPT:
+                _busy.pop(_pictures.popitem(last=False)[0], None)
+        return found
+
 
 _SMALL = 16 << 20
 """Decoded bytes up to which a picture is left to GDAL's block cache."""

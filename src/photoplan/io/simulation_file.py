@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, Strict
 
 from photoplan.io.camera.model import Entry, Number, Pair
-from photoplan.io.toml_entries import read_entries
+from photoplan.io.toml_file import read_entries
 
 #: A description with a table of defects for every element of a large sensor stays below.
 _MAX_BYTES = 20_000_000

@@ -15,9 +15,8 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io.chromatic_file import read_chromatic, write_chromatic
 from photoplan.io.raster import RasterReader
-from photoplan.project.aligned_reader import AlignedReader
-from photoplan.quality.colour.disc_displacements import disc_displacements
-from photoplan.quality.colour.discs import DiscSettings, find_discs
+from photoplan.project.restored_reader import AlignedReader
+from photoplan.quality.colour.discs import DiscSettings, disc_displacements, find_discs
 from photoplan.quality.colour.edge_displacements import edge_displacements
 from photoplan.quality.colour.model import BandModel, ChromaticModel, Displacements, fit_band
 from photoplan.quality.colour.patch_displacements import patch_displacements

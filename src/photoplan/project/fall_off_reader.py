@@ -12,14 +12,36 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.geometry.levels import reduced
+from photoplan.io.fall_off_file import read_fall_off_entry
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.raster import RasterReader
 from photoplan.plain import pick
 from photoplan.project.derived_reader import DerivedReader
-from photoplan.project.fall_off_correction import read_fall_off
 from photoplan.quality.camera.fall_off_model import FallOffModel, correct_fall_off, largest_gain
 from photoplan.quality.linearise import Linearisation
 from photoplan.quality.restoration.restorer import light_of
+
+
+def read_fall_off(path: Path) -> FallOffModel:
+    """The model of a correction file; `photoplan.quality.fall_off_model.correct_fall_off` applies it.
+
+    Raises
+    ------
+    InputError
+        The file cannot be used.
+    """
+    entry = read_fall_off_entry(path)
+    try:
+        return FallOffModel(
+            entry.size,
+            entry.principal_point_px,
+            entry.camera_constant_px,
+            tuple((term.n, term.m) for term in entry.terms),
+            tuple(term.coefficient for term in entry.terms),
+            entry.dark_dn,
+        )
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 @dataclass(frozen=True)

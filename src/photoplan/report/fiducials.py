@@ -12,8 +12,8 @@ from photoplan.orientation.marks.fiducials import FiducialResult, LocatedMark, M
 from photoplan.orientation.marks.layout import MarkLayout
 from photoplan.orientation.marks.measure import mark_window
 from photoplan.orientation.marks.search import Scan
-from photoplan.products.fiducials.result import ImageFiducials
-from photoplan.project.scan_image import ScanImage
+from photoplan.products.fiducials.run import ImageFiducials
+from photoplan.project.camera_marks import ScanImage
 from photoplan.report.drawing import png
 
 _ACROSS = 2

@@ -19,10 +19,9 @@ from photoplan.surfaces.mesh.lines import on_grid
 from photoplan.surfaces.mesh.thin import thin
 from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
 from photoplan.terrain.clean.borders import domain_of
-from photoplan.terrain.domain import Domain
 from photoplan.terrain.fit import Fit, each, fit
 from photoplan.terrain.observations import Observations, observe
-from photoplan.terrain.predict import predict_lines, predict_unit
+from photoplan.terrain.predict import Domain, predict_lines, predict_unit
 from photoplan.terrain.settings import BuildSettings
 
 #: Gaps are bridged up to twice this many spacings.

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from photoplan.events import SILENT, Events, Map
 from photoplan.kernels.patch_test import score_models, test_points
 from photoplan.surfaces.units import UnitLayout
-from photoplan.terrain.covariance import LADDER, Covariance, estimate_all, estimate_unit, ladder, near_lines
+from photoplan.terrain.covariance import LADDER, Covariance, Neighbours, estimate_all, estimate_unit, ladder, near_lines
 from photoplan.terrain.leaves import Leaves, quadtree
-from photoplan.terrain.neighbours import Neighbours
 from photoplan.terrain.observations import Observations
 from photoplan.terrain.settings import BuildSettings
 

@@ -8,8 +8,7 @@ from dataclasses import astuple, dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.cameras.lenses.inverse import newton_inverse
-from photoplan.cameras.lenses.polynomial import decentred, decentred_jacobian
+from photoplan.cameras.lenses.inverse import decentred, decentred_jacobian, newton_inverse
 from photoplan.errors import InputError
 
 

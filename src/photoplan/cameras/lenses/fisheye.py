@@ -8,7 +8,7 @@ from dataclasses import astuple, dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.cameras.lenses.radial import radial_jacobian
+from photoplan.cameras.lenses.inverse import radial_jacobian
 from photoplan.errors import InputError
 
 _ITERATIONS = 60

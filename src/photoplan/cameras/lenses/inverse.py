@@ -7,6 +7,45 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+
+def decentred(t: NDArray[np.float64], factor: NDArray[np.float64], p1: float, p2: float) -> NDArray[np.float64]:
+    """x·g + p1 (r² + 2x²) + 2 p2 x y and y·g + p2 (r² + 2y²) + 2 p1 x y, g = `factor` at t; shapes (..., 2)."""
+    out = t * factor[..., None]
+    if p1 or p2:
+        x, y = t[..., 0], t[..., 1]
+        # p1 (r² + 2x²) + 2 p2 x y = p1 r² + 2 x (p1 x + p2 y), and likewise for y.
+        r2 = x * x + y * y
+        s = 2.0 * (p1 * x + p2 * y)
+        out[..., 0] += p1 * r2 + s * x
+        out[..., 1] += p2 * r2 + s * y
+    return out
+
+
+def decentred_jacobian(
+    t: NDArray[np.float64], factor: NDArray[np.float64], slope: NDArray[np.float64], p1: float, p2: float
+) -> NDArray[np.float64]:
+    """Derivative of `decentred`, shape (..., 2, 2); `slope` = dg / d(r²)."""
+    x, y = t[..., 0], t[..., 1]
+    J = np.empty((*t.shape, 2))
+    J[..., 0, 0] = factor + 2.0 * x * x * slope + 6.0 * p1 * x + 2.0 * p2 * y
+    J[..., 1, 1] = factor + 2.0 * y * y * slope + 6.0 * p2 * y + 2.0 * p1 * x
+    J[..., 0, 1] = J[..., 1, 0] = 2.0 * (x * y * slope + p1 * y + p2 * x)
+    return J
+
+
+def radial_jacobian(
+    t: NDArray[np.float64], r: NDArray[np.float64], across: NDArray[np.float64], along: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Derivative of a radial mapping at t (..., 2) of radius r: r'/r across and dr'/dr along the radius."""
+    e = t / np.where(r > 0, r, 1.0)[..., None]
+    excess = along - across
+    J = np.empty((*t.shape, 2))
+    J[..., 0, 0] = across + excess * e[..., 0] * e[..., 0]
+    J[..., 1, 1] = across + excess * e[..., 1] * e[..., 1]
+    J[..., 0, 1] = J[..., 1, 0] = excess * e[..., 0] * e[..., 1]
+    return J
+
+
 #: What is left of the residual at a point that counts as solved, relative to 1 + |t|.
 PRECISION = 1e-12
 _ITERATIONS = 60

@@ -11,7 +11,7 @@ from pathlib import Path
 from photoplan.errors import InputError
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, common_losses, require_map
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
-from photoplan.io.prj_file import crs_beside
+from photoplan.io.plain_files import crs_beside
 from photoplan.io.project.model import ANGLE_UNITS
 from photoplan.io.table_lines import NUMBER
 from photoplan.io.tables import Columns, Dialect, Table, read_table

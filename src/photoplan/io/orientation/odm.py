@@ -25,8 +25,7 @@ from photoplan.io.camera import opensfm as camera_opensfm
 from photoplan.io.camera.model import FilmCamera, FrameCamera
 from photoplan.io.lens_forms import opencv_form
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, common_losses
-from photoplan.io.orientation.opensfm import rotation_from_axis_angle
-from photoplan.io.orientation.opensfm_write import axis_angle
+from photoplan.io.orientation.opensfm import axis_angle, rotation_from_axis_angle
 from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.plain_files import finite, read_json
 

@@ -20,7 +20,7 @@ from photoplan.io.series.model import CONDITIONS, CameraFacts, FramesEntry, Seri
 from photoplan.io.series.names import Values, find_files, number_of_time, read_conditions
 from photoplan.io.series.positions import MeasuredPositions, read_positions
 from photoplan.io.series.statistics import ReducedPoint, read_statistics
-from photoplan.io.toml_entries import read_entries
+from photoplan.io.toml_file import read_entries
 
 #: A series of a hundred thousand frames is far below this.
 _MAX_BYTES = 20_000_000

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.io.prj_file import crs_beside
+from photoplan.io.plain_files import crs_beside
 from photoplan.io.table_lines import line_blocks
 from photoplan.io.tables import Layout
 from photoplan.io.terrain.columns import Block, parse_block, points_layout

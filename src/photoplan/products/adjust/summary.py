@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import height_label
-from photoplan.io.adjusted_points import PointLayer
+from photoplan.io.geopackage import PointLayer
 from photoplan.io.project.model import ANGLE_UNITS
 from photoplan.orientation.bundle.block import AdjustSettings
 from photoplan.orientation.check_points import CheckAccuracy, check_accuracy

@@ -8,10 +8,9 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.io.series.pixels import Plane
-from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.common import Run, black_of, exposure_runs, prefix, tried
 from photoplan.products.characterise.data import SeriesData
-from photoplan.products.characterise.result import Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
 from photoplan.quality.camera.blooming import Blooming, find_blooming
 
 _LEAST = 4

@@ -8,10 +8,9 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.io.series.pixels import Plane
-from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.common import MOST_SATURATED, prefix, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
 from photoplan.quality.camera.dark_signal import DarkCurrent, dark_current, doubling_temperature
 from photoplan.quality.camera.frame_statistics import Level
 

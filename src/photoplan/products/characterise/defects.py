@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.series.pixels import Plane
-from photoplan.products.characterise.charts import Chart, Curve, Picture, shrunk
 from photoplan.products.characterise.common import MOST_SATURATED, prefix, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Picture, Table, joined, shrunk
 from photoplan.quality.camera.defects import Defect, DefectList, find_blinking, find_defects, find_lines, log_histogram
 from photoplan.quality.camera.frame_statistics import FrameStack
 from photoplan.quality.camera.photon_transfer import is_clipped_dark

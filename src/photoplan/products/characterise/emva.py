@@ -12,10 +12,9 @@ from photoplan.io.series.pixels import Plane
 from photoplan.io.series.statistics import ReducedPoint
 from photoplan.products.characterise import dark as characterise_dark
 from photoplan.products.characterise import pattern as characterise_pattern
-from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.common import Run, exposure_runs, of_one_temperature, prefix, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
 from photoplan.products.characterise.transfer import reduced_level
 from photoplan.quality.camera.dark_signal import dark_current
 from photoplan.quality.camera.emva import EmvaPoints, EmvaSheet, emva_sheet

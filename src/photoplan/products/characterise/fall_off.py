@@ -13,11 +13,10 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.fall_off_file import FallOffEntry, TermEntry, fall_off_text
 from photoplan.io.series.pixels import Plane
-from photoplan.products.characterise.charts import Chart, Curve, Picture
 from photoplan.products.characterise.common import black_of, of_one_temperature
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.groups import FrameGroup
-from photoplan.products.characterise.result import Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Picture, Table, joined
 from photoplan.quality.camera.fall_off import FallOff, fit_fall_off
 from photoplan.quality.camera.fall_off_adjust import FallOffSettings
 from photoplan.quality.camera.fall_off_model import FallOffModel, gain_image

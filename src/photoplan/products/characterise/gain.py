@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
-from photoplan.products.characterise.result import Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
 from photoplan.quality.camera.approach import LEAST_VALUES
 from photoplan.quality.camera.gain_control import GainControl, compare_transitions, gain_control
 

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.series.pixels import Plane
-from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.common import (
     MOST_SATURATED,
     Run,
@@ -20,7 +19,7 @@ from photoplan.products.characterise.common import (
     tried,
 )
 from photoplan.products.characterise.data import SeriesData
-from photoplan.products.characterise.result import Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
 from photoplan.quality.camera.frame_statistics import Level, check_level
 from photoplan.quality.camera.linearity import HIGH, Linearity, linearity
 from photoplan.quality.camera.photon_transfer import is_clipped_dark

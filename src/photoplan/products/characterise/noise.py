@@ -6,10 +6,9 @@ from math import sqrt
 
 import numpy as np
 
-from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.common import prefix
 from photoplan.products.characterise.data import SeriesData
-from photoplan.products.characterise.result import Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
 from photoplan.quality.camera.frame_statistics import Level
 
 #: What stands still: between frames of other kinds the scene or its brightness changes.

@@ -10,10 +10,9 @@ import numpy as np
 from photoplan.errors import InputError
 from photoplan.io.series.pixels import Plane
 from photoplan.plain import plain
-from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.common import black_of, of_one_temperature, prefix, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
 from photoplan.quality.camera.fixed_pattern import (
     PatternVariance,
     Spectrogram,

@@ -3,23 +3,88 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import isfinite
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.disk import write_atomically
 from photoplan.io.product import check_output
 from photoplan.io.series.file import Series, read_series
+from photoplan.io.series.pixels import Plane, grey_step, largest_of_steps
 from photoplan.io.tables import write_table
 from photoplan.io.whole_image import write_whole_image
 from photoplan.plain import pick, plain
+from photoplan.products.characterise.common import Run, black_if_known, exposure_runs
 from photoplan.products.characterise.data import SeriesData
-from photoplan.products.characterise.full_well import full_well_notes, with_full_wells
 from photoplan.products.characterise.registry import ANALYSES, Analysis
 from photoplan.products.characterise.result import Figure, Outcome, Table
-from photoplan.products.characterise.steps import step_notes, with_grey_step
+from photoplan.quality.camera.saturation import FullWell, find_saturation, full_well
+
+_LEAST = 4
+#: Share of samples at the largest grey value from which on that is what stops them.
+_MOSTLY = 0.5
+
+
+def with_full_wells(data: SeriesData) -> SeriesData:
+    """The same series with the grey values of full elements, where its flat frames show them; reads those frames."""
+    wells: dict[str, FullWell] = {}
+    for run in exposure_runs(data, ("flat",), _LEAST):
+        for plane in data.planes:
+            found = _find(data, run, plane)
+            if found is not None and (plane.name not in wells or found.level_dn < wells[plane.name].level_dn):
+                wells[plane.name] = found
+    return replace(data, wells=wells) if wells else data
+
+
+def full_well_notes(data: SeriesData) -> tuple[str, ...]:
+    """What to tell of them."""
+    largest = data.series.saturation_dn
+    below = f", below the largest grey value {largest:g}" if isfinite(largest) else ""
+    return tuple(
+        f"{f'{name}: ' if name else ''}the sensor is full at {well.level_dn:.4g} DN{below}: "
+        f"samples from {well.least_dn:.4g} DN on count as saturated"
+        for name, well in data.wells.items()
+    )
+
+
+def _find(data: SeriesData, run: Run, plane: Plane) -> FullWell | None:
+    levels = [data.levels(setting)[plane.name] for setting in run.settings]
+    variance = np.array([level.temporal_variance for level in levels])
+    try:
+        found = find_saturation(
+            run.values,
+            [level.mean for level in levels],
+            black_if_known(data, run.settings[0], plane),
+            [level.saturated_share for level in levels],
+            variance if np.isfinite(variance).all() else None,
+        )
+    except InputError:  # every level is cut off at the largest grey value: told by the analyses themselves
+        return None
+    if found is None or found.rule == "clipping" or levels[-1].saturated_share >= _MOSTLY:
+        return None
+    stack = data.stacks(run.settings[-1])[plane.name]
+    seen = stack.mean if stack.counted is None else stack.mean[stack.counted]
+    return full_well(seen, stack.level.temporal_variance, data.step)
+
+
+def with_grey_step(data: SeriesData) -> SeriesData:
+    """The same series with the distance of its grey values; reads a small part of some frames."""
+    series, step = data.series, grey_step(data.series)
+    stated = series.camera.saturation_dn is not None
+    largest = series.saturation_dn if stated else largest_of_steps(series.saturation_dn, step)
+    return replace(data, series=replace(series, saturation_dn=largest), step=step)
+
+
+def step_notes(data: SeriesData) -> tuple[str, ...]:
+    """What to tell of them."""
+    if data.step < 2:
+        return ()
+    return (f"grey values come in steps of {data.step:g} DN: rounding is taken as that coarse",)
 
 
 @dataclass(frozen=True)

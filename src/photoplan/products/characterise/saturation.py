@@ -7,10 +7,9 @@ from math import isfinite, nan
 import numpy as np
 
 from photoplan.io.series.pixels import Plane
-from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.common import MOST_SATURATED, Run, black_if_known, exposure_runs, prefix, tried
 from photoplan.products.characterise.data import SeriesData
-from photoplan.products.characterise.result import Figure, Outcome, joined
+from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, joined
 from photoplan.quality.camera.frame_statistics import check_level
 from photoplan.quality.camera.saturation import find_saturation
 

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
-from photoplan.products.characterise.result import Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
 from photoplan.products.characterise.targets import locate_targets
 from photoplan.quality.camera.stage import LEAST_POINTS, StageCalibration, b4_lines, stage_calibration
 

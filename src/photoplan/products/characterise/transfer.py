@@ -6,10 +6,9 @@ import numpy as np
 
 from photoplan.io.series.pixels import Plane
 from photoplan.io.series.statistics import ReducedPoint
-from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.common import dark_levels, prefix, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
 from photoplan.quality.camera.frame_statistics import Level
 from photoplan.quality.camera.photon_transfer import PhotonTransfer, photon_transfer
 

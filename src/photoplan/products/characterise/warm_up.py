@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.series.positions import MeasuredPositions
-from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
-from photoplan.products.characterise.result import Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
 from photoplan.products.characterise.targets import locate_targets
 from photoplan.quality.camera.approach import LEAST_VALUES
 from photoplan.quality.camera.warm_up import Course, WarmUp, warm_up

@@ -11,12 +11,11 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.series.file import Frame
 from photoplan.io.series.pixels import Plane, plane_pixels
-from photoplan.products.characterise.charts import Chart, Curve
 from photoplan.products.characterise.common import black_of, prefix, saturation_of, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
 from photoplan.quality.camera.frame_statistics import Level, StackSums
-from photoplan.quality.camera.grey_wedge import GreyWedge, grey_wedge
+from photoplan.quality.camera.straight_line import GreyWedge, grey_wedge
 
 _LEAST = 3
 

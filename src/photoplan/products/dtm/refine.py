@@ -22,9 +22,8 @@ from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
 from photoplan.io.terrain.model_tables import ModelHeader, empty_figures, input_facts
 from photoplan.io.terrain.model_write import ModelParts, ModelWriter
 from photoplan.plain import pick
-from photoplan.surfaces.memory_units import unit_range
 from photoplan.surfaces.refined_units import LinedUnits, refine_units
-from photoplan.surfaces.units import LineElement, Unit, UnitFigures
+from photoplan.surfaces.units import LineElement, Unit, UnitFigures, unit_range
 
 
 @dataclass(frozen=True)

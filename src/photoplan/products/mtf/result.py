@@ -18,7 +18,7 @@ from photoplan.quality.edges.groups import CombinedValue, GaussianFit
 from photoplan.quality.edges.koelbl import spread_of_edge
 from photoplan.quality.edges.response import EdgeMeasurement
 from photoplan.quality.mtf_curve import MtfCurve
-from photoplan.quality.restoration.filter_design import point_spread
+from photoplan.quality.restoration.design import point_spread
 from photoplan.quality.spread import SpreadFunction
 
 #: Of a measured edge, in JSON under their own names.

@@ -240,17 +240,15 @@ def read_plan(path: Path | str) -> tuple[OrthoPlan, Path]:
         if changed:
             raise InputError(
                 f"{path}: inputs have changed since the plan was written ({', '.join(changed)}); make the plan again "
-                "with `photoplan ortho --plan`"
+                "with `photoplan ortho`"
             )
         counts = [int(entry["tiles"]) for entry in header["products"]]
         chosen = [_with_tiles(product, tiles, count) for product, count in zip(products, counts)]
         plan = OrthoPlan(project, settings, tuple(p for p in chosen if p.plan.tiles), tuple(header["blind"]))
     except (KeyError, TypeError, ValueError, UsageError) as error:
-        raise InputError(
-            f"{path}: the plan is damaged ({error}); make it again with `photoplan ortho --plan`"
-        ) from error
+        raise InputError(f"{path}: the plan is damaged ({error}); make it again with `photoplan ortho`") from error
     if not plan.products:
-        raise InputError(f"{path}: the plan has no tiles left; make it again with `photoplan ortho --plan`")
+        raise InputError(f"{path}: the plan has no tiles left; make it again with `photoplan ortho`")
     return plan, (path.resolve().parent / header["output"]).resolve()
 
 

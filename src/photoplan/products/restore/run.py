@@ -28,11 +28,10 @@ from photoplan.plain import pick
 from photoplan.products.chromatic import load_chromatic, measured_once, model_figures
 from photoplan.products.restore.execute import Job, RestoredImage, earlier_result, memory_of_a_tile, restoration
 from photoplan.products.restore.request import RestoreRequest
-from photoplan.project.aligned_reader import AlignedReader
 from photoplan.project.fall_off_reader import FallOffFile, FallOffReader, load_fall_off
 from photoplan.project.filter_files import entries_of, load_filter
 from photoplan.project.linearisation import linearisation_of
-from photoplan.project.restored_reader import RestoredReader, Source, kept_nodata, restored_reader
+from photoplan.project.restored_reader import AlignedReader, RestoredReader, Source, kept_nodata, restored_reader
 from photoplan.quality.colour.model import ChromaticModel
 from photoplan.quality.linearise import Linearisation
 from photoplan.quality.restoration.filters import RestorationFilter

@@ -23,8 +23,7 @@ from photoplan.matching.features import FeatureSettings, opencv
 from photoplan.matching.grey import Grey, ReducedImage
 from photoplan.matching.loops import Loops, close_loops
 from photoplan.matching.refine import Refined, RefineSettings, reference_points, refine_tracks
-from photoplan.matching.thin import thin_tracks
-from photoplan.matching.tracks import Tracks, TracksFound, build_tracks, connected_parts
+from photoplan.matching.tracks import Tracks, TracksFound, build_tracks, connected_parts, thin_tracks
 from photoplan.matching.verify import PairMatches, VerifySettings
 from photoplan.plain import pick
 from photoplan.products.init.match import some

@@ -17,8 +17,7 @@ from photoplan.adjustment.linear import solve
 from photoplan.errors import InputError
 from photoplan.quality.patterns.pixels import MOST_CLIPPED, pattern_window
 from photoplan.quality.patterns.usaf_bars import ThreeBars, measure_three, place_pair
-from photoplan.quality.patterns.usaf_find import UsafPlace, find_usaf
-from photoplan.quality.patterns.usaf_layout import UsafElement, usaf_frequency, usaf_layout
+from photoplan.quality.patterns.usaf_find import UsafElement, UsafPlace, find_usaf, usaf_frequency, usaf_layout
 
 Array = NDArray[np.float64]
 

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.quality.patterns.pixels import least_squares
-from photoplan.quality.patterns.usaf_find import UsafPlace
-from photoplan.quality.patterns.usaf_layout import HALF, UsafElement
+from photoplan.quality.patterns.usaf_find import HALF, UsafElement, UsafPlace
 
 Array = NDArray[np.float64]
 

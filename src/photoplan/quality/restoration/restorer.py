@@ -12,11 +12,9 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.convolve import round_clipped
 from photoplan.quality.linearise import Linearisation
-from photoplan.quality.restoration.borders import Margin
-from photoplan.quality.restoration.convolution import Convolution, limits_of
+from photoplan.quality.restoration.borders import Convolution, Margin, Scratch, limits_of
 from photoplan.quality.restoration.field_weights import field_weights
 from photoplan.quality.restoration.filters import RestorationFilter
-from photoplan.quality.restoration.scratch import Scratch
 
 _SCRATCH = Scratch()
 

@@ -16,7 +16,7 @@ from photoplan.geometry.grid import MapGrid
 from photoplan.report.dtm.covariance import CovarianceTest, covariance_test
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.measured import MeasuredTerrain
-from photoplan.surfaces.memory_units import MemoryUnits
+from photoplan.surfaces.units import MemoryUnits
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.build import Built
 from photoplan.terrain.clean.run import Finding
