@@ -33,8 +33,8 @@ from photoplan.plan.product import ProductPlan, Tile
 from photoplan.surfaces.base import Surface
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
-from photoplan.surfaces.units import MemoryUnits
 from photoplan.surfaces.raster import RasterSurface
+from photoplan.surfaces.units import MemoryUnits
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.build import Built, build_terrain, plan_build
 from photoplan.terrain.clean.run import clean
