@@ -13,7 +13,6 @@ from tools.small_block import FOCAL, NAMES, SIZE, X0, Y0, YAML, Z0, Block, make_
 from photoplan.cameras.base import project
 from photoplan.errors import GeometryError, UsageError
 from photoplan.io.project.file import load_project
-from photoplan.plan.coverage import cover
 from photoplan.products.orthophoto.execution import Run, execute
 from photoplan.products.orthophoto.plan import mean_gsd, plan_orthophotos, render, two_figures
 from photoplan.project.scene import open_scene
@@ -172,7 +171,7 @@ class TestPlan:
         alone(small, np.zeros((1, SIZE[1], SIZE[0]), np.uint8), (0, 0, 15))
         project = load_project(small.project)
         scene = open_scene(project, "one")
-        gsd = mean_gsd(scene.camera, cover(scene.camera, scene.surface, scene.terrain_bounds))
+        gsd = mean_gsd(scene.camera, scene.footprint)
         assert gsd == pytest.approx((Z0 - 100) / FOCAL, rel=1e-9)
         assert plan_orthophotos(project).settings.resolution == 1.5
 

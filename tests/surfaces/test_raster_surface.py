@@ -118,11 +118,10 @@ def test_terrain_in_another_crs_lies_where_its_own_coordinates_say() -> None:
 
 
 def test_far_heights_are_read_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same heights and the same range when a look may read a few posts at once only."""
+    """The same heights when a look may read a few posts at once only."""
     s = surface()
     XY = np.random.default_rng(3).uniform((500_000, 5_299_640), (500_720, 5_300_000), (300, 2))
-    bounds = (500_010, 5_299_700, 500_700, 5_299_990)
-    heights, span = s.heights(XY), s.height_range(bounds)
+    heights = s.heights(XY)
     sizes: list[int] = []
     read = Posts.read
 
@@ -132,10 +131,38 @@ def test_far_heights_are_read_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(Posts, "read", watched)
     monkeypatch.setattr("photoplan.surfaces.raster.MOST_POSTS", 40)
-    monkeypatch.setattr("photoplan.surfaces.raster.PART", 6)
     np.testing.assert_array_equal(s.heights(XY), heights)
-    assert s.height_range(bounds) == span
     assert len(sizes) > 20 and max(sizes) <= 40
+
+
+def test_ranges_are_read_in_parts_once_and_where_they_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(4)
+    heights = rng.normal(0, 10, (90, 130)).astype(np.float32)
+    heights[rng.random(heights.shape) < 0.3] = np.nan
+    heights[16:48, 32:64] = np.nan
+    read_windows: list[Window] = []
+    read = Posts.read
+
+    def watched(self: Posts, window: Window) -> NDArray[np.float32]:
+        read_windows.append(window)
+        return read(self, window)
+
+    monkeypatch.setattr(Posts, "read", watched)
+    small, large = (RasterSurface(Posts(heights), (0, 0), (1, 1), part=(side, side)) for side in (16, 1000))
+    low, high = np.sort(rng.uniform((-20, -100), (140, 20), (2, 60, 2)), axis=0)
+    boxes = np.concatenate([low, high], axis=1)
+    found = small.height_range(boxes[:1])
+    touched = len(read_windows)
+    assert max(w.size for w in read_windows) <= 256 and len(set(read_windows)) == touched
+    found = np.concatenate([found, small.height_range(boxes[1:])])
+    assert len(set(read_windows)) == len(read_windows) > touched
+    np.testing.assert_array_equal(found, large.height_range(boxes))
+    assert len(read_windows[-1:]) == 1 and read_windows[-1] == Window(0, 0, 130, 90)
+    for (x0, y0, x1, y1), (lowest, highest) in zip(boxes, found):
+        inside = small.heights(rng.uniform((x0, y0), (x1, y1), (200, 2)))
+        inside = inside[np.isfinite(inside)]
+        assert not len(inside) or lowest <= inside.min() <= inside.max() <= highest
+    assert np.isnan(small.height_range((34, -44, 45, -20))).all()
 
 
 def test_only_map_targets_and_north_up_grids() -> None:

@@ -1,1 +1,1 @@
-"""Products before their pixels: anchors, tiles, coverage."""
+"""Products before their pixels: anchors, tiles, footprints."""

@@ -126,10 +126,10 @@ def monoplot_file(request: MonoplotRequest) -> MonoplotReport:
         tuple(float(a) for a in angle_in_radians(np.array(request.sigma_angles), unit)),  # type: ignore[arg-type]
         _axes(pose.R_ground_camera, project.orientation.rotation),
     )
-    height_range = scene.surface.height_range(scene.terrain_bounds)
-    found = monoplot(scene.camera, given.xy, scene.surface, height_range, errors, mesh)
+    seen = scene.footprint
+    found = monoplot(scene.camera, given.xy, scene.surface, seen.height_range, errors, mesh)
     if (found.reasons != "").all():
-        bounds = " ".join(f"{v:.8g}" for v in scene.terrain_bounds)
+        bounds = "nowhere" if seen.bounds is None else " ".join(f"{v:.8g}" for v in seen.bounds)
         center = " ".join(f"{v:.8g}" for v in scene.camera.center)
         notes.append(f"no point is on the ground; camera at {center}, terrain in its reach {bounds}")
     _write_table(request.output, given, found)

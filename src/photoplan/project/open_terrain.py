@@ -106,5 +106,5 @@ def _open_raster(path: Path, crs: str | None, option: str) -> OpenTerrain:
         raise InputError(f"{path}: the grid is rotated or not north-up; bring it north-up with gdalwarp first")
     columns, rows = info.size
     bounds = (x0 - xx / 2, y0 + yy * (rows - 0.5), x0 + xx * (columns - 0.5), y0 - yy / 2)
-    surface = RasterSurface(reader, (x0, y0), (xx, -yy))
+    surface = RasterSurface(reader, (x0, y0), (xx, -yy), part=reader.block)
     return OpenTerrain(info.path, surface, bounds, found, info.vertical_crs, min(xx, -yy))

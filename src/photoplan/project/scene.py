@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +23,15 @@ from photoplan.io.names import resolve_input
 from photoplan.io.orientation.table import angle_in_radians
 from photoplan.io.project.cameras import interior_of, lens_of
 from photoplan.io.project.file import parse_project
-from photoplan.io.project.model import Image, Project, Terrain
+from photoplan.io.project.model import Image, Project
+from photoplan.io.project.model import Terrain as StatedTerrain
 from photoplan.io.raster import RasterReader
+from photoplan.plan.footprint import Footprint, footprint
 from photoplan.project.filter_files import load_filter
 from photoplan.project.linearisation import linearisation_of
 from photoplan.project.open_terrain import open_terrain
-from photoplan.project.reach import reach
 from photoplan.project.restored_reader import RestoredReader, restored_reader
-from photoplan.surfaces.base import Surface
+from photoplan.surfaces.base import Terrain
 from photoplan.surfaces.level import LevelSurface
 from photoplan.surfaces.shifted import ShiftedSurface
 
@@ -82,7 +83,7 @@ class SceneAddress:
 class Ground:
     """The terrain of a project, in the project's CRS and the orientation's height system."""
 
-    surface: Surface
+    surface: Terrain
     bounds: tuple[float, float, float, float] | None
     """Outer edges xmin, ymin, xmax, ymax; None: everywhere."""
     file: Path | None
@@ -100,12 +101,15 @@ class Scene:
     """One image with its camera and the ground below it."""
 
     camera: CentralCamera
-    surface: Surface
-    terrain_bounds: tuple[float, float, float, float]
-    """Where the surface can be seen from this camera at all."""
+    surface: Terrain
     reader: RasterReader | RestoredReader
     ground: Ground
     address: SceneAddress
+
+    @cached_property
+    def footprint(self) -> Footprint:
+        """What the image sees of the ground."""
+        return footprint(self.camera, self.surface, self.ground.bounds)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -189,7 +193,7 @@ def _open(address: SceneAddress) -> Scene:
     ground = ground_of(project)
     reader = _reader(project, image)
     camera = _camera(project, image, ground, reader.size)
-    return Scene(camera, ground.surface, reach(camera, ground.surface, ground.bounds), reader, ground, address)
+    return Scene(camera, ground.surface, reader, ground, address)
 
 
 def _reader(project: Project, image: Image) -> RasterReader | RestoredReader:
@@ -207,7 +211,7 @@ def _reader(project: Project, image: Image) -> RasterReader | RestoredReader:
 class _GroundAddress:
     """What decides the ground of a project; hashable."""
 
-    terrain: Terrain
+    terrain: StatedTerrain
     orientation_system: str | None
     to_ellipsoid: bool
     crs: str

@@ -1,4 +1,4 @@
-"""What every surface can do."""
+"""What every surface can do, and what terrain can do beyond that."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.geometry.grid import Window
+from photoplan.surfaces.rays import Hits
 from photoplan.targets.base import Target
 
 
@@ -18,10 +19,39 @@ class Surface(Protocol):
         """Depth h of every pixel centre of `window`, shape (height, width), metres; NaN where there is no surface."""
         ...
 
-    def height_range(self, bounds: tuple[float, float, float, float]) -> tuple[float, float]:
-        """Lowest and highest height inside map `bounds`; NaN, NaN where there is no surface."""
-        ...
+
+class Terrain(Surface, Protocol):
+    """A surface over the map whose heights can be asked for, and that rays can be followed to."""
 
     def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
-        """Height at map points (..., 2), shape (...); NaN where there is no surface."""
+        """Height at map points (..., 2), shape (...), metres; NaN where there is no surface."""
+        ...
+
+    def height_range(self, bounds: ArrayLike) -> NDArray[np.float64]:
+        """Lower and upper bound of the heights inside map bounds xmin, ymin, xmax, ymax (..., 4), shape (..., 2).
+
+        Never narrower than the surface inside; cheap for many boxes and when asked again. NaN, NaN where there is no
+        surface.
+        """
+        ...
+
+    def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
+        """Where rays first come down onto the surface, from above it.
+
+        Parameters
+        ----------
+        paths : array_like, shape (n, k, 3)
+            Points X, Y, Z of each ray, straight in between, k ≥ 2, in any direction; a curved ray has more points. A
+            ray with NaN meets nothing.
+        bend : float
+            What a ray rises above its pieces, per squared distance on the map from the first point of its path, 1/m: a
+            level ray over a round earth (less what refraction takes of it).
+
+        Returns
+        -------
+        Hits
+            Exact over bilinear meshes and triangles. Places without surface let rays through; a ray that gets below the
+            surface, because it starts there or through such a place, goes on until it has come out above it. Where the
+            surface has a step the ray may end on the wall; a ray along a wall sees the heights left of the line.
+        """
         ...

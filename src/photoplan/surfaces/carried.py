@@ -60,3 +60,20 @@ def _between_nodes(nodes: NDArray[np.float64], at_u: NDArray[np.int64], at_v: ND
     t = ((v - at_v[upper]) / span)[:, None, None]
     full[:] = columns[upper] * (1 - t) + columns[lower] * t
     return full
+
+
+def box_points(
+    boxes: NDArray[np.float64], carry: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None
+) -> NDArray[np.float64]:
+    """Points whose bounds hold the boxes xmin, ymin, xmax, ymax (n, 4) in other coordinates, shape (n, k, 2).
+
+    Without `carry` these are two corners. Else they are a lattice over each box, and the same widened by a part in a
+    hundred: edges bend between its points.
+    """
+    if carry is None:
+        return boxes.reshape(-1, 2, 2)
+    part = np.linspace(-0.01, 1.01, 9)
+    x = boxes[:, None, None, 0] + part[None, None, :] * (boxes[:, 2] - boxes[:, 0])[:, None, None]
+    y = boxes[:, None, None, 1] + part[None, :, None] * (boxes[:, 3] - boxes[:, 1])[:, None, None]
+    lattice = np.stack(np.broadcast_arrays(x, y), axis=-1).reshape(len(boxes), 81, 2)
+    return carry(lattice) if len(boxes) else lattice

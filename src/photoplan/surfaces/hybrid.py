@@ -11,9 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
+from photoplan.kernels.extent import height_ranges
 from photoplan.kernels.hybrid import sample_hybrid, scan_faces
 from photoplan.kernels.sample_grid import sample_lattice
-from photoplan.surfaces.carried import carried_positions
+from photoplan.surfaces.carried import box_points, carried_positions
+from photoplan.surfaces.rays import NO_FACES, Hits, Part, carried_hits
 from photoplan.surfaces.units import MeshFaces, Unit, UnitSource
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
@@ -60,30 +62,25 @@ class HybridSurface:
         """
         return self._values(XY, "sigmas")
 
-    def height_range(self, bounds: tuple[float, float, float, float]) -> tuple[float, float]:
-        """Lowest and highest height of the units that `bounds` touches: never narrower than the surface inside.
-
-        NaN, NaN where there is no surface.
-        """
-        xmin, ymin, xmax, ymax = bounds
-        edge = np.linspace(0, 1, 9)
-        XY = np.stack(np.meshgrid(xmin + edge * (xmax - xmin), ymin + edge * (ymax - ymin)), axis=-1)
-        if self.to_model_crs is not None:
-            XY = self.to_model_crs(XY)
-            # The edges of the bounds may bend between the nine points.
-            XY = np.concatenate([XY, XY + (XY - XY.mean(axis=(0, 1))) * 0.01])
+    def height_range(self, bounds: ArrayLike) -> NDArray[np.float64]:
+        """Bounds of the units that map bounds (..., 4) touch, shape (..., 2); NaN, NaN where there is no surface."""
+        boxes = np.asarray(bounds, float)
+        XY = box_points(boxes.reshape(-1, 4), self.to_model_crs)
         layout = self.source.layout
-        at = np.stack([XY[..., 0] - layout.left, layout.top - XY[..., 1]], axis=-1).reshape(-1, 2) / layout.side
-        if not np.isfinite(at).any():
-            return np.nan, np.nan
-        first = np.floor(np.nanmin(at, axis=0) - ON_BORDER)
-        last = np.floor(np.nanmax(at, axis=0) + ON_BORDER)
-        col0, row0 = np.clip(first, 0, [layout.columns, layout.rows]).astype(int)
-        col1, row1 = np.clip(last + 1, 0, [layout.columns, layout.rows]).astype(int)
-        part = self.source.ranges[row0:row1, col0:col1]
-        if not np.isfinite(part).any():
-            return np.nan, np.nan
-        return float(np.nanmin(part[..., 0])), float(np.nanmax(part[..., 1]))
+        at = (XY - (layout.left, layout.top)) / (layout.side, -layout.side)
+        low = np.floor(np.fmin.reduce(at, axis=1) - ON_BORDER)
+        high = np.floor(np.fmax.reduce(at, axis=1) + ON_BORDER) + 1
+        there = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1)
+        units = np.where(there[:, None], np.concatenate([low, high], axis=1), 0)
+        units = np.clip(units, 0, np.tile([layout.columns, layout.rows], 2)).astype(np.int32)
+        ranges = self.source.ranges
+        out = np.stack([height_ranges(np.ascontiguousarray(ranges[..., k]), units)[:, k] for k in (0, 1)], axis=-1)
+        out[np.isinf(out)] = np.nan
+        return out.reshape(*boxes.shape[:-1], 2)
+
+    def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
+        """Where rays first come down onto the surface; see `Terrain.first_hit`."""
+        return carried_hits(HybridParts(self), np.asarray(paths, float), self.to_model_crs, bend)
 
     def _values(self, XY: ArrayLike, layer: Layer) -> NDArray[np.float64]:
         XY = np.asarray(XY, float)
@@ -243,3 +240,42 @@ def _no_faces(meshes: int) -> MeshFaces:
     return MeshFaces(
         np.empty((0, 3)), np.empty(0, np.float32), np.empty((0, 3), np.int32), np.zeros(meshes * meshes + 1, np.int64)
     )
+
+
+@dataclass(frozen=True, eq=False)
+class HybridParts:
+    """A hybrid model in parts for rays: its units."""
+
+    surface: HybridSurface
+
+    @property
+    def corner(self) -> tuple[float, float]:
+        """X, Y of the upper-left corner of the first unit."""
+        layout = self.surface.source.layout
+        return layout.left, layout.top
+
+    @property
+    def step(self) -> tuple[float, float]:
+        """Side of a unit, twice, metres."""
+        return self.surface.source.layout.side, self.surface.source.layout.side
+
+    @property
+    def inside(self) -> tuple[float, float, float, float]:
+        """Outer edges of the units."""
+        return self.surface.source.layout.bounds
+
+    def ranges(self, window: Window) -> NDArray[np.float64]:
+        """Bounds of units, shape (height, width, 2)."""
+        return self.surface.source.ranges[window.row : window.stop[1], window.col : window.stop[0]]
+
+    def part(self, column: int, row: int) -> Part | None:
+        """A unit; None if it is empty."""
+        unit = self.surface.source.unit(column, row)
+        if unit is None:
+            return None
+        faces = NO_FACES if unit.faces is None else (*_plain(unit.faces, "heights", unit.datum), _frame(unit))
+        return Part((unit.left, unit.top), (unit.width, unit.width), unit.heights, unit.datum, faces)
+
+    def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
+        """Heights at points of the model's CRS."""
+        return self.surface._at(np.asarray(XY, float), "heights")

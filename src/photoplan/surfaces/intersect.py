@@ -1,147 +1,77 @@
-"""Image points onto a surface."""
+"""Image points onto terrain."""
 
 from __future__ import annotations
-
-import itertools
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import CentralCamera
-from photoplan.surfaces.base import Surface
-from photoplan.surfaces.hybrid import HybridSurface
-from photoplan.surfaces.profile import profile
-from photoplan.surfaces.raster import RasterSurface
+from photoplan.surfaces.base import Terrain
+
+#: A curved ray is followed along chords that it leaves by less than this, metres …
+CURVED = 1e-4
+#: … of which there are at most so many.
+MOST_CHORDS = 64
+#: What is looked through above and below the heights of the terrain, metres.
+_MARGIN = 0.01
 
 
 def intersect(
-    camera: CentralCamera,
-    xy: ArrayLike,
-    surface: Surface,
-    height_range: tuple[float, float],
-    steps: int = 64,
-    precision: float = 1e-4,
+    camera: CentralCamera, xy: ArrayLike, terrain: Terrain, height_range: tuple[float, float]
 ) -> NDArray[np.float64]:
-    """First point of the surface that each image ray meets, coming from the camera.
+    """First point of the terrain that each image ray meets, coming from the camera.
+
+    No ridge and no wall is missed, however thin: where the ray meets the face of a wall, the point lies on it.
 
     Parameters
     ----------
     camera : CentralCamera
     xy : array_like, shape (n, 2)
         Image points in pixels.
-    surface : Surface
-    height_range : (float, float)
-        Heights between which the surface is looked for, metres.
-    steps : int
-        Levels at which the ray is compared with the surface. An obstacle thinner than a level apart can be missed.
-    precision : float
-        Height to which the point is refined, metres.
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        X, Y, Z; NaN where the ray does not meet the surface between the two heights (it looks up, passes beyond the
-        terrain or crosses a hole).
-    """
-    xy = np.asarray(xy, float)
-    low, high = height_range
-    high = min(high, float(camera.center[2]))
-    found = np.full((len(xy), 3), np.nan)
-    if not (np.isfinite([low, high]).all() and low <= high):
-        return found
-    levels = np.linspace(high + precision, low - precision, max(2, steps))
-    upper = np.full(len(xy), np.nan)
-    lower = np.full(len(xy), np.nan)
-    open_ = np.ones(len(xy), bool)
-    for above, level in itertools.pairwise(levels):
-        point = _at_height(camera, xy, np.full(len(xy), level))
-        hit = open_ & (surface.heights(point[:, :2]) >= level)
-        upper[hit], lower[hit] = above, level
-        open_ &= ~hit
-        if not open_.any():
-            break
-    there = np.isfinite(upper)
-    while there.any() and (upper[there] - lower[there]).max() > precision:
-        middle = (upper + lower) / 2
-        point = _at_height(camera, xy[there], middle[there])
-        under = surface.heights(point[:, :2]) >= middle[there]
-        index = np.flatnonzero(there)
-        lower[index[under]] = middle[index[under]]
-        upper[index[~under]] = middle[index[~under]]
-    if there.any():
-        found[there] = _at_height(camera, xy[there], (upper[there] + lower[there]) / 2)
-    return found
-
-
-def intersect_strict(
-    camera: CentralCamera,
-    xy: ArrayLike,
-    surface: HybridSurface | RasterSurface,
-    height_range: tuple[float, float],
-    tolerance: float = 0.001,
-) -> NDArray[np.float64]:
-    """First point of the surface that each image ray meets, from the profile of the surface below the ray.
-
-    No ridge and no wall is missed, however thin: where the ray meets the face of a wall, the point lies on it. Slower
-    than `intersect`: for single points, such as those that a person measures.
-
-    Parameters
-    ----------
-    camera : CentralCamera
-    xy : array_like, shape (n, 2)
-        Image points in pixels.
-    surface : HybridSurface or RasterSurface
+    terrain : Terrain
         In the CRS of the camera.
     height_range : (float, float)
-        Heights between which the surface is looked for, metres. In between, rays are taken as straight.
-    tolerance : float
-        Of the profile, metres.
+        Heights between which the terrain is looked for, metres.
 
     Returns
     -------
     ndarray, shape (n, 3)
-        X, Y, Z; NaN where the ray does not meet the surface from above: it looks up, passes beyond the terrain, or
-        goes below the terrain through a gap or the model's border.
+        X, Y, Z; NaN where the ray does not meet the surface from above between the two heights: it looks up, passes
+        beyond the terrain, or goes below it through a hole or the model's border.
     """
     xy = np.asarray(xy, float)
-    low, high = height_range
-    high = min(high, float(camera.center[2]))
-    found = np.full((len(xy), 3), np.nan)
-    if not (np.isfinite([low, high]).all() and low <= high):
-        return found
-    # A little more on both sides, so that a level surface lies between.
-    upper = _at_height(camera, xy, np.full(len(xy), high + tolerance))
-    lower = _at_height(camera, xy, np.full(len(xy), low - tolerance))
-    for i in np.flatnonzero(np.isfinite(upper).all(axis=1) & np.isfinite(lower).all(axis=1)):
-        found[i] = _first_hit(surface, upper[i], lower[i], tolerance)
-    return found
+    low, high = height_range[0] - _MARGIN, min(height_range[1] + _MARGIN, float(camera.center[2]) - 1e-6)
+    if not (np.isfinite([low, high]).all() and low <= high and len(xy)):
+        return np.full((len(xy), 3), np.nan)
+    return terrain.first_hit(_paths(camera, xy, high, low)).XYZ
 
 
-def _first_hit(
-    surface: HybridSurface | RasterSurface, upper: NDArray[np.float64], lower: NDArray[np.float64], tolerance: float
-) -> NDArray[np.float64]:
-    """Where the straight line from an upper to a lower point first comes down to the surface."""
-    nowhere = np.full(3, np.nan)
-    length = float(np.hypot(*(lower - upper)[:2]))
-    if length < tolerance * 1e-3:
-        height = float(surface.heights(upper[:2]))
-        return np.array([*upper[:2], height]) if lower[2] <= height <= upper[2] else nowhere
-    distance, _, _, Z = profile(surface, [upper[:2], lower[:2]], tolerance)
-    above = upper[2] + distance / length * (lower[2] - upper[2]) - Z
-    with np.errstate(invalid="ignore"):
-        hit = np.flatnonzero((above[:-1] >= 0) & (above[1:] <= 0))
-    if not hit.size:
-        return nowhere
-    k = hit[0]
-    drop = above[k] - above[k + 1]
-    t = (distance[k] + (distance[k + 1] - distance[k]) * (above[k] / drop if drop > 0 else 0.0)) / length
-    return np.asarray(upper + t * (lower - upper))
+def _paths(camera: CentralCamera, xy: NDArray[np.float64], high: float, low: float) -> NDArray[np.float64]:
+    """Rays between two heights as paths (n, k, 3), from above; NaN where they do not come down."""
+    ends = _at_height(camera, xy, high), _at_height(camera, xy, low)
+    paths = np.stack([end[0] for end in ends], axis=1)
+    if np.array_equal(ends[0][1], ends[1][1], equal_nan=True):
+        return paths
+    while paths.shape[1] <= MOST_CHORDS:
+        count = 2 * paths.shape[1] - 1
+        levels = np.linspace(high, low, count)
+        finer = np.empty((len(xy), count, 3))
+        finer[:, ::2] = paths
+        finer[:, 1::2] = np.stack([_at_height(camera, xy, level)[0] for level in levels[1::2]], axis=1)
+        off = np.abs(finer[:, 1::2] - (paths[:, 1:] + paths[:, :-1]) / 2)
+        paths = finer
+        # Twice as many chords have a fourth of the error.
+        if not (off > 4 * CURVED).any():
+            break
+    return paths
 
 
-def _at_height(camera: CentralCamera, xy: NDArray[np.float64], height: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points of the rays at given heights; NaN for rays that do not go down."""
-    origin, direction = camera.rays(xy, float(np.mean(height)))
+def _at_height(
+    camera: CentralCamera, xy: NDArray[np.float64], height: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points of the rays at a height, NaN for rays that do not go down, and the points that rays start from."""
+    origin, direction = camera.rays(xy, height)
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = (height - origin[..., 2]) / direction[..., 2]
-        point = origin + t[..., None] * direction
-    return np.where(direction[..., 2:] < 0, point, np.nan)
+        point = origin + ((height - origin[..., 2]) / direction[..., 2])[..., None] * direction
+    point[..., 2] = height
+    return np.where(direction[..., 2:] < 0, point, np.nan), origin

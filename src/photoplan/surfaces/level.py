@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.geometry.grid import Window
+from photoplan.surfaces.rays import Hits, Part, follow
 from photoplan.targets.base import Target
 
 
@@ -26,6 +27,46 @@ class LevelSurface:
         """The height at map points (..., 2), shape (...)."""
         return np.full(np.asarray(XY).shape[:-1], self.height)
 
-    def height_range(self, bounds: tuple[float, float, float, float]) -> tuple[float, float]:
-        """The height, twice."""
-        return self.height, self.height
+    def height_range(self, bounds: ArrayLike) -> NDArray[np.float64]:
+        """The height, twice, for map bounds (..., 4)."""
+        return np.full((*np.shape(bounds)[:-1], 2), self.height)
+
+    def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
+        """Where rays first come down to the height; see `Terrain.first_hit`."""
+        at = np.asarray(paths, float).reshape(-1, np.shape(paths)[-1])[:, :2]
+        low, high = np.fmin.reduce(at, axis=0, initial=np.inf), np.fmax.reduce(at, axis=0, initial=-np.inf)
+        if not np.isfinite([low, high]).all():
+            low, high = np.zeros(2), np.zeros(2)
+        inside = (float(low[0]) - 1, float(low[1]) - 1, float(high[0]) + 1, float(high[1]) + 1)
+        return follow(LevelParts(self, inside), paths, bend)
+
+
+@dataclass(frozen=True)
+class LevelParts:
+    """A level as one part for rays, a single mesh below all of them."""
+
+    surface: LevelSurface
+    inside: tuple[float, float, float, float]
+    """Its bounds."""
+
+    @property
+    def corner(self) -> tuple[float, float]:
+        """X, Y of its upper-left corner."""
+        return self.inside[0], self.inside[3]
+
+    @property
+    def step(self) -> tuple[float, float]:
+        """Its width and height, metres."""
+        return self.inside[2] - self.inside[0], self.inside[3] - self.inside[1]
+
+    def ranges(self, window: Window) -> NDArray[np.float64]:
+        """The height, twice, shape (height, width, 2)."""
+        return np.full((window.height, window.width, 2), self.surface.height)
+
+    def part(self, column: int, row: int) -> Part:
+        """The mesh."""
+        return Part(self.corner, self.step, np.zeros((2, 2), np.float32), self.surface.height)
+
+    def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
+        """The height at points."""
+        return self.surface.heights(XY)

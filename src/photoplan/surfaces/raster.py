@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,29 +11,20 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.sample_grid import sample_lattice, sample_points
-from photoplan.surfaces.carried import carried_positions
+from photoplan.surfaces.carried import box_points, carried_positions
+from photoplan.surfaces.ranges import CELL, GridRanges, HeightGrid
+from photoplan.surfaces.rays import Hits, Part, carried_hits
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
 
 #: Between CRSs, positions are interpolated where that is good to this part of a mesh; else each pixel is transformed.
 POSITION_TOLERANCE = 0.01
-#: Posts that are read at once where single heights are asked for …
+#: Posts that are read at once where single heights are asked for.
 MOST_POSTS = 4_000_000
-#: … and the side of the parts in which a range of heights is looked for.
-PART = 2048
 
 
-class HeightGrid(Protocol):
-    """Posts of a terrain grid, read by windows; safe to call from several threads."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Columns and rows."""
-        ...
-
-    def read(self, window: Window) -> NDArray[np.float32]:
-        """Heights of a window inside the grid, shape (height, width), metres; NaN where there is none."""
-        ...
+#: Rays that are few, and the meshes along a side of the parts that they are followed over; many rays share larger ones.
+FEW, FEW_PART, MANY_PART = 2000, 64, 512
 
 
 @dataclass(frozen=True)
@@ -52,10 +42,14 @@ class RasterSurface:
     """Mesh width in X and in Y, metres, both positive; rows run from north to south."""
     to_grid_crs: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
     """Takes X, Y of the product's CRS (..., 2) to the grid's CRS; None if they are the same."""
+    part: tuple[int, int] = (256, 256)
+    """Columns and rows that are best read at once: the blocks of a file."""
+    _ranges: GridRanges = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not (self.mesh[0] > 0 and self.mesh[1] > 0):
             raise InputError(f"terrain grid with mesh {self.mesh}; mesh widths must be positive (a north-up grid)")
+        object.__setattr__(self, "_ranges", GridRanges(self.grid, self.part))
 
     def relief(self, target: Target, window: Window) -> NDArray[np.float32]:
         """Heights of the pixel centres of a window of a map target, shape (height, width); NaN: no surface."""
@@ -100,21 +94,25 @@ class RasterSurface:
         offset = np.array([window.col, window.row], float)
         return sample_points(self.grid.read(window), posts - offset).astype(float)
 
-    def height_range(self, bounds: tuple[float, float, float, float]) -> tuple[float, float]:
-        """Lowest and highest post inside or next to map `bounds`; NaN, NaN where there is none."""
-        xmin, ymin, xmax, ymax = bounds
-        edge = np.linspace(0, 1, 9)
-        x, y = np.meshgrid(xmin + edge * (xmax - xmin), ymin + edge * (ymax - ymin))
-        XY = np.stack([x, y], axis=-1)
-        posts = self._posts(XY if self.to_grid_crs is None else self.to_grid_crs(XY)).reshape(-1, 2)
-        window = self._window(posts.min(axis=0), posts.max(axis=0))
-        low, high = np.inf, -np.inf
-        for part in window.tiles(PART):
-            heights = self.grid.read(part)
-            there = heights[np.isfinite(heights)]
-            if there.size:
-                low, high = min(low, float(there.min())), max(high, float(there.max()))
-        return (low, high) if low <= high else (np.nan, np.nan)
+    def height_range(self, bounds: ArrayLike) -> NDArray[np.float64]:
+        """Bounds of the posts inside or next to map bounds (..., 4), shape (..., 2); NaN, NaN where there is none.
+
+        Posts of up to a cell of `GridRanges` beyond the bounds count as well; each is read once.
+        """
+        boxes = np.asarray(bounds, float)
+        posts = self._posts(box_points(boxes.reshape(-1, 4), self.to_grid_crs))
+        low, high = np.floor(np.fmin.reduce(posts, axis=1)) - 1, np.floor(np.fmax.reduce(posts, axis=1)) + 3
+        there = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1)
+        windows = np.concatenate([np.where(there[:, None], low, 0), np.where(there[:, None], high, 0)], axis=1)
+        windows = np.clip(windows, 0, np.tile(self.grid.size, 2)).astype(np.int64)
+        return self._ranges.of(windows).reshape(*boxes.shape[:-1], 2)
+
+    def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
+        """Where rays first come down onto the surface; see `Terrain.first_hit`."""
+        paths = np.asarray(paths, float)
+        # No more posts at once than the file's blocks have.
+        side = max(CELL, min(FEW_PART if len(paths) < FEW else MANY_PART, *self.part))
+        return carried_hits(RasterParts(self, side), paths, self.to_grid_crs, bend)
 
     def _posts(self, XY: NDArray[np.float64]) -> NDArray[np.float64]:
         """Map coordinates to (column, row) of the posts."""
@@ -152,3 +150,56 @@ class RasterSurface:
             return np.full((window.height, window.width), np.nan, np.float32)
         flat = sample_points(part, (posts - offset).reshape(-1, 2))
         return flat.reshape(window.height, window.width)
+
+
+@dataclass(frozen=True, eq=False)
+class RasterParts:
+    """A raster in parts for rays. Posts are counted from −1: half a mesh of the first and last one is surface."""
+
+    surface: RasterSurface
+    side: int
+    """Meshes along a side of a part."""
+
+    @property
+    def corner(self) -> tuple[float, float]:
+        """X, Y of the post before the first."""
+        s = self.surface
+        return s.origin[0] - s.mesh[0], s.origin[1] + s.mesh[1]
+
+    @property
+    def step(self) -> tuple[float, float]:
+        """Width and height of a part, metres."""
+        return self.surface.mesh[0] * self.side, self.surface.mesh[1] * self.side
+
+    @property
+    def inside(self) -> tuple[float, float, float, float]:
+        """Bounds of the surface: half a mesh beyond the outer posts."""
+        s = self.surface
+        (x, y), (u, v), (columns, rows) = s.origin, s.mesh, s.grid.size
+        return x - u / 2, y - (rows - 0.5) * v, x + (columns - 0.5) * u, y + v / 2
+
+    def ranges(self, window: Window) -> NDArray[np.float64]:
+        """Bounds of parts, as far as they are known; shape (height, width, 2)."""
+        row, col = np.mgrid[window.row : window.stop[1], window.col : window.stop[0]].reshape(2, -1) * self.side
+        posts = np.stack([col - 1, row - 1, col + self.side, row + self.side], axis=1)
+        posts = np.clip(posts, 0, np.tile(self.surface.grid.size, 2))
+        return self.surface._ranges.of(posts, learn=False).reshape(window.height, window.width, 2)
+
+    def part(self, column: int, row: int) -> Part | None:
+        """A part; None if it has no ground."""
+        s, side = self.surface, self.side
+        (columns, rows), col, top = s.grid.size, column * side - 1, row * side - 1
+        left, right = max(col, 0), min(col + side + 1, columns)
+        upper, lower = max(top, 0), min(top + side + 1, rows)
+        posts = s.grid.read(Window(left, upper, right - left, lower - upper))
+        if not np.isfinite(posts).any():
+            return None
+        # The outer half mesh goes on as the posts end.
+        beyond = lower == rows and top + side + 1 > rows, right == columns and col + side + 1 > columns
+        padded = np.pad(posts, ((upper - top, int(beyond[0])), (left - col, int(beyond[1]))), mode="edge")
+        corner = s.origin[0] + col * s.mesh[0], s.origin[1] - top * s.mesh[1]
+        return Part(corner, s.mesh, padded)
+
+    def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
+        """Heights at points of the grid's CRS."""
+        return replace(self.surface, to_grid_crs=None).heights(XY)

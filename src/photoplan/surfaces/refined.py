@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
-from photoplan.surfaces.base import Surface
+from photoplan.surfaces.base import Terrain
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
 
@@ -28,8 +28,8 @@ class RefinedSurface:
     Where only one of the surfaces exists inside the polygons, that one counts.
     """
 
-    coarse: Surface
-    fine: Surface
+    coarse: Terrain
+    fine: Terrain
     polygons: Any
     """Shapely polygon or multipolygon, X and Y of the surfaces."""
     transition: float
@@ -60,13 +60,10 @@ class RefinedSurface:
         XY = np.asarray(XY, float)
         return _blended(self.coarse.heights(XY), self.fine.heights(XY), self.weights(XY))
 
-    def height_range(self, bounds: tuple[float, float, float, float]) -> tuple[float, float]:
-        """Lowest and highest height of both surfaces inside map `bounds`; NaN, NaN where there is none."""
-        ranges = [self.coarse.height_range(bounds)]
-        if self.polygons.intersects(shapely.box(*bounds)):
-            ranges.append(self.fine.height_range(bounds))
-        known = np.array([each for each in ranges if np.isfinite(each).all()])
-        return (float(known[:, 0].min()), float(known[:, 1].max())) if len(known) else (np.nan, np.nan)
+    def height_range(self, bounds: ArrayLike) -> NDArray[np.float64]:
+        """Bounds of both surfaces inside map bounds (..., 4), shape (..., 2), metres; NaN, NaN where there is none."""
+        a, b = self.coarse.height_range(bounds), self.fine.height_range(bounds)
+        return np.stack([np.fmin(a[..., 0], b[..., 0]), np.fmax(a[..., 1], b[..., 1])], axis=-1)
 
     def weights(self, XY: ArrayLike) -> NDArray[np.float64]:
         """Weight of the fine surface at map points (..., 2), shape (...): 0 outside, 1 inside the band.

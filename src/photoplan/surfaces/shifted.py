@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.geometry.grid import Window
-from photoplan.surfaces.base import Surface
+from photoplan.surfaces.base import Terrain
+from photoplan.surfaces.rays import CHORD, Hits, bent, divided
 from photoplan.targets.base import Target
 
 
@@ -17,7 +18,7 @@ from photoplan.targets.base import Target
 class ShiftedSurface:
     """A surface plus a smooth shift of heights, such as the geoid's height above the ellipsoid."""
 
-    surface: Surface
+    surface: Terrain
     shift: Callable[[NDArray[np.float64]], NDArray[np.float64]]
     """What is added to the heights at map points (..., 2), metres, shape (...). It is evaluated at nine points of a
     tile and bilinear between them: a geoid bends by less than a millimetre over a tile."""
@@ -40,10 +41,22 @@ class ShiftedSurface:
         XY = np.asarray(XY, float)
         return self.surface.heights(XY) + self.shift(XY)
 
-    def height_range(self, bounds: tuple[float, float, float, float]) -> tuple[float, float]:
-        """Range of the surface, widened by the range of the shift at corners and middle."""
-        low, high = self.surface.height_range(bounds)
-        xmin, ymin, xmax, ymax = bounds
-        points = np.array([(x, y) for x in (xmin, (xmin + xmax) / 2, xmax) for y in (ymin, (ymin + ymax) / 2, ymax)])
-        shift = self.shift(points)
-        return low + float(shift.min()), high + float(shift.max())
+    def height_range(self, bounds: ArrayLike) -> NDArray[np.float64]:
+        """Range of the surface in map bounds (..., 4), widened by the range of the shift at corners and middle."""
+        bounds = np.asarray(bounds, float)
+        part = np.array([0.0, 0.5, 1.0])
+        x = bounds[..., None, 0:1] + part * (bounds[..., None, 2:3] - bounds[..., None, 0:1])
+        y = bounds[..., 1:2, None] + part[:, None] * (bounds[..., 3:4, None] - bounds[..., 1:2, None])
+        shift = self.shift(np.stack(np.broadcast_arrays(x, y), axis=-1)).reshape(*bounds.shape[:-1], 9)
+        return self.surface.height_range(bounds) + np.stack([shift.min(axis=-1), shift.max(axis=-1)], axis=-1)
+
+    def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
+        """Where rays first come down onto the surface; see `Terrain.first_hit`."""
+        given = np.asarray(paths, float)
+        fine = bent(divided(given, CHORD), bend)
+        fine[..., 2] -= self.shift(fine[..., :2])
+        hits = self.surface.first_hit(fine)
+        there = np.isfinite(hits.along)
+        hits.XYZ[there, 2] += self.shift(hits.XYZ[there, :2])
+        hits.along[there] *= (given.shape[1] - 1) / (fine.shape[1] - 1)
+        return hits

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.cameras.base import CentralCamera, project
+from photoplan.cameras.base import CentralCamera
 from photoplan.errors import UsageError
-from photoplan.surfaces.base import Surface
+from photoplan.surfaces.base import Terrain
 from photoplan.surfaces.intersect import intersect
 
 REASONS = {
@@ -25,7 +25,6 @@ REASONS = {
 """Why an image point has no ground point."""
 #: Places along each ray at which holes of the terrain are looked for.
 HOLE_STEPS = 64
-MOST_LEVELS = 4096
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ class GroundPoints:
 def monoplot(
     camera: CentralCamera,
     xy: ArrayLike,
-    terrain: Surface,
+    terrain: Terrain,
     height_range: tuple[float, float],
     errors: MonoplotErrors,
     mesh: float,
@@ -96,13 +95,13 @@ def monoplot(
     camera : CentralCamera
     xy : array_like, shape (n, 2)
         Image points, pixels.
-    terrain : Surface
+    terrain : Terrain
         The ground.
     height_range : (float, float)
         Lowest and highest terrain that the image can show, metres.
     errors : MonoplotErrors
     mesh : float
-        Mesh width of the terrain, metres: no ray goes farther sideways between two looks at the terrain.
+        Mesh width of the terrain, metres: slopes are taken over it.
 
     Returns
     -------
@@ -113,9 +112,7 @@ def monoplot(
     XYZ = np.full((len(xy), 3), np.nan)
     asked = np.flatnonzero(reasons == "")
     if len(asked):
-        steps = _levels(camera, xy[asked], height_range, mesh)
-        first = intersect(camera, xy[asked], terrain, height_range, steps)
-        XYZ[asked] = _onto_rays(camera, xy[asked], first, terrain, mesh)
+        XYZ[asked] = intersect(camera, xy[asked], terrain, height_range)
     reasons[np.isnan(XYZ[:, 0]) & (reasons == "")] = "none"
     slope = _slope(terrain, XYZ[:, :2], mesh / 2)
     direction = _directions(camera, xy, XYZ[:, 2])
@@ -127,7 +124,7 @@ def monoplot(
 
 
 def _before(
-    camera: CentralCamera, xy: NDArray[np.float64], terrain: Surface, height_range: tuple[float, float]
+    camera: CentralCamera, xy: NDArray[np.float64], terrain: Terrain, height_range: tuple[float, float]
 ) -> NDArray[np.str_]:
     """Reasons that are known before the terrain is looked at."""
     reasons = np.full(len(xy), "", "U8")
@@ -152,37 +149,7 @@ def _directions(camera: CentralCamera, xy: NDArray[np.float64], heights: NDArray
     return camera.rays(xy, float(np.nanmean(heights)))[1]
 
 
-def _onto_rays(
-    camera: CentralCamera, xy: NDArray[np.float64], XYZ: NDArray[np.float64], terrain: Surface, mesh: float
-) -> NDArray[np.float64]:
-    """Points moved until they are exactly on their rays, which may be curved, and again on the terrain."""
-    out = XYZ.copy()
-    there = np.isfinite(out[:, 0])
-    for last in (False, False, True):
-        P = out[there]
-        A = camera.derivatives(P)
-        miss = xy[there] - project(camera, P)
-        P[:, :2] += np.linalg.solve(A[:, :, :2], miss[..., None])[..., 0]
-        if not last:
-            # Along the ray: one metre of height is so much sideways, and that is so much of slope.
-            sideways = -np.linalg.solve(A[:, :, :2], A[:, :, 2:])[..., 0]
-            rate = 1.0 - (_slope(terrain, P[:, :2], mesh / 2) * sideways).sum(axis=1)
-            step = (terrain.heights(P[:, :2]) - P[:, 2]) / np.where(np.abs(rate) > 0.05, rate, np.inf)
-            step = np.where(np.abs(step) < 0.1, step, 0.0)
-            P += step[:, None] * np.column_stack([sideways, np.ones(len(P))])
-        out[there] = P
-    return out
-
-
-def _levels(camera: CentralCamera, xy: NDArray[np.float64], height_range: tuple[float, float], mesh: float) -> int:
-    """Levels at which rays are compared with the terrain, so that none goes more than a mesh sideways in between."""
-    direction = _directions(camera, xy, np.full(len(xy), height_range[0]))
-    flat = np.hypot(direction[:, 0], direction[:, 1]) / -direction[:, 2]
-    drop = min(height_range[1], float(camera.center[2])) - height_range[0]
-    return int(np.clip(drop * float(np.quantile(flat, 0.99)) / mesh + 2, 64, MOST_LEVELS))
-
-
-def _slope(terrain: Surface, XY: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
+def _slope(terrain: Terrain, XY: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
     """∂h/∂X, ∂h/∂Y at map points (n, 2); one-sided beside holes, level where nothing is known around."""
     here = terrain.heights(XY)
     slope = np.empty_like(XY)
@@ -226,7 +193,7 @@ def _covariance(
 
 
 def _holes(
-    camera: CentralCamera, xy: NDArray[np.float64], XYZ: NDArray[np.float64], terrain: Surface, high: float
+    camera: CentralCamera, xy: NDArray[np.float64], XYZ: NDArray[np.float64], terrain: Terrain, high: float
 ) -> NDArray[np.bool_]:
     """Whether rays cross places without terrain between the highest terrain and the point."""
     crossed = np.zeros(len(xy), bool)

@@ -26,6 +26,8 @@ TERRAIN_TYPES = ("uint8", "int16", "uint16", "int32", "uint32", "float32", "floa
 _BLOCK = 256
 _VOID = 1e30
 """Numbers of this size (±3.4e38 of many programs) are never heights."""
+_PLAIN = -9_000.0
+"""Above this, metres, no value can be a usual nodata value."""
 _USUAL_NODATA = (-9999.0, -32768.0, -32767.0, -99999.0)
 
 
@@ -105,7 +107,7 @@ class TerrainReader:
         if window.size == 0 or window.col < 0 or window.row < 0 or right > width or bottom > height:
             raise UsageError(f"{self.path}: {window} is not inside the grid of {width} × {height} points")
         out = np.empty((window.height, window.width), np.float32)
-        block_width, block_height = self._block
+        block_width, block_height = self.block
         for row in range(window.row // block_height, -(-bottom // block_height)):
             for col in range(window.col // block_width, -(-right // block_width)):
                 area = Window(col * block_width, row * block_height, block_width, block_height)
@@ -120,7 +122,7 @@ class TerrainReader:
         return float(self.read(Window(col, row, 1, 1))[0, 0])
 
     @property
-    def _block(self) -> tuple[int, int]:
+    def block(self) -> tuple[int, int]:
         """Width and height of the blocks that are kept: the file's tiles, or whole lines of about 2^16 points."""
         width, height = self.info.block
         if width * height > 16 * _BLOCK * _BLOCK and height > 1:
@@ -133,6 +135,10 @@ class TerrainReader:
         """Read and check a block."""
         pixels, valid = read_pixels(self.info, window, self._missing)
         stored = pixels[0]
+        if valid is None and (self.info.scales[0], self.info.offsets[0]) == (1.0, 0.0):
+            metres = self.info.metres_per_unit or 1.0
+            if float(stored.min()) * metres > _PLAIN and float(stored.max()) * metres < HIGHEST:
+                return stored.astype(np.float32, copy=False)
         heights = stored.astype(np.float64) * self.info.scales[0] + self.info.offsets[0]
         void = ~(np.abs(heights) < _VOID)
         if valid is not None:

@@ -118,9 +118,13 @@ def assess(views: Sequence[View], heights: Heights) -> Plausibility:
     Plausibility
         Oblique images are plausible as long as they see the terrain.
     """
-    images = tuple(_look(v, v.center, v.R_ground_camera, heights) for v in views)
-    alternative = _alternative(list(views), images, heights)
-    return Plausibility(images, alternative)
+    images = tuple(look(view, heights) for view in views)
+    return Plausibility(images, other_reading(views, images, heights))
+
+
+def look(view: View, heights: Heights) -> ImagePlausibility:
+    """Look at one image as its orientation is declared."""
+    return _look(view, view.center, view.R_ground_camera, heights)
 
 
 def _look(view: View, center: NDArray[np.float64], R: NDArray[np.float64], heights: Heights) -> ImagePlausibility:
@@ -198,8 +202,9 @@ def _level_near(center: NDArray[np.float64], d: NDArray[np.float64], heights: He
     return float(np.median(found[good])) if good.any() else np.nan
 
 
-def _alternative(views: list[View], images: tuple[ImagePlausibility, ...], heights: Heights) -> str | None:
+def other_reading(views: Sequence[View], images: Sequence[ImagePlausibility], heights: Heights) -> str | None:
     """Sentence on the reading that fits where the declared one does not."""
+    views, images = list(views), tuple(images)
     chosen = _sample(views, images)
     sample, declared = [views[k] for k in chosen], [images[k] for k in chosen]
     evidence = _Evidence.of(views, declared, DECLARED)

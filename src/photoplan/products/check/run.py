@@ -11,8 +11,7 @@ import numpy as np
 from photoplan.geometry.crs import crs_label
 from photoplan.io.project.model import Project
 from photoplan.plain import pick
-from photoplan.plan.coverage import Coverage, cover
-from photoplan.products.check.plausibility import assess, view_of
+from photoplan.products.check.plausibility import ImagePlausibility, look, other_reading, view_of
 from photoplan.products.orthophoto.plan import mean_gsd, two_figures
 from photoplan.project.scene import Scene, ground_of, open_scene, pose_of
 
@@ -114,50 +113,49 @@ def check_project(project: Project, images: Sequence[str] | None = None) -> Proj
         view_of(image, project.cameras[image.camera], project.orientation, pose_of(project, image, ground).center)
         for image in entries
     ]
-    plausible = assess(views, ground.surface.heights)
-    faults = {i.name: i.fault for i in plausible.images}
-    tilts = {i.name: i.tilt for i in plausible.images}
-    checks = [_check_image(open_scene(project, name), name, tilts[name], faults[name]) for name in names]
+    looks, checks = [], []
+    for name, view in zip(names, views):
+        # All that is asked of the terrain for one image, before the next: its blocks are then at hand.
+        looks.append(look(view, ground.surface.heights))
+        checks.append(_check_image(open_scene(project, name), looks[-1]))
     gsds = [c.gsd for c in checks if np.isfinite(c.gsd)]
     return ProjectCheck(
         tuple(checks),
         two_figures(float(np.mean(gsds))) if gsds else float("nan"),
         (*ground.height_systems, ground.working_system),
         project.crs,
-        plausible.alternative,
+        other_reading(views, looks, ground.surface.heights),
         _advice(project, checks),
     )
 
 
-def _check_image(scene: Scene, name: str, tilt: float, fault: str | None) -> ImageCheck:
-    coverage = cover(scene.camera, scene.surface, scene.terrain_bounds)
+def _check_image(scene: Scene, looked: ImagePlausibility) -> ImageCheck:
+    name, tilt, fault = looked.name, looked.tilt, looked.fault
+    seen = scene.footprint
     nan = float("nan")
-    if coverage.bounds is None:
+    if seen.bounds is None:
         fault = fault or f"sees nothing of the terrain (tilt {tilt:.1f}°)"
-        return ImageCheck(name, tilt, nan, (nan, nan), coverage.on_surface, nan, nan, nan, fault, _notes(scene))
-    relief, curvature = _sensitivity(scene, coverage)
-    xmin, ymin, xmax, ymax = coverage.bounds
+        return ImageCheck(name, tilt, nan, (nan, nan), seen.on_surface, nan, nan, nan, fault, scene.notes)
+    relief, curvature = _sensitivity(scene)
+    xmin, ymin, xmax, ymax = seen.bounds
     return ImageCheck(
         name,
         tilt,
-        mean_gsd(scene.camera, coverage),
+        mean_gsd(scene.camera, seen),
         (xmax - xmin, ymax - ymin),
-        coverage.on_surface,
+        seen.on_surface,
         relief,
         1 / relief if relief > 0 else nan,
         curvature,
         fault,
-        _notes(scene),
+        scene.notes,
     )
 
 
-def _notes(scene: Scene) -> tuple[str, ...]:
-    return scene.notes
-
-
-def _sensitivity(scene: Scene, coverage: Coverage) -> tuple[float, float]:
+def _sensitivity(scene: Scene) -> tuple[float, float]:
     """Largest displacement by 1 m of height, and by the earth's curvature, over the footprint; pixels."""
-    points = coverage.outline[np.isfinite(coverage.outline).all(axis=1)]
+    outline = scene.footprint.outline
+    points = outline[np.isfinite(outline).all(axis=1)]
     if not len(points):
         return float("nan"), float("nan")
     per_metre = np.linalg.norm(scene.camera.derivatives(points)[..., 2], axis=-1)

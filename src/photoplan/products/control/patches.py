@@ -15,10 +15,10 @@ from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
 from photoplan.matching.control import best_place
 from photoplan.matching.grey import GreyImage
-from photoplan.plan.coverage import image_border
+from photoplan.plan.footprint import image_border
 from photoplan.products.control.match import OrthoPatch
 from photoplan.project.scene import Scene
-from photoplan.surfaces.base import Surface
+from photoplan.surfaces.base import Terrain
 
 #: Cells of the search at most, along each side.
 _LARGEST = 600
@@ -107,21 +107,20 @@ def _seen(scene: Scene) -> tuple[shapely.Geometry, tuple[int, int]] | None:
     camera: CentralCamera = scene.camera
     level = float(scene.surface.heights(camera.center[:2]))
     if not np.isfinite(level):
-        low, high = scene.surface.height_range(scene.terrain_bounds)
-        level = (low + high) / 2
-    if not np.isfinite(level):
+        level = sum(scene.footprint.height_range) / 2
+    if scene.footprint.bounds is None or not np.isfinite(level):
         return None
     origin, direction = camera.rays(image_border(camera.size), level)
     with np.errstate(divide="ignore", invalid="ignore"):
         t = (level - origin[:, 2]) / direction[:, 2]
         foot = origin[:, :2] + t[:, None] * direction[:, :2]
     foot = foot[np.isfinite(foot).all(axis=1) & (direction[:, 2] < 0) & (t > 0)]
-    area = shapely.convex_hull(shapely.MultiPoint(foot)).intersection(shapely.box(*scene.terrain_bounds))
+    area = shapely.convex_hull(shapely.MultiPoint(foot)).intersection(shapely.box(*scene.footprint.bounds))
     return (area, camera.size) if area.area > 0 else None
 
 
 def _in_squares(
-    ortho: Ortho, union: shapely.Geometry, surface: Surface, sizes: tuple[float, float, int, int]
+    ortho: Ortho, union: shapely.Geometry, surface: Terrain, sizes: tuple[float, float, int, int]
 ) -> list[OrthoPatch]:
     step, resolution, radius, factor = sizes
     xmin, ymin, xmax, ymax = union.bounds
@@ -146,7 +145,7 @@ def _in_squares(
     return found
 
 
-def _patch(values: NDArray[np.float64], at: tuple[float, float], surface: Surface, side: float) -> OrthoPatch | None:
+def _patch(values: NDArray[np.float64], at: tuple[float, float], surface: Terrain, side: float) -> OrthoPatch | None:
     """A patch with the plane through its ground; None where its middle has no height."""
     radius = len(values) // 2
     v, u = np.mgrid[-radius : radius + 1, -radius : radius + 1] * side

@@ -25,10 +25,9 @@ from photoplan.io.project.model import Project
 from photoplan.io.storage import nodata_for
 from photoplan.kernels.weights import KERNELS
 from photoplan.plan.compile import AnchorRule
-from photoplan.plan.coverage import Coverage, cover, covered_tiles, image_border
+from photoplan.plan.footprint import Footprint, covered_tiles, image_border, some_height
 from photoplan.plan.product import ProductPlan, Tile
 from photoplan.products.orthophoto.settings import OrthoSettings
-from photoplan.project.reach import some_height
 from photoplan.project.scene import Scene, SceneAddress, open_scene
 from photoplan.targets.map import MapTarget
 
@@ -42,8 +41,8 @@ class OrthoProduct:
 
     plan: ProductPlan
     """Grid, tiles and anchors' rule."""
-    coverage: Coverage
-    """Footprint of the image on the terrain."""
+    footprint: Footprint
+    """Where the image lies on the terrain."""
     gsd: float
     """Mean ground sampling distance of the image, metres."""
     key: str
@@ -124,20 +123,19 @@ def plan_orthophotos(
     events.begin("planning", 2 * len(names), "steps")
     for name in names:
         scene = open_scene(project, name)
-        coverage = cover(scene.camera, scene.surface, scene.terrain_bounds)
-        if coverage.bounds is None:
+        if scene.footprint.bounds is None:
             blind.append(_sees_no_terrain(scene, name))
         else:
-            looks.append((name, scene, coverage, mean_gsd(scene.camera, coverage)))
+            looks.append((name, scene, mean_gsd(scene.camera, scene.footprint)))
         events.done()
-    resolution = chosen.resolution or (two_figures(float(np.mean([look[3] for look in looks]))) if looks else 1.0)
+    resolution = chosen.resolution or (two_figures(float(np.mean([look[2] for look in looks]))) if looks else 1.0)
     products = []
-    for name, scene, coverage, gsd in looks:
-        plan = _plan_one(project, scene, name, coverage, replace(chosen, resolution=resolution))
+    for name, scene, gsd in looks:
+        plan = _plan_one(project, scene, name, replace(chosen, resolution=resolution))
         if plan is None:
-            blind.append(f"{name}: sees {_extent(coverage.bounds)}; the bounds are {_extent(chosen.bounds)}")
+            blind.append(f"{name}: sees {_extent(scene.footprint.bounds)}; the bounds are {_extent(chosen.bounds)}")
         else:
-            products.append(OrthoProduct(plan, coverage, gsd, product_key(scene.address, plan, chosen)))
+            products.append(OrthoProduct(plan, scene.footprint, gsd, product_key(scene.address, plan, chosen)))
         events.done()
     if not products:
         where = "the terrain" if chosen.bounds is None else "terrain inside the bounds"
@@ -151,10 +149,8 @@ def project_settings(project: Project) -> OrthoSettings:
     return OrthoSettings.from_dict({k: v for k, v in project.ortho_settings().items() if v is not None})
 
 
-def _plan_one(
-    project: Project, scene: Scene, name: str, coverage: Coverage, settings: OrthoSettings
-) -> ProductPlan | None:
-    bounds = settings.bounds or coverage.bounds
+def _plan_one(project: Project, scene: Scene, name: str, settings: OrthoSettings) -> ProductPlan | None:
+    bounds = settings.bounds or scene.footprint.bounds
     assert bounds is not None and settings.resolution is not None
     grid = MapGrid.covering(bounds, settings.resolution, project.crs)
     _check_storable(scene, name, grid, settings)
@@ -207,14 +203,14 @@ def product_key(scene: SceneAddress, plan: ProductPlan, settings: OrthoSettings)
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
 
-def mean_gsd(camera: CentralCamera, coverage: Coverage) -> float:
+def mean_gsd(camera: CentralCamera, seen: Footprint) -> float:
     """Mean ground sampling distance of an image over its footprint, metres.
 
     At each footprint point it is the square root of the ground area of one image pixel on level ground.
     """
-    points = coverage.outline[np.isfinite(coverage.outline).all(axis=1)]
+    points = seen.outline[np.isfinite(seen.outline).all(axis=1)]
     if not len(points):
-        xmin, ymin, xmax, ymax = coverage.bounds or (0, 0, 0, 0)
+        xmin, ymin, xmax, ymax = seen.bounds or (0, 0, 0, 0)
         return math.sqrt((xmax - xmin) * (ymax - ymin) / (camera.size[0] * camera.size[1]))
     points = np.concatenate([points, points.mean(axis=0, keepdims=True)])
     area = np.abs(np.linalg.det(camera.derivatives(points)[..., :2]))

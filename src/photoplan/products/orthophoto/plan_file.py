@@ -22,7 +22,7 @@ from photoplan.io.product import check_output
 from photoplan.io.project.file import parse_project
 from photoplan.plain import pick
 from photoplan.plan.compile import AnchorRule
-from photoplan.plan.coverage import Coverage
+from photoplan.plan.footprint import Footprint
 from photoplan.plan.product import ProductPlan, Tile, compile_tile
 from photoplan.products.orthophoto.plan import MOST_TILES, OrthoPlan, OrthoProduct, product_key, product_name
 from photoplan.products.orthophoto.settings import OrthoSettings
@@ -174,7 +174,7 @@ def write_plan(path: Path, plan: OrthoPlan, figures: PlanFigures, output: Path, 
         "image": np.array([p.plan.image for p in plan.products], object),
         "gsd": np.array([p.gsd for p in plan.products]),
         "resolution": np.array([p.grid.resolution for p in plan.products]),
-        "on_terrain": np.array([p.coverage.on_surface for p in plan.products]),
+        "on_terrain": np.array([p.footprint.on_surface for p in plan.products]),
     }
     outlines = [_outline(p) for p in plan.products]
     tables = PlanTables(header, tiles, figures.bounds[there], footprints, outlines, plan.project.crs)
@@ -204,7 +204,7 @@ def check_plan_path(path: Path, plan: OrthoPlan, overwrite: bool = False) -> Non
 
 def _outline(product: OrthoProduct) -> NDArray[np.float64]:
     """Footprint polygon; the product's rectangle where the image's border does not meet the terrain."""
-    seen = product.coverage.outline[np.isfinite(product.coverage.outline).all(axis=1), :2]
+    seen = product.footprint.outline[np.isfinite(product.footprint.outline).all(axis=1), :2]
     if len(seen) >= 3:
         return seen
     xmin, ymin, xmax, ymax = product.grid.bounds
@@ -254,7 +254,7 @@ def read_plan(path: Path | str) -> tuple[OrthoPlan, Path]:
 
 def _product_header(product: OrthoProduct, tiles: int) -> dict[str, Any]:
     """All of a product but its tiles, as plain values."""
-    plan, coverage = product.plan, product.coverage
+    plan, seen = product.plan, product.footprint
     return {
         "image": plan.image,
         "key": product.key,
@@ -262,9 +262,10 @@ def _product_header(product: OrthoProduct, tiles: int) -> dict[str, Any]:
         "grid": asdict(product.grid),
         "tile_side": plan.tile_side,
         "rule": asdict(plan.rule),
-        "outline": coverage.outline.tolist(),
-        "bounds": coverage.bounds,
-        "on_surface": coverage.on_surface,
+        "outline": seen.outline.tolist(),
+        "bounds": seen.bounds,
+        "on_surface": seen.on_surface,
+        "height_range": seen.height_range,
         "tiles": tiles,
     }
 
@@ -279,7 +280,8 @@ def _product(entry: dict[str, Any]) -> OrthoProduct:
     plan = ProductPlan(product_name(entry["image"]), (entry["image"],), MapTarget(grid), side, rule, ())
     outline = np.array(entry["outline"], float).reshape(-1, 3)
     bounds = None if entry["bounds"] is None else tuple(entry["bounds"])
-    return OrthoProduct(plan, Coverage(outline, bounds, entry["on_surface"]), entry["gsd"], entry["key"])
+    low, high = entry["height_range"]
+    return OrthoProduct(plan, Footprint(outline, bounds, entry["on_surface"], (low, high)), entry["gsd"], entry["key"])
 
 
 def _with_tiles(product: OrthoProduct, tiles: dict[str, NDArray[Any]], planned: int) -> OrthoProduct:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.surfaces.base import Surface
+from photoplan.surfaces.base import Terrain
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.volume.region import Coverage, cover
 
@@ -80,8 +80,8 @@ class VolumeSettings:
 
 
 def volume_between(
-    a: Surface,
-    b: Surface,
+    a: Terrain,
+    b: Terrain,
     polygon: Any,
     settings: VolumeSettings,
     progress: Callable[[int, int], None] | None = None,
@@ -96,7 +96,7 @@ def volume_between(
 
     Parameters
     ----------
-    a, b : Surface
+    a, b : Terrain
         In one CRS and one height system.
     polygon : shapely Polygon or MultiPolygon
     settings : VolumeSettings
@@ -121,7 +121,7 @@ def volume_between(
 
 
 def integrate(
-    a: Surface, b: Surface, polygon: Any, cell: float, progress: Callable[[int, int], None] | None = None
+    a: Terrain, b: Terrain, polygon: Any, cell: float, progress: Callable[[int, int], None] | None = None
 ) -> Sums:
     """The integral with cells of one size; grids of all sizes share their edges at multiples of the cell."""
     grid = MapGrid.covering(tuple(float(v) for v in polygon.bounds), cell, "")  # type: ignore[arg-type]
@@ -135,7 +135,7 @@ def integrate(
     return sums
 
 
-def _add(sums: Sums, a: Surface, b: Surface, grid: MapGrid, window: Window, covered: Coverage) -> Sums:
+def _add(sums: Sums, a: Terrain, b: Terrain, grid: MapGrid, window: Window, covered: Coverage) -> Sums:
     """The sums with those of one window."""
     parts: list[NDArray[np.float64]] = []
     areas: list[NDArray[np.float64]] = []

@@ -14,7 +14,7 @@ from scipy.ndimage import convolve1d
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid
-from photoplan.surfaces.base import Surface
+from photoplan.surfaces.base import Terrain
 from photoplan.terrain.volume.region import cover
 
 #: Cells of the field of errors that is held in memory; regions with more are computed by the formula of large areas.
@@ -54,7 +54,7 @@ class VolumeSigma:
 
 
 def volume_sigma(
-    a: Surface, b: Surface, errors: tuple[ErrorModel, ErrorModel], polygon: Any, cell: float, bias: float = 0.0
+    a: Terrain, b: Terrain, errors: tuple[ErrorModel, ErrorModel], polygon: Any, cell: float, bias: float = 0.0
 ) -> VolumeSigma:
     """Standard deviation of the volume between two surfaces inside a polygon.
 
@@ -69,7 +69,7 @@ def volume_sigma(
 
     Parameters
     ----------
-    a, b : Surface
+    a, b : Terrain
     errors : (ErrorModel, ErrorModel)
         How the heights of A and of B err.
     polygon : shapely Polygon or MultiPolygon
@@ -104,7 +104,7 @@ class _Fields:
     side: float
 
 
-def _fields(a: Surface, b: Surface, model: ErrorModel, polygon: Any, cell: float) -> _Fields:
+def _fields(a: Terrain, b: Terrain, model: ErrorModel, polygon: Any, cell: float) -> _Fields:
     side = _side(model.length, cell, polygon)
     grid = MapGrid.covering(tuple(float(v) for v in polygon.bounds), side, "")  # type: ignore[arg-type]
     dense = grid.window.size <= MOST_CELLS and side <= model.length

@@ -1,4 +1,4 @@
-"""Where ground can be seen at all: never too small, and found without reading far terrain."""
+"""Footprints: what an image sees of the ground; never too small, and found without reading far terrain."""
 
 from __future__ import annotations
 
@@ -7,16 +7,65 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tools.pinhole import Pinhole
+from tools.pinhole import Pinhole, vertical
 
 from photoplan.cameras.base import project
-from photoplan.geometry.grid import Window
+from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
-from photoplan.project.reach import FAR, reach
+from photoplan.plan.footprint import FAR, covered_tiles, footprint, image_border
 from photoplan.surfaces.level import LevelSurface
 from photoplan.surfaces.raster import RasterSurface
 
+GROUND = LevelSurface(100.0)
+SEARCH = (0.0, 0.0, 4000.0, 4000.0)
 MESH = 25.0
+
+
+def test_outline_projects_back_onto_the_border() -> None:
+    camera = vertical()
+    seen = footprint(camera, GROUND, SEARCH)
+    back = project(camera, seen.outline)
+    np.testing.assert_allclose(back, image_border(camera.size), atol=0.01)
+    assert seen.on_surface == 1.0
+
+
+def test_bounds_hold_the_footprint_and_little_more() -> None:
+    seen = footprint(vertical(), GROUND, SEARCH)
+    assert seen.bounds is not None
+    low, high = seen.outline[:, :2].min(axis=0), seen.outline[:, :2].max(axis=0)
+    xmin, ymin, xmax, ymax = seen.bounds
+    assert xmin <= low[0] and ymin <= low[1] and xmax >= high[0] and ymax >= high[1]
+    assert (xmax - xmin) * (ymax - ymin) < 1.05 * np.prod(high - low)
+
+
+def test_a_small_footprint_on_a_large_terrain_is_found() -> None:
+    seen = footprint(vertical(size=(80, 60)), GROUND, (-4e4, -4e4, 4e4, 4e4))
+    assert seen.bounds is not None
+    assert seen.bounds[2] - seen.bounds[0] < 12
+
+
+def test_nothing_is_seen_upwards_or_beside_the_terrain() -> None:
+    up = Pinhole(Pose.from_angles((1000, 2000, 800), (np.pi, 0, 0)), 12500, (800, 600))
+    assert footprint(up, GROUND, SEARCH).bounds is None
+    beside = footprint(vertical(), GROUND, (10000.0, 10000.0, 11000.0, 11000.0))
+    assert beside.bounds is None
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.4])
+def test_tiles_that_hold_a_pixel_are_kept(tilt: float) -> None:
+    camera = Pinhole(Pose.from_angles((1000, 2000, 800), (tilt, 0.1, 0.7)), 2000, (1600, 1200))
+    seen = footprint(camera, GROUND, SEARCH)
+    assert seen.bounds is not None
+    grid = MapGrid.covering(seen.bounds, 2.0, "EPSG:32615")
+    tiles = list(grid.window.tiles(32))
+    kept = covered_tiles(camera, GROUND, grid, tiles)
+    for tile, keep in zip(tiles, kept):
+        v, u = np.mgrid[tile.row : tile.stop[1], tile.col : tile.stop[0]]
+        XY = grid.to_map(np.stack([u, v], axis=-1))
+        xy = project(camera, np.concatenate([XY, np.full((*XY.shape[:2], 1), 100.0)], axis=-1))
+        inside = ((xy >= -0.5) & (xy <= np.array(camera.size) - 0.5)).all(axis=-1).any()
+        assert keep or not inside
+    assert not all(kept)
 
 
 @dataclass(eq=False)
@@ -46,7 +95,7 @@ def terrain(seed: int, side: int = 400, roughness: float = 250.0) -> tuple[Grid,
     u, v = rng.uniform(0.3, 0.7, 2) * side
     mountain = 900 * np.exp(-((k - u) ** 2 + (k[:, None] - v) ** 2) / 60)
     grid = Grid((500 + roughness * waves + mountain).astype(np.float32))
-    return grid, RasterSurface(grid, (-side / 2 * MESH, side / 2 * MESH), (MESH, MESH))
+    return grid, RasterSurface(grid, (-side / 2 * MESH, side / 2 * MESH), (MESH, MESH), part=(16, 16))
 
 
 def edges(grid: Grid) -> tuple[float, float, float, float]:
@@ -71,7 +120,9 @@ def test_all_ground_that_falls_into_the_image_is_inside(seed: int, tilt: float) 
     # 20 heights above the lowest ground: what is further is left out on purpose.
     near = (np.abs(XY - camera.center[:2]) < 20 * (2200 - 500)).all(axis=-1)
     seen = XY[inside & near]
-    xmin, ymin, xmax, ymax = reach(camera, surface, edges(grid))
+    bounds = footprint(camera, surface, edges(grid)).bounds
+    assert bounds is not None
+    xmin, ymin, xmax, ymax = bounds
     assert (seen >= (xmin, ymin)).all()
     assert (seen <= (xmax, ymax)).all()
 
@@ -79,7 +130,9 @@ def test_all_ground_that_falls_into_the_image_is_inside(seed: int, tilt: float) 
 def test_a_vertical_image_is_bounded_tightly_and_reads_little() -> None:
     grid, surface = terrain(1, side=2000, roughness=20.0)
     camera = Pinhole(Pose.from_angles((300, -200, 1500), (0, 0, 0)), 900.0, (800, 600))
-    xmin, ymin, xmax, ymax = reach(camera, surface, edges(grid))
+    bounds = footprint(camera, surface, edges(grid)).bounds
+    assert bounds is not None
+    xmin, ymin, xmax, ymax = bounds
     assert 800 < xmax - xmin < 1400
     assert 600 < ymax - ymin < 1000
     assert grid.largest < 60**2
@@ -90,27 +143,24 @@ def test_far_terrain_is_looked_through_in_pieces() -> None:
     """A horizontal view over 50 km of terrain holds a piece of 500 m in memory, and not all of it."""
     grid, surface = terrain(1, side=2000, roughness=20.0)
     camera = Pinhole(Pose.from_angles((300, -200, 1500), (np.pi / 2, 0, 0)), 900.0, (800, 600))
-    xmin, _ymin, xmax, ymax = reach(camera, surface, edges(grid))
+    bounds = footprint(camera, surface, edges(grid)).bounds
+    assert bounds is not None
+    xmin, _ymin, xmax, ymax = bounds
     assert xmax - xmin > 5000
     assert ymax > 15_000
     assert grid.largest < 30**2
 
 
-def test_nothing_to_see_is_a_square_metre() -> None:
+def test_nothing_is_seen_from_below_far_away_and_beside() -> None:
     grid, surface = terrain(2)
     bounds = edges(grid)
     up = Pinhole(Pose.from_angles((0, 0, 2500), (np.pi, 0, 0)), 900.0, (800, 600))
     below = Pinhole(Pose.from_angles((0, 0, -3000), (0, 0, 0)), 900.0, (800, 600))
     away = Pinhole(Pose.from_angles((10 * FAR, 0, 2500), (0, 0, 0)), 900.0, (800, 600))
     beside = Pinhole(Pose.from_angles((bounds[2] + 4000, 0, 2500), (0, 0, 0)), 900.0, (800, 600))
-    for camera in (below, away, beside):
-        xmin, ymin, xmax, ymax = reach(camera, surface, bounds)
-        assert (xmax - xmin, ymax - ymin) == (1, 1)
-        assert bounds[0] <= xmin < xmax <= bounds[2]
-        assert bounds[1] <= ymin < ymax <= bounds[3]
-    # Rays that go up meet no ground; what is left is around the camera's foot.
-    xmin, ymin, xmax, ymax = reach(up, surface, bounds)
-    assert xmin <= 0 <= xmax
+    for camera in (up, below, away, beside):
+        seen = footprint(camera, surface, bounds)
+        assert seen.bounds is None and seen.on_surface == 0 and np.isnan(seen.outline).all()
 
 
 def test_a_hole_below_the_camera() -> None:
@@ -118,13 +168,17 @@ def test_a_hole_below_the_camera() -> None:
     grid, surface = terrain(3)
     grid.values[150:260, 150:260] = np.nan
     camera = Pinhole(Pose.from_angles((0, 0, 2500), np.radians((40, 0, 0))), 900.0, (800, 600))
-    xmin, ymin, xmax, ymax = reach(camera, surface, edges(grid))
+    bounds = footprint(camera, surface, edges(grid)).bounds
+    assert bounds is not None
+    xmin, ymin, xmax, ymax = bounds
     assert ymax > 2000
     assert (xmax - xmin) * (ymax - ymin) > 1e6
 
 
 def test_level_ground_everywhere() -> None:
     camera = Pinhole(Pose.from_angles((0, 0, 1000), (0, 0, 0)), 1000.0, (800, 600))
-    xmin, ymin, xmax, ymax = reach(camera, LevelSurface(0.0), None)
+    bounds = footprint(camera, LevelSurface(0.0), None).bounds
+    assert bounds is not None
+    xmin, ymin, xmax, ymax = bounds
     assert -500 < xmin < -400 < 400 < xmax < 500
     assert -400 < ymin < -300 < 300 < ymax < 400

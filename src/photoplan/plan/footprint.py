@@ -1,0 +1,309 @@
+"""Where an image lies on the ground, before any tile is compiled.
+
+All that an image can show lies on its rays. Where the rays of its border cross a level, they enclose what the image can
+show of that level; the extent of this in a few directions, as a function of the level, bounds it. A box of the ground
+(map bounds and the range of heights inside) can be seen only if it reaches into the extents of its own levels. Ground
+is asked for its ranges, not for its posts, so a small image on a large terrain model reads what lies below it, once.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.base import CentralCamera
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.surfaces.base import Terrain
+from photoplan.surfaces.intersect import intersect
+
+Bounds = tuple[float, float, float, float]
+
+#: Ground further from the projection centre than this is not looked at, metres …
+FAR = 30_000.0
+#: … nor further than this many heights above the lowest ground (87° from the nadir).
+FLATTEST = 20.0
+#: Slope of the flattest rays that are followed; flatter ones and those that go up count as these.
+_GRAZING = 0.25 / FLATTEST
+#: Points on a side of the image's border.
+_PER_SIDE = 24
+#: Directions in which the extent of what is seen is known, beside those across the sides of the image.
+_DIRECTIONS = 16
+#: Levels between which curved rays are followed straight.
+_LEVELS = 9
+#: Boxes along a side in which the ground below an image is looked at, and how often it is looked at more closely.
+_BOXES, _LOOKS = 48, 4
+#: Points per side of the lattice that is asked for a first height where there is no ground below the camera.
+_LATTICE = 9
+_ROUNDS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Footprint:
+    """What one image sees of the ground."""
+
+    outline: NDArray[np.float64]
+    """Ground points X, Y, Z of the image's border, shape (n, 3); NaN where the ray meets no surface."""
+    bounds: Bounds | None
+    """Map bounds xmin, ymin, xmax, ymax of everything the image sees of the surface; None: nothing."""
+    on_surface: float
+    """Part of the image's border points and middle whose rays meet the surface, 0 to 1."""
+    height_range: tuple[float, float]
+    """Bounds of the heights inside the bounds, metres; NaN, NaN without bounds."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What an image can show of each level: how far it extends from the projection centre in some directions.
+
+    Straight rays cross levels at places that move linearly with the level, so an extent, the largest of many such
+    places, is a convex function of the level: between two levels it is no larger than on the line between its values.
+    """
+
+    center: NDArray[np.float64]
+    """Projection centre, shape (3,)."""
+    directions: NDArray[np.float64]
+    """Unit vectors of the map, shape (k, 2); the first are +X, +Y, −X, −Y."""
+    levels: NDArray[np.float64]
+    """Ascending heights, shape (m,), metres; the image shows nothing above the last one that is finite."""
+    extents: NDArray[np.float64]
+    """Largest coordinate along each direction, from the projection centre, shape (m, k), metres."""
+    far: float
+    """What lies further than this from the projection centre, along any direction, does not count, metres."""
+
+    @classmethod
+    def of(cls, camera: CentralCamera, low: float, high: float, far: float = math.inf) -> View | None:
+        """The view between two levels, cut off `far` from the projection centre; None: no ray gets there."""
+        center = np.asarray(camera.center, float)
+        # A little more, for surfaces whose ranges are rounded.
+        low, high = low - 0.5, high + 0.5
+        xy = _border(camera, min(low, float(center[2]) - 1.0))
+        if xy is None:
+            return None
+        rays = [camera.rays(xy, level) for level in (low, min(high, float(center[2])))]
+        straight = np.array_equal(rays[0][0], rays[1][0])
+        slope = rays[0][1][:, 2] / (np.hypot(*rays[0][1][:, :2].T) + 1e-12)
+        down, up = slope.min() < _GRAZING, straight and slope.max() > -_GRAZING
+        ends = (low if down else max(low, float(center[2])), high if up else min(high, float(center[2])))
+        if not ends[0] < ends[1]:
+            return None
+        levels = np.union1d(np.linspace(*ends, 2 if straight else _LEVELS), np.clip(center[2], *ends))
+        feet = np.stack([_feet(camera, xy, level, rays[0] if straight else None) for level in levels]) - center[:2]
+        directions = _directions(feet[0] if down else feet[-1])
+        along = feet @ directions.T
+        extents = along.max(axis=1)
+        # The border may bend between its points, by less than it does between every second one; and two pixels.
+        pixel = np.linalg.norm(np.diff(feet, axis=1), axis=2).sum(axis=1) / sum(camera.size)
+        extents += extents - along[:, ::2].max(axis=1) + pixel[:, None]
+        return cls(center, directions, levels, extents, far)
+
+    @property
+    def bounds(self) -> Bounds:
+        """Map bounds of all that the image can show of the levels."""
+        east, north, west, south = np.minimum(self.extents[:, :4].max(axis=0), self.far)
+        x, y = self.center[:2]
+        return (float(x - west), float(y - south), float(x + east), float(y + north))
+
+    def reach(self, ranges: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Extents (n, k) of what the image can show between two heights each (n, 2); −inf: nothing, NaN: no heights."""
+        low = np.maximum(ranges[:, 0], self.levels[0])
+        high = np.minimum(ranges[:, 1], self.levels[-1])
+        at = np.stack([low, high], axis=1)
+        extents = np.stack([np.interp(at, self.levels, column) for column in self.extents.T], axis=-1).max(axis=1)
+        return np.where((low > high)[:, None], -np.inf, np.minimum(extents, self.far))
+
+    def sees(self, boxes: NDArray[np.float64], ranges: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether boxes of the map (n, 4) with their ranges of heights (n, 2) can fall into the image, shape (n,)."""
+        x, y = boxes[:, ::2] - self.center[0], boxes[:, 1::2] - self.center[1]
+        u, v = self.directions.T
+        nearest = np.minimum(x[:, :1] * u, x[:, 1:] * u) + np.minimum(y[:, :1] * v, y[:, 1:] * v)
+        with np.errstate(invalid="ignore"):
+            return np.asarray((nearest <= self.reach(ranges)).all(axis=1))
+
+
+def image_border(size: tuple[int, int], per_side: int = 16) -> NDArray[np.float64]:
+    """Points along the outer edge of an image, clockwise from the upper-left corner, shape (4·per_side, 2), pixels."""
+    width, height = size
+    t = np.arange(per_side) / per_side
+    left, top, right, bottom = -0.5, -0.5, width - 0.5, height - 0.5
+    ones = np.ones(per_side)
+    sides = [
+        np.stack([left + t * width, top * ones], axis=1),
+        np.stack([right * ones, top + t * height], axis=1),
+        np.stack([right - t * width, bottom * ones], axis=1),
+        np.stack([left * ones, bottom - t * height], axis=1),
+    ]
+    return np.concatenate(sides)
+
+
+def footprint(camera: CentralCamera, terrain: Terrain, bounds: Bounds | None) -> Footprint:
+    """Footprint of an image on the ground.
+
+    Parameters
+    ----------
+    camera : CentralCamera
+    terrain : Terrain
+        In the CRS of the camera.
+    bounds : (float, float, float, float) or None
+        Outer edges of the terrain; None: it is everywhere.
+
+    Returns
+    -------
+    Footprint
+        Its bounds hold all ground that the image sees, and what projects into it behind that as long as it is no lower
+        than all ground that lies nearer. Beyond `FAR`, and `FLATTEST` heights, nothing counts.
+    """
+    seen = _seen(camera, terrain, bounds)
+    if seen is None:
+        return Footprint(np.full((64, 3), np.nan), None, 0.0, (math.nan, math.nan))
+    low, high = (float(h) for h in terrain.height_range(seen))
+    border = np.concatenate([image_border(camera.size), [[(s - 1) / 2 for s in camera.size]]])
+    outline = intersect(camera, border, terrain, (low, high))
+    return Footprint(outline[:-1], seen, float(np.isfinite(outline[:, 0]).mean()), (low, high))
+
+
+def covered_tiles(camera: CentralCamera, terrain: Terrain, grid: MapGrid, tiles: list[Window]) -> list[bool]:
+    """Which tiles can hold a pixel of the image, judged from the range of heights under each tile."""
+    boxes = np.array([grid.bounds_of(tile) for tile in tiles])
+    ranges = terrain.height_range(boxes)
+    if not np.isfinite(ranges).any():
+        return [False] * len(tiles)
+    view = View.of(camera, float(np.nanmin(ranges)), float(np.nanmax(ranges)))
+    return [False] * len(tiles) if view is None else view.sees(boxes, ranges).tolist()
+
+
+def some_height(terrain: Terrain, near: Bounds, x: float, y: float) -> float:
+    """Height at a point, or else in the middle of what some points inside `near` have; NaN if all of them have none."""
+    below = float(terrain.heights(np.array([x, y])))
+    if np.isfinite(below):
+        return below
+    part = (np.arange(_LATTICE) + 0.5) / _LATTICE
+    X, Y = near[0] + part * (near[2] - near[0]), near[1] + part * (near[3] - near[1])
+    # One at a time: a surface may read all that lies between the points of one question.
+    some = [float(terrain.heights(np.array([u, v]))) for u in X for v in Y]
+    return float(np.nanmedian(some)) if np.isfinite(some).any() else math.nan
+
+
+def _seen(camera: CentralCamera, terrain: Terrain, bounds: Bounds | None) -> Bounds | None:
+    """Bounds of the ground that can fall into the image; None: there is none.
+
+    Between two levels the rays stay inside known bounds. If the ground there does not leave the levels, no ray has met
+    ground elsewhere; otherwise the level that failed is moved, each time a little further than was found, so that
+    slopes do not take many rounds. Ground far from the footprint is never asked for.
+    """
+    x, y, z = (float(c) for c in camera.center)
+    near = (x - FAR, y - FAR, x + FAR, y + FAR)
+    near = near if bounds is None else _common(near, bounds)
+    if not _holds(near):
+        return None
+    low = high = some_height(terrain, near, x, y)
+    more, whole = 0.01, False
+    for _ in range(_ROUNDS):
+        if not low < z and not whole:
+            (low, high), whole = terrain.height_range(near), True
+        if not low < z:
+            return None
+        view = View.of(camera, low, high, min(FAR, FLATTEST * (z - low)))
+        cut = near if view is None else _common(near, view.bounds)
+        if view is None or not _holds(cut):
+            return None
+        found = terrain.height_range(cut)
+        if np.isnan(found[0]) and not whole:
+            # There is a hole where the rays come down: what lies below these levels decides.
+            found, whole = terrain.height_range(near), True
+        if not (found[0] < low or found[1] > high):
+            return _closely(view, terrain, cut)
+        low = min(low, found[0] - more * (z - found[0])) if found[0] < low else low
+        high, more = max(high, found[1]), 2 * more
+    return near
+
+
+def _closely(view: View, terrain: Terrain, bounds: Bounds) -> Bounds | None:
+    """Bounds of the boxes that can be seen, and of what can be seen of them; refined while they shrink much."""
+    for _ in range(_LOOKS):
+        x, y = np.linspace(bounds[0], bounds[2], _BOXES + 1), np.linspace(bounds[1], bounds[3], _BOXES + 1)
+        left, bottom = (a.ravel() for a in np.meshgrid(x[:-1], y[:-1]))
+        right, top = (a.ravel() for a in np.meshgrid(x[1:], y[1:]))
+        boxes = np.stack([left, bottom, right, top], axis=1)
+        ranges = terrain.height_range(boxes)
+        kept = view.sees(boxes, ranges)
+        if not kept.any():
+            return None
+        boxes = boxes[kept]
+        east, north, west, south = (view.reach(ranges[kept])[:, :4] * (1, 1, -1, -1)).T
+        tight = (
+            max(bounds[0], float(np.maximum(boxes[:, 0], view.center[0] + west).min())),
+            max(bounds[1], float(np.maximum(boxes[:, 1], view.center[1] + south).min())),
+            min(bounds[2], float(np.minimum(boxes[:, 2], view.center[0] + east).max())),
+            min(bounds[3], float(np.minimum(boxes[:, 3], view.center[1] + north).max())),
+        )
+        shrunk = (tight[2] - tight[0]) * (tight[3] - tight[1]) / ((bounds[2] - bounds[0]) * (bounds[3] - bounds[1]))
+        bounds = tight
+        if shrunk > 0.7:
+            break
+    return bounds
+
+
+def _border(camera: CentralCamera, level: float) -> NDArray[np.float64] | None:
+    """Points of the image's border whose rays reach a level; None if no ray does.
+
+    Where the border has no ray (beyond the circle of a fisheye, above the horizon of a curved earth) the last point
+    that has one, on the way from a point that has one, takes its place.
+    """
+    border = image_border(camera.size, _PER_SIDE)
+    blind = np.isnan(camera.rays(border, level)[1][:, 2])
+    if not blind.any():
+        return border
+    part = (np.arange(_LATTICE) + 0.5) / _LATTICE
+    inside = np.stack(np.meshgrid(part, part), axis=-1).reshape(-1, 2) * camera.size - 0.5
+    inside = np.concatenate([inside, border])
+    direction = camera.rays(inside, level)[1]
+    if np.isnan(direction[:, 2]).all():
+        return None
+    good = np.broadcast_to(inside[np.nanargmin(direction[:, 2])], border[blind].shape).copy()
+    bad = border[blind]
+    for _ in range(20):
+        middle = (good + bad) / 2
+        there = np.isfinite(camera.rays(middle, level)[1][:, 2:])
+        good, bad = np.where(there, middle, good), np.where(there, bad, middle)
+    border[blind] = good
+    return border
+
+
+def _feet(
+    camera: CentralCamera,
+    xy: NDArray[np.float64],
+    level: float,
+    rays: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
+) -> NDArray[np.float64]:
+    """Where rays cross a level, X and Y (n, 2); those that never do, or far away, end far away in their direction."""
+    z = float(camera.center[2])
+    if abs(level - z) < 1e-6:
+        return np.broadcast_to(camera.center[:2], xy.shape)
+    origin, direction = camera.rays(xy, level) if rays is None else rays
+    sign = np.sign(level - z)
+    least = _GRAZING * np.hypot(direction[:, 0], direction[:, 1]) + 1e-12
+    drop = sign * np.maximum(sign * direction[:, 2], least)
+    foot = origin[:, :2] + direction[:, :2] * ((level - origin[:, 2]) / drop)[:, None]
+    return np.asarray(foot)
+
+
+def _directions(feet: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Directions for extents: along the map's axes, all around, and across the sides of what is seen of a level."""
+    angle = np.concatenate([np.arange(4) * 4, np.setdiff1d(np.arange(_DIRECTIONS), np.arange(4) * 4)])
+    around = np.stack([np.cos(angle * 2 * np.pi / _DIRECTIONS), np.sin(angle * 2 * np.pi / _DIRECTIONS)], axis=1)
+    corners = feet[::_PER_SIDE]
+    side = np.roll(corners, -1, axis=0) - corners
+    across = np.stack([side[:, 1], -side[:, 0]], axis=1) / (np.linalg.norm(side, axis=1, keepdims=True) + 1e-12)
+    outwards = np.sign(((corners - corners.mean(axis=0)) * across).sum(axis=1, keepdims=True))
+    return np.concatenate([around, across * outwards])
+
+
+def _common(a: Bounds, b: Bounds) -> Bounds:
+    return (max(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), min(a[3], b[3]))
+
+
+def _holds(bounds: Bounds) -> bool:
+    return bounds[0] < bounds[2] and bounds[1] < bounds[3]
