@@ -81,7 +81,7 @@ class TestPosition:
         alone(small, np.zeros((3, SIZE[1], SIZE[0]), np.float32), angles, lens)
         scene = open_scene(load_project(small.project), "one")
         x, y = np.meshgrid(np.arange(SIZE[0], dtype=float), np.arange(SIZE[1], dtype=float))
-        ground = intersect(scene.camera, np.stack([x.ravel(), y.ravel()], axis=1), scene.surface, (85, 115), 400, 1e-7)
+        ground = intersect(scene.camera, np.stack([x.ravel(), y.ravel()], axis=1), scene.surface, (85, 115))
         ground = ground.reshape(SIZE[1], SIZE[0], 3) - (X0, Y0, 0)
         alone(small, np.moveaxis(ground, -1, 0).astype(np.float32), angles, lens)
         path, pixels, valid = made(small, resolution=1.3, kernel="bicubic", tile=128)

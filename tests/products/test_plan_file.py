@@ -55,7 +55,7 @@ def test_what_was_written_is_what_is_read(planned: tuple[Path, OrthoPlan], monke
     from photoplan.products.orthophoto import plan as planning
     from photoplan.project import scene
 
-    for module, name in ((planning, "cover"), (planning, "covered_tiles"), (scene, "_open")):
+    for module, name in ((scene, "footprint"), (planning, "covered_tiles"), (scene, "_open")):
         monkeypatch.setattr(module, name, None)
     again, _ = read_plan(path)
     assert (again.settings, again.blind, again.project) == (plan.settings, plan.blind, plan.project)
@@ -65,8 +65,8 @@ def test_what_was_written_is_what_is_read(planned: tuple[Path, OrthoPlan], monke
         mine = figures.index[(figures.product == wrote.plan.name) & (figures.cells_of_tile > 0)]
         tiles = tuple(tile for tile in wrote.plan.tiles if tile.index in mine)
         assert read.plan == replace(wrote.plan, tiles=tiles)
-        assert (read.coverage.bounds, read.coverage.on_surface) == (wrote.coverage.bounds, wrote.coverage.on_surface)
-        np.testing.assert_array_equal(read.coverage.outline, wrote.coverage.outline)
+        assert (read.footprint.bounds, read.footprint.on_surface) == (wrote.footprint.bounds, wrote.footprint.on_surface)
+        np.testing.assert_array_equal(read.footprint.outline, wrote.footprint.outline)
 
 
 def test_a_plan_moves_with_its_project(planned: tuple[Path, OrthoPlan], small: Block, tmp_path: Path) -> None:

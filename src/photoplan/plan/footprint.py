@@ -94,8 +94,8 @@ class View:
         directions = _directions(feet[0] if down else feet[-1])
         along = feet @ directions.T
         extents = along.max(axis=1)
-        # The border may bend between its points, by less than it does between every second one; and two pixels.
-        pixel = np.linalg.norm(np.diff(feet, axis=1), axis=2).sum(axis=1) / sum(camera.size)
+        # The border may bend between its points, by less than it does between every second one; and a pixel.
+        pixel = np.linalg.norm(np.diff(feet, axis=1), axis=2).sum(axis=1) / sum(camera.size) / 2
         extents += extents - along[:, ::2].max(axis=1) + pixel[:, None]
         return cls(center, directions, levels, extents, far)
 

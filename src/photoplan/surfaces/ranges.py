@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from photoplan.geometry.grid import Window
 from photoplan.kernels.extent import height_ranges
 
-#: Posts along a side of a cell, the smallest area whose range is kept; a power of two times that in larger grids …
-CELL = 16
-#: … so that there are no more cells than this (8 bytes each).
-MOST_CELLS = 4_000_000
+#: Cells whose ranges are kept (8 bytes each): single posts in small grids, squares of 2, 4, 8 … posts in larger ones.
+MOST_CELLS = 2_000_000
 
 
 class HeightGrid(Protocol):
@@ -48,7 +46,7 @@ class GridRanges:
 
     def __post_init__(self) -> None:
         columns, rows = self.grid.size
-        side = CELL
+        side = 1
         while -(-columns // side) * -(-rows // side) > MOST_CELLS:
             side *= 2
         # Parts are made of whole cells.

@@ -12,7 +12,7 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.sample_grid import sample_lattice, sample_points
 from photoplan.surfaces.carried import box_points, carried_positions
-from photoplan.surfaces.ranges import CELL, GridRanges, HeightGrid
+from photoplan.surfaces.ranges import GridRanges, HeightGrid
 from photoplan.surfaces.rays import Hits, Part, carried_hits
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
@@ -101,7 +101,9 @@ class RasterSurface:
         """
         boxes = np.asarray(bounds, float)
         posts = self._posts(box_points(boxes.reshape(-1, 4), self.to_grid_crs))
-        low, high = np.floor(np.fmin.reduce(posts, axis=1)) - 1, np.floor(np.fmax.reduce(posts, axis=1)) + 3
+        low, high = np.fmin.reduce(posts, axis=1), np.fmax.reduce(posts, axis=1)
+        # Rounding may have moved a position over a post.
+        low, high = np.floor(low - 1e-6), np.floor(high + 1e-6) + 2
         there = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1)
         windows = np.concatenate([np.where(there[:, None], low, 0), np.where(there[:, None], high, 0)], axis=1)
         windows = np.clip(windows, 0, np.tile(self.grid.size, 2)).astype(np.int64)
@@ -111,7 +113,7 @@ class RasterSurface:
         """Where rays first come down onto the surface; see `Terrain.first_hit`."""
         paths = np.asarray(paths, float)
         # No more posts at once than the file's blocks have.
-        side = max(CELL, min(FEW_PART if len(paths) < FEW else MANY_PART, *self.part))
+        side = max(16, min(FEW_PART if len(paths) < FEW else MANY_PART, *self.part))
         return carried_hits(RasterParts(self, side), paths, self.to_grid_crs, bend)
 
     def _posts(self, XY: NDArray[np.float64]) -> NDArray[np.float64]:

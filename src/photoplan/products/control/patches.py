@@ -108,14 +108,16 @@ def _seen(scene: Scene) -> tuple[shapely.Geometry, tuple[int, int]] | None:
     level = float(scene.surface.heights(camera.center[:2]))
     if not np.isfinite(level):
         level = sum(scene.footprint.height_range) / 2
-    if scene.footprint.bounds is None or not np.isfinite(level):
+    if not np.isfinite(level):
         return None
     origin, direction = camera.rays(image_border(camera.size), level)
     with np.errstate(divide="ignore", invalid="ignore"):
         t = (level - origin[:, 2]) / direction[:, 2]
         foot = origin[:, :2] + t[:, None] * direction[:, :2]
     foot = foot[np.isfinite(foot).all(axis=1) & (direction[:, 2] < 0) & (t > 0)]
-    area = shapely.convex_hull(shapely.MultiPoint(foot)).intersection(shapely.box(*scene.footprint.bounds))
+    area = shapely.convex_hull(shapely.MultiPoint(foot))
+    if scene.ground.bounds is not None:
+        area = area.intersection(shapely.box(*scene.ground.bounds))
     return (area, camera.size) if area.area > 0 else None
 
 
