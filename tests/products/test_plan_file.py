@@ -65,7 +65,10 @@ def test_what_was_written_is_what_is_read(planned: tuple[Path, OrthoPlan], monke
         mine = figures.index[(figures.product == wrote.plan.name) & (figures.cells_of_tile > 0)]
         tiles = tuple(tile for tile in wrote.plan.tiles if tile.index in mine)
         assert read.plan == replace(wrote.plan, tiles=tiles)
-        assert (read.footprint.bounds, read.footprint.on_surface) == (wrote.footprint.bounds, wrote.footprint.on_surface)
+        assert (read.footprint.bounds, read.footprint.on_surface) == (
+            wrote.footprint.bounds,
+            wrote.footprint.on_surface,
+        )
         np.testing.assert_array_equal(read.footprint.outline, wrote.footprint.outline)
 
 

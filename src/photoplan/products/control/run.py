@@ -129,13 +129,14 @@ def propose_control(request: ControlRequest, events: Events = SILENT) -> Control
     ground, points = _tables(patches, covariances, images)
     if not len(points):
         found = sum(i.matched for i in images)
+        advice = "give a larger `search`, another `correlation`, or an orthophoto of a similar date"
         if not found:
             reasons = sum((Counter(i.reasons) for i in images), Counter[str]())
             listed = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common()) or "none is in an image"
-            raise GeometryError(f"no patch of the orthophoto was found in an image: {listed}")
+            raise GeometryError(f"no patch of the orthophoto was found in an image: {listed}; {advice}")
         raise GeometryError(
             f"{found} of {sum(i.tried for i in images)} patches were found, but they do not agree on an orientation of "
-            "any image; give a larger `search`, another `correlation`, or an orthophoto of a similar date"
+            f"any image; {advice}"
         )
     write_ground_points(output, ground)
     write_image_points(image_output, points)
