@@ -18,7 +18,7 @@ import numpy as np
 
 from photoplan.engine.cluster import Question
 from photoplan.engine.executors import Workers, executor_factory, open_workers
-from photoplan.engine.run import Made, Runner, Tally, Work, run_works
+from photoplan.engine.run import Made, Runner, Tally, Work
 from photoplan.events import SILENT
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.product import ProductFile
@@ -60,7 +60,7 @@ def make(name: str, job: object, workers: Workers, folder: Path, count: int = TI
         name=name, job=job, tiles=tiles, count=len(tiles), sinks=(file,), complete=len_of, scratch=folder / ".parcels"
     )
     with clock(name, len(tiles)):
-        run_works([work], Runner(workers, 2 * workers.threads, SILENT))
+        Runner(workers, 2 * workers.threads, SILENT).run([work])
 
 
 def len_of(tally: Tally) -> int:

@@ -129,26 +129,26 @@ class Mortal(Executor):
 
     def __init__(self, deadly: Callable[[Any], bool], together: int) -> None:
         self.deadly, self.together = deadly, together
-        self.waiting: list[tuple[Future[Any], Callable[..., Any], tuple[Any, ...]]] = []
+        self.waiting: list[tuple[Future[Any], Callable[[Any], Any], Any]] = []
         self.dead = False
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         if self.dead:
             raise BrokenProcessPool("dead already")
         future: Future[Any] = Future()
-        self.waiting.append((future, fn, args))
+        self.waiting.append((future, fn, args[0]))
         threading.Timer(0.001, self._step).start()
         return future
 
     def _step(self) -> None:
         waiting, self.waiting = self.waiting, []
-        if any(self.deadly(args[1]) for _, _, args in waiting):
+        if any(self.deadly(task) for _, _, task in waiting):
             self.dead = True
-        for future, fn, args in waiting:
+        for future, fn, task in waiting:
             if self.dead:
                 future.set_exception(BrokenProcessPool("died"))
             else:
-                future.set_result(fn(*args))
+                future.set_result(fn(task))
 
 
 def test_fault_05_only_the_deadly_tile_is_blamed() -> None:

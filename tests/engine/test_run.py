@@ -11,7 +11,7 @@ import pytest
 from tools.events import Told
 
 from photoplan.engine.executors import Workers, executor_factory
-from photoplan.engine.run import Kept, Made, Runner, Tally, Work, run_works, tiles_in_flight
+from photoplan.engine.run import Kept, Made, Runner, Tally, Work, tiles_in_flight
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.plan.product import Tile
@@ -67,7 +67,7 @@ def run(*works: Work[Any] | Kept[Any], workers: int = 1, excuse: Any = None) -> 
     told = Told()
     told.begin("tiles")
     with Workers(executor_factory("threads", workers)) as pool:
-        return run_works(works, Runner(pool, 4, told, excuse)), told
+        return Runner(pool, 4, told, excuse).run(works), told
 
 
 @pytest.mark.parametrize("workers", [1, 3])
@@ -153,7 +153,7 @@ def test_what_was_complete_is_told_before_an_error_ends_the_run() -> None:
     told = Told()
     told.begin("tiles")
     with Workers(executor_factory("threads", 1)) as pool, pytest.raises(InputError):
-        run_works([work("a", [Memory()], complete=lambda t: "a"), work("b", [Memory()], fail)], Runner(pool, 1, told))
+        Runner(pool, 1, told).run([work("a", [Memory()], complete=lambda t: "a"), work("b", [Memory()], fail)])
     assert told.results == ["a"]
 
 

@@ -15,12 +15,12 @@ import rasterio
 from tools.events import Told
 from tools.small_block import CRS, NAMES, SIZE, Block, make_project, texture, write_image
 
+from photoplan.engine import execute as engine_execute
 from photoplan.engine import run as engine_run
 from photoplan.engine.executors import run_tiles
 from photoplan.errors import InputError, ResourceError, TilesFailed, UsageError
 from photoplan.io.product import ProductFile
 from photoplan.io.project.file import load_project
-from photoplan.products.orthophoto import execution
 from photoplan.products.orthophoto.execution import BASE_MEMORY, Run, execute
 from photoplan.products.orthophoto.plan import OrthoPlan, plan_orthophotos
 from photoplan.project import scene
@@ -170,14 +170,14 @@ class TestContinuing:
 def test_fault_05_failed_tiles_cost_their_product_only(
     plan: OrthoPlan, serial: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    render = execution.render_tile
+    render = engine_execute.render
 
-    def failing(product: Any, kernel: str, scene: Any, tile: Any) -> Any:
+    def failing(product: Any, tile: Any, *rest: Any) -> Any:
         if product.image == "three" and tile.index in (2, 5):
             raise RuntimeError("out of luck")
-        return render(product, kernel, scene, tile)
+        return render(product, tile, *rest)
 
-    monkeypatch.setattr(execution, "render_tile", failing)
+    monkeypatch.setattr(engine_execute, "render", failing)
     told = Told()
     with pytest.raises(TilesFailed) as error:
         execute(plan, tmp_path, Run(2, events=told))

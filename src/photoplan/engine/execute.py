@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.engine.base import Source
+from photoplan.engine.run import Made
 from photoplan.geometry.grid import Window
 from photoplan.kernels.position import ALL_MINE
 from photoplan.kernels.rectify import rectify_tile
@@ -118,3 +119,48 @@ def _border(layer: Layer, size: tuple[int, int]) -> tuple[float, float, float, f
     """Outer edges of the image x_min, y_min, x_max, y_max in the pixel coordinates of the layer's window."""
     window, f = layer.anchors.source_window, 2.0**layer.level
     return (-0.5 - window.col, -0.5 - window.row, size[0] / f - 0.5 - window.col, size[1] / f - 0.5 - window.row)
+
+
+class Opened(Protocol):
+    """What pixels and depths come from."""
+
+    @property
+    def sources(self) -> Sequence[Source]:
+        """The table of sources."""
+        ...
+
+    @property
+    def surface(self) -> Surface:
+        """What a product's depth is taken from."""
+        ...
+
+
+class Address(Protocol):
+    """How a worker opens what a plan needs: small, and pickles."""
+
+    def open(self) -> Opened:
+        """Sources and surface; kept for the next tile.
+
+        Raises
+        ------
+        InputError
+            An input has changed since it was planned.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class RenderJob:
+    """What a worker is told once of a product that is resampled."""
+
+    address: Address
+    product: ProductPlan
+    """Without its tiles."""
+    kernel: str
+
+    def __call__(self, tile: Tile) -> Made:
+        """Pixels of a tile, and the figures of its anchors."""
+        opened = self.address.open()
+        pixels = render(self.product, tile, opened.sources, opened.surface, self.kernel)
+        layer = None if pixels.values is None else (pixels.values, pixels.valid)
+        return Made((layer,), {"worst_residual": pixels.residual, "cells": pixels.cells})

@@ -147,11 +147,6 @@ def thread_map(workers: int) -> Iterator[Map]:
     pool.shutdown()
 
 
-def call(work: Callable[[Any], Any], task: Any) -> Any:
-    """What a worker does with a task."""
-    return work(task)
-
-
 def open_workers(kind: str, workers: int, question: Question, events: Events) -> Workers:
     """The workers that a user asked for; those of a cluster are asked who they are.
 
@@ -223,17 +218,12 @@ class Workers:
     ) -> None:
         self.end(wait=kind is None)
 
-    def submit(self, work: Callable[[Any], Any], task: Any) -> Future[Any]:
-        """Hand one task to the workers.
-
-        Raises
-        ------
-        BrokenExecutor
-            They have died; `end` them and submit again.
-        """
+    @property
+    def executor(self) -> Executor:
+        """Takes tasks, till it says that it is broken: `end` it then and ask again."""
         if self._executor is None:
             self._executor = self._make()
-        return self._executor.submit(call, work, task)
+        return self._executor
 
     def end(self, wait: bool = True) -> None:
         """Let the workers go, at once or after the tasks they are at."""
@@ -273,10 +263,14 @@ def run_tiles(
     alone: deque[Any] = deque()
     failures: dict[Any, int] = {}
     pending: dict[Future[Any], Any] = {}
+    solo = False
     try:
         while waiting or alone or pending:
             try:
-                _fill(workers, work, pending, waiting, alone, in_flight)
+                while not solo and (queue := _next(waiting, alone, pending, in_flight)) is not None:
+                    future = workers.executor.submit(work, queue[0])
+                    solo = queue is alone
+                    pending[future] = queue.popleft()
             except BrokenExecutor:
                 # The pool broke after its last result came: what is pending is told so below.
                 if not pending:
@@ -286,6 +280,9 @@ def run_tiles(
             if not done:
                 workers.check()
                 pulse()
+                continue
+            # Whoever runs alone is done before others begin.
+            solo = False
             if any(f.cancelled() for f in done):
                 raise workers.lost()
             broken = [f for f in done if isinstance(f.exception(), BrokenExecutor)]
@@ -310,21 +307,11 @@ def run_tiles(
             future.cancel()
 
 
-def _fill(
-    workers: Workers,
-    work: Callable[[Any], Any],
-    pending: dict[Future[Any], Any],
-    waiting: deque[Any],
-    alone: deque[Any],
-    in_flight: int,
-) -> None:
-    """Submit what may run now: many tasks at once, or one of those that must run alone."""
-    while waiting and not alone and len(pending) < in_flight:
-        future = workers.submit(work, waiting[0])
-        pending[future] = waiting.popleft()
-    if alone and not pending:
-        future = workers.submit(work, alone[0])
-        pending[future] = alone.popleft()
+def _next(waiting: deque[Any], alone: deque[Any], pending: dict[Future[Any], Any], in_flight: int) -> deque[Any] | None:
+    """Where the next task comes from: many at once, or one of those that must run alone; None: nothing may begin."""
+    if alone:
+        return None if pending else alone
+    return waiting if waiting and len(pending) < in_flight else None
 
 
 def _lost(lost: list[Any], alone: deque[Any], failures: dict[Any, int]) -> Iterator[Outcome]:

@@ -147,7 +147,7 @@ def tiles_in_flight(wanted: int, memory: int | None, base: int, each: int) -> in
 
 
 class Runner(Generic[T]):
-    """Makes products one after the other; a context manager that waits for the last one.
+    """Makes products one after the other.
 
     Parameters
     ----------
@@ -194,27 +194,36 @@ class Runner(Generic[T]):
         finally:
             self._pool.shutdown()
 
-    def make(self, work: Work[T] | Kept[T]) -> None:
-        """Compute a product's tiles, and have it completed."""
-        if isinstance(work, Kept):
-            future: Future[T] = Future()
-            future.set_result(work.result)
-            self._events.done(work.tiles)
-        else:
-            with ExitStack() as stack:
-                try:
-                    for sink in work.sinks:
-                        stack.enter_context(sink)
-                    tally = self._compute(work)
-                except PhotoplanError as error:
+    def run(self, works: Iterable[Work[T] | Kept[T]]) -> list[T]:
+        """Compute the tiles of all products, and have each completed while the next is computed.
+
+        Raises
+        ------
+        PhotoplanError
+            A product could not be made, and its error was not excused; finished tiles are kept.
+        """
+        with self:
+            for work in works:
+                if isinstance(work, Kept):
+                    kept: Future[T] = Future()
+                    kept.set_result(work.result)
+                    self._completing.append((work, kept))
+                    self._events.done(work.tiles)
+                    self._settle_done()
+                    continue
+                with ExitStack() as stack:
+                    try:
+                        for sink in work.sinks:
+                            stack.enter_context(sink)
+                        tally = self._compute(work)
+                    except PhotoplanError as error:
+                        self._settle(0)
+                        self._tell(self._excused(work, error))
+                        continue
+                    # Files of one product are assembled at a time; that of the next one is already computed.
                     self._settle(0)
-                    self._tell(self._excused(work, error))
-                    return
-                # Files of one product are assembled at a time; that of the next one is already computed.
-                self._settle(0)
-                future = self._pool.submit(_complete, work, tally, stack.pop_all())
-        self._completing.append((work, future))
-        self._settle_done()
+                    self._completing.append((work, self._pool.submit(_complete, work, tally, stack.pop_all())))
+        return self.results
 
     def _compute(self, work: Work[T]) -> Tally:
         """Bring every tile of a product into its sinks: those of an earlier run are there, the others are computed."""
@@ -295,17 +304,3 @@ def _store(sinks: Sequence[Sink], index: int, made: Made) -> None:
 def _complete(work: Work[T], tally: Tally, stack: ExitStack) -> T:
     with stack:
         return work.complete(tally)
-
-
-def run_works(works: Iterable[Work[T] | Kept[T]], runner: Runner[T]) -> list[T]:
-    """Make all products.
-
-    Raises
-    ------
-    PhotoplanError
-        A product could not be made, and its error was not excused; finished tiles are kept.
-    """
-    with runner:
-        for work in works:
-            runner.make(work)
-    return runner.results

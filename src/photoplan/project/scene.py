@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.base import CentralCamera
 from photoplan.cameras.build import oriented_camera
+from photoplan.engine.base import Source
 from photoplan.errors import InputError
 from photoplan.geometry.crs import CrsStep
 from photoplan.geometry.heights import HeightStep, declared_pair, height_step
@@ -110,6 +111,11 @@ class Scene:
     def footprint(self) -> Footprint:
         """What the image sees of the ground."""
         return footprint(self.camera, self.surface, self.ground.bounds)
+
+    @property
+    def sources(self) -> tuple[Source]:
+        """The image as a table of sources."""
+        return (Source(self.camera, self.reader),)
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -13,14 +13,14 @@ import signal
 import time
 from pathlib import Path
 
-from photoplan.engine import executors
+from photoplan.engine.execute import RenderJob
 
-_call = executors.call
+_call = RenderJob.__call__
 _how = {name: os.environ.get(f"SABOTAGE_{name}", "") for name in ("HOLD", "QUICK", "IMAGE", "BEGUN", "DEADLY", "ONCE")}
 
 
 def _sabotaged(job, tile):  # type: ignore[no-untyped-def]
-    image = getattr(getattr(job, "product", None), "image", "")
+    image = job.product.image
     if _how["HOLD"] and _how["IMAGE"] in ("", image) and tile.index >= int(_how["QUICK"] or 0):
         if _how["BEGUN"]:
             (Path(_how["BEGUN"]) / str(os.getpid())).touch()
@@ -38,4 +38,4 @@ def _sabotaged(job, tile):  # type: ignore[no-untyped-def]
     return _call(job, tile)
 
 
-executors.call = _sabotaged
+RenderJob.__call__ = _sabotaged

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from photoplan.engine.cpus import available_cpus
 from photoplan.engine.executors import Workers, executor_factory
-from photoplan.engine.run import Made, Runner, Tally, Work, run_works
+from photoplan.engine.run import Made, Runner, Tally, Work
 from photoplan.errors import ResourceError, TilesFailed, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import Placement, Window
@@ -133,7 +133,7 @@ def write_grid(
     )
     options.events.begin(path.name, len(windows))
     with Workers(make) as pool:
-        (facts,) = run_works([work], Runner(pool, 2 * workers if workers > 1 else 1, options.events))
+        (facts,) = Runner[ProductFacts](pool, 2 * workers if workers > 1 else 1, options.events).run([work])
     return facts
 
 

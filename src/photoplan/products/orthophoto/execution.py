@@ -11,20 +11,19 @@ from typing import Any
 
 from photoplan import __version__
 from photoplan.engine.cluster import Question
-from photoplan.engine.execute import MOST_SOURCE_BYTES
+from photoplan.engine.execute import MOST_SOURCE_BYTES, RenderJob
 from photoplan.engine.executors import Workers, executor_factory, open_workers
-from photoplan.engine.run import Kept, Made, Runner, Tally, Work, run_works, tiles_in_flight
+from photoplan.engine.run import Kept, Runner, Tally, Work, tiles_in_flight
 from photoplan.errors import TilesFailed, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.product import ProductFile
 from photoplan.io.quicklook import write_overview
 from photoplan.io.run_record import peak_memory_bytes, record_path, run_times, versions, write_run_record
 from photoplan.kernels.rectify import is_compiled
-from photoplan.plan.product import ProductPlan, Tile
-from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, render_tile
+from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct
 from photoplan.products.orthophoto.results import ProductResult, finished_products, product_path
 from photoplan.project.restored_reader import RestoredReader
-from photoplan.project.scene import Scene, SceneAddress, input_files, open_scene, scene_address
+from photoplan.project.scene import Scene, input_files, open_scene, scene_address
 
 #: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
 BASE_MEMORY = 320 * 2**20
@@ -77,21 +76,6 @@ class Run:
         return tiles_in_flight(wanted, self.memory, BASE_MEMORY, 3 * MOST_SOURCE_BYTES)
 
 
-@dataclass(frozen=True)
-class OrthoJob:
-    """What a worker is told once: small, and pickles."""
-
-    scene: SceneAddress
-    product: ProductPlan
-    kernel: str
-
-    def __call__(self, tile: Tile) -> Made:
-        """Pixels of a tile, and the figures of its anchors."""
-        pixels = render_tile(self.product, self.kernel, self.scene.open(), tile)
-        layer = None if pixels.values is None else (pixels.values, pixels.valid)
-        return Made((layer,), {"worst_residual": pixels.residual, "cells": pixels.cells})
-
-
 def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list[ProductResult]:
     """Make all products of a plan.
 
@@ -134,10 +118,8 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     run.events.begin("tiles", sum(len(p.plan.tiles) for p in plan.products))
     question = Question(versions, tuple(str(path.resolve()) for path in _pixel_files(plan)), str(folder.resolve()))
     with open_workers(run.executor, run.workers, question, run.events) as workers:
-        results = run_works(
-            (_work(plan, p, folder, run, kept.get(p.plan.name), workers) for p in plan.products),
-            Runner(workers, run.in_flight(workers.threads), run.events),
-        )
+        works = (_work(plan, p, folder, run, kept.get(p.plan.name), workers) for p in plan.products)
+        results = Runner[ProductResult](workers, run.in_flight(workers.threads), run.events).run(works)
     if run.quicklook:
         write_overview([r.path for r in results if not r.failed], picture)
     failed = [f"{r.path.name}: tiles {', '.join(map(str, r.failed))} ({r.reason})" for r in results if r.failed]
@@ -200,7 +182,7 @@ def _work(
     )
     return Work(
         name=product.plan.name,
-        job=OrthoJob(scene.address, replace(product.plan, tiles=()), settings.kernel),
+        job=RenderJob(scene.address, replace(product.plan, tiles=()), settings.kernel),
         tiles=product.plan.tiles,
         count=product.plan.tile_count,
         sinks=(file,),

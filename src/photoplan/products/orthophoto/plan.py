@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from photoplan import __version__
 from photoplan.cameras.base import CentralCamera
-from photoplan.engine.base import Source
-from photoplan.engine.execute import Pixels
 from photoplan.engine.execute import render as render_tiles
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
@@ -287,7 +285,7 @@ def render(
         common = tile.window & window
         if not common.size:
             continue
-        pixels = render_tile(product.plan, plan.settings.kernel, scene, tile)
+        pixels = render_tiles(product.plan, tile, scene.sources, scene.surface, plan.settings.kernel)
         if pixels.values is None or pixels.valid is None:
             continue
         to = np.s_[
@@ -309,8 +307,3 @@ def window_of(grid: MapGrid, bounds: tuple[float, float, float, float]) -> Windo
     row = round((grid.top - part.top) / grid.resolution)
     left, top = max(col, 0), max(row, 0)
     return Window(left, top, max(0, col + part.width - left), max(0, row + part.height - top)) & grid.window
-
-
-def render_tile(product: ProductPlan, kernel: str, scene: Scene, tile: Tile) -> Pixels:
-    """Pixels of one tile of a product."""
-    return render_tiles(product, tile, [Source(scene.camera, scene.reader)], scene.surface, kernel)

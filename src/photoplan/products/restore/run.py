@@ -13,7 +13,7 @@ import numpy as np
 
 from photoplan import __version__
 from photoplan.engine.executors import Workers, executor_factory
-from photoplan.engine.run import Kept, Runner, Work, run_works, tiles_in_flight
+from photoplan.engine.run import Kept, Runner, Work, tiles_in_flight
 from photoplan.errors import InputError, PhotoplanError, ResourceError, RunLocked, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.filter_file import filter_text
@@ -244,7 +244,7 @@ def restore_images(request: RestoreRequest, events: Events = SILENT) -> RestoreR
 
     events.begin("restoring", plan.tiles)
     with Workers(executor_factory("threads", request.workers)) as workers:
-        results = run_works(works(), Runner(workers, plan.in_flight, events, excuse))
+        results = Runner(workers, plan.in_flight, events, excuse).run(works())
     return RestoreReport(tuple(r for r in results if r is not None), failed, plan.filter, request.folder)
 
 
