@@ -9,9 +9,8 @@ from scipy import ndimage
 from tools.mark_scans import Simulated, ring_cross_pattern, simulate
 
 from photoplan.errors import InputError
-from photoplan.orientation.marks.locate import locate_mark
+from photoplan.orientation.marks.locate import locate_mark, paraboloid_peak
 from photoplan.orientation.marks.match import fine_template, match_template
-from photoplan.orientation.marks.paraboloid import paraboloid_peak
 from photoplan.orientation.marks.target import locate_target
 
 PATTERN = ring_cross_pattern()

@@ -9,8 +9,7 @@ from tools.photos import turned_by
 from photoplan.errors import GeometryError
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_opk
-from photoplan.orientation.start.five_point import five_point_essentials
-from photoplan.orientation.start.relative import relate
+from photoplan.orientation.start.relative import five_point_essentials, relate
 
 SIGMA = 5e-5
 

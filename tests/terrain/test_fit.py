@@ -13,8 +13,7 @@ from tools.random_field import random_field
 from photoplan.surfaces.measured import MeasuredLine
 from photoplan.terrain.build import Built, plan_build
 from photoplan.terrain.covariance import Covariance, Neighbours, estimate_all
-from photoplan.terrain.fit import _members, _unit_of
-from photoplan.terrain.leaves import quadtree
+from photoplan.terrain.fit import _members, _unit_of, quadtree
 from photoplan.terrain.settings import FAMILIES, BuildSettings
 
 STEP = 0.2

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -159,18 +158,3 @@ def solve(A: _Floats, y: _Floats, weight: _Floats | None = None) -> Fit:
     redundancy = (count - parts.rank) * (1 if y.ndim == 1 else y.shape[1])
     condition = float(parts.s[-1] / parts.s[0]) if parts.rank else 0.0
     return Fit(x, parts.cofactors, A @ x - y, parts.rank, condition, square, redundancy, A, weight)
-
-
-def spelled(direction: _Floats, names: Sequence[str], least: float = 0.1) -> list[int]:
-    """The unknowns that take part in a direction, the largest part first: their numbers.
-
-    Parameters
-    ----------
-    direction : ndarray, shape (u,)
-        Of unknowns that are scaled to one size.
-    names : sequence of str
-    least : float
-        Smallest part of the largest that counts.
-    """
-    share = np.abs(direction)
-    return [int(k) for k in np.argsort(-share) if share[k] > least * share.max() and k < len(names)]

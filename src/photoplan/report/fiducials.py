@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from photoplan.orientation.marks.drawn import draw
 from photoplan.orientation.marks.fiducials import FiducialResult, LocatedMark, MissingMark
 from photoplan.orientation.marks.layout import MarkLayout
 from photoplan.orientation.marks.measure import mark_window
 from photoplan.orientation.marks.search import Scan
+from photoplan.orientation.marks.template import draw
 from photoplan.products.fiducials.run import ImageFiducials
 from photoplan.project.camera_marks import ScanImage
 from photoplan.report.drawing import png

@@ -18,13 +18,11 @@ from photoplan.errors import GeometryError
 from photoplan.orientation.bundle.block import Active, Adjusted, AdjustSettings, Block, Correlation
 from photoplan.orientation.bundle.correlation import correlation_of, effects_of_rows
 from photoplan.orientation.bundle.model import Model, build_model
-from photoplan.orientation.bundle.normal import reduce_normals
-from photoplan.orientation.bundle.rank import check_rank
-from photoplan.orientation.bundle.result import Weighted, result_of
+from photoplan.orientation.bundle.normal import check_rank, reduce_normals
+from photoplan.orientation.bundle.result import Solution, Weighted, result_of, solution_of
 from photoplan.orientation.bundle.robust import first_taken_out, robust_weights, snooped, softened, weights_of
 from photoplan.orientation.bundle.rows import linearise, residuals_of, whitened
 from photoplan.orientation.bundle.select import Selection, select, start_points
-from photoplan.orientation.bundle.solution import Solution, solution_of
 from photoplan.orientation.bundle.unknowns import State, start_state
 
 #: Called after each iteration: its number, and the root mean square of the weighted residuals.

@@ -13,11 +13,11 @@ from photoplan.adjustment.linear import solve
 from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.orientation.marks.drawn import draw
 from photoplan.orientation.marks.edges import fit_edges
 from photoplan.orientation.marks.layout import FILM, MarkLayout, Placement, fit_placement
 from photoplan.orientation.marks.locate import BLURS, Location, best_blur, locate_mark
 from photoplan.orientation.marks.search import Scan
+from photoplan.orientation.marks.template import draw
 
 _BLUR = 0.7
 """Standard deviation of blur with which measuring begins, pixels."""

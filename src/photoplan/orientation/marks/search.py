@@ -13,10 +13,9 @@ from scipy import ndimage
 
 from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
 from photoplan.geometry.grid import Window
-from photoplan.orientation.marks.drawn import draw
 from photoplan.orientation.marks.layout import FLOOR, MarkLayout, Placement, Turn, combine
 from photoplan.orientation.marks.locate import correlation_surface
-from photoplan.orientation.marks.template import Template
+from photoplan.orientation.marks.template import Template, draw
 
 SIDE = 20
 """Pixels that the smaller side of the smallest mark has in the coarse search, about."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -221,3 +222,22 @@ def _resample(
     weights = np.where(inside, np.clip(2 * sampled[0] - 1, 0.0, 1.0), 0.0)
     values = np.divide(sampled[1], sampled[0], out=np.zeros(shape), where=sampled[0] > 0.5)
     return values.astype(np.float32), weights.astype(np.float32)
+
+
+def draw(
+    pattern: MarkPattern | MarkExample,
+    mm_to_pixel: NDArray[np.float64] | Sequence[Sequence[float]],
+    *,
+    negative: bool = False,
+    blur_px: float = 0.7,
+) -> Template:
+    """What `render` draws, or drew for the same pattern, matrix, tone and blur; see there."""
+    matrix = np.asarray(mm_to_pixel, float)
+    return _drawn(pattern, matrix.shape, tuple(matrix.ravel().tolist()), negative, float(blur_px))
+
+
+@lru_cache(maxsize=48)
+def _drawn(
+    pattern: MarkPattern | MarkExample, shape: tuple[int, int], matrix: tuple[float, ...], negative: bool, blur: float
+) -> Template:
+    return render(pattern, np.array(matrix).reshape(shape), negative=negative, blur_px=blur)
