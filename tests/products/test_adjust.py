@@ -18,8 +18,8 @@ from photoplan.io.image_points import read_image_points
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import ANGLE_UNITS
 from photoplan.orientation.bundle.block import AdjustSettings
+from photoplan.orientation.bundle.frame import angle_derivatives
 from photoplan.products.adjust.block import adjust_prepared, map_result, prepare
-from photoplan.products.adjust.frame import angle_derivatives
 from photoplan.products.adjust.inputs import read_inputs
 from photoplan.products.adjust.run import OUTPUTS, AdjustReport, AdjustRequest, adjust_project
 from photoplan.products.adjust.start import started

@@ -15,8 +15,9 @@ from photoplan.io.camera.model import FrameCamera
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.project.model import Image, Orientation
 from photoplan.io.terrain.reader import TerrainReader
-from photoplan.products.check.plausibility import Plausibility, View, assess, view_of
-from photoplan.products.check.readings import DECLARED, readings
+from photoplan.orientation.other_readings import DECLARED, readings
+from photoplan.orientation.plausibility import Plausibility, View, assess
+from photoplan.products.check.view import view_of
 from photoplan.surfaces.raster import RasterSurface
 
 EAST = np.array([1100.0, 0, 0])

@@ -16,8 +16,9 @@ from photoplan.io.project.cameras import interior_of
 from photoplan.io.project.model import ANGLE_UNITS, Project
 from photoplan.orientation.bundle.adjust import adjust_block
 from photoplan.orientation.bundle.block import Adjusted, AdjustSettings, Block, BlockCamera, BlockImage
+from photoplan.orientation.bundle.frame import BlockFrame, angle_derivatives
 from photoplan.products.adjust.cameras import Calibrated, Free, block_camera, calibrated
-from photoplan.products.adjust.frame import BlockFrame, angle_derivatives, block_frame, make_bend, nadir_heights
+from photoplan.products.adjust.frame import block_frame, make_bend, nadir_heights
 from photoplan.products.adjust.inputs import AdjustInputs
 
 _Floats = NDArray[np.float64]
@@ -225,10 +226,9 @@ def _ground_residuals(prepared: Prepared, adjusted: Adjusted, XYZ: _Floats) -> _
 
 def _position_residuals(prepared: Prepared, adjusted: Adjusted) -> _Floats:
     positions = prepared.inputs.positions
-    if positions is None or prepared.frame.local is None:
+    if positions is None:
         return np.asarray(adjusted.position_residuals)
-    back = np.linalg.inv(prepared.frame.jacobian(positions.XYZ))
-    return np.asarray((back @ adjusted.position_residuals[..., None])[..., 0])
+    return prepared.frame.map_vectors(adjusted.position_residuals, positions.XYZ)
 
 
 def _cameras(project: Project, block: Block, adjusted: Adjusted) -> tuple[Calibrated, ...]:

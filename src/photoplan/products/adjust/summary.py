@@ -226,7 +226,7 @@ def _strips(result: MapResult) -> tuple[StripFigures, ...]:
         good = mine & ~adjusted.position_rejected & np.isfinite(result.position_residuals).all(axis=1)
         r = result.position_residuals[good]
         found = drift.get(name)
-        back = np.linalg.inv(frame.jacobian(positions.XYZ[mine].mean(axis=0)))
+        middle = positions.XYZ[mine].mean(axis=0)
         nothing = np.full(3, np.nan)
         known = found is not None and bool(np.isfinite(found.sigma[:3]).any())
         out.append(
@@ -236,8 +236,8 @@ def _strips(result: MapResult) -> tuple[StripFigures, ...]:
                 int(adjusted.position_rejected[mine].sum()),
                 _triple(r.mean(axis=0) if len(r) else nothing),
                 _triple(np.sqrt((r**2).mean(axis=0)) if len(r) else nothing),
-                _triple(back @ found.shift if known and found is not None else nothing),
-                _triple(back @ found.rate if known and found is not None else nothing),
+                _triple(frame.map_vectors(found.shift, middle) if known and found is not None else nothing),
+                _triple(frame.map_vectors(found.rate, middle) if known and found is not None else nothing),
                 _triple(found.sigma[:3] if found is not None else nothing),
             )
         )

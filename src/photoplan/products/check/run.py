@@ -10,8 +10,9 @@ import numpy as np
 
 from photoplan.geometry.crs import crs_label
 from photoplan.io.project.model import Project
+from photoplan.orientation.plausibility import ImagePlausibility, look, other_reading
 from photoplan.plain import pick
-from photoplan.products.check.plausibility import ImagePlausibility, look, other_reading, view_of
+from photoplan.products.check.view import view_of
 from photoplan.products.orthophoto.plan import mean_gsd, two_figures
 from photoplan.project.scene import Scene, ground_of, open_scene, pose_of
 

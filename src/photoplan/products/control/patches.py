@@ -15,8 +15,8 @@ from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
 from photoplan.matching.control import best_place
 from photoplan.matching.grey import GreyImage
+from photoplan.matching.ortho import OrthoPatch, patch_on
 from photoplan.plan.footprint import image_border
-from photoplan.products.control.match import OrthoPatch
 from photoplan.project.scene import Scene
 from photoplan.surfaces.base import Terrain
 
@@ -141,26 +141,9 @@ def _in_squares(
                 continue
             col, row = place
             patch = values[row - radius : row + radius + 1, col - radius : col + radius + 1].astype(float)
-            made = _patch(patch, (left + col * side, top - row * side), surface, side)
+            at = left + col * side, top - row * side
+            v, u = np.mgrid[-radius : radius + 1, -radius : radius + 1] * side
+            made = patch_on(patch, at, surface.heights(np.stack([at[0] + u, at[1] - v], axis=-1)), side)
             if made is not None:
                 found.append(made)
     return found
-
-
-def _patch(values: NDArray[np.float64], at: tuple[float, float], surface: Terrain, side: float) -> OrthoPatch | None:
-    """A patch with the plane through its ground; None where its middle has no height."""
-    radius = len(values) // 2
-    v, u = np.mgrid[-radius : radius + 1, -radius : radius + 1] * side
-    XY = np.stack([at[0] + u, at[1] - v], axis=-1)
-    Z = surface.heights(XY)
-    if not np.isfinite(Z[radius, radius]):
-        return None
-    known = np.isfinite(Z)
-    A = np.stack([np.ones(known.sum()), u[known], -v[known]], axis=1)
-    plane = np.array([np.median(Z[known]), 0.0, 0.0])
-    for _ in range(5):
-        off = np.abs(Z[known] - A @ plane)
-        weight = 1.0 / np.maximum(off, 0.05 * side)
-        plane = np.linalg.lstsq(A * np.sqrt(weight)[:, None], Z[known] * np.sqrt(weight), rcond=None)[0]
-    rough = float(np.sqrt(np.mean((Z[known] - A @ plane) ** 2)))
-    return OrthoPatch(values, (at[0], at[1], float(plane[0])), (float(plane[1]), float(plane[2])), rough)

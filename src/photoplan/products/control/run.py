@@ -24,8 +24,9 @@ from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project, Terrain
 from photoplan.io.raster import RasterReader
+from photoplan.matching.grey import GreyImage
+from photoplan.matching.ortho import ImageControl, OrthoPatch, Photo, Settings, control_of_image
 from photoplan.plain import pick
-from photoplan.products.control.match import ImageControl, OrthoPatch, Settings, control_of_image
 from photoplan.products.control.patches import Ortho, choose_patches
 from photoplan.project.scene import input_files, open_scene
 
@@ -111,6 +112,7 @@ def propose_control(request: ControlRequest, events: Events = SILENT) -> Control
     ortho = _open_ortho(request, project)
     sizes, patches = choose_patches(ortho, scenes, request.grid, request.radius, request.search)
     settings = Settings(*sizes, request.correlation)
+    photos = [Photo(scene.camera, GreyImage(scene.reader)) for scene in scenes]
     if request.dry_run or not patches:
         if not patches:
             raise GeometryError("the orthophoto has no textured place with heights that one of the images could see")
@@ -118,7 +120,7 @@ def propose_control(request: ControlRequest, events: Events = SILENT) -> Control
     covariances = _ground_covariances(patches, request, ortho)
 
     def work(k: int) -> ImageControl:
-        return control_of_image(names[k], scenes[k], patches, covariances, settings)
+        return control_of_image(names[k], photos[k], patches, covariances, settings)
 
     images = []
     events.begin("matching", len(names), "images")

@@ -18,11 +18,12 @@ from photoplan.geometry.rotation import angles_from_rotation
 from photoplan.io.project.cameras import interior_of, lens_of
 from photoplan.io.project.model import ANGLE_UNITS, Image, Project
 from photoplan.orientation.bundle.block import AdjustedCamera
+from photoplan.orientation.bundle.frame import angle_derivatives
 from photoplan.orientation.resection.adjust import resect
 from photoplan.orientation.resection.model import MeasuredPoints, Resected, ResectSettings
 from photoplan.plain import pick
 from photoplan.products.adjust.cameras import Calibrated, block_camera, calibrated, camera_entries
-from photoplan.products.adjust.frame import angle_derivatives, block_frame, nadir_heights
+from photoplan.products.adjust.frame import block_frame, nadir_heights
 from photoplan.products.adjust.inputs import AdjustInputs
 from photoplan.project.scene import stated_pose
 

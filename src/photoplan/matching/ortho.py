@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import project
+from photoplan.adjustment.linear import solve
+from photoplan.adjustment.robust import huber
+from photoplan.cameras.base import CentralCamera, project
 from photoplan.geometry.grid import Window
 from photoplan.kernels.patch_match import sample_spline, spline_coefficients
 from photoplan.matching.control import FoundPatch, agree, find_patch
 from photoplan.matching.grey import GreyImage
-from photoplan.project.scene import Scene
 
 #: A patch whose ground is rougher than displaces it by this is not used, pixels of the photo (reduced).
 _ROUGH = 1.0
@@ -22,6 +23,14 @@ _ROUGH = 1.0
 
 #: No position in a photo is believed to be better than this, pixels: two pictures of one place differ.
 _SIGMA = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """An image whose orientation is known approximately."""
+
+    camera: CentralCamera
+    grey: GreyImage
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +45,37 @@ class OrthoPatch:
     """Of the plane through its ground, to the east and to the north."""
     rough: float
     """Root mean square of the ground's heights against the plane, metres."""
+
+
+def patch_on(
+    values: NDArray[np.float64], at: tuple[float, float], Z: NDArray[np.float64], side: float
+) -> OrthoPatch | None:
+    """A patch with the plane through its ground; None where its middle has no height.
+
+    Parameters
+    ----------
+    values : ndarray, shape (m, m)
+        Grey values, rows from north to south.
+    at : (float, float)
+        Its middle on the map.
+    Z : ndarray, shape (m, m)
+        Heights of the ground, metres; NaN: not known.
+    side : float
+        Of a cell, metres.
+    """
+    radius = len(values) // 2
+    if not np.isfinite(Z[radius, radius]):
+        return None
+    v, u = np.mgrid[-radius : radius + 1, -radius : radius + 1] * side
+    known = np.isfinite(Z)
+    A = np.stack([np.ones(known.sum()), u[known], -v[known]], axis=1)
+    off = Z[known] - np.median(Z[known])
+    for _ in range(5):
+        # Least absolute values: walls and trees tilt no plane.
+        fit = solve(A, Z[known], huber(off, 0.05 * side))
+        off = fit.residuals
+    level, *slope = fit.unknowns.tolist()
+    return OrthoPatch(values, (at[0], at[1], level), (slope[0], slope[1]), float(np.sqrt(np.mean(off**2))))
 
 
 @dataclass(frozen=True)
@@ -79,7 +119,7 @@ class ImageControl:
 
 
 def control_of_image(
-    name: str, scene: Scene, patches: Sequence[OrthoPatch], covariances: NDArray[np.float64], settings: Settings
+    name: str, photo: Photo, patches: Sequence[OrthoPatch], covariances: NDArray[np.float64], settings: Settings
 ) -> ImageControl:
     """Find the patches in a photo and keep those that agree on a correction of its orientation.
 
@@ -87,12 +127,12 @@ def control_of_image(
     found there is carried back into the photo by the same camera and plane: no error of the orientation enters.
     """
     XYZ = np.array([p.XYZ for p in patches])
-    expected = project(scene.camera, XYZ)
-    size = np.array(scene.camera.size)
+    expected = project(photo.camera, XYZ)
+    size = np.array(photo.camera.size)
     tried = np.flatnonzero(((expected > 0) & (expected < size - 1)).all(axis=1))
     number, xy, fits, reasons = [], [], [], Counter[str]()
     for k in tried.tolist():
-        found = _find(scene, patches[k], settings)
+        found = _find(photo, patches[k], settings)
         if isinstance(found, str):
             reasons[found] += 1
             continue
@@ -106,7 +146,7 @@ def control_of_image(
         return ImageControl(name, len(tried), 0, index, none, none, (np.nan, np.nan), np.nan, 1.0, dict(reasons))
     places, fit = np.array(xy), np.array(fits)
     fit = fit + 1e-6 * np.eye(2)
-    agreed = agree(scene.camera, XYZ[index], places, (fit, covariances[index]), max(settings.search, 1.0))
+    agreed = agree(photo.camera, XYZ[index], places, (fit, covariances[index]), max(settings.search, 1.0))
     keep = agreed.keep
     if (~keep).any():
         reasons["not in agreement"] += int((~keep).sum())
@@ -126,23 +166,23 @@ def control_of_image(
     )
 
 
-def _find(scene: Scene, patch: OrthoPatch, settings: Settings) -> tuple[NDArray[np.float64], NDArray[np.float64]] | str:
+def _find(photo: Photo, patch: OrthoPatch, settings: Settings) -> tuple[NDArray[np.float64], NDArray[np.float64]] | str:
     """Position in the photo and its covariance by the fit, or why there is none."""
-    J = scene.camera.derivatives(np.array(patch.XYZ))
+    J = photo.camera.derivatives(np.array(patch.XYZ))
     gsd = float(1 / np.sqrt(abs(np.linalg.det(J[:, :2]))))
     factor = max(1, round(settings.resolution / gsd))
     if patch.rough * float(np.linalg.norm(J[:, 2])) > _ROUGH * factor:
         return "rough ground"
     half = settings.radius + settings.cells + 2
     row, col = np.mgrid[-half : half + 1, -half : half + 1]
-    at = project(scene.camera, _on_plane(patch, col, row, settings.resolution))
-    picture = _resampled(scene, at, factor)
+    at = project(photo.camera, _on_plane(patch, col, row, settings.resolution))
+    picture = _resampled(photo, at, factor)
     if picture is None:
         return "outside the photo"
     found = find_patch(patch.values, picture, settings.correlation)
     if isinstance(found, str):
         return found
-    return _in_photo(scene, patch, found, half, settings)
+    return _in_photo(photo, patch, found, half, settings)
 
 
 def _on_plane(
@@ -155,10 +195,10 @@ def _on_plane(
     return np.stack([X + east, Y + north, Z], axis=-1)
 
 
-def _resampled(scene: Scene, at: NDArray[np.float64], factor: int) -> NDArray[np.float64] | None:
+def _resampled(photo: Photo, at: NDArray[np.float64], factor: int) -> NDArray[np.float64] | None:
     """Grey values of the photo (means of factor × factor pixels) at image points; NaN outside."""
     small = (at + 0.5) / factor - 0.5
-    size = np.array(scene.camera.size) // factor
+    size = np.array(photo.camera.size) // factor
     known: NDArray[np.bool_] = np.asarray(np.isfinite(small).all(axis=-1), np.bool_)
     if not known.any():
         return None
@@ -167,7 +207,7 @@ def _resampled(scene: Scene, at: NDArray[np.float64], factor: int) -> NDArray[np
     if (high - low < 8).any():
         return None
     window = Window(int(low[0]), int(low[1]), *(int(v) for v in high - low))
-    pixels = GreyImage(scene.reader).reduced(window, factor).astype(float)
+    pixels = photo.grey.reduced(window, factor).astype(float)
     valid = np.isfinite(pixels)
     if not valid.any():
         return None
@@ -183,11 +223,11 @@ def _resampled(scene: Scene, at: NDArray[np.float64], factor: int) -> NDArray[np
 
 
 def _in_photo(
-    scene: Scene, patch: OrthoPatch, found: FoundPatch, half: int, settings: Settings
+    photo: Photo, patch: OrthoPatch, found: FoundPatch, half: int, settings: Settings
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     col, row = (v - half for v in found.at)
     step = 0.5
     around = np.array([[0.0, 0.0], [step, 0.0], [-step, 0.0], [0.0, step], [0.0, -step]])
-    at = project(scene.camera, _on_plane(patch, col + around[:, 0], row + around[:, 1], settings.resolution))
+    at = project(photo.camera, _on_plane(patch, col + around[:, 0], row + around[:, 1], settings.resolution))
     J = np.stack([at[1] - at[2], at[3] - at[4]], axis=1) / (2 * step)
     return at[0], J @ found.covariance @ J.T
