@@ -7,6 +7,7 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from tools.arrays import noise, product
+from tools.function_surface import FunctionSurface
 from tools.pinhole import Pinhole
 
 from photoplan.engine.arrays import ArrayReader
@@ -166,7 +167,7 @@ def test_a_tile_of_one_owner_is_that_of_its_source_byte_by_byte() -> None:
     readers = [ArrayReader(noise(3, SIZE[1], SIZE[0], "uint8", k)) for k in range(2)]
     sources = [Source(*pair) for pair in zip(cameras, readers)]
     grid = MapGrid.covering((-25, -25, 25, 25), 0.8, "EPSG:32615")
-    tile, surface = Tile(0, grid.window, (0, 1)), LevelSurface(0.0)
+    tile, surface = Tile(0, grid.window, (0, 1)), FunctionSurface(lambda X, Y: 3 * np.sin(X / 3) + np.cos(Y / 2))
     alone = [render(product(grid), Tile(0, grid.window), [source], surface, "lanczos3") for source in sources]
     rng = np.random.default_rng(1)
     owner = rng.integers(0, 3, (grid.height, grid.width)).astype(np.uint16)

@@ -113,7 +113,12 @@ class _Mapping:
 
 
 def compile_anchors(
-    projection: Projection, target: Target, window: Window, relief: NDArray[np.float32], rule: AnchorRule
+    projection: Projection,
+    target: Target,
+    window: Window,
+    relief: NDArray[np.float32],
+    rule: AnchorRule,
+    wanted: NDArray[np.float32] | None = None,
 ) -> Anchors | None:
     """Cut a tile into boxes whose trilinear homogeneous interpolation meets the tolerance, and tabulate the field.
 
@@ -129,11 +134,14 @@ def compile_anchors(
         h of every pixel of the tile; NaN where there is no surface.
     rule : AnchorRule
         Tolerance and kernel radius. A field gets half of the tolerance; what it leaves is the anchors'.
+    wanted : ndarray, shape (height, width), float32, optional
+        The relief of those pixels that the source is to paint, NaN elsewhere: they decide what is read of it, and
+        nothing else, so that a pixel keeps its position whoever paints the pixels beside it.
 
     Returns
     -------
     Anchors or None
-        None if no pixel of the tile can lie in the image.
+        None if no pixel that is wanted can lie in the image.
     """
     image = _Image(projection.size, None, rule.tolerance)
     if projection.field is not None:
@@ -166,7 +174,7 @@ def compile_anchors(
             )
             residual = max(residual, float(errors[settled].max()))
         work = _next(work, relief, keep, split_u, split_v, thin)
-    return _assemble(image, done, relief, residual, rule.radius) if done else None
+    return _assemble(image, done, relief if wanted is None else wanted, residual, rule.radius) if done else None
 
 
 def _first_rects(window: Window, breaks: Breaks | None) -> NDArray[np.int32]:

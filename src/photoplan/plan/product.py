@@ -131,8 +131,8 @@ def compile_tile(product: ProductPlan, tile: Tile, cameras: Sequence[Projection]
     owner = None if product.owners is None else product.owners.owner(product.target, tile.window, relief)
     layers = []
     for source in tile.sources:
-        mine = relief if owner is None else np.where(owner == source + 1, relief, np.float32(np.nan))
-        anchors = compile_anchors(cameras[source], product.target, tile.window, mine, product.rule)
+        mine = None if owner is None else np.where(owner == source + 1, relief, np.float32(np.nan))
+        anchors = compile_anchors(cameras[source], product.target, tile.window, relief, product.rule, mine)
         if anchors is not None:
             level = product.rule.level(anchors)
             layers.append(Layer(source, level, anchors.at_level(level, cameras[source].size)))
