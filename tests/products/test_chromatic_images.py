@@ -20,7 +20,8 @@ from photoplan.products.chromatic import (
     model_lines,
     save_chromatic,
 )
-from photoplan.project.restored_reader import AlignedReader
+from photoplan.project.align import AlignStep
+from photoplan.project.stepped import SteppedReader
 from photoplan.quality.colour.model import BandModel, ChromaticModel
 from photoplan.quality.formation.model import ImageModel, form_image
 from photoplan.quality.formation.optics_parts import Lateral, Spread
@@ -72,7 +73,7 @@ def measure_aligned(bands: np.ndarray, image: Path) -> float:
 
 
 def test_result_does_not_depend_on_windows(image: Path, model: ChromaticModel) -> None:
-    reader = AlignedReader(RasterReader(image), model)
+    reader = SteppedReader(RasterReader(image), (AlignStep(model),))
     whole, _ = reader.read(Window(0, 0, 300, 220))
     for window in Window(0, 0, 300, 220).tiles(97):
         rows, columns = slice(window.row, window.stop[1]), slice(window.col, window.stop[0])
@@ -84,7 +85,7 @@ def test_whole_pixels_are_moved_without_change(dtype: str, tmp_path: Path) -> No
     values = np.random.default_rng(1).normal(100, 20, (3, 90, 110)).astype(dtype)
     write_whole_image(tmp_path / "t.tif", values)
     moved = ChromaticModel((110, 90), 2, (BandModel(1, ((0, 0, 1.0, 0.0),)), BandModel(3, ((0, 0, -2.0, 3.0),))))
-    out, valid = AlignedReader(RasterReader(tmp_path / "t.tif"), moved).read(Window(0, 0, 110, 90))
+    out, valid = SteppedReader(RasterReader(tmp_path / "t.tif"), (AlignStep(moved),)).read(Window(0, 0, 110, 90))
     assert valid is None and out.dtype == dtype
     # Where the band lies 1 px to the right, its value there is that of the reference's pixel; the border's is repeated.
     assert np.array_equal(out[0], values[0][:, np.minimum(np.arange(110) + 1, 109)])
@@ -95,7 +96,7 @@ def test_pixels_without_value_stay_so(tmp_path: Path, model: ChromaticModel) -> 
     values = np.full((3, 220, 300), 50.0, np.float32)
     values[:, 100, 150] = np.nan
     write_whole_image(tmp_path / "gap.tif", values)
-    out, valid = AlignedReader(RasterReader(tmp_path / "gap.tif"), model).read(Window(0, 0, 300, 220))
+    out, valid = SteppedReader(RasterReader(tmp_path / "gap.tif"), (AlignStep(model),)).read(Window(0, 0, 300, 220))
     assert valid is not None and not valid[100, 150] and 1 <= (~valid).sum() <= 144
     assert np.allclose(out[:, valid], 50.0, atol=1e-4)
 
@@ -149,12 +150,14 @@ def test_bands_of_a_real_camera_agree_between_frames(block: Path) -> None:
 def test_images_that_do_not_fit(image: Path, tmp_path: Path, model: ChromaticModel) -> None:
     write_whole_image(tmp_path / "small.tif", np.zeros((3, 40, 40), np.uint8))
     with pytest.raises(InputError, match="300 × 220"):
-        AlignedReader(RasterReader(tmp_path / "small.tif"), model)
+        SteppedReader(RasterReader(tmp_path / "small.tif"), (AlignStep(model),))
     far = ChromaticModel((40, 40), 2, (BandModel(1, ((0, 0, 30.0, 0.0),)),))
     with pytest.raises(InputError, match="displaces a band by 30"):
-        AlignedReader(RasterReader(tmp_path / "small.tif"), far)
+        SteppedReader(RasterReader(tmp_path / "small.tif"), (AlignStep(far),))
     with pytest.raises(InputError, match="describes band 4"):
-        AlignedReader(RasterReader(tmp_path / "small.tif"), ChromaticModel((40, 40), 2, (BandModel(4, ()),)))
+        SteppedReader(
+            RasterReader(tmp_path / "small.tif"), (AlignStep(ChromaticModel((40, 40), 2, (BandModel(4, ()),))),)
+        )
 
 
 def test_images_that_cannot_be_measured(image: Path, tmp_path: Path) -> None:

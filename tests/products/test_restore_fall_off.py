@@ -13,9 +13,9 @@ from tools.command import Here
 
 from photoplan.geometry.grid import Window
 from photoplan.io.fall_off_file import FallOffEntry, TermEntry, fall_off_text
-from photoplan.io.raster import RasterReader
 from photoplan.products.characterise.fall_off import correction_text
 from photoplan.products.restore.run import RestoreReport, RestoreRequest, plan_restoration, restore_images
+from photoplan.project.restored import restoration_of
 from photoplan.quality.camera.fall_off import fit_fall_off
 from photoplan.quality.camera.fall_off_adjust import FallOffSettings
 from photoplan.quality.camera.fall_off_model import FallOffModel
@@ -236,7 +236,7 @@ class TestRuns:
         """The key and the record of runs without a correction hold nothing of it."""
         image = write(tmp_path / "a.tif", texture())
         (job,) = plan_restoration(RestoreRequest((image,), SHARPER)).jobs
-        assert isinstance(job.reader.source, RasterReader) and not job.reader.restorer.light_given
+        assert len(job.reader.steps) == 1 and not restoration_of(job.reader).restorer.light_given
 
     def test_no_filter_and_an_aperture_contradict_each_other(self, photoplan: Here, tmp_path: Path) -> None:
         image = write(tmp_path / "a.tif", texture())

@@ -12,7 +12,8 @@ from tools.small_block import write_image
 from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
 from photoplan.products.restore.run import RestoreRequest, restore_images
-from photoplan.project.restored_reader import restored_reader
+from photoplan.project.restored import restored
+from photoplan.project.stepped import SteppedReader
 from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
 
 SIZE = (700, 560)
@@ -44,7 +45,7 @@ def test_any_window_is_that_of_the_file(tmp_path: Path, kind: str) -> None:
         pixels[:, bad] = nodata
         write_image(image, pixels, nodata=nodata)
     file = RasterReader(restore_images(RestoreRequest((image,), sharpening(), tmp_path / "out")).images[0].path)
-    reader = restored_reader(RasterReader(image), sharpening())
+    reader = restored(SteppedReader(RasterReader(image)), sharpening())
     assert (reader.size, reader.bands, reader.dtype) == (file.size, file.bands, file.dtype)
     windows = [Window(0, 0, *SIZE), Window(690, 550, 10, 10), Window(299, 190, 3, 30), Window(0, 259, 700, 1)]
     for _ in range(12):

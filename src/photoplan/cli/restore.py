@@ -14,7 +14,7 @@ from photoplan.cli.output import end_with_failures, show, show_json
 if TYPE_CHECKING:
     from photoplan.products.restore.filter import FilterRequest
     from photoplan.products.restore.run import RestoredImage, RestorePlan
-    from photoplan.project.restored_reader import RestoredReader
+    from photoplan.project.stepped import SteppedReader
 
 _OPTIONS = (
     click.option("--filter", "filter_file", type=click.Path(path_type=Path), metavar="FILE|none",
@@ -188,13 +188,15 @@ def _before(plan: RestorePlan) -> list[str]:
     return lines + [line for job in plan.jobs for line in _corrections(job.reader)]
 
 
-def _corrections(reader: RestoredReader) -> list[str]:
+def _corrections(reader: SteppedReader) -> list[str]:
     """What is corrected in an image before the filter."""
     from photoplan.products.chromatic import model_lines
-    from photoplan.project.fall_off_reader import fall_off_line
+    from photoplan.project.align import AlignStep
+    from photoplan.project.fall_off import FallOffStep, fall_off_line
 
-    lines = [] if reader.lit is None else [fall_off_line(reader.lit.fall_off)]
-    lines += [] if reader.aligned is None else model_lines(reader.aligned.model)
+    lit, aligned = reader.step(FallOffStep), reader.step(AlignStep)
+    lines = [] if lit is None else [fall_off_line(lit.fall_off)]
+    lines += [] if aligned is None else model_lines(aligned.model)
     return [f"{reader.info.path.name}: {line}" for line in lines]
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.base import Projection
 from photoplan.geometry.grid import Window
+from photoplan.geometry.levels import Pixels
 
 
 @runtime_checkable
@@ -31,7 +32,7 @@ class Reader(Protocol):
         """Type of the pixels: uint8, uint16, int16 or float32."""
         ...
 
-    def read(self, window: Window, level: int = 0) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+    def read(self, window: Window, level: int = 0) -> Pixels:
         """Pixels of a window inside the image, shape (bands, height, width), and their validity.
 
         Parameters
@@ -48,6 +49,35 @@ class Reader(Protocol):
         values, valid
             The validity has shape (height, width), True = valid; None means that every pixel is valid.
         """
+        ...
+
+
+class Step(Protocol):
+    """Pixels into pixels, on their way from a file to whoever reads it: the grid of the image stays.
+
+    What becomes of a pixel does not depend on the window in which it is asked for.
+    """
+
+    def check(self, size: tuple[int, int], bands: int) -> None:
+        """Refuse images that the step is not for.
+
+        Raises
+        ------
+        InputError
+            Saying why; the image is named by the caller.
+        """
+        ...
+
+    def result(self, stored: np.dtype[Any]) -> np.dtype[Any]:
+        """Type of the pixels that come of pixels of a type."""
+        ...
+
+    def around(self, window: Window, size: tuple[int, int], gaps: bool) -> Window:
+        """Pixels of an image of `size` that those of a window depend on; `gaps`: if some of them are invalid."""
+        ...
+
+    def apply(self, window: Window, at: Window, pixels: NDArray[Any], valid: NDArray[np.bool_] | None) -> Pixels:
+        """Pixels of a window and their validity, from those of the window `at` around it."""
         ...
 
 

@@ -15,7 +15,8 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io.chromatic_file import read_chromatic, write_chromatic
 from photoplan.io.raster import RasterReader
-from photoplan.project.restored_reader import AlignedReader
+from photoplan.project.align import AlignStep
+from photoplan.project.stepped import SteppedReader
 from photoplan.quality.colour.discs import DiscSettings, disc_displacements, find_discs
 from photoplan.quality.colour.edge_displacements import edge_displacements
 from photoplan.quality.colour.model import BandModel, ChromaticModel, Displacements, fit_band
@@ -184,9 +185,9 @@ def _joined(parts: list[Displacements]) -> Displacements:
     )
 
 
-def correct_chromatic(source: RasterReader, model: ChromaticModel) -> AlignedReader:
-    """An image whose bands are brought to the place of the reference band while it is read; see `AlignedReader`."""
-    return AlignedReader(source, model)
+def correct_chromatic(source: RasterReader, model: ChromaticModel) -> SteppedReader:
+    """An image whose bands are brought to the place of the reference band while it is read; see `AlignStep`."""
+    return SteppedReader(source, (AlignStep(model),))
 
 
 def load_chromatic(path: Path) -> ChromaticModel:

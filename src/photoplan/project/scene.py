@@ -31,7 +31,8 @@ from photoplan.plan.footprint import Footprint, footprint
 from photoplan.project.filter_files import load_filter
 from photoplan.project.linearisation import linearisation_of
 from photoplan.project.open_terrain import open_terrain
-from photoplan.project.restored_reader import RestoredReader, restored_reader
+from photoplan.project.restored import RestoreStep, restored
+from photoplan.project.stepped import SteppedReader
 from photoplan.surfaces.base import Terrain
 from photoplan.surfaces.level import LevelSurface
 from photoplan.surfaces.shifted import ShiftedSurface
@@ -103,7 +104,7 @@ class Scene:
 
     camera: CentralCamera
     surface: Terrain
-    reader: RasterReader | RestoredReader
+    reader: SteppedReader
     ground: Ground
     address: SceneAddress
 
@@ -121,8 +122,9 @@ class Scene:
     def notes(self) -> tuple[str, ...]:
         """What a user should know of the pixels, one sentence each."""
         found = self.reader.info.warnings
-        if isinstance(self.reader, RestoredReader):
-            found += (f"{self.reader.info.path.name}: {self.reader.describe()}",)
+        step = self.reader.step(RestoreStep)
+        if step is not None:
+            found += (f"{self.reader.path.name}: {step.describe()}",)
         return found
 
     @property
@@ -202,15 +204,15 @@ def _open(address: SceneAddress) -> Scene:
     return Scene(camera, ground.surface, reader, ground, address)
 
 
-def _reader(project: Project, image: Image) -> RasterReader | RestoredReader:
+def _reader(project: Project, image: Image) -> SteppedReader:
     """The image's pixels, restored if the project says so."""
-    source = RasterReader(project.resolve(image.file))
+    source = SteppedReader(RasterReader(project.resolve(image.file)))
     restoration = project.restoration(image)
     if restoration is None:
         return source
     table = restoration.linearisation
     light = linearisation_of(table if table in ("linear", "srgb") else str(project.resolve(table)))
-    return restored_reader(source, load_filter(project.resolve(restoration.filter)), light)
+    return restored(source, load_filter(project.resolve(restoration.filter)), light)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from photoplan.io.run_record import peak_memory_bytes, record_path, run_times, v
 from photoplan.kernels.rectify import is_compiled
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct
 from photoplan.products.orthophoto.results import ProductResult, finished_products, product_path
-from photoplan.project.restored_reader import RestoredReader
+from photoplan.project.restored import RestoreStep
 from photoplan.project.scene import Scene, input_files, open_scene, scene_address
 
 #: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
@@ -273,7 +273,7 @@ def _record(plan: OrthoPlan, product: OrthoProduct, scene: Scene, run: Run, resu
         "crs_operations": [
             {"operation": step.operation, "accuracy_m": step.accuracy} for step in scene.ground.operations
         ],
-        "restored": scene.reader.describe() if isinstance(scene.reader, RestoredReader) else None,
+        "restored": None if (step := scene.reader.step(RestoreStep)) is None else step.describe(),
         "projection_centre": [float(c) for c in center],
         "gsd_m": product.gsd,
         "run": {"workers": run.workers, "executor": run.executor, "memory": run.memory},

@@ -24,14 +24,17 @@ from photoplan.plain import pick
 from photoplan.plan.product import Tile
 from photoplan.products.chromatic import model_figures, save_chromatic
 from photoplan.products.restore.request import RestoreRequest
-from photoplan.project.restored_reader import PART, RestoredReader
+from photoplan.project.align import AlignStep
+from photoplan.project.fall_off import FallOffStep
+from photoplan.project.restored import read_counted, restoration_of
+from photoplan.project.stepped import PART, SteppedReader
 
 
 @dataclass(frozen=True, eq=False)
 class Job:
     """One image and what becomes of it."""
 
-    reader: RestoredReader
+    reader: SteppedReader
     target: Path
     form: ImageForm
     key: str
@@ -93,17 +96,17 @@ class RestoredImage:
         return pick(self, *own, clipped_below="below", clipped_above="above", resumed_tiles="resumed")
 
 
-def memory_of_a_tile(reader: RestoredReader) -> int:
+def memory_of_a_tile(reader: SteppedReader) -> int:
     """Bytes that one tile in flight takes at most: pixels as read, as light, and as the result."""
-    margin = reader.restorer.margin
+    margin = restoration_of(reader).restorer.margin
     area = (PART + 6 * margin.columns) * (PART + 6 * margin.rows)
-    each = reader.bands * (2 * reader.source.dtype.itemsize + 2 * reader.dtype.itemsize) + 48
-    if reader.lit is not None:
+    each = reader.bands * (2 * reader.dtype_before(len(reader.steps) - 1).itemsize + 2 * reader.dtype.itemsize) + 48
+    if reader.step(FallOffStep) is not None:
         # Stored pixels, light before and after, and the terms of the gain.
         each += reader.bands * (np.dtype(reader.info.dtype).itemsize + 20) + 100
-    if reader.aligned is not None:
+    if reader.step(AlignStep) is not None:
         # The same pixels before they are displaced, and the displacements.
-        each += 2 * reader.bands * reader.source.dtype.itemsize + 56
+        each += 2 * reader.bands * reader.dtype_before(len(reader.steps) - 1).itemsize + 56
     return int(area * each)
 
 
@@ -136,11 +139,11 @@ def earlier_result(job: Job, settings: dict[str, Any]) -> RestoredImage | None:
 class RestoreJob:
     """What a worker is told once."""
 
-    reader: RestoredReader
+    reader: SteppedReader
 
     def __call__(self, tile: Tile) -> Made:
         """Restored pixels of a tile, and how many were clipped."""
-        pixels = self.reader.read_counted(tile.window)
+        pixels = read_counted(self.reader, tile.window)
         record = {"below": [int(n) for n in pixels.below], "above": [int(n) for n in pixels.above]}
         return Made(((pixels.values, pixels.valid),), record)
 
@@ -156,7 +159,7 @@ def restoration(job: Job, how: RestoreRequest, events: Events) -> Work[RestoredI
     reader = job.reader
     for note in reader.info.warnings:
         events.talk(f"note: {note}")
-    if not reader.restorer.is_compiled:
+    if not restoration_of(reader).restorer.is_compiled:
         events.talk("compiling the filter kernels, once (some seconds)")
     file = ProductFile(
         job.target,
@@ -191,15 +194,16 @@ def _complete(
         raise PhotoplanError(f"{job.target}: {tally.reasons[0]}; finished tiles are kept")
     facts = file.complete(_tags(job))
     reader = job.reader
-    if how.chromatic == "measure" and reader.aligned is not None:
-        save_chromatic(job.chromatic_file, reader.aligned.model)
+    aligned = reader.step(AlignStep)
+    if how.chromatic == "measure" and aligned is not None:
+        save_chromatic(job.chromatic_file, aligned.model)
     ran = times()
     nothing = [0] * reader.bands
     result = RestoredImage(
         reader.info.path.name,
         job.target,
         str(reader.dtype),
-        reader.restorer.filter.noise_gain,
+        restoration_of(reader).restorer.filter.noise_gain,
         tuple(tally.totals.get("below", nothing)),
         tuple(tally.totals.get("above", nothing)),
         facts.valid_share,
@@ -223,7 +227,7 @@ def _tags(job: Job) -> dict[str, str]:
     return {
         "PHOTOPLAN_VERSION": __version__,
         "PHOTOPLAN_IMAGE": job.reader.info.path.name,
-        "PHOTOPLAN_RESTORED": job.reader.restorer.filter.description or "yes",
+        "PHOTOPLAN_RESTORED": restoration_of(job.reader).restorer.filter.description or "yes",
         "PHOTOPLAN_KEY": job.key,
         "TIFFTAG_SOFTWARE": f"photoplan {__version__}",
     }
@@ -231,7 +235,8 @@ def _tags(job: Job) -> dict[str, str]:
 
 def _record(job: Job, how: RestoreRequest, result: RestoredImage, facts: ProductFacts) -> dict[str, Any]:
     """The run record: what a person needs to answer for the result, and to make it again."""
-    restorer = job.reader.restorer
+    restorer = restoration_of(job.reader).restorer
+    aligned, lit = job.reader.step(AlignStep), job.reader.step(FallOffStep)
     return {
         "product": result,
         "key": job.key,
@@ -239,8 +244,8 @@ def _record(job: Job, how: RestoreRequest, result: RestoredImage, facts: Product
         + [{"path": path} for path in job.inputs if path.resolve() != job.reader.info.path.resolve()],
         "settings": how.settings,
         "linearisation": restorer.linearisation.describe(),
-        "chromatic": None if job.reader.aligned is None else model_figures(job.reader.aligned.model),
-        "fall_off": job.reader.lit and job.reader.lit.fall_off,
+        "chromatic": None if aligned is None else model_figures(aligned.model),
+        "fall_off": lit and lit.fall_off,
         "filter": {
             "description": restorer.filter.description,
             "image_size": restorer.filter.image_size,

@@ -28,10 +28,12 @@ from photoplan.plain import pick
 from photoplan.products.chromatic import load_chromatic, measured_once, model_figures
 from photoplan.products.restore.execute import Job, RestoredImage, earlier_result, memory_of_a_tile, restoration
 from photoplan.products.restore.request import RestoreRequest
-from photoplan.project.fall_off_reader import FallOffFile, FallOffReader, load_fall_off
+from photoplan.project.align import AlignStep
+from photoplan.project.fall_off import FallOffFile, FallOffStep, load_fall_off
 from photoplan.project.filter_files import entries_of, load_filter
 from photoplan.project.linearisation import linearisation_of
-from photoplan.project.restored_reader import AlignedReader, RestoredReader, Source, kept_nodata, restored_reader
+from photoplan.project.restored import kept_nodata, restoration_of, restored
+from photoplan.project.stepped import SteppedReader
 from photoplan.quality.colour.model import ChromaticModel
 from photoplan.quality.linearise import Linearisation
 from photoplan.quality.restoration.filters import RestorationFilter
@@ -83,13 +85,14 @@ class Corrections:
         model = load_chromatic(request.chromatic) if isinstance(request.chromatic, Path) else request.chromatic
         return cls(fall_off, model, light)
 
-    def source(self, path: Path) -> Source:
+    def source(self, path: Path) -> SteppedReader:
         """The pixels of an image, corrected."""
-        raw = RasterReader(path)
-        lit = raw if self.fall_off is None else FallOffReader(raw, self.fall_off, self.light)
+        source = SteppedReader(RasterReader(path))
+        if self.fall_off is not None:
+            source = source.then(FallOffStep(self.fall_off, self.light, source.dtype))
         if self.chromatic is None:
-            return lit
-        return AlignedReader(lit, measured_once(path) if self.chromatic == "measure" else self.chromatic)
+            return source
+        return source.then(AlignStep(measured_once(path) if self.chromatic == "measure" else self.chromatic))
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +141,7 @@ def plan_restoration(request: RestoreRequest) -> RestorePlan:
             out = np.dtype(source.info.dtype if request.dtype == "same" else request.dtype)
             _check_bands(path, source.bands, request.bands)
             chosen = _only(filter_, request.bands, source.bands)
-            reader = restored_reader(source, chosen, light, out)
+            reader = restored(source, chosen, light, out)
             target = request.folder / f"{stems[path.name]}_restored.tif"
             jobs.append(_job(request, reader, target, text, tuple(inputs)))
         except InputError as error:
@@ -164,15 +167,16 @@ def _only(filter_: RestorationFilter, bands: tuple[int, ...], count: int) -> Res
     return RestorationFilter(tuple(kernels), filter_.image_size, filter_.description, filter_.facts)
 
 
-def _job(request: RestoreRequest, reader: RestoredReader, target: Path, text: str, inputs: tuple[Path, ...]) -> Job:
+def _job(request: RestoreRequest, reader: SteppedReader, target: Path, text: str, inputs: tuple[Path, ...]) -> Job:
     info = reader.info
     digest = fingerprint(info.path).digest
     facts = [__version__, digest, text, request.settings["bands"], str(reader.dtype), request.linearisation]
-    if reader.aligned is not None:
-        facts.append(model_figures(reader.aligned.model))
-    if reader.lit is not None:
-        facts += ["light fall-off", reader.lit.fall_off.digest]
-    light = reader.restorer.linearisation
+    aligned, lit = reader.step(AlignStep), reader.step(FallOffStep)
+    if aligned is not None:
+        facts.append(model_figures(aligned.model))
+    if lit is not None:
+        facts += ["light fall-off", lit.fall_off.digest]
+    light = restoration_of(reader).restorer.linearisation
     if light.grey is not None and light.light is not None:
         facts += [light.grey.tolist(), light.light.tolist()]
     key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()

@@ -14,7 +14,9 @@ from photoplan.products.restore.design import DesignedPart, MeasuredFilter
 from photoplan.products.restore.execute import Job, RestoredImage
 from photoplan.products.restore.filter import FoundFilter
 from photoplan.products.restore.run import RestoreReport
-from photoplan.project.fall_off_reader import fall_off_line
+from photoplan.project.align import AlignStep
+from photoplan.project.fall_off import FallOffStep, fall_off_line
+from photoplan.project.restored import restoration_of
 from photoplan.quality.colour.model import ChromaticModel
 from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.restoration.design import Sharpness
@@ -110,7 +112,7 @@ def _measured_parts(measured: MeasuredFilter, plots: RestorePlots) -> list[str]:
 
 
 def _image(image: RestoredImage, job: Job, plots: RestorePlots | None) -> list[str]:
-    size, aligned = job.reader.size, job.reader.aligned
+    size, aligned = job.reader.size, job.reader.step(AlignStep)
     clipped = sum(image.below) + sum(image.above)
     figures = [
         (f"{size[0]} × {size[1]}", "pixels", f"{len(image.below)} band(s) of {image.dtype}"),
@@ -119,10 +121,11 @@ def _image(image: RestoredImage, job: Job, plots: RestorePlots | None) -> list[s
         (f"{image.noise_gain:.3g} ×", "growth of noise", "the largest of all kernels"),
     ]
     parts = [headline(figures)]
-    light = job.reader.restorer.linearisation.describe()
+    lit = job.reader.step(FallOffStep)
+    light = restoration_of(job.reader).restorer.linearisation.describe()
     parts.append(f"<p>{text(f'The result is {image.path.name}; light: {light}.')}</p>")
-    if job.reader.lit is not None:
-        parts.append(f"<p>{text(f'Before the filter: {fall_off_line(job.reader.lit.fall_off)}.')}</p>")
+    if lit is not None:
+        parts.append(f"<p>{text(f'Before the filter: {fall_off_line(lit.fall_off)}.')}</p>")
     if plots is not None:
         seen = compare(RasterReader(job.reader.info.path), RasterReader(image.path))
         window = seen.window

@@ -1,4 +1,4 @@
-"""Source images whose light fall-off is corrected while they are read."""
+"""Light fall-off of source images, corrected while they are read."""
 
 from __future__ import annotations
 
@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.geometry.levels import reduced
+from photoplan.geometry.levels import Pixels
 from photoplan.io.fall_off_file import read_fall_off_entry
 from photoplan.io.fingerprint import fingerprint
-from photoplan.io.raster import RasterReader
 from photoplan.plain import pick
-from photoplan.project.derived_reader import DerivedReader
 from photoplan.quality.camera.fall_off_model import FallOffModel, correct_fall_off, largest_gain
 from photoplan.quality.linearise import Linearisation
 from photoplan.quality.restoration.restorer import light_of
@@ -92,55 +90,46 @@ def fall_off_line(used: FallOffFile) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class FallOffReader(DerivedReader):
-    """A source image behind the engine's `Reader` as light, with the same gain in all bands.
+class FallOffStep:
+    """Grey values to light with the fall-off corrected, the same gain in all bands.
 
-    Grey values are decoded to light and corrected; what is read is float32 on the scale of the image's type, neither
-    rounded nor clipped. The grey value of no light is decoded by the same curve. The result does not depend on the
-    windows in which it is read.
-
-    Raises
-    ------
-    InputError
-        When made: the model is for images of another size. When read: damaged pixels, or grey values that the
-        linearisation's table does not have.
+    Grey values are decoded to light and corrected; what comes out is float32 on the scale of the image's type, neither
+    rounded nor clipped. The grey value of no light is decoded by the same curve.
     """
 
-    source: RasterReader
     fall_off: FallOffFile
     linearisation: Linearisation
+    stored: np.dtype[Any]
+    """Type of the image."""
 
-    def __post_init__(self) -> None:
-        size, known = self.source.size, self.fall_off.model.size
+    def check(self, size: tuple[int, int], bands: int) -> None:
+        """The correction is for images of one size."""
+        known = self.fall_off.model.size
         if size != known:
             raise InputError(
-                f"{self.source.path}: {size[0]} × {size[1]} pixels; the light fall-off in {self.fall_off.path} is for "
+                f"{size[0]} × {size[1]} pixels; the light fall-off in {self.fall_off.path} is for "
                 f"images of {known[0]} × {known[1]}: an image that was cropped or scaled needs a correction of its own"
             )
 
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the light: float32, whatever the image has."""
+    def result(self, stored: np.dtype[Any]) -> np.dtype[Any]:
+        """Float32, whatever the image has."""
         return np.dtype(np.float32)
 
-    def read(self, window: Window, level: int = 0) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
-        """Light of a window inside the image, shape (bands, height, width), and its validity."""
-        if level:
-            return reduced(self, window, level)
-        pixels, valid = self.source.read(window)
+    def around(self, window: Window, size: tuple[int, int], gaps: bool) -> Window:
+        """The window itself."""
+        return window
+
+    def apply(self, window: Window, at: Window, pixels: NDArray[Any], valid: NDArray[np.bool_] | None) -> Pixels:
+        """Light of a window and its validity."""
         light = np.empty(pixels.shape, np.float32)
         dark = np.zeros((pixels.shape[0], 1, 1), np.float32)
-        try:
-            for band, grey in enumerate(pixels, start=1):
-                if valid is not None and not valid.any():
-                    light[band - 1] = 0.0
-                    continue
-                light[band - 1] = light_of(self.linearisation, grey, valid, band)
-                dark[band - 1] = self._dark(band)
-        except InputError as error:
-            raise InputError(f"{self.path}: {error}") from None
-        none = replace(self.fall_off.model, dark=0.0)
-        corrected, _ = correct_fall_off(light - dark, window, none)
+        for band, grey in enumerate(pixels, start=1):
+            if valid is not None and not valid.any():
+                light[band - 1] = 0.0
+                continue
+            light[band - 1] = light_of(self.linearisation, grey, valid, band)
+            dark[band - 1] = self._dark(band)
+        corrected, _ = correct_fall_off(light - dark, window, replace(self.fall_off.model, dark=0.0))
         return corrected + dark, valid
 
     def _dark(self, band: int) -> float:
@@ -148,5 +137,5 @@ class FallOffReader(DerivedReader):
         dark, curve = self.fall_off.model.dark, self.linearisation
         if curve.is_linear or dark == 0.0:
             return dark
-        scale = curve.full_scale(self.source.dtype) if curve.kind == "srgb" else 1.0
+        scale = curve.full_scale(self.stored) if curve.kind == "srgb" else 1.0
         return float(curve.to_linear(np.array([dark / scale]), band)[0]) * scale
