@@ -12,7 +12,15 @@ from tools.command import process
 from photoplan.quality.formation.model import ImageModel, form_image
 from photoplan.quality.formation.optics_parts import Falloff, Spread
 from photoplan.quality.formation.scenes import PatternScene
-from photoplan.quality.formation.sensor_parts import DarkCurrent, Defect, Exposure, Gain, Quantisation, Readout, Well
+from photoplan.quality.formation.sensor_parts import (
+    DarkCurrentPart,
+    DefectPart,
+    Exposure,
+    Gain,
+    Quantisation,
+    Readout,
+    Well,
+)
 
 SIZE = (96, 80)
 FULL_DN = 64 + 0.33 * 8000
@@ -40,7 +48,7 @@ def camera(**parts: object) -> ImageModel:
     usual: dict[str, object] = {
         "spread": Spread(gaussian=(0.6, 0.6)),
         "exposure": Exposure(light=100.0),
-        "dark": DarkCurrent(rate=10.0),
+        "dark": DarkCurrentPart(rate=10.0),
         "well": Well(8000.0),
         "readout": Readout(shot_noise=True, noise=15.0),
         "gain": Gain(factor=0.33, offset=64.0),
@@ -57,7 +65,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     lamp = PatternScene("discs", SIZE, (400.0, 10.0), levels=(3.0, 0.003), oversampling=4)
     for kind, scene, model, exposures in (
         ("flat", flat, camera(falloff=Falloff(focal=200.0)), (10, 20, 40, 60, 75, 100, 140)),
-        ("dark", black, camera(defects=(Defect(30, 20, "hot", 400.0),)), (5, 10, 15, 100, 400, 1000)),
+        ("dark", black, camera(defects=(DefectPart(30, 20, "hot", 400.0),)), (5, 10, 15, 100, 400, 1000)),
         ("lamp", lamp, camera(), (4, 8, 12, 20, 26, 30, 40, 80)),
     ):
         for t in exposures:

@@ -11,7 +11,7 @@ import pytest
 
 from photoplan.errors import InputError
 from photoplan.io.camera.file import read_cameras
-from photoplan.io.camera.model import FilmCamera, FrameCamera, NoLens, OpenCVFisheyeLens, OpenCVLens
+from photoplan.io.camera.model import FilmCamera, FrameEntry, IdealLens, OpenCVFisheyeLens, OpenCVLens
 from photoplan.io.camera.opensfm import resized
 
 
@@ -25,7 +25,7 @@ def test_the_drone_blocks_camera(block: Path) -> None:
     cameras = read_cameras(block / "int.yaml").cameras
     assert list(cameras) == ["DJI FC300S half-res"]
     camera = cameras["DJI FC300S half-res"]
-    assert isinstance(camera, FrameCamera)
+    assert isinstance(camera, FrameEntry)
     assert camera.size == (2000, 1125)
     assert camera.focal == (1435.5077, 1432.9259)
     assert camera.principal_point == (999.5, 562.0)
@@ -34,11 +34,11 @@ def test_the_drone_blocks_camera(block: Path) -> None:
 
 def test_the_dmc_camera(shared: Path) -> None:
     camera = read_cameras(shared / "data" / "ngi_dmc" / "eo" / "ngi_int_param.yaml").cameras["Integraph DMC"]
-    assert isinstance(camera, FrameCamera)
+    assert isinstance(camera, FrameEntry)
     # 120 mm over pixels of 92.16 mm / 640 = 0.144 mm.
     np.testing.assert_allclose(camera.focal, 120 / 0.144, rtol=1e-14)
     assert camera.principal_point == (319.5, 575.5)
-    assert camera.lens == NoLens()
+    assert camera.lens == IdealLens()
 
 
 def test_yaml_units_and_the_principal_point_in_parts_of_the_larger_side(tmp_path: Path) -> None:
@@ -147,7 +147,7 @@ focal_px = 90
     cameras = read_cameras(write(tmp_path, "c.toml", text)).cameras
     assert isinstance(cameras["RC10"], FilmCamera)
     assert cameras["RC10"].fiducials_mm["1"] == (105.999, -106.016)
-    assert isinstance(cameras["drone"], FrameCamera)
+    assert isinstance(cameras["drone"], FrameEntry)
     with pytest.raises(InputError, match=r"c\.toml:10: cameras\.drone\.focal_px: -90 given"):
         read_cameras(write(tmp_path, "c.toml", text.replace("= 90", "= -90")))
     with pytest.raises(InputError, match=r"no \[cameras.NAME\] table"):

@@ -7,7 +7,7 @@ import pytest
 from tools.orientation_blocks import CAMERA, CENTERS, GROUND, NAMES, block, our_pixels, pixels_of_matrix
 
 from photoplan.errors import InputError
-from photoplan.io.camera.model import BrownLens, FilmCamera, FrameCamera
+from photoplan.io.camera.model import BrownLens, FilmCamera, FrameEntry
 from photoplan.io.orientation.block import without_lenses
 from photoplan.io.orientation.file import orientation_format, read_orientation_block, write_orientation
 from photoplan.io.orientation.table import TableFormat
@@ -146,7 +146,7 @@ def test_written_and_read_again_in_whole(tmp_path, matrix):
 
 
 def test_a_camera_in_pixels_gets_pixels_of_assumed_size(tmp_path):
-    camera = FrameCamera(size=(4000, 3000), focal_px=(3100.5, 3101.25), principal_point_px=(2010.25, 1490.5))
+    camera = FrameEntry(size=(4000, 3000), focal_px=(3100.5, 3101.25), principal_point_px=(2010.25, 1490.5))
     made = block(camera)
     (path,) = write_orientation(made, tmp_path / "out.prj", "inpho")
     again = read_orientation_block(path)

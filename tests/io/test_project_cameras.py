@@ -11,7 +11,7 @@ from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera as ComputingCamera
 from photoplan.errors import InputError
 from photoplan.geometry.pose import Pose
-from photoplan.io.camera.model import BrownLens, FilmCamera, FrameCamera, OpenCVLens, RadialTableLens
+from photoplan.io.camera.model import BrownLens, FilmCamera, FrameEntry, OpenCVLens, RadialTableLens
 from photoplan.io.project.cameras import fiducial_fit, image_size, interior_of, lens_of
 from photoplan.io.project.model import Image
 
@@ -42,12 +42,10 @@ def project_at(camera: Any, points: Any, image: Image = IMAGE) -> np.ndarray:
 def test_one_camera_described_in_pixels_and_in_millimetres() -> None:
     size, c, pixel = (640, 1152), 120.0, 0.144
     ways = [
-        FrameCamera(size=size, focal_px=c / pixel, principal_point_px=(319.5 + 2, 575.5 + 3)),
-        FrameCamera(size=size, camera_constant_mm=c, pixel_size_um=144.0, principal_point_mm=(2 * pixel, -3 * pixel)),
-        FrameCamera(size=size, camera_constant_mm=c, pixel_size_um=144.0, principal_point_px=(321.5, 578.5)),
-        FrameCamera(
-            size=size, camera_constant_mm=c, sensor_size_mm=(92.16, 165.888), principal_point_px=(321.5, 578.5)
-        ),
+        FrameEntry(size=size, focal_px=c / pixel, principal_point_px=(319.5 + 2, 575.5 + 3)),
+        FrameEntry(size=size, camera_constant_mm=c, pixel_size_um=144.0, principal_point_mm=(2 * pixel, -3 * pixel)),
+        FrameEntry(size=size, camera_constant_mm=c, pixel_size_um=144.0, principal_point_px=(321.5, 578.5)),
+        FrameEntry(size=size, camera_constant_mm=c, sensor_size_mm=(92.16, 165.888), principal_point_px=(321.5, 578.5)),
     ]
     points = np.array([[0.0, 0, -1], [0.1, 0.2, -1], [-0.3, 0.1, -2]])
     expected = [[321.5, 578.5], [321.5 + 0.1 * c / pixel, 578.5 - 0.2 * c / pixel]]
@@ -58,7 +56,7 @@ def test_one_camera_described_in_pixels_and_in_millimetres() -> None:
 
 
 def test_the_default_principal_point_is_the_middle() -> None:
-    camera = FrameCamera(size=(4, 3), focal_px=(10.0, 20.0))
+    camera = FrameEntry(size=(4, 3), focal_px=(10.0, 20.0))
     np.testing.assert_allclose(project_at(camera, [0.1, 0.1, -1.0]), [1.5 + 1.0, 1.0 - 2.0])
 
 
@@ -66,7 +64,7 @@ def test_opencv_lens_in_opencvs_own_frame() -> None:
     """x right, y down, z forwards: the formulas of its documentation, written out here."""
     k1, k2, p1, p2, k3, k4, k5, k6 = 0.1, -0.02, 0.003, -0.004, 0.005, 0.01, -0.006, 0.007
     lens = OpenCVLens(type="opencv", k1=k1, k2=k2, p1=p1, p2=p2, k3=k3, k4=k4, k5=k5, k6=k6)
-    camera = FrameCamera(size=(2000, 1500), focal_px=(1500.0, 1490.0), principal_point_px=(990.0, 760.0), lens=lens)
+    camera = FrameEntry(size=(2000, 1500), focal_px=(1500.0, 1490.0), principal_point_px=(990.0, 760.0), lens=lens)
     x, y = 0.31, -0.22
     r2 = x * x + y * y
     g = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
@@ -86,13 +84,13 @@ def test_browns_lens_in_every_unit_axis_and_meaning() -> None:
     f = c / pixel
     px = BrownLens(type="brown", unit="px", k1=k1 / f**2, p1=p1 / f, p2=p2 / f, b2=b2)
     points = np.array([[0.1, 0.12, -1], [-0.15, 0.05, -1]])
-    expected = project_at(FrameCamera(**base, lens=tangent), points)
-    assert np.abs(expected - project_at(FrameCamera(**base), points)).max() > 1
+    expected = project_at(FrameEntry(**base, lens=tangent), points)
+    assert np.abs(expected - project_at(FrameEntry(**base), points)).max() > 1
     for lens in (mm, down, px):
-        np.testing.assert_allclose(project_at(FrameCamera(**base, lens=lens), points), expected, atol=1e-8)
-    correction = lens_of(FrameCamera(**base, lens=tangent.model_copy(update={"meaning": "correction"})))
+        np.testing.assert_allclose(project_at(FrameEntry(**base, lens=lens), points), expected, atol=1e-8)
+    correction = lens_of(FrameEntry(**base, lens=tangent.model_copy(update={"meaning": "correction"})))
     t = np.array([0.1, 0.12])
-    np.testing.assert_allclose(lens_of(FrameCamera(**base, lens=tangent)).distort(correction.distort(t)), t, atol=1e-12)
+    np.testing.assert_allclose(lens_of(FrameEntry(**base, lens=tangent)).distort(correction.distort(t)), t, atol=1e-12)
 
 
 def test_a_reports_radial_table_by_angle_and_by_radius() -> None:
@@ -101,11 +99,11 @@ def test_a_reports_radial_table_by_angle_and_by_radius() -> None:
     um = (3.0, 4.0, 1.0, -3.0, -4.0, 3.0)
     radii = tuple(float(152.299 * np.tan(np.radians(a))) for a in angles)
     base: dict[str, Any] = {"size": (23000, 23000), "camera_constant_mm": 152.299, "pixel_size_um": 10.0}
-    by_angle = FrameCamera(**base, lens=RadialTableLens(type="radial_table", angles_deg=angles, distortion_um=um))
-    by_radius = FrameCamera(**base, lens=RadialTableLens(type="radial_table", radii_mm=radii, distortion_um=um))
+    by_angle = FrameEntry(**base, lens=RadialTableLens(type="radial_table", angles_deg=angles, distortion_um=um))
+    by_radius = FrameEntry(**base, lens=RadialTableLens(type="radial_table", radii_mm=radii, distortion_um=um))
     for angle, shift in ((15.0, 4.0), (30.0, -3.0)):
         at = np.array([np.tan(np.radians(angle)), 0.0, -1.0])
-        plain = project_at(FrameCamera(**base), at)
+        plain = project_at(FrameEntry(**base), at)
         for camera in (by_angle, by_radius):
             np.testing.assert_allclose((project_at(camera, at) - plain) * 10.0, [shift, 0.0], atol=1e-6)
 

@@ -15,7 +15,7 @@ from photoplan.errors import HeightSystemError, InputError, UsageError
 from photoplan.io.camera.model import (
     BrownLens,
     FilmCamera,
-    FrameCamera,
+    FrameEntry,
     OpenCVFisheyeLens,
     OpenCVLens,
     RadialTableLens,
@@ -26,7 +26,7 @@ from photoplan.io.project.model import Image, Orientation, OrthoDefaults, Projec
 
 MARKS = {"1": (105.999, -106.016), "2": (-106.012, -106.006), "3": (-105.997, 105.993), "4": (106.007, 105.993)}
 SCAN = {"1": (68.0, 131.5), "2": (62.0, 2248.0), "3": (2182.0, 2253.0), "4": (2189.0, 141.0)}
-DRONE = FrameCamera(size=(2000, 1125), focal_px=(1435.5077, 1432.9259), lens=OpenCVLens(type="opencv", k1=0.0136))
+DRONE = FrameEntry(size=(2000, 1125), focal_px=(1435.5077, 1432.9259), lens=OpenCVLens(type="opencv", k1=0.0136))
 FILM = FilmCamera(type="film", camera_constant_mm=153.24, fiducials_mm=MARKS, size=(2300, 2300))
 
 
@@ -52,11 +52,11 @@ def test_written_and_read_again_is_equal(tmp_path: Path) -> None:
         "table": RadialTableLens(type="radial_table", angles_deg=(0, 7.5, 40.0), distortion_um=(0.0, 3.0, -4.0)),
     }
     cameras: dict[str, Any] = {
-        name: FrameCamera(size=(10, 20), camera_constant_mm=120.0, pixel_size_um=12.0, lens=lens)
+        name: FrameEntry(size=(10, 20), camera_constant_mm=120.0, pixel_size_um=12.0, lens=lens)
         for name, lens in lenses.items()
     }
-    cameras["fish"] = FrameCamera(size=(9, 9), focal_px=5.0, lens=OpenCVFisheyeLens(type="opencv_fisheye", k4=1e-3))
-    cameras["metric"] = FrameCamera(
+    cameras["fish"] = FrameEntry(size=(9, 9), focal_px=5.0, lens=OpenCVFisheyeLens(type="opencv_fisheye", k4=1e-3))
+    cameras["metric"] = FrameEntry(
         size=(640, 1152), camera_constant_mm=120.0, sensor_size_mm=(92.16, 165.888), principal_point_mm=(0.01, -0.02)
     )
     plain = project(tmp_path)
@@ -248,7 +248,7 @@ def test_json_round_trip_for_workers(tmp_path: Path) -> None:
 )
 def test_cameras_are_described_one_way(entries: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=says):
-        FrameCamera(**entries)
+        FrameEntry(**entries)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from photoplan.cli.init import command
 from photoplan.errors import HeightSystemError, InputError, PhotoplanError, UsageError
 from photoplan.geometry.crs import crs_step
 from photoplan.geometry.rotation import rotation_opk
-from photoplan.io.camera.model import FilmCamera, FrameCamera
+from photoplan.io.camera.model import FilmCamera, FrameEntry
 from photoplan.io.orientation.table import TableFormat
 from photoplan.io.project.file import load_project
 from photoplan.products.init.run import InitRequest, init_project, make_project
@@ -313,7 +313,7 @@ def test_opensfm_goes_into_the_terrains_crs_at_the_images_resolution(files: dict
     assert "(from dtm.tif)" in said[0]
     assert project.crs == "EPSG:32632"
     made = project.cameras["c"]
-    assert isinstance(made, FrameCamera)
+    assert isinstance(made, FrameEntry)
     assert (made.size, made.focal, made.principal_point) == ((40, 30), (50.0, 50.0), (19.5, 14.5))
     a, b = project.images
     np.testing.assert_allclose(a.center, (x, y, 500.0), atol=1e-6)

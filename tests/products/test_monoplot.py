@@ -29,7 +29,7 @@ from photoplan.io.project.file import load_project
 from photoplan.products.monoplot import MonoplotRequest, monoplot_file
 from photoplan.project.scene import open_scene
 from photoplan.surfaces.level import LevelSurface
-from photoplan.terrain.monoplot import GroundPoints, MonoplotErrors, monoplot
+from photoplan.terrain.monoplot import MonoplotErrors, MonoplotPoints, monoplot
 
 X0, Y0, H = 500_000.0, 5_300_000.0, 900.0
 INTERIOR = Interior.digital((2000, 1125), (1435.5, 1432.9), (3.2, -5.1))
@@ -162,7 +162,7 @@ def test_fault_21_points_without_ground_say_why():
     assert (monoplot(low, xy, ring, (0, 0), MonoplotErrors(), 2.0).reasons == "below").all()
     hill = FunctionSurface(lambda x, y: np.where((y - Y0 > 100) & (y - Y0 < 120), np.nan, 0.2 * (y - Y0) - 50))
     slow = oriented_camera(INTERIOR, NoLens(), Pose.from_angles([X0, Y0, 100.0], np.radians([60.0, 0, 0])))
-    through: GroundPoints = monoplot(slow, [[1000, 560]], hill, (-50, 100), MonoplotErrors(), 2.0)
+    through: MonoplotPoints = monoplot(slow, [[1000, 560]], hill, (-50, 100), MonoplotErrors(), 2.0)
     assert through.reasons[0] == "" and through.hole[0]
 
 

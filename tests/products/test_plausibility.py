@@ -11,7 +11,7 @@ import pytest
 
 from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles, rotation_opk
 from photoplan.io.camera.file import read_cameras
-from photoplan.io.camera.model import FrameCamera
+from photoplan.io.camera.model import FrameEntry
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.project.model import Image, Orientation
 from photoplan.io.terrain.reader import TerrainReader
@@ -22,7 +22,7 @@ from photoplan.surfaces.raster import RasterSurface
 
 EAST = np.array([1100.0, 0, 0])
 MIDDLE = np.array([700_000.0, 5_300_000.0])
-CAMERA = FrameCamera(size=(4000, 3000), focal_px=4000.0)
+CAMERA = FrameEntry(size=(4000, 3000), focal_px=4000.0)
 
 
 def hills(XY: np.ndarray) -> np.ndarray:

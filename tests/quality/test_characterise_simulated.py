@@ -13,7 +13,7 @@ from photoplan.quality.camera.gain_control import gain_control
 from photoplan.quality.camera.line_jitter import line_jitter
 from photoplan.quality.camera.plumb_edge import correlate_edge, fit_edge
 from photoplan.quality.formation.model import ImageModel, form_image, form_series
-from photoplan.quality.formation.optics_parts import Falloff, LineJitter, Spread
+from photoplan.quality.formation.optics_parts import Falloff, LineJitterPart, Spread
 from photoplan.quality.formation.scenes import PatternScene
 from photoplan.quality.formation.sensor_parts import (
     AutomaticGain,
@@ -62,7 +62,7 @@ def test_fall_off_of_the_model() -> None:
 
 def test_line_jitter_of_the_model() -> None:
     """Independent displacements, an offset of the fields, and an oscillation of 120 lines."""
-    put_in = LineJitter(sigma=0.15, field=0.12, amplitude=0.25, period=120.0, phase_deg=40.0)
+    put_in = LineJitterPart(sigma=0.15, field=0.12, amplitude=0.25, period=120.0, phase_deg=40.0)
     model = camera(spread=Spread(gaussian=(0.6, 0.6)), jitter=put_in)
     scene = PatternScene("edge", (48, 480), (0.5,), levels=(40.0, 200.0), oversampling=4)
     image = form_image(model, scene)

@@ -10,9 +10,9 @@ from photoplan.quality.formation.scenes import PatternScene
 from photoplan.quality.formation.sensor import overflow
 from photoplan.quality.formation.sensor_parts import (
     AutomaticGain,
-    DarkCurrent,
-    Defect,
-    Enhancement,
+    DarkCurrentPart,
+    DefectPart,
+    EnhancementPart,
     Exposure,
     FixedPattern,
     Gain,
@@ -59,7 +59,7 @@ def test_dark_current_doubles():
     """Behr 1989, section 3.6.4: about every 10 °C."""
     means = []
     for degrees in (20.0, 30.0, 45.0):
-        dark = DarkCurrent(rate=8.0, at_deg=20.0, doubling_deg=10.0, temperature_deg=degrees)
+        dark = DarkCurrentPart(rate=8.0, at_deg=20.0, doubling_deg=10.0, temperature_deg=degrees)
         image = form_image(ImageModel(exposure=Exposure(seconds=2.0), dark=dark), 0.0 * FLAT, exposure=3.0)
         means.append(image.values.mean())
         assert image.facts["dark_electrons"] == pytest.approx(means[-1])
@@ -67,7 +67,12 @@ def test_dark_current_doubles():
 
 
 def test_defects():
-    defects = (Defect(3, 5, "dead"), Defect(7, 5, "weak", 0.5), Defect(8, 5, "hot", 100.0), Defect(9, 5, "stuck", 77.0))
+    defects = (
+        DefectPart(3, 5, "dead"),
+        DefectPart(7, 5, "weak", 0.5),
+        DefectPart(8, 5, "hot", 100.0),
+        DefectPart(9, 5, "stuck", 77.0),
+    )
     image = form_image(ImageModel(defects=defects, exposure=Exposure(light=10.0)), np.ones((10, 12)), exposure=2.0)
     assert image.values[5, [3, 7, 8, 9]].tolist() == [0.0, 10.0, 220.0, 77.0]
     assert np.delete(image.values.ravel(), [5 * 12 + c for c in (3, 7, 8, 9)]).tolist() == [20.0] * 116
@@ -165,7 +170,7 @@ def test_quantisation_noise():
 
 def test_edge_enhancement_over_and_undershoots():
     scene = PatternScene("edge", (60, 20), (0.0,), 8, levels=(50.0, 150.0))
-    model = ImageModel(Spread(gaussian=(0.8, 0.8)), enhancement=Enhancement(1.0, 1.5))
+    model = ImageModel(Spread(gaussian=(0.8, 0.8)), enhancement=EnhancementPart(1.0, 1.5))
     row = form_image(model, scene).values[10]
     assert row.max() > 155.0 and row.min() < 45.0
     assert row[[0, -1]] == pytest.approx([50.0, 150.0])
@@ -205,11 +210,11 @@ def test_series_is_its_single_frames():
     ("make", "words"),
     [
         (lambda: Well(100.0, drain=0.7, circular=0.6), "at most 1"),
-        (lambda: Defect(1, 1, "odd"), "dead, weak, hot"),
+        (lambda: DefectPart(1, 1, "odd"), "dead, weak, hot"),
         (lambda: Quantisation(17), "bits"),
         (lambda: Tone("table", table=((1.0, 2.0),)), "2 to 65536"),
         (lambda: ImageModel(seed=-1), "seed"),
-        (lambda: form_image(ImageModel(defects=(Defect(9, 0, "dead"),)), np.ones((4, 4))), "column 9"),
+        (lambda: form_image(ImageModel(defects=(DefectPart(9, 0, "dead"),)), np.ones((4, 4))), "column 9"),
         (lambda: form_image(ImageModel(), np.ones((4, 4)), exposure=-1.0), "exposure"),
         (lambda: list(form_series(ImageModel(), [PatternScene("flat", (3, 3))] * 2, (1.0, 2.0, 3.0))), "equal numbers"),
     ],

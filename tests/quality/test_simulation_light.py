@@ -9,7 +9,7 @@ from photoplan.geometry.grid import Window
 from photoplan.quality.formation import optics
 from photoplan.quality.formation.kernels import pixel_kernel
 from photoplan.quality.formation.model import ImageModel, form_image
-from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitter, Spread
+from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitterPart, Spread
 from photoplan.quality.formation.scenes import ArrayScene, PatternScene, parse_pattern
 from photoplan.quality.formation.truth import line_spread_width, model_modulation, model_mtf50
 from photoplan.quality.spread import GAUSSIAN_WIDTH
@@ -187,7 +187,7 @@ def test_fall_off():
 
 
 def test_jitter_moves_lines_by_what_the_truth_says():
-    jitter = LineJitter(sigma=0.3, field=0.4, amplitude=0.5, period=40.0, phase_deg=30.0)
+    jitter = LineJitterPart(sigma=0.3, field=0.4, amplitude=0.5, period=40.0, phase_deg=30.0)
     model = ImageModel(Spread(gaussian=(0.7, 0.7)), jitter=jitter, seed=5)
     image = form_image(model, PatternScene("edge", (64, 2000), (0.0,), 8), frame=2)
     edge = 64 - image.values.sum(1) - 0.5

@@ -7,13 +7,13 @@ import numpy as np
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera as PixelCamera
 from photoplan.geometry.pose import Pose
-from photoplan.io.camera.model import FrameCamera
+from photoplan.io.camera.model import FrameEntry
 from photoplan.io.orientation.block import OrientationBlock
 from photoplan.io.orientation.table import OrientationTable, OrientedImage
 from photoplan.io.project.cameras import interior_of, lens_of
 from photoplan.io.project.model import Image
 
-CAMERA = FrameCamera(
+CAMERA = FrameEntry(
     size=(13824, 7680), camera_constant_mm=120.01, pixel_size_um=12.0, principal_point_mm=(0.024, -0.036)
 )
 CENTERS = ((512345.678, 5274112.875, 2630.44), (513000.125, 5274100.5, 2641.0625), (512345.0, 5273000.25, 2619.75))

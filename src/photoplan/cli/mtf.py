@@ -12,7 +12,7 @@ from photoplan.cli.options import json_option
 from photoplan.cli.output import end_with_failures, show, show_json, talking
 
 
-class _Image(Protocol):
+class _MeasuredImage(Protocol):
     @property
     def name(self) -> str: ...
     @property
@@ -21,7 +21,7 @@ class _Image(Protocol):
 
 class _Report(Protocol):
     @property
-    def images(self) -> Sequence[_Image]: ...
+    def images(self) -> Sequence[_MeasuredImage]: ...
     @property
     def csv(self) -> Path | None: ...
 

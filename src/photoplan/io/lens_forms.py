@@ -13,7 +13,7 @@ from photoplan.cameras.lenses.fisheye import Fisheye
 from photoplan.cameras.lenses.none import NoLens
 from photoplan.cameras.lenses.opencv import OpenCV
 from photoplan.errors import InputError
-from photoplan.io.camera.model import FilmCamera, FrameCamera
+from photoplan.io.camera.model import FilmCamera, FrameEntry
 from photoplan.io.orientation.block import Loss, OrientationBlock
 from photoplan.io.plain_files import build
 from photoplan.io.project.cameras import lens_of
@@ -39,9 +39,9 @@ class OpenCVForm:
         return not self.fisheye and any(self.k[3:])
 
 
-def opencv_form(camera: FrameCamera | FilmCamera) -> OpenCVForm | None:
+def opencv_form(camera: FrameEntry | FilmCamera) -> OpenCVForm | None:
     """OpenCV's form of a camera; None for film, and for lenses that OpenCV does not have."""
-    if not isinstance(camera, FrameCamera):
+    if not isinstance(camera, FrameEntry):
         return None
     (fx, fy), lens = camera.focal, lens_of(camera)
     k: tuple[float, ...] = (0.0,) * 6
@@ -98,9 +98,9 @@ class AgisoftForm:
     fisheye: bool = False
 
 
-def agisoft_form(camera: FrameCamera | FilmCamera) -> AgisoftForm | None:
+def agisoft_form(camera: FrameEntry | FilmCamera) -> AgisoftForm | None:
     """Agisoft's form of a camera; None for film, and for lenses that it does not have."""
-    if not isinstance(camera, FrameCamera):
+    if not isinstance(camera, FrameEntry):
         return None
     (fx, fy), lens = camera.focal, lens_of(camera)
     k, p, b, fisheye = (0.0, 0.0, 0.0, 0.0), (0.0, 0.0), (0.0, 0.0), False
@@ -119,7 +119,7 @@ def agisoft_form(camera: FrameCamera | FilmCamera) -> AgisoftForm | None:
     return AgisoftForm(camera.size, fy, offset, k, p, in_pixels, fisheye)
 
 
-def frame_camera(form: OpenCVForm | AgisoftForm, where: str) -> FrameCamera:
+def frame_camera(form: OpenCVForm | AgisoftForm, where: str) -> FrameEntry:
     """The description of a camera in one of the two forms; `where` begins messages.
 
     Raises
@@ -144,7 +144,7 @@ def frame_camera(form: OpenCVForm | AgisoftForm, where: str) -> FrameCamera:
         "principal_point_px": point,
         "lens": lens,
     }
-    return build(FrameCamera, values, where)
+    return build(FrameEntry, values, where)
 
 
 def _agisoft_lens(form: AgisoftForm, where: str) -> tuple[dict[str, Any], tuple[float, float]]:

@@ -21,13 +21,13 @@ Box = tuple[Number, Number, Number, Number]
 Name = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
-class _Entry(BaseModel):
+class _MarkEntry(BaseModel):
     """Unknown keys are errors, values never change."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class _Free(_Entry):
+class _Free(_MarkEntry):
     """A mark that stands free on even ground."""
 
     bright: Flag = True
@@ -84,7 +84,7 @@ class DotCross(_Free):
     rotation: Number = 0.0
 
 
-class Part(_Entry):
+class Part(_MarkEntry):
     """A polygon of one tone."""
 
     outline: Annotated[tuple[Point, ...], Field(min_length=3, max_length=1000)]
@@ -92,7 +92,7 @@ class Part(_Entry):
     """0 dark to 1 bright; left out: not compared."""
 
 
-class Polygon(_Entry):
+class Polygon(_MarkEntry):
     """Anything, from polygons; each covers those before it."""
 
     type: Literal["polygon"]
@@ -103,7 +103,7 @@ class Polygon(_Entry):
     rotation: Number = 0.0
 
 
-class Silhouette(_Entry):
+class Silhouette(_MarkEntry):
     """A mark that is the outline of the camera's frame, described as at the upper side of a picture."""
 
     band: Length = 0.25
@@ -115,7 +115,7 @@ class Silhouette(_Entry):
     window: Box | None = None
 
 
-class Block(Silhouette):
+class BlockSilhouette(Silhouette):
     """A stepped trapezoid."""
 
     type: Literal["block"]
@@ -170,7 +170,7 @@ class Arc(Silhouette):
     run: Length
 
 
-class Example(_Entry):
+class Example(_MarkEntry):
     """A mark cut from a scan."""
 
     type: Literal["example"]
@@ -187,12 +187,12 @@ class Example(_Entry):
 
 
 Mark = Annotated[
-    Cross | Dot | Ring | RingCross | DotCross | Polygon | Block | Curve | Notch | Triangle | Arc | Example,
+    Cross | Dot | Ring | RingCross | DotCross | Polygon | BlockSilhouette | Curve | Notch | Triangle | Arc | Example,
     Field(discriminator="type"),
 ]
 
 
-class EachMark(_Entry):
+class EachMark(_MarkEntry):
     """A description for every mark by its name."""
 
     model_config = ConfigDict(frozen=True, extra="allow")

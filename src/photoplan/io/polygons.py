@@ -40,7 +40,7 @@ class Feature:
 
 
 @dataclass(frozen=True, eq=False)
-class Features:
+class VectorFeatures:
     """Objects of one layer."""
 
     path: Path
@@ -49,7 +49,7 @@ class Features:
     items: tuple[Feature, ...]
 
 
-def read_features(path: Path, *kinds: str) -> Features:
+def read_features(path: Path, *kinds: str) -> VectorFeatures:
     """Objects of the first layer of a GeoPackage, Shapefile, GeoJSON or FlatGeobuf.
 
     Parameters
@@ -89,7 +89,7 @@ def read_features(path: Path, *kinds: str) -> Features:
     if not items:
         raise InputError(f"{path}: holds no {' or '.join(kinds)}; give a file that does")
     _refuse_invalid(path, items)
-    return Features(path, meta["crs"] if _states_crs(path, head) else None, tuple(items))
+    return VectorFeatures(path, meta["crs"] if _states_crs(path, head) else None, tuple(items))
 
 
 def _states_crs(path: Path, head: bytes) -> bool:

@@ -101,7 +101,7 @@ class Chip(Entry):
         return (self.pitch[0] * self.elements[0] / 1000.0, self.pitch[1] * self.elements[1] / 1000.0)
 
 
-class Picture(Entry):
+class PictureEntry(Entry):
     """The digital image."""
 
     pixels: tuple[Count, Count] | None = None
@@ -162,7 +162,7 @@ class Noise(Entry):
         return self
 
 
-class Optics(Entry):
+class OpticsEntry(Entry):
     """The lens at its limit."""
 
     f_number: Amount
@@ -176,10 +176,10 @@ class SensorDescription(Entry):
     viewing: Viewing | None = None
     video: Video | None = None
     sensor: Chip | None = None
-    image: Picture | None = None
+    image: PictureEntry | None = None
     transfer: Transfer | None = None
     noise: Noise | None = None
-    optics: Optics | None = None
+    optics: OpticsEntry | None = None
     stated: Annotated[dict[Name, Number], Field(max_length=200, default_factory=dict)]
     """Figures as somebody else states them, by the name of the figure."""
 

@@ -72,7 +72,7 @@ class Dialect:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Layout:
+class TableLayout:
     """What the columns of a file are."""
 
     delimiter: str
@@ -99,7 +99,7 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     lines: tuple[int, ...]
     """Line of each row in the file."""
-    layout: Layout
+    layout: TableLayout
     decimal_comma: bool = False
 
     @property
@@ -197,13 +197,13 @@ def read_table(path: Path, columns: Columns, dialect: Dialect = Dialect(), max_b
     )
 
 
-def wrong_width(width: int, layout: Layout) -> str:
+def wrong_width(width: int, layout: TableLayout) -> str:
     """What to say of a line with another number of fields."""
     hint = "; is the decimal sign a comma? decimal commas need another delimiter" if layout.delimiter == "," else ""
     return f"{width} columns, the first line has {layout.width}{hint}"
 
 
-def find_layout(path: Path, lines: Sequence[Line], columns: Columns, dialect: Dialect = Dialect()) -> Layout:
+def find_layout(path: Path, lines: Sequence[Line], columns: Columns, dialect: Dialect = Dialect()) -> TableLayout:
     """What the columns hold, from the first lines of a file; at least one of them holds data.
 
     Raises
@@ -218,29 +218,29 @@ def find_layout(path: Path, lines: Sequence[Line], columns: Columns, dialect: Di
     if columns.untitled:
         words = not any(decimal(f, dialect.decimal_comma) is not None or f.casefold() in NOTHING for f in first)
         roles = {role: k for k, role in enumerate(columns.orders[-1][: len(first)])}
-        return Layout(delimiter=delimiter, roles=roles, names=first, header=line * words)
+        return TableLayout(delimiter=delimiter, roles=roles, names=first, header=line * words)
     if dialect.columns is not None and "=" not in dialect.columns:
         roles = _declared_order(where, first, columns, dialect.columns)
         fields = [first[at] for role, at in roles.items() if role in columns.numbers]
         header = bool(fields) and not any(re.match(r"[-+]?\.?\d", text) for text in fields)
-        return Layout(delimiter=delimiter, roles=roles, names=first, header=line * header)
+        return TableLayout(delimiter=delimiter, roles=roles, names=first, header=line * header)
     renamed = None if dialect.columns is None else _declared_names(dialect.columns, columns)
     found = _header(where, first, columns, renamed)
     if not isinstance(found, str):
-        return Layout(delimiter=delimiter, roles=found, names=first, header=line)
+        return TableLayout(delimiter=delimiter, roles=found, names=first, header=line)
     if renamed is None:
         for item in (i for i in lines if i[0] < line):
             head = (item[0], item[1].lstrip()[1:].strip())
             for names in (_try_split(path, head, d) for d in DELIMITERS):
                 roles_of_comment = _header(where, names, columns, None) if len(names) == len(first) else ""
                 if not isinstance(roles_of_comment, str):
-                    return Layout(delimiter=delimiter, roles=roles_of_comment, names=names, header=item[0])
+                    return TableLayout(delimiter=delimiter, roles=roles_of_comment, names=names, header=item[0])
         numeric = sum(decimal(f, dialect.decimal_comma) is not None for f in first)
         order = next((o for o in columns.orders if len(o) == len(first)), None)
         least = sum(role in columns.numbers for role in columns.needed)
         if order is not None and numeric >= least:
             roles = {role: k for k, role in enumerate(order)}
-            return Layout(delimiter=delimiter, roles=roles, names=first, header=0, by_order=True)
+            return TableLayout(delimiter=delimiter, roles=roles, names=first, header=0, by_order=True)
         own = columns.explain(first, found)
         if own is not None:
             raise InputError(f"{where}: {own}")

@@ -19,7 +19,7 @@ TILE = 2048
 _LUMINANCE = (0.299, 0.587, 0.114)
 
 
-class Pixels(Protocol):
+class GreyPixels(Protocol):
     """An image that is read by windows; safe to call from several threads."""
 
     @property
@@ -49,7 +49,7 @@ class Grey(Protocol):
 class GreyImage:
     """Grey values of an image and where they count."""
 
-    pixels: Pixels
+    pixels: GreyPixels
     area: tuple[float, float, float, float] | None = None
     """Columns and rows xmin, ymin, xmax, ymax of the picture on a scan, without its margin; None: everything."""
 

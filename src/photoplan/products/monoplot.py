@@ -24,7 +24,7 @@ from photoplan.plain import pick
 from photoplan.project.open_terrain import open_terrain
 from photoplan.project.scene import Scene, input_files, open_scene, pose_of
 from photoplan.surfaces.hybrid import HybridSurface
-from photoplan.terrain.monoplot import REASONS, GroundPoints, MonoplotErrors, monoplot
+from photoplan.terrain.monoplot import REASONS, MonoplotErrors, MonoplotPoints, monoplot
 
 #: Flatter than this the ray grazes the terrain: small errors move the point far, and not linearly. Radians.
 GRAZING = math.radians(5.0)
@@ -188,7 +188,7 @@ def _read(request: MonoplotRequest) -> _Given:
     return _Given(xy, ("name", "x", "y"), rows, line if True in kinds else None, tuple(name for name, _ in parts))
 
 
-def _write_table(path: Path, given: _Given, found: GroundPoints) -> None:
+def _write_table(path: Path, given: _Given, found: MonoplotPoints) -> None:
     """The columns of the input, then `COLUMNS`; fields without a value are empty."""
     rows = []
     degrees = np.degrees(found.angle)
@@ -202,7 +202,7 @@ def _text(value: float, digits: int) -> str:
     return f"{value:.{digits}f}" if math.isfinite(value) else ""
 
 
-def _remark(found: GroundPoints, i: int) -> str:
+def _remark(found: MonoplotPoints, i: int) -> str:
     """Why there is no point, or what is to be said about it."""
     if found.reasons[i]:
         return REASONS[str(found.reasons[i])]
@@ -210,7 +210,7 @@ def _remark(found: GroundPoints, i: int) -> str:
     return "; ".join(said + (["through a hole"] if found.hole[i] else []))
 
 
-def _write_vectors(path: Path, given: _Given, found: GroundPoints, crs: str) -> None:
+def _write_vectors(path: Path, given: _Given, found: MonoplotPoints, crs: str) -> None:
     there = np.isfinite(found.XYZ[:, 0])
     sigma = found.sigmas
     if given.line is None:
@@ -234,7 +234,9 @@ def _runs(line: NDArray[np.int64], there: NDArray[np.bool_]) -> list[NDArray[np.
     return [run for run in np.split(index, breaks) if len(run) > 1]
 
 
-def _report(request: MonoplotRequest, found: GroundPoints, height_system: str, notes: Sequence[str]) -> MonoplotReport:
+def _report(
+    request: MonoplotRequest, found: MonoplotPoints, height_system: str, notes: Sequence[str]
+) -> MonoplotReport:
     met = found.reasons == ""
     missed = {str(key): int((found.reasons == key).sum()) for key in np.unique(found.reasons[~met])}
     sigmas = found.sigmas[np.isfinite(found.sigmas).all(axis=1)]

@@ -19,7 +19,7 @@ from photoplan.surfaces.mesh.lines import on_grid
 from photoplan.surfaces.mesh.thin import thin
 from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
 from photoplan.terrain.clean.borders import domain_of
-from photoplan.terrain.fit import Fit, each, fit
+from photoplan.terrain.fit import TerrainFit, each, fit
 from photoplan.terrain.observations import Observations, observe
 from photoplan.terrain.predict import Domain, predict_lines, predict_unit
 from photoplan.terrain.settings import BuildSettings
@@ -56,7 +56,7 @@ class Built:
     """A model in memory."""
 
     plan: BuildPlan
-    fit: Fit
+    fit: TerrainFit
     units: dict[tuple[int, int], Unit]
     """Units that are not empty, by column and row."""
     lines: tuple[LineElement, ...]
@@ -220,7 +220,7 @@ def _with_faces(
 
 
 def _figures(
-    plan: BuildPlan, found: Fit, units: dict[tuple[int, int], Unit], lines: list[LineElement]
+    plan: BuildPlan, found: TerrainFit, units: dict[tuple[int, int], Unit], lines: list[LineElement]
 ) -> list[UnitFigures]:
     layout = plan.layout
     passing = _passing(layout, lines)

@@ -143,7 +143,7 @@ class Covariance:
 
 
 @dataclass(frozen=True, eq=False)
-class _Blocks:
+class _PointBlocks:
     """Data of some blocks as the likelihood takes them."""
 
     d2: NDArray[np.float64]
@@ -220,7 +220,7 @@ def _some(members: list[NDArray[np.int64]]) -> list[NDArray[np.int64]]:
     return rich[:: max(1, -(-len(rich) // _UNITS))]
 
 
-def _blocks(seen: Observations, neighbours: Neighbours, points: NDArray[np.int64]) -> _Blocks:
+def _blocks(seen: Observations, neighbours: Neighbours, points: NDArray[np.int64]) -> _PointBlocks:
     """Blocks around some of the points: close ones and, last, a wide one."""
     rng = np.random.default_rng(int(points[0]) if len(points) else 0)
     middles = seen.xyz[rng.choice(points, _BLOCKS) if len(points) else [0] * _BLOCKS, :2]
@@ -237,7 +237,7 @@ def _blocks(seen: Observations, neighbours: Neighbours, points: NDArray[np.int64
     return _join([_block(seen, numbers[:size]) for numbers in chosen])
 
 
-def _block(seen: Observations, numbers: NDArray[np.int64]) -> _Blocks:
+def _block(seen: Observations, numbers: NDArray[np.int64]) -> _PointBlocks:
     xyz = seen.xyz[numbers]
     xy = xyz[:, :2] - xyz[:, :2].mean(axis=0)
     d2 = ((xy[:, None] - xy[None]) ** 2).sum(axis=2)
@@ -256,7 +256,7 @@ def _block(seen: Observations, numbers: NDArray[np.int64]) -> _Blocks:
     wild = np.abs(rest - np.median(rest)) > _OUTLIER * size
     if size > 0:
         noise[wild, 0] = 1e6 * size**2
-    return _Blocks(d2[None], apart[None], b[None], noise[None])
+    return _PointBlocks(d2[None], apart[None], b[None], noise[None])
 
 
 def near_lines(
@@ -274,18 +274,20 @@ def near_lines(
     return np.vstack([np.empty((0, 2)), *parts]), np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
 
 
-def _join(parts: list[_Blocks]) -> _Blocks:
-    return _Blocks(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("d2", "sides", "b", "noise")))
+def _join(parts: list[_PointBlocks]) -> _PointBlocks:
+    return _PointBlocks(
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in ("d2", "sides", "b", "noise"))
+    )
 
 
-def _cut(blocks: _Blocks, size: int) -> _Blocks:
-    return _Blocks(
+def _cut(blocks: _PointBlocks, size: int) -> _PointBlocks:
+    return _PointBlocks(
         blocks.d2[:, :size, :size], blocks.sides[:, :size, :size], blocks.b[:, :size], blocks.noise[:, :size]
     )
 
 
 def _start(
-    seen: Observations, blocks: _Blocks, settings: BuildSettings
+    seen: Observations, blocks: _PointBlocks, settings: BuildSettings
 ) -> tuple[NDArray[np.float64], tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Logarithms to begin with and their bounds, from the size of the heights and the spacing."""
     size = float(np.median(np.abs(blocks.b[..., 0]))) or 1.0

@@ -118,7 +118,7 @@ def _separate(code: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class TerrainFit:
     """The stochastic model of a terrain, and what its points say of it."""
 
     seen: Observations
@@ -168,7 +168,7 @@ def patches_at(leaves: Leaves, some: NDArray[np.int64]) -> NDArray[np.float64]:
 
 def fit(
     seen: Observations, layout: UnitLayout, settings: BuildSettings, run: Map = map, events: Events = SILENT
-) -> Fit:
+) -> TerrainFit:
     """Estimate the covariance functions, choose among them in every patch, and flag gross errors.
 
     `events` are told of each unit three times.
@@ -183,7 +183,7 @@ def fit(
     whole = estimate_all(seen, neighbours, members, settings)
     units = each(lambda u: estimate_unit(seen, neighbours, members[u], whole, settings), range(count), run, events)
     mass = np.array([unit.noise for unit in units])
-    found = Fit(
+    found = TerrainFit(
         seen=seen,
         layout=layout,
         leaves=leaves,
@@ -216,7 +216,7 @@ def _members(unit: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
 
 
 def lines_of(
-    found: Fit, patches: NDArray[np.float64], ids: NDArray[np.int64]
+    found: TerrainFit, patches: NDArray[np.float64], ids: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Barriers that any of the patches can meet, from their squares and their data."""
     data = found.seen.xyz[ids.ravel()[ids.ravel() >= 0], :2]
@@ -226,7 +226,7 @@ def lines_of(
     return near_lines(found.seen, low, high)
 
 
-def _choose(found: Fit, unit: int) -> None:
+def _choose(found: TerrainFit, unit: int) -> None:
     """Weights of the ladder's functions in the patches of a unit."""
     some = found.leaves.of_unit(unit)
     ids = found.neighbours.query(found.leaves.middle[some])
@@ -241,7 +241,7 @@ def _choose(found: Fit, unit: int) -> None:
     found.shares[some] = weight / weight.sum(axis=1, keepdims=True)
 
 
-def _test(found: Fit, some: NDArray[np.int64]) -> None:
+def _test(found: TerrainFit, some: NDArray[np.int64]) -> None:
     """Residuals of the points in some leaves, by the best function of each patch."""
     if not len(some):
         return
@@ -267,7 +267,7 @@ def _test(found: Fit, some: NDArray[np.int64]) -> None:
     )
 
 
-def _flag(found: Fit, limit: float, run: Map) -> None:
+def _flag(found: TerrainFit, limit: float, run: Map) -> None:
     """Flag the worst point of each neighbourhood, test the neighbourhood again, until none is left (data snooping).
 
     A point that fits no smooth surface may still show what the terrain is like: a ditch or a stone that no line
@@ -297,7 +297,7 @@ def _flag(found: Fit, limit: float, run: Map) -> None:
         _test_again(found, leaves, run)
 
 
-def _supported(found: Fit, suspect: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _supported(found: TerrainFit, suspect: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Whether another point close by deviates clearly and to the same side."""
     near = found.neighbours.near[0].query(found.seen.xyz[suspect, :2])
     apart = np.linalg.norm(found.seen.xyz[near, :2] - found.seen.xyz[suspect, None, :2], axis=2)
@@ -307,19 +307,19 @@ def _supported(found: Fit, suspect: NDArray[np.int64]) -> NDArray[np.bool_]:
     return supported
 
 
-def _test_again(found: Fit, leaves: NDArray[np.int64], run: Map) -> None:
+def _test_again(found: TerrainFit, leaves: NDArray[np.int64], run: Map) -> None:
     unit = found.leaves.unit[leaves]
     each(lambda u: _test(found, leaves[unit == u]), np.unique(unit).tolist(), run)
 
 
-def _leaf_of(found: Fit) -> NDArray[np.int64]:
+def _leaf_of(found: TerrainFit) -> NDArray[np.int64]:
     """Leaf of every point and vertex."""
     leaf = np.empty(len(found.leaves.order), np.int64)
     leaf[found.leaves.order] = np.repeat(np.arange(len(found.leaves.half)), found.leaves.count)
     return leaf
 
 
-def _spread(found: Fit) -> NDArray[np.float64]:
+def _spread(found: TerrainFit) -> NDArray[np.float64]:
     """Spread of the normalised residuals of each unit's points, drawn to that of all where there are few."""
     points = found.seen.points
     good = (found.noise[:points] >= 0) & np.isfinite(found.residuals[:, 2])

@@ -51,7 +51,7 @@ class MonoplotErrors:
 
 
 @dataclass(frozen=True, eq=False)
-class GroundPoints:
+class MonoplotPoints:
     """Ground points of image points, in their order."""
 
     XYZ: NDArray[np.float64]
@@ -79,7 +79,7 @@ def monoplot(
     height_range: tuple[float, float],
     errors: MonoplotErrors,
     mesh: float,
-) -> GroundPoints:
+) -> MonoplotPoints:
     """Where the rays of image points first meet a surface.
 
     With A = ∂(x, y)/∂(X, Y, Z) and the terrain's slope s = ∂h/∂(X, Y), small changes obey
@@ -105,7 +105,7 @@ def monoplot(
 
     Returns
     -------
-    GroundPoints
+    MonoplotPoints
     """
     xy = np.asarray(xy, float).reshape(-1, 2)
     reasons = _before(camera, xy, terrain, height_range)
@@ -120,7 +120,7 @@ def monoplot(
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     angle = np.where(np.isnan(XYZ[:, 0]), np.nan, np.arcsin(np.clip(-(normal * direction).sum(axis=1), -1, 1)))
     covariance = _covariance(camera, XYZ, slope, errors)
-    return GroundPoints(XYZ, covariance, angle, _holes(camera, xy, XYZ, terrain, height_range[1]), reasons)
+    return MonoplotPoints(XYZ, covariance, angle, _holes(camera, xy, XYZ, terrain, height_range[1]), reasons)
 
 
 def _before(

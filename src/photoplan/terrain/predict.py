@@ -14,7 +14,7 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 from photoplan.events import Map
 from photoplan.kernels.patch import predict
 from photoplan.surfaces.units import LineElement, Unit
-from photoplan.terrain.fit import REACH, Fit, each, lines_of, patches_at
+from photoplan.terrain.fit import REACH, TerrainFit, each, lines_of, patches_at
 
 #: A prepared polygon builds its index when it is first asked, and GEOS does not guard that against other threads.
 _ONE_AT_A_TIME = threading.Lock()
@@ -70,7 +70,7 @@ class Domain:
 
 
 def heights_at(
-    fit: Fit, unit: int, xy: NDArray[np.float64]
+    fit: TerrainFit, unit: int, xy: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Predicted heights of places (n, 2) in or near a unit.
 
@@ -101,7 +101,7 @@ def heights_at(
     return heights, sigmas * _spread_at(fit, xy), sums[:, 3]
 
 
-def _spread_at(fit: Fit, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+def _spread_at(fit: TerrainFit, xy: NDArray[np.float64]) -> NDArray[np.float64]:
     """Factor of standard deviations at places, linear between the middles of units: else they would step at borders."""
     layout = fit.layout
     spread = fit.spread.reshape(layout.rows, layout.columns)
@@ -111,7 +111,7 @@ def _spread_at(fit: Fit, xy: NDArray[np.float64]) -> NDArray[np.float64]:
     return factor
 
 
-def _leaves_near(fit: Fit, unit: int, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.int64]:
+def _leaves_near(fit: TerrainFit, unit: int, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.int64]:
     """Leaves of a unit and of the units beside it whose patches meet a rectangle."""
     columns, rows = fit.layout.columns, fit.layout.rows
     row, column = divmod(unit, columns)
@@ -143,7 +143,7 @@ def _targets(
     return (np.concatenate(found) if found else np.empty(0, np.int64)), np.concatenate([[0], np.cumsum(sizes)])
 
 
-def predict_unit(fit: Fit, unit: int, domain: Domain, meshes: int, reach: float) -> Unit | None:
+def predict_unit(fit: TerrainFit, unit: int, domain: Domain, meshes: int, reach: float) -> Unit | None:
     """Posts of a unit, NaN outside the domain and far from data; None if there are none.
 
     Heights are relative to the origin of the observations; the unit's place is absolute.
@@ -175,7 +175,7 @@ def predict_unit(fit: Fit, unit: int, domain: Domain, meshes: int, reach: float)
     )
 
 
-def predict_lines(fit: Fit, run: Map = map) -> list[LineElement]:
+def predict_lines(fit: TerrainFit, run: Map = map) -> list[LineElement]:
     """Lines with filtered heights: at each vertex of a breakline the mean of what its two sides say, of a wall each.
 
     Vertices that lines share have one height.
@@ -202,7 +202,7 @@ def predict_lines(fit: Fit, run: Map = map) -> list[LineElement]:
     return _elements(fit, left, right)
 
 
-def _elements(fit: Fit, left: NDArray[np.float64], right: NDArray[np.float64]) -> list[LineElement]:
+def _elements(fit: TerrainFit, left: NDArray[np.float64], right: NDArray[np.float64]) -> list[LineElement]:
     lines = fit.seen.lines
     walls = np.concatenate([np.full(len(line.xyz), line.right is not None) for line in lines.lines])
     weight = 1 / np.maximum(np.stack([left[:, 1], right[:, 1]]), 1e-9) ** 2

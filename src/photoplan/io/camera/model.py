@@ -40,7 +40,7 @@ class Entry(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class NoLens(Entry):
+class IdealLens(Entry):
     """A lens without distortion."""
 
     type: Literal["none"] = "none"
@@ -115,7 +115,7 @@ class RadialTableLens(Entry):
         return self
 
 
-Lens = Annotated[NoLens | BrownLens | OpenCVLens | OpenCVFisheyeLens | RadialTableLens, Field(discriminator="type")]
+Lens = Annotated[IdealLens | BrownLens | OpenCVLens | OpenCVFisheyeLens | RadialTableLens, Field(discriminator="type")]
 
 
 def _in_mm(lens: Lens) -> bool:
@@ -153,7 +153,7 @@ def _restoration(value: Any) -> Any:
 Restore = Annotated[Restoration, BeforeValidator(_restoration)]
 
 
-class FrameCamera(Entry):
+class FrameEntry(Entry):
     """A digital frame camera: by its focal length in pixels, or by camera constant and pixel or sensor size."""
 
     type: Literal["frame"] = "frame"
@@ -168,7 +168,7 @@ class FrameCamera(Entry):
     """Column and row of the principal point, (0, 0) the centre of the upper-left pixel; default the image's middle."""
     principal_point_mm: Pair | None = None
     """The same as x0 to the right and y0 upwards from the image's middle, millimetres."""
-    lens: Lens = NoLens()
+    lens: Lens = IdealLens()
     restore: Restore | None = None
     """Filter that its images are restored with, where they state no other."""
 
@@ -245,7 +245,7 @@ class FilmCamera(Entry):
     """Width and height of the scans in pixels, where all are equal."""
     marks: Marks | None = None
     """What the fiducial marks look like: one description for all, or one for each by name."""
-    lens: Lens = NoLens()
+    lens: Lens = IdealLens()
     restore: Restore | None = None
     """Filter that its scans are restored with, where they state no other."""
 
@@ -275,5 +275,5 @@ def _camera_type(value: Any) -> str:
 
 
 Camera = Annotated[
-    Annotated[FrameCamera, Tag("frame")] | Annotated[FilmCamera, Tag("film")], Discriminator(_camera_type)
+    Annotated[FrameEntry, Tag("frame")] | Annotated[FilmCamera, Tag("film")], Discriminator(_camera_type)
 ]

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from photoplan.errors import InputError
-from photoplan.io.camera.model import FilmCamera, FrameCamera
+from photoplan.io.camera.model import FilmCamera, FrameEntry
 from photoplan.io.plain_files import build, finite, read_json
 
 _COEFFICIENTS = {
@@ -26,7 +26,7 @@ _COEFFICIENTS = {
 }
 
 
-def read(path: Path) -> dict[str, FrameCamera | FilmCamera]:
+def read(path: Path) -> dict[str, FrameEntry | FilmCamera]:
     """Cameras of a JSON file by name; sizes are those that the file states.
 
     Raises
@@ -40,13 +40,13 @@ def read(path: Path) -> dict[str, FrameCamera | FilmCamera]:
     return cameras_of(contents, path)
 
 
-def cameras_of(reconstructions: Any, path: Path) -> dict[str, FrameCamera | FilmCamera]:
+def cameras_of(reconstructions: Any, path: Path) -> dict[str, FrameEntry | FilmCamera]:
     """Cameras of the parsed contents of a ``reconstruction.json``."""
     if not isinstance(reconstructions, list) or not all(
         isinstance(r, dict) and isinstance(r.get("cameras"), dict) for r in reconstructions
     ):
         raise InputError(f"{path}: neither a reconstruction.json of OpenSfM nor a cameras.json of OpenDroneMap")
-    cameras: dict[str, FrameCamera | FilmCamera] = {}
+    cameras: dict[str, FrameEntry | FilmCamera] = {}
     for reconstruction in reconstructions:
         for name, values in reconstruction["cameras"].items():
             camera = _camera(values, f"{path}: camera {name!r}")
@@ -59,7 +59,7 @@ def _is_camera(values: Any) -> bool:
     return isinstance(values, dict) and "projection_type" in values
 
 
-def _camera(values: Any, where: str) -> FrameCamera:
+def _camera(values: Any, where: str) -> FrameEntry:
     if not _is_camera(values):
         raise InputError(f"{where}: projection_type is missing")
     kind = values["projection_type"]
@@ -83,7 +83,7 @@ def _camera(values: Any, where: str) -> FrameCamera:
         ),
         "lens": {"type": "opencv_fisheye" if kind.startswith("fisheye") else "opencv", **lens},
     }
-    return build(FrameCamera, plain, where)
+    return build(FrameEntry, plain, where)
 
 
 def _number(values: dict[str, Any], key: str, where: str, default: float = 0.0) -> float:
@@ -91,7 +91,7 @@ def _number(values: dict[str, Any], key: str, where: str, default: float = 0.0) 
     return number
 
 
-def resized(camera: FrameCamera, size: tuple[int, int], where: str) -> FrameCamera:
+def resized(camera: FrameEntry, size: tuple[int, int], where: str) -> FrameEntry:
     """The camera for images of another resolution, as normalised coordinates define it.
 
     Raises

@@ -10,15 +10,15 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from photoplan.errors import InputError
-from photoplan.io.camera.model import Camera, FilmCamera, FrameCamera
+from photoplan.io.camera.model import Camera, FilmCamera, FrameEntry
 from photoplan.io.camera.usgs import check_report
 from photoplan.io.project.errors import explain
 from photoplan.io.toml_file import read_toml
 
-_CAMERAS: TypeAdapter[dict[str, FrameCamera | FilmCamera]] = TypeAdapter(dict[str, Camera])
+_CAMERAS: TypeAdapter[dict[str, FrameEntry | FilmCamera]] = TypeAdapter(dict[str, Camera])
 
 
-def read(path: Path) -> dict[str, FrameCamera | FilmCamera]:
+def read(path: Path) -> dict[str, FrameEntry | FilmCamera]:
     """Cameras of a TOML file by name.
 
     Raises

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from photoplan.errors import InputError
-from photoplan.io.camera.model import FilmCamera, FrameCamera
+from photoplan.io.camera.model import FilmCamera, FrameEntry
 from photoplan.io.plain_files import finite
 
 #: Coordinates and distances are printed to a micrometre each; rounding makes 2 µm, and the least-squares solution that
@@ -53,7 +53,7 @@ def distance_differences(
     return found
 
 
-def check_report(contents: Mapping[str, Any], cameras: Mapping[str, FrameCamera | FilmCamera], where: str) -> None:
+def check_report(contents: Mapping[str, Any], cameras: Mapping[str, FrameEntry | FilmCamera], where: str) -> None:
     """Compare the ``[report]`` of a TOML file, if it has one, with the camera that it is about.
 
     Raises

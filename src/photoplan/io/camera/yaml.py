@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from photoplan.errors import InputError
-from photoplan.io.camera.model import FilmCamera, FrameCamera
+from photoplan.io.camera.model import FilmCamera, FrameEntry
 from photoplan.io.plain_files import build, finite, read_yaml
 
 _COEFFICIENTS = {
@@ -32,7 +32,7 @@ _COMMON = ("type", "im_size", "focal_len", "sensor_size", "cx", "cy")
 _UNSUPPORTED = ("s1", "s2", "s3", "s4", "tx", "ty")
 
 
-def read(path: Path) -> dict[str, FrameCamera | FilmCamera]:
+def read(path: Path) -> dict[str, FrameEntry | FilmCamera]:
     """Cameras of a YAML file by name.
 
     Raises
@@ -49,7 +49,7 @@ def read(path: Path) -> dict[str, FrameCamera | FilmCamera]:
     return {str(name): _camera(values, f"{path}: camera {str(name)!r}") for name, values in contents.items()}
 
 
-def _camera(values: Any, where: str) -> FrameCamera:
+def _camera(values: Any, where: str) -> FrameEntry:
     if not isinstance(values, dict):
         raise InputError(f"{where}: {values!r} given; needed are `type`, `im_size` and `focal_len`")
     kind = values.get("type")
@@ -73,7 +73,7 @@ def _camera(values: Any, where: str) -> FrameCamera:
         "principal_point_px": ((w - 1) / 2 + cx * max(w, h), (h - 1) / 2 + cy * max(w, h)),
         "lens": _lens(kind, values, where),
     }
-    return build(FrameCamera, plain, where)
+    return build(FrameEntry, plain, where)
 
 
 def _focal(values: dict[str, Any], size: tuple[int, int], where: str) -> tuple[float, float]:

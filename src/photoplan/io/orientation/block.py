@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.rotation import angles_from_rotation
-from photoplan.io.camera.model import FilmCamera, FrameCamera, NoLens
+from photoplan.io.camera.model import FilmCamera, FrameEntry, IdealLens
 from photoplan.io.orientation.table import Direction, OrientationTable, OrientedImage, TableFormat
 from photoplan.io.project.model import ANGLE_UNITS
 
@@ -40,7 +40,7 @@ class OrientationBlock:
 
     table: OrientationTable
     """Poses and the names of the images and of their cameras."""
-    cameras: Mapping[str, FrameCamera | FilmCamera] = field(default_factory=dict)
+    cameras: Mapping[str, FrameEntry | FilmCamera] = field(default_factory=dict)
     """Descriptions by name; empty where the file holds none. With one camera, images need not name it."""
     files: Mapping[str, str] = field(default_factory=dict)
     """Image files by image name, as stated (relative to the orientation file, or absolute); not all are known."""
@@ -80,7 +80,7 @@ class OrientationBlock:
             )
         return image.camera
 
-    def camera(self, image: OrientedImage) -> FrameCamera | FilmCamera:
+    def camera(self, image: OrientedImage) -> FrameEntry | FilmCamera:
         """Description of an image's camera; raises as `camera_name`."""
         return self.cameras[self.camera_name(image)]
 
@@ -155,7 +155,7 @@ def require_cameras(block: OrientationBlock, path: Path, what: str) -> None:
 
 def without_lenses(block: OrientationBlock) -> OrientationBlock:
     """The block with all lenses taken as free of distortion."""
-    cameras = {name: camera.model_copy(update={"lens": NoLens()}) for name, camera in block.cameras.items()}
+    cameras = {name: camera.model_copy(update={"lens": IdealLens()}) for name, camera in block.cameras.items()}
     return replace(block, cameras=cameras)
 
 

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.geometry.rotation import rotation_opk
-from photoplan.io.camera.model import FilmCamera, FrameCamera
+from photoplan.io.camera.model import FilmCamera, FrameEntry
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation.inpho_write import losses, render
 from photoplan.io.orientation.table import Direction, OrientationTable, TableFormat
@@ -83,7 +83,7 @@ def _plain(text: str) -> str:
     return text.replace("\\ ", " ").strip()
 
 
-class _File:
+class _InphoFile:
     """The parts of a file that are read."""
 
     def __init__(self) -> None:
@@ -93,8 +93,8 @@ class _File:
         self.other = _Section(0)
 
 
-def _parse(path: Path) -> _File:
-    file, section, nested, navigating = _File(), None, 0, False
+def _parse(path: Path) -> _InphoFile:
+    file, section, nested, navigating = _InphoFile(), None, 0, False
     for entry in _entries(read_text(path, MAX_BYTES)):
         key = entry.key
         if key in ("$CAMERA", "$CAMERA_DEFINITION") and not entry.value:
@@ -152,7 +152,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     poses = [_Pose(photo, path) for photo in photos]
     direction, reason = _direction(poses, file, form, path)
     notes.append(f"{path.name}: rotation matrices read as {DIRECTIONS[direction]}{reason}")
-    cameras: dict[str, FrameCamera | FilmCamera] = {}
+    cameras: dict[str, FrameEntry | FilmCamera] = {}
     turns: dict[str, NDArray[np.float64]] = {}
     for section in file.cameras:
         name, camera, turn, why = _camera(section, path)
@@ -199,7 +199,7 @@ class _Pose:
         self.M = checked_rotation(rows, f"{where}: image {name!r}")
 
 
-def _direction(poses: list[_Pose], file: _File, form: TableFormat, path: Path) -> tuple[Direction, str]:
+def _direction(poses: list[_Pose], file: _InphoFile, form: TableFormat, path: Path) -> tuple[Direction, str]:
     """What the matrices do: as declared, as the angles of `$INS` tell, or as MATCH-AT writes them; and the reason."""
     if form.declares_direction:
         return form.direction, ""
@@ -239,7 +239,7 @@ def _between(A: NDArray[np.float64], B: NDArray[np.float64]) -> float:
     return float(np.degrees(np.arctan2(sine, np.trace(S) - 1)))
 
 
-def _camera(section: _Section, path: Path) -> tuple[str, FrameCamera | None, NDArray[np.float64], str | None]:
+def _camera(section: _Section, path: Path) -> tuple[str, FrameEntry | None, NDArray[np.float64], str | None]:
     """Name, camera, rotation from the file's image axes to those of the pixels, and why there is no camera."""
     name = section.text("$CAMERA_ID", "$ID", "$TYPE")
     if name is None:
@@ -290,7 +290,7 @@ def _frame(
     t: NDArray[np.float64],
     pixel: NDArray[np.float64],
     path: Path,
-) -> FrameCamera:
+) -> FrameEntry:
     where = f"{path}:{section.line}: camera {name!r}"
     ppa = numbers((section.text("$PRINCIPAL_POINT_PPA") or "0 0").split(), where, "$PRINCIPAL_POINT_PPA", 2)
     col, row = (A @ ppa + t).tolist()
@@ -302,7 +302,7 @@ def _frame(
         "pixel_size_um": width if abs(width - height) < 1e-9 * width else (width, height),
         "principal_point_px": (col, row),
     }
-    return build(FrameCamera, values, where)
+    return build(FrameEntry, values, where)
 
 
 def _count(section: _Section, key: str, where: str) -> int:
@@ -312,7 +312,7 @@ def _count(section: _Section, key: str, where: str) -> int:
     return int(text)
 
 
-def _crs(file: _File, path: Path, notes: list[str]) -> tuple[str | None, str | None]:
+def _crs(file: _InphoFile, path: Path, notes: list[str]) -> tuple[str | None, str | None]:
     entry = file.other.get("$COORDINATE_SYSTEM")
     text = " ".join([entry.value, *entry.rows]).strip() if entry is not None else ""
     if not text:

@@ -23,7 +23,7 @@ from photoplan.io.project.write import camera_lines, toml_value
 from photoplan.io.toml_file import read_toml
 
 
-class _Line(BaseModel):
+class _TomlLine(BaseModel):
     # What else a project states of an image is not needed here.
     model_config = ConfigDict(frozen=True, extra="ignore")
     name: Name
@@ -42,7 +42,7 @@ class _File(BaseModel):
     crs: Name | None = None
     orientation: Orientation = Orientation()
     cameras: dict[Name, Camera] = Field(default_factory=dict)
-    images: Annotated[tuple[_Line, ...], Field(min_length=1)]
+    images: Annotated[tuple[_TomlLine, ...], Field(min_length=1)]
 
 
 def read(path: Path, form: TableFormat) -> OrientationTable:

@@ -16,7 +16,7 @@ from photoplan.io.camera import model as described
 from photoplan.io.project.model import Image
 
 
-def image_size(camera: described.FrameCamera | described.FilmCamera, image: Image) -> tuple[int, int]:
+def image_size(camera: described.FrameEntry | described.FilmCamera, image: Image) -> tuple[int, int]:
     """Width and height of an image as the project states it.
 
     Raises
@@ -51,7 +51,7 @@ def fiducial_fit(camera: described.FilmCamera, image: Image) -> FiducialFit:
 
 
 def interior_of(
-    camera: described.FrameCamera | described.FilmCamera, image: Image, size: tuple[int, int] | None = None
+    camera: described.FrameEntry | described.FilmCamera, image: Image, size: tuple[int, int] | None = None
 ) -> Interior:
     """Interior orientation of an image.
 
@@ -80,7 +80,7 @@ def interior_of(
     return Interior.digital(size, camera.focal, (col - (size[0] - 1) / 2, row - (size[1] - 1) / 2))
 
 
-def lens_of(camera: described.FrameCamera | described.FilmCamera) -> Lens:
+def lens_of(camera: described.FrameEntry | described.FilmCamera) -> Lens:
     """Lens of a camera.
 
     Raises
@@ -89,7 +89,7 @@ def lens_of(camera: described.FrameCamera | described.FilmCamera) -> Lens:
         The coefficients cannot be a lens's.
     """
     lens = camera.lens
-    if isinstance(lens, described.NoLens):
+    if isinstance(lens, described.IdealLens):
         return NoLens()
     if isinstance(lens, described.OpenCVLens):
         return OpenCV(lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, lens.k4, lens.k5, lens.k6)
@@ -103,11 +103,11 @@ def lens_of(camera: described.FrameCamera | described.FilmCamera) -> Lens:
     return RadialTable.from_radii(lens.radii_mm or (), lens.distortion_um, c)
 
 
-def _brown(lens: described.BrownLens, camera: described.FrameCamera | described.FilmCamera) -> Lens:
+def _brown(lens: described.BrownLens, camera: described.FrameEntry | described.FilmCamera) -> Lens:
     c = 1.0
     if lens.unit == "mm":
         c = _camera_constant(camera)
-    elif lens.unit == "px" and isinstance(camera, described.FrameCamera):
+    elif lens.unit == "px" and isinstance(camera, described.FrameEntry):
         c = camera.focal[0]
     made = Brown.from_image_units(c, k=(lens.k1, lens.k2, lens.k3, lens.k4), p=(lens.p1, lens.p2), b=(lens.b1, lens.b2))
     if lens.y_axis == "down":
@@ -116,7 +116,7 @@ def _brown(lens: described.BrownLens, camera: described.FrameCamera | described.
     return Reversed(made) if lens.meaning == "correction" else made
 
 
-def _camera_constant(camera: described.FrameCamera | described.FilmCamera) -> float:
+def _camera_constant(camera: described.FrameEntry | described.FilmCamera) -> float:
     if camera.camera_constant_mm is None:
         raise InputError("the lens is described in millimetres; give camera_constant_mm")
     return camera.camera_constant_mm

@@ -17,7 +17,7 @@ from photoplan.io.camera.model import (
     Entry,
     Fiducials,
     FilmCamera,
-    FrameCamera,
+    FrameEntry,
     Name,
     Number,
     Pixels,
@@ -116,7 +116,7 @@ class Orientation(Entry):
     refraction: Annotated[bool, Strict()] = False
 
 
-class Observations(Entry):
+class ObservationsEntry(Entry):
     """Files of measurements that determine orientations, and their accuracy where the files do not state it."""
 
     image_points: tuple[InputName, ...] = ()
@@ -191,7 +191,7 @@ class Project(Entry):
     crs: Annotated[str, Field(min_length=1, max_length=20_000)]
     terrain: Terrain | None = None
     orientation: Orientation = Orientation()
-    observations: Observations = Observations()
+    observations: ObservationsEntry = ObservationsEntry()
     adjustment: Adjustment = Adjustment()
     cameras: dict[Name, Camera]
     images: tuple[Image, ...]
@@ -296,9 +296,9 @@ def _plain_file(text: str) -> str:
         raise ValueError(str(error)) from None
 
 
-def _check_film(image: Image, camera: FrameCamera | FilmCamera, where: str) -> None:
+def _check_film(image: Image, camera: FrameEntry | FilmCamera, where: str) -> None:
     """Marks of a film scan are the camera's, and enough or not yet measured; a digital image has none."""
-    if isinstance(camera, FrameCamera):
+    if isinstance(camera, FrameEntry):
         if image.fiducials is not None:
             raise ValueError(f'{where}: fiducials are given, but camera {image.camera!r} is digital (type = "frame")')
         return

@@ -9,11 +9,11 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from photoplan.io.camera.model import FilmCamera, FrameCamera
+from photoplan.io.camera.model import FilmCamera, FrameEntry
 from photoplan.io.project.model import (
     Adjustment,
     Image,
-    Observations,
+    ObservationsEntry,
     Orientation,
     OrthoDefaults,
     Project,
@@ -117,8 +117,8 @@ def _given(section: BaseModel, comments: Mapping[str, str]) -> list[str]:
     return _entries((key, value, comments[key]) for key, value in values.items() if value != ())
 
 
-def _observations(observations: Observations) -> list[str]:
-    if observations == Observations():
+def _observations(observations: ObservationsEntry) -> list[str]:
+    if observations == ObservationsEntry():
         return []
     comments = {
         "image_points": "measured image points: point, image, column, row",
@@ -175,12 +175,12 @@ def _ortho(ortho: OrthoDefaults) -> list[str]:
     ]
 
 
-def camera_lines(name: str, camera: FrameCamera | FilmCamera) -> list[str]:
+def camera_lines(name: str, camera: FrameEntry | FilmCamera) -> list[str]:
     """The ``[cameras.NAME]`` table of a camera."""
-    return _frame(name, camera) if isinstance(camera, FrameCamera) else _film(name, camera)
+    return _frame(name, camera) if isinstance(camera, FrameEntry) else _film(name, camera)
 
 
-def _frame(name: str, camera: FrameCamera) -> list[str]:
+def _frame(name: str, camera: FrameEntry) -> list[str]:
     rows: list[tuple[str, Any, str]] = [
         ("type", camera.type, "digital frame camera"),
         ("size", camera.size, "width and height, pixels"),
@@ -216,7 +216,7 @@ def _film(name: str, camera: FilmCamera) -> list[str]:
     return [head, *_entries(r for r in rows if r[1] is not None), *_lens(camera.lens), ""]
 
 
-def _restore(camera: FrameCamera | FilmCamera) -> list[tuple[str, Any, str]]:
+def _restore(camera: FrameEntry | FilmCamera) -> list[tuple[str, Any, str]]:
     return [("restore", camera.restore and camera.restore.model_dump(), "filter that its images are restored with")]
 
 

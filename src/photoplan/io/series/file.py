@@ -28,7 +28,7 @@ _MAX_FRAMES = 100_000
 
 
 @dataclass(frozen=True)
-class Group:
+class SeriesGroup:
     """A ``[[frames]]`` entry."""
 
     index: int
@@ -48,7 +48,7 @@ class Frame:
     """One image of the series and its conditions; None: not stated."""
 
     file: Path
-    group: Group
+    group: SeriesGroup
     kind: str
     exposure_ms: float | None = None
     temperature_c: float | None = None
@@ -117,7 +117,7 @@ def read_series(path: Path) -> Series:
         for file, values in files.items():
             facts = facts.join(file, where)
             assert facts.size is not None
-            group = Group(index, entry, _window(entry, facts.size, where), mask, where, most)
+            group = SeriesGroup(index, entry, _window(entry, facts.size, where), mask, where, most)
             frames.append(_frame(file, group, values, _row_of(conditions, file, table), entries.camera))
         if mask is not None:
             _check_mask(mask, facts, where)
@@ -230,7 +230,7 @@ def _refuse_twice(path: Path, frames: list[Frame]) -> None:
             seen[key] = frame.group.index
 
 
-def _frame(file: Path, group: Group, named: Values, row: Values, camera: CameraFacts) -> Frame:
+def _frame(file: Path, group: SeriesGroup, named: Values, row: Values, camera: CameraFacts) -> Frame:
     """A frame with its conditions: the table counts before the name, the name before the entry."""
     from_entry = {k: v for k in CONDITIONS if (v := getattr(group.entry, k)) is not None}
     values: dict[str, float | str] = {**group.entry.values, **from_entry, **named, **row}

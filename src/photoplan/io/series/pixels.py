@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
-from photoplan.io.series.file import Frame, Group, Series
+from photoplan.io.series.file import Frame, Series, SeriesGroup
 
 #: Pixels of a frame that are held in memory at once.
 MAX_PIXELS = 400_000_000
@@ -108,7 +108,7 @@ def split(pixels: NDArray[Any], plane: Plane, window: Window) -> NDArray[Any]:
     return pixels[plane.band, row :: plane.step, col :: plane.step]
 
 
-def plane_mask(group: Group, plane: Plane) -> NDArray[np.bool_] | None:
+def plane_mask(group: SeriesGroup, plane: Plane) -> NDArray[np.bool_] | None:
     """Which pixels of a plane count by the group's mask, shape as `plane_pixels`; None: all of them.
 
     Raises

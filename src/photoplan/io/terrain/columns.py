@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.table_lines import NOTHING, decimal, has_decimal_comma, number, split_line
-from photoplan.io.tables import Columns, Dialect, Layout, find_layout, wrong_width
+from photoplan.io.tables import Columns, Dialect, TableLayout, find_layout, wrong_width
 from photoplan.io.terrain.options import CodeClass
 
 LookUp = Callable[[str, int], CodeClass]
@@ -63,7 +63,7 @@ COLUMNS = Columns(
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class PointBlock:
     """Columns of a block of lines."""
 
     xyz: NDArray[np.float64]
@@ -75,7 +75,7 @@ class Block:
     right: NDArray[np.float64] | None
 
 
-def points_layout(path: Path, lines: Sequence[str], dialect: Dialect) -> Layout | None:
+def points_layout(path: Path, lines: Sequence[str], dialect: Dialect) -> TableLayout | None:
     """What the columns hold, from the first lines of a file; None: they hold no data.
 
     Raises
@@ -115,8 +115,8 @@ def _are_numbers_of_points(rows: Sequence[Sequence[str]]) -> bool:
 
 
 def parse_block(
-    path: Path, layout: Layout, first: int, lines: list[str], look_up: LookUp, decimal_comma: bool
-) -> Block | None:
+    path: Path, layout: TableLayout, first: int, lines: list[str], look_up: LookUp, decimal_comma: bool
+) -> PointBlock | None:
     """Columns of the lines of a block that hold data; None if there are none.
 
     Raises
@@ -136,7 +136,7 @@ def parse_block(
     return block if block is not None else _slow(path, layout, (lines, records), look_up, decimal_comma)
 
 
-def _fast(layout: Layout, lines: list[str], records: NDArray[np.int64], decimal_comma: bool) -> Block | None:
+def _fast(layout: TableLayout, lines: list[str], records: NDArray[np.int64], decimal_comma: bool) -> PointBlock | None:
     """Columns by NumPy's reader; None where anything is unusual."""
     texts = [r for r in layout.roles if r not in NUMBERS]
     if decimal_comma:
@@ -174,7 +174,7 @@ def _fast(layout: Layout, lines: list[str], records: NDArray[np.int64], decimal_
         if max(map(len, values)) >= TEXT or any("'" in v or (decimal_comma and "." in v) for v in values):
             return None  # the text may be cut off or in quotes, or its point may have been a comma
         found[role] = [v.strip() for v in values]
-    return Block(
+    return PointBlock(
         xyz,
         records,
         found["code"],
@@ -187,11 +187,11 @@ def _fast(layout: Layout, lines: list[str], records: NDArray[np.int64], decimal_
 
 def _slow(
     path: Path,
-    layout: Layout,
+    layout: TableLayout,
     block: tuple[list[str], NDArray[np.int64]],
     look_up: LookUp,
     decimal_comma: bool,
-) -> Block:
+) -> PointBlock:
     """The same line by line: it names the line and the column that cannot be read."""
     lines, records = block
     rows: dict[str, list[Any]] = {role: [] for role in layout.roles}
@@ -217,7 +217,7 @@ def _slow(
     found = {r: np.array(rows[r], np.float64) for r in NUMBERS if r in rows}
     xyz = np.stack([found[r] for r in NEEDED], axis=1)
     texts = (rows.get("code"), rows.get("line"), rows.get("name"))
-    return Block(xyz, records, *texts, found.get("sigma"), found.get("z_right"))
+    return PointBlock(xyz, records, *texts, found.get("sigma"), found.get("z_right"))
 
 
 def _without_height(cls: CodeClass) -> bool:

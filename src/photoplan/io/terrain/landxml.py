@@ -32,7 +32,7 @@ _METRE = ("meter", "metre", "m")
 
 
 @dataclass
-class _Surface:
+class _LandXmlSurface:
     """What was read of one surface."""
 
     name: str
@@ -79,7 +79,7 @@ class _Reader:
     def __init__(self, path: Path, options: ReadOptions) -> None:
         self.path, self.options = path, options
         self.open: list[Element] = []
-        self.surfaces: list[_Surface] = []
+        self.surfaces: list[_LandXmlSurface] = []
         self.system: dict[str, str] = {}
         self.notes: list[str] = []
         self.walls = 0
@@ -92,7 +92,7 @@ class _Reader:
         if len(self.open) > MAX_DEPTH:
             raise InputError(f"{self.path}: nested deeper than {MAX_DEPTH} levels; this is no LandXML surface")
         if tag == "Surface":
-            self.surfaces.append(_Surface(element.get("name") or f"surface {len(self.surfaces) + 1}"))
+            self.surfaces.append(_LandXmlSurface(element.get("name") or f"surface {len(self.surfaces) + 1}"))
 
     def end(self, element: Element) -> None:
         self.open.pop()
@@ -117,7 +117,7 @@ class _Reader:
                 "metres are needed: export the file in metres, or convert it beforehand"
             )
 
-    def data_points(self, element: Element, surface: _Surface) -> None:
+    def data_points(self, element: Element, surface: _LandXmlSurface) -> None:
         code = _code(element)
         where = f"{self.path}: {surface.name}: data points"
         for part in element:
@@ -126,7 +126,7 @@ class _Reader:
             elif _tag(part) == "PntList2D":
                 raise InputError(f"{where}: a PntList2D has no heights; export points with heights")
 
-    def breakline(self, element: Element, surface: _Surface) -> None:
+    def breakline(self, element: Element, surface: _LandXmlSurface) -> None:
         where = self._where(element, surface, "breakline")
         self.walls += element.get("brkType") == "wall"
         flat = next((p for p in element if _tag(p) == "PntList2D"), None)
@@ -134,21 +134,21 @@ class _Reader:
             raise InputError(f"{where}: a PntList2D has no heights; export breaklines with heights")
         self._line(element, surface, where, "breakline")
 
-    def boundary(self, element: Element, surface: _Surface) -> None:
+    def boundary(self, element: Element, surface: _LandXmlSurface) -> None:
         where = self._where(element, surface, "boundary")
         kind = _BOUNDARIES.get(element.get("bndType", "outer"))
         if kind is None:
             raise InputError(f"{where}: bndType {element.get('bndType')!r}; LandXML knows outer, void and island")
         self._line(element, surface, where, kind)
 
-    def contour(self, element: Element, surface: _Surface) -> None:
+    def contour(self, element: Element, surface: _LandXmlSurface) -> None:
         where = self._where(element, surface, "contour")
         height = _floats(element.get("elev", ""), where)
         if len(height) != 1:
             raise InputError(f"{where}: elev = {element.get('elev')!r}; the height of a contour is needed")
         self._line(element, surface, where, "formline", float(height[0]))
 
-    def wall(self, element: Element, surface: _Surface) -> None:
+    def wall(self, element: Element, surface: _LandXmlSurface) -> None:
         where = self._where(element, surface, "retaining wall")
         points = [p for p in element if _tag(p) == "RetWallPnt"]
         if len(points) < 2:
@@ -170,7 +170,7 @@ class _Reader:
             )
         surface.lines.append(MeasuredLine(self._name(element, surface), "breakline", xyz, other, None, _code(element)))
 
-    def vertex(self, element: Element, surface: _Surface) -> None:
+    def vertex(self, element: Element, surface: _LandXmlSurface) -> None:
         where = f"{self.path}: {surface.name}: point {element.get('id')!r} of the triangulation"
         text = element.get("id", "")
         if not text.strip().isdigit() or len(text) > 18:
@@ -181,7 +181,7 @@ class _Reader:
         surface.numbers[int(text)] = len(surface.vertices)
         surface.vertices.append(xyz[0, [1, 0, 2]])
 
-    def face(self, element: Element, surface: _Surface) -> None:
+    def face(self, element: Element, surface: _LandXmlSurface) -> None:
         if element.get("i", "0").strip() == "1":
             return
         ids = (element.text or "").split()
@@ -196,14 +196,16 @@ class _Reader:
             )
         surface.faces.append(corners)
 
-    def _where(self, element: Element, surface: _Surface, what: str) -> str:
+    def _where(self, element: Element, surface: _LandXmlSurface, what: str) -> str:
         return f"{self.path}: {surface.name}: {what} {element.get('name') or len(surface.lines) + 1!s}"
 
-    def _name(self, element: Element, surface: _Surface) -> str:
+    def _name(self, element: Element, surface: _LandXmlSurface) -> str:
         own = element.get("name") or str(len(surface.lines) + 1)
         return " ".join(t for t in (f"{self.path.name}: {_tag(element).lower()} {own}", _code(element)) if t)
 
-    def _line(self, element: Element, surface: _Surface, where: str, kind: str, height: float = float("nan")) -> None:
+    def _line(
+        self, element: Element, surface: _LandXmlSurface, where: str, kind: str, height: float = float("nan")
+    ) -> None:
         flat = next((p for p in element if _tag(p) == "PntList2D"), None)
         full = next((p for p in element if _tag(p) == "PntList3D"), None)
         if full is not None:
@@ -252,7 +254,7 @@ class _Reader:
         lines = tuple(line for s in surfaces for line in s.lines)
         return MeasuredTerrain(tuple(groups), lines, crs, heights, _tin(surfaces), (self.path,), tuple(self.notes))
 
-    def _chosen(self) -> list[_Surface]:
+    def _chosen(self) -> list[_LandXmlSurface]:
         names = [s.name for s in self.surfaces]
         wanted = self.options.layers
         chosen = [s for s in self.surfaces if wanted is None or s.name in wanted]
@@ -262,7 +264,7 @@ class _Reader:
             raise InputError(f"{self.path}: holds {len(chosen)} surfaces: {names}; choose with the option for layers")
         return chosen
 
-    def _groups(self, surface: _Surface) -> list[PointGroup]:
+    def _groups(self, surface: _LandXmlSurface) -> list[PointGroup]:
         groups, count = [], 0
         by_code: dict[str, list[NDArray[np.float64]]] = {}
         for code, xyz in surface.points:
@@ -340,7 +342,7 @@ def _code(element: Element) -> str:
     return (element.get("code") or "").strip()
 
 
-def _tin(surfaces: list[_Surface]) -> Tin | None:
+def _tin(surfaces: list[_LandXmlSurface]) -> Tin | None:
     chosen = [s for s in surfaces if s.vertices and s.faces]
     if not chosen:
         return None

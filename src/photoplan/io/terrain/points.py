@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.table_lines import DELIMITERS, Line, decimal, line_blocks, number, split_line
-from photoplan.io.tables import Dialect, Layout, wrong_width
+from photoplan.io.tables import Dialect, TableLayout, wrong_width
 
 _NAMES = {
     "x": ("x", "east", "easting", "e", "x_m", "rechtswert", "point_x", "longitude", "lon"),
@@ -73,7 +73,7 @@ class PointTable:
     def parts(self, size: int) -> Iterator[PointPart]:
         """The points, in parts of at most `size` lines."""
         lines = islice(self._lines(), int(self.form.header), None)
-        layout = Layout(delimiter=self.delimiter, roles={}, names=self.names, header=0)
+        layout = TableLayout(delimiter=self.delimiter, roles={}, names=self.names, header=0)
         comma = self.form.dialect.decimal_comma
         while part := list(islice(lines, size)):
             rows = [split_line(self.path, item, self.delimiter) for item in part]

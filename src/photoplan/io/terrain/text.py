@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.io.plain_files import crs_beside
 from photoplan.io.table_lines import line_blocks
-from photoplan.io.tables import Layout
-from photoplan.io.terrain.columns import Block, parse_block, points_layout
+from photoplan.io.tables import TableLayout
+from photoplan.io.terrain.columns import PointBlock, parse_block, points_layout
 from photoplan.io.terrain.groups import CodeIndex, PointColumns, class_of, is_line, make_groups
 from photoplan.io.terrain.options import CodeClass, ReadOptions
 from photoplan.surfaces.measured import LineKind, MeasuredLine, MeasuredTerrain
@@ -49,7 +49,7 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
     InputError
         A line cannot be read as declared; the message names file and line.
     """
-    layout: Layout | None = None
+    layout: TableLayout | None = None
     codes, ids, out = CodeIndex(), CodeIndex(), _Columns()
     classes: list[CodeClass] = []
 
@@ -70,7 +70,7 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
     return _terrain(path, layout, out, codes, ids, classes)
 
 
-def _append(out: _Columns, block: Block, codes: CodeIndex, ids: CodeIndex) -> None:
+def _append(out: _Columns, block: PointBlock, codes: CodeIndex, ids: CodeIndex) -> None:
     out.xyz.append(block.xyz)
     out.records.append(block.records)
     count = len(block.xyz)
@@ -86,7 +86,9 @@ def _append(out: _Columns, block: Block, codes: CodeIndex, ids: CodeIndex) -> No
         out.names.append(np.array(block.name))
 
 
-def _learn(classes: list[CodeClass], codes: CodeIndex, block: Block, look_up: Callable[[str, int], CodeClass]) -> None:
+def _learn(
+    classes: list[CodeClass], codes: CodeIndex, block: PointBlock, look_up: Callable[[str, int], CodeClass]
+) -> None:
     """Classes of the codes that this block brought; unknown ones are named with their line."""
     for code in codes.texts[len(classes) :]:
         at = int(block.records[block.code.index(code)]) if block.code is not None and code in block.code else 0
@@ -94,7 +96,7 @@ def _learn(classes: list[CodeClass], codes: CodeIndex, block: Block, look_up: Ca
 
 
 def _terrain(
-    path: Path, layout: Layout, out: _Columns, codes: CodeIndex, ids: CodeIndex, classes: list[CodeClass]
+    path: Path, layout: TableLayout, out: _Columns, codes: CodeIndex, ids: CodeIndex, classes: list[CodeClass]
 ) -> MeasuredTerrain:
     def whole(parts: list[Any]) -> Any:
         joined = np.concatenate(parts) if parts else None

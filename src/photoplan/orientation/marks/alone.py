@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
 from photoplan.errors import InputError
-from photoplan.orientation.marks.edges import EdgeFit, fit_edges
+from photoplan.orientation.marks.edges import MarkEdge, fit_edges
 from photoplan.orientation.marks.locate import Location, correlation_surface, locate_mark
 from photoplan.orientation.marks.template import Template, render
 
@@ -63,7 +63,7 @@ class AloneMark:
     """`edges`, `matching`, `paraboloid` or `pixel`."""
     refused: str
     """Why the place is not to be used; empty: it is accepted."""
-    edges: EdgeFit | None
+    edges: MarkEdge | None
     """Place by edges, of patterns."""
 
     @property
@@ -140,7 +140,7 @@ def _nothing(why: str) -> AloneMark:
     return AloneMark(nan, nan, nan, nan, nan, nan, "pixel", why, None)
 
 
-_Found = tuple[float, tuple[float, float], EdgeFit | None, NDArray[np.float64]]
+_Found = tuple[float, tuple[float, float], MarkEdge | None, NDArray[np.float64]]
 
 
 def _by_edges(
@@ -179,7 +179,7 @@ def _judged(
     pattern: MarkPattern | MarkExample,
     fine: Location,
     at: tuple[float, float],
-    edges: EdgeFit | None,
+    edges: MarkEdge | None,
     second: float,
     least_correlation: float,
 ) -> AloneMark:

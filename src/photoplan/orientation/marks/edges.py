@@ -51,7 +51,7 @@ class PatternEdges:
 
 
 @dataclass(frozen=True, eq=False)
-class EdgeFit:
+class MarkEdge:
     """A mark placed by its edges."""
 
     x: float
@@ -120,7 +120,7 @@ def fit_edges(
     negative: bool = False,
     search_px: float = 6.0,
     sigmas: tuple[float, float] = (0.035, 0.02),
-) -> EdgeFit | None:
+) -> MarkEdge | None:
     """Place of a mark from its edges.
 
     Parameters
@@ -175,7 +175,7 @@ def fit_edges(
     total = matrix @ np.linalg.inv(np.array(mm_to_pixel, np.float64))
     scale = math.sqrt(abs(np.linalg.det(total)))
     rotation = -math.atan2(total[1, 0], total[0, 0])
-    return EdgeFit(
+    return MarkEdge(
         float(place[0]),
         float(place[1]),
         solution.covariance,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from photoplan.adjustment.linear import solve
 from photoplan.cameras.fiducials_fit import FiducialFit, fit_affine
 from photoplan.errors import InputError
-from photoplan.orientation.marks.layout import TURNS, MarkLayout, Placement, Turn
+from photoplan.orientation.marks.layout import TURNS, MarkLayout, MarkPlacement, ScanTurn
 from photoplan.orientation.marks.locate import LEAST_CORRELATION, Location
 from photoplan.orientation.marks.measure import Measured, measure_marks
 from photoplan.orientation.marks.search import Scan, Search, pixel_sizes, search_placements
@@ -101,12 +101,12 @@ class FiducialResult:
     """Affine transformation from millimetres to pixels."""
     residuals_um: NDArray[np.float64]
     """Transformed minus measured position of each mark in `fit`, in the image plane (x right, y up), micrometres."""
-    turn: Turn
+    turn: ScanTurn
     """How the upright picture was turned before it was scanned."""
     negative: bool
     blur_px: float
     """Standard deviation of the scan's blur that fits best, pixels."""
-    placement: Placement
+    placement: MarkPlacement
     """The similarity that led to the marks."""
     notes: tuple[str, ...]
     """What a user should know, one sentence each."""
@@ -155,8 +155,8 @@ def find_fiducials(scan: Scan, layout: MarkLayout, known: FiducialSearch = Fiduc
 
 
 def _search(
-    scan: Scan, layout: MarkLayout, known: FiducialSearch, turns: tuple[Turn, ...]
-) -> tuple[list[Placement], list[str]]:
+    scan: Scan, layout: MarkLayout, known: FiducialSearch, turns: tuple[ScanTurn, ...]
+) -> tuple[list[MarkPlacement], list[str]]:
     """Placements, best first; a resolution that is stated but does not fit is said and left."""
     negatives = (False, True) if known.negative is None else (known.negative,)
     notes: list[str] = []
@@ -174,11 +174,11 @@ def _search(
     return wide, notes
 
 
-def _convincing(placement: Placement, layout: MarkLayout) -> bool:
+def _convincing(placement: MarkPlacement, layout: MarkLayout) -> bool:
     return len(placement.found) >= min(3, len(layout.names)) and placement.score >= 0.25 * len(placement.found)
 
 
-def _ties(placements: Sequence[Placement]) -> list[Placement]:
+def _ties(placements: Sequence[MarkPlacement]) -> list[MarkPlacement]:
     """Placements that fit as well as the best one."""
     best = placements[0]
     margin = TIE * len(best.found)
@@ -189,16 +189,16 @@ def _ties(placements: Sequence[Placement]) -> list[Placement]:
     ]
 
 
-def _usual(ties: Sequence[Placement], known: FiducialSearch) -> Placement:
+def _usual(ties: Sequence[MarkPlacement], known: FiducialSearch) -> MarkPlacement:
     """Among equals the one that is not turned, and mirrored as usual with this camera."""
     return min(ties, key=lambda p: (p.turn.mirrored != known.usual_mirrored, p.turn.rotation))
 
 
 def _decide(
-    layout: MarkLayout, measured: Measured, ties: Sequence[Placement], chosen: Placement, known: FiducialSearch
-) -> tuple[Turn, FiducialFit, dict[str, str], list[str]]:
+    layout: MarkLayout, measured: Measured, ties: Sequence[MarkPlacement], chosen: MarkPlacement, known: FiducialSearch
+) -> tuple[ScanTurn, FiducialFit, dict[str, str], list[str]]:
     """Turn, adjustment and new names of the marks; among equal turns the residuals decide, if they can."""
-    fits: list[tuple[float, Placement, FiducialFit, dict[str, str]]] = []
+    fits: list[tuple[float, MarkPlacement, FiducialFit, dict[str, str]]] = []
     for p in ties:
         names = _renamed(layout, measured, chosen, p)
         if names is None:
@@ -228,7 +228,9 @@ def _decide(
     return taken[1].turn, taken[2], taken[3], [said]
 
 
-def _renamed(layout: MarkLayout, measured: Measured, chosen: Placement, other: Placement) -> dict[str, str] | None:
+def _renamed(
+    layout: MarkLayout, measured: Measured, chosen: MarkPlacement, other: MarkPlacement
+) -> dict[str, str] | None:
     """Names under the chosen turn → names under another one; None if the places are not the same."""
     gate = 0.05 * layout.extent / chosen.pixel_mm
     renamed = {}
@@ -253,7 +255,7 @@ def _typical_sigma(measured: Measured) -> float:
     return float(np.median([max(at.sigma_x, at.sigma_y) for at in measured.found.values()]))
 
 
-def _without_false(layout: MarkLayout, measured: Measured, turn: Turn) -> tuple[Measured, list[str]]:
+def _without_false(layout: MarkLayout, measured: Measured, turn: ScanTurn) -> tuple[Measured, list[str]]:
     """Leave out one mark that contradicts at least four others that agree; with four marks none can be told."""
     notes: list[str] = []
     names = list(measured.found)
@@ -275,7 +277,7 @@ def _without_false(layout: MarkLayout, measured: Measured, turn: Turn) -> tuple[
     return replace(measured, found=kept, missed=missed), notes
 
 
-def _sigma0(layout: MarkLayout, measured: Measured, names: Sequence[str], turn: Turn) -> float:
+def _sigma0(layout: MarkLayout, measured: Measured, names: Sequence[str], turn: ScanTurn) -> float:
     P = layout.mm[[layout.names.index(n) for n in names]]
     p = np.array([(measured.found[n].x, measured.found[n].y) for n in names])
     return solve(np.column_stack([P, np.ones(len(P))]), p).sigma0
@@ -284,7 +286,7 @@ def _sigma0(layout: MarkLayout, measured: Measured, names: Sequence[str], turn: 
 def _result(
     layout: MarkLayout,
     measured: Measured,
-    decided: tuple[Turn, FiducialFit, dict[str, str]],
+    decided: tuple[ScanTurn, FiducialFit, dict[str, str]],
     notes: Sequence[str],
 ) -> FiducialResult:
     turn, fit, names = decided

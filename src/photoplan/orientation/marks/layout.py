@@ -60,7 +60,7 @@ class MarkLayout:
 
 
 @dataclass(frozen=True)
-class Turn:
+class ScanTurn:
     """How the upright picture was turned before it was scanned."""
 
     rotation: int
@@ -79,14 +79,14 @@ class Turn:
         return f"{self.rotation}°{' mirrored' if self.mirrored else ''}"
 
 
-TURNS = tuple(Turn(rotation, mirrored) for mirrored in (False, True) for rotation in (0, 90, 180, 270))
+TURNS = tuple(ScanTurn(rotation, mirrored) for mirrored in (False, True) for rotation in (0, 90, 180, 270))
 
 
 @dataclass(frozen=True, eq=False)
-class Placement:
+class MarkPlacement:
     """A similarity from the image plane to the scan, and the candidates that it joins."""
 
-    turn: Turn
+    turn: ScanTurn
     negative: bool
     matrix: NDArray[np.float64]
     """From millimetres to columns and rows, shape (2, 2)."""
@@ -128,12 +128,12 @@ def fit_placement(
 def combine(
     layout: MarkLayout,
     candidates: Sequence[NDArray[np.float64]],
-    turn: Turn,
+    turn: ScanTurn,
     negative: bool,
     px_per_mm: float,
     scale_tolerance: float,
     blunt: float,
-) -> Placement | None:
+) -> MarkPlacement | None:
     """The similarity that joins the most and best candidates.
 
     Every pair of candidates of every pair of marks gives one; it is dropped where scale or rotation are impossible,
@@ -174,7 +174,7 @@ def combine(
     index = [layout.names.index(n) for n in found]
     matrix, shift = fit_placement(layout.mm[index], np.array([f[:2] for f in found.values()]), turn.mirrored)
     rivals = _rivals(layout, candidates, found, blunt)
-    return Placement(turn, negative, matrix, shift, found, total, rivals)
+    return MarkPlacement(turn, negative, matrix, shift, found, total, rivals)
 
 
 def _rivals(
@@ -199,7 +199,7 @@ def _scores(
     layout: MarkLayout,
     candidates: Sequence[NDArray[np.float64]],
     pair: tuple[int, int],
-    turn: Turn,
+    turn: ScanTurn,
     px_per_mm: float,
     scale_tolerance: float,
     gate: float,

@@ -14,7 +14,7 @@ from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.orientation.marks.edges import fit_edges
-from photoplan.orientation.marks.layout import FILM, MarkLayout, Placement, fit_placement
+from photoplan.orientation.marks.layout import FILM, MarkLayout, MarkPlacement, fit_placement
 from photoplan.orientation.marks.locate import BLURS, Location, best_blur, locate_mark
 from photoplan.orientation.marks.search import Scan
 from photoplan.orientation.marks.template import draw
@@ -35,7 +35,7 @@ _EDGES_USED, _EDGES_RMS, _EDGES_AGREE = 0.4, 1.5, 1.5
 class Measured:
     """Marks by name, as the placement names them."""
 
-    placement: Placement
+    placement: MarkPlacement
     found: Mapping[str, Location]
     """Places in the scan."""
     missed: Mapping[str, tuple[float, str]]
@@ -66,7 +66,7 @@ class _Look:
     """Standard deviations of rotation (radians) and scale of the matrix."""
 
 
-def measure_marks(scan: Scan, layout: MarkLayout, placement: Placement, least: float) -> Measured:
+def measure_marks(scan: Scan, layout: MarkLayout, placement: MarkPlacement, least: float) -> Measured:
     """Measure all marks: as the placement draws them, then as the affine transformation and blur so found do.
 
     Parameters
@@ -74,7 +74,7 @@ def measure_marks(scan: Scan, layout: MarkLayout, placement: Placement, least: f
     scan : Scan
     layout : MarkLayout
         The marks that are sought.
-    placement : Placement
+    placement : MarkPlacement
         Where they about lie.
     least : float
         A place that correlates less is no mark.
@@ -191,7 +191,7 @@ def _blur(scan: Scan, layout: MarkLayout, look: _Look, found: Mapping[str, Locat
 
 
 def _refit(
-    layout: MarkLayout, placement: Placement, found: Mapping[str, Location]
+    layout: MarkLayout, placement: MarkPlacement, found: Mapping[str, Location]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Matrix of the affine transformation (similarity, below four marks), and where it puts all marks."""
     if len(found) < 2:

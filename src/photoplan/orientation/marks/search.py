@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
 from photoplan.geometry.grid import Window
-from photoplan.orientation.marks.layout import FLOOR, MarkLayout, Placement, Turn, combine
+from photoplan.orientation.marks.layout import FLOOR, MarkLayout, MarkPlacement, ScanTurn, combine
 from photoplan.orientation.marks.locate import correlation_surface
 from photoplan.orientation.marks.template import Template, draw
 
@@ -52,7 +52,7 @@ class Search:
 
     scan: Scan
     layout: MarkLayout
-    turns: tuple[Turn, ...]
+    turns: tuple[ScanTurn, ...]
     """Turns of the film that come into question."""
     negatives: tuple[bool, ...]
     """Tones that come into question."""
@@ -74,7 +74,7 @@ def pixel_sizes(layout: MarkLayout, size: tuple[int, int]) -> tuple[float, ...]:
     return tuple(short * w / min(size) for w in sorted(wider, key=lambda w: abs(math.log(w / USUAL))))
 
 
-def search_placements(search: Search, pixels_mm: Sequence[float]) -> list[Placement]:
+def search_placements(search: Search, pixels_mm: Sequence[float]) -> list[MarkPlacement]:
     """The best placement for every turn and tone, best first.
 
     Parameters
@@ -84,7 +84,7 @@ def search_placements(search: Search, pixels_mm: Sequence[float]) -> list[Placem
     pixels_mm : sequence of float
         Sides of a pixel that are tried, millimetres; not all, if one fits all marks very well.
     """
-    best: dict[tuple[Turn, bool], Placement] = {}
+    best: dict[tuple[ScanTurn, bool], MarkPlacement] = {}
     for pixel_mm in pixels_mm:
         search._surfaces.clear()
         search._templates.clear()
@@ -127,7 +127,7 @@ def _side(pattern: MarkPattern | MarkExample) -> float:
     return min(x1 - x0, y1 - y0)
 
 
-def _surface(search: Search, k: int, turn: Turn, pixel_mm: float, factor: int) -> _Surface | None:
+def _surface(search: Search, k: int, turn: ScanTurn, pixel_mm: float, factor: int) -> _Surface | None:
     """Correlation of mark k with all places where it may lie; None: nowhere."""
     index, template = _template(search, search.layout.patterns[k], turn, pixel_mm * factor)
     region = _region(search, k, turn, pixel_mm, factor)
@@ -146,7 +146,9 @@ def _surface(search: Search, k: int, turn: Turn, pixel_mm: float, factor: int) -
     return _Surface(search._surfaces[key], (factor * ox + half, factor * oy + half), max(2, round(0.5 * min(a, b))))
 
 
-def _template(search: Search, pattern: MarkPattern | MarkExample, turn: Turn, coarse_mm: float) -> tuple[int, Template]:
+def _template(
+    search: Search, pattern: MarkPattern | MarkExample, turn: ScanTurn, coarse_mm: float
+) -> tuple[int, Template]:
     """Number and template of a pattern; turns that leave it as it is share one."""
     made = draw(pattern, turn.matrix / coarse_mm, blur_px=0.7)
     for number, (owner, size, other) in enumerate(search._templates):
@@ -157,7 +159,7 @@ def _template(search: Search, pattern: MarkPattern | MarkExample, turn: Turn, co
     return len(search._templates) - 1, made
 
 
-def _region(search: Search, k: int, turn: Turn, pixel_mm: float, factor: int) -> Window | None:
+def _region(search: Search, k: int, turn: ScanTurn, pixel_mm: float, factor: int) -> Window | None:
     """Coarse pixels where mark k may lie if all marks lie in the scan, turned by a few degrees; None: nowhere."""
     places = search.layout.mm @ turn.matrix.T / pixel_mm
     low, high = places.min(axis=0), places.max(axis=0)

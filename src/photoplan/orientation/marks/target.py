@@ -22,7 +22,7 @@ _STEPS = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
+class MarkTarget:
     """A round target."""
 
     location: Location
@@ -33,7 +33,7 @@ class Target:
     """Whether it is brighter than what surrounds it."""
 
 
-def locate_target(image: NDArray[np.floating], *, bright: bool = True, least: float = LEAST_CORRELATION) -> Target:
+def locate_target(image: NDArray[np.floating], *, bright: bool = True, least: float = LEAST_CORRELATION) -> MarkTarget:
     """Middle and diameter of the one round target in a window (Behr 1989, §4.1.1, eq. 4.1–4.4).
 
     Halfway between the extreme grey values lies the threshold; the largest extent of what exceeds it, in rows and
@@ -90,7 +90,7 @@ def locate_target(image: NDArray[np.floating], *, bright: bool = True, least: fl
         raise InputError(
             f"{where}: correlates by {at.correlation:.2f} with a disc, less than {least:g}: no round target"
         )
-    return Target(at, diameter, bright)
+    return MarkTarget(at, diameter, bright)
 
 
 def _area(grey: NDArray[np.float64], piece: NDArray[np.bool_]) -> float:

@@ -23,7 +23,7 @@ from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.pose import Pose
 from photoplan.orientation.resection.direct import DirectPose, moved, resect_direct, tangent_derivatives
 from photoplan.orientation.resection.model import CameraOf, MeasuredPoints, Resected, ResectSettings
-from photoplan.orientation.resection.rank import Unknowns, refuse_undetermined
+from photoplan.orientation.resection.rank import ResectionUnknowns, refuse_undetermined
 
 Array = NDArray[np.float64]
 
@@ -316,9 +316,9 @@ def _tested(task: _Task, equations: _Equations, use: NDArray[np.bool_]) -> _Test
     return _Tests(cofactor * units[:, None] * units, normalised, numbers, float(np.nanmax([1.0, scale])), sigma0)
 
 
-def _unknowns(task: _Task, equations: _Equations) -> Unknowns:
+def _unknowns(task: _Task, equations: _Equations) -> ResectionUnknowns:
     where = f"image {task.name!r}: its {len(task.points)} control points"
-    return Unknowns(where, equations.units, task.settings.free, float(np.median(task.points.sigma)))
+    return ResectionUnknowns(where, equations.units, task.settings.free, float(np.median(task.points.sigma)))
 
 
 def _result(task: _Task, state: _State, equations: _Equations, use: NDArray[np.bool_], tests: _Tests) -> Resected:

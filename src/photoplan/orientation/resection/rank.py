@@ -20,7 +20,7 @@ _ROUNDING = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
-class Unknowns:
+class ResectionUnknowns:
     """How the unknowns of a resection are called."""
 
     where: str
@@ -33,7 +33,7 @@ class Unknowns:
     """Standard deviation of a measurement, pixels."""
 
 
-def refuse_undetermined(A: Array, sigma0: float, unknowns: Unknowns) -> Array:
+def refuse_undetermined(A: Array, sigma0: float, unknowns: ResectionUnknowns) -> Array:
     """Inverse normal equations of whitened equations (m, u) in natural units.
 
     Raises
@@ -49,7 +49,7 @@ def refuse_undetermined(A: Array, sigma0: float, unknowns: Unknowns) -> Array:
     raise GeometryError(f"{unknowns.where} do not determine {_spelled(worst, float(s[-1]), unknowns)}")
 
 
-def _spelled(direction: Array, singular: float, unknowns: Unknowns) -> str:
+def _spelled(direction: Array, singular: float, unknowns: ResectionUnknowns) -> str:
     """A combination of unknowns that leaves the image as it is, in numbers."""
     share = np.abs(direction)
     parts = [int(k) for k in np.argsort(-share) if share[k] > 0.1 * share.max()]

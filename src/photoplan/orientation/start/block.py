@@ -14,7 +14,7 @@ from photoplan.errors import GeometryError
 from photoplan.geometry.pose import Pose
 from photoplan.orientation.bundle.block import BlockCamera
 from photoplan.orientation.resection.direct import resect_direct
-from photoplan.orientation.start.model import Model, free_model, grown, looseness
+from photoplan.orientation.start.model import StartModel, free_model, grown, looseness
 from photoplan.orientation.start.net import Net, net_of
 from photoplan.orientation.start.similarity import Similarity, robust_similarity
 
@@ -80,7 +80,7 @@ def start_block(
         Standard deviation of measurements that state none, pixels.
     """
     net = net_of(cameras, images, observations, ground, sigma)
-    block = Model({}, net.control.copy())
+    block = StartModel({}, net.control.copy())
     how: dict[int, str] = {}
     for k, image in enumerate(images):
         if image.pose is not None:
@@ -110,7 +110,7 @@ def start_block(
     return _result(net, images, block, how, reasons)
 
 
-def _resect_by_control(net: Net, block: Model, how: dict[int, str]) -> None:
+def _resect_by_control(net: Net, block: StartModel, how: dict[int, str]) -> None:
     known = np.isfinite(net.control[:, 0])
     for k in range(net.images):
         mine = net.of_image[k]
@@ -126,13 +126,13 @@ def _resect_by_control(net: Net, block: Model, how: dict[int, str]) -> None:
             how[k] = "control points"
 
 
-def _grow(net: Net, block: Model, how: dict[int, str], loose: float) -> None:
+def _grow(net: Net, block: StartModel, how: dict[int, str], loose: float) -> None:
     new = grown(net, block, range(net.images), loose)
     how |= dict.fromkeys(new, "tie points")
 
 
 def _placed(
-    net: Net, model: Model, block: Model, images: Sequence[StartImage], positions: ObservedPositions | None
+    net: Net, model: StartModel, block: StartModel, images: Sequence[StartImage], positions: ObservedPositions | None
 ) -> Similarity:
     """Transformation of a free model into the ground system.
 
@@ -164,7 +164,7 @@ def _placed(
 
 
 def _result(
-    net: Net, images: Sequence[StartImage], block: Model, how: dict[int, str], reasons: dict[int, str]
+    net: Net, images: Sequence[StartImage], block: StartModel, how: dict[int, str], reasons: dict[int, str]
 ) -> Started:
     left = []
     for k, image in enumerate(images):

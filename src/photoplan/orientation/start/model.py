@@ -30,7 +30,7 @@ _SWEEPS = 2
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class StartModel:
     """Poses and points in one system; both are filled while the model grows."""
 
     poses: dict[int, Pose]
@@ -38,14 +38,14 @@ class Model:
     """(p, 3); NaN: not known."""
 
 
-def free_model(net: Net, images: Iterable[int]) -> Model | None:
+def free_model(net: Net, images: Iterable[int]) -> StartModel | None:
     """A model of its own of as many of `images` as hang together; None where no pair does."""
     wanted = sorted(images)
     pair = _best_pair(net, wanted)
     if pair is None:
         return None
     first, second, found = pair
-    model = Model({first: Pose(np.zeros(3), np.eye(3)), second: found.pose}, np.full((len(net.points), 3), np.nan))
+    model = StartModel({first: Pose(np.zeros(3), np.eye(3)), second: found.pose}, np.full((len(net.points), 3), np.nan))
     grown(net, model, wanted, 1.0, fixed=False)
     return model
 
@@ -79,7 +79,7 @@ def _related(net: Net, a: int, b: int) -> RelativeOrientation:
     return relate(net.tangents[one], net.tangents[two], float(np.median(net.sigma[one])))
 
 
-def grown(net: Net, model: Model, images: Iterable[int], loose: float, fixed: bool = True) -> list[int]:
+def grown(net: Net, model: StartModel, images: Iterable[int], loose: float, fixed: bool = True) -> list[int]:
     """Add images until none has enough known points; the numbers of those that were added.
 
     Parameters
@@ -122,7 +122,7 @@ def grown(net: Net, model: Model, images: Iterable[int], loose: float, fixed: bo
                 model.poses[k] = _polished(net, model, k, loose)
 
 
-def looseness(net: Net, model: Model) -> float:
+def looseness(net: Net, model: StartModel) -> float:
     """By how much the poses that the model has miss the measurements' standard deviation; at least 1."""
     numbers = sorted(model.poses)
     place = np.full(net.images, -1)
@@ -143,7 +143,7 @@ def looseness(net: Net, model: Model) -> float:
     return float(np.clip(2.0 * np.median(miss) / _SLACK, 1.0, 200.0)) if len(miss) else 1.0
 
 
-def _intersected(net: Net, model: Model, loose: float, fixed: bool) -> None:
+def _intersected(net: Net, model: StartModel, loose: float, fixed: bool) -> None:
     """Points of all oriented images, anew."""
     numbers = sorted(model.poses)
     place = np.full(net.images, -1)
@@ -163,13 +163,13 @@ def _intersected(net: Net, model: Model, loose: float, fixed: bool) -> None:
     model.XYZ[free] = found.XYZ[free]
 
 
-def _known(net: Net, model: Model, k: int) -> tuple[Array, Array, float]:
+def _known(net: Net, model: StartModel, k: int) -> tuple[Array, Array, float]:
     mine = net.of_image[k]
     mine = mine[np.isfinite(model.XYZ[net.point[mine], 0])]
     return net.tangents[mine], model.XYZ[net.point[mine]], float(np.median(net.sigma[mine]))
 
 
-def _resected(net: Net, model: Model, k: int, loose: float) -> Pose | None:
+def _resected(net: Net, model: StartModel, k: int, loose: float) -> Pose | None:
     """Pose of an image; None where too few of its known points agree."""
     t, X, sigma = _known(net, model, k)
     try:
@@ -180,7 +180,7 @@ def _resected(net: Net, model: Model, k: int, loose: float) -> Pose | None:
     return found.pose if good else None
 
 
-def _polished(net: Net, model: Model, k: int, loose: float) -> Pose:
+def _polished(net: Net, model: StartModel, k: int, loose: float) -> Pose:
     t, X, sigma = _known(net, model, k)
     pose = model.poses[k]
     r = np.linalg.norm(reprojected(pose.R_ground_camera[None], pose.center[None], X)[0] - t, axis=1)

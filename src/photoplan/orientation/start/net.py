@@ -17,7 +17,7 @@ from photoplan.orientation.bundle.block import BlockCamera
 Array = NDArray[np.float64]
 
 
-class _Image(Protocol):
+class _NetImage(Protocol):
     @property
     def name(self) -> str: ...
     @property
@@ -50,7 +50,7 @@ class Net:
 
 def net_of(
     cameras: Mapping[str, BlockCamera],
-    images: Sequence[_Image],
+    images: Sequence[_NetImage],
     observations: ImagePoints,
     ground: GroundPoints,
     sigma: float,

@@ -21,7 +21,7 @@ from photoplan.io.camera import model as described
 from photoplan.io.project.cameras import lens_of
 from photoplan.orientation.bundle.block import PARAMETERS, AdjustedCamera, BlockCamera
 
-Description = described.FrameCamera | described.FilmCamera
+Description = described.FrameEntry | described.FilmCamera
 
 #: Parameters that every camera has; the others are its lens's.
 INTERIOR = ("c", "x0", "y0")
@@ -190,7 +190,7 @@ def camera_entries(camera: Description, start: BlockCamera, found: AdjustedCamer
     _, new = _interior(camera, start, found)
     entries: dict[str, Any] = {}
     constant, x0, y0 = new
-    if isinstance(camera, described.FrameCamera) and camera.focal_px is not None:
+    if isinstance(camera, described.FrameEntry) and camera.focal_px is not None:
         fx, fy = camera.focal
         entries["focal_px"] = constant if fx == fy else [constant, constant * fy / fx]
     else:
@@ -213,14 +213,14 @@ def _in_pixels(camera: Description) -> bool:
 
 
 def _constant_in_pixels_of_mm(camera: Description) -> bool:
-    return _in_pixels(camera) and isinstance(camera, described.FrameCamera) and camera.camera_constant_mm is not None
+    return _in_pixels(camera) and isinstance(camera, described.FrameEntry) and camera.camera_constant_mm is not None
 
 
 def _unit(camera: Description) -> tuple[dict[str, str], float]:
     """Unit of c, x0, y0 in the project, and what turns y0 into rows."""
     if not _in_pixels(camera):
         return dict.fromkeys(INTERIOR, "mm"), 1.0
-    assert isinstance(camera, described.FrameCamera)
+    assert isinstance(camera, described.FrameEntry)
     fx, fy = camera.focal
     c = "mm" if _constant_in_pixels_of_mm(camera) else "px"
     return {"c": c, "x0": "px", "y0": "px"}, -fy / fx
@@ -232,7 +232,7 @@ def _interior(
     """c, x0, y0 before and after, as the project states them: principal point as column and row, or in millimetres."""
     if not _in_pixels(camera):
         return (start.c, *start.principal_point), (found.c, *found.principal_point)
-    assert isinstance(camera, described.FrameCamera)
+    assert isinstance(camera, described.FrameEntry)
     col, row = camera.principal_point
     _, to_row = _unit(camera)
     factor = 1.0

@@ -8,9 +8,9 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.io.series.pixels import Plane
-from photoplan.products.characterise.common import Run, black_of, exposure_runs, prefix, tried
+from photoplan.products.characterise.common import SettingsRun, black_of, exposure_runs, prefix, tried
 from photoplan.products.characterise.data import SeriesData
-from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Trace, joined
 from photoplan.quality.camera.blooming import Blooming, find_blooming
 
 _LEAST = 4
@@ -28,12 +28,12 @@ def missing(data: SeriesData) -> str | None:
     )
 
 
-def analyse(data: SeriesData) -> Outcome:
+def analyse(data: SeriesData) -> Findings:
     """Onset and extent for every plane and run."""
     return joined([_run(data, run) for run in exposure_runs(data, ("scene",), _LEAST)])
 
 
-def _run(data: SeriesData, run: Run) -> Outcome:
+def _run(data: SeriesData, run: SettingsRun) -> Findings:
     window = run.settings[0].first.group.window
     if window.size * len(run.settings) > _MOST:
         raise InputError(
@@ -55,7 +55,7 @@ def _run(data: SeriesData, run: Run) -> Outcome:
     )
 
 
-def _plane(data: SeriesData, run: Run, plane: Plane, images: list[np.ndarray]) -> Outcome:
+def _plane(data: SeriesData, run: SettingsRun, plane: Plane, images: list[np.ndarray]) -> Findings:
     blacks = [black_of(data, setting, plane).mean for setting in run.settings]
     if not isfinite(data.saturation_dn(plane.name)):
         raise InputError("the largest grey value is not known; give camera.bits or camera.saturation_dn")
@@ -104,10 +104,10 @@ def _plane(data: SeriesData, run: Run, plane: Plane, images: list[np.ndarray]) -
         (plane.name, run.label, x, float(o), float(e), float(s))
         for x, o, e, s in zip(run.values, found.object_dn, found.excess_dn, found.excess_sigma)
     )
-    return Outcome(
+    return Findings(
         tuple(figures),
         refused,
-        {"neighbours": Table(head, rows, "Neighbours of the bright object")},
+        {"neighbours": Listing(head, rows, "Neighbours of the bright object")},
         (_plot(found, prefix("Blooming", plane.name, run.label)),),
         details={prefix("blooming", plane.name, run.label).replace(" ", "_"): found},
     )
@@ -120,7 +120,7 @@ def _plot(found: Blooming, title: str) -> Chart:
         "response promises.",
         "object DN",
         "excess of neighbours DN",
-        (Curve(found.object_dn, found.excess_dn, style="line and points", sigma=found.excess_sigma),),
+        (Trace(found.object_dn, found.excess_dn, style="line and points", sigma=found.excess_sigma),),
         log_x=True,
         marks=((found.onset_dn, "onset"),) if isfinite(found.onset_dn) else (),
     )

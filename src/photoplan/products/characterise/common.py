@@ -11,7 +11,7 @@ import numpy as np
 from photoplan.errors import InputError
 from photoplan.io.series.pixels import Plane
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Outcome
+from photoplan.products.characterise.result import Findings
 from photoplan.quality.camera.frame_statistics import Level
 from photoplan.quality.camera.photon_transfer import is_clipped_dark
 
@@ -26,7 +26,7 @@ _ABSCISSAS = (
 
 
 @dataclass(frozen=True)
-class Run:
+class SettingsRun:
     """Settings that differ in one condition only, by its growing value."""
 
     settings: tuple[Setting, ...]
@@ -43,7 +43,7 @@ class Run:
         return tuple(float(getattr(setting.first, self.name)) for setting in self.settings)
 
 
-def exposure_runs(data: SeriesData, kinds: Sequence[str], least: int) -> list[Run]:
+def exposure_runs(data: SeriesData, kinds: Sequence[str], least: int) -> list[SettingsRun]:
     """Runs of at least so many settings of different exposure, photons or illumination (the first that differs)."""
     found: dict[tuple[object, ...], list[Setting]] = {}
     for setting in data.settings(*kinds):
@@ -58,13 +58,13 @@ def exposure_runs(data: SeriesData, kinds: Sequence[str], least: int) -> list[Ru
     return runs
 
 
-def _run(settings: Sequence[Setting]) -> Run | None:
+def _run(settings: Sequence[Setting]) -> SettingsRun | None:
     for name, axis, unit in _ABSCISSAS:
         values = [getattr(setting.first, name) for setting in settings]
         if None in values or len(set(values)) < 2 or len(set(values)) < len(values):
             continue
         ordered = tuple(sorted(settings, key=lambda s: float(getattr(s.first, name))))
-        return Run(ordered, name, axis, unit, _common(ordered))
+        return SettingsRun(ordered, name, axis, unit, _common(ordered))
     return None
 
 
@@ -173,9 +173,9 @@ def prefix(*parts: str) -> str:
     return " ".join(part for part in parts if part)
 
 
-def tried(what: str, make: Callable[[], Outcome]) -> Outcome:
+def tried(what: str, make: Callable[[], Findings]) -> Findings:
     """The outcome, or the refusal of `what` with its reason where the data do not allow it."""
     try:
         return make()
     except InputError as error:
-        return Outcome(refused={what: str(error)})
+        return Findings(refused={what: str(error)})

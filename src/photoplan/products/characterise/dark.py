@@ -10,7 +10,7 @@ from photoplan.errors import InputError
 from photoplan.io.series.pixels import Plane
 from photoplan.products.characterise.common import MOST_SATURATED, prefix, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Trace, joined
 from photoplan.quality.camera.dark_signal import DarkCurrent, dark_current, doubling_temperature
 from photoplan.quality.camera.frame_statistics import Level
 
@@ -26,12 +26,12 @@ def missing(data: SeriesData) -> str | None:
     return f"dark frames at {len(exposures)} stated exposures; the dark signal needs {_LEAST}"
 
 
-def analyse(data: SeriesData) -> Outcome:
+def analyse(data: SeriesData) -> Findings:
     """Dark current of every plane and temperature, and the doubling temperature."""
     return joined([_plane(data, plane) for plane in data.planes])
 
 
-def _plane(data: SeriesData, plane: Plane) -> Outcome:
+def _plane(data: SeriesData, plane: Plane) -> Findings:
     by_temperature: dict[float | None, list[Setting]] = {}
     for setting in data.settings("dark"):
         if setting.first.exposure_ms is not None:
@@ -52,7 +52,7 @@ def _plane(data: SeriesData, plane: Plane) -> Outcome:
 
 def _current(
     settings: list[Setting], levels: list[Level], name: str, at: tuple[float | None, str], currents: Currents
-) -> Outcome:
+) -> Findings:
     exposures = [float(setting.first.exposure_ms or 0.0) for setting in settings]
     full = [k for k, level in enumerate(levels) if level.saturated_share > MOST_SATURATED]
     used = [k for k in range(len(levels)) if k not in full]
@@ -93,25 +93,25 @@ def _current(
         f"Dark current {found.current_dn_s:.4g} ± {found.current_dn_s_sigma:.2g} DN/s.",
         "exposure s",
         "mean grey value DN",
-        (Curve(t, np.array(means), "dark frames"), Curve(t, found.line.at(t), "line", "dashed")),
+        (Trace(t, np.array(means), "dark frames"), Trace(t, found.line.at(t), "line", "dashed")),
     )
-    return Outcome(
+    return Findings(
         figures,
-        tables={"levels": Table(head, rows, "Dark frames")},
+        tables={"levels": Listing(head, rows, "Dark frames")},
         plots=(chart,),
         notes=tuple(f"{settings[k].label}: saturated, not used" for k in full),
         details={prefix("dark_current", name, at[1]).replace(" ", "_"): found},
     )
 
 
-def _doubling(currents: Currents, name: str, stated: int) -> Outcome:
+def _doubling(currents: Currents, name: str, stated: int) -> Findings:
     known = {t: c for t, c in currents.items() if t is not None}
     key = prefix("doubling temperature", name)
     if stated < 2:
         why = f"the dark frames state {stated} temperatures; two or more are needed (temperature_c)"
-        return Outcome(refused={"doubling temperature": why})
+        return Findings(refused={"doubling temperature": why})
     if len(known) < 2:
-        return Outcome(
+        return Findings(
             refused={key: f"a dark current is known at {len(known)} of {stated} temperatures; two are needed"}
         )
     temperatures = sorted(known)
@@ -120,7 +120,7 @@ def _doubling(currents: Currents, name: str, stated: int) -> Outcome:
     try:
         found = doubling_temperature(temperatures, values, sigmas)
     except InputError as error:
-        return Outcome(refused={key: str(error)})
+        return Findings(refused={key: str(error)})
     grid = np.linspace(temperatures[0], temperatures[-1], 50)
     model = found.current_at_reference * 2 ** ((grid - found.reference_c) / found.doubling_k)
     chart = Chart(
@@ -129,12 +129,12 @@ def _doubling(currents: Currents, name: str, stated: int) -> Outcome:
         "temperature °C",
         "dark current DN/s",
         (
-            Curve(np.array(temperatures), np.array(values), "measured", sigma=np.array(sigmas)),
-            Curve(grid, model, "exponential", "dashed"),
+            Trace(np.array(temperatures), np.array(values), "measured", sigma=np.array(sigmas)),
+            Trace(grid, model, "exponential", "dashed"),
         ),
         log_y=True,
     )
     figure = Figure(
         "doubling_temperature_k", found.doubling_k, found.doubling_k_sigma, "doubling temperature", "K", name
     )
-    return Outcome((figure,), plots=(chart,), details={prefix("doubling", name).replace(" ", "_"): found})
+    return Findings((figure,), plots=(chart,), details={prefix("doubling", name).replace(" ", "_"): found})

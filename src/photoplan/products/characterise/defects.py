@@ -11,7 +11,7 @@ from photoplan.errors import InputError
 from photoplan.io.series.pixels import Plane
 from photoplan.products.characterise.common import MOST_SATURATED, prefix, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Picture, Table, joined, shrunk
+from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Plate, Trace, joined, shrunk
 from photoplan.quality.camera.defects import Defect, DefectList, find_blinking, find_defects, find_lines, log_histogram
 from photoplan.quality.camera.frame_statistics import FrameStack
 from photoplan.quality.camera.photon_transfer import is_clipped_dark
@@ -31,12 +31,12 @@ def missing(data: SeriesData) -> str | None:
     return "no setting of dark or flat frames has two frames or more"
 
 
-def analyse(data: SeriesData) -> Outcome:
+def analyse(data: SeriesData) -> Findings:
     """Defects of every plane, from the longest dark exposure and from flat frames at half of saturation."""
     return joined([_plane(data, plane) for plane in data.planes])
 
 
-def _plane(data: SeriesData, plane: Plane) -> Outcome:
+def _plane(data: SeriesData, plane: Plane) -> Findings:
     outcomes = []
     darks = sorted(_pairs(data, "dark"), key=lambda s: s.first.exposure_ms or 0.0)
     sound = [s for s in darks if data.levels(s)[plane.name].saturated_share <= MOST_SATURATED]
@@ -51,10 +51,10 @@ def _plane(data: SeriesData, plane: Plane) -> Outcome:
             outcomes.append(tried(key, lambda s=setting, h=how: _setting(data, s, plane, h)))  # type: ignore[misc]
     if flat is None:
         why = "no flat frames, two or more at a setting, that are not saturated"
-        outcomes.append(Outcome(refused={prefix("dark pixels", plane.name): why}))
+        outcomes.append(Findings(refused={prefix("dark pixels", plane.name): why}))
     if dark is None:
         why = "no dark frames, two or more at a setting"
-        outcomes.append(Outcome(refused={prefix("hot pixels", plane.name): why}))
+        outcomes.append(Findings(refused={prefix("hot pixels", plane.name): why}))
     return joined(outcomes)
 
 
@@ -62,7 +62,7 @@ def _pairs(data: SeriesData, kind: str) -> list[Setting]:
     return [s for s in data.settings(kind) if len(s.frames) >= 2]
 
 
-def _setting(data: SeriesData, setting: Setting, plane: Plane, how: tuple[tuple[str, ...], float]) -> Outcome:
+def _setting(data: SeriesData, setting: Setting, plane: Plane, how: tuple[tuple[str, ...], float]) -> Findings:
     kinds, share = how
     stack = data.stacks(setting)[plane.name]
     level = stack.level
@@ -81,13 +81,13 @@ def _setting(data: SeriesData, setting: Setting, plane: Plane, how: tuple[tuple[
     figures = _figures(lists, kinds, plane.name, setting.label)
     head = ("plane", "setting", "kind", "column", "row", "deviation_dn", "over_threshold")
     rows = tuple(_row(d, plane, setting) for part in lists.values() for d in part.defects)
-    growth = _growth(data, setting, plane, found) if setting.first.kind == "dark" else Outcome()
+    growth = _growth(data, setting, plane, found) if setting.first.kind == "dark" else Findings()
     return joined(
         [
-            Outcome(
+            Findings(
                 tuple(figures),
                 refused,
-                {"list": Table(head, rows, "Defect elements, the strongest first; positions are those of the image")},
+                {"list": Listing(head, rows, "Defect elements, the strongest first; positions are those of the image")},
                 _plots(found, stack, plane, setting),
             ),
             growth,
@@ -115,7 +115,7 @@ def _figures(lists: dict[str, DefectList], kinds: tuple[str, ...], plane: str, l
     return figures
 
 
-def _growth(data: SeriesData, setting: Setting, plane: Plane, found: DefectList) -> Outcome:
+def _growth(data: SeriesData, setting: Setting, plane: Plane, found: DefectList) -> Findings:
     """Grey values of the strongest hot pixels at every dark exposure."""
     hot = [d for d in found.defects if d.kind == "hot"][:_CANDIDATES]
     settings = sorted(
@@ -130,7 +130,7 @@ def _growth(data: SeriesData, setting: Setting, plane: Plane, found: DefectList)
         key=lambda s: s.first.exposure_ms or 0.0,
     )
     if not hot or len(settings) < 2:
-        return Outcome()
+        return Findings()
     window = setting.first.group.window
     means = [data.stacks(s)[plane.name].mean for s in settings]
     exposures = np.array([s.first.exposure_ms or 0.0 for s in settings])
@@ -151,7 +151,7 @@ def _growth(data: SeriesData, setting: Setting, plane: Plane, found: DefectList)
         f"{overfull} hot pixels are full at {exposures[-1]:g} ms; charge that runs over makes their neighbours hot, too"
     )
     curves = tuple(
-        Curve(exposures, v, f"column {at[0]}, row {at[1]}", "line and points") for at, v in zip(places[:6], values)
+        Trace(exposures, v, f"column {at[0]}, row {at[1]}", "line and points") for at, v in zip(places[:6], values)
     )
     chart = Chart(
         f"Growth of the hottest pixels {plane.name}".strip(),
@@ -160,8 +160,8 @@ def _growth(data: SeriesData, setting: Setting, plane: Plane, found: DefectList)
         "grey value DN",
         curves,
     )
-    table = Table(head, tuple(rows), "Grey values of the hottest pixels at each dark exposure")
-    return Outcome(
+    table = Listing(head, tuple(rows), "Grey values of the hottest pixels at each dark exposure")
+    return Findings(
         (hottest,) if isfinite(rates[0]) else (),
         tables={f"hot_growth{plane.name and f'_{plane.name}'}": table},
         plots=(chart,),
@@ -174,7 +174,7 @@ def _rate(seconds: NDArray[np.float64], values: NDArray[np.float64], usable: NDA
     return float(np.polyfit(seconds[usable], values[usable], 1)[0]) if usable.sum() > 1 else nan
 
 
-def _plots(found: DefectList, stack: FrameStack, plane: Plane, setting: Setting) -> tuple[Chart | Picture, ...]:
+def _plots(found: DefectList, stack: FrameStack, plane: Plane, setting: Setting) -> tuple[Chart | Plate, ...]:
     assert found.deviation is not None
     bars = log_histogram(found.deviation[np.isfinite(found.deviation)], found.scatter)
     seen = bars.count > 0
@@ -185,15 +185,15 @@ def _plots(found: DefectList, stack: FrameStack, plane: Plane, setting: Setting)
         "deviation DN",
         "pixels",
         (
-            Curve(bars.deviation[seen], bars.count[seen].astype(float), "pixels", "points"),
-            Curve(bars.deviation[bars.model > 0.3], bars.model[bars.model > 0.3], "Gaussian", "dashed"),
+            Trace(bars.deviation[seen], bars.count[seen].astype(float), "pixels", "points"),
+            Trace(bars.deviation[bars.model > 0.3], bars.model[bars.model > 0.3], "Gaussian", "dashed"),
         ),
         log_y=True,
         marks=((found.threshold, "threshold"),),
     )
     points = tuple((d.col, d.row) for d in found.defects[:_FOLLOWED])
     small, factor = shrunk(stack.mean)
-    shown = Picture(
+    shown = Plate(
         f"Defect pixels, {title}",
         f"Mean image; the {len(points)} strongest of {found.count} are circled. Positions are those of the plane.",
         small,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, central_window, frame_groups
-from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Trace, joined
 from photoplan.quality.camera.brightness_drift import LEAST_MEASUREMENTS, BrightnessDrift, brightness_drift
 
 #: Side of the window in the middle of the image (Behr 1989, §4.2.4).
@@ -26,12 +26,12 @@ def missing(data: SeriesData) -> str | None:
     return None if most >= LEAST_MEASUREMENTS else f"{LEAST_MEASUREMENTS} drift frames in one entry; there are {most}"
 
 
-def analyse(data: SeriesData) -> Outcome:
+def analyse(data: SeriesData) -> Findings:
     """The figures of table 4.1 for every entry and plane."""
     return joined([_group(data, g) for g in frame_groups(data, "drift")])
 
 
-def _group(data: SeriesData, group: FrameGroup) -> Outcome:
+def _group(data: SeriesData, group: FrameGroup) -> Findings:
     times = group.times()
     side = int(group.number("window", WINDOW * max(p.step for p in data.planes), 1, 100_000))
     window = central_window(group.group.window, side, group.group.label)
@@ -57,7 +57,7 @@ def _group(data: SeriesData, group: FrameGroup) -> Outcome:
     return joined(parts)
 
 
-def _outcome(found: BrightnessDrift, at: str, plane: str, side: int) -> Outcome:
+def _outcome(found: BrightnessDrift, at: str, plane: str, side: int) -> Findings:
     n, root = found.count, math.sqrt(found.count)
     nan = math.nan
 
@@ -84,11 +84,11 @@ def _outcome(found: BrightnessDrift, at: str, plane: str, side: int) -> Outcome:
     lapses = [
         (label, float(a), float(b), int(c), float(d)) for a, b, c, d in zip(v.lapse, v.structure, v.pairs, v.allan)
     ]
-    return Outcome(
+    return Findings(
         tuple(figures),
         tables={
-            "series": Table(("series", "time_s", "mean_dn"), tuple(rows), "Mean grey value of the window"),
-            "variation": Table(
+            "series": Listing(("series", "time_s", "mean_dn"), tuple(rows), "Mean grey value of the window"),
+            "variation": Listing(
                 ("series", "lapse_s", "structure_dn", "pairs", "allan_dn"),
                 tuple(lapses),
                 "Variation over lapses of time",
@@ -102,18 +102,18 @@ def _charts(found: BrightnessDrift, label: str, side: int) -> tuple[Chart, ...]:
     minutes = found.times / 60.0
     line = found.trend * (found.times - found.times.mean()) / 3600.0 + found.mean
     v = found.variation
-    curves = [Curve(v.lapse, v.structure, "structure function", "line and points")]
+    curves = [Trace(v.lapse, v.structure, "structure function", "line and points")]
     if np.isfinite(v.allan).any():
-        curves.append(Curve(v.lapse, v.allan, "Allan deviation of means", "line and points"))
+        curves.append(Trace(v.lapse, v.allan, "Allan deviation of means", "line and points"))
         white = found.short_sigma * np.sqrt(v.lapse[0] / v.lapse)
-        curves.append(Curve(v.lapse, white, "Allan deviation of white noise", "dashed"))
+        curves.append(Trace(v.lapse, white, "Allan deviation of white noise", "dashed"))
     return (
         Chart(
             f"Brightness over time, {label}",
             f"Mean of {side} × {side} pixels in the middle (Behr 1989, figs. 4.15 and 4.16), and the straight trend.",
             "minutes",
             "grey value",
-            (Curve(minutes, found.values, "measured", "line and points"), Curve(minutes, line, "trend", "dashed")),
+            (Trace(minutes, found.values, "measured", "line and points"), Trace(minutes, line, "trend", "dashed")),
         ),
         Chart(
             f"Flicker and drift, {label}",

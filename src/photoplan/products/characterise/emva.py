@@ -12,9 +12,9 @@ from photoplan.io.series.pixels import Plane
 from photoplan.io.series.statistics import ReducedPoint
 from photoplan.products.characterise import dark as characterise_dark
 from photoplan.products.characterise import pattern as characterise_pattern
-from photoplan.products.characterise.common import Run, exposure_runs, of_one_temperature, prefix, tried
+from photoplan.products.characterise.common import SettingsRun, exposure_runs, of_one_temperature, prefix, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Trace, joined
 from photoplan.products.characterise.transfer import reduced_level
 from photoplan.quality.camera.dark_signal import dark_current
 from photoplan.quality.camera.emva import EmvaPoints, EmvaSheet, emva_sheet
@@ -55,11 +55,11 @@ def missing(data: SeriesData) -> str | None:
     return None
 
 
-def _runs(data: SeriesData) -> list[Run]:
+def _runs(data: SeriesData) -> list[SettingsRun]:
     return exposure_runs(data, ("flat",), _LEAST)
 
 
-def analyse(data: SeriesData) -> Outcome:
+def analyse(data: SeriesData) -> Findings:
     """Sheets of every plane and run."""
     if data.series.reduced_of("flat"):
         return _of_reduced(data)
@@ -70,16 +70,16 @@ def analyse(data: SeriesData) -> Outcome:
             key = prefix("EMVA 1288", plane.name, run.label)
             found = tried(key, lambda p=plane, r=run: _of_frames(data, r, p))  # type: ignore[misc]
             gain = next((f for f in found.figures if f.name == "gain_dn_e"), None)
-            taken = Outcome() if gain is None else _taken(others, plane, gain, run.label)
+            taken = Findings() if gain is None else _taken(others, plane, gain, run.label)
             outcomes += [found, taken]
     return joined(outcomes)
 
 
-def _of_reduced(data: SeriesData) -> Outcome:
+def _of_reduced(data: SeriesData) -> Findings:
     bright, dark = ([_reduced(p) for p in data.series.reduced_of(kind)] for kind in ("flat", "dark"))
     found = tried("EMVA 1288", lambda: _sheet(bright, dark, ("", ""), 1.0))
     gain = next((f for f in found.figures if f.name == "gain_dn_e"), None)
-    no_images = Outcome(refused={"DSNU and PRNU": "reduced figures hold no images; give frames"})
+    no_images = Findings(refused={"DSNU and PRNU": "reduced figures hold no images; give frames"})
     if gain is None:
         return found
     points = [p for p in data.series.reduced_of("dark") if p.exposure_ms is not None]
@@ -88,10 +88,10 @@ def _of_reduced(data: SeriesData) -> Outcome:
     return joined([found, tried("dark current", lambda: _dark_current(exposures, levels, gain)), no_images])
 
 
-def _dark_current(exposures: list[float], levels: list[Level], gain: Figure) -> Outcome:
+def _dark_current(exposures: list[float], levels: list[Level], gain: Figure) -> Findings:
     found = dark_current(exposures, levels)
     value, sigma = _in_electrons(found.current_dn_s, found.current_dn_s_sigma, gain)
-    return Outcome((Figure("dark_current_e_s", value, sigma, "dark current", "e/s"),))
+    return Findings((Figure("dark_current_e_s", value, sigma, "dark current", "e/s"),))
 
 
 def _in_electrons(value: float, sigma: float, gain: Figure) -> tuple[float, float]:
@@ -99,13 +99,13 @@ def _in_electrons(value: float, sigma: float, gain: Figure) -> tuple[float, floa
     return value / gain.value, hypot(sigma, value * gain.sigma / gain.value) / gain.value
 
 
-def _others(data: SeriesData) -> Outcome:
+def _others(data: SeriesData) -> Findings:
     """What the analyses of the pattern and of the dark signal say."""
     parts = [module for module in (characterise_pattern, characterise_dark) if module.missing(data) is None]
     return joined([module.analyse(data) for module in parts])
 
 
-def _taken(others: Outcome, plane: Plane, gain: Figure, label: str) -> Outcome:
+def _taken(others: Findings, plane: Plane, gain: Figure, label: str) -> Findings:
     """Figures of other analyses in the units of the sheet, and those that they refused."""
     figures, refused = [], {}
     for there, here, words, unit, divided in _TAKEN:
@@ -116,10 +116,10 @@ def _taken(others: Outcome, plane: Plane, gain: Figure, label: str) -> Outcome:
         if not known:
             why = [w for what, w in others.refused.items() if what.lower().startswith(words.lower())]
             refused[prefix(words, plane.name, label)] = why[0] if why else "the series lacks frames for it"
-    return Outcome(tuple(figures), refused)
+    return Findings(tuple(figures), refused)
 
 
-def _of_frames(data: SeriesData, run: Run, plane: Plane) -> Outcome:
+def _of_frames(data: SeriesData, run: SettingsRun, plane: Plane) -> Findings:
     bright = [_point(data, s, plane.name) for s in run.settings if len(s.frames) >= 2]
     darks = [s for s in data.settings("dark") if len(s.frames) >= 2]
     settings = [s for s in darks if of_one_temperature(s, run.settings[0])]
@@ -148,7 +148,7 @@ def _point(data: SeriesData, setting: Setting, name: str) -> _Point:
     )
 
 
-def _sheet(bright: list[_Point], dark: list[_Point], of: tuple[str, str], step: float) -> Outcome:
+def _sheet(bright: list[_Point], dark: list[_Point], of: tuple[str, str], step: float) -> Findings:
     plane, label = of
     by_exposure = {point.exposure: point for point in dark}
     pairs = [(p, by_exposure[p.exposure]) for p in bright if p.exposure in by_exposure]
@@ -179,10 +179,10 @@ def _sheet(bright: list[_Point], dark: list[_Point], of: tuple[str, str], step: 
     head = ("plane", "at", "photons", "mean_dn", "variance_dn2", "dark_mean_dn", "dark_variance_dn2", "used")
     columns = (p.photons, p.mean, p.variance, p.dark_mean, p.dark_variance, found.used)
     rows: list[tuple[str | float | int, ...]] = [(plane, label, *(float(v) for v in row)) for row in zip(*columns)]
-    return Outcome(
+    return Findings(
         figures,
         {prefix(what, plane, label): why for what, why in found.refused.items()},
-        {"points": Table(head, tuple(rows), "Levels of the sheet")},
+        {"points": Listing(head, tuple(rows), "Levels of the sheet")},
         _plots(found, p, prefix("EMVA 1288", plane, label)),
         tuple(notes),
         {prefix("sheet", plane, label).replace(" ", "_"): found},
@@ -235,9 +235,9 @@ def _plots(s: EmvaSheet, p: EmvaPoints, title: str) -> tuple[Chart, ...]:
             "signal DN",
             "variance above dark DN²",
             (
-                Curve(signal[s.used], variance[s.used], "used"),
-                Curve(signal[~s.used], variance[~s.used], "not used", colour=3),
-                Curve(grid, s.gain * grid, "line", "dashed", colour=1),
+                Trace(signal[s.used], variance[s.used], "used"),
+                Trace(signal[~s.used], variance[~s.used], "not used", colour=3),
+                Trace(grid, s.gain * grid, "line", "dashed", colour=1),
             ),
         )
     ]
@@ -252,8 +252,8 @@ def _plots(s: EmvaSheet, p: EmvaPoints, title: str) -> tuple[Chart, ...]:
                 "photons per pixel",
                 "signal-to-noise ratio",
                 (
-                    Curve(p.photons[good], signal[good] / noise[good], "measured"),
-                    Curve(p.photons[good], ideal, "ideal", "dashed"),
+                    Trace(p.photons[good], signal[good] / noise[good], "measured"),
+                    Trace(p.photons[good], ideal, "ideal", "dashed"),
                 ),
                 log_x=True,
                 log_y=True,

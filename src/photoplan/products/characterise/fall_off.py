@@ -16,7 +16,7 @@ from photoplan.io.series.pixels import Plane
 from photoplan.products.characterise.common import black_of, of_one_temperature
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.groups import FrameGroup
-from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Picture, Table, joined
+from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Plate, Trace, joined
 from photoplan.quality.camera.fall_off import FallOff, fit_fall_off
 from photoplan.quality.camera.fall_off_adjust import FallOffSettings
 from photoplan.quality.camera.fall_off_model import FallOffModel, gain_image
@@ -35,7 +35,7 @@ def missing(data: SeriesData) -> str | None:
     )
 
 
-def analyse(data: SeriesData) -> Outcome:
+def analyse(data: SeriesData) -> Findings:
     """Light fall-off of the brightest flat frames that are not saturated."""
     setting = _brightest(data)
     flats = {name: (stack.mean, stack.counted) for name, stack in data.stacks(setting).items()}
@@ -48,11 +48,11 @@ def analyse(data: SeriesData) -> Outcome:
         image -= below if isinstance(below, float) else _whole(data, setting, plane, below)
         settings = _settings(data, setting, plane, below if isinstance(below, float) else float(below.mean()))
         parts.append(_fitted(image, settings, plane, setting))
-    first = Outcome(notes=(f"from {len(setting.frames)} frames, {setting.label}; {note}",))
+    first = Findings(notes=(f"from {len(setting.frames)} frames, {setting.label}; {note}",))
     return joined([first, *parts])
 
 
-def _fitted(image: Array, settings: FallOffSettings, plane: Plane, setting: Setting) -> Outcome:
+def _fitted(image: Array, settings: FallOffSettings, plane: Plane, setting: Setting) -> Findings:
     """The fall-off; without its natural part where the light shows none and nobody asked for it."""
     try:
         return _outcome(fit_fall_off(image, settings), plane, setting)
@@ -60,7 +60,7 @@ def _fitted(image: Array, settings: FallOffSettings, plane: Plane, setting: Sett
         if settings.natural != "estimated" or "natural" in setting.first.group.entry.values:
             raise
         rest = replace(settings, natural="none")
-        refused = Outcome(refused={f"natural part{f' ({plane.name})' if plane.name else ''}": str(error)})
+        refused = Findings(refused={f"natural part{f' ({plane.name})' if plane.name else ''}": str(error)})
         return joined([_outcome(fit_fall_off(image, rest), plane, setting), refused])
 
 
@@ -131,7 +131,7 @@ def _settings(data: SeriesData, setting: Setting, plane: Plane, dark: float) -> 
     )
 
 
-def _outcome(found: FallOff, of: Plane, setting: Setting) -> Outcome:
+def _outcome(found: FallOff, of: Plane, setting: Setting) -> Findings:
     plane = of.name
     suffix = f"_{plane.replace(' ', '_')}" if plane else ""
     names = f"fall_off_model{suffix}.toml", f"fall_off_gain{suffix}.tif"
@@ -152,13 +152,15 @@ def _outcome(found: FallOff, of: Plane, setting: Setting) -> Outcome:
         (plane, *_place(of, d.x, d.y), d.width * of.step, d.height * of.step, 100 * d.depth) for d in found.dirt
     )
     head = ("plane", "corner", "total_percent", "sigma", "natural_percent", "artificial_percent")
-    return Outcome(
+    return Findings(
         _figures(found, of),
         refused,
         {
-            "corners": Table(head, corners, "Brightness lost in the corners"),
-            "terms": Table(("plane", "n", "m", "coefficient", "sigma"), terms, "Terms r^n cos(m θ) of the polynomial"),
-            "dirt": Table(("plane", "x", "y", "width", "height", "depth_percent"), dirt, "Dust and stains"),
+            "corners": Listing(head, corners, "Brightness lost in the corners"),
+            "terms": Listing(
+                ("plane", "n", "m", "coefficient", "sigma"), terms, "Terms r^n cos(m θ) of the polynomial"
+            ),
+            "dirt": Listing(("plane", "x", "y", "width", "height", "depth_percent"), dirt, "Dust and stains"),
         },
         _plots(found, of),
         tuple(notes),
@@ -208,7 +210,7 @@ def _figures(found: FallOff, of: Plane) -> tuple[Figure, ...]:
     return tuple(figures)
 
 
-def _plots(found: FallOff, plane: Plane) -> tuple[Chart | Picture, ...]:
+def _plots(found: FallOff, plane: Plane) -> tuple[Chart | Plate, ...]:
     assert found.blocks is not None and found.residuals is not None
     blocks, model = found.blocks, found.model
     of = f", {plane.name}" if plane.name else ""
@@ -218,7 +220,7 @@ def _plots(found: FallOff, plane: Plane) -> tuple[Chart | Picture, ...]:
     dirt = tuple(_place(plane, d.x, d.y) for d in found.dirt[:30])
     relative = blocks.values / found.level
     return (
-        Picture(
+        Plate(
             f"Brightness{of}",
             "Mean of the flat frames in blocks, relative to the principal point (Behr 1989, fig. 4.9).",
             100 * relative,
@@ -227,7 +229,7 @@ def _plots(found: FallOff, plane: Plane) -> tuple[Chart | Picture, ...]:
             extent=extent,
         ),
         _profile(found, of, plane.step),
-        Picture(
+        Plate(
             f"After correction{of}",
             f"What the model leaves; {len(found.dirt)} places with dust or stains (circles) did not count.",
             100 * found.residuals,
@@ -253,12 +255,12 @@ def _profile(found: FallOff, of: str, unit: int) -> Chart:
     y = model.principal_point[1] + s * (farthest[1] - model.principal_point[1])
     r = s * unit * math.dist(farthest, model.principal_point)
     curves = [
-        Curve(radius[::step], 100 * blocks.known[::step] / found.level, "blocks", "points", colour=5),
-        Curve(r, 100 * model.relative(x, y), "model to the farthest corner", "line", colour=0),
+        Trace(radius[::step], 100 * blocks.known[::step] / found.level, "blocks", "points", colour=5),
+        Trace(r, 100 * model.relative(x, y), "model to the farthest corner", "line", colour=0),
     ]
     if model.camera_constant is not None:
-        curves.append(Curve(r, 100 * model.natural(x, y), "cos⁴ω", "dashed", colour=1))
-        curves.append(Curve(r, 100 * model.artificial(x, y), "artificial", "dashed", colour=2))
+        curves.append(Trace(r, 100 * model.natural(x, y), "cos⁴ω", "dashed", colour=1))
+        curves.append(Trace(r, 100 * model.artificial(x, y), "artificial", "dashed", colour=2))
     radial = FallOffModel(
         model.size,
         model.principal_point,
@@ -266,7 +268,7 @@ def _profile(found: FallOff, of: str, unit: int) -> Chart:
         tuple(t for t in model.terms if t[1] == 0),
         tuple(c for t, c in zip(model.terms, model.coefficients) if t[1] == 0),
     )
-    curves.append(Curve(r, 100 * radial.relative(x, y), "symmetric part", "line", colour=3))
+    curves.append(Trace(r, 100 * radial.relative(x, y), "symmetric part", "line", colour=3))
     return Chart(
         f"Fall-off from the principal point{of}",
         "Relative brightness; the spread of the blocks at one distance is asymmetry, noise and dust.",

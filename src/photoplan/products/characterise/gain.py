@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
-from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Trace, joined
 from photoplan.quality.camera.approach import LEAST_VALUES
 from photoplan.quality.camera.gain_control import GainControl, compare_transitions, gain_control
 
@@ -24,9 +24,9 @@ def missing(data: SeriesData) -> str | None:
     return None if most > LEAST_VALUES else f"{LEAST_VALUES + 1} step frames in one entry; there are {most}"
 
 
-def analyse(data: SeriesData) -> Outcome:
+def analyse(data: SeriesData) -> Findings:
     """Every transition, and bright-dark against dark-bright."""
-    parts: list[Outcome] = []
+    parts: list[Findings] = []
     found: dict[str, list[GainControl]] = {}
     for group in frame_groups(data, "step"):
         for plane, (control, noise) in _transitions(data, group).items():
@@ -69,7 +69,7 @@ def _transitions(data: SeriesData, group: FrameGroup) -> dict[str, tuple[GainCon
     return out
 
 
-def _outcome(found: GainControl, pixel: tuple[float, float], of: tuple[str, str], step: float) -> Outcome:
+def _outcome(found: GainControl, pixel: tuple[float, float], of: tuple[str, str], step: float) -> Findings:
     (at, plane), (a, refused) = of, (found.approach, {})
     nan = math.nan
 
@@ -97,33 +97,33 @@ def _outcome(found: GainControl, pixel: tuple[float, float], of: tuple[str, str]
     t = found.times - found.times[found.first]
     curve = np.linspace(0.0, float(t[-1]), 200)
     rows = tuple((found.name, float(x), float(y)) for x, y in zip(found.times, found.values))
-    return Outcome(
+    return Findings(
         tuple(figures),
         refused,
-        {"series": Table(("series", "time_s", "mean_dn"), rows, "Mean grey value of the window")},
+        {"series": Listing(("series", "time_s", "mean_dn"), rows, "Mean grey value of the window")},
         (
             Chart(
                 f"After the step, {found.name}",
                 f"{found.direction}: {a.verdict} (Behr 1989, fig. 4.17).",
                 "seconds since the step",
                 "grey value",
-                (Curve(t, found.values, "measured", "points"), Curve(curve, a.at(curve), "adjusted", "line")),
+                (Trace(t, found.values, "measured", "points"), Trace(curve, a.at(curve), "adjusted", "line")),
                 marks=((0.0, "step"),),
             ),
         ),
     )
 
 
-def _asymmetry(found: list[GainControl], plane: str) -> Outcome:
+def _asymmetry(found: list[GainControl], plane: str) -> Findings:
     """The first transition of each direction compared."""
     dark = next((g for g in found if g.direction == "bright to dark"), None)
     bright = next((g for g in found if g.direction == "dark to bright"), None)
     if dark is None or bright is None:
-        return Outcome(notes=("transitions in both directions are needed to compare them",))
+        return Findings(notes=("transitions in both directions are needed to compare them",))
     try:
         a = compare_transitions(dark, bright)
     except InputError as error:
-        return Outcome(refused={"asymmetry": str(error)})
+        return Findings(refused={"asymmetry": str(error)})
     remark = f"chance of equal changes {a.probability:.2g}"
     label = "change after bright to dark minus that after dark to bright"
-    return Outcome((Figure("asymmetry_dn", a.difference, a.sigma, label, "DN", plane, remark=remark),))
+    return Findings((Figure("asymmetry_dn", a.difference, a.sigma, label, "DN", plane, remark=remark),))

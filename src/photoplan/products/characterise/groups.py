@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.io.series.file import Frame, Group
+from photoplan.io.series.file import Frame, SeriesGroup
 from photoplan.io.series.pixels import frame_pixels, plane_mask, split
 from photoplan.products.characterise.data import SeriesData
 
@@ -25,7 +25,7 @@ class FrameGroup:
     Whether a point in a name is that of a decimal, the times decide.
     """
 
-    group: Group
+    group: SeriesGroup
     frames: tuple[Frame, ...]
 
     @property

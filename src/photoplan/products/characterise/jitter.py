@@ -13,7 +13,7 @@ from photoplan.io.series.model import EdgeEntry
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
 from photoplan.products.characterise.jitter_edge import Edge, measured_edge
-from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Trace, joined
 from photoplan.quality.camera.line_jitter import grey_error
 from photoplan.quality.camera.parallel_edges import EdgePair, above_control, compare_edges
 
@@ -24,9 +24,9 @@ def jitter_charts(edges: Sequence[Edge]) -> list[Chart]:
     curves = []
     for k, edge in enumerate(edges):
         s = edge.jitter.spectrum
-        curves.append(Curve(1.0 / s.frequency, 100 * s.power, edge.entry.name, "line", colour=k))
+        curves.append(Trace(1.0 / s.frequency, 100 * s.power, edge.entry.name, "line", colour=k))
         level = np.full(2, 100 * s.level)
-        curves.append(Curve(1.0 / s.frequency[[0, -1]], level, "", "dashed", colour=k))
+        curves.append(Trace(1.0 / s.frequency[[0, -1]], level, "", "dashed", colour=k))
     file = edges[0].frame.file.name
     charts.append(
         Chart(
@@ -44,22 +44,22 @@ def jitter_charts(edges: Sequence[Edge]) -> list[Chart]:
 
 def _deviations(edge: Edge) -> Chart:
     j, line = edge.jitter, edge.first_line + edge.jitter.line
-    curves = [Curve(line[j.used], j.deviation[j.used], "deviation", "points", colour=5)]
+    curves = [Trace(line[j.used], j.deviation[j.used], "deviation", "points", colour=5)]
     if j.harmonics or j.fields_differ:
         if j.fields_differ:
             for first, name, colour in ((0, "even", 0), (1, "odd", 2)):
                 rows_of = line % 2 == first
                 curves.append(
-                    Curve(line[rows_of], j.regular[rows_of], f"regular part, {name} rows", "line", colour=colour)
+                    Trace(line[rows_of], j.regular[rows_of], f"regular part, {name} rows", "line", colour=colour)
                 )
         else:
-            curves.append(Curve(line, j.regular, "periodic part", "line", colour=0))
+            curves.append(Trace(line, j.regular, "periodic part", "line", colour=0))
     if j.spikes:
         shown = np.abs(j.deviation) <= 20 * max(j.sigma, 0.05)
         spikes = ~j.used & shown
         hidden = int((~shown & ~j.used).sum())
         label = "spikes" + (f" ({hidden} lie outside)" if hidden else "")
-        curves.append(Curve(line[spikes], j.deviation[spikes], label, "points", colour=1))
+        curves.append(Trace(line[spikes], j.deviation[spikes], label, "points", colour=1))
     shape = "straight line" if j.degree == 1 else f"polynomial of degree {j.degree}"
     rows = "row" if edge.entry.direction == "vertical" else "column"
     return Chart(
@@ -84,7 +84,7 @@ def missing(data: SeriesData) -> str | None:
     return None
 
 
-def analyse(data: SeriesData) -> Outcome:
+def analyse(data: SeriesData) -> Findings:
     """Every edge in every frame, pairs of vertical edges, and vertical ones beside the control."""
     measured = [(group, _measured(data, group)) for group in frame_groups(data, "plumb")]
     controls = [edges for _, found in measured for edges in found.values() if edges[0].entry.direction == "horizontal"]
@@ -108,7 +108,7 @@ def _measured(data: SeriesData, group: FrameGroup) -> dict[str, list[Edge]]:
     return found
 
 
-def _group(data: SeriesData, group: FrameGroup, found: dict[str, list[Edge]], controls: list[list[Edge]]) -> Outcome:
+def _group(data: SeriesData, group: FrameGroup, found: dict[str, list[Edge]], controls: list[list[Edge]]) -> Findings:
     # A control of the same frames comes first.
     own = [edges for edges in found.values() if edges[0].entry.direction == "horizontal"]
     control = next(iter(own or controls), None)
@@ -117,15 +117,15 @@ def _group(data: SeriesData, group: FrameGroup, found: dict[str, list[Edge]], co
     if len(vertical) > 1:
         parts.append(_pair(group, vertical[0], vertical[1]))
     elif vertical:
-        parts.append(Outcome(notes=(f"{group.label}: two parallel edges are needed to tell where jitter comes from",)))
+        parts.append(Findings(notes=(f"{group.label}: two parallel edges are needed to tell where jitter comes from",)))
     if control is None:
-        parts.append(Outcome(notes=(f"{group.label}: without a horizontal edge the method's noise is not checked",)))
+        parts.append(Findings(notes=(f"{group.label}: without a horizontal edge the method's noise is not checked",)))
     rows = tuple(_row(data, group, edge) for edges in found.values() for edge in edges)
     plots = [jitter_charts([edges[k] for edges in found.values()]) for k in range(min(_CHARTS, len(group.frames)))]
-    table = Table(_HEAD, rows, "Edges by frame")
+    table = Listing(_HEAD, rows, "Edges by frame")
     charts = tuple(chart for each in plots for chart in each)
     name = f"line_jitter_lines_{group.group.index + 1}.csv"
-    return joined([*parts, Outcome(tables={"edges": table}, plots=charts, files={name: _lines_text(found)})])
+    return joined([*parts, Findings(tables={"edges": table}, plots=charts, files={name: _lines_text(found)})])
 
 
 def _mean(values: list[float], sigmas: list[float]) -> tuple[float, float]:
@@ -135,7 +135,7 @@ def _mean(values: list[float], sigmas: list[float]) -> tuple[float, float]:
     return float(np.mean(values)), float(np.std(values, ddof=1)) / math.sqrt(len(values))
 
 
-def _figures(data: SeriesData, group: FrameGroup, edges: list[Edge], control: list[Edge] | None) -> Outcome:
+def _figures(data: SeriesData, group: FrameGroup, edges: list[Edge], control: list[Edge] | None) -> Findings:
     entry, figures, refused = edges[0].entry, [], {}
     at = f"{group.label}, {entry.name}" if len(frame_groups(data, "plumb")) > 1 else entry.name
     lines = [len(e.jitter.line) for e in edges]
@@ -185,7 +185,7 @@ def _figures(data: SeriesData, group: FrameGroup, edges: list[Edge], control: li
     figures.append(Figure("spikes", spikes, math.nan, "lines with spikes", "", "", at, f"of {sum(lines)}"))
     lost = sum(len(e.jitter.missing) for e in edges)
     figures.append(Figure("missing_lines", lost, math.nan, "lines without an edge", "", "", at))
-    return Outcome(tuple(figures), refused, notes=_curved(edges, at))
+    return Findings(tuple(figures), refused, notes=_curved(edges, at))
 
 
 def _periodic(data: SeriesData, edges: list[Edge], at: str) -> list[Figure]:
@@ -219,7 +219,7 @@ def _curved(edges: list[Edge], at: str) -> tuple[str, ...]:
     )
 
 
-def _pair(group: FrameGroup, first: list[Edge], second: list[Edge]) -> Outcome:
+def _pair(group: FrameGroup, first: list[Edge], second: list[Edge]) -> Findings:
     """Two vertical edges over all frames."""
     both = [(a.jitter, b.jitter, b.first_line - a.first_line) for a, b in zip(first, second)]
     pairs = [compare_edges(*each) for each in both]
@@ -238,7 +238,7 @@ def _pair(group: FrameGroup, first: list[Edge], second: list[Edge]) -> Outcome:
             figures.append(Figure(f"{prefix}own_px", own, math.nan, f"own part{what}", "px", "", name))
     shared, single = (sum(len(s) for s in each) for each in zip(*((p.common_spikes, p.single_spikes) for p in pairs)))
     note = f"{group.label}: {shared} spikes in both edges, {single} in one only" if shared or single else ""
-    return Outcome(tuple(figures), notes=(note,) if note else ())
+    return Findings(tuple(figures), notes=(note,) if note else ())
 
 
 def _correlation(pairs: Sequence[EdgePair]) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from photoplan.errors import InputError
 from photoplan.io.series.pixels import Plane
 from photoplan.products.characterise.common import (
     MOST_SATURATED,
-    Run,
+    SettingsRun,
     black_of,
     exposure_runs,
     prefix,
@@ -19,7 +19,7 @@ from photoplan.products.characterise.common import (
     tried,
 )
 from photoplan.products.characterise.data import SeriesData
-from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Trace, joined
 from photoplan.quality.camera.frame_statistics import Level, check_level
 from photoplan.quality.camera.linearity import HIGH, Linearity, linearity
 from photoplan.quality.camera.photon_transfer import is_clipped_dark
@@ -40,7 +40,7 @@ def missing(data: SeriesData) -> str | None:
     )
 
 
-def analyse(data: SeriesData) -> Outcome:
+def analyse(data: SeriesData) -> Findings:
     """Linearity of every plane and run."""
     outcomes = [
         tried(prefix("linearity", plane.name, run.label), lambda r=run, p=plane: _run(data, r, p))  # type: ignore[misc]
@@ -50,7 +50,7 @@ def analyse(data: SeriesData) -> Outcome:
     return joined(outcomes)
 
 
-def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
+def _run(data: SeriesData, run: SettingsRun, plane: Plane) -> Findings:
     levels = [data.levels(setting)[plane.name] for setting in run.settings]
     for level in levels:
         check_level(level)
@@ -71,7 +71,7 @@ def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
     rules = tuple(dict.fromkeys(black.rule for black in blacks))
     # Where black hides a part of the pixels, the mean of the others is not the signal.
     hidden = np.array([is_clipped_dark(level) for level in levels])
-    return Outcome(
+    return Findings(
         _figures(found, run, plane.name, (found.signal < HIGH * full) & ~hidden & ~partly),
         refused={
             prefix("signal over exposure", plane.name, run.label, f"{found.exposure[k]:g} {run.unit}"): (
@@ -86,7 +86,7 @@ def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
     )
 
 
-def _figures(found: Linearity, run: Run, plane: str, known: NDArray[np.bool_]) -> tuple[Figure, ...]:
+def _figures(found: Linearity, run: SettingsRun, plane: str, known: NDArray[np.bool_]) -> tuple[Figure, ...]:
     """Error, response of the line, and response of every level whose mean is that of the signal."""
     unit = f"DN/{run.unit}"
     where = {"plane": plane, "at": run.label}
@@ -103,7 +103,7 @@ def _figures(found: Linearity, run: Run, plane: str, known: NDArray[np.bool_]) -
     return tuple(figures)
 
 
-def _full(data: SeriesData, plane: Plane, run: Run, levels: list[Level], signal: list[float]) -> float:
+def _full(data: SeriesData, plane: Plane, run: SettingsRun, levels: list[Level], signal: list[float]) -> float:
     """Signal at saturation: where this run shows it, else what the camera can write."""
     if len(levels) >= 4:
         variance = np.array([level.temporal_variance for level in levels])
@@ -114,7 +114,7 @@ def _full(data: SeriesData, plane: Plane, run: Run, levels: list[Level], signal:
     return saturation_of(data, plane, levels) - (levels[-1].mean - signal[-1])
 
 
-def _table(found: Linearity, run: Run, name: str) -> Table:
+def _table(found: Linearity, run: SettingsRun, name: str) -> Listing:
     head = ("plane", "run", run.name, "signal_dn", "response", "segment_slope", "deviation_percent", "used")
     rows = tuple(
         (name, run.label, float(x), float(y), float(r), float(s), float(d), int(u))
@@ -122,19 +122,19 @@ def _table(found: Linearity, run: Run, name: str) -> Table:
             found.exposure, found.signal, found.response, found.segment, found.deviation_percent, found.used
         )
     )
-    return Table(head, rows, f"Signal and response; slopes in DN/{run.unit}")
+    return Listing(head, rows, f"Signal and response; slopes in DN/{run.unit}")
 
 
-def _plots(found: Linearity, run: Run, name: str, full: float) -> tuple[Chart, ...]:
+def _plots(found: Linearity, run: SettingsRun, name: str, full: float) -> tuple[Chart, ...]:
     title = prefix("Linearity", name, run.label)
     low = found.signal < 0.999 * full
     grid = np.linspace(0.0, float(found.exposure[found.used].max()) * 1.05, 60)
     curves = [
-        Curve(found.exposure[k], found.signal[k], label, colour=c)
+        Trace(found.exposure[k], found.signal[k], label, colour=c)
         for k, label, c in ((found.used, "used", 0), (~found.used & low, "not used", 3))
         if k.any()
     ]
-    line = Curve(grid, found.offset + found.slope * grid, "least relative deviations", "dashed", colour=1)
+    line = Trace(grid, found.offset + found.slope * grid, "least relative deviations", "dashed", colour=1)
     caption = f"Linearity error {found.error_percent:.3g} %, from 5 % to 95 % of saturation."
     used = found.used
     return (
@@ -144,6 +144,6 @@ def _plots(found: Linearity, run: Run, name: str, full: float) -> tuple[Chart, .
             "Relative deviation from the line.",
             run.axis,
             "deviation %",
-            (Curve(found.exposure[used], found.deviation_percent[used], style="line and points"),),
+            (Trace(found.exposure[used], found.deviation_percent[used], style="line and points"),),
         ),
     )

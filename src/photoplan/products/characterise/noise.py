@@ -8,7 +8,7 @@ import numpy as np
 
 from photoplan.products.characterise.common import prefix
 from photoplan.products.characterise.data import SeriesData
-from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Trace, joined
 from photoplan.quality.camera.frame_statistics import Level
 
 #: What stands still: between frames of other kinds the scene or its brightness changes.
@@ -22,7 +22,7 @@ def missing(data: SeriesData) -> str | None:
     return "no setting has two frames or more; noise is what changes between them"
 
 
-def analyse(data: SeriesData) -> Outcome:
+def analyse(data: SeriesData) -> Findings:
     """Mean grey value and temporal standard deviation of every setting, by plane."""
     settings = [setting for setting in data.settings(*_KINDS) if len(setting.frames) >= 2]
     levels = [(setting.label, data.levels(setting)) for setting in settings]
@@ -31,7 +31,7 @@ def analyse(data: SeriesData) -> Outcome:
     )
 
 
-def _plane(data: SeriesData, name: str, levels: list[tuple[str, Level]]) -> Outcome:
+def _plane(data: SeriesData, name: str, levels: list[tuple[str, Level]]) -> Findings:
     ordered = sorted(levels, key=lambda item: item[1].mean)
     rows, refused = [], {}
     for label, level in ordered:
@@ -63,10 +63,10 @@ def _plane(data: SeriesData, name: str, levels: list[tuple[str, Level]]) -> Outc
         "mean grey value DN",
         "noise DN",
         (
-            Curve(
+            Trace(
                 x, np.array([row[2] for row in sound_rows]), "measured", sigma=np.array([row[3] for row in sound_rows])
             ),
-            Curve(
+            Trace(
                 np.array([x.min(), x.max()]) if x.size else x,
                 np.full(min(2, 2 * x.size), rounding),
                 "rounding",
@@ -75,6 +75,9 @@ def _plane(data: SeriesData, name: str, levels: list[tuple[str, Level]]) -> Outc
         ),
     )
     caption = "Mean grey value and standard deviation of a pixel (Behr 1989, table 4.2)"
-    return Outcome(
-        tuple(figures), refused, {"levels": Table(head, tuple(rows), caption)}, (chart,) if len(sound_rows) > 1 else ()
+    return Findings(
+        tuple(figures),
+        refused,
+        {"levels": Listing(head, tuple(rows), caption)},
+        (chart,) if len(sound_rows) > 1 else (),
     )

@@ -12,7 +12,7 @@ from photoplan.io.series.pixels import Plane
 from photoplan.plain import plain
 from photoplan.products.characterise.common import black_of, of_one_temperature, prefix, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Trace, joined
 from photoplan.quality.camera.fixed_pattern import (
     PatternVariance,
     Spectrogram,
@@ -47,12 +47,12 @@ def _flats(data: SeriesData) -> list[Setting]:
     return [s for s in data.settings("flat") if len(s.frames) >= 2]
 
 
-def analyse(data: SeriesData) -> Outcome:
+def analyse(data: SeriesData) -> Findings:
     """DSNU and PRNU of every plane."""
     return joined([_plane(data, plane) for plane in data.planes])
 
 
-def _plane(data: SeriesData, plane: Plane) -> Outcome:
+def _plane(data: SeriesData, plane: Plane) -> Findings:
     outcomes = []
     dark: PatternVariance | None = None
     flat = _half_bright(data, plane)
@@ -64,7 +64,7 @@ def _plane(data: SeriesData, plane: Plane) -> Outcome:
             dark = _variance(stack, filtered=False)
     if flat is None:
         why = "no flat frames, two or more at a setting, between 5 % and 95 % of saturation"
-        outcomes.append(Outcome(refused={prefix("PRNU", plane.name): why}))
+        outcomes.append(Findings(refused={prefix("PRNU", plane.name): why}))
     else:
         outcomes.append(tried(prefix("PRNU", plane.name), lambda: _prnu(data, flat, plane, dark)))
     return joined(outcomes)
@@ -101,7 +101,7 @@ def _variance(stack: FrameStack, filtered: bool) -> PatternVariance:
     return pattern_variance(stack.mean, stack.level.temporal_variance, stack.level.frames, filtered=filtered)
 
 
-def _dsnu(stack: FrameStack, plane: Plane, label: str) -> Outcome:
+def _dsnu(stack: FrameStack, plane: Plane, label: str) -> Findings:
     if is_clipped_dark(stack.level):
         raise InputError(
             f"black is cut off: {100 * stack.level.zero_share:.3g} % of the samples are zero, which hides the pattern; "
@@ -116,7 +116,7 @@ def _dsnu(stack: FrameStack, plane: Plane, label: str) -> Outcome:
     )
 
 
-def _prnu(data: SeriesData, flat: Setting, plane: Plane, dark: PatternVariance | None) -> Outcome:
+def _prnu(data: SeriesData, flat: Setting, plane: Plane, dark: PatternVariance | None) -> Findings:
     stack = data.stacks(flat)[plane.name]
     raw = _variance(stack, filtered=False)
     even = _variance(stack, filtered=True)
@@ -133,7 +133,7 @@ def _prnu(data: SeriesData, flat: Setting, plane: Plane, dark: PatternVariance |
         value, sigma = prnu_percent(found, dark if dark is not None else _no_pattern(black))
         figures.append(Figure(kind, value, sigma, "PRNU", "%", name, remark=remark))
     notes = () if dark is not None else (f"{prefix(name, 'PRNU')}: no dark pattern taken out",)
-    whole = Outcome(tuple(figures), notes=notes)
+    whole = Findings(tuple(figures), notes=notes)
     parts = _parts(even, "bright", "bright pattern", name, "%", 100 / signal, flat.label)
     return joined([whole, parts, _spectra(stack, plane, f"flat {name}".strip())])
 
@@ -142,7 +142,7 @@ def _no_pattern(black: float) -> PatternVariance:
     return PatternVariance(0, 0, 0, 0, 0, 0, 0, 0, black, 0, False)
 
 
-def _parts(found: PatternVariance, key: str, words: str, plane: str, unit: str, factor: float, label: str) -> Outcome:
+def _parts(found: PatternVariance, key: str, words: str, plane: str, unit: str, factor: float, label: str) -> Findings:
     """Total, rows, columns and pixels of a pattern as figures, variances as a table."""
     figures = []
     for part, variance, sigma in (
@@ -156,10 +156,10 @@ def _parts(found: PatternVariance, key: str, words: str, plane: str, unit: str, 
         what = f"{words}, {part}s" if part else words
         remark = "not above zero" if variance <= 0 else ""
         figures.append(Figure(name, value * factor, of_value * factor, what, unit, plane, remark=remark))
-    return Outcome(tuple(figures), details={prefix(key, plane).replace(" ", "_"): {**plain(found), "setting": label}})
+    return Findings(tuple(figures), details={prefix(key, plane).replace(" ", "_"): {**plain(found), "setting": label}})
 
 
-def _spectra(stack: FrameStack, of: Plane, title: str) -> Outcome:
+def _spectra(stack: FrameStack, of: Plane, title: str) -> Findings:
     """Spectrograms along rows and columns, with frequencies in pixels of the image."""
     plane = of.name
     along = {way: _of_image(spectrogram(stack.mean, axis), of.step) for way, axis in (("rows", 1), ("columns", 0))}
@@ -177,7 +177,7 @@ def _spectra(stack: FrameStack, of: Plane, title: str) -> Outcome:
         )
         for way, s in along.items()
     ]
-    curves = tuple(Curve(s.frequency, s.amplitude, f"along {way}", "line") for way, s in along.items())
+    curves = tuple(Trace(s.frequency, s.amplitude, f"along {way}", "line") for way, s in along.items())
     chart = Chart(
         f"Spectrogram, {title}",
         "Root of the power; white noise is level, peaks are periodic patterns.",
@@ -186,7 +186,7 @@ def _spectra(stack: FrameStack, of: Plane, title: str) -> Outcome:
         curves,
         log_y=True,
     )
-    return Outcome(tuple(figures), tables={"spectrograms": Table(head, rows, "Spectrograms")}, plots=(chart,))
+    return Findings(tuple(figures), tables={"spectrograms": Listing(head, rows, "Spectrograms")}, plots=(chart,))
 
 
 def _of_image(s: Spectrogram, step: int) -> Spectrogram:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import cast
 
 from photoplan.products.characterise.data import SeriesData
-from photoplan.products.characterise.result import Outcome
+from photoplan.products.characterise.result import Findings
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class Analysis:
         """What the series lacks for it; None: nothing."""
         return cast(Callable[[SeriesData], str | None], self._function("missing"))(data)
 
-    def analyse(self, data: SeriesData) -> Outcome:
+    def analyse(self, data: SeriesData) -> Findings:
         """Run it."""
-        return cast(Callable[[SeriesData], Outcome], self._function("analyse"))(data)
+        return cast(Callable[[SeriesData], Findings], self._function("analyse"))(data)
 
     def _function(self, name: str) -> object:
         return getattr(importlib.import_module(f"photoplan.products.characterise.{self.module}"), name)

@@ -17,7 +17,7 @@ MOST_PIXELS = 900
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class Trace:
     """One series of a chart."""
 
     x: NDArray[np.float64]
@@ -40,7 +40,7 @@ class Chart:
     caption: str
     x_label: str
     y_label: str
-    curves: tuple[Curve, ...]
+    curves: tuple[Trace, ...]
     log_x: bool = False
     log_y: bool = False
     marks: tuple[tuple[float, str], ...] = ()
@@ -48,7 +48,7 @@ class Chart:
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class Plate:
     """An image with a scale, and positions in it."""
 
     title: str
@@ -140,7 +140,7 @@ def _plain(value: float, digits: int) -> str:
 
 
 @dataclass(frozen=True)
-class Table:
+class Listing:
     """Rows of figures; written as CSV and shown in the report."""
 
     head: tuple[str, ...]
@@ -149,15 +149,15 @@ class Table:
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class Findings:
     """What one analysis found."""
 
     figures: tuple[Figure, ...] = ()
     refused: Mapping[str, str] = field(default_factory=dict)
     """Figures that the data do not allow, and why, one sentence each."""
-    tables: Mapping[str, Table] = field(default_factory=dict)
+    tables: Mapping[str, Listing] = field(default_factory=dict)
     """By the stem of their CSV file."""
-    plots: tuple[Chart | Picture, ...] = ()
+    plots: tuple[Chart | Plate, ...] = ()
     notes: tuple[str, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
     """More plain values for JSON."""
@@ -165,15 +165,15 @@ class Outcome:
     """More files by name, written beside the tables: contents, or an image of type float32."""
 
 
-def joined(outcomes: Sequence[Outcome]) -> Outcome:
+def joined(outcomes: Sequence[Findings]) -> Findings:
     """Several outcomes (of planes, of wavelengths) as one; later tables of one name are put below earlier ones."""
-    tables: dict[str, Table] = {}
+    tables: dict[str, Listing] = {}
     for outcome in outcomes:
         for name, table in outcome.tables.items():
             known = tables.get(name)
             rows = table.rows if known is None else known.rows + table.rows
-            tables[name] = Table(table.head, rows, table.caption)
-    return Outcome(
+            tables[name] = Listing(table.head, rows, table.caption)
+    return Findings(
         tuple(f for o in outcomes for f in o.figures),
         {key: why for o in outcomes for key, why in o.refused.items()},
         tables,

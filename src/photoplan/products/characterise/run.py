@@ -19,10 +19,10 @@ from photoplan.io.series.pixels import Plane, grey_step, largest_of_steps
 from photoplan.io.tables import write_table
 from photoplan.io.whole_image import write_whole_image
 from photoplan.plain import pick, plain
-from photoplan.products.characterise.common import Run, black_if_known, exposure_runs
+from photoplan.products.characterise.common import SettingsRun, black_if_known, exposure_runs
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.registry import ANALYSES, Analysis
-from photoplan.products.characterise.result import Figure, Outcome, Table
+from photoplan.products.characterise.result import Figure, Findings, Listing
 from photoplan.quality.camera.saturation import FullWell, find_saturation, full_well
 
 _LEAST = 4
@@ -52,7 +52,7 @@ def full_well_notes(data: SeriesData) -> tuple[str, ...]:
     )
 
 
-def _find(data: SeriesData, run: Run, plane: Plane) -> FullWell | None:
+def _find(data: SeriesData, run: SettingsRun, plane: Plane) -> FullWell | None:
     levels = [data.levels(setting)[plane.name] for setting in run.settings]
     variance = np.array([level.temporal_variance for level in levels])
     try:
@@ -106,7 +106,7 @@ class AnalysisRun:
     """What became of one analysis."""
 
     analysis: Analysis
-    outcome: Outcome | None = None
+    outcome: Findings | None = None
     missing: str | None = None
     """What the series lacks for it."""
     failed: str | None = None
@@ -274,7 +274,7 @@ def _write_files(request: CharacteriseRequest, series: Series, done: Sequence[An
     return written
 
 
-def _figure_table(figures: Sequence[tuple[str, Figure]]) -> Table:
+def _figure_table(figures: Sequence[tuple[str, Figure]]) -> Listing:
     head = ("analysis", "name", "plane", "at", "value", "sigma", "unit", "remark")
     rows = [(name, f.name, f.plane, f.at, plain(f.value), plain(f.sigma), f.unit, f.remark) for name, f in figures]
-    return Table(head, tuple(tuple("" if v is None else v for v in row) for row in rows))
+    return Listing(head, tuple(tuple("" if v is None else v for v in row) for row in rows))

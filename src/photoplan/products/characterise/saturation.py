@@ -7,9 +7,16 @@ from math import isfinite, nan
 import numpy as np
 
 from photoplan.io.series.pixels import Plane
-from photoplan.products.characterise.common import MOST_SATURATED, Run, black_if_known, exposure_runs, prefix, tried
+from photoplan.products.characterise.common import (
+    MOST_SATURATED,
+    SettingsRun,
+    black_if_known,
+    exposure_runs,
+    prefix,
+    tried,
+)
 from photoplan.products.characterise.data import SeriesData
-from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, joined
+from photoplan.products.characterise.result import Chart, Figure, Findings, Trace, joined
 from photoplan.quality.camera.frame_statistics import check_level
 from photoplan.quality.camera.saturation import find_saturation
 
@@ -33,7 +40,7 @@ def missing(data: SeriesData) -> str | None:
     )
 
 
-def analyse(data: SeriesData) -> Outcome:
+def analyse(data: SeriesData) -> Findings:
     """Saturation of every plane and run."""
     return joined(
         [
@@ -44,7 +51,7 @@ def analyse(data: SeriesData) -> Outcome:
     )
 
 
-def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
+def _run(data: SeriesData, run: SettingsRun, plane: Plane) -> Findings:
     levels = [data.levels(setting)[plane.name] for setting in run.settings]
     for level in levels:
         check_level(level)
@@ -62,7 +69,7 @@ def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
         share = levels[-1].saturated_share
         spot = f", {100 * share:.3g} % of its samples are saturated: give them a roi, a mask or brightest"
         why = f"not reached: the brightest level has a mean of {mean[-1]:.4g} DN"
-        return Outcome(refused={key: why + (spot if share > MOST_SATURATED else "")})
+        return Findings(refused={key: why + (spot if share > MOST_SATURATED else "")})
     where = {"plane": plane.name, "at": run.label}
     words = _FULL if found.rule == "clipping" and plane.name in data.wells else _WORDS[found.rule]
     between = f"between {found.last_unsaturated:g} and {found.first_saturated:g} {run.unit}"
@@ -81,8 +88,8 @@ def _run(data: SeriesData, run: Run, plane: Plane) -> Outcome:
         f"Saturated {between}: {words}.",
         run.axis,
         "mean grey value DN",
-        (Curve(x, mean, style="line and points"),),
+        (Trace(x, mean, style="line and points"),),
         log_x=True,
         marks=((found.first_saturated, "saturated"),),
     )
-    return Outcome(tuple(figures), plots=(chart,), details={key.replace(" ", "_"): found})
+    return Findings(tuple(figures), plots=(chart,), details={key.replace(" ", "_"): found})

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
-from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Trace, joined
 from photoplan.products.characterise.targets import locate_targets
 from photoplan.quality.camera.stage import LEAST_POINTS, StageCalibration, b4_lines, stage_calibration
 
@@ -37,7 +37,7 @@ def missing(data: SeriesData) -> str | None:
     return f"{LEAST_POINTS} or more stage frames with stage_x and stage_y, or a table of positions of kind stage"
 
 
-def analyse(data: SeriesData) -> Outcome:
+def analyse(data: SeriesData) -> Findings:
     """Affine transformation between stage and image, for every target and table."""
     points = [p for group in frame_groups(data, "stage") for p in _of_frames(data, group)]
     points += [
@@ -90,7 +90,7 @@ def _of_frames(data: SeriesData, group: FrameGroup) -> list[_Points]:
     return out
 
 
-def _outcome(found: StageCalibration, given: _Points, number: int) -> Outcome:
+def _outcome(found: StageCalibration, given: _Points, number: int) -> Findings:
     at, unit, f = given.label, given.unit, found.facts
     n = len(found.names) - len(found.gross)
 
@@ -117,13 +117,13 @@ def _outcome(found: StageCalibration, given: _Points, number: int) -> Outcome:
     ]
     points = tuple(_row(found, at, k) for k in range(len(found.names)))
     head = ("series", "point", "stage_x", "stage_y", "x_px", "y_px", "residual_x_px", "residual_y_px", "remark")
-    return Outcome(
+    return Findings(
         tuple(figures),
         tables={
-            "matrices": Table(
+            "matrices": Listing(
                 ("series", "way", "a1", "a2", "a3", "b1", "b2", "b3"), tuple(matrices), "Affine matrices"
             ),
-            "points": Table(head, points, "Points, residuals measured minus transformed"),
+            "points": Listing(head, points, "Points, residuals measured minus transformed"),
         },
         plots=(_chart(found, at),),
         notes=(*given.notes, *_notes(found, at)),
@@ -159,5 +159,5 @@ def _chart(found: StageCalibration, at: str) -> Chart:
         f"{found.sigma[1]:.2f} px (Behr 1989, figs. B.2 and B.3).",
         "column px",
         "row px (upwards in the figure)",
-        (Curve(x, y, "points", "points"), Curve(x, y, "residuals", vectors=found.residuals)),
+        (Trace(x, y, "points", "points"), Trace(x, y, "residuals", vectors=found.residuals)),
     )

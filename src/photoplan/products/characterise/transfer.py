@@ -8,7 +8,7 @@ from photoplan.io.series.pixels import Plane
 from photoplan.io.series.statistics import ReducedPoint
 from photoplan.products.characterise.common import dark_levels, prefix, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Trace, joined
 from photoplan.quality.camera.frame_statistics import Level
 from photoplan.quality.camera.photon_transfer import PhotonTransfer, photon_transfer
 
@@ -26,7 +26,7 @@ def missing(data: SeriesData) -> str | None:
     return f"{len(pairs)} settings with two flat frames or more{more}; photon transfer needs {_LEAST} of different mean"
 
 
-def analyse(data: SeriesData) -> Outcome:
+def analyse(data: SeriesData) -> Findings:
     """Gain, read noise and full well with sigmas, of every plane."""
     if data.series.reduced_of("flat"):
         bright = [reduced_level(data, point) for point in data.series.reduced_of("flat")]
@@ -37,7 +37,7 @@ def analyse(data: SeriesData) -> Outcome:
     return joined([_of_frames(data, plane, flats) for plane in data.planes])
 
 
-def _of_frames(data: SeriesData, plane: Plane, flats: list[Setting]) -> Outcome:
+def _of_frames(data: SeriesData, plane: Plane, flats: list[Setting]) -> Findings:
     bright, dark = [data.levels(setting)[plane.name] for setting in flats], dark_levels(data, plane, flats[0])
     return tried(prefix("gain", plane.name), lambda: _plane(plane.name, bright, dark, data))
 
@@ -50,7 +50,7 @@ def reduced_level(data: SeriesData, point: ReducedPoint) -> Level:
     )
 
 
-def _plane(name: str, bright: list[Level], dark: tuple[list[Level], list[float]], data: SeriesData) -> Outcome:
+def _plane(name: str, bright: list[Level], dark: tuple[list[Level], list[float]], data: SeriesData) -> Findings:
     black = data.series.camera.black_level_dn
     stated = "black_level_dn" in data.series.camera.model_fields_set
     found = photon_transfer(bright, *dark, black if stated else float("nan"), data.step)
@@ -90,10 +90,14 @@ def _plane(name: str, bright: list[Level], dark: tuple[list[Level], list[float]]
     rows = tuple(
         (name, m, v, int(u)) for m, v, u in zip(found.mean.tolist(), found.variance.tolist(), found.used.tolist())
     )
-    return Outcome(
+    return Findings(
         tuple(figures),
         refused,
-        {"levels": Table(("plane", "mean_dn", "variance_dn2", "used"), rows, "Levels and whether the line uses them")},
+        {
+            "levels": Listing(
+                ("plane", "mean_dn", "variance_dn2", "used"), rows, "Levels and whether the line uses them"
+            )
+        },
         _plots(found, name, data.step),
         details={f"photon_transfer{name and f'_{name}'}": found},
     )
@@ -108,16 +112,16 @@ def _plots(found: PhotonTransfer, name: str, step: float) -> tuple[Chart, ...]:
     least = max(0.1 * step, 1e-5 * float(signal.max()))
     seen = (signal > least) & (found.variance > 0)
     grid = np.geomspace(max(float(signal[seen].min()), least), float(signal.max()), 100)
-    curves = [Curve(signal[found.used], found.variance[found.used], "used", colour=0)]
+    curves = [Trace(signal[found.used], found.variance[found.used], "used", colour=0)]
     if rest.any():
-        curves.append(Curve(signal[rest], found.variance[rest], "not used", colour=3))
-    line = Curve(grid, found.line.at(grid + bias), "line", "dashed", colour=1)
+        curves.append(Trace(signal[rest], found.variance[rest], "not used", colour=3))
+    line = Trace(grid, found.line.at(grid + bias), "line", "dashed", colour=1)
     log = [
-        Curve(signal[k], np.sqrt(found.variance[k]), label, colour=c)
+        Trace(signal[k], np.sqrt(found.variance[k]), label, colour=c)
         for k, label, c in ((found.used & seen, "used", 0), (rest & seen, "not used", 3))
         if k.any()
     ]
-    model = Curve(
+    model = Trace(
         grid,
         np.sqrt(np.maximum(found.line.at(grid + bias), 1e-9 * step**2)),
         "√(read² + K · signal)",

@@ -12,7 +12,7 @@ from photoplan.errors import InputError
 from photoplan.io.series.positions import MeasuredPositions
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
-from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Trace, joined
 from photoplan.products.characterise.targets import locate_targets
 from photoplan.quality.camera.approach import LEAST_VALUES
 from photoplan.quality.camera.warm_up import Course, WarmUp, warm_up
@@ -51,7 +51,7 @@ def missing(data: SeriesData) -> str | None:
     return f"target frames (or a table of positions) at {LEAST_VALUES} or more times after switching on"
 
 
-def analyse(data: SeriesData) -> Outcome:
+def analyse(data: SeriesData) -> Findings:
     """Shift, scale and rotation of every entry and table over time."""
     inputs = [_of_frames(data, group) for group in frame_groups(data, "target")]
     inputs += [_of_table(p) for p in data.series.positions if p.entry.kind == "target"]
@@ -126,7 +126,7 @@ def _of_table(table: MeasuredPositions) -> _Input:
     return _Input(table.label, times, positions, None, "first", BOUND)
 
 
-def _outcome(found: WarmUp, given: _Input) -> Outcome:
+def _outcome(found: WarmUp, given: _Input) -> Findings:
     at, nan = given.label, math.nan
     figures: list[Figure] = []
     refused: dict[str, str] = {}
@@ -159,8 +159,8 @@ def _outcome(found: WarmUp, given: _Input) -> Outcome:
         f"row {found.centre[1]:.0f}",
         *(f"{at}: {note}" for note in found.notes),
     )
-    table = Table(head, rows, "Parameters by epoch (shifts px, scales in parts, angles rad)")
-    return Outcome(tuple(figures), refused, {"epochs": table}, _charts(found, at), notes)
+    table = Listing(head, rows, "Parameters by epoch (shifts px, scales in parts, angles rad)")
+    return Findings(tuple(figures), refused, {"epochs": table}, _charts(found, at), notes)
 
 
 def _course(course: Course, at: str, bound: float) -> tuple[list[Figure], dict[str, str]]:
@@ -203,15 +203,15 @@ def _charts(found: WarmUp, at: str) -> tuple[Chart, ...]:
         curves = []
         for k, c in enumerate(courses):
             factor, unit = _UNITS[c.unit]
-            curves.append(Curve(minutes, factor * c.values, _LABELS[c.name], "points", factor * c.sigmas, colour=k))
+            curves.append(Trace(minutes, factor * c.values, _LABELS[c.name], "points", factor * c.sigmas, colour=k))
             if c.approach is not None and c.approach.change is not None:
-                curves.append(Curve(curve / 60.0, factor * c.approach.at(curve), "", "line", colour=k))
+                curves.append(Trace(curve / 60.0, factor * c.approach.at(curve), "", "line", colour=k))
         if curves:
             caption = "Measured with standard deviations, and the exponential course where there is one (Behr 1989, "
             caption += "fig. 4.2)."
             charts.append(Chart(f"Warm-up, {what}, {at}", caption, "minutes", f"{what} {unit}", tuple(curves)))
     moved = [
-        Curve(
+        Trace(
             minutes,
             t.shift[:, axis],
             f"{t.name}, {'column' if axis == 0 else 'row'}",

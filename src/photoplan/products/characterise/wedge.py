@@ -13,7 +13,7 @@ from photoplan.io.series.file import Frame
 from photoplan.io.series.pixels import Plane, plane_pixels
 from photoplan.products.characterise.common import black_of, prefix, saturation_of, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Chart, Curve, Figure, Outcome, Table, joined
+from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Trace, joined
 from photoplan.quality.camera.frame_statistics import Level, StackSums
 from photoplan.quality.camera.straight_line import GreyWedge, grey_wedge
 
@@ -39,7 +39,7 @@ def missing(data: SeriesData) -> str | None:
     )
 
 
-def analyse(data: SeriesData) -> Outcome:
+def analyse(data: SeriesData) -> Findings:
     """Characteristic curve of every plane and illumination."""
     outcomes = []
     for plane in data.planes:
@@ -81,7 +81,7 @@ def _patches(data: SeriesData, setting: Setting, plane: Plane) -> list[_Patch]:
     return found
 
 
-def _curve(data: SeriesData, patches: list[_Patch], plane: Plane, label: str) -> Outcome:
+def _curve(data: SeriesData, patches: list[_Patch], plane: Plane, label: str) -> Findings:
     blacks = [black_of(data, patch.setting, plane) for patch in patches]
     signal = [patch.level.mean - black.mean for patch, black in zip(patches, blacks)]
     sigma = [
@@ -104,9 +104,9 @@ def _curve(data: SeriesData, patches: list[_Patch], plane: Plane, label: str) ->
         for d, t, y, u in zip(found.density, found.transmission, found.signal, found.used)
     )
     head = ("plane", "at", "density", "transmission", "signal_dn", "used")
-    return Outcome(
+    return Findings(
         figures,
-        tables={"patches": Table(head, rows, "Patches of the wedge")},
+        tables={"patches": Listing(head, rows, "Patches of the wedge")},
         plots=(_plot(found, prefix("Grey wedge", plane.name, label)),),
         details={prefix("wedge", plane.name, label).replace(" ", "_"): found},
     )
@@ -120,7 +120,7 @@ def _plot(found: GreyWedge, title: str) -> Chart:
         "density",
         "signal DN",
         (
-            Curve(found.density, found.signal, "measured", "line and points"),
-            Curve(grid, found.slope * 10.0**-grid, "proportional", "dashed"),
+            Trace(found.density, found.signal, "measured", "line and points"),
+            Trace(grid, found.slope * 10.0**-grid, "proportional", "dashed"),
         ),
     )

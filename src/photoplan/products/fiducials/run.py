@@ -13,7 +13,7 @@ import numpy as np
 from photoplan.errors import InputError, PhotoplanError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.camera.file import read_cameras
-from photoplan.io.camera.model import FilmCamera, FrameCamera
+from photoplan.io.camera.model import FilmCamera, FrameEntry
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
@@ -231,7 +231,7 @@ def _jobs(request: FiducialsRequest, project: Project | None) -> list[_Job]:
 
 
 def _film_camera(path: Path, wanted: str | None) -> tuple[str, FilmCamera]:
-    cameras: Mapping[str, FilmCamera | FrameCamera] = read_cameras(path).cameras
+    cameras: Mapping[str, FilmCamera | FrameEntry] = read_cameras(path).cameras
     film = {name: camera for name, camera in cameras.items() if isinstance(camera, FilmCamera)}
     listed = ", ".join(map(repr, film)) or "none"
     if wanted is not None:

@@ -14,7 +14,7 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import height_label
 from photoplan.io.camera.file import CameraFile, read_cameras
-from photoplan.io.camera.model import FilmCamera, FrameCamera, Triple
+from photoplan.io.camera.model import FilmCamera, FrameEntry, Triple
 from photoplan.io.camera.opensfm import resized
 from photoplan.io.names import check_input_name, match_key, relative_path
 from photoplan.io.orientation.file import read_orientation
@@ -189,9 +189,9 @@ def _cameras(
     cameras: CameraFile,
     infos: dict[Path, RasterInfo],
     table: Path | None,
-) -> dict[str, tuple[str, FrameCamera | FilmCamera]]:
+) -> dict[str, tuple[str, FrameEntry | FilmCamera]]:
     """Camera (name and description) of every image name; sizes agree with the files'."""
-    used: dict[str, tuple[str, FrameCamera | FilmCamera]] = {}
+    used: dict[str, tuple[str, FrameEntry | FilmCamera]] = {}
     sizes: dict[str, tuple[tuple[int, int], Path]] = {}
     for file, image in pairs:
         size = infos[file].size
@@ -200,7 +200,7 @@ def _cameras(
         else:
             name = camera_name(image, cameras, table)
         camera = cameras.cameras[name]
-        if isinstance(camera, FrameCamera):
+        if isinstance(camera, FrameEntry):
             before = sizes.setdefault(name, (size, file))
             if cameras.normalised and size == before[0]:
                 camera = resized(camera, size, f"{file}: camera {name!r}")
@@ -218,7 +218,7 @@ def _checked(
     terrain: Terrain | None,
     systems: tuple[str | None, str],
     crs: str,
-    cameras: dict[str, FrameCamera | FilmCamera],
+    cameras: dict[str, FrameEntry | FilmCamera],
     images: list[Image],
 ) -> Project:
     """The project, checked as if it had been read."""
@@ -262,7 +262,7 @@ def _present(file: Path, folder: Path, *, or_folder: bool = False) -> str:
 
 
 def _summary(
-    used: dict[str, tuple[str, FrameCamera | FilmCamera]],
+    used: dict[str, tuple[str, FrameEntry | FilmCamera]],
     pairs: Sequence[tuple[Path, OrientedImage | Unoriented]],
     crs: str,
     lonely: tuple[list[Path], list[str]],

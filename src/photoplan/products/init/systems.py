@@ -68,7 +68,7 @@ class Systems(Protocol):
 
 
 @dataclass(frozen=True)
-class TerrainFacts:
+class TerrainSource:
     """What a terrain file states of its systems."""
 
     path: Path
@@ -76,15 +76,15 @@ class TerrainFacts:
     vertical_crs: str | None
 
 
-def _terrain_facts(file: Path) -> TerrainFacts:
+def _terrain_facts(file: Path) -> TerrainSource:
     if is_terrain_model(file):
         header = ModelReader(file).header
-        return TerrainFacts(file, header.crs, header.height_system)
+        return TerrainSource(file, header.crs, header.height_system)
     info = read_info(file)
-    return TerrainFacts(info.path, info.crs, info.vertical_crs)
+    return TerrainSource(info.path, info.crs, info.vertical_crs)
 
 
-def terrain_entry(request: Systems) -> tuple[Terrain | None, TerrainFacts | None]:
+def terrain_entry(request: Systems) -> tuple[Terrain | None, TerrainSource | None]:
     """The terrain entry (height system still open) and the facts of its file.
 
     Raises
@@ -114,7 +114,7 @@ def terrain_entry(request: Systems) -> tuple[Terrain | None, TerrainFacts | None
     return Terrain(file=relative_path(file.absolute(), request.folder), crs=crs), replace(info, crs=stated)
 
 
-def project_crs(request: Systems, table: OrientationTable | None, terrain: TerrainFacts | None) -> tuple[str, str]:
+def project_crs(request: Systems, table: OrientationTable | None, terrain: TerrainSource | None) -> tuple[str, str]:
     """The project's CRS and where it comes from.
 
     Raises
@@ -145,7 +145,7 @@ def _horizontal(text: str) -> str:
 
 
 def height_systems(
-    request: Systems, table: OrientationTable | None, terrain: TerrainFacts | None
+    request: Systems, table: OrientationTable | None, terrain: TerrainSource | None
 ) -> tuple[str | None, str]:
     """Height systems of terrain and orientation (with that of control): as declared, else as the files state.
 

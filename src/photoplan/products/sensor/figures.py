@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import degrees, radians
 
 from photoplan.errors import InputError
-from photoplan.io.sensor_file import Chip, Noise, Optics, Picture, SensorDescription, Transfer, Video, Viewing
+from photoplan.io.sensor_file import Chip, Noise, OpticsEntry, PictureEntry, SensorDescription, Transfer, Video, Viewing
 from photoplan.quality.sensor import figures as sensor
 from photoplan.quality.sensor import noise as sensor_noise
 from photoplan.quality.sensor import video_norm
@@ -21,7 +21,7 @@ SHARES = (0.25, 0.5, 0.75, 1.0)
 
 
 @dataclass(frozen=True)
-class Figure:
+class SensorFigure:
     """One figure of a sensor."""
 
     section: str
@@ -41,7 +41,7 @@ class Figure:
 Found = Iterator[tuple[str, str, float, str, str]]
 
 
-def sensor_figures(described: SensorDescription, file: str) -> tuple[Figure, ...]:
+def sensor_figures(described: SensorDescription, file: str) -> tuple[SensorFigure, ...]:
     """Every figure that a description determines, in the order of its tables.
 
     Parameters
@@ -70,7 +70,7 @@ def sensor_figures(described: SensorDescription, file: str) -> tuple[Figure, ...
         parts.append(("noise", _noise(described)))
     if described.optics is not None:
         parts.append(("optics", _optics(described.optics, described.sensor)))
-    found = [Figure(section, *figure) for section, figures in parts for figure in figures]
+    found = [SensorFigure(section, *figure) for section, figures in parts for figure in figures]
     names = {figure.name for figure in found}
     for name in described.stated:
         if name not in names:
@@ -79,7 +79,8 @@ def sensor_figures(described: SensorDescription, file: str) -> tuple[Figure, ...
                 f"{', '.join(sorted(names)) or 'none'}"
             )
     return tuple(
-        Figure(f.section, f.name, f.meaning, f.value, f.unit, f.source, described.stated.get(f.name)) for f in found
+        SensorFigure(f.section, f.name, f.meaning, f.value, f.unit, f.source, described.stated.get(f.name))
+        for f in found
     )
 
 
@@ -141,7 +142,7 @@ def _chip(table: Chip) -> Found:
             yield name, f"{words}, {along}", mtf, "", "|sinc(f w)|"
 
 
-def _picture(table: Picture, chip: Chip | None) -> Found:
+def _picture(table: PictureEntry, chip: Chip | None) -> Found:
     for k, (axis, along) in enumerate(zip(_AXES, _ALONG)):
         if table.pixels is not None:
             pairs = sensor.line_resolution(table.pixels[k])
@@ -175,7 +176,7 @@ def _picture(table: Picture, chip: Chip | None) -> Found:
             yield from _jitter(table.jitter_ns * 1e-9, table.sampling_mhz * 1e6, table)
 
 
-def _pixel(table: Picture, axis: int) -> float | None:
+def _pixel(table: PictureEntry, axis: int) -> float | None:
     if table.pixel_um is not None:
         return table.pixel_um[axis]
     if table.reference_mm is None or table.reference_pixels is None:
@@ -183,7 +184,7 @@ def _pixel(table: Picture, axis: int) -> float | None:
     return sensor.pixel_um(table.reference_mm, table.reference_pixels[axis])
 
 
-def _jitter(jitter_s: float, sampling_hz: float, table: Picture) -> Found:
+def _jitter(jitter_s: float, sampling_hz: float, table: PictureEntry) -> Found:
     shift = sensor.jitter_pixels(jitter_s, sampling_hz)
     yield "jitter_px", "error of position by jitter", shift, "px", "Behr 1989, eq. 4.5 (product)"
     step = table.grey_step if table.grey_step is not None else 2.0**table.bits - 1.0 if table.bits else None
@@ -277,7 +278,7 @@ def _noise(described: SensorDescription) -> Found:
         yield "dynamic_range", "full well through the noise without light", spread, "", "full well / noise in the dark"
 
 
-def _optics(table: Optics, chip: Chip | None) -> Found:
+def _optics(table: OpticsEntry, chip: Chip | None) -> Found:
     cutoff = sensor.diffraction_cutoff(table.f_number, table.wavelength_nm)
     yield "diffraction_limit_lp_mm", "diffraction limit of the lens", cutoff, "LP/mm", "1 / (λ N)"
     airy = 2.44 * table.wavelength_nm * table.f_number / 1000.0

@@ -11,7 +11,7 @@ from pathlib import Path
 from photoplan.io.disk import write_atomically
 from photoplan.io.product import check_output
 from photoplan.io.sensor_file import SensorDescription, read_sensor
-from photoplan.products.sensor.figures import Figure, sensor_figures
+from photoplan.products.sensor.figures import SensorFigure, sensor_figures
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class SensorReport:
     """Figures of a sensor."""
 
     described: SensorDescription
-    figures: tuple[Figure, ...]
+    figures: tuple[SensorFigure, ...]
     csv: Path | None
     """Table that was written."""
 
@@ -81,7 +81,7 @@ def describe_sensor(request: SensorRequest) -> SensorReport:
     return SensorReport(described, figures, written)
 
 
-def _table(figures: Sequence[Figure]) -> str:
+def _table(figures: Sequence[SensorFigure]) -> str:
     """Figures as comma-separated values."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")

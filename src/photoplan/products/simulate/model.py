@@ -7,12 +7,12 @@ from typing import Any
 from photoplan.errors import InputError
 from photoplan.io.simulation_file import SimulationFile
 from photoplan.quality.formation.model import ImageModel
-from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitter, Spread
+from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitterPart, Spread
 from photoplan.quality.formation.sensor_parts import (
     AutomaticGain,
-    DarkCurrent,
-    Defect,
-    Enhancement,
+    DarkCurrentPart,
+    DefectPart,
+    EnhancementPart,
     Exposure,
     FixedPattern,
     Gain,
@@ -26,19 +26,19 @@ _PARTS: dict[str, Any] = {
     "spread": Spread,
     "aperture": Aperture,
     "falloff": Falloff,
-    "jitter": LineJitter,
+    "jitter": LineJitterPart,
     "exposure": Exposure,
-    "dark": DarkCurrent,
+    "dark": DarkCurrentPart,
     "fixed_pattern": FixedPattern,
     "well": Well,
     "readout": Readout,
     "gain": Gain,
     "automatic_gain": AutomaticGain,
-    "enhancement": Enhancement,
+    "enhancement": EnhancementPart,
     "tone": Tone,
     "quantisation": Quantisation,
 }
-_LISTS: dict[str, Any] = {"lateral": Lateral, "defects": Defect}
+_LISTS: dict[str, Any] = {"lateral": Lateral, "defects": DefectPart}
 
 
 def model_of(described: SimulationFile, source: str) -> ImageModel:

@@ -22,7 +22,7 @@ from photoplan.io.whole_image import write_whole_image
 from photoplan.plain import pick
 from photoplan.products.simulate.model import model_of
 from photoplan.quality.formation.model import MOST_PIXELS, FormedImage, ImageModel, form_series
-from photoplan.quality.formation.scenes import PATTERNS, PatternScene, Scene, parse_pattern
+from photoplan.quality.formation.scenes import PATTERNS, LightScene, PatternScene, parse_pattern
 from photoplan.quality.formation.sensor_parts import Quantisation
 from photoplan.quality.formation.truth import model_mtf50
 
@@ -188,7 +188,7 @@ def simulate(
     return report
 
 
-def _frames(model: ImageModel, scene: Scene, exposures: list[float]) -> Iterator[FormedImage]:
+def _frames(model: ImageModel, scene: LightScene, exposures: list[float]) -> Iterator[FormedImage]:
     try:
         yield from form_series(model, scene, exposures)
     except MemoryError:
@@ -215,10 +215,10 @@ def _model(request: SimulateRequest) -> tuple[ImageModel, str]:
     return model, dtype or ("uint8" if bits <= 8 else "uint16")
 
 
-def _scene(request: SimulateRequest, model: ImageModel) -> Scene:
+def _scene(request: SimulateRequest, model: ImageModel) -> LightScene:
     pattern = parse_pattern(request.scene)
     k = request.oversampling
-    scene: Scene
+    scene: LightScene
     if pattern is None:
         if request.size is not None or request.levels is not None or request.phase is not None:
             raise UsageError(f"`size`, `levels` and `phase` are for patterns ({', '.join(PATTERNS)}), not for files")
@@ -298,7 +298,7 @@ def _tags(request: SimulateRequest, model: ImageModel, frame: int) -> dict[str, 
     }
 
 
-def _notes(scene: Scene, dtype: str, images: list[SimulatedImage]) -> Iterator[str]:
+def _notes(scene: LightScene, dtype: str, images: list[SimulatedImage]) -> Iterator[str]:
     """What a user should know."""
     clipped = [i for i in images if i.facts.get("saturated_pixels")]
     if clipped:

@@ -12,8 +12,8 @@ from scipy import ndimage
 from photoplan.adjustment.robust import spread
 from photoplan.errors import GeometryError, InputError
 from photoplan.quality.camera.fall_off_adjust import (
+    FallOffFit,
     FallOffSettings,
-    Fit,
     adjust,
     columns,
     separability,
@@ -192,7 +192,7 @@ def _checked(flat: NDArray[np.floating], saturation: float | None) -> Blocks:
     return blocks
 
 
-def _rank(fit: Fit, shares: dict[str, float], settings: FallOffSettings) -> str:
+def _rank(fit: FallOffFit, shares: dict[str, float], settings: FallOffSettings) -> str:
     """Which unknowns cannot be told apart; empty: none."""
     sigmas = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
     lost = [
@@ -212,7 +212,7 @@ def _rank(fit: Fit, shares: dict[str, float], settings: FallOffSettings) -> str:
 
 
 def _result(
-    blocks: Blocks, settings: FallOffSettings, fit: Fit, of_corners: Array, rank: tuple[str, dict[str, float]]
+    blocks: Blocks, settings: FallOffSettings, fit: FallOffFit, of_corners: Array, rank: tuple[str, dict[str, float]]
 ) -> FallOff:
     k, level = len(fit.free), float(fit.linear[0])
     factors = fit.linear[1:] / level
@@ -254,7 +254,7 @@ def _corner_places(size: tuple[int, int]) -> tuple[Array, Array]:
     return np.array([0.0, right, 0.0, right]), np.array([0.0, 0.0, lower, lower])
 
 
-def _corner_sigmas(fit: Fit, size: tuple[int, int]) -> Array:
+def _corner_sigmas(fit: FallOffFit, size: tuple[int, int]) -> Array:
     """Standard deviations of the brightness in the corners, by differences."""
     x, y = _corner_places(size)
     unit, k = half_diagonal(size), len(fit.free)

@@ -59,7 +59,7 @@ class FallOffSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class FallOffFit:
     """Unknowns: those of the natural part first (log of the camera constant, point), then level and level · terms."""
 
     point: tuple[float, float]
@@ -85,7 +85,7 @@ def columns(blocks: Blocks, point: tuple[float, float], c: float | None, terms: 
 
 def adjust(
     blocks: Blocks, settings: FallOffSettings, terms: tuple[tuple[int, int], ...], weights: Array | None = None
-) -> Fit:
+) -> FallOffFit:
     """Gauss-Newton for the unknowns of the natural part beside the linear ones.
 
     Weights are those of the blocks, shape (n,); None: all equal.
@@ -116,7 +116,7 @@ def adjust(
     fit = solve(A, y, w)
     linear, residuals = fit.unknowns, -fit.residuals
     J = np.column_stack([_derivatives(blocks, (point, c), (terms, linear), free), A]) if free else A
-    return Fit(point, c, terms, linear, _covariance(blocks, J, residuals, w), w, residuals, free)
+    return FallOffFit(point, c, terms, linear, _covariance(blocks, J, residuals, w), w, residuals, free)
 
 
 def _start_constant(blocks: Blocks, point: tuple[float, float]) -> float:
@@ -182,7 +182,7 @@ def _covariance(blocks: Blocks, J: Array, residuals: Array, w: Array) -> Array:
     return solve(J, residuals, w).cofactors * variance * blocks.inflation(np.where(used, residuals, np.nan))
 
 
-def separability(blocks: Blocks, fit: Fit) -> dict[str, float]:
+def separability(blocks: Blocks, fit: FallOffFit) -> dict[str, float]:
     """For each estimated unknown, the sine of the angle between its effect and what all others can do."""
     J = _derivatives(blocks, (fit.point, fit.camera_constant), (fit.terms, fit.linear), fit.free)
     A = columns(blocks, fit.point, fit.camera_constant, fit.terms)
@@ -194,7 +194,7 @@ def separability(blocks: Blocks, fit: Fit) -> dict[str, float]:
     return shares
 
 
-def significant(blocks: Blocks, fit: Fit) -> tuple[tuple[int, int], ...]:
+def significant(blocks: Blocks, fit: FallOffFit) -> tuple[tuple[int, int], ...]:
     """Terms that are significant after all of lower degree, and those of the same direction below them."""
     if not fit.terms:
         return ()
@@ -209,7 +209,7 @@ def significant(blocks: Blocks, fit: Fit) -> tuple[tuple[int, int], ...]:
     return tuple(t for t in fit.terms if any(s[1] == t[1] and s[0] >= t[0] for s in strong))
 
 
-def weakest(fit: Fit) -> tuple[int, int] | None:
+def weakest(fit: FallOffFit) -> tuple[int, int] | None:
     """The least significant term of those that are the highest of their direction; None: all of these count.
 
     What `significant` keeps may have carried a part of terms of higher degree, since terms are not at right angles to

@@ -13,7 +13,7 @@ from photoplan.adjustment.chances import chance_t
 from photoplan.adjustment.robust import spread
 from photoplan.errors import InputError
 from photoplan.quality.camera.line_period import (
-    Adjusted,
+    AdjustedPeriod,
     Harmonic,
     Spectrum,
     Waves,
@@ -184,7 +184,7 @@ def _base(t: Array, degree: int, lines: int) -> tuple[Array, Array]:
     return np.asarray(np.polynomial.legendre.legvander(u, degree), float), np.where(t % 2 == 0, -0.5, 0.5)
 
 
-def _chosen(t: Array, y: Array, degree: int | None, lines: int) -> tuple[int, Adjusted, Spectrum]:
+def _chosen(t: Array, y: Array, degree: int | None, lines: int) -> tuple[int, AdjustedPeriod, Spectrum]:
     """Degree of the polynomial with the adjustment, and the spectrum beside this polynomial."""
     waves = Waves(t)
     tried = {d: _adjusted(waves, t, y, (d, lines)) for d in ([degree] if degree else range(1, _MOST_DEGREE + 1))}
@@ -198,7 +198,7 @@ def _chosen(t: Array, y: Array, degree: int | None, lines: int) -> tuple[int, Ad
     return best, *tried[best]
 
 
-def _adjusted(waves: Waves, t: Array, y: Array, shape: tuple[int, int]) -> tuple[Adjusted, Spectrum]:
+def _adjusted(waves: Waves, t: Array, y: Array, shape: tuple[int, int]) -> tuple[AdjustedPeriod, Spectrum]:
     """Oscillations one after the other, each searched beside all that were found before."""
     base = np.column_stack(_base(t, *shape))
     first = found = spectrum(waves, y, base)

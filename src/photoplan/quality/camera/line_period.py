@@ -144,7 +144,7 @@ def _explained(c: Array, s: Array, Q: Array, rest: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Adjusted:
+class AdjustedPeriod:
     """Base functions and oscillations adjusted together."""
 
     unknowns: Array
@@ -157,7 +157,7 @@ class Adjusted:
     """Standard deviation of one value."""
 
 
-def adjust_periods(t: Array, y: Array, base: Array, frequencies: list[float], chances: list[float]) -> Adjusted:
+def adjust_periods(t: Array, y: Array, base: Array, frequencies: list[float], chances: list[float]) -> AdjustedPeriod:
     """Adjust the base functions and the frequency, amplitude and phase of every oscillation by least squares.
 
     Parameters
@@ -190,7 +190,7 @@ def adjust_periods(t: Array, y: Array, base: Array, frequencies: list[float], ch
     sigma0 = math.sqrt(found.square / max(len(t) - J.shape[1], 1))
     covariance = solve(J, y).cofactors * sigma0**2
     harmonics = tuple(_harmonic(i, k, f, found.unknowns, covariance, middle, chances) for i in range(len(f)))
-    return Adjusted(found.unknowns[:k], np.sqrt(np.diag(covariance)[:k]), harmonics, found.residuals, sigma0)
+    return AdjustedPeriod(found.unknowns[:k], np.sqrt(np.diag(covariance)[:k]), harmonics, found.residuals, sigma0)
 
 
 def _design(t: Array, base: Array, f: Array) -> Array:

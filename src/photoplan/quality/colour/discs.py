@@ -196,11 +196,11 @@ def _located(
     if np.isnan(grey).any():
         return "pixels without value"
     used, index = np.unique(number, return_inverse=True)
-    fit = _Fit(x[near] - x0, y[near] - y0, grey, index, used.size)
+    fit = _DiscFit(x[near] - x0, y[near] - y0, grey, index, used.size)
     return fit.run(start, settings)
 
 
-class _Fit:
+class _DiscFit:
     """Gauss-Newton of one disc.
 
     Unknown: centre, size, two of the shape, blur, and per plane the grey of the ground with its slopes and the step.

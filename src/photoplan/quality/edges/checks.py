@@ -66,7 +66,7 @@ class EdgeSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Residuals:
+class EdgeResiduals:
     """What a profile leaves of the pixels, relative to the step, with where they are; shape (n,) each."""
 
     across: NDArray[np.float64]
@@ -185,7 +185,7 @@ def grain(pixels: NDArray[np.float64], along: NDArray[np.float64], across: NDArr
     return spread(steps) / float(np.sqrt(2.0)) if steps.size else 0.0
 
 
-def check_line(residuals: Residuals, most: float, curve: int) -> float:
+def check_line(residuals: EdgeResiduals, most: float, curve: int) -> float:
     """Root mean square deviation of the edge from its line beyond noise, pixels; refuse a bent edge.
 
     Each row's shift is that of least squares, Σ r · LSF / Σ LSF²; shifts of the rows are compared with what the pixels'
@@ -216,7 +216,7 @@ def check_line(residuals: Residuals, most: float, curve: int) -> float:
     return deviation
 
 
-def check_sides(residuals: Residuals, most: float) -> float:
+def check_sides(residuals: EdgeResiduals, most: float) -> float:
     """Structure beside the edge that noise does not explain, root mean square relative to the step; refuse too much.
 
     Means over squares of 5 × 5 pixels on either side are compared with the noise of single pixels, which follows from

@@ -159,7 +159,7 @@ def fit_line(
     line, model, levels
         Levels: dark, step, then the slopes of the dark and of the bright side along the edge.
     """
-    start = _State(line, _first_blur(pixels, line))
+    start = _LineState(line, _first_blur(pixels, line))
     state = levenberg(
         start,
         lambda state: _linearised(pixels, state, curve, shading)[:2],
@@ -170,21 +170,21 @@ def fit_line(
 
 
 @dataclass(frozen=True)
-class _State:
+class _LineState:
     line: EdgeLine
     blur: float
 
-    def moved(self, step: NDArray[np.float64], curve: int) -> _State:
+    def moved(self, step: NDArray[np.float64], curve: int) -> _LineState:
         old = self.line
         bend = old.bend + (float(step[2]) if curve > 1 else 0.0)
         slope = float(np.clip(old.slope + step[1], -3.0, 3.0))
         line = EdgeLine(old.direction, old.offset + float(step[0]), slope, bend, old.middle, old.rising)
         blur = float(np.clip(self.blur + step[curve + 1], max(LEAST_BLUR, 0.4 * self.blur), 2.5 * self.blur))
-        return _State(line, blur)
+        return _LineState(line, blur)
 
 
 def _linearised(
-    pixels: EdgePixels, state: _State, curve: int, shading: bool
+    pixels: EdgePixels, state: _LineState, curve: int, shading: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Design matrix (n, unknowns) with the levels in it, residuals (n,) computed minus observed, levels of a state."""
     line = state.line

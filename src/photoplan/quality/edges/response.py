@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from photoplan.adjustment.linear import solve
 from photoplan.errors import InputError
 from photoplan.quality.edges.checks import (
+    EdgeResiduals,
     EdgeSettings,
-    Residuals,
     check_certainty,
     check_clipping,
     check_line,
@@ -357,7 +357,7 @@ def _residual_checks(found: _Context, step: float) -> tuple[float, float]:
     fitted = np.interp(found.distance, table, fit.basis.edge(table) @ fit.shape)
     fitted += _levels(pixels, found.distance, found.line, rise, settings) @ fit.levels
     value = (pixels.light - fitted) / step
-    residuals = Residuals(pixels.across, pixels.along, found.distance, value, spread, fit.basis.model.total)
+    residuals = EdgeResiduals(pixels.across, pixels.along, found.distance, value, spread, fit.basis.model.total)
     structure = check_sides(residuals, settings.most_structure)
     return check_line(residuals, settings.most_bend, settings.curve), structure
 

@@ -18,14 +18,14 @@ from scipy import ndimage
 
 from photoplan.errors import InputError
 from photoplan.quality.formation.optics import Optics, falloff_factors, line_displacements, sample_scene
-from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitter, Spread, check_range
-from photoplan.quality.formation.scenes import ArrayScene, Scene
+from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitterPart, Spread, check_range
+from photoplan.quality.formation.scenes import ArrayScene, LightScene
 from photoplan.quality.formation.sensor import Pattern, add_shot_noise, fixed_pattern, moved_charge, overflow
 from photoplan.quality.formation.sensor_parts import (
     AutomaticGain,
-    DarkCurrent,
-    Defect,
-    Enhancement,
+    DarkCurrentPart,
+    DefectPart,
+    EnhancementPart,
     Exposure,
     FixedPattern,
     Gain,
@@ -57,7 +57,7 @@ def next_gain(automatic: AutomaticGain, gain: float, mean: float) -> float:
     return gain + (wanted - gain) * share
 
 
-def enhanced(grey: _Array, enhancement: Enhancement) -> _Array:
+def enhanced(grey: _Array, enhancement: EnhancementPart) -> _Array:
     """Grey values of one band with over- and undershoot beside edges."""
     width = (enhancement.width if enhancement.direction == "both" else 0.0, enhancement.width)
     smooth = ndimage.gaussian_filter(grey, width, mode="nearest")
@@ -91,16 +91,16 @@ class ImageModel:
     aperture: Aperture = field(default_factory=Aperture)
     lateral: tuple[Lateral, ...] = ()
     falloff: Falloff = field(default_factory=Falloff)
-    jitter: LineJitter = field(default_factory=LineJitter)
+    jitter: LineJitterPart = field(default_factory=LineJitterPart)
     exposure: Exposure = field(default_factory=Exposure)
-    dark: DarkCurrent = field(default_factory=DarkCurrent)
+    dark: DarkCurrentPart = field(default_factory=DarkCurrentPart)
     fixed_pattern: FixedPattern = field(default_factory=FixedPattern)
-    defects: tuple[Defect, ...] = ()
+    defects: tuple[DefectPart, ...] = ()
     well: Well | None = None
     readout: Readout = field(default_factory=Readout)
     gain: Gain = field(default_factory=Gain)
     automatic_gain: AutomaticGain | None = None
-    enhancement: Enhancement | None = None
+    enhancement: EnhancementPart | None = None
     tone: Tone | None = None
     quantisation: Quantisation | None = None
     seed: int = 0
@@ -140,14 +140,14 @@ class FormedImage:
 
 
 def form_image(
-    model: ImageModel, scene: Scene | NDArray[Any], frame: int = 0, exposure: float = 1.0, gain: float = 1.0
+    model: ImageModel, scene: LightScene | NDArray[Any], frame: int = 0, exposure: float = 1.0, gain: float = 1.0
 ) -> FormedImage:
     """Form one image of a scene.
 
     Parameters
     ----------
     model : ImageModel
-    scene : Scene or array
+    scene : LightScene or array
         An array is taken as a scene with one cell per pixel.
     frame : int
         Number in a series: frames differ in what is random in time, not in the fixed pattern.
@@ -169,14 +169,14 @@ def form_image(
 
 
 def form_series(
-    model: ImageModel, scenes: Scene | Sequence[Scene], exposures: Sequence[float] = (1.0,)
+    model: ImageModel, scenes: LightScene | Sequence[LightScene], exposures: Sequence[float] = (1.0,)
 ) -> Iterator[FormedImage]:
     """Form the frames of a series one after the other; automatic gain runs through them.
 
     Parameters
     ----------
     model : ImageModel
-    scenes : Scene or sequence of Scene
+    scenes : LightScene or sequence of Scene
         One for all frames, or one for each frame.
     exposures : sequence of float
         One for each frame; with several scenes a single one holds for all.
@@ -208,7 +208,7 @@ class _Frame:
     gain: float
 
 
-def _checked(model: ImageModel, scene: Any) -> Scene:
+def _checked(model: ImageModel, scene: Any) -> LightScene:
     """A scene that is small enough and has the bands that the model describes."""
     made: Any = ArrayScene(scene) if isinstance(scene, np.ndarray) else scene
     width, height = made.size
@@ -222,7 +222,7 @@ def _checked(model: ImageModel, scene: Any) -> Scene:
             f"lateral: band {absent[0]} is described, but the scene has only {made.bands}; leave its "
             "entry out, or give a scene that has it"
         )
-    found: Scene = made
+    found: LightScene = made
     return found
 
 
@@ -231,7 +231,7 @@ def _random(model: ImageModel, *key: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence([model.seed, *key]))
 
 
-def _light(model: ImageModel, scene: Scene, frame: int) -> tuple[_Array, _Array]:
+def _light(model: ImageModel, scene: LightScene, frame: int) -> tuple[_Array, _Array]:
     """Displacement of the lines, and light on the pixels, shape (bands, height, width)."""
     shift = line_displacements(model.jitter, scene.size[1], _random(model, 1, frame))
     light = sample_scene(scene, model.optics, shift if shift.any() else None)

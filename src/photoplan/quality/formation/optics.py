@@ -12,8 +12,8 @@ from scipy import fft, ndimage
 
 from photoplan.geometry.grid import Window
 from photoplan.quality.formation.kernels import PixelKernel, pixel_kernel
-from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitter, Spread
-from photoplan.quality.formation.scenes import Scene
+from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitterPart, Spread
+from photoplan.quality.formation.scenes import LightScene
 
 _Array = NDArray[np.float64]
 _Spectrum = NDArray[np.complex128]
@@ -57,7 +57,7 @@ def falloff_factors(falloff: Falloff, size: tuple[int, int], rows: slice | None 
     return np.maximum(factors, 0.0)
 
 
-def line_displacements(jitter: LineJitter, lines: int, rng: np.random.Generator) -> _Array:
+def line_displacements(jitter: LineJitterPart, lines: int, rng: np.random.Generator) -> _Array:
     """By how many pixels each line of a frame is moved to the right, shape (lines,)."""
     line = np.arange(lines)
     moved = jitter.amplitude * np.sin(2.0 * np.pi * line / jitter.period + np.radians(jitter.phase_deg))
@@ -67,12 +67,12 @@ def line_displacements(jitter: LineJitter, lines: int, rng: np.random.Generator)
     return np.asarray(moved)
 
 
-def sample_scene(scene: Scene, optics: Optics, moved: _Array | None = None) -> _Array:
+def sample_scene(scene: LightScene, optics: Optics, moved: _Array | None = None) -> _Array:
     """Mean light on every pixel's aperture, in the units of the scene.
 
     Parameters
     ----------
-    scene : Scene
+    scene : LightScene
     optics : Optics
     moved : (height,), optional
         By how many pixels each line shows the scene further right.
@@ -92,7 +92,7 @@ def sample_scene(scene: Scene, optics: Optics, moved: _Array | None = None) -> _
     return out
 
 
-def _tile_side(scene: Scene, optics: Optics) -> int:
+def _tile_side(scene: LightScene, optics: Optics) -> int:
     """Pixels of a tile's side."""
     k, cells = scene.oversampling, _TILE_CELLS
     if optics.spread.varies:
@@ -150,7 +150,7 @@ def _displacement(
     return dx, dy
 
 
-def _tile(scene: Scene, optics: Optics, tile: Window, moved: _Array | None, transforms: _Transforms) -> _Array:
+def _tile(scene: LightScene, optics: Optics, tile: Window, moved: _Array | None, transforms: _Transforms) -> _Array:
     """Light on the pixels of a tile, shape (bands, height, width)."""
     k = scene.oversampling
     moves = [_displacement(optics.lateral, b, scene.size, tile, moved) for b in range(scene.bands)]

@@ -168,7 +168,7 @@ class Aperture:
 
 
 @dataclass(frozen=True)
-class LineJitter:
+class LineJitterPart:
     """Displacement of whole lines along x, as faulty line synchronisation makes it (Behr 1989, section 4.1.2).
 
     A positive one moves what the line shows to the right. Random displacements are new in every frame.

@@ -24,7 +24,7 @@ PATTERNS: dict[str, tuple[str, tuple[float, ...]]] = {
 }
 
 
-class Scene(Protocol):
+class LightScene(Protocol):
     """What is imaged: mean values of cells, `oversampling` of them along each side of a pixel."""
 
     @property

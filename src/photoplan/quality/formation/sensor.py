@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, special
 
 from photoplan.errors import InputError
-from photoplan.quality.formation.sensor_parts import DarkCurrent, Defect, FixedPattern, Readout, Well
+from photoplan.quality.formation.sensor_parts import DarkCurrentPart, DefectPart, FixedPattern, Readout, Well
 
 _Array = NDArray[np.float64]
 #: Times that circular overflow spreads again where it meets full elements; what is left then goes along the columns.
@@ -33,8 +33,8 @@ class Pattern:
 
 def fixed_pattern(
     fixed: FixedPattern,
-    dark: DarkCurrent,
-    defects: Sequence[Defect],
+    dark: DarkCurrentPart,
+    defects: Sequence[DefectPart],
     size: tuple[int, int],
     rng: np.random.Generator,
 ) -> Pattern:

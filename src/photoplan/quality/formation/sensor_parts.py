@@ -27,7 +27,7 @@ class Exposure:
 
 
 @dataclass(frozen=True)
-class DarkCurrent:
+class DarkCurrentPart:
     """Charge without light, which doubles with temperature (Behr 1989, section 3.6.4: about every 10 °C)."""
 
     rate: float = 0.0
@@ -74,7 +74,7 @@ class FixedPattern:
 
 
 @dataclass(frozen=True)
-class Defect:
+class DefectPart:
     """A sensor element that does not do as the others."""
 
     column: int
@@ -184,7 +184,7 @@ class AutomaticGain:
 
 
 @dataclass(frozen=True)
-class Enhancement:
+class EnhancementPart:
     """Edge enhancement inside the camera: amount × (signal − signal smoothed by a Gaussian) is added.
 
     It makes the over- and undershoot beside edges of which Kölbl (2006, section 4) says that they limit restoration.

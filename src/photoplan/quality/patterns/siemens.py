@@ -19,8 +19,8 @@ from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.patterns.pixels import pattern_window, white_noise
 from photoplan.quality.patterns.star_fit import (
     SECTORS,
-    Ring,
     StarPixels,
+    StarRing,
     count_sectors,
     find_centre,
     fit_ring,
@@ -189,7 +189,7 @@ def _radii(inner: float, outer: float, least: float = 0.75) -> list[tuple[float,
     return radii[:-1] if len(radii) > 1 and radii[-1][0] < inner else radii
 
 
-def _direction(pixels: StarPixels, radius: float, half: float, k: int, count: int, sectors: int) -> Ring | None:
+def _direction(pixels: StarPixels, radius: float, half: float, k: int, count: int, sectors: int) -> StarRing | None:
     """The wave of both opposite parts of a ring whose frequency has the k-th direction; None: too few pixels."""
     values, angle = pixels.between(radius - half, radius + half)
     # Across the sectors: a quarter turn from the direction in which they lie.
@@ -205,7 +205,7 @@ def _direction(pixels: StarPixels, radius: float, half: float, k: int, count: in
     return ring if np.isfinite(ring.sigma) and ring.mean > 0.0 else None
 
 
-def _refuse_weak(rings: list[Ring], noise: float, what: str) -> None:
+def _refuse_weak(rings: list[StarRing], noise: float, what: str) -> None:
     """Refuse what is no star: weak waves, or other structure on the rings."""
     if len(rings) < 3:
         raise InputError(f"{what}: only {len(rings)} rings can be measured; the star is too small")
@@ -222,7 +222,7 @@ def _refuse_weak(rings: list[Ring], noise: float, what: str) -> None:
         )
 
 
-def _wave(rings: list[Ring]) -> Literal["square", "sine"]:
+def _wave(rings: list[StarRing]) -> Literal["square", "sine"]:
     """A third harmonic wave of more than a tenth of the fundamental one comes from sharp sectors."""
     widest = rings[0]
     third = 0.0 if widest.third is None else float(np.hypot(*widest.third))
@@ -231,7 +231,7 @@ def _wave(rings: list[Ring]) -> Literal["square", "sine"]:
 
 def _levels(
     pixels: StarPixels,
-    rings: list[Ring],
+    rings: list[StarRing],
     levels: tuple[float, float] | None,
     wave: str,
     sectors: int,
@@ -271,7 +271,7 @@ def _levels(
     return low, high, uncertain, f"middle of the widest sectors, {2 * pi * outer / sectors:.1f} pixels a period"
 
 
-def _curve(rings: list[Ring], sectors: int, object_wave: tuple[float, float]) -> MtfCurve:
+def _curve(rings: list[StarRing], sectors: int, object_wave: tuple[float, float]) -> MtfCurve:
     """Rings as a curve; each ring's wave through its mean, against that of the object and its relative error."""
     full, uncertain = object_wave
     frequency = np.array([sectors / (2.0 * pi * ring.radius) for ring in rings])

@@ -57,7 +57,7 @@ class StarPixels:
 
 
 @dataclass(frozen=True, eq=False)
-class Ring:
+class StarRing:
     """The wave that is left on a ring, or on a part of it."""
 
     radius: float
@@ -83,7 +83,7 @@ class Ring:
         return float(np.sqrt(np.trace(self.covariance) / 2.0))
 
 
-def fit_ring(values: Array, angle: Array, radius: float, sectors: int, *, whole: bool) -> Ring:
+def fit_ring(values: Array, angle: Array, radius: float, sectors: int, *, whole: bool) -> StarRing:
     """Least squares of a wave with so many periods around the centre, beside a level that changes slowly.
 
     Parameters
@@ -113,7 +113,7 @@ def fit_ring(values: Array, angle: Array, radius: float, sectors: int, *, whole:
     if 3 in high:
         place = start + 2 + 2 * high.index(3)
         third = (float(solution[place]), float(solution[place + 1]))
-    return Ring(
+    return StarRing(
         radius,
         float(solution[0]),
         float(solution[start]),

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.products.characterise.result import MOST_PIXELS, Chart, Curve, Figure, Outcome, Picture, block_means
+from photoplan.products.characterise.result import MOST_PIXELS, Chart, Figure, Findings, Plate, Trace, block_means
 from photoplan.products.characterise.run import CharacteriseReport
 from photoplan.report.drawing import BLUE, GREEN, ORANGE, PURPLE, RED, SKY, SOFT, STYLE, png, round_down
 from photoplan.report.page import Cell, figure, headline, page, section, table, text
@@ -33,7 +33,7 @@ class ChartDrawer:
 
     mpl: Any
 
-    def draw(self, plot: Chart | Picture) -> bytes:
+    def draw(self, plot: Chart | Plate) -> bytes:
         """A plot as PNG."""
         with self.mpl.rc_context(STYLE):
             return self._chart(plot) if isinstance(plot, Chart) else self._picture(plot)
@@ -71,7 +71,7 @@ class ChartDrawer:
         axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
         axis.set_minor_formatter(ticker.NullFormatter())
 
-    def _picture(self, picture: Picture) -> bytes:
+    def _picture(self, picture: Plate) -> bytes:
         values = np.asarray(picture.values, np.float64)
         factor = max(1, -(-max(values.shape) // MOST_PIXELS))
         known = values[np.isfinite(values)]
@@ -93,7 +93,7 @@ class ChartDrawer:
         return png(fig)
 
 
-def _draw_curve(axes: Any, curve: Curve, colour: str) -> None:
+def _draw_curve(axes: Any, curve: Trace, colour: str) -> None:
     x, y = np.asarray(curve.x, float), np.asarray(curve.y, float)
     options: dict[str, Any] = {"color": colour, "label": curve.label or None}
     if curve.vectors is not None:
@@ -111,7 +111,7 @@ def _draw_curve(axes: Any, curve: Curve, colour: str) -> None:
         axes.errorbar(x, y, yerr=curve.sigma, fmt="none", ecolor=colour, elinewidth=0.9, capsize=2)
 
 
-def _draw_vectors(axes: Any, x: Array, y: Array, curve: Curve, options: dict[str, Any]) -> None:
+def _draw_vectors(axes: Any, x: Array, y: Array, curve: Trace, options: dict[str, Any]) -> None:
     """Lines from the points, by a round factor longer than they are, so that the longest is a tenth of the extent."""
     vectors = np.asarray(curve.vectors, float)
     largest = float(np.linalg.norm(vectors, axis=1).max()) or 1.0
@@ -167,7 +167,7 @@ def characterise_page(made: CharacteriseReport, mpl: Any) -> str:
     return page(title, f"From the image series {series.path.name}", [head, *remarks, *sections])
 
 
-def _section(title: str, outcome: Outcome, drawer: ChartDrawer) -> str:
+def _section(title: str, outcome: Findings, drawer: ChartDrawer) -> str:
     found: list[str] = []
     if outcome.figures:
         found.append(

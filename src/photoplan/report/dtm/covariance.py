@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.sides import sides_of
 from photoplan.terrain.covariance import Covariance, near_lines
-from photoplan.terrain.fit import Fit
+from photoplan.terrain.fit import TerrainFit
 from photoplan.terrain.settings import FAMILIES
 
 #: Neighbourhoods that are looked at, points of each, and classes of distance.
@@ -53,7 +53,7 @@ def correlation_at(family: str, t: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.exp(-np.log(2) * t))
 
 
-def covariance_test(fit: Fit) -> CovarianceTest:
+def covariance_test(fit: TerrainFit) -> CovarianceTest:
     """Fitted functions over distance, and the covariance of the points' heights above local planes.
 
     A plane through a neighbourhood takes a part of the signal with it. So the fitted functions are not compared with
@@ -89,14 +89,14 @@ def _curve(covariance: Covariance, distance: NDArray[np.float64]) -> NDArray[np.
     return covariance.variance * correlation_at(covariance.name, distance / covariance.length)
 
 
-def _leaves(fit: Fit) -> list[int]:
+def _leaves(fit: TerrainFit) -> list[int]:
     """Leaves that hold points, in an order in which the first of them already cover the area evenly."""
     rich = np.flatnonzero(fit.leaves.count >= 3)
     step = max(1, -(-len(rich) // _BLOCKS))
     return [leaf for first in range(min(step, _ROUNDS)) for leaf in rich[first::step].tolist()]
 
 
-def _block(fit: Fit, leaf: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _block(fit: TerrainFit, leaf: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Distances of all pairs of a neighbourhood's points, products of their residuals, and these products' means."""
     seen = fit.seen
     tree = fit.neighbours.near[0]
@@ -119,7 +119,7 @@ def _block(fit: Fit, leaf: int) -> tuple[NDArray[np.float64], NDArray[np.float64
     return d, r[first] * r[second], expected[first, second]
 
 
-def _apart(fit: Fit, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+def _apart(fit: TerrainFit, xy: NDArray[np.float64]) -> NDArray[np.float64]:
     """Squared differences of the side coordinates of places (n, 2): not zero where breaklines part them."""
     vertices, start = near_lines(fit.seen, xy.min(axis=0), xy.max(axis=0))
     sides = np.zeros((len(xy), max(1, len(start) - 1)))
@@ -128,7 +128,7 @@ def _apart(fit: Fit, xy: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(((sides[:, None] - sides[None]) ** 2).sum(axis=2))
 
 
-def _matrix(fit: Fit, leaf: int, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+def _matrix(fit: TerrainFit, leaf: int, xy: NDArray[np.float64]) -> NDArray[np.float64]:
     """Covariances of the signal at places (n, 2), by the functions that the leaf's patch uses."""
     d2 = ((xy[:, None] - xy[None]) ** 2).sum(axis=2)
     apart = _apart(fit, xy)

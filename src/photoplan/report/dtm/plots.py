@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from photoplan.report.drawing import BLUE, INK, PURPLE, RED, SKY, SOFT, STYLE, png
 from photoplan.report.dtm.covariance import CovarianceTest
-from photoplan.report.dtm.samples import FilterEffect, GrossError, ReportMap
+from photoplan.report.dtm.samples import FilterEffect, PlottedError, ReportMap
 
 #: What lines of each kind are called.
 LINE_WORDS = {"breakline": "breaklines", "formline": "form lines", "border": "border lines", "hole": "holes"}
@@ -150,7 +150,7 @@ class Plots:
             self._bar(fig, axes, tints, norm, "measured − filtered cm", extend="both")
             return png(fig)
 
-    def gross(self, errors: Sequence[GrossError], area: ReportMap) -> bytes:
+    def gross(self, errors: Sequence[PlottedError], area: ReportMap) -> bytes:
         """Gross errors on the relief; those above the model point up, those below it down."""
         with self.mpl.rc_context(STYLE):
             fig, axes = self._map(area)

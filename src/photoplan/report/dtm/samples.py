@@ -85,7 +85,7 @@ class FilterEffect:
 
 
 @dataclass(frozen=True)
-class GrossError:
+class PlottedError:
     """A point that was left out."""
 
     name: str
@@ -142,7 +142,7 @@ class BuildFacts:
     """Normalised residuals of points that were used, or a sample of them."""
     covariance: CovarianceTest
     effects: tuple[FilterEffect, ...]
-    gross: tuple[GrossError, ...]
+    gross: tuple[PlottedError, ...]
     notes: tuple[Note, ...] = ()
     """What cleaning found."""
     settings: tuple[tuple[str, str], ...] = ()
@@ -319,7 +319,7 @@ def _one(sigma: NDArray[np.float64]) -> float:
     return float(sigma[0]) if len(sigma) and np.ptp(sigma) <= 1e-9 * sigma[0] else np.nan
 
 
-def _gross(built: Built, measured: MeasuredTerrain, surface: HybridSurface) -> tuple[GrossError, ...]:
+def _gross(built: Built, measured: MeasuredTerrain, surface: HybridSurface) -> tuple[PlottedError, ...]:
     fit, seen = built.fit, built.fit.seen
     some = fit.gross
     if not len(some):
@@ -329,7 +329,7 @@ def _gross(built: Built, measured: MeasuredTerrain, surface: HybridSurface) -> t
     names = [measured.points[seen.group[k]].label(int(seen.record[k])) for k in some.tolist()]
     normalised = fit.residuals[some, 2]
     return tuple(
-        GrossError(name, float(X), float(Y), float(Z), float(d), float(z))
+        PlottedError(name, float(X), float(Y), float(Z), float(d), float(z))
         for name, (X, Y, Z), d, z in zip(names, xyz, difference, normalised)
     )
 

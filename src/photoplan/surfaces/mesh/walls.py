@@ -13,7 +13,7 @@ from photoplan.surfaces.units import LineElement
 
 
 @dataclass(frozen=True, eq=False)
-class _Rays:
+class _WallRays:
     """Pieces of walls that leave a node, sorted by node and direction; sector k lies left of ray k."""
 
     node: NDArray[np.int64]
@@ -65,7 +65,7 @@ def split_at_walls(
     return values, number.reshape(corners.shape).astype(np.int32)
 
 
-def _rays(nodes: Nodes, lines: Sequence[LineElement]) -> _Rays:
+def _rays(nodes: Nodes, lines: Sequence[LineElement]) -> _WallRays:
     node, angle, on_left, on_right, outward = [], [], [], [], []
     begin = 0
     for line in lines:
@@ -86,7 +86,7 @@ def _rays(nodes: Nodes, lines: Sequence[LineElement]) -> _Rays:
             outward.append(np.full(len(here), out))
     if not node:
         empty = np.empty(0, np.int64)
-        return _Rays(empty, np.empty(0), np.empty(0), empty, empty, empty)
+        return _WallRays(empty, np.empty(0), np.empty(0), empty, empty, empty)
     at, turn = np.concatenate(node), np.concatenate(angle)
     order = np.lexsort((turn, at))
     left, right = np.concatenate(on_left)[order], np.concatenate(on_right)[order]
@@ -99,7 +99,7 @@ def _sectors(
     left: NDArray[np.float64],
     right: NDArray[np.float64],
     out: NDArray[np.bool_],
-) -> _Rays:
+) -> _WallRays:
     count = len(at)
     first = np.searchsorted(at, at, side="left")
     last = np.searchsorted(at, at, side="right")
@@ -116,11 +116,11 @@ def _sectors(
     np.minimum.at(low, first, height)
     np.maximum.at(high, first, height)
     rank[low[first] == high[first]] = 0
-    return _Rays(at, turn, height, rank, first, last)
+    return _WallRays(at, turn, height, rank, first, last)
 
 
 def _find_sectors(
-    nodes: Nodes, rays: _Rays, corners: NDArray[np.int32], rank: NDArray[np.int64], height: NDArray[np.float64]
+    nodes: Nodes, rays: _WallRays, corners: NDArray[np.int32], rank: NDArray[np.int64], height: NDArray[np.float64]
 ) -> None:
     """Sector of every corner that is at a wall, from the direction of the triangle's middle."""
     at_wall = np.zeros(len(nodes.xy), bool)
@@ -138,7 +138,7 @@ def _find_sectors(
     height[face, corner] = rays.height[ray]
 
 
-def _last_before(rays: _Rays, node: NDArray[np.int64], turn: NDArray[np.float64]) -> NDArray[np.int64]:
+def _last_before(rays: _WallRays, node: NDArray[np.int64], turn: NDArray[np.float64]) -> NDArray[np.int64]:
     """The ray of a node from which a direction is reached counter-clockwise, without another between."""
     all_nodes = np.concatenate([rays.node, node])
     all_turns = np.concatenate([rays.angle, turn])

@@ -13,7 +13,7 @@ from photoplan.geometry.grid import MapGrid, Window
 
 
 @dataclass(frozen=True, eq=False)
-class Coverage:
+class CoveredCells:
     """Cells of a window that lie in a polygon."""
 
     whole: NDArray[np.bool_]
@@ -27,7 +27,7 @@ class Coverage:
     """X, Y of the covered part's centroid, shape (n, 2): a linear function times the area is integrated exactly."""
 
 
-def cover(polygon: Any, grid: MapGrid, window: Window) -> Coverage | None:
+def cover(polygon: Any, grid: MapGrid, window: Window) -> CoveredCells | None:
     """Cells of a window that lie inside a polygon; None if none does.
 
     Blocks of cells are halved until they lie inside or outside, so that the cost follows the polygon's length, not its
@@ -54,7 +54,7 @@ def cover(polygon: Any, grid: MapGrid, window: Window) -> Coverage | None:
     if not (whole.any() or keep.any()):
         return None
     centroids = shapely.get_coordinates(shapely.centroid(parts[keep]))
-    return Coverage(whole, cells[keep, 0], cells[keep, 1], areas[keep], centroids)
+    return CoveredCells(whole, cells[keep, 0], cells[keep, 1], areas[keep], centroids)
 
 
 def _boxes(grid: MapGrid, window: Window, blocks: NDArray[np.int64]) -> NDArray[Any]:

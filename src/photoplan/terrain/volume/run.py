@@ -14,7 +14,7 @@ from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.surfaces.base import Terrain
 from photoplan.targets.map import MapTarget
-from photoplan.terrain.volume.region import Coverage, cover
+from photoplan.terrain.volume.region import CoveredCells, cover
 
 #: Side of the windows that are held in memory at once, cells.
 TILE = 512
@@ -135,7 +135,7 @@ def integrate(
     return sums
 
 
-def _add(sums: Sums, a: Terrain, b: Terrain, grid: MapGrid, window: Window, covered: Coverage) -> Sums:
+def _add(sums: Sums, a: Terrain, b: Terrain, grid: MapGrid, window: Window, covered: CoveredCells) -> Sums:
     """The sums with those of one window."""
     parts: list[NDArray[np.float64]] = []
     areas: list[NDArray[np.float64]] = []
