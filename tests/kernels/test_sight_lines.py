@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from photoplan.kernels.jit import COMPILED
-from photoplan.kernels.visibility import height_pyramid, sight_rows
+from photoplan.kernels.raycast import pyramid_of
+from photoplan.kernels.visibility import sight_rows
 
 SIZE = 41 if COMPILED else 15
 
@@ -16,7 +17,7 @@ SIZE = 41 if COMPILED else 15
 def sight(heights, eye, target_height=0.0, radius=np.inf, stop=False):
     out = np.empty(heights.shape, np.float32)
     heights = np.ascontiguousarray(heights, np.float32)
-    sight_rows(heights, height_pyramid(heights), (*eye, radius), (0, heights.shape[0]), target_height, stop, out)
+    sight_rows(heights, pyramid_of(heights), (*eye, radius), (0, heights.shape[0]), target_height, stop, out)
     return out
 
 
@@ -72,16 +73,3 @@ def test_a_slope_seen_from_above_hides_nothing_and_radius_ends_the_view():
     assert sight(heights, (SIZE / 2, SIZE / 2)).max() < 1e-5
     near = np.isfinite(sight(heights, (5.0, 6.0), radius=4.0))
     np.testing.assert_array_equal(near, np.hypot(i - 5, j - 6) <= 4)
-
-
-def test_pyramid_holds_the_highest_posts_of_its_blocks():
-    rng = np.random.default_rng(2)
-    heights = rng.normal(0, 1, (12, 18)).astype(np.float32)
-    heights[3:6, 7:10] = np.nan
-    values, levels = height_pyramid(heights)
-    for level, (start, rows, columns) in enumerate(levels):
-        for j in range(rows):
-            for i in range(columns):
-                block = heights[j << level : ((j + 1) << level) + 1, i << level : ((i + 1) << level) + 1]
-                top = np.nanmax(block) if np.isfinite(block).any() else -np.inf
-                assert values[start + j * columns + i] == top

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
+from cameras.camera_examples import BROWN
 from numpy.typing import NDArray
+from tools.large_block import LEFT, TOP, relief
 from tools.pinhole import Pinhole, vertical
 
-from photoplan.cameras.base import project
+from photoplan.cameras.base import CentralCamera, project
+from photoplan.cameras.build import oriented_camera
+from photoplan.cameras.interior import Interior
+from photoplan.cameras.lenses.base import Lens
+from photoplan.cameras.lenses.none import NoLens
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
 from photoplan.plan.footprint import FAR, covered_tiles, footprint, image_border
@@ -182,3 +188,61 @@ def test_level_ground_everywhere() -> None:
     xmin, ymin, xmax, ymax = bounds
     assert -500 < xmin < -400 < 400 < xmax < 500
     assert -400 < ymin < -300 < 300 < ymax < 400
+
+
+def oblique(seed: int, lens: Lens, curvature: str) -> CentralCamera:
+    """A camera 2200 m above sea, anything from upright to half the horizon in the picture."""
+    rng = np.random.default_rng(seed)
+    center = (500_000 + rng.uniform(-1500, 1500), 5_300_000 + rng.uniform(-1500, 1500), 2200.0)
+    pose = Pose.from_angles(center, np.radians((rng.uniform(0, 70), rng.uniform(-15, 15), rng.uniform(-180, 180))))
+    interior = Interior.digital((800, 600), (float(rng.uniform(500, 1500)),) * 2, (3.0, -2.0))
+    return oriented_camera(interior, lens, pose, crs="EPSG:32633", earth_curvature=curvature, mean_ground=500.0)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_every_pixel_that_falls_into_the_image_is_in_the_bounds_and_in_a_kept_tile(seed: int) -> None:
+    """Random terrain with holes, oblique cameras with a lens, over a flat and over a round earth."""
+    grid, local = terrain(seed + 20)
+    grid.values[np.random.default_rng(seed).random(grid.values.shape) < 0.01] = np.nan
+    surface = replace(local, origin=(local.origin[0] + 500_000, local.origin[1] + 5_300_000))
+    camera = oblique(seed, BROWN if seed % 2 else NoLens(), "strict" if seed % 3 == 2 else "none")
+    x, y = (500_000.0, 5_300_000.0)
+    left, bottom, right, top = edges(grid)
+    seen = footprint(camera, surface, (left + x, bottom + y, right + x, top + y))
+    assert seen.bounds is not None
+    target = MapGrid.covering((x - 4500, y - 4500, x + 4500, y + 4500), 20.0, "EPSG:32633")
+    v, u = np.mgrid[: target.height, : target.width]
+    XY = target.to_map(np.stack([u, v], axis=-1).astype(float))
+    xy = project(camera, np.concatenate([XY, surface.heights(XY)[..., None]], axis=-1))
+    inside = (xy >= -0.5).all(axis=-1) & (xy <= np.array(camera.size) - 0.5).all(axis=-1)
+    assert inside.sum() > 500
+    assert (XY[inside] >= seen.bounds[:2]).all() and (XY[inside] <= seen.bounds[2:]).all()
+    tiles = list(target.window.tiles(30))
+    kept = covered_tiles(camera, surface, target, tiles)
+    for tile, keep in zip(tiles, kept):
+        assert keep or not inside[tile.row : tile.stop[1], tile.col : tile.stop[0]].any()
+    assert sum(kept) < len(tiles)
+
+
+def test_a_hundred_ordinary_images_read_the_ground_below_them_once() -> None:
+    """Tilts of 3° over mountains with hills on them: no search runs away, whatever the ground beside the image does."""
+    side, mesh = 2000, 20.0
+    X, Y = np.meshgrid(LEFT + np.arange(side) * mesh, TOP - np.arange(side) * mesh)
+    grid = Grid(relief(X, Y).astype(np.float32))
+    surface = RasterSurface(grid, (LEFT, TOP), (mesh, mesh), part=(64, 64))
+    bounds = (LEFT, TOP - side * mesh, LEFT + side * mesh, TOP)
+    rng = np.random.default_rng(7)
+    for _ in range(100):
+        center = (LEFT + rng.uniform(2000, 38_000), TOP - rng.uniform(2000, 38_000), 3200.0)
+        camera = Pinhole(
+            Pose.from_angles(center, np.radians((*rng.uniform(-3, 3, 2), rng.uniform(0, 360)))), 1000, (1058, 680)
+        )
+        grid.asked.clear()
+        found = footprint(camera, surface, bounds).bounds
+        assert found is not None
+        # 2.6 × 1.7 km on the mean level, in any direction, and what 600 m of relief add.
+        assert found[2] - found[0] < 4800 and found[3] - found[1] < 4800
+        # Parts of 1280 m: 5 × 5 below the box of the levels, and windows for the rays.
+        parts = [w for w in grid.asked if (w.width, w.height) == (64, 64)]
+        assert len(parts) <= 36
+        assert sum(w.size for w in grid.asked) < 400_000

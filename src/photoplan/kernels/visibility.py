@@ -13,60 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
+from photoplan.kernels.raycast import Pyramid, leave
 
 _NUDGE = 1e-7
 """Part of a mesh by which a position on a grid line is moved on to find the mesh that comes next."""
-
-
-@kernel
-def _meshes(heights: NDArray[np.float32], level: NDArray[np.float32]) -> None:
-    """Highest post of each mesh; NaN does not count, −inf where there is none."""
-    for j in range(level.shape[0]):
-        for i in range(level.shape[1]):
-            top = np.float32(-np.inf)
-            for k in range(4):
-                h = heights[j + (k >> 1), i + (k & 1)]
-                top = h if h > top else top
-            level[j, i] = top
-
-
-@kernel
-def _halve(fine: NDArray[np.float32], coarse: NDArray[np.float32]) -> None:
-    """Highest of four blocks each."""
-    for j in range(coarse.shape[0]):
-        for i in range(coarse.shape[1]):
-            top = np.float32(-np.inf)
-            for row in range(2 * j, min(2 * j + 2, fine.shape[0])):
-                for col in range(2 * i, min(2 * i + 2, fine.shape[1])):
-                    top = fine[row, col] if fine[row, col] > top else top
-            coarse[j, i] = top
-
-
-def height_pyramid(heights: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Highest posts of blocks of 1, 2, 4 … meshes.
-
-    Parameters
-    ----------
-    heights : ndarray, shape (rows, cols), float32
-        At least two posts each way; NaN = no height.
-
-    Returns
-    -------
-    values : ndarray, float32
-        All levels, one after the other, row by row; −inf where a block has no height.
-    levels : ndarray, shape (n, 3), int64
-        Start in `values`, rows and columns of each level.
-    """
-    rows, columns = heights.shape[0] - 1, heights.shape[1] - 1
-    parts = [np.empty((rows, columns), np.float32)]
-    _meshes(heights, parts[0])
-    while max(rows, columns) > 1:
-        rows, columns = (rows + 1) // 2, (columns + 1) // 2
-        parts.append(np.empty((rows, columns), np.float32))
-        _halve(parts[-2], parts[-1])
-    start = np.cumsum([0, *(part.size for part in parts[:-1])])
-    levels = np.array([(s, *part.shape) for s, part in zip(start, parts)], np.int64)
-    return np.concatenate([part.ravel() for part in parts]), levels
 
 
 @inner
@@ -93,19 +43,9 @@ def _crossing(heights: NDArray[np.float32], x: float, y: float) -> float:
 
 
 @inner
-def _leave(block: int, level: int, start: float, step: float) -> float:
-    """u at which a line leaves a block in one direction of the grid; infinite if it runs along it."""
-    if step > 0.0:
-        return (((block + 1) << level) - start) / step
-    if step < 0.0:
-        return ((block << level) - start) / step
-    return np.inf
-
-
-@inner
 def _follow(
     heights: NDArray[np.float32],
-    pyramid: tuple[NDArray[np.float32], NDArray[np.int64]],
+    pyramid: Pyramid,
     target: tuple[float, float],
     way: tuple[float, float],
     top: float,
@@ -113,7 +53,7 @@ def _follow(
 ) -> float:
     """Smallest height at the target, not below `top`, whose line of sight to the eye is free; with `stop` infinity as
     soon as `top` is not enough."""
-    values, levels = pyramid
+    _, values, levels = pyramid
     x, y = target
     dx, dy = way
     nudge = _NUDGE / max(abs(dx), abs(dy))
@@ -123,28 +63,28 @@ def _follow(
         col = min(max(np.int64(np.floor(x + ahead * dx)), 0), heights.shape[1] - 2)
         row = min(max(np.int64(np.floor(y + ahead * dy)), 0), heights.shape[0] - 2)
         bx, by = col >> level, row >> level
-        leave = max(min(_leave(bx, level, x, dx), _leave(by, level, y, dy)), ahead)
-        end = min(leave, 1.0)
+        away = max(min(leave(bx, level, x, dx), leave(by, level, y, dy)), ahead)
+        end = min(away, 1.0)
         lowest = top * (1.0 - (end if top >= 0.0 else u))
         if values[levels[level, 0] + by * levels[level, 2] + bx] <= lowest:
             level = min(level + 1, last)
         elif level > 0:
             level -= 1
             continue
-        elif leave < 1.0:
-            ground = _crossing(heights, x + leave * dx, y + leave * dy)
-            if ground > top * (1.0 - leave):
+        elif away < 1.0:
+            ground = _crossing(heights, x + away * dx, y + away * dy)
+            if ground > top * (1.0 - away):
                 if stop:
                     return np.inf
-                top = ground / (1.0 - leave)
-        u = leave
+                top = ground / (1.0 - away)
+        u = away
     return top
 
 
 @kernel
 def sight_rows(
     heights: NDArray[np.float32],
-    pyramid: tuple[NDArray[np.float32], NDArray[np.int64]],
+    pyramid: Pyramid,
     eye: tuple[float, float, float],
     rows: tuple[int, int],
     target_height: float,
@@ -158,7 +98,7 @@ def sight_rows(
     heights : ndarray, shape (rows, cols), float32
         Relative to the eye, metres; NaN = no height, which blocks nothing.
     pyramid : tuple
-        `height_pyramid(heights)`.
+        `kernels.raycast.pyramid_of(heights)`.
     eye : (float, float, float)
         Column and row of the eye, and the radius in posts beyond which nothing is looked at.
     rows : (int, int)

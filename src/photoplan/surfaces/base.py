@@ -52,6 +52,7 @@ class Terrain(Surface, Protocol):
         Hits
             Exact over bilinear meshes and triangles. Places without surface let rays through; a ray that gets below the
             surface, because it starts there or through such a place, goes on until it has come out above it. Where the
-            surface has a step the ray may end on the wall; a ray along a wall sees the heights left of the line.
+            surface has a step the ray may end on the wall. A ray along a wall sees the heights left of the line, or,
+            where the line is a border of meshes, those of the eastern or southern mesh.
         """
         ...

@@ -24,7 +24,7 @@ MOST_POSTS = 4_000_000
 
 
 #: Rays that are few, and the meshes along a side of the parts that they are followed over; many rays share larger ones.
-FEW, FEW_PART, MANY_PART = 2000, 64, 512
+FEW, FEW_PART, MANY_PART = 2000, 32, 512
 
 
 @dataclass(frozen=True)
@@ -198,9 +198,10 @@ class RasterParts:
             return None
         # The outer half mesh goes on as the posts end.
         beyond = lower == rows and top + side + 1 > rows, right == columns and col + side + 1 > columns
-        padded = np.pad(posts, ((upper - top, int(beyond[0])), (left - col, int(beyond[1]))), mode="edge")
+        if any(beyond) or col < 0 or top < 0:
+            posts = np.pad(posts, ((upper - top, int(beyond[0])), (left - col, int(beyond[1]))), mode="edge")
         corner = s.origin[0] + col * s.mesh[0], s.origin[1] - top * s.mesh[1]
-        return Part(corner, s.mesh, padded)
+        return Part(corner, s.mesh, posts)
 
     def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
         """Heights at points of the grid's CRS."""

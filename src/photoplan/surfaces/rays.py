@@ -25,7 +25,7 @@ from photoplan.kernels.raycast import (
     pyramid_of,
 )
 
-#: Bytes of parts, with their pyramids, that are kept while rays are followed.
+#: Bytes of parts, with their pyramids, that are kept while rays are followed, if all are as large as the last one.
 CACHE = 64 << 20
 #: Pieces of rays longer than this, metres, are not straight in another CRS, or where heights are shifted.
 CHORD = 200.0
@@ -227,6 +227,7 @@ def _over_parts(
             states[here] = state
             met = (result != MISS) & ~asks
             done[here[met]], t[here[met]], results[here[met]] = True, local[met, 7], result[met]
+    states[np.isnan(t) & (begin + size < 1)] = NONE
     return begin + size * t, states, results
 
 
@@ -292,8 +293,8 @@ def _groups(place: NDArray[np.int64]) -> list[NDArray[np.int64]]:
 def _kept(parts: Parts, at: tuple[int, int], cache: Cache) -> Part | None:
     """A part, from the cache if it is there; parts used longest ago are forgotten."""
     if at not in cache:
-        cache[at] = parts.part(*at)
-        while len(cache) > 1 and sum(part.bytes for part in cache.values() if part is not None) > CACHE:
+        part = cache[at] = parts.part(*at)
+        while part is not None and len(cache) > max(1, CACHE // part.bytes):
             cache.popitem(last=False)
     cache.move_to_end(at)
     return cache[at]

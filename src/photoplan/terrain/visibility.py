@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.events import Map
-from photoplan.kernels.visibility import height_pyramid, sight_rows
+from photoplan.kernels.raycast import pyramid_of
+from photoplan.kernels.visibility import sight_rows
 
 #: Rows that one task of a thread computes.
 ROWS = 32
@@ -121,7 +122,7 @@ def needed_heights(
     for row in range(rows):
         distance2 = (across + (row - observer.row) ** 2) * mesh**2
         relative[row] = heights[row].astype(float) - observer.eye - distance2 * settings.bend
-    pyramid = height_pyramid(relative)
+    pyramid = pyramid_of(relative)
     out = np.empty(heights.shape, np.float32)
     eye = (float(observer.column), float(observer.row), settings.radius / mesh)
 

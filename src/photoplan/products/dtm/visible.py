@@ -29,7 +29,7 @@ from photoplan.terrain.visibility import Observer, SightSettings, horizon, neede
 
 TILE = 512
 #: Bytes of one post while one observer is looked at: heights, those relative to the eye, pyramid, result.
-POST_BYTES = 28
+POST_BYTES = 34
 COLUMNS = Columns(
     roles={
         "x": ("x", "e", "east", "easting"),
