@@ -6,6 +6,7 @@ import ast
 import re
 from pathlib import Path
 
+import click
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,6 +14,7 @@ from tools.command import options_of, unknown_options, verbs
 
 import photoplan
 from photoplan.cli.main import photoplan as command
+from photoplan.cli.options import listed
 from photoplan.cli.output import spelled
 
 SOURCE = Path(photoplan.__file__).parent
@@ -69,3 +71,20 @@ def test_examples(verb: str, text: str, said: str) -> None:
 def test_a_verb_that_is_named_lends_its_options() -> None:
     text = "declare `angle_unit` gon to `photoplan init`; `overwrite`"
     assert spelled(text, VERBS["check"], command) == "declare --angle-unit gon to `photoplan init`; --overwrite"
+
+
+def test_shared_options_are_one_in_all_verbs() -> None:
+    """One declaration: the same spellings and kinds of value wherever a verb has the option."""
+    for name in ("--json", "--overwrite", "--quiet", "--workers", "--bounds", "--dry-run"):
+        found = [p for c in VERBS.values() for p in c.params if isinstance(p, click.Option) and name in p.opts]
+        assert len(found) > 2
+        assert len({(tuple(p.opts), p.nargs, p.multiple, p.is_flag, p.name) for p in found}) == 1, name
+    without_talk = {name for name, command in VERBS.items() if "-q" not in options_of(command)}
+    assert without_talk == set()
+
+
+def test_images_with_commas_or_repeated(tmp_path: Path) -> None:
+    own = tmp_path / "a,b.tif"
+    own.touch()
+    assert listed(["a, b", "c*"]) == ("a", "b", "c*")
+    assert listed([str(own), "d,"]) == (str(own), "d")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import dry_run_option, images_option, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import show, show_json
 
 if TYPE_CHECKING:
@@ -23,16 +23,16 @@ _SHOWN = 20
 @click.option(
     "--calibrate", multiple=True, metavar="CAMERA=c:SIGMA,x0,…", help="Unknowns, with what is known [as stated]."
 )
-@click.option("--images", multiple=True, metavar="NAME", help="Image or pattern; may be repeated [all].")
+@images_option()
 @click.option("--no-robust", is_flag=True, help="Seek no gross errors.")
 @click.option("--critical", type=float, default=4.0, show_default=True, help="Normalised residual of a gross error.")
 @click.option("--no-variance-components", is_flag=True, help="Weight groups as stated, not as their residuals show.")
 @click.option("--no-correlation", is_flag=True, help="Take errors of neighbouring image points as independent.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Report [PROJECT/adjustment].")
-@click.option("--dry-run", is_flag=True, help="Adjust and print the figures; write nothing.")
-@click.option("--overwrite", is_flag=True, help="Replace an older report.")
+@dry_run_option("Adjust and print the figures; write nothing.")
+@overwrite_option
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Orientations, points and cameras from all measurements of a project at once.
 

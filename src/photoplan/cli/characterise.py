@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import dry_run_option, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import end_with_failures, say, show, show_json
 
 if TYPE_CHECKING:
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 @click.option("--only", multiple=True, metavar="NAME", help="Run this analysis; may be repeated [all possible].")
 @click.option("--report", type=click.Path(path_type=Path), metavar="FILE", help="Write an HTML report with plots.")
 @click.option("--csv", type=click.Path(path_type=Path), metavar="FOLDER", help="Write the figures as tables.")
-@click.option("--overwrite", is_flag=True, help="Replace a report and tables that exist.")
-@click.option("--dry-run", is_flag=True, help="Say which analyses would run and what is missing for the others.")
+@overwrite_option
+@dry_run_option("Say which analyses would run and what is missing for the others.")
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(series: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     """Know a camera from image series: noise, gain, linearity, dark signal, defects, light fall-off …
 

@@ -6,15 +6,16 @@ from pathlib import Path
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import images_option, json_option, quiet_option
 from photoplan.cli.output import show, show_json
 
 
 @click.command("check")
 @click.argument("project", type=click.Path(path_type=Path))
-@click.option("--images", "images", multiple=True, metavar="NAME", help="Image or pattern; may be repeated [all].")
+@images_option()
 @json_option
-def command(project: Path, images: tuple[str, ...], as_json: bool) -> None:
+@quiet_option
+def command(project: Path, images: tuple[str, ...], as_json: bool, quiet: bool) -> None:
     """Open every input of PROJECT and print, image by image, what it promises.
 
     Ends with exit code 3 if orientations are implausible or another reading fits better; that is named.

@@ -8,7 +8,14 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import (
+    dry_run_option,
+    images_option,
+    json_option,
+    overwrite_option,
+    quiet_option,
+    workers_option,
+)
 from photoplan.cli.output import say, show, show_json
 
 
@@ -26,17 +33,17 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--ortho-sigma", type=float, metavar="M", help="Standard deviation of X and of Y in it [one pixel].")
 @click.option("--heights", type=click.Path(path_type=Path), metavar="FILE", help="[the project's terrain]")
 @click.option("--height-system", metavar="NAME", help="Of --heights, where the file states none.")
-@click.option("--images", "images", multiple=True, metavar="NAME", help="Image or pattern; may be repeated [all].")
+@images_option()
 @click.option("--grid", type=int, default=8, show_default=True, help="Patches along each side of an image.")
 @click.option("--search", type=float, default=30.0, show_default=True, metavar="M", help="How far points may be off.")
 @click.option("--radius", type=int, default=15, show_default=True, help="Of a patch, pixels of the coarser picture.")
 @click.option("--correlation", type=float, default=0.7, show_default=True, help="Least correlation of a patch.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), metavar="CSV", help="[control.csv by the project]")
-@click.option("--workers", type=click.IntRange(1), default=None, help="Images worked on at once [all cores].")
-@click.option("--dry-run", is_flag=True, help="Choose the patches and stop.")
-@click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+@workers_option
+@dry_run_option("Choose the patches and stop.")
+@overwrite_option
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Propose control for the approximately oriented images of PROJECT.
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import DIRECTIONS, json_option, reading_options, table_format
+from photoplan.cli.options import DIRECTIONS, json_option, overwrite_option, quiet_option, reading_options, table_format
 from photoplan.cli.output import say, show, show_json
 
 
@@ -38,9 +38,9 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--list-readings", is_flag=True, help="Only list the readings of the file that fit measured points.")
 @click.option("--image-points", type=click.Path(path_type=Path), help="Measured image points, for --list-readings.")
 @click.option("--control", type=click.Path(path_type=Path), help="Their ground points, for --list-readings.")
-@click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+@overwrite_option
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(
     orientation: Path,
     target: str | None,

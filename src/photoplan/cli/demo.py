@@ -7,11 +7,13 @@ from pathlib import Path
 
 import click
 
+from photoplan.cli.options import quiet_option
+
 
 @click.command("demo")
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False), default=Path("photoplan-demo"))
 @click.option("--resolution", type=float, default=0.1, show_default=True, help="Ground pixel in metres.")
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(folder: Path, resolution: float, quiet: bool) -> None:
     """Copy the included drone block (18 images of Brighton Beach) to FOLDER and make its orthophotos.
 

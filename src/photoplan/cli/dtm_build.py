@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import dry_run_option, json_option, overwrite_option, quiet_option, workers_option
 from photoplan.cli.output import show, show_json
 
 if TYPE_CHECKING:
@@ -43,12 +43,12 @@ _SHOWN = 10
 @click.option("--nodata", type=float, help="Height that means none.")
 @click.option("--crs", help="CRS of files that state none.")
 @click.option("--height-system", help="Height system of files that state none: ellipsoidal or EPSG:nnnn.")
-@click.option("--workers", type=click.IntRange(1), help="Units computed at once [all cores].")
+@workers_option
 @click.option("--report/--no-report", default=None, help="A page with plots beside the model [if matplotlib is there].")
-@click.option("--dry-run", is_flag=True, help="Read, clean and plan; print it and stop.")
-@click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+@dry_run_option("Read, clean and plan; print it and stop.")
+@overwrite_option
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     """Predict a terrain model from POINTS: files of points and lines (text, LAS, LandXML, GeoPackage, Shapefile, DXF).
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import bounds_option, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import say, show, show_json
 
 _PATH = click.Path(path_type=Path)
@@ -24,7 +24,7 @@ _POSITIVE = click.FloatRange(0, min_open=True)
 @click.option("--band", type=click.FloatRange(0, 0.5, min_open=True, max_open=True), default=0.25, show_default=True,
               help="Half width of the band, part of the interval.")  # fmt: skip
 @click.option("--shortest", type=click.FloatRange(0), default=0.0, help="Leave out lines shorter than this, metres.")
-@click.option("--bounds", type=float, nargs=4, default=None, metavar="XMIN YMIN XMAX YMAX", help="Part [all].")
+@bounds_option
 @click.option("--labels", is_flag=True, help="Places for labels: a second layer or file.")
 @click.option("--label-all", is_flag=True, help="Labels on every contour, not on index contours alone.")
 @click.option("--text-height", type=_POSITIVE, help="Height of labels, metres on the ground [1/200 of the extent].")
@@ -32,9 +32,9 @@ _POSITIVE = click.FloatRange(0, min_open=True)
 @click.option("--crs", help="CRS of a model that does not state it.")
 @click.option("-o", "--output", type=_PATH, required=True, metavar="FILE", help=".gpkg, .shp, .geojson or .dxf")
 @click.option("--preview", type=_PATH, metavar="PNG", help="A small picture to look at, too.")
-@click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+@overwrite_option
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Contour lines on MODEL's own surface: they bend sharply at breaklines, end at borders and at walls.
 

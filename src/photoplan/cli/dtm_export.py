@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import bounds_option, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import say, show, show_json
 
 
@@ -15,12 +15,12 @@ from photoplan.cli.output import say, show, show_json
 @click.argument("model", type=click.Path(path_type=Path))
 @click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="What to write, by its suffix.")
 @click.option("--resolution", type=click.FloatRange(0, min_open=True), metavar="R", help="Of a raster [finest width].")
-@click.option("--bounds", type=float, nargs=4, default=None, metavar="XMIN YMIN XMAX YMAX", help="Part of a raster.")
+@bounds_option
 @click.option("--sigma", type=click.Path(path_type=Path), metavar="TIF", help="Write the standard deviations too.")
 @click.option("--crs", help="CRS of a terrain file that does not state it.")
-@click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+@overwrite_option
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Write MODEL as a raster (.tif), a triangulation (.obj, .ply, .xml = LandXML) or points (.xyz, .csv).
 

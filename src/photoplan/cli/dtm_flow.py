@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import BYTES, json_option
+from photoplan.cli.options import BYTES, json_option, overwrite_option, quiet_option, workers_option
 from photoplan.cli.output import say, show, show_json
 
 
@@ -20,11 +20,11 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--method", type=click.Choice(["d8", "dinf"]), default="d8", help="How upstream areas are summed [d8].")
 @click.option("-o", "--output", type=click.Path(path_type=Path), required=True, metavar="TIF", help="The raster.")
 @click.option("--memory", type=BYTES, default="2GB", show_default=True, metavar="SIZE", help="Stay under this.")
-@click.option("--workers", type=click.IntRange(1), default=None, help="Threads that write [all cores].")
+@workers_option
 @click.option("--crs", help="CRS of a model that does not state it.")
-@click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+@overwrite_option
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Upstream area, flow length, direction and catchment of every cell, in six bands of one raster.
 

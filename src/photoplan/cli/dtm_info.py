@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import json_option, quiet_option
 from photoplan.cli.output import show, show_json
 
 
@@ -14,7 +14,8 @@ from photoplan.cli.output import show, show_json
 @click.argument("model", type=click.Path(path_type=Path))
 @click.option("--gross", is_flag=True, help="List the measurements that were flagged as gross errors.")
 @json_option
-def command(model: Path, gross: bool, as_json: bool) -> None:
+@quiet_option
+def command(model: Path, gross: bool, as_json: bool, quiet: bool) -> None:
     """Show the figures of MODEL: units, lines, accuracy, gross errors. A raster is shown as by `photoplan info`."""
     from photoplan.products.dtm.info import dtm_info
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import json_option, overwrite_option, quiet_option
 from photoplan.cli.output import say, show, show_json
 
 
@@ -23,9 +23,9 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--line", "line_column", metavar="NAME", help="Column that tells lines apart [line, if there is one].")
 @click.option("--decimal-comma", is_flag=True, help="Numbers of a CSV are written 1,5.")
 @click.option("--crs", help="CRS of a terrain file that does not state it.")
-@click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
+@overwrite_option
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(
     outputs: tuple[Path, ...],
     x: str | None,

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import json_option, overwrite_option, quiet_option
 from photoplan.cli.output import say, show, show_json
 
 _PATH = click.Path(path_type=Path)
@@ -23,9 +23,9 @@ _PATH = click.Path(path_type=Path)
               help="Largest grid width inside the polygons [the fine model's finest].")  # fmt: skip
 @click.option("--height-system", metavar="same", help="Declare that both models have the same height system.")
 @click.option("-o", "--output", type=_PATH, required=True, metavar="MODEL", help="The new model, a .gpkg.")
-@click.option("--overwrite", is_flag=True, help="Replace the model if it exists.")
+@overwrite_option
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Write the model COARSE with the model FINE inside polygons, joined without a step.
 

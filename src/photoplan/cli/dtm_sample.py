@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import json_option, overwrite_option, quiet_option
 from photoplan.cli.output import say, show, show_json
 
 
@@ -24,9 +24,9 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--digits", type=click.IntRange(0, 9), default=4, show_default=True, help="Decimals of the heights.")
 @click.option("--points-crs", metavar="CRS", help="CRS of the points [the model's].")
 @click.option("--crs", help="CRS of a terrain file that does not state it.")
-@click.option("--overwrite", is_flag=True, help="Replace the output if it exists.")
+@overwrite_option
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(
     x: str | None,
     y: str | None,

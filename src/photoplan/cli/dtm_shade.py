@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import bounds_option, json_option, overwrite_option, quiet_option, workers_option
 from photoplan.cli.output import say, show, show_json
 
 if TYPE_CHECKING:
@@ -22,14 +22,14 @@ def picture_options(command: Callable[..., Any]) -> Callable[..., Any]:
     options = [
         click.argument("model", type=path),
         click.option("--resolution", type=positive, metavar="R", help="Pixel in metres [the model's mesh width]."),
-        click.option("--bounds", type=float, nargs=4, default=None, metavar="XMIN YMIN XMAX YMAX", help="Part [all]."),
+        bounds_option,
         click.option("--crs", help="CRS of a model that does not state it."),
         click.option("-o", "--output", type=path, required=True, metavar="TIF", help="The GeoTIFF."),
         click.option("--preview", type=path, metavar="PNG", help="A small picture to look at, too."),
-        click.option("--workers", type=click.IntRange(1), default=None, help="Tiles computed at once [all cores]."),
-        click.option("--overwrite", is_flag=True, help="Replace the output if it exists."),
+        workers_option,
+        overwrite_option,
         json_option,
-        click.option("-q", "--quiet", is_flag=True, help="No talk on stderr."),
+        quiet_option,
     ]
     for option in reversed(options):
         command = option(command)

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import BYTES, json_option
+from photoplan.cli.options import BYTES, json_option, overwrite_option, quiet_option, workers_option
 from photoplan.cli.output import say, show, show_json
 
 
@@ -25,11 +25,11 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--resolution", type=click.FloatRange(0, min_open=True), help="Pixel of the map, metres [mesh width].")
 @click.option("-o", "--output", type=click.Path(path_type=Path), required=True, metavar="TIF", help="The map.")
 @click.option("--memory", type=BYTES, default="2GB", show_default=True, metavar="SIZE", help="Stay under this.")
-@click.option("--workers", type=click.IntRange(1), default=None, help="Threads [all cores].")
+@workers_option
 @click.option("--crs", help="CRS of a model that does not state it.")
-@click.option("--overwrite", is_flag=True, help="Replace the map if it exists.")
+@overwrite_option
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Map of what can be seen: 1 visible, 0 hidden, 255 no terrain; for several observers first how many see it.
 

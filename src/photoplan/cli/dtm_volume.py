@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import json_option, overwrite_option, quiet_option
 from photoplan.cli.output import say, show, show_json
 
 
@@ -24,9 +24,9 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--bias", type=float, default=0.0, help="Standard deviation of a common height error, metres [0].")
 @click.option("--height-system", metavar="same", help="Declare that both models have the same height system.")
 @click.option("--crs", help="CRS of files that do not state it.")
-@click.option("--overwrite", is_flag=True, help="Replace the raster if it exists.")
+@overwrite_option
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Cut, fill and net volume from terrain A to terrain B, with their exactness.
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import dry_run_option, images_option, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import end_with_failures, say, show, show_json
 
 _ANSWER = {"auto": None, "yes": True, "no": False}
@@ -17,8 +17,7 @@ _ANSWER = {"auto": None, "yes": True, "no": False}
 @click.argument("scans", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="IMAGE…")
 @click.option("--camera", type=click.Path(path_type=Path), metavar="FILE", help="Describes the camera and its marks.")
 @click.option("--camera-name", metavar="NAME", help="Which camera of the file, where it describes several.")
-@click.option("--images", "select", multiple=True, metavar="NAME",
-              help="Of a project: image or pattern; may be repeated [all film].")  # fmt: skip
+@images_option("all film", "select")
 @click.option("--scan-resolution", metavar="DPI|UM", help="Such as 1200dpi or 21um [what the files state, else found].")
 @click.option("--rotation", type=click.Choice(["auto", "0", "90", "180", "270"]), default="auto", show_default=True,
               help="By which the picture was turned before scanning, counter-clockwise.")  # fmt: skip
@@ -29,10 +28,10 @@ _ANSWER = {"auto": None, "yes": True, "no": False}
 @click.option("--band", type=click.IntRange(1), metavar="N", help="Band to use [luminance of the first three].")
 @click.option("--least-correlation", type=click.FloatRange(0.3, 0.99), metavar="R", help="Less is no mark [0.6].")
 @click.option("--pictures", type=click.Path(path_type=Path), metavar="FOLDER", help="Receives a picture of the marks.")
-@click.option("--overwrite", is_flag=True, help="Replace pictures that exist.")
-@click.option("--dry-run", is_flag=True, help="Of a project: do not write the marks into it.")
+@overwrite_option
+@dry_run_option("Of a project: do not write the marks into it.")
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any) -> None:
     """Find the fiducial marks of scanned film photos, without approximate values.
 

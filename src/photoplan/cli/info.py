@@ -6,16 +6,17 @@ from pathlib import Path
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import json_option, overwrite_option, quiet_option
 from photoplan.cli.output import show, show_json
 
 
 @click.command("info")
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option("--plot", type=click.Path(path_type=Path), metavar="PICTURE", help="Draw a restoration filter as PNG.")
-@click.option("--overwrite", is_flag=True, help="Replace a picture that exists.")
+@overwrite_option
 @json_option
-def command(file: Path, plot: Path | None, overwrite: bool, as_json: bool) -> None:
+@quiet_option
+def command(file: Path, plot: Path | None, overwrite: bool, as_json: bool, quiet: bool) -> None:
     """Show what FILE holds: a raster, a terrain model, a project, a plan, a run record or a restoration filter."""
     from photoplan.products.describe.run import describe
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option, reading_options, table_format
+from photoplan.cli.options import json_option, listed, overwrite_option, quiet_option, reading_options, table_format
 from photoplan.cli.output import show, show_json, talking
 
 _FILE = click.Path(path_type=Path)
@@ -15,7 +15,8 @@ _FILE = click.Path(path_type=Path)
 
 @click.command("init")
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
-@click.option("--images", "images", multiple=True, required=True, metavar="PATTERN", help="Files; may be repeated.")
+@click.option("--images", multiple=True, required=True, metavar="PATTERN,…", help="Files; may be repeated.",
+              callback=lambda context, parameter, values: listed(values))  # fmt: skip
 @click.option("--camera", required=True, type=click.Path(path_type=Path), help="Cameras: TOML, YAML or JSON.")
 @click.option("--orientation", type=_FILE, help="Orientation: TOML, JSON, table … [images are to be oriented].")
 @click.option(
@@ -38,9 +39,9 @@ _FILE = click.Path(path_type=Path)
     "--earth-curvature", type=click.Choice(["none", "correction", "strict"]), default="none", show_default=True
 )
 @click.option("--refraction", is_flag=True, help="Correct for refraction by a standard atmosphere.")
-@click.option("--overwrite", is_flag=True, help="Replace a project file that exists.")
+@overwrite_option
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(
     folder: Path,
     as_json: bool,

@@ -7,13 +7,13 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import images_option, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import end_with_failures, say, show, show_json
 
 
 @click.command("interior")
 @click.argument("project", type=click.Path(path_type=Path))
-@click.option("--images", "images", multiple=True, metavar="NAME", help="Image or pattern; may be repeated [all film].")
+@images_option("all film")
 @click.option(
     "--model",
     type=click.Choice(["similarity", "affine", "bilinear"]),
@@ -23,9 +23,9 @@ from photoplan.cli.output import end_with_failures, say, show, show_json
 @click.option("--report", type=click.Path(path_type=Path), metavar="HTML", help="Figures and plots as a page.")
 @click.option("--plot", type=click.Path(path_type=Path), metavar="PNG", help="Residual vectors.")
 @click.option("--write", is_flag=True, help="Make --model that of the cameras in the project file.")
-@click.option("--overwrite", is_flag=True, help="Replace report and plot if they exist.")
+@overwrite_option
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(images: tuple[str, ...], as_json: bool, quiet: bool, **options: Any) -> None:
     """Residuals, sigma0, scales, shear and film shrinkage of the scans in PROJECT.
 

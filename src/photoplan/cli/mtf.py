@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import json_option, overwrite_option, quiet_option
 from photoplan.cli.output import end_with_failures, show, show_json, talking
 
 
@@ -136,9 +136,9 @@ def _refuse(names: set[str], why: str) -> None:
               help="Contrast of an edge over its noise.")  # fmt: skip
 @click.option("--report", type=click.Path(path_type=Path), metavar="FILE.html", help="Report with plots.")
 @click.option("--csv", type=click.Path(path_type=Path), metavar="FILE", help="A row for each edge.")
-@click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
+@overwrite_option
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(images: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any) -> None:
     """Measure sharpness: edges are found, or given by --roi, and their spread function and MTF measured.
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import click
@@ -67,12 +68,42 @@ class _Bytes(click.ParamType):
 BYTES = _Bytes()
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
+quiet_option = click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+overwrite_option = click.option("--overwrite", is_flag=True, help="Replace what exists.")
+workers_option = click.option("--workers", type=click.IntRange(1), default=None, help="Worked on at once [all cores].")
+memory_option = click.option("--memory", type=BYTES, default=None, metavar="SIZE", help="Stay under this, e.g. 2GB.")
+bounds_option = click.option(
+    "--bounds", type=float, nargs=4, default=None, metavar="XMIN YMIN XMAX YMAX", help="Part to make [all]."
+)
+
+
+def dry_run_option(what: str) -> Callable[..., Any]:
+    """`--dry-run`, with what happens instead."""
+    return click.option("--dry-run", is_flag=True, help=what)
+
+
+def images_option(default: str = "all", name: str = "images") -> Callable[..., Any]:
+    """`--images A,B` or repeated, for verbs that choose among the images of a project."""
+    return click.option(
+        "--images",
+        name,
+        multiple=True,
+        metavar="NAME,…",
+        callback=lambda context, parameter, values: listed(values),
+        help=f"Images or patterns; may be repeated [{default}].",
+    )
+
+
+def listed(values: Sequence[str]) -> tuple[str, ...]:
+    """Values with commas between them, or of an option that is repeated; a file that is there is one value."""
+    parts = [[value] if Path(value).exists() else value.split(",") for value in values]
+    return tuple(part.strip() for split in parts for part in split if part.strip())
 
 
 def executing(command: Callable[..., Any]) -> Callable[..., Any]:
     """The options of every verb that executes a plan."""
     options = [
-        click.option("--workers", type=click.IntRange(1), default=None, help="Tiles computed at once [all cores]."),
+        workers_option,
         click.option(
             "--executor",
             default="threads",
@@ -80,11 +111,11 @@ def executing(command: Callable[..., Any]) -> Callable[..., Any]:
             metavar="KIND",
             help="threads, processes, or a Dask scheduler's address tcp://host:port.",
         ),
-        click.option("--memory", type=BYTES, default=None, metavar="SIZE", help="Stay under this, e.g. 2GB."),
-        click.option("--overwrite", is_flag=True, help="Replace products that exist."),
+        memory_option,
+        overwrite_option,
         click.option("--no-quicklook", is_flag=True, help="Do not write overview.png."),
         json_option,
-        click.option("-q", "--quiet", is_flag=True, help="No talk on stderr."),
+        quiet_option,
     ]
     for option in reversed(options):
         command = option(command)

@@ -7,14 +7,14 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import executing
+from photoplan.cli.options import bounds_option, dry_run_option, executing, images_option
 
 
 @click.command("ortho")
 @click.argument("project", type=click.Path(path_type=Path))
-@click.option("--images", "images", multiple=True, metavar="NAME", help="Image or pattern; may be repeated [all].")
+@images_option()
 @click.option("--resolution", type=float, metavar="R", help="Ground pixel in metres [the images' mean GSD].")
-@click.option("--bounds", type=float, nargs=4, default=None, metavar="XMIN YMIN XMAX YMAX", help="Part to make.")
+@bounds_option
 @click.option("--kernel", help="nearest, bilinear, bicubic, bicubic-1 or lanczos3 [bicubic].")
 @click.option("--tolerance", type=float, metavar="PX", help="Largest residual of the anchors [0.02].")
 @click.option("--compress", help="deflate, zstd, lzw, jpeg or none [deflate].")
@@ -23,7 +23,7 @@ from photoplan.cli.options import executing
 @click.option("--tile", type=int, metavar="PX", help="Side of a tile [512].")
 @click.option("--output", type=click.Path(path_type=Path), help="Folder of the products [PROJECT's folder/products].")
 @click.option("--plan", "plan_file", type=click.Path(path_type=Path), help="Write the plan (GeoPackage) and stop.")
-@click.option("--dry-run", is_flag=True, help="Compile the plan, print it, and stop.")
+@dry_run_option("Compile the plan, print it, and stop.")
 @executing
 def command(
     project: Path,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import dry_run_option, images_option, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import end_with_failures, say, show, show_json
 
 if TYPE_CHECKING:
@@ -20,8 +20,7 @@ _FILE = click.Path(path_type=Path)
 
 @click.command("resect")
 @click.argument("project", type=_FILE)
-@click.option("--images", multiple=True, metavar="NAME",
-              help="Image or pattern; may be repeated [all with 3 control points].")  # fmt: skip
+@images_option("all with 3 control points")
 @click.option("--image-points", multiple=True, type=_FILE, metavar="FILE", help="Instead of the project's.")
 @click.option("--control", multiple=True, type=_FILE, metavar="FILE", help="Instead of the project's.")
 @click.option("--sigma-image", type=click.FloatRange(0, min_open=True), help="Of image points, pixels [the project's].")
@@ -31,10 +30,10 @@ _FILE = click.Path(path_type=Path)
 @click.option("--critical", type=click.FloatRange(2, 20), default=4.0, show_default=True,
               help="Normalised residual from which a point is a gross error.")  # fmt: skip
 @click.option("--report", type=_FILE, metavar="HTML", help="Residuals with pictures.")
-@click.option("--overwrite", is_flag=True, help="Replace a report that exists.")
-@click.option("--dry-run", is_flag=True, help="Do not write into the project.")
+@overwrite_option
+@dry_run_option("Do not write into the project.")
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(as_json: bool, quiet: bool, free: str | None, **options: Any) -> None:
     """Exterior orientation of single images by control points, without start values.
 

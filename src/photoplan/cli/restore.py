@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import BYTES, json_option
+from photoplan.cli.options import (
+    dry_run_option,
+    json_option,
+    memory_option,
+    overwrite_option,
+    quiet_option,
+    workers_option,
+)
 from photoplan.cli.output import end_with_failures, show, show_json
 
 if TYPE_CHECKING:
@@ -105,14 +112,14 @@ def _refuse_measuring(given: str) -> None:
               help="How grey values become light, which is what is filtered.")  # fmt: skip
 @click.option("--dtype", default="same", show_default=True, metavar="same|float32|uint16", help="Type of the results.")
 @click.option("--compress", default="deflate", show_default=True, help="deflate, zstd, lzw, jpeg or none.")
-@click.option("--workers", type=click.IntRange(1), default=None, help="Tiles computed at once [all cores].")
-@click.option("--memory", type=BYTES, default=None, metavar="SIZE", help="Stay under this, e.g. 2GB.")
+@workers_option
+@memory_option
 @click.option("--report", type=click.Path(path_type=Path), metavar="FILE.html", help="Report with plots.")
-@click.option("--overwrite", is_flag=True, help="Replace results that exist.")
+@overwrite_option
 @click.option("--no-quicklook", is_flag=True, help="Write no pictures.")
-@click.option("--dry-run", is_flag=True, help="Say what would be done, and stop.")
+@dry_run_option("Say what would be done, and stop.")
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool, **options: Any) -> None:
     """Restore images of any size: NAME_restored.tif (a cloud-optimised GeoTIFF) and its run record.
 

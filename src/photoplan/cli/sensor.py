@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import dry_run_option, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import say, show, show_json
 
 
@@ -15,10 +15,10 @@ from photoplan.cli.output import say, show, show_json
 @click.argument("file", type=click.Path(path_type=Path), metavar="FILE")
 @click.option("--report", type=click.Path(path_type=Path), metavar="HTML", help="Figures and plots as a page.")
 @click.option("--csv", type=click.Path(path_type=Path), metavar="CSV", help="Figures as a table.")
-@click.option("--overwrite", is_flag=True, help="Replace report and table if they exist.")
-@click.option("--dry-run", is_flag=True, help="Print the figures, write nothing.")
+@overwrite_option
+@dry_run_option("Print the figures, write nothing.")
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Resolution, bandwidth, charge transfer and noise of the sensor that FILE (TOML) describes."""
     from photoplan.products.sensor.run import SensorRequest, describe_sensor

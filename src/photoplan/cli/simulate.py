@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import dry_run_option, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import say, show, show_json
 
 
@@ -29,10 +29,10 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--oversampling", type=click.IntRange(1, 64), metavar="K",
               help="Cells of the scene along a side of a pixel [1 for files, 8 for patterns].")  # fmt: skip
 @click.option("--dtype", type=click.Choice(["uint8", "uint16", "float32"]), help="Of the files [as the model says].")
-@click.option("--overwrite", is_flag=True, help="Replace images that exist.")
-@click.option("--dry-run", is_flag=True, help="Check everything, say what would be written, write nothing.")
+@overwrite_option
+@dry_run_option("Check everything, say what would be written, write nothing.")
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(scene: str, as_json: bool, quiet: bool, **options: Any) -> None:
     """Form images of a scene with blur, noise, jitter, blooming and all else that a camera does.
 

@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import json_option
+from photoplan.cli.options import (
+    dry_run_option,
+    images_option,
+    json_option,
+    overwrite_option,
+    quiet_option,
+    workers_option,
+)
 from photoplan.cli.output import say, show, show_json
 
 if TYPE_CHECKING:
@@ -16,7 +23,7 @@ if TYPE_CHECKING:
 
 @click.command("tie")
 @click.argument("project", type=click.Path(path_type=Path))
-@click.option("--images", "images", multiple=True, metavar="NAME", help="Image or pattern; may be repeated [all].")
+@images_option()
 @click.option("--pairs", default="auto", show_default=True, metavar="auto|all|FILE", help="Which images are compared.")
 @click.option("--scale", type=float, help="Look for features in images reduced to this, e.g. 0.5 [by their size].")
 @click.option("--features", type=int, default=4000, show_default=True, help="Features per image.")
@@ -25,11 +32,11 @@ if TYPE_CHECKING:
 @click.option("--ignore-orientation", is_flag=True, help="Work as if no image had a position.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), metavar="CSV", help="[tie_points.csv by the project]")
 @click.option("--no-picture", is_flag=True, help="Do not write a picture beside the output.")
-@click.option("--workers", type=click.IntRange(1), default=None, help="Images worked on at once [all cores].")
-@click.option("--dry-run", is_flag=True, help="Open the images, choose pairs and stop.")
-@click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+@workers_option
+@dry_run_option("Open the images, choose pairs and stop.")
+@overwrite_option
 @json_option
-@click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
+@quiet_option
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Find points that several images of PROJECT have in common.
 
