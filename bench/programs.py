@@ -49,11 +49,8 @@ def photoplan() -> Program:
     return Program("photoplan", command, lambda folder: folder / f"{FRAME}_ortho.tif")
 
 
-def orthority(terrain: str) -> Program:
-    """orthority in an environment of its own, installed when it is first needed.
-
-    `terrain` is its interpolation of heights: ``cubic`` is its default, ``bilinear`` what the others do here.
-    """
+def install_orthority() -> Path:
+    """orthority's command, installed into an environment of its own when it is first needed."""
     script = ORTHORITY / "bin" / "oty"
     if not script.exists():
         print("installing orthority into an environment of its own …", file=sys.stderr)
@@ -62,6 +59,15 @@ def orthority(terrain: str) -> Program:
             subprocess.run([ORTHORITY / "bin" / "pip", "install", "--quiet", "orthority"], check=True)
         except (OSError, subprocess.CalledProcessError) as error:
             raise Missing(f"orthority: could not be installed ({error})") from None
+    return script
+
+
+def orthority(terrain: str) -> Program:
+    """orthority in an environment of its own.
+
+    `terrain` is its interpolation of heights: ``cubic`` is its default, ``bilinear`` what the others do here.
+    """
+    script = install_orthority()
 
     def command(source: Source, folder: Path, bounds: Bounds | None) -> list[str]:
         call = [script, "frame", "-r", source.resolution, "-ap", "-ip", source.camera, "-ep", source.orientation]

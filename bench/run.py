@@ -26,6 +26,7 @@ from pathlib import Path
 import rasterio
 from agreement import compare
 from filter import report_filter
+from oblique import report_oblique
 from orientation import report_orientation
 from prepare import DATA, LARGE, SMALL, WORK, Source, prepare
 from programs import Bounds, Missing, Program, gdalwarp, orthority, photoplan
@@ -205,6 +206,7 @@ def main() -> int:
             results["sizes"].append(compare_at(source, entries))
             report(results["sizes"][-1])
     WORK.mkdir(exist_ok=True)
+    results["oblique"] = report_oblique(options.repeat)
     results["filter"] = report_filter(options.quick)
     results["terrain"] = report_terrain(options.quick, options.large)
     results["orientation"] = report_orientation(options.quick)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
-from photoplan.kernels.position import RUN, locate_run
+from photoplan.kernels.position import RUN, cell_space, locate_run
 
 EMPTY, INTERIOR, BORDER, AVERAGE = 0, 1, 2, 3
 """Kinds of pixels: outside or without relief; all taps inside and valid; some not; averaged over a wider kernel."""
@@ -143,11 +143,7 @@ def place_runs(
     corner, first, part, kind, fill = block
     before, shift = max(taps // 2 - 1, 0), np.float32(0.5 if taps == 1 else 0.0)
     origin = np.empty(2)
-    located_by = (
-        origin,
-        np.empty((4, 3)),
-        (np.empty(RUN, np.int32), np.empty(RUN, np.float32), np.empty(RUN, np.float32)),
-    )
+    located_by = (origin, np.empty((4, 3)), cell_space())
     moved, kinds = np.empty((2, RUN), np.float32), np.empty(RUN, np.int32)
     doubtful = 0
     for k in range(runs.shape[0]):

@@ -131,42 +131,54 @@ def _keep_from(
 
 
 @inner
-def _add_field(
+def cell_space() -> tuple[Any, ...]:
+    """Working space of `find_cells` for one run."""
+    return np.empty(RUN, np.int32), np.empty(RUN, np.float32), np.empty(RUN, np.float32)
+
+
+@inner
+def find_cells(
     frame: NDArray[np.float64],
     nodes: NDArray[np.float32],
     origin: NDArray[np.float64],
-    work: tuple[Any, ...],
     dx: NDArray[np.float32],
     dy: NDArray[np.float32],
+    work: tuple[Any, ...],
 ) -> None:
-    """Add the field to the positions of a run, bilinear between nodes; positions beyond the nodes become NaN.
+    """Cells of the field and fractions within them for positions relative to `origin`.
 
-    Two loops: the first finds cells and fractions in vectors, the second gathers.
+    Fills work = (first element of each cell in the flat nodes, −1 beyond the nodes and for NaN; fractions along x, y).
     """
     cell, along_x, along_y = work
     rows, cols = nodes.shape[0], nodes.shape[1]
-    table = nodes.reshape(-1)
     first_x = np.float32((origin[0] - frame[0]) * frame[2])
     first_y = np.float32((origin[1] - frame[1]) * frame[3])
     per_x, per_y = np.float32(frame[2]), np.float32(frame[3])
     last_x, last_y, stride = np.float32(cols - 1), np.float32(rows - 1), np.float32(cols)
-    nothing, nowhere = np.float32(0.0), np.float32(np.nan)
-    n = dx.shape[0]
-    for i in range(n):
+    nothing = np.float32(0.0)
+    for i in range(dx.shape[0]):
         x, y = first_x + dx[i] * per_x, first_y + dy[i] * per_y
         inside = (x >= nothing) & (x < last_x) & (y >= nothing) & (y < last_y)
         x = x if inside else nothing
         y = y if inside else nothing
         col, row = np.floor(x), np.floor(y)
         along_x[i], along_y[i] = x - col, y - row
-        cell[i] = np.int32(row * stride + col)
-        dx[i] = dx[i] if inside else nowhere
-        dy[i] = dy[i] if inside else nowhere
+        first = np.int32(2) * np.int32(row * stride + col)
+        cell[i] = first if inside else np.int32(-1)
+
+
+@inner
+def _add_field(
+    nodes: NDArray[np.float32], work: tuple[Any, ...], dx: NDArray[np.float32], dy: NDArray[np.float32]
+) -> None:
+    """Add the field to the positions of a run, bilinear between nodes; positions beyond the nodes become NaN."""
+    cell, along_x, along_y = work
+    table = nodes.reshape(-1)
     # Unsigned, or every access would ask for a negative index.
-    below = np.uint64(2 * cols)
+    below = np.uint64(2 * nodes.shape[1])
     one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
-    for i in range(n):
-        a = np.uint64(np.uint32(cell[i])) * two
+    for i in range(dx.shape[0]):
+        a = np.uint64(np.uint32(max(cell[i], np.int32(0))))
         b = a + below
         fx, fy = along_x[i], along_y[i]
         upper_x = table[a] + fx * (table[a + two] - table[a])
@@ -175,6 +187,10 @@ def _add_field(
         lower_y = table[b + one] + fx * (table[b + three] - table[b + one])
         dx[i] += upper_x + fy * (lower_x - upper_x)
         dy[i] += upper_y + fy * (lower_y - upper_y)
+    nowhere = np.float32(np.nan)
+    for i in range(dx.shape[0]):
+        dx[i] = dx[i] if cell[i] >= 0 else nowhere
+        dy[i] = dy[i] if cell[i] >= 0 else nowhere
 
 
 @inner
@@ -217,7 +233,8 @@ def locate_run(
             _run_positions(coef, run[3] - u_ref, heights, h_ref, higher[0], higher[1])
             _keep_from(heights, np.float32(box_heights[box, 0]), higher[0], higher[1], dx, dy)
     if field.size > 0:
-        _add_field(field_frame, field, origin, work, dx, dy)
+        find_cells(field_frame, field, origin, dx, dy, work)
+        _add_field(field, work, dx, dy)
 
 
 @inner
@@ -301,11 +318,7 @@ def _positions(
     offset: tuple[int, int],
     result: NDArray[Any],
 ) -> None:
-    frame = (
-        np.empty(2),
-        np.empty((4, 3)),
-        (np.empty(RUN, np.int32), np.empty(RUN, np.float32), np.empty(RUN, np.float32)),
-    )
+    frame = (np.empty(2), np.empty((4, 3)), cell_space())
     origin = frame[0]
     moved = np.empty((2, RUN), np.float32)
     for k in range(runs.shape[0]):

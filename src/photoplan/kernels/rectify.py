@@ -21,8 +21,8 @@ from photoplan.kernels.jit import is_ready
 from photoplan.kernels.pack import as_bytes, pack, solid_patches
 from photoplan.kernels.place import empty_block, place_runs
 from photoplan.kernels.position import ALL_MINE, RUN, tile_runs
-from photoplan.kernels.scale import largest_scales, stretch_runs
-from photoplan.kernels.weights import KERNELS, STRETCH_FROM, weight_table
+from photoplan.kernels.scale import LOOK_CLOSER, largest_scales, stretch_runs
+from photoplan.kernels.weights import KERNELS, weight_table
 
 AnchorArrays = tuple[NDArray[Any], ...]
 """rects (m, 4), box_start (m + 1,), box_heights (n, 2), corners (n, 8, 3), field_frame (5,), field (rows, cols, 2)."""
@@ -33,13 +33,8 @@ Owned = tuple[NDArray[np.uint16], int]
 Border = tuple[float, float, float, float]
 """Outer edges of the image x_min, y_min, x_max, y_max in pixels of the source window."""
 
-# Scales are measured at the corners of boxes; between them a perspective is hardly larger. A rectangle that comes
-# this near to averaging is looked at pixel by pixel.
 BLOCK = 64
 """Runs that go through the steps together: small enough to stay in the processor's cache."""
-
-_LOOK_CLOSER = 0.97 * STRETCH_FROM
-
 
 _ANCHOR_TYPES = (np.int32, np.int32, np.float64, np.float64, np.float64, np.float32)
 
@@ -163,7 +158,7 @@ def _resample(
     coarse = np.zeros(len(rects), bool)
     if name != "nearest":
         stretch = frame[4] if field.size else 1.0
-        coarse = ~(stretch * largest_scales(rects, box_start, corners) <= _LOOK_CLOSER)
+        coarse = ~(stretch * largest_scales(rects, box_start, corners) <= LOOK_CLOSER)
     for averaging in (False, True):
         chosen = np.flatnonzero(coarse == averaging)
         runs = tile_runs(rects, chosen, offset, relief.shape, owned)

@@ -9,8 +9,21 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 from photoplan.kernels.place import ALL, AVERAGE, EMPTY, INTERIOR, NOTHING, SOME
-from photoplan.kernels.position import RUN, middle_of_run, row_weights, run_coefficients, shift_to, single
+from photoplan.kernels.position import (
+    RUN,
+    cell_space,
+    find_cells,
+    middle_of_run,
+    row_weights,
+    run_coefficients,
+    shift_to,
+    single,
+)
 from photoplan.kernels.weights import STRETCH_FROM, STRETCH_FULL
+
+# Scales are measured at the corners of boxes and the ends of runs; between them a perspective is hardly larger. What
+# comes this near to averaging is looked at pixel by pixel.
+LOOK_CLOSER = 0.97 * STRETCH_FROM
 
 
 @kernel
@@ -76,29 +89,49 @@ def _run_slopes(
 
 @inner
 def _bend_slopes(
-    frame: NDArray[np.float64],
-    nodes: NDArray[np.float32],
-    origin: NDArray[np.float64],
-    slopes: NDArray[np.float32],
-    count: int,
+    frame: NDArray[np.float64], nodes: NDArray[np.float32], work: tuple[Any, ...], slopes: NDArray[np.float32]
 ) -> None:
-    """Derivatives of positions with the field instead of without; beyond the nodes they stay."""
-    rows, cols = nodes.shape[0], nodes.shape[1]
-    for i in range(count):
-        x = (origin[0] + slopes[0, i] - frame[0]) * frame[2]
-        y = (origin[1] + slopes[3, i] - frame[1]) * frame[3]
-        if not ((x >= 0.0) & (x < cols - 1) & (y >= 0.0) & (y < rows - 1)):
-            continue
-        col, row = np.int64(x), np.int64(y)
-        fx, fy = x - col, y - row
-        xu, xv, yu, yv = slopes[1, i], slopes[2, i], slopes[4, i], slopes[5, i]
-        for c in range(2):
-            a, b = nodes[row, col, c], nodes[row, col + 1, c]
-            d, e = nodes[row + 1, col, c], nodes[row + 1, col + 1, c]
-            by_x = ((b - a) + fy * ((e - d) - (b - a))) * frame[2]
-            by_y = ((d - a) + fx * ((e - b) - (d - a))) * frame[3]
-            slopes[3 * c + 1, i] += by_x * xu + by_y * yu
-            slopes[3 * c + 2, i] += by_x * xv + by_y * yv
+    """Derivatives of positions with the field instead of without; beyond the nodes any."""
+    cell, along_x, along_y = work
+    table = nodes.reshape(-1)
+    below = np.uint64(2 * nodes.shape[1])
+    two = np.uint64(2)
+    per_x, per_y = np.float32(frame[2]), np.float32(frame[3])
+    xu, xv, yu, yv = slopes[1], slopes[2], slopes[4], slopes[5]
+    for i in range(cell.shape[0]):
+        a = np.uint64(np.uint32(max(cell[i], np.int32(0))))
+        b = a + below
+        fx, fy = along_x[i], along_y[i]
+        upper, lower = table[a + two] - table[a], table[b + two] - table[b]
+        left, right = table[b] - table[a], table[b + two] - table[a + two]
+        x_x, x_y = (upper + fy * (lower - upper)) * per_x, (left + fx * (right - left)) * per_y
+        a, b = a + np.uint64(1), b + np.uint64(1)
+        upper, lower = table[a + two] - table[a], table[b + two] - table[b]
+        left, right = table[b] - table[a], table[b + two] - table[a + two]
+        y_x, y_y = (upper + fy * (lower - upper)) * per_x, (left + fx * (right - left)) * per_y
+        u_x, v_x, u_y, v_y = xu[i], xv[i], yu[i], yv[i]
+        xu[i], xv[i] = u_x + (x_x * u_x + x_y * u_y), v_x + (x_x * v_x + x_y * v_y)
+        yu[i], yv[i] = u_y + (y_x * u_x + y_y * u_y), v_y + (y_x * v_x + y_y * v_y)
+
+
+@inner
+def _largest_of_run(
+    coef: NDArray[np.float64], slope: NDArray[np.float64], ends: tuple[Any, ...], heights: NDArray[np.float64]
+) -> float:
+    """Largest squared scale at the ends of a run and of its box; ends: first and last column, and reference height."""
+    largest = 0.0
+    for c in range(2):
+        for k in range(4):
+            u, h = (ends[0] if k & 1 else ends[1]), heights[k >> 1] - ends[2]
+            inverse = 1.0 / ((coef[0, 2] + coef[1, 2] * u) + h * (coef[2, 2] + coef[3, 2] * u))
+            x = ((coef[0, c] + coef[1, c] * u) + h * (coef[2, c] + coef[3, c] * u)) * inverse
+            along_u = ((coef[1, c] + coef[3, c] * h) - x * (coef[1, 2] + coef[3, 2] * h)) * inverse
+            rise = (slope[0, c] + slope[1, c] * u) + h * (slope[2, c] + slope[3, c] * u)
+            fall = (slope[0, 2] + slope[1, 2] * u) + h * (slope[2, 2] + slope[3, 2] * u)
+            along_v = (rise - x * fall) * inverse
+            squared = along_u * along_u + along_v * along_v
+            largest = squared if not squared <= largest else largest
+    return largest
 
 
 @inner
@@ -121,19 +154,25 @@ def _stretch_of_run(
     origin: NDArray[np.float64],
     work: tuple[Any, ...],
     stretch: NDArray[np.float32],
-) -> None:
-    """Fills stretch (2, RUN) along image x and y."""
+) -> bool:
+    """Fills stretch (2, RUN) along image x and y; False if nothing in the run is widened."""
     rects, box_start, box_heights, corners, frame, field = anchors
-    coef, slope, slopes, higher = work
+    coef, slope, slopes, higher, cells = work
     rect, lowest = rects[run[0]], box_start[run[0]]
     u_ref, edges = middle_of_run(rect, run), row_weights(rect, run[1])
+    # The run as the rectangle has it: crops must decide the same.
+    first, last = float(run[2] - u_ref), float(min(run[2] + RUN, rect[2]) - 1 - u_ref)
     per_row = 1.0 / (rect[3] - rect[1])
     n = heights.shape[0]
+    longer = frame[4] if field.size > 0 else 1.0
     for box in range(lowest, box_start[run[0] + 1]):
         h_ref = run_coefficients(rect, box_heights[box], corners[box], u_ref, edges, coef)
         run_coefficients(rect, box_heights[box], corners[box], u_ref, (-per_row, per_row), slope)
         shift_to(origin, coef)
         shift_to(origin, slope)
+        largest = longer * longer * _largest_of_run(coef, slope, (first, last, h_ref), box_heights[box])
+        if box == lowest and box + 1 == box_start[run[0] + 1] and largest <= LOOK_CLOSER * LOOK_CLOSER:
+            return False
         if box == lowest:
             _run_slopes(coef, slope, run[3] - u_ref, heights, h_ref, slopes)
         else:
@@ -144,9 +183,11 @@ def _stretch_of_run(
                     for k in range(6):
                         slopes[k, i] = higher[k, i]
     if field.size > 0:
-        _bend_slopes(frame, field, origin, slopes, n)
+        find_cells(frame, field, origin, slopes[0, :n], slopes[3, :n], cells)
+        _bend_slopes(frame, field, (cells[0][:n], cells[1], cells[2]), slopes)
     _widening(slopes[1, :n], slopes[2, :n], stretch[0])
     _widening(slopes[4, :n], slopes[5, :n], stretch[1])
+    return True
 
 
 @kernel
@@ -168,13 +209,15 @@ def stretch_runs(
     See `place_runs` for the others.
     """
     corner, _, _, kind, fill = block
-    work = (np.empty((4, 3)), np.empty((4, 3)), np.empty((6, RUN), np.float32), np.empty((6, RUN), np.float32))
+    slopes = (np.empty((6, RUN), np.float32), np.empty((6, RUN), np.float32))
+    work = (np.empty((4, 3)), np.empty((4, 3)), slopes[0], slopes[1], cell_space())
     origin = np.empty(2)
     count = 0
     for k in range(runs.shape[0]):
         row, col, n = runs[k, 1] - offset[1], runs[k, 3] - offset[0], runs[k, 4] - runs[k, 3]
         origin[0], origin[1] = float(corner[k, 0]), float(corner[k, 1])
-        _stretch_of_run(anchors, runs[k], relief[row, col : col + n], origin, work, scales[k])
+        if not _stretch_of_run(anchors, runs[k], relief[row, col : col + n], origin, work, scales[k]):
+            continue
         whole = fill[k] == ALL
         interior = 0
         for i in range(n):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -15,7 +16,7 @@ from photoplan.cameras.base import ImageField
 _WIDEST, _NARROWEST = 256.0, 1.0 / 64.0
 #: Intervals of nodes along each axis at which the spacing is tried out.
 _SAMPLES = 24
-#: The residual is measured at the middles of cells and of their sides; what a third derivative adds beside them.
+#: The residual is that of the middles of cells and of their sides; what a third derivative adds beside them.
 _BESIDE = 1.1
 
 
@@ -27,6 +28,8 @@ class FieldGrid:
     """
 
     field: ImageField
+    size: tuple[int, int]
+    """Of the image, pixels."""
     phase: tuple[float, float]
     spacing: tuple[float, float]
     """Along x and y, pixels."""
@@ -41,23 +44,34 @@ class FieldGrid:
         """Nodes around the ideal positions from `low` to `high`, (x, y) each, cut at `bounds`."""
         low = np.clip(low, self.bounds[:2], self.bounds[2:])
         high = np.clip(high, self.bounds[:2], self.bounds[2:])
-        axes, fractions = [], []
-        for axis, breaks in enumerate(_breaks(self.field)):
-            phase, spacing = self.phase[axis], self.spacing[axis]
-            first, last = (int(np.floor((a[axis] - phase) / spacing)) for a in (low, high))
-            starts = phase + spacing * np.arange(first, last + 1, dtype=float)
-            lattice, fraction = _probed(starts, spacing, breaks)
-            axes.append(np.r_[lattice[:, :2].ravel(), lattice[-1, 2]])
-            fractions.append(fraction)
-        shifts = _shifts(self.field, *axes)
-        origin = np.round(shifts[::2, ::2].mean(axis=(0, 1)))
-        shifts -= origin
-        nodes = shifts[::2, ::2].astype(np.float32)
-        shifts[::2, ::2] = nodes
+        ends = [
+            [int(np.floor((a[axis] - self.phase[axis]) / self.spacing[axis])) for a in (low, high)] for axis in range(2)
+        ]
+        starts = [p + s * np.arange(e[0], e[1] + 1.0) for p, s, e in zip(self.phase, self.spacing, ends)]
+        nodes, residual = (self._smooth if self.field.breaks is None else self._bent)(starts)
+        origin = np.round(nodes.mean(axis=(0, 1)))
+        kept = (nodes - origin).astype(np.float32)
+        rounding = float(np.spacing(np.abs(kept).max()))
+        return FieldTable((float(starts[0][0]), float(starts[1][0])), origin, kept, residual + rounding)
+
+    def _smooth(self, starts: list[NDArray[np.float64]]) -> tuple[NDArray[np.float64], float]:
+        """Shifts at nodes, and what cells miss by the second differences of the nodes (and those around them)."""
+        x, y = (np.r_[a[0] - s, a, a[-1] + s, a[-1] + 2 * s] for a, s in zip(starts, self.spacing))
+        shifts, used = _shifts(self.field, self.size, self.spacing, x, y)
+        across = shifts[1:-1, :-2] - 2 * shifts[1:-1, 1:-1] + shifts[1:-1, 2:]
+        down = shifts[:-2, 1:-1] - 2 * shifts[1:-1, 1:-1] + shifts[2:, 1:-1]
+        miss = (np.hypot(across[..., 0], across[..., 1]) + np.hypot(down[..., 0], down[..., 1])) / 8
+        return shifts[1:-1, 1:-1], _BESIDE * float(miss[used[1:-1, 1:-1]].max(initial=0.0))
+
+    def _bent(self, starts: list[NDArray[np.float64]]) -> tuple[NDArray[np.float64], float]:
+        """Shifts at nodes, and what cells miss at their middles or at the breaks that cross them."""
+        probed = [_probed(a, s, breaks) for a, s, breaks in zip(starts, self.spacing, _breaks(self.field))]
+        x, y = (np.r_[lattice[:, :2].ravel(), lattice[-1, 2]] for lattice, _ in probed)
+        shifts, used = _shifts(self.field, self.size, self.spacing, x, y)
         corners = (shifts[:-1:2, :-1:2], shifts[:-1:2, 2::2], shifts[2::2, :-1:2], shifts[2::2, 2::2])
         probes = (shifts[:-1:2, 1::2], shifts[1::2, :-1:2], shifts[1::2, 1::2])
-        residual = _BESIDE * float(_misses(corners, probes, *fractions).max())
-        return FieldTable((axes[0][0], axes[1][0]), origin, nodes, residual)
+        misses = _misses(corners, probes, (probed[0][1], probed[1][1]), used[1::2, 1::2])
+        return shifts[::2, ::2], _BESIDE * float(misses.max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,12 +104,13 @@ def field_grid(field: ImageField, size: tuple[int, int], tolerance: float) -> Fi
         phases.append(float(breaks[0]) if even else 0.0)
         spacings.append(widest if even else 2.0 ** np.floor(np.log2(widest)))
     while True:
-        along_x, along_y, worst, stretch = _try_out(field, bounds, phases, spacings)
+        along_x, along_y, worst, stretch = _try_out(field, size, bounds, phases, spacings)
         if worst <= tolerance / _BESIDE or min(spacings) <= _NARROWEST:
             break
         share = min(tolerance / 3, max(along_x, along_y))
-        spacings = [s / 2 if miss >= share else s for s, miss in zip(spacings, (along_x, along_y))]
-    return FieldGrid(field, (phases[0], phases[1]), (spacings[0], spacings[1]), bounds, stretch, _BESIDE * worst)
+        finer = [0.5 if len(breaks) else 0.5**0.5 for breaks in _breaks(field)]
+        spacings = [s * f if miss >= share else s for s, f, miss in zip(spacings, finer, (along_x, along_y))]
+    return FieldGrid(field, size, (phases[0], phases[1]), (spacings[0], spacings[1]), bounds, stretch, _BESIDE * worst)
 
 
 def _breaks(field: ImageField) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -118,7 +133,11 @@ def _ideal_bounds(field: ImageField, size: tuple[int, int]) -> tuple[float, floa
 
 
 def _try_out(
-    field: ImageField, bounds: tuple[float, float, float, float], phases: list[float], spacings: list[float]
+    field: ImageField,
+    size: tuple[int, int],
+    bounds: tuple[float, float, float, float],
+    phases: list[float],
+    spacings: list[float],
 ) -> tuple[float, float, float, float]:
     """Misses along x, along y and anywhere, and the largest stretch, at intervals spread over the bounds."""
     axes, fractions = [], []
@@ -130,10 +149,10 @@ def _try_out(
         lattice, fraction = _probed(phases[axis] + spacings[axis] * first, spacings[axis], breaks)
         axes.append(lattice.ravel())
         fractions.append(fraction)
-    shifts = _shifts(field, *axes)
+    shifts, used = _shifts(field, size, spacings, *axes)
     corners = (shifts[::3, ::3], shifts[::3, 2::3], shifts[2::3, ::3], shifts[2::3, 2::3])
     probes = (shifts[::3, 1::3], shifts[1::3, ::3], shifts[1::3, 1::3])
-    along_x, along_y, middle = _misses(corners, probes, *fractions)
+    along_x, along_y, middle = _misses(corners, probes, (fractions[0], fractions[1]), used[1::3, 1::3])
     by_x, by_y = (corners[1] - corners[0]) / spacings[0], (corners[2] - corners[0]) / spacings[1]
     stretch = 1.0 + float(np.maximum(np.abs(by_x), np.abs(by_y)).sum(axis=-1).max())
     return along_x, along_y, max(along_x, along_y, middle), stretch
@@ -157,21 +176,30 @@ def _probed(
     return np.stack([first, first + fraction * spacing, first + spacing], axis=1), fraction
 
 
-def _shifts(field: ImageField, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Real minus ideal positions on a lattice, (rows, columns, 2)."""
+def _shifts(
+    field: ImageField, size: tuple[int, int], near: Sequence[float], x: NDArray[np.float64], y: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Real minus ideal positions on a lattice, (rows, columns, 2), and which places lie in the image or `near`."""
     ideal = np.stack(np.broadcast_arrays(x[None], y[:, None]), axis=-1)
-    return field(ideal) - ideal
+    real = field(ideal)
+    used = (real > np.subtract(-0.5, near)) & (real < np.add(np.subtract(size, 0.5), near))
+    return real - ideal, np.asarray(used.all(axis=-1))
 
 
 def _misses(
-    corners: tuple[Any, ...], probes: tuple[Any, ...], fx: NDArray[np.float64], fy: NDArray[np.float64]
+    corners: tuple[Any, ...],
+    probes: tuple[Any, ...],
+    fractions: tuple[NDArray[np.float64], NDArray[np.float64]],
+    used: NDArray[np.bool_],
 ) -> NDArray[np.float64]:
     """Worst miss of bilinear interpolation: on cells' upper sides, left sides, and inside; shape (3,).
 
-    corners: upper left, upper right, lower left, lower right; probes: upper side, left side, inside.
+    corners: upper left, upper right, lower left, lower right; probes: upper side, left side, inside. Cells that are not
+    `used` do not count.
     """
     a, b, c, d = corners
-    fx, fy = fx[None, :, None], fy[:, None, None]
+    fx, fy = fractions[0][None, :, None], fractions[1][:, None, None]
     upper, left = a + fx * (b - a), a + fy * (c - a)
     inside = upper + fy * (c + fx * (d - c) - upper)
-    return np.array([np.hypot(*np.moveaxis(g - p, -1, 0)).max() for g, p in zip((upper, left, inside), probes)])
+    places = zip((upper, left, inside), probes)
+    return np.array([np.hypot(*np.moveaxis((g - p)[used], -1, 0)).max(initial=0.0) for g, p in places])
