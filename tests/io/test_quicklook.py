@@ -83,6 +83,13 @@ def test_many_products_lie_where_the_map_says(tmp_path: Path) -> None:
         assert tuple(found[:, y // 5, x // 5].tolist()) == colour
 
 
+def test_small_products_make_a_small_picture(tmp_path: Path) -> None:
+    """No finer than the finest of them."""
+    products = [product(tmp_path / f"{left}.tif", left, (9, 9, 9), size=100) for left in (0, 50)]
+    path = write_overview(products, tmp_path / "all.png")
+    assert path is not None and png(path).shape == (4, 100, 150)
+
+
 def test_nothing_and_nonsense(tmp_path: Path) -> None:
     assert write_overview([], tmp_path / "all.png") is None
     with pytest.raises(UsageError, match="16 to 20,000"):

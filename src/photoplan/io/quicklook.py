@@ -77,7 +77,8 @@ def write_overview(products: Sequence[Path], picture: Path, *, max_side: int = 1
         return None
     left, top = min(s.left for s in sheets), max(s.top for s in sheets)
     right, bottom = max(s.right for s in sheets), min(s.bottom for s in sheets)
-    pixel = max(right - left, top - bottom, min(s.right - s.left for s in sheets)) / max_side
+    # Never finer than the finest product: small ones make a small picture.
+    pixel = max(max(right - left, top - bottom) / max_side, min(s.pixel for s in sheets))
     canvas = np.zeros((4, _scaled(top - bottom, pixel), _scaled(right - left, pixel)), np.uint8)
     for sheet in reversed(sheets):
         col, row = int((sheet.left - left) / pixel), int((top - sheet.top) / pixel)
@@ -99,6 +100,7 @@ class _Sheet:
     top: float
     right: float
     bottom: float
+    pixel: float
 
 
 def _placed(products: Sequence[Path]) -> list[_Sheet]:
@@ -111,7 +113,7 @@ def _placed(products: Sequence[Path]) -> list[_Sheet]:
             north_up = dataset.transform.b == dataset.transform.d == 0 and dataset.transform.e < 0
             if dataset.crs == first and north_up:
                 b = dataset.bounds
-                sheets.append(_Sheet(Path(path), b.left, b.top, b.right, b.bottom))
+                sheets.append(_Sheet(Path(path), b.left, b.top, b.right, b.bottom, dataset.transform.a))
     return sheets
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -21,7 +20,7 @@ from photoplan.events import SILENT, Events
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import check_height_system, height_label
 from photoplan.io.product import check_output
-from photoplan.io.run_record import peak_memory_bytes, record_path, versions, write_run_record
+from photoplan.io.run_record import peak_memory_bytes, record_path, run_times, versions, write_run_record
 from photoplan.io.terrain.files import read_measured
 from photoplan.io.terrain.model_tables import GrossError, ModelHeader, empty_figures, input_facts
 from photoplan.io.terrain.model_write import ModelParts, ModelWriter
@@ -107,12 +106,13 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
     ResourceError
         The disk is full, or the points need more memory than there is.
     """
-    started = time.perf_counter()
+    times = run_times()
     if request.output.suffix.lower() != ".gpkg":
         raise UsageError(f"{request.output}: a terrain model is a GeoPackage; give it a name that ends with .gpkg")
     if not request.output.resolve().parent.is_dir():
         raise UsageError(f"{request.output}: no such folder; make it first")
     check_output(request.output, request.inputs, overwrite=request.overwrite)
+    events.begin("reading measurements")
     measured, findings, crs, system = load(request)
     plan = plan_build(measured, request.settings)
     events.talk(describe_plan(plan, measured, crs, system))
@@ -122,23 +122,26 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
         with thread_map(request.workers) as run:
             built = build_terrain(plan, run, events)
         gross = tuple(_gross(built, measured))
+        events.begin("writing the model", len(built.figures), "units")
         done = writer.done()
         for of_unit in built.figures:
             place = of_unit.column, of_unit.row
             if place not in done:
                 unit = built.units.get(place)
                 writer.add(unit, of_unit if unit is not None else empty_figures(*place))
+            events.done()
         totals = _totals(built, measured, findings, len(gross))
         header = ModelHeader(
             crs, system, plan.layout, asdict(request.settings), tuple(facts), built.fit.whole.name, totals
         )
         writer.finish(ModelParts(header, built.lines, gross, plan.polygon))
-    seconds = time.perf_counter() - started
-    figures = {**totals, "crs": crs_label(crs), "height_system": system, "seconds": seconds}
+    ran = times()
+    figures = {**totals, "crs": crs_label(crs), "height_system": system, "seconds": ran["seconds"]}
     report = BuildReport(request.output, figures, gross, findings, built, measured)
     record = {"product": request.output.name, "kind": "terrain model", **report.json_fields()}
     del record["findings"]
     record |= {"inputs": facts, "settings": request.settings, "versions": versions()}
+    record |= {"run": {"workers": request.workers, **ran}}
     record |= {"finding_counts": dict(Counter(f.kind for f in findings)), "peak_memory_bytes": peak_memory_bytes()}
     write_run_record(record_path(request.output), record)
     return report

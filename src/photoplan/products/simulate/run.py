@@ -16,7 +16,7 @@ from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import Window
 from photoplan.io.product import check_output
 from photoplan.io.raster import RasterReader
-from photoplan.io.run_record import record_path, versions, write_run_record
+from photoplan.io.run_record import record_path, run_times, versions, write_run_record
 from photoplan.io.simulation_file import read_simulation
 from photoplan.io.whole_image import write_whole_image
 from photoplan.plain import pick
@@ -164,6 +164,7 @@ def simulate(
     InputError
         Scene or model cannot be used.
     """
+    times = run_times()
     model, dtype = _model(request)
     scene = _scene(request, model)
     exposures = _exposures(request)
@@ -184,7 +185,8 @@ def simulate(
     if request.dry_run:
         return dataclasses.replace(report, record=None)
     stated = {"model": dataclasses.asdict(model), "scene": request.scene, "oversampling": scene.oversampling}
-    write_run_record(record, {"command": "simulate", **stated, **report.json_fields(), "versions": versions()})
+    stated |= {**report.json_fields(), "run": times(), "versions": versions()}
+    write_run_record(record, {"command": "simulate", **stated})
     return report
 
 

@@ -1,0 +1,55 @@
+"""What `photoplan ortho` takes before and after its pixels: a product of one tile of the included block.
+
+    python bench/startup.py
+
+Prints processor seconds (user + system), the least of five runs: imports alone, a product, and its quick look.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from importlib.resources import as_file, files
+from pathlib import Path
+
+RUNS = 5
+
+
+def cpu_of(*words: object) -> float:
+    """Least processor time of a few runs of Python, seconds."""
+    taken = []
+    for _ in range(RUNS):
+        before = os.times()
+        subprocess.run([sys.executable, *map(str, words)], check=True, capture_output=True)
+        after = os.times()
+        taken.append(after.children_user + after.children_system - before.children_user - before.children_system)
+    return min(taken)
+
+
+def main() -> None:
+    """All rows."""
+    with as_file(files("photoplan") / "demo_block") as block, tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        command = ["-m", "photoplan.cli.main"]
+        inputs = ["--images", block / "images" / "*.jpg", "--camera", block / "int.yaml", "--orientation"]
+        inputs += [block / "ext.csv", "--terrain", block / "dsm.tif", "--height-system", "same"]
+        words = [sys.executable, *command, "init", folder, *inputs]
+        subprocess.run([str(word) for word in words], check=True, capture_output=True)
+        first = sorted((block / "images").glob("*.jpg"))[0].stem
+        ortho = [*command, "ortho", folder / "project.toml", "--images", f"{first}*", "--resolution", 2, "--workers", 1]
+        ortho += ["--overwrite", "-q"]
+        cpu_of(*ortho)
+        rows = {
+            "import numba": cpu_of("-c", "import numba"),
+            "imports of photoplan ortho": cpu_of("-c", "import photoplan.cli.running"),
+            "photoplan ortho, one tile": cpu_of(*ortho),
+            "without its quick look": cpu_of(*ortho, "--no-quicklook"),
+        }
+    for what, seconds in rows.items():
+        print(f"{what:<28} {seconds:6.2f} CPU s")
+
+
+if __name__ == "__main__":
+    main()
