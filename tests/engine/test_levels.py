@@ -155,3 +155,16 @@ def test_invalid_pixels_are_left_out_of_means(tmp_path: Path) -> None:
     assert valid is not None and not valid[inner].any()
     sure = valid & good
     assert sure.sum() > 3000 and np.abs(got.astype(int) - want)[:, sure].max() <= 2
+
+
+def test_a_file_is_read_once_however_its_tiles_lie(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A turned image: windows of neighbouring tiles overlap by half, blocks of the reduced image are made once."""
+    image = noise(1, 2400, 2000, "uint8")
+    reader = RasterReader(write(tmp_path / "a.tif", image, None))
+    full = Counted(monkeypatch)
+    cam = Pinhole(Pose.from_angles((0, 0, 100), (0.01, 0.02, 0.8)), 2000.0, (2000, 2400))
+    grid = MapGrid.covering((-100, -100, 100, 100), 0.5, "EPSG:32615")
+    plan = product(grid, side=64)
+    for tile in plan.tiles:
+        render(plan, tile, [Source(cam, reader)], LevelSurface(0.0), "bicubic")
+    assert 0.9 * image.size < full.pixels < 1.2 * image.size

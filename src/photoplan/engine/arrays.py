@@ -64,5 +64,5 @@ class ArrayReader:
             return reduced(self, window, level)
         if window & Window(0, 0, *self.size) != window:
             raise UsageError(f"{window} is not inside the image of {self.size[0]} × {self.size[1]} pixels")
-        part = np.s_[window.row : window.stop[1], window.col : window.stop[0]]
-        return self.image[:, part[0], part[1]], None if self.valid is None else self.valid[part]
+        rows, cols = window.slices(Window(0, 0, *self.size))
+        return self.image[:, rows, cols], None if self.valid is None else self.valid[rows, cols]

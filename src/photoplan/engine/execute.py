@@ -106,8 +106,7 @@ def _joined(window: Window, parts: list[tuple[Window, Pixels]]) -> Pixels:
     for part, pixels in parts:
         if pixels.values is None or pixels.valid is None:
             continue
-        rows = slice(part.row - window.row, part.stop[1] - window.row)
-        cols = slice(part.col - window.col, part.stop[0] - window.col)
+        rows, cols = part.slices(window)
         values[:, rows, cols] = pixels.values
         valid[rows, cols] = pixels.valid
         if owner is not None and pixels.owner is not None:

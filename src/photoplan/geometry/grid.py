@@ -45,6 +45,11 @@ class Window:
         bottom = min(self.stop[1], other.stop[1])
         return Window(col, row, max(0, right - col), max(0, bottom - row))
 
+    def slices(self, frame: Window) -> tuple[slice, slice]:
+        """Rows and columns of this window in an array that holds the pixels of `frame`."""
+        row, col = self.row - frame.row, self.col - frame.col
+        return slice(row, row + self.height), slice(col, col + self.width)
+
     def tiles(self, side: int) -> Iterator[Window]:
         """The window cut into tiles of `side` pixels, row by row; the last ones are smaller."""
         right, bottom = self.stop

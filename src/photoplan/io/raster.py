@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.geometry.levels import reduced
 from photoplan.io.checks import IMAGE_LIMITS, RasterLimits
 from photoplan.io.gdal import gdal_settings, handle
 from photoplan.io.overviews import best_overview
 from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.raster_pixels import both, missing_blocks, read_pixels
+from photoplan.io.reduced_blocks import reduced_by_blocks
 from photoplan.io.tiff_layout import read_tiff_layout
 from photoplan.io.validity import MissingBlocks
 
@@ -78,9 +78,11 @@ class RasterReader:
         """Pixels of a window and their validity, see `engine.base.Reader`; from the file's overviews where it can."""
         if level:
             overview = best_overview(self.info, level)
+            state = self.path.stat() if self.path.is_file() else None
+            key = (self.path, overview is None, None if state is None else (state.st_mtime_ns, state.st_ino))
             if overview is None:
-                return reduced(self, window, level)
-            return reduced(overview, window, level - overview.level)
+                return reduced_by_blocks(key, self, window, level)
+            return reduced_by_blocks(key, overview, window, level - overview.level)
         pixels, valid = read_pixels(self.info, window, self._missing)
         if self.info.palette:
             pixels, opaque = _expand(self.info, pixels[0])

@@ -124,7 +124,7 @@ class Raster:
         )
         with file:
             for index, window in enumerate(file.windows):
-                part = np.s_[window.row : window.stop[1], window.col : window.stop[0]]
+                part = window.slices(self.placement.window)
                 file.append(index, np.ascontiguousarray(self.values[:, part[0], part[1]]), self.valid[part])
             file.complete()
         return Path(path)
@@ -206,7 +206,7 @@ def _collected(plan: ProductPlan, reader: Reader, work: Any, workers: int) -> Ra
     values = np.zeros((reader.bands, height, width), reader.dtype)
     valid = np.zeros((height, width), bool)
     owner = None if plan.owners is None else np.zeros((height, width), np.uint16)
-    residual = 0.0
+    residual, place = 0.0, plan.target.window
     with Workers(executor_factory("threads", workers)) as pool:
         for outcome in run_tiles(plan.tiles, work, pool, 2 * workers):
             if outcome.error is not None:
@@ -216,7 +216,7 @@ def _collected(plan: ProductPlan, reader: Reader, work: Any, workers: int) -> Ra
             residual = max(residual, pixels.residual)
             if pixels.values is None or pixels.valid is None:
                 continue
-            part = np.s_[window.row : window.stop[1], window.col : window.stop[0]]
+            part = window.slices(place)
             values[:, part[0], part[1]], valid[part] = pixels.values, pixels.valid
             if owner is not None and pixels.owner is not None:
                 owner[part] = pixels.owner

@@ -93,8 +93,7 @@ class SteppedReader:
         valid = np.ones((window.height, window.width), bool)
         for part in parts:
             pixels, good = self._after(len(self.steps), part)
-            rows = slice(part.row - window.row, part.stop[1] - window.row)
-            cols = slice(part.col - window.col, part.stop[0] - window.col)
+            rows, cols = part.slices(window)
             values[:, rows, cols] = pixels
             if good is not None:
                 valid[rows, cols] = good

@@ -288,13 +288,7 @@ def render(
         pixels = render_tiles(product.plan, tile, scene.sources, scene.surface, plan.settings.kernel)
         if pixels.values is None or pixels.valid is None:
             continue
-        to = np.s_[
-            common.row - window.row : common.stop[1] - window.row, common.col - window.col : common.stop[0] - window.col
-        ]
-        of = np.s_[
-            common.row - tile.window.row : common.stop[1] - tile.window.row,
-            common.col - tile.window.col : common.stop[0] - tile.window.col,
-        ]
+        to, of = common.slices(window), common.slices(tile.window)
         values[:, to[0], to[1]] = pixels.values[:, of[0], of[1]]
         valid[to] = pixels.valid[of]
     return values, valid
