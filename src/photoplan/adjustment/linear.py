@@ -34,16 +34,16 @@ class Decomposed:
     """V / s / length: a square root of the cofactors (u, u); 0 along what is not determined."""
 
     @classmethod
-    def of(cls, A: _Floats) -> Decomposed:
-        """Decompose equations (n, u)."""
+    def of(cls, A: _Floats, least: float = 0.0) -> Decomposed:
+        """Decompose equations (n, u); singular values below the part `least` of the largest count as 0."""
         length = np.sqrt(np.einsum("ij,ij->j", A, A))
         length = np.where(length > 0.0, length, 1.0)
         if len(A) > _TALL * A.shape[1]:
             values, vectors = np.linalg.eigh(A.T @ A / np.multiply.outer(length, length))
-            s, V, least = np.sqrt(np.maximum(values[::-1], 0.0)), vectors[:, ::-1], _ROUNDING_TALL
+            s, V, least = np.sqrt(np.maximum(values[::-1], 0.0)), vectors[:, ::-1], max(least, _ROUNDING_TALL)
         else:
             s, Vt = np.linalg.svd(A / length, full_matrices=False)[1:]
-            V, least = Vt.T, ROUNDING
+            V, least = Vt.T, max(least, ROUNDING)
         known = s > least * s.max(initial=0.0)
         inverse = np.where(known, 1.0 / np.where(known, s, 1.0), 0.0)
         return cls(A, length, np.where(known, s, 0.0), V * inverse / length[:, None])

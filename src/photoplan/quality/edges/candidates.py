@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter1d
 
-from photoplan.adjustment.robust import huber, spread
+from photoplan.adjustment.robust import MEDIAN_1D, huber, spread
 from photoplan.kernels.edge_chains import grow, ridge
 
 Array = NDArray[np.float64]
@@ -111,8 +111,8 @@ def noise_of(grey: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) 
     blocks = blocks[np.isfinite(blocks).all(axis=1)]
     if not len(blocks):
         return float("nan")
-    # The mask's weights have a root of the sum of squares of 6; 0.6745 makes a median of magnitudes a deviation.
-    return float(np.quantile(np.median(blocks, axis=1), 0.2) / 0.6745 / 6)
+    # The mask's weights have a root of the sum of squares of 6; a median of magnitudes becomes a deviation.
+    return float(np.quantile(np.median(blocks, axis=1), 0.2) / MEDIAN_1D / 6)
 
 
 def find_lines(

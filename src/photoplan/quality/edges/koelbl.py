@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from photoplan.adjustment.linear import solve
 from photoplan.errors import InputError
 from photoplan.quality.edges.response import EdgeMeasurement
 from photoplan.quality.spread import SpreadFunction
@@ -127,16 +128,15 @@ def _symmetric(rise: NDArray[np.float64], border: int, reach: int) -> tuple[floa
     for k in range(-reach, reach + 1):
         fold[reach + k, abs(k)] = 1.0
 
-    def solve(shift: float) -> tuple[NDArray[np.float64], float]:
+    def fitted(shift: float) -> tuple[NDArray[np.float64], float]:
         matrix = _taps(rise.size, shift, border, reach) @ fold
-        side = np.linalg.lstsq(matrix, rise, rcond=None)[0]
-        left = rise - matrix @ side
-        return np.asarray(side, np.float64), float(left @ left)
+        fit = solve(matrix, rise)
+        return fit.unknowns, fit.square
 
-    found = minimize_scalar(lambda s: solve(s)[1], bounds=(-0.5, 0.5), method="bounded", options={"xatol": 1e-10})
+    found = minimize_scalar(lambda s: fitted(s)[1], bounds=(-0.5, 0.5), method="bounded", options={"xatol": 1e-10})
     # An edge on the border is the common case of the source; the search ends beside 0 by its own tolerance.
-    shift = 0.0 if solve(0.0)[1] <= found.fun + 1e-15 else float(found.x)
-    side, square = solve(shift)
+    shift = 0.0 if fitted(0.0)[1] <= found.fun + 1e-15 else float(found.x)
+    side, square = fitted(shift)
     return shift, np.asarray(fold @ side, np.float64), float(np.sqrt(square / rise.size))
 
 
@@ -145,9 +145,8 @@ def _unsymmetric(
 ) -> tuple[float, NDArray[np.float64], float]:
     shift = float(np.clip(shift, -0.5, 0.5))
     matrix = _taps(rise.size, shift, border, reach)
-    values = np.linalg.lstsq(matrix, rise, rcond=None)[0]
-    left = rise - matrix @ values
-    return shift, np.asarray(values, np.float64), float(np.sqrt(left @ left / rise.size))
+    fit = solve(matrix, rise)
+    return shift, fit.unknowns, float(np.sqrt(fit.square / rise.size))
 
 
 def spread_from_response(

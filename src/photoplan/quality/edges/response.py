@@ -22,7 +22,7 @@ from photoplan.quality.edges.checks import (
     grain,
 )
 from photoplan.quality.edges.confidence import EdgeFigures, EdgeShape, edge_figures, gaussian_width
-from photoplan.quality.edges.line import EdgeLine, EdgePixels, find_line, fit_line
+from photoplan.quality.edges.line import EdgeLine, EdgePixels, determines, find_line, fit_line
 from photoplan.quality.edges.model import PixelEdge
 from photoplan.quality.edges.profile import EdgeFit, ProfileBasis, fit_profile
 from photoplan.quality.mtf_curve import MtfCurve
@@ -171,7 +171,7 @@ def measure_edge(
         every = every.where(np.abs(line.distance(every.across, every.along)) <= max(4.0 * chosen.reach, 64.0))
     line, model, levels = fit_line(every, line, chosen.curve, chosen.shading != "none", _FIRST_STEPS)
     near = np.abs(line.distance(every.across, every.along)) < 2.5 * model.total
-    if np.count_nonzero(near) > 40:
+    if np.count_nonzero(near) > 40 and determines(every.where(near), line, model, chosen.curve):
         line, model, levels = fit_line(every.where(near), line, chosen.curve, False)
     distance = line.distance(every.across, every.along)
     check_clipping(every.light, distance, limits, chosen.most_clipped)

@@ -9,6 +9,7 @@ from math import ceil, floor, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.robust import MEDIAN_1D
 from photoplan.quality.edges.candidates import StraightEdge
 
 Array = NDArray[np.float64]
@@ -83,9 +84,9 @@ class Strip:
         if not np.isfinite(near).all() or near.max() <= 0.0:
             return None
         peak = middle - 3 + int(np.argmax(near))
-        # Second differences tell the noise of the slopes: 0.6745 and 6 of medians and of their own weights.
+        # Second differences tell the noise of the slopes: their own weights have a sum of squares of 6.
         bends = np.abs(np.diff(profile, 2))
-        noise = float(_median(bends)) / 0.6745 / 6**0.5 * 2**0.5
+        noise = float(_median(bends)) / MEDIAN_1D / 6**0.5 * 2**0.5
         even = max(0.05 * slope[peak], 2.0 * noise)
         ends = []
         for step in (-1, 1):
