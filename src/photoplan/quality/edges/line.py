@@ -173,7 +173,7 @@ def fit_line(
 
 def determines(pixels: EdgePixels, line: EdgeLine, model: PixelEdge, curve: int) -> bool:
     """Whether pixels near an edge determine its place and blur beside both levels."""
-    design = _linearised(pixels, _State(line, model.blur), curve, False)[0]
+    design = _linearised(pixels, _LineState(line, model.blur), curve, False)[0]
     return Decomposed.of(design, _DETERMINED).rank == design.shape[1]
 
 
