@@ -60,7 +60,7 @@ class Survey:
 
     def model(self, points: NDArray[np.float64]) -> Built:
         lines = tuple(MeasuredLine(f"l{k}", "breakline", line) for k, line in enumerate(self.lines))
-        return build_terrain(plan_build(terrain(points, *lines), BuildSettings()), 2)
+        return build_terrain(plan_build(terrain(points, *lines), BuildSettings()))
 
 
 @pytest.fixture(scope="session")
@@ -136,7 +136,7 @@ def rock_and_terrain(folder: Path) -> list[tuple[Built, Tin]]:
         raw, tin = read_measured([folder / name], ReadOptions()), read_landxml_tin(folder / name)
         around = shapely.box(*tin_outline(found[0][1] if found else tin).bounds).buffer(40)
         measured, _ = clean(inside(raw, around))
-        found.append((build_terrain(plan_build(measured, BuildSettings()), 2), tin))
+        found.append((build_terrain(plan_build(measured, BuildSettings())), tin))
     return found
 
 

@@ -63,7 +63,7 @@ def measured():
 
 @pytest.fixture(scope="module")
 def built(measured):
-    return build_terrain(plan_build(measured, BuildSettings(unit_meshes=16)), 2)
+    return build_terrain(plan_build(measured, BuildSettings(unit_meshes=16)))
 
 
 @pytest.fixture(scope="module")
@@ -121,9 +121,9 @@ def test_measured_minus_filtered_heights_are_the_noise(facts):
 def test_headline_figures(facts, document):
     assert dict(facts.counts)["mass points"] == 700
     assert facts.units == sum(n for _, n in facts.widths) >= 9
-    assert facts.noise == pytest.approx(NOISE, rel=0.3)
+    assert facts.whole.noise == pytest.approx(NOISE, rel=0.3)
     assert 0.8 < facts.spread < 1.2
-    for words in ("700", "12.3 s", f"{facts.noise:.3f} m", facts.family):
+    for words in ("700", "12.3 s", f"{facts.whole.noise:.3f} m", facts.whole.name):
         assert words in "".join(Page(document).words)
 
 
@@ -214,8 +214,9 @@ def test_neighbourhoods_that_a_breakline_parts_are_left_out(built):
 def test_covariance_classes_use_all_pairs_once(facts):
     c = facts.covariance
     assert (np.diff(c.classes[c.pairs > 0]) > 0).all()
-    assert c.whole[0] == pytest.approx(facts.variance)
-    assert c.whole[np.argmin(np.abs(c.distance - facts.length))] == pytest.approx(facts.variance / 2, rel=0.05)
+    whole = facts.whole
+    assert c.whole[0] == pytest.approx(whole.variance)
+    assert c.whole[np.argmin(np.abs(c.distance - whole.length))] == pytest.approx(whole.variance / 2, rel=0.05)
     assert (c.low <= c.high).all()
 
 

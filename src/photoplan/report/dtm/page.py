@@ -66,11 +66,11 @@ def _headline(facts: BuildFacts) -> list[tuple[str, str, str]]:
         (_number(lines), "lines", "with their intersections with the grid"),
         (_number(facts.units), "computing units", f"{widths}; {_number(facts.empty)} units are empty"),
         (_metres(facts.sigma), "standard deviation of heights", "root mean square over all posts"),
-        (_metres(facts.noise), "noise of mass points", "their filter value"),
+        (_metres(facts.whole.noise), "noise of mass points", "their filter value"),
         (
-            f"{np.sqrt(facts.variance):.3g} m",
+            f"{np.sqrt(facts.whole.variance):.3g} m",
             "standard deviation of the signal",
-            f"{facts.family} covariance function, half its value at {facts.length:.3g} m",
+            f"{facts.whole.name} covariance function, half its value at {facts.whole.length:.3g} m",
         ),
         (_plain(facts.spread, 2), "spread of normalised residuals", "1 where the stochastic model fits"),
         (

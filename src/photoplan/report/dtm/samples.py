@@ -20,6 +20,7 @@ from photoplan.surfaces.units import MemoryUnits
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.build import Built
 from photoplan.terrain.clean.run import Finding
+from photoplan.terrain.covariance import Covariance
 
 T = TypeVar("T", bound=np.generic)
 #: Longer side of the map, pixels.
@@ -124,14 +125,8 @@ class BuildFacts:
     """Units that have none."""
     widths: tuple[tuple[float, int], ...]
     """Grid widths, metres, and the number of units that have each."""
-    family: str
-    """Family of the covariance functions."""
-    variance: float
-    """Of the whole area's function, m²."""
-    length: float
-    """Its half-value distance, metres."""
-    noise: float
-    """Filter value of mass points in the whole area, metres."""
+    whole: Covariance
+    """Function and filter value of the whole area."""
     sigma: float
     """Root mean square of the standard deviations of posts, metres."""
     spread: float
@@ -178,10 +173,7 @@ def build_facts(
         units=len(full),
         empty=len(figures) - len(full),
         widths=tuple(sorted(widths.items())),
-        family=fit.whole.name,
-        variance=fit.whole.variance,
-        length=fit.whole.length,
-        noise=fit.whole.noise,
+        whole=fit.whole,
         sigma=sigma,
         spread=float(used.std()) if len(used) >= 20 else np.nan,
         seconds=seconds,
