@@ -157,4 +157,14 @@ def solve(A: _Floats, y: _Floats, weight: _Floats | None = None) -> Fit:
     count = len(A) if weight is None else int(np.count_nonzero(weight))
     redundancy = (count - parts.rank) * (1 if y.ndim == 1 else y.shape[1])
     condition = float(parts.s[-1] / parts.s[0]) if parts.rank else 0.0
-    return Fit(x, parts.cofactors, A @ x - y, parts.rank, condition, square, redundancy, A, weight)
+    return Fit(
+        unknowns=x,
+        cofactors=parts.cofactors,
+        residuals=A @ x - y,
+        rank=parts.rank,
+        condition=condition,
+        square=square,
+        redundancy=redundancy,
+        A=A,
+        weight=weight,
+    )

@@ -160,14 +160,14 @@ class _Adjusted:
 
 def _result(common: _Pairs, transformation: Affine2D | Bilinear2D, found: _Adjusted, model: str) -> FiducialFit:
     return FiducialFit(
-        transformation,
-        common.names,
-        found.residuals,
-        found.redundancy,
-        found.sigma0,
-        found.covariance,
-        common.missing,
-        model,
+        transformation=transformation,
+        names=common.names,
+        residuals=found.residuals,
+        redundancy=found.redundancy,
+        sigma0=found.sigma0,
+        covariance=found.covariance,
+        missing=common.missing,
+        model=model,
     )
 
 

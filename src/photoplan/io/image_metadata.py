@@ -75,18 +75,18 @@ def read_image_metadata(path: str | Path) -> ImageMetadata:
     focal = _number(exif, "FocalLength")
     names = [n for n in (_text(exif, "Make"), _text(exif, "Model")) if n]
     return ImageMetadata(
-        path,
-        size,
-        _position(exif, dji, path),
-        _text(exif, "GPSMapDatum"),
-        _float(dji.get("RelativeAltitude")),
-        _sigma(exif, dji, schema),
-        _attitude(dji),
-        focal,
-        _sensor(exif, size, focal),
-        " ".join(names) or None,
-        _time(exif),
-        int(_number(exif, "Orientation") or 1),
+        file=path,
+        size=size,
+        position=_position(exif, dji, path),
+        datum=_text(exif, "GPSMapDatum"),
+        relative_altitude=_float(dji.get("RelativeAltitude")),
+        sigma=_sigma(exif, dji, schema),
+        yaw_pitch_roll=_attitude(dji),
+        focal_length_mm=focal,
+        sensor_size_mm=_sensor(exif, size, focal),
+        camera=" ".join(names) or None,
+        time=_time(exif),
+        display=int(_number(exif, "Orientation") or 1),
     )
 
 

@@ -143,7 +143,14 @@ def read_observed_positions(
     sigma_angle = angle_in_radians(table.numbers("sigma_angle", empty=True), form.angle_unit)
     _positive(table, "sigma_angle", sigma_angle)
     return PositionTable(
-        path, tuple(names), XYZ, _sigma(table), _rotations(table, form), sigma_angle, strips, _times(table)
+        path=path,
+        images=tuple(names),
+        XYZ=XYZ,
+        sigma=_sigma(table),
+        R_ground_camera=_rotations(table, form),
+        sigma_angle=sigma_angle,
+        strip=strips,
+        time=_times(table),
     )
 
 
@@ -217,7 +224,16 @@ def _from_images(path: Path, crs: str) -> PositionTable:
     times = [m.time for m in images]
     time = np.array(times, float) if all(t is not None for t in times) else np.arange(n, dtype=float)
     names = tuple(m.file.name for m in images)
-    return PositionTable(path, names, map_positions(images, crs), sigma, None, np.full(n, np.nan), ("all",) * n, time)
+    return PositionTable(
+        path=path,
+        images=names,
+        XYZ=map_positions(images, crs),
+        sigma=sigma,
+        R_ground_camera=None,
+        sigma_angle=np.full(n, np.nan),
+        strip=("all",) * n,
+        time=time,
+    )
 
 
 def _from_orientation(path: Path, form: TableFormat, crs: str | None) -> PositionTable:
@@ -228,12 +244,12 @@ def _from_orientation(path: Path, form: TableFormat, crs: str | None) -> Positio
         _same(path, table.crs, crs)
     n = len(table.images)
     return PositionTable(
-        path,
-        tuple(image.name for image in table.images),
-        table.centers,
-        np.full((n, 3), np.nan),
-        table.rotations,
-        np.full(n, np.nan),
-        ("all",) * n,
-        np.arange(n, dtype=float),
+        path=path,
+        images=tuple(image.name for image in table.images),
+        XYZ=table.centers,
+        sigma=np.full((n, 3), np.nan),
+        R_ground_camera=table.rotations,
+        sigma_angle=np.full(n, np.nan),
+        strip=("all",) * n,
+        time=np.arange(n, dtype=float),
     )

@@ -143,7 +143,18 @@ def control_of_image(
     index = np.array(number, np.int64)
     if not number:
         none = np.empty((0, 2))
-        return ImageControl(name, len(tried), 0, index, none, none, (np.nan, np.nan), np.nan, 1.0, dict(reasons))
+        return ImageControl(
+            name=name,
+            tried=len(tried),
+            matched=0,
+            points=index,
+            xy=none,
+            sigma=none,
+            shift=(np.nan, np.nan),
+            rms=np.nan,
+            factor=1.0,
+            reasons=dict(reasons),
+        )
     places, fit = np.array(xy), np.array(fits)
     fit = fit + 1e-6 * np.eye(2)
     agreed = agree(photo.camera, XYZ[index], places, (fit, covariances[index]), max(settings.search, 1.0))
@@ -153,16 +164,16 @@ def control_of_image(
     sigma = np.maximum(agreed.factor * np.sqrt(np.diagonal(fit, axis1=1, axis2=2)), _SIGMA)
     rms = float(np.sqrt((agreed.residuals[keep] ** 2).mean())) if keep.any() else float("nan")
     return ImageControl(
-        name,
-        len(tried),
-        len(number),
-        index[keep],
-        places[keep],
-        sigma[keep],
-        agreed.shift,
-        rms,
-        agreed.factor,
-        dict(reasons),
+        name=name,
+        tried=len(tried),
+        matched=len(number),
+        points=index[keep],
+        xy=places[keep],
+        sigma=sigma[keep],
+        shift=agreed.shift,
+        rms=rms,
+        factor=agreed.factor,
+        reasons=dict(reasons),
     )
 
 

@@ -90,17 +90,17 @@ def check_accuracy(residuals: NDArray[np.float64], sigma: NDArray[np.float64]) -
     h = float(np.hypot(fit_h, np.nan_to_num(survey_h)))
     v = float(np.hypot(fit_v, np.nan_to_num(survey_v)))
     return CheckAccuracy(
-        int(plane.sum()),
-        int(known[:, 2].sum()),
-        (mean[0], mean[1], mean[2]),
-        (rmse[0], rmse[1], rmse[2]),
-        fit_h,
-        fit_v,
-        float(survey_h),
-        float(survey_v),
-        h,
-        v,
-        float(np.hypot(h, v)),
+        horizontal=int(plane.sum()),
+        vertical=int(known[:, 2].sum()),
+        mean=(mean[0], mean[1], mean[2]),
+        rmse=(rmse[0], rmse[1], rmse[2]),
+        fit_h=fit_h,
+        fit_v=fit_v,
+        survey_h=float(survey_h),
+        survey_v=float(survey_v),
+        rmse_h=h,
+        rmse_v=v,
+        rmse_3d=float(np.hypot(h, v)),
     )
 
 

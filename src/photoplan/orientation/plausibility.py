@@ -138,14 +138,14 @@ def _look(view: View, center: NDArray[np.float64], R: NDArray[np.float64], heigh
     elif not seen.any():
         fault = f"sees nothing of the terrain (tilt {tilt:.1f}°)"
     return ImagePlausibility(
-        view.name,
-        tilt,
-        azimuth,
-        float(center[2] - below),
-        distance * view.pixel,
-        float(seen.mean()),
-        middle,
-        fault,
+        name=view.name,
+        tilt=tilt,
+        azimuth=azimuth,
+        height_above_ground=float(center[2] - below),
+        gsd=distance * view.pixel,
+        on_terrain=float(seen.mean()),
+        middle_on_terrain=middle,
+        fault=fault,
     )
 
 

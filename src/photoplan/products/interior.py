@@ -191,7 +191,16 @@ def _interior(project: Project, image: Image, model: str | None, pitch: tuple[fl
     plane = np.array([camera.fiducials_mm[name] for name in fit.names])
     on_film = 1000 * residuals_on_film(fit.transformation, plane, fit.residuals)
     facts = affine_facts(fit.transformation)
-    plain = ImageInterior(image.name, image.camera, fit, facts, plane, on_film, None, None)
+    plain = ImageInterior(
+        image=image.name,
+        camera=image.camera,
+        fit=fit,
+        facts=facts,
+        plane_mm=plane,
+        residuals_um=on_film,
+        pitch=None,
+        shrinkage=None,
+    )
     if pitch is None:
         try:
             pitch = read_pitch(project.resolve(image.file))

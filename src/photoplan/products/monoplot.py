@@ -242,14 +242,14 @@ def _report(
     sigmas = found.sigmas[np.isfinite(found.sigmas).all(axis=1)]
     median = tuple(float(v) for v in np.median(sigmas, axis=0)) if len(sigmas) else None
     return MonoplotReport(
-        request.output,
-        request.vectors,
-        len(met),
-        int(met.sum()),
-        {REASONS[key]: count for key, count in missed.items()},
-        int((found.angle[met] < GRAZING).sum()),
-        int(found.hole[met].sum()),
-        median,  # type: ignore[arg-type]
-        height_system,
-        tuple(notes),
+        output=request.output,
+        vectors=request.vectors,
+        points=len(met),
+        met=int(met.sum()),
+        reasons={REASONS[key]: count for key, count in missed.items()},
+        grazing=int((found.angle[met] < GRAZING).sum()),
+        through_holes=int(found.hole[met].sum()),
+        median_sigma=median,  # type: ignore[arg-type]
+        height_system=height_system,
+        notes=tuple(notes),
     )

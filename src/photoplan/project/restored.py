@@ -115,7 +115,16 @@ def restored(
     avoided = nodata if isinstance(nodata, float) and out.kind != "f" else None
     light, lit = linearisation or Linearisation(), source.step(FallOffStep) is not None
     try:
-        restorer = Restorer(filter_, source.size, source.bands, stored, out, light, avoided, lit)
+        restorer = Restorer(
+            filter=filter_,
+            size=source.size,
+            bands=source.bands,
+            dtype=stored,
+            out=out,
+            linearisation=light,
+            nodata=avoided,
+            light_given=lit,
+        )
     except InputError as error:
         raise InputError(f"{source.path}: {error}") from None
     return source.then(RestoreStep(restorer, lit))

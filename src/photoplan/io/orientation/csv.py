@@ -70,7 +70,15 @@ def read(path: Path, form: TableFormat) -> OrientationTable:
     beside = crs_beside(path)
     crs, side, heights = (None,) * 3 if beside is None else (beside.crs, beside.file, beside.height_system)
     return OrientationTable(
-        path, images, form.angle_unit, form.rotation, form.direction, crs, side, heights, notes=notes
+        file=path,
+        images=images,
+        angle_unit=form.angle_unit,
+        rotation=form.rotation,
+        direction=form.direction,
+        crs=crs,
+        crs_file=side,
+        height_system=heights,
+        notes=notes,
     )
 
 

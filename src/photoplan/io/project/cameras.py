@@ -92,7 +92,7 @@ def lens_of(camera: described.FrameEntry | described.FilmCamera) -> Lens:
     if isinstance(lens, described.IdealLens):
         return NoLens()
     if isinstance(lens, described.OpenCVLens):
-        return OpenCV(lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, lens.k4, lens.k5, lens.k6)
+        return OpenCV(k1=lens.k1, k2=lens.k2, p1=lens.p1, p2=lens.p2, k3=lens.k3, k4=lens.k4, k5=lens.k5, k6=lens.k6)
     if isinstance(lens, described.OpenCVFisheyeLens):
         return Fisheye(lens.k1, lens.k2, lens.k3, lens.k4)
     if isinstance(lens, described.BrownLens):

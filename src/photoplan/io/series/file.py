@@ -135,16 +135,16 @@ def read_series(path: Path) -> Series:
     _refuse_twice(path, frames)
     saturation = entries.camera.saturation_dn or (2.0**bits - 1.0 if bits else facts.largest)
     return Series(
-        path,
-        entries.camera,
-        tuple(frames),
-        tuple(reduced),
-        facts.size,
-        facts.bands,
-        facts.dtype,
-        saturation,
-        tuple(positions),
-        tuple(dict.fromkeys(inputs)),
+        path=path,
+        camera=entries.camera,
+        frames=tuple(frames),
+        reduced=tuple(reduced),
+        size=facts.size,
+        bands=facts.bands,
+        dtype=facts.dtype,
+        saturation_dn=saturation,
+        positions=tuple(positions),
+        inputs=tuple(dict.fromkeys(inputs)),
     )
 
 

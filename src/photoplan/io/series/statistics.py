@@ -85,15 +85,15 @@ def _point(kind: str, found: Mapping[str, Any], entry: StatisticsEntry, where: s
             "needs two pixels and two frames"
         )
     return ReducedPoint(
-        kind,
-        float(found["mean"]),
-        variance,
-        int(pixels),
-        int(frames),
-        found.get("exposure_ms"),
-        found.get("photons_per_pixel"),
-        found.get("temperature_c", entry.temperature_c),
-        found.get("wavelength_nm", entry.wavelength_nm),
+        kind=kind,
+        mean=float(found["mean"]),
+        variance=variance,
+        pixels=int(pixels),
+        frames=int(frames),
+        exposure_ms=found.get("exposure_ms"),
+        photons_per_pixel=found.get("photons_per_pixel"),
+        temperature_c=found.get("temperature_c", entry.temperature_c),
+        wavelength_nm=found.get("wavelength_nm", entry.wavelength_nm),
     )
 
 
@@ -150,13 +150,13 @@ def _of_sums(
         raise InputError(f"{path}: exposure {exposure:g}: 'sum' and 'pvar' must be numbers")
     total, pvar = (float(v) for v in values if v is not None)
     return ReducedPoint(
-        kind,
-        total / (2 * pixels),
-        pvar / (4 * pixels),
-        pixels,
-        2,
-        exposure * 1e-6,
-        photons,
-        entry.temperature_c,
-        entry.wavelength_nm,
+        kind=kind,
+        mean=total / (2 * pixels),
+        variance=pvar / (4 * pixels),
+        pixels=pixels,
+        frames=2,
+        exposure_ms=exposure * 1e-6,
+        photons_per_pixel=photons,
+        temperature_c=entry.temperature_c,
+        wavelength_nm=entry.wavelength_nm,
     )

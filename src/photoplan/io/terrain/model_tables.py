@@ -80,7 +80,21 @@ def input_facts(path: Path) -> dict[str, Any]:
 def empty_figures(column: int, row: int) -> UnitFigures:
     """Figures of a unit without a surface."""
     nan = math.nan
-    return UnitFigures(column, row, 0, nan, nan, 0, 0, nan, nan, nan, nan, nan, 0)
+    return UnitFigures(
+        column=column,
+        row=row,
+        meshes=0,
+        low=nan,
+        high=nan,
+        points=0,
+        lines=0,
+        variance=nan,
+        length=nan,
+        noise=nan,
+        sigma=nan,
+        spread=nan,
+        gross=0,
+    )
 
 
 def check_layout(layout: UnitLayout, where: str) -> None:

@@ -122,7 +122,15 @@ def solution_of(
     if not covariance:
         none = np.full(len(e), np.nan)
         return Solution(
-            model, state, reduced, found, e, weight, None, none, np.full((len(model.point_names), 3, 3), np.nan)
+            model=model,
+            state=state,
+            reduced=reduced,
+            found=found,
+            e=e,
+            weight=weight,
+            inverse=None,
+            redundancies=none,
+            point_cofactors=np.full((len(model.point_names), 3, 3), np.nan),
         )
     inverse = Inverse(reduced)
     points, variance = inverse.variances()
@@ -136,7 +144,17 @@ def solution_of(
         points = points - reduced.V_inverse + own
         others = slice(model.parts.image.stop, None)
         redundancies[others] = np.clip(1.0 - variance[others], 0.0, 1.0)
-    return Solution(model, state, reduced, found, e, weight, inverse, redundancies, points)
+    return Solution(
+        model=model,
+        state=state,
+        reduced=reduced,
+        found=found,
+        e=e,
+        weight=weight,
+        inverse=inverse,
+        redundancies=redundancies,
+        point_cofactors=points,
+    )
 
 
 @dataclass(frozen=True, eq=False)

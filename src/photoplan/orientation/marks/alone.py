@@ -137,7 +137,9 @@ def find_mark(
 
 def _nothing(why: str) -> AloneMark:
     nan = math.nan
-    return AloneMark(nan, nan, nan, nan, nan, nan, "pixel", why, None)
+    return AloneMark(
+        x=nan, y=nan, sigma_x=nan, sigma_y=nan, correlation=nan, second=nan, method="pixel", refused=why, edges=None
+    )
 
 
 _Found = tuple[float, tuple[float, float], MarkEdge | None, NDArray[np.float64]]
@@ -203,7 +205,17 @@ def _judged(
         refused = f"edges and correlation differ by {math.hypot(x - at[0], y - at[1]):.1f} px"
     elif not max(sx, sy) <= _SURE:
         refused = f"standard deviation of {max(sx, sy):.1f} px; {_SURE} px are allowed"
-    return AloneMark(float(x), float(y), float(sx), float(sy), fine.correlation, second, method, refused, edges)
+    return AloneMark(
+        x=float(x),
+        y=float(y),
+        sigma_x=float(sx),
+        sigma_y=float(sy),
+        correlation=fine.correlation,
+        second=second,
+        method=method,
+        refused=refused,
+        edges=edges,
+    )
 
 
 def _disagreement(grey: NDArray[np.float32], template: Template, at: tuple[float, float]) -> float:

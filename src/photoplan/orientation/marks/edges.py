@@ -176,14 +176,14 @@ def fit_edges(
     scale = math.sqrt(abs(np.linalg.det(total)))
     rotation = -math.atan2(total[1, 0], total[0, 0])
     return MarkEdge(
-        float(place[0]),
-        float(place[1]),
-        solution.covariance,
-        rotation,
-        scale,
-        solution.rms,
-        solution.used,
-        solution.count,
+        x=float(place[0]),
+        y=float(place[1]),
+        covariance=solution.covariance,
+        rotation=rotation,
+        scale=scale,
+        rms=solution.rms,
+        used=solution.used,
+        count=solution.count,
     )
 
 

@@ -318,22 +318,29 @@ def _result(
         )
     order = [marks[n] for n in layout.names if n in marks]
     return FiducialResult(
-        tuple(order), tuple(missing), fit, residuals, turn, measured.placement.negative, measured.blur_px,
-        measured.placement, tuple(said),
-    )  # fmt: skip
+        marks=tuple(order),
+        missing=tuple(missing),
+        fit=fit,
+        residuals_um=residuals,
+        turn=turn,
+        negative=measured.placement.negative,
+        blur_px=measured.blur_px,
+        placement=measured.placement,
+        notes=tuple(said),
+    )
 
 
 def _located(name: str, at: Location) -> LocatedMark:
     return LocatedMark(
-        name,
-        at.x,
-        at.y,
-        at.sigma_x,
-        at.sigma_y,
-        at.correlation,
-        at.method,
-        None if at.peak is None else (at.peak.x, at.peak.y),
-        None if at.match is None else (at.match.x, at.match.y),
+        name=name,
+        x=at.x,
+        y=at.y,
+        sigma_x=at.sigma_x,
+        sigma_y=at.sigma_y,
+        correlation=at.correlation,
+        method=at.method,
+        paraboloid=None if at.peak is None else (at.peak.x, at.peak.y),
+        matching=None if at.match is None else (at.match.x, at.match.y),
     )
 
 

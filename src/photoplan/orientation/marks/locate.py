@@ -178,7 +178,16 @@ def locate_mark(
     else:
         inside = surface
     if not np.isfinite(inside).any():
-        return Location(math.nan, math.nan, math.nan, math.nan, math.nan, "pixel", None, None)
+        return Location(
+            x=math.nan,
+            y=math.nan,
+            sigma_x=math.nan,
+            sigma_y=math.nan,
+            correlation=math.nan,
+            method="pixel",
+            peak=None,
+            match=None,
+        )
     row, column = np.unravel_index(int(np.nanargmax(inside)), inside.shape)
     r = float(inside[row, column])
     top = paraboloid_peak(surface, int(row), int(column))
@@ -187,11 +196,31 @@ def locate_mark(
     match = match_template(image, fine_template(pattern, mm_to_pixel, blur_px, negative), x, y)
     if match is not None and match.gain > 0 and max(abs(match.x - x), abs(match.y - y)) <= AGREE:
         sx, sy = np.sqrt(np.diag(match.covariance))
-        return Location(match.x, match.y, float(sx), float(sy), r, "matching", peak, match)
+        return Location(
+            x=match.x,
+            y=match.y,
+            sigma_x=float(sx),
+            sigma_y=float(sy),
+            correlation=r,
+            method="matching",
+            peak=peak,
+            match=match,
+        )
     if peak is not None:
-        return Location(x, y, peak.sigma_x, peak.sigma_y, r, "paraboloid", peak, match)
+        return Location(
+            x=x,
+            y=y,
+            sigma_x=peak.sigma_x,
+            sigma_y=peak.sigma_y,
+            correlation=r,
+            method="paraboloid",
+            peak=peak,
+            match=match,
+        )
     pixel = math.sqrt(1 / 12)
-    return Location(float(x), float(y), pixel, pixel, r, "pixel", None, match)
+    return Location(
+        x=float(x), y=float(y), sigma_x=pixel, sigma_y=pixel, correlation=r, method="pixel", peak=None, match=match
+    )
 
 
 def best_blur(

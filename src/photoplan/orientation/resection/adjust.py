@@ -333,15 +333,15 @@ def _result(task: _Task, state: _State, equations: _Equations, use: NDArray[np.b
             "points do not tell which; measure another one"
         )
     return Resected(
-        state.pose,
-        state.interior,
-        tests.cofactor * tests.sigma0**2,
-        task.settings.free,
-        equations.residuals,
-        tests.redundancies,
-        tests.normalised,
-        ~use,
-        tests.sigma0,
-        redundancy,
-        tuple(notes),
+        pose=state.pose,
+        interior=state.interior,
+        covariance=tests.cofactor * tests.sigma0**2,
+        free=task.settings.free,
+        residuals=equations.residuals,
+        redundancies=tests.redundancies,
+        normalised=tests.normalised,
+        rejected=~use,
+        sigma0=tests.sigma0,
+        redundancy=redundancy,
+        notes=tuple(notes),
     )

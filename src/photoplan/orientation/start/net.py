@@ -93,5 +93,12 @@ def net_of(
     ends = np.searchsorted(image[order], np.arange(len(images) + 1))
     of_image = tuple(order[a:b] for a, b in pairwise(ends))
     return Net(
-        len(images), observations.points, image, point, tangents[keep], (stated / scale)[keep], control, of_image
+        images=len(images),
+        points=observations.points,
+        image=image,
+        point=point,
+        tangents=tangents[keep],
+        sigma=(stated / scale)[keep],
+        control=control,
+        of_image=of_image,
     )

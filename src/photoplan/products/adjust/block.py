@@ -196,17 +196,17 @@ def map_result(prepared: Prepared, adjusted: Adjusted) -> MapResult:
     of_centers = frame.map_covariance(adjusted.pose_covariance[:, :3, :3], centers)
     XYZ = frame.map_points(adjusted.XYZ)
     return MapResult(
-        prepared,
-        adjusted,
-        poses,
-        angles,
-        _roots(of_centers),
-        _roots(of_angles) * to_unit,
-        XYZ,
-        frame.map_covariance(adjusted.point_covariance, XYZ),
-        _ground_residuals(prepared, adjusted, XYZ),
-        _position_residuals(prepared, adjusted),
-        _cameras(project, prepared.block, adjusted),
+        prepared=prepared,
+        adjusted=adjusted,
+        poses=poses,
+        angles=angles,
+        sigma_center=_roots(of_centers),
+        sigma_angles=_roots(of_angles) * to_unit,
+        XYZ=XYZ,
+        covariance=frame.map_covariance(adjusted.point_covariance, XYZ),
+        ground_residuals=_ground_residuals(prepared, adjusted, XYZ),
+        position_residuals=_position_residuals(prepared, adjusted),
+        cameras=_cameras(project, prepared.block, adjusted),
     )
 
 

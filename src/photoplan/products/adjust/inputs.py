@@ -94,7 +94,17 @@ def read_inputs(project: Project, names: Sequence[str]) -> AdjustInputs:
         )
     wanted = set(names)
     images = tuple(image for image in project.images if image.name in wanted)
-    return AdjustInputs(project, images, points, ground, table, positions, attitudes, tuple(files), tuple(notes))
+    return AdjustInputs(
+        project=project,
+        images=images,
+        points=points,
+        ground=ground,
+        table=table,
+        positions=positions,
+        attitudes=attitudes,
+        files=tuple(files),
+        notes=tuple(notes),
+    )
 
 
 def _control(project: Project) -> tuple[list[GroundPoints], list[tuple[Path, ImagePoints]], list[Path]]:
@@ -201,12 +211,12 @@ def _positions(project: Project, names: Sequence[str], notes: list[str]) -> Posi
         notes.append(f"{table.path.name}: {len(unknown)} positions are of images that are not in the project")
     at: NDArray[np.int64] = np.array(keep, np.int64)
     return PositionTable(
-        table.path,
-        tuple(known[match_key(table.images[k])] for k in keep),
-        table.XYZ[at],
-        table.sigma[at],
-        None if table.R_ground_camera is None else table.R_ground_camera[at],
-        table.sigma_angle[at],
-        tuple(table.strip[k] for k in keep),
-        table.time[at],
+        path=table.path,
+        images=tuple(known[match_key(table.images[k])] for k in keep),
+        XYZ=table.XYZ[at],
+        sigma=table.sigma[at],
+        R_ground_camera=None if table.R_ground_camera is None else table.R_ground_camera[at],
+        sigma_angle=table.sigma_angle[at],
+        strip=tuple(table.strip[k] for k in keep),
+        time=table.time[at],
     )

@@ -167,16 +167,16 @@ def _images(result: MapResult, used: NDArray[np.bool_]) -> tuple[ImageFigures, .
         none = not len(mine)
         out.append(
             ImageFigures(
-                name,
-                strip.get(name, ""),
-                len(mine),
-                int(adjusted.rejected[rows].sum()),
-                (float("nan"),) * 2 if none else (float(r[:, 0].mean()), float(r[:, 1].mean())),
-                (float("nan"),) * 2 if none else (_rms(r[:, 0]), _rms(r[:, 1])),
-                float(np.nanmax(w)) if np.isfinite(w).any() else float("nan"),
-                _triple(result.poses[k].center),
-                _triple(result.sigma_center[k]),
-                _triple(result.sigma_angles[k]),
+                name=name,
+                strip=strip.get(name, ""),
+                measurements=len(mine),
+                rejected=int(adjusted.rejected[rows].sum()),
+                mean=(float("nan"),) * 2 if none else (float(r[:, 0].mean()), float(r[:, 1].mean())),
+                rms=(float("nan"),) * 2 if none else (_rms(r[:, 0]), _rms(r[:, 1])),
+                worst=float(np.nanmax(w)) if np.isfinite(w).any() else float("nan"),
+                center=_triple(result.poses[k].center),
+                sigma_center=_triple(result.sigma_center[k]),
+                sigma_angles=_triple(result.sigma_angles[k]),
             )
         )
     return tuple(out)
@@ -198,15 +198,15 @@ def ground_facts(result: MapResult) -> tuple[GroundFigures, ...]:
         a, b, c = (bool(v) for v in adjusted.ground_rejected[k])
         out.append(
             GroundFigures(
-                name,
-                bool(ground.check[k]),
-                0 if at is None else int(adjusted.rays[at]),
-                _triple(ground.XYZ[k]),
-                _triple(result.ground_residuals[k]),
-                _triple(ground.sigma[k]),
-                _triple(normalised[k]),
-                (a, b, c),
-                np.full((3, 3), np.nan) if at is None else result.covariance[at],
+                name=name,
+                check=bool(ground.check[k]),
+                rays=0 if at is None else int(adjusted.rays[at]),
+                XYZ=_triple(ground.XYZ[k]),
+                residual=_triple(result.ground_residuals[k]),
+                stated=_triple(ground.sigma[k]),
+                normalised=_triple(normalised[k]),
+                rejected=(a, b, c),
+                covariance=np.full((3, 3), np.nan) if at is None else result.covariance[at],
             )
         )
     return tuple(out)
@@ -231,14 +231,14 @@ def _strips(result: MapResult) -> tuple[StripFigures, ...]:
         known = found is not None and bool(np.isfinite(found.sigma[:3]).any())
         out.append(
             StripFigures(
-                str(name),
-                int(mine.sum()),
-                int(adjusted.position_rejected[mine].sum()),
-                _triple(r.mean(axis=0) if len(r) else nothing),
-                _triple(np.sqrt((r**2).mean(axis=0)) if len(r) else nothing),
-                _triple(frame.map_vectors(found.shift, middle) if known and found is not None else nothing),
-                _triple(frame.map_vectors(found.rate, middle) if known and found is not None else nothing),
-                _triple(found.sigma[:3] if found is not None else nothing),
+                name=str(name),
+                count=int(mine.sum()),
+                rejected=int(adjusted.position_rejected[mine].sum()),
+                mean=_triple(r.mean(axis=0) if len(r) else nothing),
+                rms=_triple(np.sqrt((r**2).mean(axis=0)) if len(r) else nothing),
+                shift=_triple(frame.map_vectors(found.shift, middle) if known and found is not None else nothing),
+                rate=_triple(frame.map_vectors(found.rate, middle) if known and found is not None else nothing),
+                sigma_shift=_triple(found.sigma[:3] if found is not None else nothing),
             )
         )
     return tuple(out)

@@ -107,11 +107,33 @@ def _figures(lists: dict[str, DefectList], kinds: tuple[str, ...], plane: str, l
     for kind in kinds:
         count = sum(d.kind == kind for d in pixels.defects) if len(kinds) > 1 else pixels.count
         remark = f"deviation over {pixels.threshold:.3g} DN, scatter {pixels.scatter:.3g} DN"
-        figures.append(Figure(f"{kind}_pixels", count, nan, f"{kind} pixels", "", plane, label, remark))
+        figures.append(
+            Figure(
+                name=f"{kind}_pixels",
+                value=count,
+                sigma=nan,
+                label=f"{kind} pixels",
+                unit="",
+                plane=plane,
+                at=label,
+                remark=remark,
+            )
+        )
     for key, name, what in (("blinking", "blinking_pixels", "blinking pixels"), ("lines", "lines", "rows and columns")):
         if key in lists:
             part = lists[key]
-            figures.append(Figure(name, part.count, nan, what, "", plane, label, f"over {part.threshold:.3g} DN"))
+            figures.append(
+                Figure(
+                    name=name,
+                    value=part.count,
+                    sigma=nan,
+                    label=what,
+                    unit="",
+                    plane=plane,
+                    at=label,
+                    remark=f"over {part.threshold:.3g} DN",
+                )
+            )
     return figures
 
 

@@ -62,7 +62,7 @@ def _outcome(found: BrightnessDrift, at: str, plane: str, side: int) -> Findings
     nan = math.nan
 
     def figure(name: str, value: float, sigma: float, label: str, unit: str = "DN", remark: str = "") -> Figure:
-        return Figure(name, value, sigma, label, unit, plane, at, remark)
+        return Figure(name=name, value=value, sigma=sigma, label=label, unit=unit, plane=plane, at=at, remark=remark)
 
     drift = "drifts" if found.drifts else "no more than noise"
     trend = "significant" if found.has_trend else "not significant"

@@ -74,7 +74,7 @@ def _outcome(found: GainControl, pixel: tuple[float, float], of: tuple[str, str]
     nan = math.nan
 
     def figure(name: str, value: float, sigma: float, label: str, unit: str = "DN", remark: str = "") -> Figure:
-        return Figure(name, value, sigma, label, unit, plane, at, remark)
+        return Figure(name=name, value=value, sigma=sigma, label=label, unit=unit, plane=plane, at=at, remark=remark)
 
     figures = [figure("before_dn", found.before, found.sigma_before or nan, "grey value before the step")]
     figures.append(figure("step_dn", found.step, nan, "step of the scene", remark=found.direction))

@@ -182,7 +182,18 @@ def _figures(data: SeriesData, group: FrameGroup, edges: list[Edge], control: li
         refused[f"periodic part, {at}"] = "no oscillation is significant (chance of a false alarm below 1 ‰)"
     figures += _periodic(data, edges, at)
     spikes = sum(len(e.jitter.spikes) for e in edges)
-    figures.append(Figure("spikes", spikes, math.nan, "lines with spikes", "", "", at, f"of {sum(lines)}"))
+    figures.append(
+        Figure(
+            name="spikes",
+            value=spikes,
+            sigma=math.nan,
+            label="lines with spikes",
+            unit="",
+            plane="",
+            at=at,
+            remark=f"of {sum(lines)}",
+        )
+    )
     lost = sum(len(e.jitter.missing) for e in edges)
     figures.append(Figure("missing_lines", lost, math.nan, "lines without an edge", "", "", at))
     return Findings(tuple(figures), refused, notes=_curved(edges, at))
@@ -198,13 +209,35 @@ def _periodic(data: SeriesData, edges: list[Edge], at: str) -> list[Figure]:
         chance = f"chance of a false alarm {h.probability:.1g}"
         if len(edges) > 1:
             chance += f"; of {edge.frame.file.name}, the others are in the table" if edge is not None else ""
-        figures.append(Figure("amplitude_px", h.amplitude, h.sigma_amplitude, "amplitude", "px", "", which, chance))
+        figures.append(
+            Figure(
+                name="amplitude_px",
+                value=h.amplitude,
+                sigma=h.sigma_amplitude,
+                label="amplitude",
+                unit="px",
+                plane="",
+                at=which,
+                remark=chance,
+            )
+        )
         figures.append(Figure("period_lines", h.period, h.sigma_period, "period", "lines", "", which))
         if camera.line_frequency_hz is not None and edge is not None and edge.entry.direction == "vertical":
             hertz = h.hertz(1.0 / camera.line_frequency_hz, camera.interlaced)
             remark = "two rows of the image are one line of a field" if camera.interlaced else ""
             sigma = hertz * h.sigma_period / h.period
-            figures.append(Figure("frequency_hz", hertz, sigma, "frequency", "Hz", "", which, remark))
+            figures.append(
+                Figure(
+                    name="frequency_hz",
+                    value=hertz,
+                    sigma=sigma,
+                    label="frequency",
+                    unit="Hz",
+                    plane="",
+                    at=which,
+                    remark=remark,
+                )
+            )
     return figures
 
 
@@ -229,7 +262,18 @@ def _pair(group: FrameGroup, first: list[Edge], second: list[Edge]) -> Findings:
     for prefix, what, of in (("", "", pairs), ("random_", " without fields and periodic parts", random)):
         r, sigma = _correlation(of)
         label = f"correlation of the deviations{what}"
-        figures.append(Figure(f"{prefix}correlation", r, sigma, label, "", "", at, of[0].verdict))
+        figures.append(
+            Figure(
+                name=f"{prefix}correlation",
+                value=r,
+                sigma=sigma,
+                label=label,
+                unit="",
+                plane="",
+                at=at,
+                remark=of[0].verdict,
+            )
+        )
         common, of_common = _mean([p.common_sigma for p in of], [p.sigma_common for p in of])
         figures.append(Figure(f"{prefix}common_px", common, of_common, f"common part{what}", "px", "", at))
         for k, edges in enumerate((first, second)):

@@ -139,7 +139,19 @@ def _prnu(data: SeriesData, flat: Setting, plane: Plane, dark: PatternVariance |
 
 
 def _no_pattern(black: float) -> PatternVariance:
-    return PatternVariance(0, 0, 0, 0, 0, 0, 0, 0, black, 0, False)
+    return PatternVariance(
+        total=0,
+        total_sigma=0,
+        row=0,
+        row_sigma=0,
+        column=0,
+        column_sigma=0,
+        pixel=0,
+        pixel_sigma=0,
+        mean=black,
+        temporal_rest=0,
+        filtered=False,
+    )
 
 
 def _parts(found: PatternVariance, key: str, words: str, plane: str, unit: str, factor: float, label: str) -> Findings:

@@ -46,7 +46,16 @@ def reduced_level(data: SeriesData, point: ReducedPoint) -> Level:
     """A reduced figure as a level; from a mean of 99.9 % of saturation on, samples are clipped."""
     clipped = 1.0 if point.mean > 0.999 * data.series.saturation_dn else 0.0
     return Level(
-        point.frames, point.pixels, point.mean, point.variance, float("nan"), 0.0, clipped, 0.0, point.mean, point.mean
+        frames=point.frames,
+        pixels=point.pixels,
+        mean=point.mean,
+        temporal_variance=point.variance,
+        spatial_variance=float("nan"),
+        frame_mean_sigma=0.0,
+        saturated_share=clipped,
+        zero_share=0.0,
+        largest=point.mean,
+        smallest=point.mean,
     )
 
 

@@ -178,7 +178,18 @@ def _course(course: Course, at: str, bound: float) -> tuple[list[Figure], dict[s
         return figures, {f"warm-up of {label}, {at}": f"{a.verdict} (chance of none {a.probability:.2g})"}
     remark = f"chance of none {a.probability:.1g}"
     change, sigma = factor * a.change, factor * a.sigma_change
-    figures.append(Figure(f"{name}_drift_{suffix}", change, sigma, f"{label}, warm-up drift", unit, "", at, remark))
+    figures.append(
+        Figure(
+            name=f"{name}_drift_{suffix}",
+            value=change,
+            sigma=sigma,
+            label=f"{label}, warm-up drift",
+            unit=unit,
+            plane="",
+            at=at,
+            remark=remark,
+        )
+    )
     label_of = f"{label}, time constant"
     figures.append(Figure(f"{name}_time_s", a.time_constant, a.sigma_time_constant, label_of, "s", "", at))
     if unit == "px":

@@ -136,20 +136,31 @@ def _check_image(scene: Scene, looked: ImagePlausibility) -> ImageCheck:
     nan = float("nan")
     if seen.bounds is None:
         fault = fault or f"sees nothing of the terrain (tilt {tilt:.1f}°)"
-        return ImageCheck(name, tilt, nan, (nan, nan), seen.on_surface, nan, nan, nan, fault, scene.notes)
+        return ImageCheck(
+            image=name,
+            tilt_deg=tilt,
+            gsd=nan,
+            footprint=(nan, nan),
+            on_terrain=seen.on_surface,
+            relief_px=nan,
+            admissible_height_error=nan,
+            curvature_px=nan,
+            fault=fault,
+            notes=scene.notes,
+        )
     relief, curvature = _sensitivity(scene)
     xmin, ymin, xmax, ymax = seen.bounds
     return ImageCheck(
-        name,
-        tilt,
-        mean_gsd(scene.camera, seen),
-        (xmax - xmin, ymax - ymin),
-        seen.on_surface,
-        relief,
-        1 / relief if relief > 0 else nan,
-        curvature,
-        fault,
-        scene.notes,
+        image=name,
+        tilt_deg=tilt,
+        gsd=mean_gsd(scene.camera, seen),
+        footprint=(xmax - xmin, ymax - ymin),
+        on_terrain=seen.on_surface,
+        relief_px=relief,
+        admissible_height_error=1 / relief if relief > 0 else nan,
+        curvature_px=curvature,
+        fault=fault,
+        notes=scene.notes,
     )
 
 

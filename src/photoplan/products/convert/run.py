@@ -106,7 +106,14 @@ def convert_orientation(request: ConvertRequest) -> ConvertReport:
     files = write_orientation(block, output, target.name, overwrite=request.overwrite)
     table = block.table
     return ConvertReport(
-        tuple(files), source, target.name, len(table.images), tuple(block.cameras), table.crs, table.notes, lost
+        files=tuple(files),
+        source_format=source,
+        target_format=target.name,
+        images=len(table.images),
+        cameras=tuple(block.cameras),
+        crs=table.crs,
+        notes=table.notes,
+        lost=lost,
     )
 
 

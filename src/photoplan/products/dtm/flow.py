@@ -128,14 +128,14 @@ def dtm_flow(request: FlowRequest) -> FlowReport:
         _write_catchments(request.catchments, grid, flow, rows, terrain.crs)
     pixel = grid.resolution**2
     return FlowReport(
-        request.output,
-        request.catchments,
-        grid.resolution,
-        float(np.isfinite(heights).sum()) * pixel,
-        float(flow.area[flow.leaves].sum()),
-        float((depth > 0).sum()) * pixel,
-        float(np.nansum(depth, dtype=float)) * pixel,
-        tuple(rows),
+        path=request.output,
+        catchments=request.catchments,
+        resolution=grid.resolution,
+        area=float(np.isfinite(heights).sum()) * pixel,
+        outflow=float(flow.area[flow.leaves].sum()),
+        pits=float((depth > 0).sum()) * pixel,
+        pit_volume=float(np.nansum(depth, dtype=float)) * pixel,
+        rows=tuple(rows),
     )
 
 

@@ -108,7 +108,16 @@ def dtm_sample(request: SampleRequest, events: Events = SILENT) -> SampleReport:
     sigma = float(np.sqrt(squares / known)) if known else np.nan
     if outside == count:
         low = high = np.nan
-    return SampleReport(request.output, count, outside, low, high, sigma, terrain.crs, terrain.height_system)
+    return SampleReport(
+        path=request.output,
+        points=count,
+        outside=outside,
+        low=low,
+        high=high,
+        sigma=sigma,
+        crs=terrain.crs,
+        height_system=terrain.height_system,
+    )
 
 
 def _values(terrain: OpenTerrain, XY: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -196,7 +196,16 @@ def slope_picture(unit: str = "degrees", classes: tuple[float, ...] = ()) -> Cal
     table = {0: (0, 0, 0)} | {
         i + 1: (int(r), int(g), int(b)) for i, (r, g, b) in enumerate(np.column_stack(mixed).tolist())
     }
-    return lambda terrain, grid: Picture("slope classes", "uint8", 1, "auto", settings, tile, "mode", table)
+    return lambda terrain, grid: Picture(
+        kind="slope classes",
+        dtype="uint8",
+        bands=1,
+        nodata="auto",
+        settings=settings,
+        tile=tile,
+        resampling="mode",
+        colours=table,
+    )
 
 
 def aspect_picture() -> Callable[[OpenTerrain, MapGrid], Picture]:

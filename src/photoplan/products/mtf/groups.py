@@ -79,22 +79,22 @@ def _group(
     spreads = [found for m in own if (found := spread_of_edge(m)) is not None]
     low, middle, high = quantiles([m.mtf50 for m in own], (0.1, 0.5, 0.9))
     return EdgeGroup(
-        edges[0].channel,
-        edges[0].band,
-        direction,
-        edges[0].flight if direction is not None else None,
-        None if where is None else where[0],
-        None if where is None else where[1],
-        combine([m.mtf50 for m in own], [sigma_of_interval(m.mtf50_interval) for m in own], least=0.0),
-        combine([m.mtf10 for m in own], [sigma_of_interval(m.mtf10_interval) for m in own], least=0.0),
-        combine([m.fwhm for m in own], [sigma_of_interval(m.fwhm_interval) for m in own], least=0.0),
-        combine([m.overshoot for m in own], [m.overshoot_sigma for m in own], least=0.0),
-        combine([m.undershoot for m in own], [m.undershoot_sigma for m in own], least=0.0),
-        (low, middle, high),
-        curve,
-        fit_gaussian(curve),
-        tuple(_coefficient(spreads, k) for k in range(SHARES)) if direction is not None and spreads else (),
-        beside,
+        channel=edges[0].channel,
+        band=edges[0].band,
+        direction=direction,
+        flight=edges[0].flight if direction is not None else None,
+        cell=None if where is None else where[0],
+        bounds=None if where is None else where[1],
+        mtf50=combine([m.mtf50 for m in own], [sigma_of_interval(m.mtf50_interval) for m in own], least=0.0),
+        mtf10=combine([m.mtf10 for m in own], [sigma_of_interval(m.mtf10_interval) for m in own], least=0.0),
+        fwhm=combine([m.fwhm for m in own], [sigma_of_interval(m.fwhm_interval) for m in own], least=0.0),
+        overshoot=combine([m.overshoot for m in own], [m.overshoot_sigma for m in own], least=0.0),
+        undershoot=combine([m.undershoot for m in own], [m.undershoot_sigma for m in own], least=0.0),
+        mtf50_range=(low, middle, high),
+        curve=curve,
+        gaussian=fit_gaussian(curve),
+        spread=tuple(_coefficient(spreads, k) for k in range(SHARES)) if direction is not None and spreads else (),
+        laboratory=beside,
     )
 
 

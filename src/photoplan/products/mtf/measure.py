@@ -108,17 +108,17 @@ def measure_image(name: tuple[str, Path], image: LightImage, how: Measuring, adv
     if enhancement.enhanced:
         notes.append(enhancement.warning)
     return ImageMtf(
-        name[0],
-        name[1],
-        image.size,
-        image.linearisation.describe(),
-        tuple(edges),
-        tuple(group_edges(edges, image.size, 0 if how.rois else how.grid, how.lab)),
-        enhancement,
-        count,
-        how.grid,
-        dict(rejected),
-        tuple(notes),
+        name=name[0],
+        file=name[1],
+        size=image.size,
+        linearisation=image.linearisation.describe(),
+        edges=tuple(edges),
+        groups=tuple(group_edges(edges, image.size, 0 if how.rois else how.grid, how.lab)),
+        enhancement=enhancement,
+        found=count,
+        grid=how.grid,
+        rejected=dict(rejected),
+        notes=tuple(notes),
     )
 
 
@@ -238,7 +238,15 @@ def _measured(image: LightImage, channel: int, number: int, region: EdgeRegion, 
     flight = None if how.flight is None else "along" if measured.direction == how.flight else "across"
     name = image.channel_name(channel)
     return MeasuredEdge(
-        number, region.of, region.line.ends, region.half, region.aligned, channel, name, flight, measured
+        number=number,
+        line=region.of,
+        ends=region.line.ends,
+        half=region.half,
+        aligned=region.aligned,
+        channel=channel,
+        band=name,
+        flight=flight,
+        measured=measured,
     )
 
 

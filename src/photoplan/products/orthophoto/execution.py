@@ -216,16 +216,16 @@ def _complete(
     facts = None if tally.failed else file.complete(_tags(plan, product))
     ran = times()
     result = ProductResult(
-        file.path,
-        product.plan.image,
-        ran["seconds"],
-        0.0 if facts is None else facts.valid_share,
-        tally.totals.get("worst_residual", 0.0),
-        tally.totals.get("cells", 0),
-        product.plan.tile_count,
-        tally.resumed,
-        tuple(sorted(tally.failed)),
-        next(iter(tally.reasons), ""),
+        path=file.path,
+        image=product.plan.image,
+        seconds=ran["seconds"],
+        valid_share=0.0 if facts is None else facts.valid_share,
+        residual=tally.totals.get("worst_residual", 0.0),
+        cells=tally.totals.get("cells", 0),
+        tiles=product.plan.tile_count,
+        resumed=tally.resumed,
+        failed=tuple(sorted(tally.failed)),
+        reason=next(iter(tally.reasons), ""),
     )
     if facts is not None:
         record = _record(plan, product, scene, run, result)

@@ -113,14 +113,14 @@ def compile_figures(plan: OrthoPlan, events: Events = SILENT) -> PlanFigures:
             events.done(1, tile.window.size)
     columns = list(zip(*rows))
     return PlanFigures(
-        np.array(columns[0], object),
-        np.array(columns[1], object),
-        np.array(columns[2], np.int64),
-        np.array(columns[3], np.int64),
-        np.array(columns[4], float),
-        np.array(columns[5], np.int64),
-        np.array(columns[6], np.int64),
-        np.array(columns[7], float),
+        product=np.array(columns[0], object),
+        image=np.array(columns[1], object),
+        index=np.array(columns[2], np.int64),
+        cells_of_tile=np.array(columns[3], np.int64),
+        residual_of_tile=np.array(columns[4], float),
+        source=np.array(columns[5], np.int64),
+        windows=np.array(columns[6], np.int64),
+        bounds=np.array(columns[7], float),
     )
 
 

@@ -74,15 +74,15 @@ def _kept(plan: OrthoPlan, product: OrthoProduct, folder: Path) -> ProductResult
             return None
         made = record["product"]
         return ProductResult(
-            path,
-            product.plan.image,
-            made["seconds"],
-            made["valid_share"],
-            made["worst_anchor_residual_px"],
-            made["cells"],
-            made["tiles"],
-            made["tiles"],
-            (),
+            path=path,
+            image=product.plan.image,
+            seconds=made["seconds"],
+            valid_share=made["valid_share"],
+            residual=made["worst_anchor_residual_px"],
+            cells=made["cells"],
+            tiles=made["tiles"],
+            resumed=made["tiles"],
+            failed=(),
         )
     except (OSError, ValueError, KeyError, TypeError, UsageError):
         return None

@@ -172,19 +172,19 @@ def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -
         )
         camera, entries = calibrated(described, start, adjusted), camera_entries(described, start, adjusted)
     return ResectedImage(
-        image,
-        interior.size,
-        given,
-        found,
-        center,
-        angles_from_rotation(R, orientation.rotation) * to_unit,
-        np.sqrt(np.diag(found.covariance)[:3]),
-        np.sqrt(np.diag(of_angles)) * to_unit,
-        tuple(_GREEK[k] for k in orientation.rotation),
-        orientation.angle_unit,
-        camera,
-        entries,
-        (*found.notes, *_notes(of_angles)),
+        image=image,
+        size=interior.size,
+        points=given,
+        found=found,
+        center=center,
+        angles=angles_from_rotation(R, orientation.rotation) * to_unit,
+        sigma_center=np.sqrt(np.diag(found.covariance)[:3]),
+        sigma_angles=np.sqrt(np.diag(of_angles)) * to_unit,
+        angle_names=tuple(_GREEK[k] for k in orientation.rotation),
+        angle_unit=orientation.angle_unit,
+        calibrated=camera,
+        camera_entries=entries,
+        notes=(*found.notes, *_notes(of_angles)),
     )
 
 

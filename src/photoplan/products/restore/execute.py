@@ -118,18 +118,18 @@ def earlier_result(job: Job, settings: dict[str, Any]) -> RestoredImage | None:
         if record["key"] != job.key or record["settings"] != settings or not job.target.is_file():
             return None
         return RestoredImage(
-            made["image"],
-            job.target,
-            made["dtype"],
-            made["noise_gain"],
-            tuple(made["clipped_below"]),
-            tuple(made["clipped_above"]),
-            made["valid_share"],
-            made["pixels"],
-            made["tiles"],
-            made["tiles"],
-            made["seconds"],
-            job.picture if job.picture.is_file() else None,
+            image=made["image"],
+            path=job.target,
+            dtype=made["dtype"],
+            noise_gain=made["noise_gain"],
+            below=tuple(made["clipped_below"]),
+            above=tuple(made["clipped_above"]),
+            valid_share=made["valid_share"],
+            pixels=made["pixels"],
+            tiles=made["tiles"],
+            resumed=made["tiles"],
+            seconds=made["seconds"],
+            picture=job.picture if job.picture.is_file() else None,
         )
     except (OSError, ValueError, KeyError, TypeError):
         return None
@@ -200,18 +200,18 @@ def _complete(
     ran = times()
     nothing = [0] * reader.bands
     result = RestoredImage(
-        reader.info.path.name,
-        job.target,
-        str(reader.dtype),
-        restoration_of(reader).restorer.filter.noise_gain,
-        tuple(tally.totals.get("below", nothing)),
-        tuple(tally.totals.get("above", nothing)),
-        facts.valid_share,
-        reader.size[0] * reader.size[1],
-        job.tiles,
-        tally.resumed,
-        ran["seconds"],
-        job.picture if how.quicklook else None,
+        image=reader.info.path.name,
+        path=job.target,
+        dtype=str(reader.dtype),
+        noise_gain=restoration_of(reader).restorer.filter.noise_gain,
+        below=tuple(tally.totals.get("below", nothing)),
+        above=tuple(tally.totals.get("above", nothing)),
+        valid_share=facts.valid_share,
+        pixels=reader.size[0] * reader.size[1],
+        tiles=job.tiles,
+        resumed=tally.resumed,
+        seconds=ran["seconds"],
+        picture=job.picture if how.quicklook else None,
     )
     # The record first: a disk that is full for the picture does not leave a result without it.
     record = _record(job, how, result, facts)

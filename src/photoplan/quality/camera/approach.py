@@ -125,26 +125,52 @@ def fit_approach(times: Array, values: Array, sigma: Array | None = None, what: 
     if probability >= LEVEL:
         verdict = "no significant change"
         rms = math.sqrt(rss0 / (n - 1))
-        return Approach(mean, None, None, None, None, None, None, None, rms, probability, n - 1, verdict)
+        return Approach(
+            mean=mean,
+            start=None,
+            end=None,
+            change=None,
+            sigma_change=None,
+            time_constant=None,
+            sigma_time_constant=None,
+            sigma_end=None,
+            rms=rms,
+            probability=probability,
+            redundancy=n - 1,
+            verdict=verdict,
+        )
     rms = math.sqrt(rss1 / (n - 3))
     sigmas = _sigmas(t, w, (start, end, tau), rms)
     verdict = _verdict(t, tau, sigmas[2], (abs(end - start), sigmas[3]))
     if verdict.startswith("the series"):  # its end is not seen
-        return Approach(mean, start, None, None, None, None, None, None, rms, probability, n - 3, verdict)
+        return Approach(
+            mean=mean,
+            start=start,
+            end=None,
+            change=None,
+            sigma_change=None,
+            time_constant=None,
+            sigma_time_constant=None,
+            sigma_end=None,
+            rms=rms,
+            probability=probability,
+            redundancy=n - 3,
+            verdict=verdict,
+        )
     known = not verdict.startswith("the change")
     return Approach(
-        mean,
-        start if known else None,
-        end,
-        end - start if known else None,
-        sigmas[3] if known else None,
-        tau if known else None,
-        sigmas[2] if known else None,
-        sigmas[1],
-        rms,
-        probability,
-        n - 3,
-        verdict,
+        mean=mean,
+        start=start if known else None,
+        end=end,
+        change=end - start if known else None,
+        sigma_change=sigmas[3] if known else None,
+        time_constant=tau if known else None,
+        sigma_time_constant=sigmas[2] if known else None,
+        sigma_end=sigmas[1],
+        rms=rms,
+        probability=probability,
+        redundancy=n - 3,
+        verdict=verdict,
     )
 
 

@@ -129,18 +129,18 @@ def find_blooming(
     # What is full by its own light, blurred edges and stray light included, is the object by then.
     rows, columns = _extent(lifted, bright, _grown(bright, promised >= 0.9 * full))
     return Blooming(
-        onset,
-        onset_sigma,
-        last,
-        object_dn,
-        excess,
-        sigma,
-        rows,
-        columns,
-        float(times[last_told]),
-        float(thresholds[last_told]),
-        int(bright.sum()),
-        int(near.sum()),
+        onset_dn=onset,
+        onset_dn_sigma=onset_sigma,
+        last_without=last,
+        object_dn=object_dn,
+        excess_dn=excess,
+        excess_sigma=sigma,
+        extent_rows=rows,
+        extent_columns=columns,
+        extent_exposure=float(times[last_told]),
+        threshold_dn=float(thresholds[last_told]),
+        object_pixels=int(bright.sum()),
+        neighbour_pixels=int(near.sum()),
     )
 
 

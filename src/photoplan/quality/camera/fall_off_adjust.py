@@ -116,7 +116,16 @@ def adjust(
     fit = solve(A, y, w)
     linear, residuals = fit.unknowns, -fit.residuals
     J = np.column_stack([_derivatives(blocks, (point, c), (terms, linear), free), A]) if free else A
-    return FallOffFit(point, c, terms, linear, _covariance(blocks, J, residuals, w), w, residuals, free)
+    return FallOffFit(
+        point=point,
+        camera_constant=c,
+        terms=terms,
+        linear=linear,
+        covariance=_covariance(blocks, J, residuals, w),
+        weights=w,
+        residuals=residuals,
+        free=free,
+    )
 
 
 def _start_constant(blocks: Blocks, point: tuple[float, float]) -> float:

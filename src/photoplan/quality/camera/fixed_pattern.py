@@ -89,17 +89,17 @@ def pattern_variance(
     pixel_sigma = sqrt(measured_sigma**2 + rest_sigma**2)
     total_sigma = sqrt(row_sigma**2 + column_sigma**2 + pixel_sigma**2)
     return PatternVariance(
-        total,
-        total_sigma,
-        row,
-        row_sigma,
-        column,
-        column_sigma,
-        pixel,
-        pixel_sigma,
-        float(mean.mean()),
-        rest,
-        filtered,
+        total=total,
+        total_sigma=total_sigma,
+        row=row,
+        row_sigma=row_sigma,
+        column=column,
+        column_sigma=column_sigma,
+        pixel=pixel,
+        pixel_sigma=pixel_sigma,
+        mean=float(mean.mean()),
+        temporal_rest=rest,
+        filtered=filtered,
     )
 
 

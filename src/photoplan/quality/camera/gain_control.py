@@ -126,7 +126,18 @@ def gain_control(
     direction = "bright to dark" if after < before else "dark to bright"
     sigma_before = None if spread is None else spread / math.sqrt(first)
     noise = NoiseChange(spread, approach.rms, _ratio_test(spread, first - 1, approach))
-    return GainControl(name, float(t[first]), direction, before, sigma_before, approach, noise, first, t, y)
+    return GainControl(
+        name=name,
+        step_time=float(t[first]),
+        direction=direction,
+        before=before,
+        sigma_before=sigma_before,
+        approach=approach,
+        noise=noise,
+        first=first,
+        times=t,
+        values=y,
+    )
 
 
 def compare_transitions(dark: GainControl, bright: GainControl) -> Asymmetry:

@@ -99,20 +99,20 @@ def linearity(
     with np.errstate(invalid="ignore"):
         segment = np.concatenate([[np.nan], np.diff(y) / np.diff(x)])
     return Linearity(
-        x,
-        y,
-        y / x,
-        s / x,
-        segment,
-        used,
-        float(offset),
-        float(slope),
-        float(np.sqrt((fit.influence[1] ** 2) @ relative**2)),
-        deviation,
-        error,
-        error_sigma,
-        float(deviation[used].min()),
-        float(deviation[used].max()),
+        exposure=x,
+        signal=y,
+        response=y / x,
+        response_sigma=s / x,
+        segment=segment,
+        used=used,
+        offset=float(offset),
+        slope=float(slope),
+        slope_sigma=float(np.sqrt((fit.influence[1] ** 2) @ relative**2)),
+        deviation_percent=deviation,
+        error_percent=error,
+        error_percent_sigma=error_sigma,
+        error_min_percent=float(deviation[used].min()),
+        error_max_percent=float(deviation[used].max()),
     )
 
 

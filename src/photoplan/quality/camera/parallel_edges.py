@@ -106,17 +106,17 @@ def compare_edges(first: LineJitter, second: LineJitter, offset: int = 0, *, per
     spikes_a = {s.line for s in first.spikes}
     spikes_b = {s.line + offset for s in second.spikes}
     return EdgePair(
-        n,
-        r,
-        math.tanh(z - 1.96 * half),
-        math.tanh(z + 1.96 * half),
-        effective,
-        common,
-        of_covariance / (2.0 * common) if common > 0.0 else math.nan,
-        (math.sqrt(max(variances[0] - covariance, 0.0)), math.sqrt(max(variances[1] - covariance, 0.0))),
-        chance_normal(z / half),
-        tuple(sorted(spikes_a & spikes_b)),
-        tuple(sorted(spikes_a ^ spikes_b)),
+        lines=n,
+        correlation=r,
+        low=math.tanh(z - 1.96 * half),
+        high=math.tanh(z + 1.96 * half),
+        effective=effective,
+        common_sigma=common,
+        sigma_common=of_covariance / (2.0 * common) if common > 0.0 else math.nan,
+        own_sigma=(math.sqrt(max(variances[0] - covariance, 0.0)), math.sqrt(max(variances[1] - covariance, 0.0))),
+        probability=chance_normal(z / half),
+        common_spikes=tuple(sorted(spikes_a & spikes_b)),
+        single_spikes=tuple(sorted(spikes_a ^ spikes_b)),
     )
 
 

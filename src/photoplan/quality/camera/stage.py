@@ -110,22 +110,22 @@ def stage_calibration(
     covariance = np.asarray(np.kron(np.eye(2), fit.covariance), float)
     sizes, directions, shear = _sigmas(forward, covariance)
     return StageCalibration(
-        labels,
-        S,
-        P,
-        forward,
-        ~forward,
-        covariance,
-        residuals,
-        (float(columns), float(rows)),
-        fit.sigma0,
-        fit.redundancy,
-        tuple(n for n, u in zip(labels, used) if not u),
-        affine_facts(forward),
-        sizes,
-        directions,
-        shear,
-        _systematic(S[used], residuals[used]),
+        names=labels,
+        stage=S,
+        measured=P,
+        to_image=forward,
+        to_stage=~forward,
+        covariance=covariance,
+        residuals=residuals,
+        sigma=(float(columns), float(rows)),
+        sigma0=fit.sigma0,
+        redundancy=fit.redundancy,
+        gross=tuple(n for n, u in zip(labels, used) if not u),
+        facts=affine_facts(forward),
+        sigma_pixel_size=sizes,
+        sigma_direction=directions,
+        sigma_shear=shear,
+        systematic=_systematic(S[used], residuals[used]),
     )
 
 

@@ -152,13 +152,13 @@ def grey_wedge(density: ArrayLike, signal: ArrayLike, sigma: ArrayLike, saturati
     slope = float(np.sum(v / t) / v.size)
     deviation = v - slope * t
     return GreyWedge(
-        d,
-        y,
-        transmission,
-        used,
-        line.slope,
-        line.slope_sigma,
-        slope,
-        float(100 * np.abs(deviation).max() / v.max()),
-        float(100 * y.max() / saturation),
+        density=d,
+        signal=y,
+        transmission=transmission,
+        used=used,
+        gamma=line.slope,
+        gamma_sigma=line.slope_sigma,
+        slope=slope,
+        error_percent=float(100 * np.abs(deviation).max() / v.max()),
+        used_range_percent=float(100 * y.max() / saturation),
     )

@@ -124,19 +124,19 @@ def warm_up(
     sigmas, sigma0 = _sigmas(cofactors, rest, (repeat, P), reference)
     courses = _courses(t, values, sigmas, chosen)
     return WarmUp(
-        t - t[0],
-        chosen,
-        courses,
-        tuple(
+        times=t - t[0],
+        model=chosen,
+        courses=courses,
+        targets=tuple(
             Movement(n, xy, (float(np.nanmax(xy[:, 0]) - np.nanmin(xy[:, 0])), float(np.ptp(_known(xy[:, 1])))))
             for n, xy in zip(names, moved)
         ),
-        repeat,
-        redundancy,
-        sigma0,
-        reference,
-        (middle[0], middle[1]),
-        _notes(chosen, names, repeat, len(t)),
+        repeat_sigma=repeat,
+        repeat_redundancy=redundancy,
+        sigma0=sigma0,
+        reference=reference,
+        centre=(middle[0], middle[1]),
+        notes=_notes(chosen, names, repeat, len(t)),
     )
 
 

@@ -270,7 +270,16 @@ class _DiscFit:
         if sigma.max() > settings.most_sigma:
             return "centre too uncertain"
         x, y = start[0] + float(shape[0]), start[1] + float(shape[1])
-        return Disc(x, y, float(sigma[0]), float(sigma[1]), radius, float(np.exp(shape[5])), contrast, noise)
+        return Disc(
+            x=x,
+            y=y,
+            sigma_x=float(sigma[0]),
+            sigma_y=float(sigma[1]),
+            radius=radius,
+            blur=float(np.exp(shape[5])),
+            contrast=contrast,
+            noise=noise,
+        )
 
 
 def _whole(grey: _Array) -> bool:

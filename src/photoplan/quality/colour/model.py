@@ -208,7 +208,16 @@ def fit_band(band: int, size: tuple[int, int], measured: Displacements, kind: st
     terms, sigmas = _terms(chosen, fit.unknowns, fit.cofactors)
     rejected = groups - np.unique(measured.group[kept]).size
     trials = tuple(Trial(t.kind, t.unknowns.size, t.predicted) for t in tried)
-    return BandModel(band, terms, sigmas, chosen, fit.rms, groups, rejected, trials)
+    return BandModel(
+        band=band,
+        terms=terms,
+        sigmas=sigmas,
+        kind=chosen,
+        residual=fit.rms,
+        count=groups,
+        rejected=rejected,
+        trials=trials,
+    )
 
 
 @dataclass(frozen=True, eq=False)

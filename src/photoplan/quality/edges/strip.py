@@ -310,5 +310,12 @@ def strip_along(
         return np.bincount(cell[of], weights, minlength=shape[0] * shape[1]).astype(float).reshape(shape)
 
     return Strip(
-        line, block, half, summed(good), summed(good, values), summed(good, values**2), summed(clipped), summed(~usable)
+        line=line,
+        block=block,
+        half=half,
+        count=summed(good),
+        total=summed(good, values),
+        square=summed(good, values**2),
+        saturated=summed(clipped),
+        invalid=summed(~usable),
     )

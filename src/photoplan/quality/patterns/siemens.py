@@ -140,16 +140,16 @@ def measure_star(
         if len(kept) >= 2:
             directional[degrees(pi * k / rules.directions)] = _curve(kept, sectors, (full, uncertain))
     return StarMtf(
-        pixels.centre,
-        sigma,
-        sectors,
-        wave,
-        low,
-        high,
-        source,
-        (inner, outer),
-        _curve(rings, sectors, (full, uncertain)),
-        directional,
+        centre=pixels.centre,
+        centre_sigma=sigma,
+        sectors=sectors,
+        wave=wave,
+        low=low,
+        high=high,
+        levels_from=source,
+        radii=(inner, outer),
+        mtf=_curve(rings, sectors, (full, uncertain)),
+        directional=directional,
     )
 
 

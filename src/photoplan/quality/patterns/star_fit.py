@@ -114,14 +114,14 @@ def fit_ring(values: Array, angle: Array, radius: float, sectors: int, *, whole:
         place = start + 2 + 2 * high.index(3)
         third = (float(solution[place]), float(solution[place + 1]))
     return StarRing(
-        radius,
-        float(solution[0]),
-        float(solution[start]),
-        float(solution[start + 1]),
-        covariance[start : start + 2, start : start + 2],
-        third,
-        float(np.sqrt((residuals**2).mean())),
-        angle.size,
+        radius=radius,
+        mean=float(solution[0]),
+        cosine=float(solution[start]),
+        sine=float(solution[start + 1]),
+        covariance=covariance[start : start + 2, start : start + 2],
+        third=third,
+        residual=float(np.sqrt((residuals**2).mean())),
+        pixels=angle.size,
     )
 
 

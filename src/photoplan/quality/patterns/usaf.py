@@ -218,14 +218,14 @@ def _bars(item: UsafElement, three: ThreeBars, full: Array, first: int, rules: U
     resolved = bool(contrast >= rules.least_contrast and contrast > 3.0 * sigma)
     square = bool(three.square / level > _SEEN and three.square > 3.0 * three.square_sigma)
     return UsafBars(
-        group,
-        item.element,
-        item.horizontal,
-        usaf_frequency(group, item.element),
-        three.frequency,
-        three.centre,
-        contrast,
-        sigma,
-        resolved,
-        resolved or square,
+        group=group,
+        element=item.element,
+        horizontal=item.horizontal,
+        lp_mm=usaf_frequency(group, item.element),
+        frequency=three.frequency,
+        centre=three.centre,
+        contrast=contrast,
+        sigma=sigma,
+        resolved=resolved,
+        seen=resolved or square,
     )

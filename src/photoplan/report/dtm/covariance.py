@@ -81,7 +81,14 @@ def covariance_test(fit: TerrainFit) -> CovarianceTest:
             return np.asarray(np.bincount(number, values, minlength=_CLASSES + 1)[:_CLASSES] / count)
 
     return CovarianceTest(
-        distance, _curve(fit.whole, distance), low, high, mean(d), mean(product), mean(expected), count
+        distance=distance,
+        whole=_curve(fit.whole, distance),
+        low=low,
+        high=high,
+        classes=mean(d),
+        empirical=mean(product),
+        expected=mean(expected),
+        pairs=count,
     )
 
 
