@@ -37,6 +37,8 @@ docs: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/python -m pip install --quiet --editable '.[bench]'
 	$(BIN)/python bench/run.py
+	$(BIN)/python bench/overhead.py
+	$(BIN)/python bench/startup.py
 
 clean:
 	rm -rf $(VENV) demo build docs/_build .pytest_cache .mypy_cache .ruff_cache
