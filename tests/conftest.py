@@ -7,11 +7,17 @@ import sys
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 # Before NumPy is loaded: on the small matrices of most tests, threads of linear algebra spend their time waiting for
 # each other, all the more with several processes on the same cores (an edge is measured in 0.17 or 0.026 s of CPU).
 assert "numpy" not in sys.modules
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# Invented cases are the same in every run; `--hypothesis-profile search` looks for new ones (`make test-slow`).
+settings.register_profile("same", derandomize=True, deadline=None)
+settings.register_profile("search", deadline=None, print_blob=True)
+settings.load_profile("same")
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import struct
-import time
 import zlib
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 import rasterio
 import rasterio.shutil
+from tools.effort import at_most
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
@@ -189,10 +189,8 @@ class TestFault07Bombs:
     def test_fault_07_refused_from_the_header(self, tmp_path: Path, content: bytes, message: str) -> None:
         path = tmp_path / "bomb.tif"
         path.write_bytes(content)
-        start = time.perf_counter()
-        with pytest.raises(InputError, match=message) as error:
+        with at_most(1), pytest.raises(InputError, match=message) as error:
             RasterReader(path)
-        assert time.perf_counter() - start < 1.0
         assert "bomb.tif" in str(error.value)
 
     def test_fault_07_sparse_file_of_a_petabyte(self, tmp_path: Path) -> None:
@@ -210,12 +208,11 @@ class TestFault07Bombs:
         }
         with rasterio.open(path, "w", driver="GTiff", **profile):
             pass
-        start = time.perf_counter()
-        with pytest.raises(InputError, match="more than the limit"):
-            RasterReader(path)
-        with pytest.raises(InputError, match="more than the limit"):
-            TerrainReader(path)
-        assert time.perf_counter() - start < 1.0
+        with at_most(1):
+            with pytest.raises(InputError, match="more than the limit"):
+                RasterReader(path)
+            with pytest.raises(InputError, match="more than the limit"):
+                TerrainReader(path)
 
     def test_fault_07_a_legitimate_sparse_file_passes(self, tmp_path: Path) -> None:
         path = tmp_path / "sparse.tif"

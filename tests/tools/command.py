@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -90,7 +91,13 @@ def start(*words: object, env: Mapping[str, str] | None = None, before: Sequence
         text=True,
         env={**os.environ, **(env or {})},
         start_new_session=True,
+        preexec_fn=_listen if os.name == "posix" else None,
     )
+
+
+def _listen() -> None:
+    """A shell lets what it runs in the background ignore Ctrl-C, tests too; their commands are to hear it."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def wait_for(condition: Callable[[], object], running: subprocess.Popen[str], seconds: float = 120) -> None:
