@@ -4,7 +4,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-slow test-nojit lint docs bench clean
+OLDEST := .venv-oldest
+
+.PHONY: demo test test-slow test-nojit test-plain test-oldest lint docs bench clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -18,8 +20,25 @@ demo: $(STAMP)
 test: lint docs test-nojit
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile -m "not slow and not bench"
 
-test-slow: $(STAMP)
+# What is too long for every change: large inputs, simulations at their full size, new invented cases, kernels without
+# numba's inside, and the oldest libraries that pyproject.toml allows.
+test-slow: $(STAMP) test-plain test-oldest
 	$(BIN)/python -m pytest -m "slow"
+	$(BIN)/python -m pytest -m "hypothesis and not bench" --hypothesis-profile search
+
+# The kernels from plain loops, as with a numba that `kernels/numba_parts.py` does not know.
+test-plain: $(STAMP)
+	PHOTOPLAN_PLAIN_KERNELS=1 NUMBA_CACHE_DIR=$(CURDIR)/build/plain-kernels $(BIN)/python -m pytest -q -m "not slow and not bench" tests/kernels
+
+test-oldest: $(OLDEST)/.installed
+	PYTHONPATH=src NUMBA_CACHE_DIR=$(CURDIR)/build/oldest-kernels $(OLDEST)/bin/python -m pytest -m "not slow and not bench" \
+		$(addprefix tests/,kernels geometry cameras surfaces plan engine io orientation terrain matching products)
+
+$(OLDEST)/.installed: pyproject.toml tests/tools/oldest.py
+	$(PYTHON) -m venv --clear $(OLDEST)
+	$(PYTHON) tests/tools/oldest.py > $(OLDEST)/oldest.txt
+	$(OLDEST)/bin/python -m pip install --quiet -r $(OLDEST)/oldest.txt
+	touch $@
 
 # The kernels once more as plain Python, on small sizes, so that a mistake cannot hide behind the compiler.
 test-nojit: $(STAMP)
@@ -41,4 +60,4 @@ bench: $(STAMP)
 	$(BIN)/python bench/startup.py
 
 clean:
-	rm -rf $(VENV) demo build docs/_build .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) $(OLDEST) demo build docs/_build .pytest_cache .mypy_cache .ruff_cache

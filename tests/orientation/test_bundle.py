@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tools.sim_block import FOCAL, Simulated, simulate
+from tools.thinned import thinned
 
 from photoplan.cameras.lenses.brown import Brown
 from photoplan.cameras.lenses.opencv import OpenCV
@@ -98,11 +99,12 @@ def test_sparse_solution_equals_dense_least_squares() -> None:
     np.testing.assert_allclose(redundancy.sum(), result.redundancy, atol=1e-5)
 
 
-def test_simulated_blocks_are_unbiased_and_covariances_calibrated() -> None:
-    """200 blocks: normalised errors of orientations, camera and points have mean 0 and spread 0.9 to 1.1."""
+@thinned("count", 60, 200)
+def test_simulated_blocks_are_unbiased_and_covariances_calibrated(count: int) -> None:
+    """Normalised errors of orientations, camera and points have mean 0 and spread 0.9 to 1.1."""
     normal: dict[str, list[np.ndarray]] = {"orientations": [], "camera": [], "points": []}
     sigma0 = []
-    for seed in range(200):
+    for seed in range(count):
         simulated = simulate(
             seed, strips=2, images=4, per_image=24, gnss=0.05, free=("c", "x0", "y0"), cross=True, sigma=0.4
         )
@@ -116,13 +118,13 @@ def test_simulated_blocks_are_unbiased_and_covariances_calibrated() -> None:
         sigma = np.sqrt(np.diagonal(result.point_covariance, axis1=1, axis2=2))
         normal["points"].append((result.XYZ - true) / sigma)
         sigma0.append(result.sigma0)
-    print(f"\n200 simulated blocks: sigma0 {np.mean(sigma0):.3f}")
+    print(f"\n{count} simulated blocks: sigma0 {np.mean(sigma0):.3f}")
     for name, parts in normal.items():
         values = np.concatenate(parts)
         spread, mean = values.std(axis=0), values.mean(axis=0)
         print(f"  {name}: spread {spread.round(3)}, mean {mean.round(3)} of {len(values)}")
         # Errors within a block are correlated, so means are judged by the number of blocks.
-        assert (np.abs(mean) < 4.0 / np.sqrt(200)).all()
+        assert (np.abs(mean) < 4.0 / np.sqrt(count)).all()
         assert 0.9 <= float(np.sqrt((values**2).mean())) <= 1.1
         assert (spread > 0.85).all() and (spread < 1.15).all()
     assert 0.97 < np.mean(sigma0) < 1.03
@@ -217,12 +219,13 @@ def with_smooth_errors(simulated: Simulated, seed: int, size: float, reach: floa
     return replace(simulated, block=replace(simulated.block, observations=replace(seen, xy=xy)))
 
 
-def test_correlated_image_errors_are_noticed_and_covariances_stay_calibrated() -> None:
+@thinned("count", 3, 8)
+def test_correlated_image_errors_are_noticed_and_covariances_stay_calibrated(count: int) -> None:
     """Errors that are alike over 500 of 4000 pixels: taken as independent, accuracies are twice too good."""
     spreads = {}
     for regarded in (True, False):
         normal, effects = [], []
-        for seed in range(8):
+        for seed in range(count):
             simulated = simulate(
                 seed, strips=3, images=5, per_image=150, gnss=0.1, attitude=3e-4, sigma=0.2, base=0.25, control=9
             )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from tools.mark_scans import CORNERS, ArrayScan, Simulated, ring_cross_pattern, simulate
+from tools.thinned import thinned
 
 from photoplan.cameras.mark_pattern import MarkPart, MarkPattern
 from photoplan.errors import InputError
@@ -22,10 +23,11 @@ def errors(found: FiducialResult, truth: dict[str, tuple[float, float]]) -> NDAr
     return np.array([(m.x - truth[m.name][0], m.y - truth[m.name][1]) for m in found.marks])
 
 
-def test_marks_of_scans_of_any_kind_within_a_twentieth_of_a_pixel_and_standard_deviations_are_true() -> None:
+@thinned("count", 10, 30)
+def test_marks_of_scans_of_any_kind_within_a_twentieth_of_a_pixel_and_standard_deviations_are_true(count: int) -> None:
     rng = np.random.default_rng(1)
     off, sigmas, tops = [], [], []
-    for seed in range(30):
+    for seed in range(count):
         made = Simulated(
             rotation=int(rng.integers(4)) * 90,
             mirrored=bool(rng.integers(2)),
@@ -45,7 +47,7 @@ def test_marks_of_scans_of_any_kind_within_a_twentieth_of_a_pixel_and_standard_d
         sigmas.append([(m.sigma_x, m.sigma_y) for m in found.marks])
         tops.append([np.subtract(m.paraboloid, truth[m.name]) for m in found.marks])
     all_off, all_sigmas = np.concatenate(off), np.concatenate(sigmas)
-    assert len(all_off) == 120
+    assert len(all_off) == 4 * count
     assert np.sqrt(np.mean(all_off**2)) <= 0.05
     assert 0.8 <= np.sqrt(np.mean((all_off / all_sigmas) ** 2)) <= 1.25
     assert np.sqrt(np.mean(np.square(tops))) <= 0.1

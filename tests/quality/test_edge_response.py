@@ -8,6 +8,7 @@ from math import cos, pi, radians, sin, sqrt
 import numpy as np
 import pytest
 from tools.edges import TAILED, edge_image, gaussian, line_spread, modulation, true_fwhm, true_mtf50
+from tools.thinned import thinned
 
 from photoplan.quality.edges.model import PixelEdge
 from photoplan.quality.edges.response import EdgeSettings, measure_edge
@@ -53,11 +54,12 @@ def test_without_much_noise_nothing_is_biased(angle, spread):
     assert edge.sampling == "super-sampled" and edge.direction == ("x" if abs(cos(radians(angle))) > 0.7 else "y")
 
 
-def test_figures_and_intervals_of_many_edges():
-    """300 edges of 60 × 100 pixels: any angle, any place, any width; the issue's bounds as root mean squares."""
+@thinned("count", 100, 300)
+def test_figures_and_intervals_of_many_edges(count):
+    """Edges of 60 × 100 pixels: any angle, any place, any width; the issue's bounds as root mean squares."""
     random = np.random.default_rng(2024)
     errors, covered, limits = [], [], []
-    for _ in range(300):
+    for _ in range(count):
         angle, spread = random.uniform(0.0, 360.0), gaussian(random.uniform(0.35, 1.1))
         edge = measure_edge(_edge(angle, spread, random))
         truth = true_mtf50(angle, spread), true_fwhm(angle, spread)

@@ -1,11 +1,12 @@
-"""Orthophotos of real images, made once per session through the Python API."""
+"""Orthophotos of real images, made once for all tests, through the Python API."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
+from tools.kept import kept
 from tools.real_projects import dmc_project, drone_project
 
 from photoplan.io.project.file import load_project
@@ -22,17 +23,34 @@ def make_orthos(project_folder: Path, images: Sequence[str] | None, resolution: 
     return [result.path for result in results]
 
 
+def kept_orthos(name: str, make: Callable[[Path], list[Path]], data: Path) -> list[Path]:
+    """What `make` makes in a folder, kept from run to run."""
+
+    def listed(folder: Path) -> None:
+        paths = make(folder)
+        (folder / "order.txt").write_text("\n".join(str(path.relative_to(folder)) for path in paths))
+
+    folder = kept(name, listed, ["photoplan.products.orthophoto.execution", "photoplan.kernels.rectify"], [data])
+    return [folder / line for line in (folder / "order.txt").read_text().split("\n")]
+
+
 @pytest.fixture(scope="session")
-def brighton(block: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def brighton(block: Path) -> list[Path]:
     """The drone block at 0.1 m, all 18 images."""
-    folder = tmp_path_factory.mktemp("brighton")
-    drone_project(block, folder)
-    return make_orthos(folder, None, 0.1)
+
+    def make(folder: Path) -> list[Path]:
+        drone_project(block, folder)
+        return make_orthos(folder, None, 0.1)
+
+    return kept_orthos("brighton-orthos", make, block)
 
 
 @pytest.fixture(scope="session")
-def ngi(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def ngi(shared: Path) -> list[Path]:
     """The four DMC frames at 5 m."""
-    folder = tmp_path_factory.mktemp("ngi")
-    dmc_project(shared, folder)
-    return make_orthos(folder, None, 5.0)
+
+    def make(folder: Path) -> list[Path]:
+        dmc_project(shared, folder)
+        return make_orthos(folder, None, 5.0)
+
+    return kept_orthos("ngi-orthos", make, shared / "data" / "ngi_dmc")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from tools.command import peak_of
 from tools.ign_block import Published, ign_project, published
+from tools.kept import kept
 
 from photoplan.geometry.rotation import rotation_opk
 from photoplan.io.image_points import read_image_points
@@ -21,14 +22,17 @@ GIB = 2**30
 
 
 @pytest.fixture(scope="module")
-def block(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, Path, int, Published]:
+def block(shared: Path) -> tuple[dict, Path, int, Published]:
     data = shared / "data" / "ign_borea"
-    folder = tmp_path_factory.mktemp("ign")
-    project = ign_project(folder, data, position_noise=0.1, attitude_noise_deg=0.01)
-    said, peak = peak_of("adjust", project, "-q")
-    assert said.code == 0, said.err
+
+    def make(folder: Path) -> None:
+        said, peak = peak_of("adjust", ign_project(folder, data, position_noise=0.1, attitude_noise_deg=0.01), "-q")
+        assert said.code == 0, said.err
+        (folder / "peak.txt").write_text(str(peak))
+
+    folder = kept("ign-block", make, ["photoplan.cli.adjust"], [data])
     report = json.loads((folder / "adjustment" / "report.json").read_text())
-    return report, project, peak, published(data)
+    return report, folder / "project.toml", int((folder / "peak.txt").read_text()), published(data)
 
 
 def deviations(project: Path, truth: Published) -> tuple[np.ndarray, np.ndarray]:

@@ -56,14 +56,16 @@ def kept(name: str, make: Callable[[Path], None], code: Iterable[str], inputs: I
     """
     above = folder_of_cache()
     above.mkdir(parents=True, exist_ok=True)
-    modules = [*code, *_imports(Path(inspect.getfile(make)))]
-    folder = above / f"{name}-{_key(Path(inspect.getfile(make)), modules, inputs)}"
+    maker = Path(inspect.getfile(make))
     with _locked(above / f"{name}.lock"):
+        folder = above / f"{name}-{_key(maker, [*code, *_imports(maker)], inputs)}"
         if not folder.is_dir():
             _forget(above)
             with tempfile.TemporaryDirectory(prefix=f".{name}-", dir=above) as made:
-                make(Path(made) / "result")
-                (Path(made) / "result").rename(folder)
+                result = Path(made) / "result"
+                result.mkdir()
+                make(result)
+                result.rename(folder)
         os.utime(folder)
     return folder
 

@@ -22,7 +22,6 @@ def test_made_once_and_anew_when_an_input_changes(made: list[Path], tmp_path: Pa
     given.write_text("one")
 
     def make(folder: Path) -> None:
-        folder.mkdir()
         (folder / "copy.txt").write_text(given.read_text())
         made.append(folder)
 
@@ -36,7 +35,6 @@ def test_made_once_and_anew_when_an_input_changes(made: list[Path], tmp_path: Pa
 
 def test_what_fails_is_not_kept(made: list[Path], tmp_path: Path) -> None:
     def fail(folder: Path) -> None:
-        folder.mkdir()
         made.append(folder)
         raise ValueError("not this time")
 
