@@ -54,7 +54,7 @@ def test_without_much_noise_nothing_is_biased(angle, spread):
     assert edge.sampling == "super-sampled" and edge.direction == ("x" if abs(cos(radians(angle))) > 0.7 else "y")
 
 
-@thinned("count", 100, 300)
+@thinned("count", 150, 300)
 def test_figures_and_intervals_of_many_edges(count):
     """Edges of 60 × 100 pixels: any angle, any place, any width; the issue's bounds as root mean squares."""
     random = np.random.default_rng(2024)

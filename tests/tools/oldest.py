@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 PROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
-EXTRAS = ("cluster", "points", "report", "match", "test")
+EXTRAS = ("arrays", "cluster", "points", "report", "match", "test")
 
 
 def oldest(project: Path = PROJECT) -> Iterator[str]:
