@@ -6,9 +6,7 @@ triangulation of the same points and lines.
 
 from __future__ import annotations
 
-import json
-import pickle
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +14,6 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 from tools.build_terrain import surface_of, terrain, unit_of
-from tools.kept import kept
 from tools.tin_volume import exact_volume, read_landxml_tin, tin_heights, tin_outline
 
 from photoplan.geometry.triangulation import constrained_faces
@@ -108,14 +105,9 @@ def compared(survey: Survey, seed: int, keep: int) -> Compared:
 
 
 @pytest.fixture(scope="module", params=[1, 8])
-def seed_0(request: pytest.FixtureRequest, folder: Path, survey: Survey) -> Compared:
+def seed_0(request: pytest.FixtureRequest, survey: Survey) -> Compared:
     """With 12,812 points, and with 1,602."""
-
-    def make(made: Path) -> None:
-        (made / "compared.json").write_text(json.dumps(asdict(compared(survey, 0, request.param))))
-
-    found = kept(f"m3-seed-0-{request.param}", make, [], [folder]) / "compared.json"
-    return Compared(**{name: tuple(pair) for name, pair in json.loads(found.read_text()).items()})
+    return compared(survey, 0, request.param)
 
 
 def test_prediction_is_not_worse_than_the_constrained_triangulation(seed_0: Compared) -> None:
@@ -139,14 +131,7 @@ def test_normalised_residuals_of_held_out_points_have_spread_one(seed_0: Compare
 
 @pytest.fixture(scope="module")
 def rock_and_terrain(folder: Path) -> list[tuple[Built, Tin]]:
-    def make(made: Path) -> None:
-        (made / "models.pickle").write_bytes(pickle.dumps(rock_and_terrain_of(folder)))
-
-    return pickle.loads((kept("m3-rock-and-terrain", make, [], [folder]) / "models.pickle").read_bytes())
-
-
-def rock_and_terrain_of(folder: Path) -> list[tuple[Built, Tin]]:
-    found: list[tuple[Built, Tin]] = []
+    found = []
     for name in ("M3_Rockbed_survey.mm.xml", "M3_Terrain.mm.xml"):
         raw, tin = read_measured([folder / name], ReadOptions()), read_landxml_tin(folder / name)
         around = shapely.box(*tin_outline(found[0][1] if found else tin).bounds).buffer(40)

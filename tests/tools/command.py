@@ -59,7 +59,7 @@ def process(*words: object, env: Mapping[str, str] | None = None, before: Sequen
         [*before, *COMMAND, *map(str, words)],
         capture_output=True,
         text=True,
-        timeout=240,
+        timeout=1800,
         env={**os.environ, **(env or {})},
         check=False,
     )
@@ -100,7 +100,7 @@ def _listen() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def wait_for(condition: Callable[[], object], running: subprocess.Popen[str], seconds: float = 120) -> None:
+def wait_for(condition: Callable[[], object], running: subprocess.Popen[str], seconds: float = 900) -> None:
     """Wait until something holds while a command runs."""
     end = time.monotonic() + seconds
     while not condition():
