@@ -56,7 +56,8 @@ def kept(name: str, make: Callable[[Path], None], code: Iterable[str], inputs: I
     """
     above = folder_of_cache()
     above.mkdir(parents=True, exist_ok=True)
-    maker = Path(inspect.getfile(make))
+    code, maker = list(code), Path(inspect.getfile(make))
+    assert all(_source(module) for module in code), code
     with _locked(above / f"{name}.lock"):
         folder = above / f"{name}-{_key(maker, [*code, *_imports(maker)], inputs)}"
         if not folder.is_dir():
