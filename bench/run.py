@@ -28,6 +28,7 @@ from agreement import compare
 from filter import report_filter
 from oblique import report_oblique
 from orientation import report_orientation
+from owners import report_owners
 from prepare import DATA, LARGE, SMALL, WORK, Source, prepare
 from programs import Bounds, Missing, Program, gdalwarp, orthority, photoplan
 from terrain import report_terrain
@@ -206,6 +207,7 @@ def main() -> int:
             results["sizes"].append(compare_at(source, entries))
             report(results["sizes"][-1])
     WORK.mkdir(exist_ok=True)
+    results["owners"] = report_owners()
     results["oblique"] = report_oblique(options.repeat)
     results["filter"] = report_filter(options.quick)
     results["terrain"] = report_terrain(options.quick, options.large)
