@@ -58,6 +58,13 @@ def test_what_is_not_determined_is_counted_and_stays_zero(n):
     assert np.allclose(A @ fit.unknowns, A[:, 0], atol=1e-7)
 
 
+@pytest.mark.parametrize("n", [8, 600])
+def test_columns_that_have_vanished_are_not_determined(n):
+    A = np.column_stack([np.ones(n), np.full(n, 1e-155), np.zeros(n)])
+    fit = solve(A, np.full(n, 3.0))
+    assert fit.rank == 1 and np.allclose(fit.unknowns, [3.0, 0.0, 0.0])
+
+
 def test_standard_deviations_are_those_of_repetition():
     A = np.column_stack([np.ones(30), np.linspace(-1, 5, 30)])
     fits = [solve(A, RNG.normal(0.0, 2.0, 30)) for _ in range(2000)]

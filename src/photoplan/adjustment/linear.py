@@ -37,7 +37,8 @@ class Decomposed:
     def of(cls, A: _Floats, least: float = 0.0) -> Decomposed:
         """Decompose equations (n, u); singular values below the part `least` of the largest count as 0."""
         length = np.sqrt(np.einsum("ij,ij->j", A, A))
-        length = np.where(length > 0.0, length, 1.0)
+        # What is as good as zero is not brought to one: it counts as not determined.
+        length = np.where(length > 1e-100 * length.max(initial=0.0), length, 1.0)
         if len(A) > _TALL * A.shape[1]:
             values, vectors = np.linalg.eigh(A.T @ A / np.multiply.outer(length, length))
             s, V, least = np.sqrt(np.maximum(values[::-1], 0.0)), vectors[:, ::-1], max(least, _ROUNDING_TALL)
