@@ -19,10 +19,7 @@ from photoplan.cli.output import spelled
 
 SOURCE = Path(photoplan.__file__).parent
 #: Options of other programs, and the names of colours in style sheets.
-FOREIGN = re.compile(
-    r"pyproj sync --file|colmap model_converter --output_type|(var\(|:root .*)--[a-z]+"
-    r"|[Pp]lain values for `--json`"
-)
+FOREIGN = re.compile(r"pyproj sync --file|colmap model_converter --output_type|(var\(|:root .*)--[a-z]+")
 VERBS = verbs()
 WORDS = sorted(
     {o.removeprefix("--").removeprefix("no-").replace("-", "_") for c in VERBS.values() for o in options_of(c)}

@@ -162,7 +162,7 @@ def describe_plan(plan: BuildPlan, measured: MeasuredTerrain, crs: str, system: 
 def plan_facts(
     plan: BuildPlan, measured: MeasuredTerrain, findings: Sequence[Finding], crs: str, system: str | None
 ) -> dict[str, Any]:
-    """What will be computed, as plain values for `--json`."""
+    """What will be computed, as plain values."""
     return {
         "points": measured.count,
         "lines": dict(Counter(line.kind for line in measured.lines)),

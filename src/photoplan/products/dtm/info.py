@@ -19,7 +19,7 @@ class TerrainFacts:
     facts: dict[str, Any]
     """In words, by name; lists have a line each."""
     figures: dict[str, Any]
-    """Plain values for `--json`."""
+    """Plain values, as JSON takes them."""
     gross: list[dict[str, Any]]
     """Measurements flagged as gross errors, the largest normalised residual first."""
 
