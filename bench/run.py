@@ -29,6 +29,7 @@ from filter import report_filter
 from oblique import report_oblique
 from orientation import report_orientation
 from owners import report_owners
+from planning import report_planning
 from prepare import DATA, LARGE, SMALL, WORK, Source, prepare
 from programs import Bounds, Missing, Program, gdalwarp, orthority, photoplan
 from terrain import report_terrain
@@ -212,6 +213,7 @@ def main() -> int:
     results["filter"] = report_filter(options.quick)
     results["terrain"] = report_terrain(options.quick, options.large)
     results["orientation"] = report_orientation(options.quick)
+    results["planning"] = report_planning(options.quick)
     if options.json:
         options.json.write_text(json.dumps(results, indent=2) + "\n")
     return 0

@@ -15,7 +15,7 @@ from photoplan.errors import UsageError
 Six = tuple[float, float, float, float, float, float]
 
 
-@dataclass(frozen=True, order=True)
+@dataclass(frozen=True, order=True, slots=True)
 class Window:
     """A rectangle of pixels: `col`, `row` of its first pixel, `width`, `height` in pixels (zero: empty)."""
 

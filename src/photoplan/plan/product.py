@@ -18,7 +18,7 @@ from photoplan.surfaces.base import Surface
 from photoplan.targets.base import Target
 
 
-@dataclass(frozen=True, order=True)
+@dataclass(frozen=True, order=True, slots=True)
 class Tile:
     """A part of a product that is one task."""
 
