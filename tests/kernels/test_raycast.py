@@ -10,7 +10,8 @@ from tools.hybrid_models import line, model
 from photoplan.errors import UsageError
 from photoplan.geometry.crs import crs_step
 from photoplan.kernels.jit import COMPILED
-from photoplan.kernels.raycast import MISS, SURFACE, WALL, pyramid_of
+from photoplan.kernels.pyramid import pyramid_of
+from photoplan.kernels.raycast import MISS, SURFACE, WALL
 from photoplan.surfaces.level import LevelSurface
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.surfaces.shifted import ShiftedSurface

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from photoplan.kernels.jit import COMPILED
-from photoplan.kernels.raycast import pyramid_of
+from photoplan.kernels.pyramid import pyramid_of
 from photoplan.kernels.visibility import sight_rows
 
 SIZE = 41 if COMPILED else 15

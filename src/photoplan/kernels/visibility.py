@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
-from photoplan.kernels.raycast import Pyramid, leave
+from photoplan.kernels.pyramid import Pyramid, leave
 
 _NUDGE = 1e-7
 """Part of a mesh by which a position on a grid line is moved on to find the mesh that comes next."""

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
+from photoplan.kernels.pyramid import Pyramid, pyramid_of
 from photoplan.kernels.raycast import (
     ABOVE,
     ASK,
@@ -19,10 +20,8 @@ from photoplan.kernels.raycast import (
     MISS,
     NONE,
     Faces,
-    Pyramid,
     first_hit,
     next_part,
-    pyramid_of,
 )
 
 #: Bytes of parts, with their pyramids, that are kept while rays are followed, if all are as large as the last one.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.events import Map
-from photoplan.kernels.raycast import pyramid_of
+from photoplan.kernels.pyramid import pyramid_of
 from photoplan.kernels.visibility import sight_rows
 
 #: Rows that one task of a thread computes.
