@@ -203,7 +203,7 @@ class TestFaults:
     @pytest.mark.parametrize(
         ("text", "says"),
         [
-            ("0 0\n1 x\n", ":2: 'x' is not a number"),
+            ("0 0\n1 x\n", ":2: column 2 = 'x' is not a number"),
             ("0 0\n255 1\n", "hold"),
             ("0 0\n0 1\n", "increase"),
             ("", "no line"),

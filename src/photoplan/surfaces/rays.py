@@ -199,7 +199,7 @@ def _over_parts(
     rays, window = _in_parts(parts, lines)
     done = ~(size >= 0)
     ranges = parts.ranges(window)
-    low, high = (np.ascontiguousarray(ranges[..., j]) for j in (0, 1))
+    low, high = (np.array(ranges[..., j], order="C") for j in (0, 1))
     low[np.isnan(low)], high[np.isnan(high)] = np.inf, -np.inf
     while not done.all():
         active = np.flatnonzero(~done)
