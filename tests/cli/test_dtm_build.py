@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import os
 import signal
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from tools.build_terrain import scattered
-from tools.command import Here, process, sabotage, start, wait_for
+from tools.command import Here, patience, process, sabotage, start, wait_for
 from tools.landxml import write_landxml
 
 from photoplan.io.lock import FileLock
@@ -217,7 +218,9 @@ def test_faults_03_25_a_build_that_is_killed_or_interrupted(tmp_path: Path, sign
     wait_for(begun.exists, running)
     assert (tmp_path / ".m.gpkg.lock").exists()
     running.send_signal(sign)
+    began = time.monotonic()
     running.communicate(timeout=120)
+    assert time.monotonic() - began < patience(10)
     assert running.returncode == (130 if sign == signal.SIGINT else -sign)
     assert not out.exists() and not list(tmp_path.glob(".*.part*"))
     again = process(*words)

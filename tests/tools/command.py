@@ -110,8 +110,8 @@ def wait_for(condition: Callable[[], object], running: subprocess.Popen[str], se
 
 
 def patience(seconds: float) -> float:
-    """A time that a quiet machine keeps, longer where others use this one as well."""
-    return seconds * max(1.0, 2 * os.getloadavg()[0] / (os.cpu_count() or 1))
+    """A time as it is asked for; longer only where far more runs than the suite itself, two for each core."""
+    return seconds * max(1.0, os.getloadavg()[0] / (2 * (os.cpu_count() or 1)))
 
 
 @dataclass(frozen=True)
