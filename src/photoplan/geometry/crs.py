@@ -204,6 +204,12 @@ def crs_step(source: str, target: str, bounds: tuple[float, float, float, float]
     return CrsStep(source, target, best.description, accuracy, best.definition)
 
 
+def utm_codes(latitude: float, longitude: float) -> list[str]:
+    """The UTM zone of WGS 84 at a place (degrees), then the zones beside it, as EPSG codes."""
+    zone = int((longitude + 180) // 6) % 60
+    return [f"EPSG:{326 if latitude >= 0 else 327}{(zone + shift) % 60 + 1:02d}" for shift in (0, -1, 1)]
+
+
 def missing_grids(group: TransformerGroup) -> list[str]:
     """Grids that the best operation of a group would need and that are not installed, with their address."""
     for operation in group.unavailable_operations:

@@ -56,9 +56,25 @@ def enu_poses(geodetic: ArrayLike) -> tuple[tuple[float, float, float], _Floats,
     points = np.asarray(geodetic, float).reshape(-1, 3)
     earth = np.column_stack(_to_earth().transform(points[:, 1], points[:, 0], points[:, 2]))
     origin = geodetic_of_geocentric(earth.mean(axis=0))
-    axes = enu_axes(*origin[:2])
     own = np.stack([enu_axes(lat, lon).T for lat, lon in points[:, :2]])
-    return origin, (earth - geocentric_of_geodetic(origin)) @ axes.T, axes @ own
+    return origin, enu_of_geodetic(origin, points), enu_axes(*origin[:2]) @ own
+
+
+def geodetic_of_enu(origin: tuple[float, float, float], enu: ArrayLike) -> _Floats:
+    """Latitude, longitude (degrees, WGS 84) and height of points (n, 3) east, north, up; NaN stays NaN."""
+    xyz = np.asarray(enu, float) @ enu_axes(*origin[:2]) + geocentric_of_geodetic(origin)
+    lon, lat, h = _to_earth().transform(*xyz.T, direction="INVERSE")
+    out = np.column_stack([lat, lon, h])
+    out[~np.isfinite(xyz).all(axis=1)] = np.nan
+    return out
+
+
+def enu_of_geodetic(origin: tuple[float, float, float], geodetic: ArrayLike) -> _Floats:
+    """Inverse of `geodetic_of_enu`; NaN stays NaN."""
+    points = np.asarray(geodetic, float)
+    earth = np.column_stack(_to_earth().transform(points[:, 1], points[:, 0], points[:, 2]))
+    earth[~np.isfinite(earth).all(axis=1)] = np.nan
+    return (earth - geocentric_of_geodetic(origin)) @ enu_axes(*origin[:2]).T
 
 
 def _to_earth() -> Transformer:
@@ -155,8 +171,7 @@ def topocentric_of_map(origin: tuple[float, float, float], crs: str, XYZ: ArrayL
     require_projected_metres(crs)
     XYZ = np.asarray(XYZ, float).reshape(-1, 3)
     lonlat = crs_step(crs, "EPSG:4326")(XYZ[:, :2])
-    earth = np.column_stack(_to_earth().transform(lonlat[:, 0], lonlat[:, 1], XYZ[:, 2]))
-    enu = (earth - geocentric_of_geodetic(origin)) @ enu_axes(*origin[:2]).T
+    enu = enu_of_geodetic(origin, np.column_stack([lonlat[:, ::-1], XYZ[:, 2]]))
     for _ in range(2):
         # The two ways through the projection differ by rounding; the step back is the one that readers take.
         back, R = topocentric_poses(origin, crs, enu)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.geometry.crs import canonical_crs, crs_label, crs_step
+from photoplan.geometry.crs import canonical_crs, crs_label, crs_step, utm_codes
 from photoplan.io.camera import opensfm as camera_opensfm
 from photoplan.io.camera.model import FilmCamera, FrameEntry
 from photoplan.io.lens_forms import opencv_form
@@ -78,10 +78,7 @@ def _shot(feature: Any, k: int, path: Path) -> tuple[tuple[int, int], OrientedIm
 
 def _utm_zone(lonlat: NDArray[np.float64], XYZ: NDArray[np.float64], path: Path) -> tuple[str | None, list[str]]:
     """The UTM zone in which longitude, latitude and the map coordinates agree, with a note."""
-    lon, lat = float(np.median(lonlat[:, 0])), float(np.median(lonlat[:, 1]))
-    zone = int((lon + 180) // 6) % 60 + 1
-    for shift in (0, -1, 1):
-        code = f"EPSG:{326 if lat >= 0 else 327}{(zone - 1 + shift) % 60 + 1:02d}"
+    for code in utm_codes(float(np.median(lonlat[:, 1])), float(np.median(lonlat[:, 0]))):
         try:
             there = crs_step("EPSG:4326", code)(lonlat[:, :2])
         except InputError:

@@ -3,7 +3,7 @@
 As its documentation defines it (opensfm.org/docs: geometry, dataset): ``rotation`` is an angle-axis vector that, with
 ``translation``, takes world coordinates to camera coordinates, x_camera = R x_world + t, the camera's axes being x
 right, y down, z forwards. World coordinates are a local tangential system (east, north, up) whose origin is
-``reference_lla``. So the projection centre is −Rᵀ t, and with our axes (y up, z backwards)
+``reference_lla``, or with OpenDroneMap of today a UTM zone (`photoplan.io.orientation.opensfm_world`). So the projection centre is −Rᵀ t, and with our axes (y up, z backwards)
 R_ground_camera = Rᵀ diag(1, −1, −1).
 """
 
@@ -20,11 +20,12 @@ from scipy.spatial.transform import Rotation
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_step
-from photoplan.geometry.earth_poses import topocentric_of_map
+from photoplan.geometry.earth_poses import enu_of_geodetic, geodetic_of_enu, topocentric_of_map
 from photoplan.io.camera.model import FilmCamera, FrameEntry
 from photoplan.io.camera.opensfm import cameras_of
 from photoplan.io.lens_forms import opencv_form, opencv_losses
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, height_losses, require_cameras
+from photoplan.io.orientation.opensfm_world import Shots, world_of
 from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.plain_files import finite, read_json
 
@@ -51,7 +52,7 @@ def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     """
     require_cameras(block, path, "reconstruction.json")
     origin, centers, rotations = _tangential(block.table, path)
-    shots = {}
+    shots: dict[str, dict[str, Any]] = {}
     for image, center, R in zip(block.table.images, centers, rotations):
         R_camera_world = FLIP @ R.T
         shots[image.name] = {
@@ -60,6 +61,11 @@ def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
             "camera": block.camera_name(image),
             "orientation": 1,
         }
+    if block.table.positions is not None:
+        gps = enu_of_geodetic(origin, block.table.positions)
+        for shot, position in zip(shots.values(), gps):
+            if np.isfinite(position).all():
+                shot["gps_position"] = position.tolist()
     contents = {
         "cameras": {name: normalised_camera(name, camera, path) for name, camera in block.cameras.items()},
         "shots": shots,
@@ -118,12 +124,12 @@ def rotation_from_axis_angle(vector: ArrayLike) -> NDArray[np.float64]:
 
 
 def read(path: Path, form: TableFormat) -> OrientationTable:
-    """Orientation table of a ``reconstruction.json``, in its local tangential system; `form` is not used.
+    """Orientation table of a ``reconstruction.json``, in its local system or UTM zone; `form` is not used.
 
     Raises
     ------
     InputError
-        The file is no such JSON, or it is not georeferenced.
+        The file is no such JSON, it is not georeferenced, or its poses are in no known world.
     """
     contents = read_json(path)
     if not isinstance(contents, list) or not all(isinstance(r, dict) and "shots" in r for r in contents):
@@ -131,12 +137,32 @@ def read(path: Path, form: TableFormat) -> OrientationTable:
     origins = {_origin(r, path) for r in contents}
     if len(origins) != 1:
         raise InputError(f"{path}: the reconstructions have {len(origins)} different origins; keep one reconstruction")
-    images = [_image(name, shot, path) for r in contents for name, shot in r["shots"].items()]
-    notes = []
+    origin = origins.pop()
+    stated = [(name, shot) for r in contents for name, shot in r["shots"].items()]
+    if not stated:
+        raise InputError(f"{path}: a reconstruction.json without shots; reconstruct again")
+    shots = _shots(stated, path)
+    world = world_of(path, origin, shots)
+    rotations = np.stack([rotation_from_axis_angle(v).T @ FLIP for v in shots.vectors])
+    images = tuple(
+        OrientedImage(name, (x, y, z), (a[0], a[1], a[2]), str(shot["camera"]) if shot.get("camera") else None)
+        for (name, shot), (x, y, z), a in zip(
+            stated, (shots.centers + world.offset).tolist(), degrees_of(rotations).tolist()
+        )
+    )
+    notes = [world.note]
     if len(contents) > 1:
         sizes = ", ".join(str(len(r["shots"])) for r in contents)
-        notes.append(f"{path.name}: {len(contents)} separate reconstructions ({sizes} images), tied by GPS only")
-    return OrientationTable(path, tuple(images), origin=origins.pop(), notes=tuple(notes))
+        notes.insert(0, f"{path.name}: {len(contents)} separate reconstructions ({sizes} images), tied by GPS only")
+    known = np.isfinite(shots.gps).any()
+    return OrientationTable(
+        path,
+        images,
+        crs=world.crs,
+        origin=origin if world.crs is None else None,
+        positions=geodetic_of_enu(origin, shots.gps) if known else None,
+        notes=tuple(notes),
+    )
 
 
 def _origin(reconstruction: dict[str, Any], path: Path) -> tuple[float, float, float]:
@@ -152,20 +178,26 @@ def _origin(reconstruction: dict[str, Any], path: Path) -> tuple[float, float, f
     return lat, lon, alt
 
 
-def _image(name: str, shot: Any, path: Path) -> OrientedImage:
-    where = f"{path}: shot {name!r}"
-    if not isinstance(shot, dict) or "rotation" not in shot or "translation" not in shot:
-        raise InputError(f"{where}: rotation or translation is missing")
-    R_camera_world = rotation_from_axis_angle(finite(shot["rotation"], f"{where}: rotation", 3))
-    t = np.array(finite(shot["translation"], f"{where}: translation", 3))
-    center = -R_camera_world.T @ t
-    angles = degrees_of((R_camera_world.T @ FLIP)[None])[0]
-    camera = shot.get("camera")
-    return OrientedImage(
-        name,
-        (float(center[0]), float(center[1]), float(center[2])),
-        (float(angles[0]), float(angles[1]), float(angles[2])),
-        str(camera) if camera is not None else None,
+def _shots(stated: list[tuple[str, Any]], path: Path) -> Shots:
+    """Poses and positions of receivers, as stated."""
+    centers, vectors, gps, dops = [], [], [], []
+    for name, shot in stated:
+        where = f"{path}: shot {name!r}"
+        if not isinstance(shot, dict) or "rotation" not in shot or "translation" not in shot:
+            raise InputError(f"{where}: rotation or translation is missing")
+        vectors.append(finite(shot["rotation"], f"{where}: rotation", 3))
+        t = np.array(finite(shot["translation"], f"{where}: translation", 3))
+        centers.append(-rotation_from_axis_angle(vectors[-1]).T @ t)
+        position = shot.get("gps_position")
+        gps.append([np.nan] * 3 if position is None else finite(position, f"{where}: gps_position", 3))
+        dops.append(shot["gps_dop"] if isinstance(shot.get("gps_dop"), int | float) else np.nan)
+    known = [d for d in dops if np.isfinite(d)]
+    return Shots(
+        names=tuple(name for name, _ in stated),
+        centers=np.array(centers),
+        vectors=np.array(vectors),
+        gps=np.array(gps, float),
+        dop=float(np.median(known)) if known else np.nan,
     )
 
 

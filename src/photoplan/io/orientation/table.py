@@ -114,6 +114,9 @@ class OrientationTable:
     origin: tuple[float, float, float] | None = None
     """Latitude, longitude (degrees, WGS 84) and height of a local tangential system (east, north, up), where positions
     and rotations refer to one; None where they refer to `crs`."""
+    positions: NDArray[np.float64] | None = None
+    """Latitude, longitude (degrees, WGS 84) and height that a receiver measured, shape (n, 3), where the file states
+    them beside the poses; NaN for images without. They were not used to place the poses."""
     notes: tuple[str, ...] = ()
     """What a user should know of how the file was read."""
 
