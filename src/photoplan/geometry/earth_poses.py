@@ -63,7 +63,7 @@ def enu_poses(geodetic: ArrayLike) -> tuple[tuple[float, float, float], _Floats,
 def geodetic_of_enu(origin: tuple[float, float, float], enu: ArrayLike) -> _Floats:
     """Latitude, longitude (degrees, WGS 84) and height of points (n, 3) east, north, up; NaN stays NaN."""
     xyz = np.asarray(enu, float) @ enu_axes(*origin[:2]) + geocentric_of_geodetic(origin)
-    lon, lat, h = _to_earth().transform(*xyz.T, direction="INVERSE")
+    lon, lat, h = _to_earth().transform(xyz[:, 0], xyz[:, 1], xyz[:, 2], direction="INVERSE")
     out = np.column_stack([lat, lon, h])
     out[~np.isfinite(xyz).all(axis=1)] = np.nan
     return out

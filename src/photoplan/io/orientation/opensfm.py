@@ -3,8 +3,8 @@
 As its documentation defines it (opensfm.org/docs: geometry, dataset): ``rotation`` is an angle-axis vector that, with
 ``translation``, takes world coordinates to camera coordinates, x_camera = R x_world + t, the camera's axes being x
 right, y down, z forwards. World coordinates are a local tangential system (east, north, up) whose origin is
-``reference_lla``, or with OpenDroneMap of today a UTM zone (`photoplan.io.orientation.opensfm_world`). So the projection centre is −Rᵀ t, and with our axes (y up, z backwards)
-R_ground_camera = Rᵀ diag(1, −1, −1).
+``reference_lla``, or with OpenDroneMap of today a UTM zone (`photoplan.io.orientation.opensfm_world`). So the
+projection centre is −Rᵀ t, and with our axes (y up, z backwards) R_ground_camera = Rᵀ diag(1, −1, −1).
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ OpenSfM, and OpenDroneMap up to 2020, write east, north, up about ``reference_ll
 file by one in the axes of its UTM zone, minus an offset in whole metres, and keeps the former as
 ``reconstruction.topocentric.json`` (its stage ``run_opensfm``: OpenSfM's ``export_geocoords``). It puts the reference
 at the offset itself, with height 0 (``opendm/osfm.py``, write_reference_lla), so that both files state the same
-reference, and their origins coincide; they differ by the convergence of meridians and the map's scale. ``gps_position`` of
-the shots stays east, north, up in both.
+reference, and their origins coincide; they differ by the convergence of meridians and the map's scale.
+``gps_position`` of the shots stays east, north, up in both.
 """
 
 from __future__ import annotations
