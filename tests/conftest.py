@@ -33,7 +33,7 @@ def shared() -> Path:
 
 @pytest.fixture(scope="session")
 def block() -> Path:
-    """The real drone block that the package brings along."""
-    folder = CHECKOUT / "src" / "photoplan" / "demo_block"
+    """The real drone block whose reduced images the package brings along."""
+    folder = CHECKOUT / "tests" / "data" / "brighton"
     assert folder.is_dir()
     return folder

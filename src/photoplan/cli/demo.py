@@ -15,7 +15,7 @@ from photoplan.cli.options import quiet_option
 @click.option("--resolution", type=float, default=0.1, show_default=True, help="Ground pixel in metres.")
 @quiet_option
 def command(folder: Path, resolution: float, quiet: bool) -> None:
-    """Copy the included drone block (18 images of Brighton Beach) to FOLDER and make its orthophotos.
+    """Copy the included drone block (18 reduced images of Brighton Beach) to FOLDER and make its orthophotos.
 
     Every step is the command that you would call yourself; it is printed before it runs.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
 import re
 import threading
@@ -161,3 +162,7 @@ def close_handles() -> None:
     """Close all rasters that this thread holds open."""
     while _handles.open:
         _handles.open.popitem()[1].close()
+
+
+# Left to the interpreter's end, rasterio closes them when its own modules are gone: "Error in sys.excepthook" (3.12).
+atexit.register(close_handles)
