@@ -1,19 +1,22 @@
-"""What several analyses of a camera share: series of settings, black levels, words for reasons."""
+"""What several analyses of a camera share: series of settings, black levels, refusals."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite, nan
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.series.pixels import Plane
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Findings
+from photoplan.products.characterise.result import Findings, Subject, Trace, joined
 from photoplan.quality.camera.frame_statistics import Level
 from photoplan.quality.camera.photon_transfer import is_clipped_dark
+from photoplan.quality.camera.saturation import Saturation, find_saturation
 
 #: Share of saturated samples up to which a mean grey value is one.
 MOST_SATURATED = 1e-2
@@ -42,6 +45,18 @@ class SettingsRun:
         """The condition, increasing."""
         return tuple(float(getattr(setting.first, self.name)) for setting in self.settings)
 
+    def saturation(self, data: SeriesData, plane: Plane) -> Saturation | None:
+        """Where its levels saturate; it has four at least."""
+        levels = [data.levels(setting)[plane.name] for setting in self.settings]
+        variance = np.array([level.temporal_variance for level in levels])
+        return find_saturation(
+            self.values,
+            [level.mean for level in levels],
+            black_if_known(data, self.settings[0], plane),
+            [level.saturated_share for level in levels],
+            variance if np.isfinite(variance).all() else None,
+        )
+
 
 def exposure_runs(data: SeriesData, kinds: Sequence[str], least: int) -> list[SettingsRun]:
     """Runs of at least so many settings of different exposure, photons or illumination (the first that differs)."""
@@ -50,12 +65,27 @@ def exposure_runs(data: SeriesData, kinds: Sequence[str], least: int) -> list[Se
         first = setting.first
         key = (first.group.index, first.kind, first.wavelength_nm, first.temperature_c, first.density)
         found.setdefault(key, []).append(setting)
-    runs = []
-    for settings in found.values():
-        run = _run(settings)
-        if run is not None and len(run.settings) >= least:
-            runs.append(run)
-    return runs
+    runs = (_run(settings) for settings in found.values())
+    return [run for run in runs if run is not None and len(run.settings) >= least]
+
+
+def no_run(data: SeriesData, kinds: Sequence[str], least: int, what: str) -> str | None:
+    """Why there is no run for an analysis; None: there is one."""
+    if exposure_runs(data, kinds, least):
+        return None
+    return (
+        f"{len(data.settings(*kinds))} settings of {' or '.join(kinds)} frames; {what} needs {least} that differ in "
+        "exposure_ms (or photons_per_pixel, or illumination) and in nothing else"
+    )
+
+
+def of_runs(
+    data: SeriesData, kinds: Sequence[str], least: int, what: str, analyse: Callable[..., Findings]
+) -> Findings:
+    """What an analysis finds in every run and plane: of data, run, plane, and what figures are of."""
+    of = [(run, plane) for run in exposure_runs(data, kinds, least) for plane in data.planes]
+    subjects = [Subject(plane.name, run.label) for run, plane in of]
+    return joined([tried(s.named(what), analyse, data, *each, s) for each, s in zip(of, subjects)])
 
 
 def _run(settings: Sequence[Setting]) -> SettingsRun | None:
@@ -128,7 +158,7 @@ def black_if_known(data: SeriesData, setting: Setting, plane: Plane) -> float:
     """Black of a setting; NaN: neither dark frames nor the series file tell it."""
     black = black_of(data, setting, plane)
     told = black.sigma > 0 or black.level is not None or black.rule.startswith("from dark frames")
-    return black.mean if told or "black_level_dn" in data.series.camera.model_fields_set else nan
+    return black.mean if told else data.stated_black
 
 
 def _between(exposure: float, known: Sequence[tuple[float, float]]) -> float:
@@ -150,16 +180,22 @@ def of_one_temperature(dark: Setting, setting: Setting) -> bool:
     return a is None or b is None or abs(a - b) <= 0.5
 
 
+def dark_like(data: SeriesData, setting: Setting, least: int = 1) -> Setting | None:
+    """Dark frames of the exposure and temperature of a setting."""
+    fit = (s for s in data.settings("dark", least=least) if s.first.exposure_ms == setting.first.exposure_ms)
+    return next((s for s in fit if of_one_temperature(s, setting)), None)
+
+
 def dark_levels(data: SeriesData, plane: Plane, like: Setting) -> tuple[list[Level], list[float]]:
     """Levels of the dark settings with two frames or more, the shortest exposure first, and their exposures.
 
     Of those that have the temperature of a setting, or of the coolest where it states none.
     """
-    settings = [s for s in data.settings("dark") if len(s.frames) >= 2 and of_one_temperature(s, like)]
+    settings = [s for s in data.settings("dark", least=2) if of_one_temperature(s, like)]
     coolest = min((s.first.temperature_c for s in settings if s.first.temperature_c is not None), default=0.0)
     settings = [s for s in settings if (s.first.temperature_c or coolest) <= coolest + 0.5]
-    settings.sort(key=lambda s: s.first.exposure_ms or 0.0)
-    return [data.levels(s)[plane.name] for s in settings], [s.first.exposure_ms or 0.0 for s in settings]
+    settings.sort(key=lambda s: s.exposure)
+    return [data.levels(s)[plane.name] for s in settings], [s.exposure for s in settings]
 
 
 def saturation_of(data: SeriesData, plane: Plane, levels: Sequence[Level]) -> float:
@@ -168,14 +204,21 @@ def saturation_of(data: SeriesData, plane: Plane, levels: Sequence[Level]) -> fl
     return stated if stated < inf else max((level.largest for level in levels), default=nan)
 
 
-def prefix(*parts: str) -> str:
-    """Parts that say something, as the key of a refusal."""
-    return " ".join(part for part in parts if part)
+def cut_off(levels: Sequence[Level], of: str = "") -> str | None:
+    """That black is cut off in some levels, as the beginning of a refusal; None: it is not."""
+    share = max((level.zero_share for level in levels if is_clipped_dark(level)), default=None)
+    return None if share is None else f"black is cut off: {100 * share:.3g} % of the samples{of} are zero"
 
 
-def tried(what: str, make: Callable[[], Findings]) -> Findings:
+def tried(what: str, make: Callable[..., Findings], *given: Any) -> Findings:
     """The outcome, or the refusal of `what` with its reason where the data do not allow it."""
     try:
-        return make()
+        return make(*given)
     except InputError as error:
         return Findings(refused={what: str(error)})
+
+
+def used_and_rest(x: NDArray[Any], y: NDArray[Any], used: NDArray[np.bool_]) -> list[Trace]:
+    """Points that an adjustment used, and the others, in two colours."""
+    parts = ((used, "used", 0), (~used, "not used", 3))
+    return [Trace(x[k], y[k], label, colour=colour) for k, label, colour in parts if k.any()]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from math import nan
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,11 @@ class Setting:
         return self.frames[0]
 
     @property
+    def exposure(self) -> float:
+        """Milliseconds; 0 where it is not stated."""
+        return self.first.exposure_ms or 0.0
+
+    @property
     def label(self) -> str:
         """Its condition in words, such as ``flat 25 ms 500 nm``."""
         words = [self.first.kind]
@@ -49,8 +55,6 @@ class SeriesData:
     """A series whose frames are read when an analysis asks; memory holds one frame and the images of one condition."""
 
     series: Series
-    watch: Callable[[int], None] = lambda frames: None
-    """Called with 1 after each frame that was read."""
     wells: Mapping[str, FullWell] = field(default_factory=dict)
     """Planes that are full below the largest grey value of the series."""
     step: float = 1.0
@@ -63,13 +67,19 @@ class SeriesData:
     def __post_init__(self) -> None:
         object.__setattr__(self, "planes", series_planes(self.series) if self.series.size else (Plane("", 0),))
 
-    def settings(self, *kinds: str) -> tuple[Setting, ...]:
-        """Conditions under which frames of these kinds were taken, in the order of the file."""
+    @property
+    def stated_black(self) -> float:
+        """Grey value without light as the series states it; NaN: it does not."""
+        camera = self.series.camera
+        return camera.black_level_dn if "black_level_dn" in camera.model_fields_set else nan
+
+    def settings(self, *kinds: str, least: int = 1) -> tuple[Setting, ...]:
+        """Conditions under which at least so many frames of these kinds were taken, in the order of the file."""
         found: dict[tuple[object, ...], list[Frame]] = {}
         for frame in self.series.of(*kinds):
             key = (frame.group.index, *(getattr(frame, name) for name, _ in _CONDITIONS))
             found.setdefault(key, []).append(frame)
-        return tuple(Setting(tuple(frames)) for frames in found.values())
+        return tuple(Setting(tuple(frames)) for frames in found.values() if len(frames) >= least)
 
     def saturation_dn(self, plane: str) -> float:
         """Grey value from which on samples of a plane count as saturated."""
@@ -79,7 +89,6 @@ class SeriesData:
     def pixels(self, frame: Frame) -> dict[str, NDArray[Any]]:
         """Pixels of a frame by plane, each of shape (h, w)."""
         pixels = frame_pixels(frame)
-        self.watch(1)
         return {plane.name: split(pixels, plane, frame.group.window) for plane in self.planes}
 
     def stacks(self, setting: Setting) -> dict[str, FrameStack]:

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import hypot, isfinite, nan, sqrt
+from math import hypot, isfinite, nan
 
 import numpy as np
 
 from photoplan.errors import InputError
-from photoplan.io.series.pixels import Plane
 from photoplan.io.series.statistics import ReducedPoint
-from photoplan.products.characterise import dark as characterise_dark
-from photoplan.products.characterise import pattern as characterise_pattern
-from photoplan.products.characterise.common import SettingsRun, exposure_runs, of_one_temperature, prefix, tried
+from photoplan.products.characterise import dark, pattern
+from photoplan.products.characterise.common import (
+    SettingsRun,
+    cut_off,
+    exposure_runs,
+    of_one_temperature,
+    tried,
+    used_and_rest,
+)
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Trace, joined
+from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Subject, Trace, joined, known
 from photoplan.products.characterise.transfer import reduced_level
 from photoplan.quality.camera.dark_signal import dark_current
 from photoplan.quality.camera.emva import EmvaPoints, EmvaSheet, emva_sheet
 from photoplan.quality.camera.frame_statistics import Level
-from photoplan.quality.camera.photon_transfer import is_clipped_dark
 
 _LEAST = 5
 #: Figures of other analyses that belong to the sheet: name there, name here, words, unit, and whether K divides them.
@@ -31,28 +34,17 @@ _TAKEN = (
 )
 
 
-@dataclass(frozen=True)
-class _Point:
-    photons: float
-    exposure: float | None
-    mean: float
-    variance: float
-    samples: float
-    mean_sigma: float
+#: Photons per pixel (NaN: not stated), exposure and grey values of a setting.
+_Point = tuple[float, float | None, Level]
 
 
 def missing(data: SeriesData) -> str | None:
     """What the series lacks."""
     if len(data.series.reduced_of("flat")) >= _LEAST:
-        if data.series.reduced_of("dark"):
-            return None
-        return "reduced figures of dark frames"
-    pairs = [run for run in _runs(data) if sum(len(s.frames) >= 2 for s in run.settings) >= _LEAST]
-    if not pairs:
+        return None if data.series.reduced_of("dark") else "reduced figures of dark frames"
+    if not any(sum(len(s.frames) >= 2 for s in run.settings) >= _LEAST for run in _runs(data)):
         return f"flat frames, two or more at each of {_LEAST} exposures or photons per pixel, from dark to saturated"
-    if not any(len(s.frames) >= 2 for s in data.settings("dark")):
-        return "dark frames, two or more at the exposures of the flat ones"
-    return None
+    return None if data.settings("dark", least=2) else "dark frames, two or more at the exposures of the flat ones"
 
 
 def _runs(data: SeriesData) -> list[SettingsRun]:
@@ -64,34 +56,31 @@ def analyse(data: SeriesData) -> Findings:
     if data.series.reduced_of("flat"):
         return _of_reduced(data)
     outcomes = []
-    others = _others(data)
+    others = [module.analyse(data) for module in (pattern, dark) if module.missing(data) is None]
     for run in _runs(data):
         for plane in data.planes:
-            key = prefix("EMVA 1288", plane.name, run.label)
-            found = tried(key, lambda p=plane, r=run: _of_frames(data, r, p))  # type: ignore[misc]
+            of = Subject(plane.name, run.label)
+            found = tried(of.named("EMVA 1288"), _of_frames, data, run, of)
             gain = next((f for f in found.figures if f.name == "gain_dn_e"), None)
-            taken = Findings() if gain is None else _taken(others, plane, gain, run.label)
-            outcomes += [found, taken]
+            outcomes += [found] if gain is None else [found, _taken(joined(others), gain, of)]
     return joined(outcomes)
 
 
 def _of_reduced(data: SeriesData) -> Findings:
-    bright, dark = ([_reduced(p) for p in data.series.reduced_of(kind)] for kind in ("flat", "dark"))
-    found = tried("EMVA 1288", lambda: _sheet(bright, dark, ("", ""), 1.0))
+    bright, darks = ([_reduced(data, p) for p in data.series.reduced_of(kind)] for kind in ("flat", "dark"))
+    found = tried("EMVA 1288", _sheet, bright, darks, Subject(), 1.0)
     gain = next((f for f in found.figures if f.name == "gain_dn_e"), None)
-    no_images = Findings(refused={"DSNU and PRNU": "reduced figures hold no images; give frames"})
     if gain is None:
         return found
-    points = [p for p in data.series.reduced_of("dark") if p.exposure_ms is not None]
-    levels = [reduced_level(data, p) for p in points]
-    exposures = [p.exposure_ms or 0.0 for p in points]
-    return joined([found, tried("dark current", lambda: _dark_current(exposures, levels, gain)), no_images])
+    timed = [(exposure, level) for _, exposure, level in darks if exposure is not None]
+    no_images = Findings(refused={"DSNU and PRNU": "reduced figures hold no images; give frames"})
+    return joined([found, tried("dark current", _dark_current, timed, gain), no_images])
 
 
-def _dark_current(exposures: list[float], levels: list[Level], gain: Figure) -> Findings:
-    found = dark_current(exposures, levels)
-    value, sigma = _in_electrons(found.current_dn_s, found.current_dn_s_sigma, gain)
-    return Findings((Figure("dark_current_e_s", value, sigma, "dark current", "e/s"),))
+def _dark_current(timed: list[tuple[float, Level]], gain: Figure) -> Findings:
+    found = dark_current([exposure for exposure, _ in timed], [level for _, level in timed])
+    in_electrons = _in_electrons(found.current_dn_s, found.current_dn_s_sigma, gain)
+    return Findings((Figure("dark_current_e_s", *in_electrons, "dark current", "e/s"),))
 
 
 def _in_electrons(value: float, sigma: float, gain: Figure) -> tuple[float, float]:
@@ -99,130 +88,90 @@ def _in_electrons(value: float, sigma: float, gain: Figure) -> tuple[float, floa
     return value / gain.value, hypot(sigma, value * gain.sigma / gain.value) / gain.value
 
 
-def _others(data: SeriesData) -> Findings:
-    """What the analyses of the pattern and of the dark signal say."""
-    parts = [module for module in (characterise_pattern, characterise_dark) if module.missing(data) is None]
-    return joined([module.analyse(data) for module in parts])
-
-
-def _taken(others: Findings, plane: Plane, gain: Figure, label: str) -> Findings:
+def _taken(others: Findings, gain: Figure, of: Subject) -> Findings:
     """Figures of other analyses in the units of the sheet, and those that they refused."""
     figures, refused = [], {}
     for there, here, words, unit, divided in _TAKEN:
-        known = [f for f in others.figures if f.name == there and f.plane == plane.name]
-        for f in known:
-            value, sigma = _in_electrons(f.value, f.sigma, gain) if divided else (f.value, f.sigma)
-            figures.append(Figure(here, value, sigma, words, unit, plane.name, prefix(label, f.at)))
-        if not known:
+        known_there = [f for f in others.figures if f.name == there and f.plane == of.plane]
+        for f in known_there:
+            both = _in_electrons(f.value, f.sigma, gain) if divided else (f.value, f.sigma)
+            figures.append(of.under(f.at).figure(here, *both, words, unit))
+        if not known_there:
             why = [w for what, w in others.refused.items() if what.lower().startswith(words.lower())]
-            refused[prefix(words, plane.name, label)] = why[0] if why else "the series lacks frames for it"
+            refused[of.named(words)] = why[0] if why else "the series lacks frames for it"
     return Findings(tuple(figures), refused)
 
 
-def _of_frames(data: SeriesData, run: SettingsRun, plane: Plane) -> Findings:
-    bright = [_point(data, s, plane.name) for s in run.settings if len(s.frames) >= 2]
-    darks = [s for s in data.settings("dark") if len(s.frames) >= 2]
-    settings = [s for s in darks if of_one_temperature(s, run.settings[0])]
-    levels = [data.levels(s)[plane.name] for s in settings]
-    clipped = [level for level in levels if is_clipped_dark(level)]
-    if clipped:
-        share = 100 * max(level.zero_share for level in clipped)
-        raise InputError(
-            f"black is cut off: {share:.3g} % of the samples of dark frames are zero; raise the camera's black level"
-        )
-    dark = [_point(data, s, plane.name) for s in settings]
-    return _sheet(bright, dark, (plane.name, run.label), data.step)
+def _of_frames(data: SeriesData, run: SettingsRun, of: Subject) -> Findings:
+    settings = [s for s in data.settings("dark", least=2) if of_one_temperature(s, run.settings[0])]
+    darks = [_point(data, s, of.plane) for s in settings]
+    cut = cut_off([level for _, _, level in darks], " of dark frames")
+    if cut:
+        raise InputError(f"{cut}; raise the camera's black level")
+    bright = [_point(data, s, of.plane) for s in run.settings if len(s.frames) >= 2]
+    return _sheet(bright, darks, of, data.step)
 
 
-def _reduced(point: ReducedPoint) -> _Point:
+def _reduced(data: SeriesData, point: ReducedPoint) -> _Point:
     photons = nan if point.photons_per_pixel is None else point.photons_per_pixel
-    degrees, of_mean = (point.frames - 1) * (point.pixels - 1), sqrt(point.variance / point.frames / point.pixels)
-    return _Point(photons, point.exposure_ms, point.mean, point.variance, degrees, of_mean)
+    return photons, point.exposure_ms, reduced_level(data, point)
 
 
 def _point(data: SeriesData, setting: Setting, name: str) -> _Point:
-    level = data.levels(setting)[name]
     photons = nan if setting.first.photons_per_pixel is None else setting.first.photons_per_pixel
-    return _Point(
-        photons, setting.first.exposure_ms, level.mean, level.temporal_variance, level.degrees, level.mean_sigma
-    )
+    return photons, setting.first.exposure_ms, data.levels(setting)[name]
 
 
-def _sheet(bright: list[_Point], dark: list[_Point], of: tuple[str, str], step: float) -> Findings:
-    plane, label = of
-    by_exposure = {point.exposure: point for point in dark}
-    pairs = [(p, by_exposure[p.exposure]) for p in bright if p.exposure in by_exposure]
-    notes = []
-    if len(pairs) < len(bright):
-        notes.append(
-            f"{prefix(plane, label)}: {len(bright) - len(pairs)} levels have no dark frames of their exposure".lstrip(
-                ": "
-            )
-        )
-    points = EmvaPoints(
-        np.array([p.photons for p, _ in pairs], float),
-        np.array([p.mean for p, _ in pairs], float),
-        np.array([p.variance for p, _ in pairs], float),
-        np.array([d.mean for _, d in pairs], float),
-        np.array([d.variance for _, d in pairs], float),
-        np.array([p.samples for p, _ in pairs], float),
-        np.array([hypot(p.mean_sigma, d.mean_sigma) for p, d in pairs], float),
-    )
-    found = emva_sheet(points, step)
-    where = {"plane": plane, "at": label}
-    figures = tuple(
-        Figure(name, value, sigma, words, unit, **where)
-        for name, value, sigma, words, unit in _lines(found)
-        if isfinite(value)
-    )
-    p = points.sorted()
-    head = ("plane", "at", "photons", "mean_dn", "variance_dn2", "dark_mean_dn", "dark_variance_dn2", "used")
-    columns = (p.photons, p.mean, p.variance, p.dark_mean, p.dark_variance, found.used)
-    rows: list[tuple[str | float | int, ...]] = [(plane, label, *(float(v) for v in row)) for row in zip(*columns)]
-    return Findings(
-        figures,
-        {prefix(what, plane, label): why for what, why in found.refused.items()},
-        {"points": Listing(head, tuple(rows), "Levels of the sheet")},
-        _plots(found, p, prefix("EMVA 1288", plane, label)),
-        tuple(notes),
-        {prefix("sheet", plane, label).replace(" ", "_"): found},
-    )
-
-
-def _lines(s: EmvaSheet) -> list[tuple[str, float, float, str, str]]:
-    line = s.linearity
-    return [
-        (
-            "quantum_efficiency_percent",
-            s.quantum_efficiency_percent,
-            s.quantum_efficiency_percent_sigma,
-            "quantum efficiency η",
-            "%",
-        ),
-        ("gain_dn_e", s.gain, s.gain_sigma, "system gain K", "DN/e"),
-        ("responsivity_dn_photon", s.responsivity, s.responsivity_sigma, "responsivity R", "DN/photon"),
-        ("temporal_dark_noise_dn", s.temporal_dark_noise_dn, nan, "temporal dark noise", "DN"),
-        (
-            "temporal_dark_noise_e",
-            s.temporal_dark_noise_e,
-            s.temporal_dark_noise_e_sigma,
-            "temporal dark noise σ_d",
-            "e",
-        ),
-        ("saturation_photons", s.saturation_photons, nan, "saturation capacity", "photons"),
-        ("saturation_e", s.saturation_e, s.saturation_e_sigma, "saturation capacity", "e"),
-        ("threshold_photons", s.threshold_photons, nan, "absolute sensitivity threshold", "photons"),
-        ("threshold_e", s.threshold_e, nan, "absolute sensitivity threshold", "e"),
-        ("dynamic_range_db", s.dynamic_range_db, nan, "dynamic range", "dB"),
-        ("snr_max_db", s.snr_max_db, nan, "largest signal-to-noise ratio", "dB"),
-        (
-            "linearity_error_percent",
-            line.error_percent if line else nan,
-            line.error_percent_sigma if line else nan,
-            "linearity error LE",
-            "%",
-        ),
+def _sheet(bright: list[_Point], darks: list[_Point], of: Subject, step: float) -> Findings:
+    by_exposure = {exposure: level for _, exposure, level in darks}
+    pairs = [(photons, level, by_exposure[at]) for photons, at, level in bright if at in by_exposure]
+    lacking = f"{of.named()}: {len(bright) - len(pairs)} levels have no dark frames of their exposure".lstrip(": ")
+    rows = [
+        (p, a.mean, a.temporal_variance, b.mean, b.temporal_variance, a.degrees, hypot(a.mean_sigma, b.mean_sigma))
+        for p, a, b in pairs
     ]
+    points = EmvaPoints(*np.array(rows, float).reshape(-1, 7).T).sorted()
+    found = emva_sheet(points, step)
+    table = Listing.of(
+        "Levels of the sheet",
+        plane=of.plane,
+        at=of.at,
+        photons=points.photons,
+        mean_dn=points.mean,
+        variance_dn2=points.variance,
+        dark_mean_dn=points.dark_mean,
+        dark_variance_dn2=points.dark_variance,
+        used=found.used,
+    )
+    return Findings(
+        _figures(found, of),
+        {of.named(what): why for what, why in found.refused.items()},
+        {"points": table},
+        _plots(found, points, of.named("EMVA 1288")),
+        (lacking,) if len(pairs) < len(bright) else (),
+        {of.key("sheet"): found},
+    )
+
+
+def _figures(s: EmvaSheet, of: Subject) -> tuple[Figure, ...]:
+    efficiency, of_efficiency = s.quantum_efficiency_percent, s.quantum_efficiency_percent_sigma
+    noise, of_noise = s.temporal_dark_noise_e, s.temporal_dark_noise_e_sigma
+    line = s.linearity
+    error, of_error = (nan, nan) if line is None else (line.error_percent, line.error_percent_sigma)
+    return known(
+        of.figure("quantum_efficiency_percent", efficiency, of_efficiency, "quantum efficiency η", "%"),
+        of.figure("gain_dn_e", s.gain, s.gain_sigma, "system gain K", "DN/e"),
+        of.figure("responsivity_dn_photon", s.responsivity, s.responsivity_sigma, "responsivity R", "DN/photon"),
+        of.figure("temporal_dark_noise_dn", s.temporal_dark_noise_dn, nan, "temporal dark noise", "DN"),
+        of.figure("temporal_dark_noise_e", noise, of_noise, "temporal dark noise σ_d", "e"),
+        of.figure("saturation_photons", s.saturation_photons, nan, "saturation capacity", "photons"),
+        of.figure("saturation_e", s.saturation_e, s.saturation_e_sigma, "saturation capacity", "e"),
+        of.figure("threshold_photons", s.threshold_photons, nan, "absolute sensitivity threshold", "photons"),
+        of.figure("threshold_e", s.threshold_e, nan, "absolute sensitivity threshold", "e"),
+        of.figure("dynamic_range_db", s.dynamic_range_db, nan, "dynamic range", "dB"),
+        of.figure("snr_max_db", s.snr_max_db, nan, "largest signal-to-noise ratio", "dB"),
+        of.figure("linearity_error_percent", error, of_error, "linearity error LE", "%"),
+    )
 
 
 def _plots(s: EmvaSheet, p: EmvaPoints, title: str) -> tuple[Chart, ...]:
@@ -235,8 +184,7 @@ def _plots(s: EmvaSheet, p: EmvaPoints, title: str) -> tuple[Chart, ...]:
             "signal DN",
             "variance above dark DN²",
             (
-                Trace(signal[s.used], variance[s.used], "used"),
-                Trace(signal[~s.used], variance[~s.used], "not used", colour=3),
+                *used_and_rest(signal, variance, s.used),
                 Trace(grid, s.gain * grid, "line", "dashed", colour=1),
             ),
         )

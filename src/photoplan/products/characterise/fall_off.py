@@ -13,13 +13,13 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.fall_off_file import FallOffEntry, TermEntry, fall_off_text
 from photoplan.io.series.pixels import Plane
-from photoplan.products.characterise.common import black_of, of_one_temperature
+from photoplan.products.characterise.common import black_of, dark_like
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.groups import FrameGroup
-from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Plate, Trace, joined
+from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Plate, Subject, Trace, joined
 from photoplan.quality.camera.fall_off import FallOff, fit_fall_off
 from photoplan.quality.camera.fall_off_adjust import FallOffSettings
-from photoplan.quality.camera.fall_off_model import FallOffModel, gain_image
+from photoplan.quality.camera.fall_off_model import gain_image
 
 _SATURATED = 1e-3
 #: Longer side of the gain image that is written.
@@ -38,12 +38,11 @@ def missing(data: SeriesData) -> str | None:
 def analyse(data: SeriesData) -> Findings:
     """Light fall-off of the brightest flat frames that are not saturated."""
     setting = _brightest(data)
-    flats = {name: (stack.mean, stack.counted) for name, stack in data.stacks(setting).items()}
+    flats = {name: stack.only_counted(stack.mean) for name, stack in data.stacks(setting).items()}
     dark, note = _dark(data, setting)
     parts = []
     for plane in data.planes:
-        mean, counted = flats[plane.name]
-        image = _whole(data, setting, plane, np.where(counted, mean, np.nan) if counted is not None else mean)
+        image = _whole(data, setting, plane, flats[plane.name])
         below = dark[plane.name]
         image -= below if isinstance(below, float) else _whole(data, setting, plane, below)
         settings = _settings(data, setting, plane, below if isinstance(below, float) else float(below.mean()))
@@ -66,29 +65,22 @@ def _fitted(image: Array, settings: FallOffSettings, plane: Plane, setting: Sett
 
 def _brightest(data: SeriesData) -> Setting:
     """Frames with the highest mean of those that are not saturated."""
-    best: tuple[float, Setting] | None = None
-    for setting in data.settings("flat"):
-        levels = data.levels(setting).values()
-        if max(level.saturated_share for level in levels) > _SATURATED:
-            continue
-        mean = float(np.mean([level.mean for level in levels]))
-        if best is None or mean > best[0]:
-            best = mean, setting
-    if best is None:
+    levels = [(setting, list(data.levels(setting).values())) for setting in data.settings("flat")]
+    sound = [each for each in levels if max(level.saturated_share for level in each[1]) <= _SATURATED]
+    if not sound:
         full = ", ".join(f"{data.saturation_dn(plane.name):.4g}" for plane in data.planes)
         raise InputError(
             f"{data.series.path}: all flat frames are saturated (more than {100 * _SATURATED:g} % of the pixels at "
             f"{full} DN); take flat frames with less light"
         )
-    return best[1]
+    return max(sound, key=lambda each: float(np.mean([level.mean for level in each[1]])))[0]
 
 
 def _dark(data: SeriesData, flat: Setting) -> tuple[dict[str, Array | float], str]:
     """Mean dark image at the same exposure and window, else the grey value that other dark frames or the file tell."""
-    for setting in data.settings("dark"):
-        same = setting.first.exposure_ms == flat.first.exposure_ms and of_one_temperature(setting, flat)
-        if same and setting.first.group.window == flat.first.group.window:
-            return {n: s.mean for n, s in data.stacks(setting).items()}, f"{setting.label} subtracted"
+    setting = dark_like(data, flat)
+    if setting is not None and setting.first.group.window == flat.first.group.window:
+        return {n: s.mean for n, s in data.stacks(setting).items()}, f"{setting.label} subtracted"
     blacks = {plane.name: black_of(data, flat, plane) for plane in data.planes}
     levels = ", ".join(dict.fromkeys(f"{black.mean:.4g}" for black in blacks.values()))
     rule = next(iter(blacks.values())).rule
@@ -146,22 +138,34 @@ def _outcome(found: FallOff, of: Plane, setting: Setting) -> Findings:
             f"({found.neighbour_correlation:.2f}): structure is left that the model does not "
             "describe; standard deviations are enlarged for it"
         )
-    terms = tuple((plane, t.n, t.m, t.coefficient, t.sigma) for t in found.terms)
-    corners = tuple((plane, c.name, *_percent(c.total, c.sigma, c.natural, c.artificial)) for c in found.corners)
-    dirt = tuple(
-        (plane, *_place(of, d.x, d.y), d.width * of.step, d.height * of.step, 100 * d.depth) for d in found.dirt
+    corners = Listing.of(
+        "Brightness lost in the corners",
+        plane=plane,
+        corner=[c.name for c in found.corners],
+        total_percent=[100 * c.total for c in found.corners],
+        sigma=[100 * c.sigma for c in found.corners],
+        natural_percent=["" if c.natural is None else 100 * c.natural for c in found.corners],
+        artificial_percent=["" if c.artificial is None else 100 * c.artificial for c in found.corners],
     )
-    head = ("plane", "corner", "total_percent", "sigma", "natural_percent", "artificial_percent")
+    terms = Listing.of(
+        "Terms r^n cos(m θ) of the polynomial",
+        plane=plane,
+        **{name: [getattr(t, name) for t in found.terms] for name in ("n", "m", "coefficient", "sigma")},
+    )
+    places = [_place(of, d.x, d.y) for d in found.dirt]
+    dirt = Listing.of(
+        "Dust and stains",
+        plane=plane,
+        x=[x for x, _ in places],
+        y=[y for _, y in places],
+        width=[d.width * of.step for d in found.dirt],
+        height=[d.height * of.step for d in found.dirt],
+        depth_percent=[100 * d.depth for d in found.dirt],
+    )
     return Findings(
         _figures(found, of),
         refused,
-        {
-            "corners": Listing(head, corners, "Brightness lost in the corners"),
-            "terms": Listing(
-                ("plane", "n", "m", "coefficient", "sigma"), terms, "Terms r^n cos(m θ) of the polynomial"
-            ),
-            "dirt": Listing(("plane", "x", "y", "width", "height", "depth_percent"), dirt, "Dust and stains"),
-        },
+        {"corners": corners, "terms": terms, "dirt": dirt},
         _plots(found, of),
         tuple(notes),
         {f"separability{suffix}": found.separability} if found.separability else {},
@@ -177,37 +181,30 @@ def _place(plane: Plane, x: float, y: float) -> tuple[float, float]:
     return plane.col + plane.step * x, plane.row + plane.step * y
 
 
-def _percent(*values: float | None) -> tuple[float | str, ...]:
-    return tuple("" if v is None else 100.0 * v for v in values)
-
-
-def _figures(found: FallOff, of: Plane) -> tuple[Figure, ...]:
+def _figures(found: FallOff, plane: Plane) -> tuple[Figure, ...]:
     """Lengths in pixels of the image, of which a colour has every second one."""
-    nan, plane, step = math.nan, of.name, of.step
-
-    def figure(name: str, value: float, sigma: float, label: str, unit: str = "%", at: str = "") -> Figure:
-        return Figure(name, value, sigma, label, unit, plane, at)
-
-    figures = [figure("centre_dn", found.level, found.sigma_level, "grey value at the principal point", "DN")]
+    nan, of, step = math.nan, Subject(plane.name), plane.step
+    figures = [of.figure("centre_dn", found.level, found.sigma_level, "grey value at the principal point", "DN")]
     for c in found.corners:
-        figures.append(figure("corner_percent", 100 * c.total, 100 * c.sigma, "fall-off in the corner", at=c.name))
+        at = of.under(c.name)
+        figures.append(at.figure("corner_percent", 100 * c.total, 100 * c.sigma, "fall-off in the corner", "%"))
         if c.natural is not None and c.artificial is not None:
-            figures.append(figure("natural_percent", 100 * c.natural, nan, "natural part cos⁴ω", at=c.name))
-            figures.append(figure("artificial_percent", 100 * c.artificial, nan, "artificial part", at=c.name))
+            figures.append(at.figure("natural_percent", 100 * c.natural, nan, "natural part cos⁴ω", "%"))
+            figures.append(at.figure("artificial_percent", 100 * c.artificial, nan, "artificial part", "%"))
     if found.camera_constant is not None and found.sigma_camera_constant is not None:
         constant, s = step * found.camera_constant, step * found.sigma_camera_constant
-        figures.append(figure("camera_constant_px", constant, s, "camera constant from the fall-off", "px"))
+        figures.append(of.figure("camera_constant_px", constant, s, "camera constant from the fall-off", "px"))
     if found.sigma_principal_point is not None:
-        for axis, value, s in zip("xy", _place(of, *found.model.principal_point), found.sigma_principal_point):
-            figures.append(figure(f"principal_point_{axis}_px", value, step * s, f"principal point {axis}", "px"))
-    figures += [
-        figure("asymmetry_percent", 100 * found.asymmetry, nan, "largest difference of two corners"),
-        figure("range_before_percent", 100 * found.range_before, nan, "brightest minus darkest before correction"),
-        figure("residual_percent", 100 * found.residual_rms, nan, "left after correction, rms"),
-        figure("residual_largest_percent", 100 * found.residual_largest, nan, "left after correction, largest"),
-        figure("dirt", len(found.dirt), nan, "places with dust or stains", ""),
-    ]
-    return tuple(figures)
+        for axis, value, s in zip("xy", _place(plane, *found.model.principal_point), found.sigma_principal_point):
+            figures.append(of.figure(f"principal_point_{axis}_px", value, step * s, f"principal point {axis}", "px"))
+    for name, part, label in (
+        ("asymmetry", found.asymmetry, "largest difference of two corners"),
+        ("range_before", found.range_before, "brightest minus darkest before correction"),
+        ("residual", found.residual_rms, "left after correction, rms"),
+        ("residual_largest", found.residual_largest, "left after correction, largest"),
+    ):
+        figures.append(of.figure(f"{name}_percent", 100 * part, nan, label, "%"))
+    return (*figures, of.figure("dirt", len(found.dirt), nan, "places with dust or stains"))
 
 
 def _plots(found: FallOff, plane: Plane) -> tuple[Chart | Plate, ...]:
@@ -261,13 +258,9 @@ def _profile(found: FallOff, of: str, unit: int) -> Chart:
     if model.camera_constant is not None:
         curves.append(Trace(r, 100 * model.natural(x, y), "cos⁴ω", "dashed", colour=1))
         curves.append(Trace(r, 100 * model.artificial(x, y), "artificial", "dashed", colour=2))
-    radial = FallOffModel(
-        model.size,
-        model.principal_point,
-        model.camera_constant,
-        tuple(t for t in model.terms if t[1] == 0),
-        tuple(c for t, c in zip(model.terms, model.coefficients) if t[1] == 0),
-    )
+    symmetric = [(t, c) for t, c in zip(model.terms, model.coefficients) if t[1] == 0]
+    terms, coefficients = zip(*symmetric) if symmetric else ((), ())
+    radial = replace(model, terms=terms, coefficients=coefficients)
     curves.append(Trace(r, 100 * radial.relative(x, y), "symmetric part", "line", colour=3))
     return Chart(
         f"Fall-off from the principal point{of}",

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from math import nan
 from typing import Any
 
 import numpy as np
@@ -64,7 +65,6 @@ class FrameGroup:
         masks = {plane.name: plane_mask(inside, plane) for plane in data.planes}
         for frame in self.frames:
             image = frame_pixels(frame, window)
-            data.watch(1)
             parts = {plane.name: split(image, plane, window) for plane in data.planes}
             yield {name: part if (mask := masks[name]) is None else part[mask] for name, part in parts.items()}
 
@@ -99,6 +99,41 @@ class FrameGroup:
     def has(self, key: str) -> bool:
         """Whether the entry states a value."""
         return key in self.group.entry.values
+
+
+@dataclass(frozen=True, eq=False)
+class WindowMeans:
+    """A window followed from frame to frame."""
+
+    mean: NDArray[np.float64]
+    """Grey value in each frame, shape (n,)."""
+    variance: NDArray[np.float64]
+    """Of a pixel, from the difference of two successive frames, without what the whole window changes; NaN of a single
+    pixel; shape (n − 1,)."""
+    pixels: int
+
+
+def window_means(data: SeriesData, group: FrameGroup, window: Window, advice: str) -> dict[str, WindowMeans]:
+    """Means of a window in every frame of an entry, by plane.
+
+    Raises
+    ------
+    InputError
+        Over 1 % of the window is saturated in a frame; the message ends with the advice.
+    """
+    means: dict[str, list[float]] = {p.name: [] for p in data.planes}
+    variances: dict[str, list[float]] = {p.name: [] for p in data.planes}
+    last: dict[str, NDArray[np.float64]] = {}
+    for frame, planes in zip(group.frames, group.pixels(data, window)):
+        for name, pixels in planes.items():
+            values = pixels.astype(float)
+            if float((values >= data.saturation_dn(name)).mean()) > 0.01:
+                raise InputError(f"{group.group.label}: {frame.file.name} is saturated in the window; {advice}")
+            means[name].append(float(values.mean()))
+            if name in last:
+                variances[name].append(float((values - last[name]).var(ddof=1)) / 2.0 if values.size > 1 else nan)
+            last[name] = values
+    return {n: WindowMeans(np.array(m), np.array(variances[n]), last[n].size) for n, m in means.items()}
 
 
 def frame_groups(data: SeriesData, kind: str) -> tuple[FrameGroup, ...]:

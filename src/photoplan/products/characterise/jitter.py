@@ -6,19 +6,82 @@ import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
+from photoplan.errors import InputError
+from photoplan.geometry.grid import Window
+from photoplan.io.series.file import Frame
 from photoplan.io.series.model import EdgeEntry
+from photoplan.io.series.pixels import frame_pixels
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
-from photoplan.products.characterise.jitter_edge import Edge, measured_edge
-from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Trace, joined
-from photoplan.quality.camera.line_jitter import grey_error
+from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Subject, Trace, joined
+from photoplan.quality.camera.line_jitter import LineJitter, grey_error, line_jitter
 from photoplan.quality.camera.parallel_edges import EdgePair, above_control, compare_edges
+from photoplan.quality.camera.plumb_edge import EdgeLines, correlate_edge, fit_edge
+
+#: Frames that are drawn.
+_CHARTS = 4
 
 
-def jitter_charts(edges: Sequence[Edge]) -> list[Chart]:
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """An edge in a frame."""
+
+    entry: EdgeEntry
+    frame: Frame
+    window: Window
+    fitted: EdgeLines
+    jitter: LineJitter
+    """Of the least-squares positions."""
+    correlated: LineJitter
+    """Of the positions by correlation and parabola."""
+
+    @property
+    def first_line(self) -> int:
+        """Row (column, of a horizontal edge) of the image in which line 0 lies."""
+        return self.window.row if self.entry.direction == "vertical" else self.window.col
+
+    @property
+    def field_offset(self) -> float:
+        """Odd rows minus even rows of the image."""
+        return -self.jitter.field_offset if self.first_line % 2 else self.jitter.field_offset
+
+
+def measured_edge(data: SeriesData, frame: Frame, entry: EdgeEntry, degree: int | None) -> Edge:
+    """An edge of a frame by least squares and by correlation, and the jitter of both.
+
+    Raises
+    ------
+    InputError
+        The edge's window leaves the image, or holds no clean edge.
+    """
+    window = Window(*entry.roi)
+    assert data.series.size is not None
+    if window.stop[0] > data.series.size[0] or window.stop[1] > data.series.size[1]:
+        raise InputError(
+            f"{frame.group.label}: edge {entry.name}: roi {list(entry.roi)} leaves the image of "
+            f"{data.series.size[0]} × {data.series.size[1]} pixels"
+        )
+    grey = frame_pixels(frame, window)[0].astype(float)
+    lines = grey if entry.direction == "vertical" else grey.T
+    name = f"{frame.file.name}, edge {entry.name}"
+    saturation = data.saturation_dn(data.planes[0].name)
+    fitted = fit_edge(lines, name=name, saturation=saturation if math.isfinite(saturation) else None)
+    by_correlation = correlate_edge(lines, fitted, name=name)
+    return Edge(
+        entry,
+        frame,
+        window,
+        fitted,
+        line_jitter(fitted.position, name, degree),
+        line_jitter(by_correlation.position, name, degree),
+    )
+
+
+def _charts(edges: Sequence[Edge]) -> list[Chart]:
     """Deviations of every edge of a frame, and their spectra."""
     charts = [_deviations(edge) for edge in edges]
     curves = []
@@ -45,15 +108,12 @@ def jitter_charts(edges: Sequence[Edge]) -> list[Chart]:
 def _deviations(edge: Edge) -> Chart:
     j, line = edge.jitter, edge.first_line + edge.jitter.line
     curves = [Trace(line[j.used], j.deviation[j.used], "deviation", "points", colour=5)]
-    if j.harmonics or j.fields_differ:
-        if j.fields_differ:
-            for first, name, colour in ((0, "even", 0), (1, "odd", 2)):
-                rows_of = line % 2 == first
-                curves.append(
-                    Trace(line[rows_of], j.regular[rows_of], f"regular part, {name} rows", "line", colour=colour)
-                )
-        else:
-            curves.append(Trace(line, j.regular, "periodic part", "line", colour=0))
+    if j.fields_differ:
+        for first, name, colour in ((0, "even", 0), (1, "odd", 2)):
+            of = line % 2 == first
+            curves.append(Trace(line[of], j.regular[of], f"regular part, {name} rows", "line", colour=colour))
+    elif j.harmonics:
+        curves.append(Trace(line, j.regular, "periodic part", "line", colour=0))
     if j.spikes:
         shown = np.abs(j.deviation) <= 20 * max(j.sigma, 0.05)
         spikes = ~j.used & shown
@@ -69,10 +129,6 @@ def _deviations(edge: Edge) -> Chart:
         "deviation px",
         tuple(curves),
     )
-
-
-_CHARTS = 4
-"""Frames that are drawn."""
 
 
 def missing(data: SeriesData) -> str | None:
@@ -104,7 +160,6 @@ def _measured(data: SeriesData, group: FrameGroup) -> dict[str, list[Edge]]:
     for frame in group.frames:
         for entry in entries:
             found[entry.name].append(measured_edge(data, frame, entry, degree))
-        data.watch(1)
     return found
 
 
@@ -120,9 +175,8 @@ def _group(data: SeriesData, group: FrameGroup, found: dict[str, list[Edge]], co
         parts.append(Findings(notes=(f"{group.label}: two parallel edges are needed to tell where jitter comes from",)))
     if control is None:
         parts.append(Findings(notes=(f"{group.label}: without a horizontal edge the method's noise is not checked",)))
-    rows = tuple(_row(data, group, edge) for edges in found.values() for edge in edges)
-    plots = [jitter_charts([edges[k] for edges in found.values()]) for k in range(min(_CHARTS, len(group.frames)))]
-    table = Listing(_HEAD, rows, "Edges by frame")
+    plots = [_charts([edges[k] for edges in found.values()]) for k in range(min(_CHARTS, len(group.frames)))]
+    table = _table([edge for edges in found.values() for edge in edges])
     charts = tuple(chart for each in plots for chart in each)
     name = f"line_jitter_lines_{group.group.index + 1}.csv"
     return joined([*parts, Findings(tables={"edges": table}, plots=charts, files={name: _lines_text(found)})])
@@ -136,107 +190,63 @@ def _mean(values: list[float], sigmas: list[float]) -> tuple[float, float]:
 
 
 def _figures(data: SeriesData, group: FrameGroup, edges: list[Edge], control: list[Edge] | None) -> Findings:
-    entry, figures, refused = edges[0].entry, [], {}
-    at = f"{group.label}, {entry.name}" if len(frame_groups(data, "plumb")) > 1 else entry.name
-    lines = [len(e.jitter.line) for e in edges]
+    entry, jitters = edges[0].entry, [e.jitter for e in edges]
+    of = Subject(at=f"{group.label}, {entry.name}" if len(frame_groups(data, "plumb")) > 1 else entry.name)
+    lines = [len(j.line) for j in jitters]
+    figures: list[Figure] = []
 
-    def add(
-        name: str, values: list[float], sigmas: list[float], label: str, unit: str = "px", remark: str = ""
-    ) -> None:
-        figures.append(Figure(name, *_mean(values, sigmas), label, unit, "", at, remark))
+    def add(name: str, values: list[float], label: str, unit: str = "px") -> None:
+        """A standard deviation over the lines of each frame, whose own accuracy follows from their number."""
+        sigmas = [v / math.sqrt(2.0 * max(n - 3, 1)) for v, n in zip(values, lines)]
+        figures.append(of.figure(name, *_mean(values, sigmas), label, unit))
 
-    def with_spread(values: list[float]) -> tuple[list[float], list[float]]:
-        return values, [v / math.sqrt(2.0 * max(n - 3, 1)) for v, n in zip(values, lines)]
-
-    sigma = [e.jitter.sigma for e in edges]
-    add("sigma_px", *with_spread(sigma), "standard deviation of d_i, least squares")
-    by_correlation = [e.correlated.sigma for e in edges]
-    add("sigma_correlation_px", *with_spread(by_correlation), "the same by correlation (eq. 4.8 to 4.10)")
-    formal = [float(np.nanmean(e.fitted.sigma)) for e in edges]
-    add("pixel_noise_px", *with_spread(formal), "of it from noise of the pixels")
-    beside = [e.jitter.neighbour_sigma for e in edges]
-    add("neighbours_px", *with_spread(beside), "difference of neighbouring lines, rms")
-    add("residual_px", *with_spread([e.jitter.residual_sigma for e in edges]), "without fields and periodic parts")
+    sigma = [j.sigma for j in jitters]
+    add("sigma_px", sigma, "standard deviation of d_i, least squares")
+    add("sigma_correlation_px", [e.correlated.sigma for e in edges], "the same by correlation (eq. 4.8 to 4.10)")
+    add("pixel_noise_px", [float(np.nanmean(e.fitted.sigma)) for e in edges], "of it from noise of the pixels")
+    add("neighbours_px", [j.neighbour_sigma for j in jitters], "difference of neighbouring lines, rms")
+    add("residual_px", [j.residual_sigma for j in jitters], "without fields and periodic parts")
     if entry.direction == "vertical":
-        offsets, theirs = [e.field_offset for e in edges], [e.jitter.sigma_field_offset for e in edges]
-        remark = "significant" if any(e.jitter.fields_differ for e in edges) else "not significant"
-        add("field_offset_px", offsets, theirs, "odd rows minus even rows", remark=remark)
+        offset = _mean([e.field_offset for e in edges], [j.sigma_field_offset for j in jitters])
+        remark = "significant" if any(j.fields_differ for j in jitters) else "not significant"
+        figures.append(of.figure("field_offset_px", *offset, "odd rows minus even rows", "px", remark))
         greys = [grey_error(e.jitter.sigma, e.fitted.gradient) for e in edges]
-        add("grey_error_dn", greys, [math.nan] * len(edges), "grey error at the edge by jitter (eq. 4.6)", "DN")
+        grey = _mean(greys, [math.nan] * len(edges))
+        figures.append(of.figure("grey_error_dn", *grey, "grey error at the edge by jitter (eq. 4.6)", "DN"))
         if group.has("pixel_frequency_hz"):
             clock = group.number("pixel_frequency_hz", 1.0, 1.0, 1e12)
-            nanoseconds = [1e9 * s / clock for s in sigma]
-            add("jitter_ns", *with_spread(nanoseconds), "standard deviation as time (eq. 4.5)", "ns")
+            add("jitter_ns", [1e9 * s / clock for s in sigma], "standard deviation as time (eq. 4.5)", "ns")
         if control is not None:
-            beyond = [above_control(e.jitter, control[k % len(control)].jitter) for k, e in enumerate(edges)]
+            beyond = [above_control(j, control[k % len(control)].jitter) for k, j in enumerate(jitters)]
             remark = f"chance of none {max(b.probability for b in beyond):.1g}"
-            add(
-                "jitter_px",
-                [b.sigma for b in beyond],
-                [b.sigma_sigma for b in beyond],
-                "beyond the control",
-                "px",
-                remark,
-            )
-    if not any(e.jitter.harmonics for e in edges):
-        refused[f"periodic part, {at}"] = "no oscillation is significant (chance of a false alarm below 1 ‰)"
-    figures += _periodic(data, edges, at)
-    spikes = sum(len(e.jitter.spikes) for e in edges)
-    figures.append(
-        Figure(
-            name="spikes",
-            value=spikes,
-            sigma=math.nan,
-            label="lines with spikes",
-            unit="",
-            plane="",
-            at=at,
-            remark=f"of {sum(lines)}",
-        )
-    )
-    lost = sum(len(e.jitter.missing) for e in edges)
-    figures.append(Figure("missing_lines", lost, math.nan, "lines without an edge", "", "", at))
-    return Findings(tuple(figures), refused, notes=_curved(edges, at))
+            both = _mean([b.sigma for b in beyond], [b.sigma_sigma for b in beyond])
+            figures.append(of.figure("jitter_px", *both, "beyond the control", "px", remark))
+    refused = {}
+    if not any(j.harmonics for j in jitters):
+        refused[f"periodic part, {of.at}"] = "no oscillation is significant (chance of a false alarm below 1 ‰)"
+    figures += _periodic(data, edges, of.at)
+    spikes, missed = sum(len(j.spikes) for j in jitters), sum(len(j.missing) for j in jitters)
+    figures.append(of.figure("spikes", spikes, math.nan, "lines with spikes", "", f"of {sum(lines)}"))
+    figures.append(of.figure("missing_lines", missed, math.nan, "lines without an edge"))
+    return Findings(tuple(figures), refused, notes=_curved(edges, of.at))
 
 
 def _periodic(data: SeriesData, edges: list[Edge], at: str) -> list[Figure]:
     """Of the first frame in which there is one; the table holds all frames."""
-    camera = data.series.camera
-    figures = []
     edge = next((e for e in edges if e.jitter.harmonics), None)
-    for k, h in enumerate(edge.jitter.harmonics if edge is not None else (), 1):
-        which = f"{at}, oscillation {k}"
-        chance = f"chance of a false alarm {h.probability:.1g}"
-        if len(edges) > 1:
-            chance += f"; of {edge.frame.file.name}, the others are in the table" if edge is not None else ""
-        figures.append(
-            Figure(
-                name="amplitude_px",
-                value=h.amplitude,
-                sigma=h.sigma_amplitude,
-                label="amplitude",
-                unit="px",
-                plane="",
-                at=which,
-                remark=chance,
-            )
-        )
-        figures.append(Figure("period_lines", h.period, h.sigma_period, "period", "lines", "", which))
-        if camera.line_frequency_hz is not None and edge is not None and edge.entry.direction == "vertical":
+    if edge is None:
+        return []
+    camera, figures = data.series.camera, []
+    others = f"; of {edge.frame.file.name}, the others are in the table" if len(edges) > 1 else ""
+    for k, h in enumerate(edge.jitter.harmonics, 1):
+        of, chance = Subject(at=f"{at}, oscillation {k}"), f"chance of a false alarm {h.probability:.1g}{others}"
+        figures.append(of.figure("amplitude_px", h.amplitude, h.sigma_amplitude, "amplitude", "px", chance))
+        figures.append(of.figure("period_lines", h.period, h.sigma_period, "period", "lines"))
+        if camera.line_frequency_hz is not None and edge.entry.direction == "vertical":
             hertz = h.hertz(1.0 / camera.line_frequency_hz, camera.interlaced)
             remark = "two rows of the image are one line of a field" if camera.interlaced else ""
-            sigma = hertz * h.sigma_period / h.period
             figures.append(
-                Figure(
-                    name="frequency_hz",
-                    value=hertz,
-                    sigma=sigma,
-                    label="frequency",
-                    unit="Hz",
-                    plane="",
-                    at=which,
-                    remark=remark,
-                )
+                of.figure("frequency_hz", hertz, hertz * h.sigma_period / h.period, "frequency", "Hz", remark)
             )
     return figures
 
@@ -259,27 +269,16 @@ def _pair(group: FrameGroup, first: list[Edge], second: list[Edge]) -> Findings:
     random = [compare_edges(*each, periodic=False) for each in both]
     at = f"{first[0].entry.name} and {second[0].entry.name}"
     figures = []
-    for prefix, what, of in (("", "", pairs), ("random_", " without fields and periodic parts", random)):
-        r, sigma = _correlation(of)
-        label = f"correlation of the deviations{what}"
-        figures.append(
-            Figure(
-                name=f"{prefix}correlation",
-                value=r,
-                sigma=sigma,
-                label=label,
-                unit="",
-                plane="",
-                at=at,
-                remark=of[0].verdict,
-            )
-        )
-        common, of_common = _mean([p.common_sigma for p in of], [p.sigma_common for p in of])
-        figures.append(Figure(f"{prefix}common_px", common, of_common, f"common part{what}", "px", "", at))
+    for prefix, what, of_pairs in (("", "", pairs), ("random_", " without fields and periodic parts", random)):
+        of, verdict = Subject(at=at), of_pairs[0].verdict
+        r = _correlation(of_pairs)
+        figures.append(of.figure(f"{prefix}correlation", *r, f"correlation of the deviations{what}", "", verdict))
+        common = _mean([p.common_sigma for p in of_pairs], [p.sigma_common for p in of_pairs])
+        figures.append(of.figure(f"{prefix}common_px", *common, f"common part{what}", "px"))
         for k, edges in enumerate((first, second)):
-            own = float(np.sqrt(np.mean([p.own_sigma[k] ** 2 for p in of])))
-            name = edges[0].entry.name
-            figures.append(Figure(f"{prefix}own_px", own, math.nan, f"own part{what}", "px", "", name))
+            own = float(np.sqrt(np.mean([p.own_sigma[k] ** 2 for p in of_pairs])))
+            mine = Subject(at=edges[0].entry.name)
+            figures.append(mine.figure(f"{prefix}own_px", own, math.nan, f"own part{what}", "px"))
     shared, single = (sum(len(s) for s in each) for each in zip(*((p.common_spikes, p.single_spikes) for p in pairs)))
     note = f"{group.label}: {shared} spikes in both edges, {single} in one only" if shared or single else ""
     return Findings(tuple(figures), notes=(note,) if note else ())
@@ -292,47 +291,27 @@ def _correlation(pairs: Sequence[EdgePair]) -> tuple[float, float]:
     return math.tanh(float(np.mean(z))), sigma
 
 
-_HEAD = (
-    "edge",
-    "frame",
-    "lines",
-    "sigma_px",
-    "sigma_correlation_px",
-    "residual_px",
-    "field_offset_px",
-    "sigma_field_offset_px",
-    "degree",
-    "sagitta_px",
-    "amplitude_px",
-    "period_lines",
-    "phase_rad",
-    "spikes",
-    "contrast_dn",
-    "width_px",
-)
-
-
-def _row(data: SeriesData, group: FrameGroup, edge: Edge) -> tuple[str | float | int, ...]:
-    j = edge.jitter
-    h = j.harmonics[0] if j.harmonics else None
-    spikes = " ".join(f"{edge.first_line + s.line}:{s.deviation:+.2f}" for s in j.spikes[:50])
-    return (
-        edge.entry.name,
-        edge.frame.file.name,
-        len(j.line),
-        j.sigma,
-        edge.correlated.sigma,
-        j.residual_sigma,
-        edge.field_offset,
-        j.sigma_field_offset,
-        j.degree,
-        j.sagitta,
-        "" if h is None else h.amplitude,
-        "" if h is None else h.period,
-        "" if h is None else h.phase,
-        spikes,
-        edge.fitted.contrast,
-        edge.fitted.width,
+def _table(edges: Sequence[Edge]) -> Listing:
+    jitters = [e.jitter for e in edges]
+    first = [j.harmonics[0] if j.harmonics else None for j in jitters]
+    return Listing.of(
+        "Edges by frame",
+        edge=[e.entry.name for e in edges],
+        frame=[e.frame.file.name for e in edges],
+        lines=[len(j.line) for j in jitters],
+        sigma_px=[j.sigma for j in jitters],
+        sigma_correlation_px=[e.correlated.sigma for e in edges],
+        residual_px=[j.residual_sigma for j in jitters],
+        field_offset_px=[e.field_offset for e in edges],
+        sigma_field_offset_px=[j.sigma_field_offset for j in jitters],
+        degree=[j.degree for j in jitters],
+        sagitta_px=[j.sagitta for j in jitters],
+        amplitude_px=["" if h is None else h.amplitude for h in first],
+        period_lines=["" if h is None else h.period for h in first],
+        phase_rad=["" if h is None else h.phase for h in first],
+        spikes=[" ".join(f"{e.first_line + s.line}:{s.deviation:+.2f}" for s in e.jitter.spikes[:50]) for e in edges],
+        contrast_dn=[e.fitted.contrast for e in edges],
+        width_px=[e.fitted.width for e in edges],
     )
 
 

@@ -6,9 +6,8 @@ from math import sqrt
 
 import numpy as np
 
-from photoplan.products.characterise.common import prefix
 from photoplan.products.characterise.data import SeriesData
-from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Trace, joined
+from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined
 from photoplan.quality.camera.frame_statistics import Level
 
 #: What stands still: between frames of other kinds the scene or its brightness changes.
@@ -17,67 +16,59 @@ _KINDS = ("dark", "flat", "scene", "wedge", "drift")
 
 def missing(data: SeriesData) -> str | None:
     """What the series lacks."""
-    if any(len(setting.frames) >= 2 for setting in data.settings(*_KINDS)):
-        return None
-    return "no setting has two frames or more; noise is what changes between them"
+    return (
+        None
+        if data.settings(*_KINDS, least=2)
+        else ("no setting has two frames or more; noise is what changes between them")
+    )
 
 
 def analyse(data: SeriesData) -> Findings:
     """Mean grey value and temporal standard deviation of every setting, by plane."""
-    settings = [setting for setting in data.settings(*_KINDS) if len(setting.frames) >= 2]
-    levels = [(setting.label, data.levels(setting)) for setting in settings]
-    return joined(
-        [_plane(data, plane.name, [(label, level[plane.name]) for label, level in levels]) for plane in data.planes]
+    levels = [(setting.label, data.levels(setting)) for setting in data.settings(*_KINDS, least=2)]
+    return joined([_plane(data, p.name, [(label, level[p.name]) for label, level in levels]) for p in data.planes])
+
+
+def _plane(data: SeriesData, name: str, labelled: list[tuple[str, Level]]) -> Findings:
+    of = Subject(name)
+    ordered = sorted((item for item in labelled if np.isfinite(item[1].temporal_variance)), key=lambda i: i[1].mean)
+    levels = [level for _, level in ordered]
+    mean, sigma = np.array([level.mean for level in levels]), np.sqrt([level.temporal_variance for level in levels])
+    with np.errstate(invalid="ignore"):
+        of_sigma = np.where(sigma > 0, [level.variance_sigma for level in levels] / (2 * sigma), 0.0)
+    clipped = np.array([max(level.zero_share, level.saturated_share) > 0.005 for level in levels], bool)
+    sound = np.flatnonzero((sigma > 0) & ~clipped)
+    table = Listing.of(
+        "Mean grey value and standard deviation of a pixel (Behr 1989, table 4.2)",
+        plane=name,
+        mean_dn=mean,
+        sigma_dn=sigma,
+        sigma_of_sigma_dn=of_sigma,
+        frames=[level.frames for level in levels],
+        pixels=[level.pixels for level in levels],
+        not_clipped=["yes" if k in sound else "no" for k in range(len(levels))],
+        setting=[label for label, _ in ordered],
     )
-
-
-def _plane(data: SeriesData, name: str, levels: list[tuple[str, Level]]) -> Findings:
-    ordered = sorted(levels, key=lambda item: item[1].mean)
-    rows, refused = [], {}
-    for label, level in ordered:
-        sigma = sqrt(level.temporal_variance)
-        of_sigma = level.variance_sigma / (2 * sigma) if sigma > 0 else 0.0
-        if not np.isfinite(sigma):
-            continue
-        sound = sigma > 0 and level.zero_share <= 0.005 and level.saturated_share <= 0.005
-        rows.append((name, level.mean, sigma, of_sigma, level.frames, level.pixels, "yes" if sound else "no", label))
-    sound_rows = [row for row in rows if row[6] == "yes"]
-    figures = []
-    if sound_rows:
-        least = min(sound_rows, key=lambda row: row[2])
-        most = max(sound_rows, key=lambda row: row[2])
-        figures = [
-            Figure("least_noise_dn", least[2], least[3], "smallest noise", "DN", name, f"mean {least[1]:.4g} DN"),
-            Figure("largest_noise_dn", most[2], most[3], "largest noise", "DN", name, f"mean {most[1]:.4g} DN"),
-        ]
-    else:
-        refused[prefix("noise", name)] = (
+    if not sound.size:
+        why = (
             "every level is cut off at black or saturated or has no noise at all, so that its noise is not the sensor's"
         )
-    head = ("plane", "mean_dn", "sigma_dn", "sigma_of_sigma_dn", "frames", "pixels", "not_clipped", "setting")
-    x = np.array([row[1] for row in sound_rows])
+        return Findings(refused={of.named("noise"): why}, tables={"levels": table})
+    ends = zip(("least", "largest"), ("smallest", "largest"), sound[[sigma[sound].argmin(), sigma[sound].argmax()]])
+    figures = []
+    for name, word, k in ends:
+        at = of.under(f"mean {mean[k]:.4g} DN")
+        figures.append(at.figure(f"{name}_noise_dn", float(sigma[k]), float(of_sigma[k]), f"{word} noise", "DN"))
+    x = mean[sound]
     rounding = data.step / sqrt(12)  # Behr 1989, eq. 3.14
     chart = Chart(
-        f"Noise against grey value{f' {name}' if name else ''}",
+        of.named("Noise against grey value"),
         f"Standard deviation of a pixel between frames; the dashed line is rounding alone ({rounding:.3g} DN).",
         "mean grey value DN",
         "noise DN",
         (
-            Trace(
-                x, np.array([row[2] for row in sound_rows]), "measured", sigma=np.array([row[3] for row in sound_rows])
-            ),
-            Trace(
-                np.array([x.min(), x.max()]) if x.size else x,
-                np.full(min(2, 2 * x.size), rounding),
-                "rounding",
-                "dashed",
-            ),
+            Trace(x, sigma[sound], "measured", sigma=of_sigma[sound]),
+            Trace(x[[0, -1]], np.full(2, rounding), "rounding", "dashed"),
         ),
     )
-    caption = "Mean grey value and standard deviation of a pixel (Behr 1989, table 4.2)"
-    return Findings(
-        tuple(figures),
-        refused,
-        {"levels": Listing(head, tuple(rows), caption)},
-        (chart,) if len(sound_rows) > 1 else (),
-    )
+    return Findings(tuple(figures), tables={"levels": table}, plots=(chart,) if x.size > 1 else ())

@@ -103,7 +103,7 @@ class Figure:
 
     def __str__(self) -> str:
         sigma = f" ± {_plain(self.sigma, 2)}" if math.isfinite(self.sigma) else ""
-        where = " ".join(filter(None, [self.plane, self.at]))
+        where = spaced(self.plane, self.at)
         unit = f" {self.unit}" if self.unit else ""
         more = f" · {self.remark}" if self.remark else ""
         return f"{self.label}{f' ({where})' if where else ''}: {_short(self.value, self.sigma)}{sigma}{unit}{more}"
@@ -117,6 +117,42 @@ class Figure:
         """Keys that say nothing are left out."""
         more = {key: value for key, value in pick(self, "plane", "at", "remark", "label").items() if value}
         return {**pick(self, "name", "value", "sigma", "unit"), **more}
+
+
+def spaced(*parts: str) -> str:
+    """Parts that say something, with spaces between them."""
+    return " ".join(filter(None, parts))
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Of what figures are: a colour plane and a condition, either of which may be empty."""
+
+    plane: str = ""
+    at: str = ""
+
+    def figure(self, name: str, value: float, sigma: float, label: str, unit: str = "", remark: str = "") -> Figure:
+        """A figure of it."""
+        return Figure(
+            name=name, value=value, sigma=sigma, label=label, unit=unit, plane=self.plane, at=self.at, remark=remark
+        )
+
+    def under(self, condition: str) -> Subject:
+        """The same under one more condition."""
+        return Subject(self.plane, spaced(self.at, condition))
+
+    def named(self, *words: str) -> str:
+        """Words and what it is, as a title or the key of a refusal."""
+        return spaced(*words, self.plane, self.at)
+
+    def key(self, word: str) -> str:
+        """The same as a name among the details."""
+        return self.named(word).replace(" ", "_")
+
+
+def known(*figures: Figure) -> tuple[Figure, ...]:
+    """Those whose value is known, not NaN."""
+    return tuple(figure for figure in figures if math.isfinite(figure.value))
 
 
 def _short(value: float, sigma: float = math.nan) -> str:
@@ -146,6 +182,15 @@ class Listing:
     head: tuple[str, ...]
     rows: tuple[tuple[str | float | int, ...], ...]
     caption: str = ""
+
+    @classmethod
+    def of(cls, caption: str, **columns: Any) -> Listing:
+        """Rows of columns by their heads; a text or a number stands in every row, yes and no become 1 and 0."""
+        lists = {head: v.tolist() if isinstance(v, np.ndarray) else v for head, v in columns.items()}
+        count = next(len(v) for v in lists.values() if isinstance(v, list | tuple))
+        filled = (v if isinstance(v, list | tuple) else [v] * count for v in lists.values())
+        cells = ([int(v) if isinstance(v, bool) else v for v in column] for column in filled)
+        return cls(tuple(columns), tuple(zip(*cells)), caption)
 
 
 @dataclass(frozen=True, eq=False)

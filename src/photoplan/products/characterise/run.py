@@ -8,8 +8,6 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.disk import write_atomically
@@ -19,11 +17,11 @@ from photoplan.io.series.pixels import Plane, grey_step, largest_of_steps
 from photoplan.io.tables import write_table
 from photoplan.io.whole_image import write_whole_image
 from photoplan.plain import pick, plain
-from photoplan.products.characterise.common import SettingsRun, black_if_known, exposure_runs
+from photoplan.products.characterise.common import SettingsRun, exposure_runs
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.registry import ANALYSES, Analysis
 from photoplan.products.characterise.result import Figure, Findings, Listing
-from photoplan.quality.camera.saturation import FullWell, find_saturation, full_well
+from photoplan.quality.camera.saturation import FullWell, full_well
 
 _LEAST = 4
 #: Share of samples at the largest grey value from which on that is what stops them.
@@ -54,15 +52,8 @@ def full_well_notes(data: SeriesData) -> tuple[str, ...]:
 
 def _find(data: SeriesData, run: SettingsRun, plane: Plane) -> FullWell | None:
     levels = [data.levels(setting)[plane.name] for setting in run.settings]
-    variance = np.array([level.temporal_variance for level in levels])
     try:
-        found = find_saturation(
-            run.values,
-            [level.mean for level in levels],
-            black_if_known(data, run.settings[0], plane),
-            [level.saturated_share for level in levels],
-            variance if np.isfinite(variance).all() else None,
-        )
+        found = run.saturation(data, plane)
     except InputError:  # every level is cut off at the largest grey value: told by the analyses themselves
         return None
     if found is None or found.rule == "clipping" or levels[-1].saturated_share >= _MOSTLY:
@@ -230,51 +221,39 @@ def _run(analysis: Analysis, data: SeriesData) -> AnalysisRun:
 
 def _check_outputs(request: CharacteriseRequest, series: Series) -> None:
     """Refuse outputs that exist or are inputs, before any work."""
-    if request.csv is not None:
-        folder = request.csv
-        if folder.exists() and not folder.is_dir():
-            raise UsageError(f"{folder}: is no folder; `csv` takes one")
-        if folder.is_dir() and any(folder.glob("*.csv")) and not request.overwrite:
-            raise UsageError(f"{folder}: holds tables; give `overwrite` to replace them, or another `csv`")
-        for path in folder.glob("*.csv"):
-            if path.resolve() in {p.resolve() for p in series.inputs}:
-                raise UsageError(f"{path}: is an input of the series; give another `csv`")
+    folder = request.csv
+    if folder is None:
+        return
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"{folder}: is no folder; `csv` takes one")
+    tables = list(folder.glob("*.csv"))
+    if tables and not request.overwrite:
+        raise UsageError(f"{folder}: holds tables; give `overwrite` to replace them, or another `csv`")
+    inputs = {p.resolve() for p in series.inputs}
+    for path in tables:
+        if path.resolve() in inputs:
+            raise UsageError(f"{path}: is an input of the series; give another `csv`")
 
 
 def _write_tables(request: CharacteriseRequest, series: Series, runs: Sequence[AnalysisRun]) -> list[Path]:
     if request.csv is None:
         return []
-    done = [run for run in runs if run.outcome is not None]
-    figures = [(run.analysis.name, figure) for run in done if run.outcome for figure in run.outcome.figures]
-    tables = {"figures": _figure_table(figures)}
-    for run in done:
-        assert run.outcome is not None
-        tables |= {f"{run.analysis.name}_{name}": table for name, table in run.outcome.tables.items()}
-    written = []
+    done = [(run.analysis.name, run.outcome) for run in runs if run.outcome is not None]
+    tables = {"figures": _figure_table([(name, figure) for name, outcome in done for figure in outcome.figures])}
+    tables |= {f"{name}_{stem}": table for name, outcome in done for stem, table in outcome.tables.items()}
     for name, table in tables.items():
-        path = request.csv / f"{name}.csv"
-        write_table(path, table.head, table.rows)
-        written.append(path)
-    return written + _write_files(request, series, done)
-
-
-def _write_files(request: CharacteriseRequest, series: Series, done: Sequence[AnalysisRun]) -> list[Path]:
-    assert request.csv is not None
-    written = []
-    for run in done:
-        assert run.outcome is not None
-        for name, content in run.outcome.files.items():
-            path = request.csv / name
-            check_output(path, list(series.inputs), overwrite=request.overwrite)
-            if isinstance(content, bytes):
-                write_atomically(path, content)
-            else:
-                write_whole_image(path, content)
-            written.append(path)
-    return written
+        write_table(request.csv / f"{name}.csv", table.head, table.rows)
+    files = {request.csv / name: content for _, outcome in done for name, content in outcome.files.items()}
+    for path, content in files.items():
+        check_output(path, list(series.inputs), overwrite=request.overwrite)
+        if isinstance(content, bytes):
+            write_atomically(path, content)
+        else:
+            write_whole_image(path, content)
+    return [*(request.csv / f"{name}.csv" for name in tables), *files]
 
 
 def _figure_table(figures: Sequence[tuple[str, Figure]]) -> Listing:
-    head = ("analysis", "name", "plane", "at", "value", "sigma", "unit", "remark")
-    rows = [(name, f.name, f.plane, f.at, plain(f.value), plain(f.sigma), f.unit, f.remark) for name, f in figures]
-    return Listing(head, tuple(tuple("" if v is None else v for v in row) for row in rows))
+    names = ("name", "plane", "at", "value", "sigma", "unit", "remark")
+    rows = ((name, *(plain(v) for v in pick(figure, *names).values())) for name, figure in figures)
+    return Listing(("analysis", *names), tuple(tuple("" if v is None else v for v in row) for row in rows))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
-from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Trace, joined
+from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined
 from photoplan.products.characterise.targets import locate_targets
 from photoplan.quality.camera.stage import LEAST_POINTS, StageCalibration, b4_lines, stage_calibration
 
@@ -91,51 +91,40 @@ def _of_frames(data: SeriesData, group: FrameGroup) -> list[_Points]:
 
 
 def _outcome(found: StageCalibration, given: _Points, number: int) -> Findings:
-    at, unit, f = given.label, given.unit, found.facts
+    at, unit, f, of = given.label, given.unit, found.facts, Subject(at=given.label)
     n = len(found.names) - len(found.gross)
-
-    def figure(name: str, value: float, sigma: float, label: str, unit: str) -> Figure:
-        return Figure(name, value, sigma, label, unit, "", at)
-
     figures = []
     for axis, scale, size, sigma in zip("xy", f.scale, f.pixel_size, found.sigma_pixel_size):
-        figures.append(figure(f"scale_{axis}", scale, scale * sigma / size, f"scale factor in {axis}", f"px/{unit}"))
-        figures.append(figure(f"pixel_size_{axis}", size, sigma, f"pixel size in {axis}", unit))
+        words = f"scale factor in {axis}"
+        figures.append(of.figure(f"scale_{axis}", scale, scale * sigma / size, words, f"px/{unit}"))
+        figures.append(of.figure(f"pixel_size_{axis}", size, sigma, f"pixel size in {axis}", unit))
     for axis, value, sigma in zip("xy", (f.direction_x, f.direction_y), found.sigma_direction):
-        figures.append(
-            figure(f"rotation_{axis}_gon", value * _GON, sigma * _GON, f"rotation of the {axis} axis", "gon")
-        )
-    figures.append(figure("shear_gon", f.shear * _GON, found.sigma_shear * _GON, "shear", "gon"))
+        words = f"rotation of the {axis} axis"
+        figures.append(of.figure(f"rotation_{axis}_gon", value * _GON, sigma * _GON, words, "gon"))
+    figures.append(of.figure("shear_gon", f.shear * _GON, found.sigma_shear * _GON, "shear", "gon"))
     for axis, value in zip("xy", found.sigma):
-        figures.append(
-            figure(f"mean_error_{axis}_px", value, value / math.sqrt(2 * (n - 3)), f"mean error {axis}", "px")
-        )
-    figures.append(figure("m0_px", found.sigma0, found.sigma0 / math.sqrt(2 * found.redundancy), "M0", "px"))
-    matrices: list[tuple[str | float | int, ...]] = [
-        (at, way, *(float(getattr(t, f"a{k}")) for k in range(1, 7)))
-        for way, t in (("stage to image", found.to_image), ("image to stage", found.to_stage))
-    ]
-    points = tuple(_row(found, at, k) for k in range(len(found.names)))
-    head = ("series", "point", "stage_x", "stage_y", "x_px", "y_px", "residual_x_px", "residual_y_px", "remark")
+        of_value = value / math.sqrt(2 * (n - 3))
+        figures.append(of.figure(f"mean_error_{axis}_px", value, of_value, f"mean error {axis}", "px"))
+    figures.append(of.figure("m0_px", found.sigma0, found.sigma0 / math.sqrt(2 * found.redundancy), "M0", "px"))
+    both = [[float(getattr(t, f"a{k}")) for k in range(1, 7)] for t in (found.to_image, found.to_stage)]
+    elements = dict(zip(("a1", "a2", "a3", "b1", "b2", "b3"), zip(*both)))
+    points = Listing.of(
+        "Points, residuals measured minus transformed",
+        series=at,
+        point=found.names,
+        **dict(zip(("stage_x", "stage_y"), found.stage.T)),
+        **dict(zip(("x_px", "y_px"), found.measured.T)),
+        **dict(zip(("residual_x_px", "residual_y_px"), found.residuals.T)),
+        remark=["gross error" if name in found.gross else "" for name in found.names],
+    )
+    matrices = Listing.of("Affine matrices", series=at, way=("stage to image", "image to stage"), **elements)
     return Findings(
         tuple(figures),
-        tables={
-            "matrices": Listing(
-                ("series", "way", "a1", "a2", "a3", "b1", "b2", "b3"), tuple(matrices), "Affine matrices"
-            ),
-            "points": Listing(head, points, "Points, residuals measured minus transformed"),
-        },
+        tables={"matrices": matrices, "points": points},
         plots=(_chart(found, at),),
         notes=(*given.notes, *_notes(found, at)),
         files={f"stage_calibration_{number}.txt": ("\n".join(b4_lines(found, unit)) + "\n").encode()},
     )
-
-
-def _row(found: StageCalibration, at: str, k: int) -> tuple[str | float | int, ...]:
-    """A point with its residuals."""
-    name = found.names[k]
-    numbers = (float(v) for v in (*found.stage[k], *found.measured[k], *found.residuals[k]))
-    return (at, name, *numbers, "gross error" if name in found.gross else "")
 
 
 def _notes(found: StageCalibration, at: str) -> list[str]:

@@ -51,7 +51,6 @@ def locate_targets(data: SeriesData, group: FrameGroup) -> dict[str, list[Locate
     for frame in group.frames:
         for target in targets_of(group):
             found[target.name].append(_locate(data, group, frame, target))
-        data.watch(1)
     for name, places in found.items():
         lost = [p for p in places if p.why]
         if len(lost) > _MOST_LOST * len(places):

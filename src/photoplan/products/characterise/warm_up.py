@@ -12,7 +12,7 @@ from photoplan.errors import InputError
 from photoplan.io.series.positions import MeasuredPositions
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
-from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Trace, joined
+from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Subject, Trace, joined, known
 from photoplan.products.characterise.targets import locate_targets
 from photoplan.quality.camera.approach import LEAST_VALUES
 from photoplan.quality.camera.warm_up import Course, WarmUp, warm_up
@@ -127,31 +127,24 @@ def _of_table(table: MeasuredPositions) -> _Input:
 
 
 def _outcome(found: WarmUp, given: _Input) -> Findings:
-    at, nan = given.label, math.nan
+    at, nan, of = given.label, math.nan, Subject(at=given.label)
     figures: list[Figure] = []
     refused: dict[str, str] = {}
-    if found.repeat_sigma is not None:
-        for axis, sigma in zip(("x", "y"), found.repeat_sigma):
-            of_sigma = sigma / math.sqrt(2.0 * found.repeat_redundancy)
-            label = f"standard deviation of a single measurement in {axis}"
-            figures.append(Figure(f"repeat_sigma_{axis}_px", sigma, of_sigma, label, "px", "", at))
-    if math.isfinite(found.sigma0[0]):
-        for axis, sigma in zip(("x", "y"), found.sigma0):
-            label = f"standard deviation of an epoch's position in {axis}"
-            figures.append(Figure(f"epoch_sigma_{axis}_px", sigma, nan, label, "px", "", at))
+    for axis, sigma in zip("xy", found.repeat_sigma or ()):
+        words = f"standard deviation of a single measurement in {axis}"
+        of_sigma = sigma / math.sqrt(2.0 * found.repeat_redundancy)
+        figures.append(of.figure(f"repeat_sigma_{axis}_px", sigma, of_sigma, words, "px"))
+    for axis, sigma in zip("xy", found.sigma0):
+        words = f"standard deviation of an epoch's position in {axis}"
+        figures.append(of.figure(f"epoch_sigma_{axis}_px", sigma, nan, words, "px"))
     for course in found.courses:
-        more, why = _course(course, at, given.bound)
+        more, why = _course(course, of, given.bound)
         figures += more
         refused |= why
     for target in found.targets:
-        for axis, value in zip(("x", "y"), target.largest):
-            label = f"largest movement in {axis}"
-            figures.append(Figure(f"movement_{axis}_px", value, nan, label, "px", "", f"{at}, {target.name}"))
-    head = ("series", "time_s", *(f"{c.name}{s}" for c in found.courses for s in ("", "_sigma")))
-    rows: tuple[tuple[str | float | int, ...], ...] = tuple(
-        (at, float(t), *(float(v) for c in found.courses for v in (c.values[k], c.sigmas[k])))
-        for k, t in enumerate(found.times)
-    )
+        mine = Subject(at=f"{at}, {target.name}")
+        for axis, value in zip("xy", target.largest):
+            figures.append(mine.figure(f"movement_{axis}_px", value, nan, f"largest movement in {axis}", "px"))
     against = "the first epoch" if found.reference == "first" else "the mean of the epochs"
     notes = (
         *given.notes,
@@ -159,44 +152,33 @@ def _outcome(found: WarmUp, given: _Input) -> Findings:
         f"row {found.centre[1]:.0f}",
         *(f"{at}: {note}" for note in found.notes),
     )
-    table = Listing(head, rows, "Parameters by epoch (shifts px, scales in parts, angles rad)")
-    return Findings(tuple(figures), refused, {"epochs": table}, _charts(found, at), notes)
+    values = {f"{c.name}{s}": v for c in found.courses for s, v in (("", c.values), ("_sigma", c.sigmas))}
+    caption = "Parameters by epoch (shifts px, scales in parts, angles rad)"
+    table = Listing.of(caption, series=at, time_s=found.times, **values)
+    return Findings(known(*figures), refused, {"epochs": table}, _charts(found, at), notes)
 
 
-def _course(course: Course, at: str, bound: float) -> tuple[list[Figure], dict[str, str]]:
+def _course(course: Course, of: Subject, bound: float) -> tuple[list[Figure], dict[str, str]]:
     """Size, time constant and time until warm of one parameter."""
     factor, unit = _UNITS[course.unit]
     label, name = _LABELS[course.name], course.name
     suffix = {"px": "px", "ppm": "ppm", "µrad": "urad"}[unit]
-    figures = [
-        Figure(f"{name}_range_{suffix}", factor * course.largest, math.nan, f"{label}, largest range", unit, "", at)
-    ]
+    largest = factor * course.largest
+    figures = [of.figure(f"{name}_range_{suffix}", largest, math.nan, f"{label}, largest range", unit)]
     a = course.approach
     if a is None:
         return figures, {}
     if a.change is None or a.sigma_change is None or a.time_constant is None or a.sigma_time_constant is None:
-        return figures, {f"warm-up of {label}, {at}": f"{a.verdict} (chance of none {a.probability:.2g})"}
-    remark = f"chance of none {a.probability:.1g}"
+        return figures, {f"warm-up of {label}, {of.at}": f"{a.verdict} (chance of none {a.probability:.2g})"}
+    remark, words = f"chance of none {a.probability:.1g}", f"{label}, warm-up drift"
     change, sigma = factor * a.change, factor * a.sigma_change
-    figures.append(
-        Figure(
-            name=f"{name}_drift_{suffix}",
-            value=change,
-            sigma=sigma,
-            label=f"{label}, warm-up drift",
-            unit=unit,
-            plane="",
-            at=at,
-            remark=remark,
-        )
-    )
-    label_of = f"{label}, time constant"
-    figures.append(Figure(f"{name}_time_s", a.time_constant, a.sigma_time_constant, label_of, "s", "", at))
-    if unit == "px":
-        within = a.time_within(bound)
-        if within is not None:
-            text = f"{label}, time until within {bound:g} px of the end"
-            figures.append(Figure(f"{name}_warm_s", within, math.nan, text, "s", "", at))
+    figures.append(of.figure(f"{name}_drift_{suffix}", change, sigma, words, unit, remark))
+    words = f"{label}, time constant"
+    figures.append(of.figure(f"{name}_time_s", a.time_constant, a.sigma_time_constant, words, "s"))
+    within = a.time_within(bound) if unit == "px" else None
+    if within is not None:
+        words = f"{label}, time until within {bound:g} px of the end"
+        figures.append(of.figure(f"{name}_warm_s", within, math.nan, words, "s"))
     return figures, {}
 
 
@@ -218,19 +200,13 @@ def _charts(found: WarmUp, at: str) -> tuple[Chart, ...]:
             if c.approach is not None and c.approach.change is not None:
                 curves.append(Trace(curve / 60.0, factor * c.approach.at(curve), "", "line", colour=k))
         if curves:
-            caption = "Measured with standard deviations, and the exponential course where there is one (Behr 1989, "
-            caption += "fig. 4.2)."
+            caption = "Measured with standard deviations, and the exponential course where there is one"
+            caption += " (Behr 1989, fig. 4.2)."
             charts.append(Chart(f"Warm-up, {what}, {at}", caption, "minutes", f"{what} {unit}", tuple(curves)))
     moved = [
-        Trace(
-            minutes,
-            t.shift[:, axis],
-            f"{t.name}, {'column' if axis == 0 else 'row'}",
-            "line",
-            colour=2 * (k % 3) + axis,
-        )
+        Trace(minutes, t.shift[:, axis], f"{t.name}, {word}", "line", colour=2 * k + axis)
         for k, t in enumerate(found.targets[:3])
-        for axis in (0, 1)
+        for axis, word in enumerate(("column", "row"))
     ]
     caption = "Each target against the reference; targets that move by different amounts tell a change of scale."
     charts.append(Chart(f"Targets, {at}", caption, "minutes", "movement px", tuple(moved)))

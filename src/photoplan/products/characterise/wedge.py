@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite, sqrt
+from math import isfinite, nan, sqrt
 
 import numpy as np
 
@@ -11,9 +11,9 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.series.file import Frame
 from photoplan.io.series.pixels import Plane, plane_pixels
-from photoplan.products.characterise.common import black_of, prefix, saturation_of, tried
+from photoplan.products.characterise.common import black_of, saturation_of, tried
 from photoplan.products.characterise.data import SeriesData, Setting
-from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Trace, joined
+from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined, spaced
 from photoplan.quality.camera.frame_statistics import Level, StackSums
 from photoplan.quality.camera.straight_line import GreyWedge, grey_wedge
 
@@ -47,16 +47,15 @@ def analyse(data: SeriesData) -> Findings:
         for setting in data.settings("wedge"):
             patches.setdefault(_label(setting.first), []).extend(_patches(data, setting, plane))
         for label, of_label in patches.items():
-            key = prefix("grey wedge", plane.name, label)
-            outcomes.append(tried(key, lambda p=of_label, n=plane, a=label: _curve(data, p, n, a)))  # type: ignore[misc]
+            of = Subject(plane.name, label)
+            outcomes.append(tried(of.named("grey wedge"), _curve, data, of_label, plane, of))
     return joined(outcomes)
 
 
 def _label(frame: Frame) -> str:
-    words = [frame.group.entry.name or ""]
-    words += [] if frame.illumination is None else [f"illumination {frame.illumination:g}"]
-    words += [] if frame.exposure_ms is None else [f"{frame.exposure_ms:g} ms"]
-    return prefix(*words)
+    light = "" if frame.illumination is None else f"illumination {frame.illumination:g}"
+    time = "" if frame.exposure_ms is None else f"{frame.exposure_ms:g} ms"
+    return spaced(frame.group.entry.name or "", light, time)
 
 
 def _patches(data: SeriesData, setting: Setting, plane: Plane) -> list[_Patch]:
@@ -81,7 +80,7 @@ def _patches(data: SeriesData, setting: Setting, plane: Plane) -> list[_Patch]:
     return found
 
 
-def _curve(data: SeriesData, patches: list[_Patch], plane: Plane, label: str) -> Findings:
+def _curve(data: SeriesData, patches: list[_Patch], plane: Plane, of: Subject) -> Findings:
     blacks = [black_of(data, patch.setting, plane) for patch in patches]
     signal = [patch.level.mean - black.mean for patch, black in zip(patches, blacks)]
     sigma = [
@@ -92,23 +91,24 @@ def _curve(data: SeriesData, patches: list[_Patch], plane: Plane, label: str) ->
     ]
     full = saturation_of(data, plane, [patch.level for patch in patches]) - blacks[0].mean
     found = grey_wedge([patch.density for patch in patches], signal, sigma, full)
-    where = {"plane": plane.name, "at": label}
-    nan = float("nan")
-    figures = (
-        Figure("gamma", found.gamma, found.gamma_sigma, "gamma of the characteristic curve", "", **where),
-        Figure("wedge_error_percent", found.error_percent, nan, "largest deviation from proportionality", "%", **where),
-        Figure("used_range_percent", found.used_range_percent, nan, "part of the grey scale used", "%", **where),
+    table = Listing.of(
+        "Patches of the wedge",
+        plane=of.plane,
+        at=of.at,
+        density=found.density,
+        transmission=found.transmission,
+        signal_dn=found.signal,
+        used=found.used,
     )
-    rows = tuple(
-        (plane.name, label, float(d), float(t), float(y), int(u))
-        for d, t, y, u in zip(found.density, found.transmission, found.signal, found.used)
-    )
-    head = ("plane", "at", "density", "transmission", "signal_dn", "used")
     return Findings(
-        figures,
-        tables={"patches": Listing(head, rows, "Patches of the wedge")},
-        plots=(_plot(found, prefix("Grey wedge", plane.name, label)),),
-        details={prefix("wedge", plane.name, label).replace(" ", "_"): found},
+        (
+            of.figure("gamma", found.gamma, found.gamma_sigma, "gamma of the characteristic curve"),
+            of.figure("wedge_error_percent", found.error_percent, nan, "largest deviation from proportionality", "%"),
+            of.figure("used_range_percent", found.used_range_percent, nan, "part of the grey scale used", "%"),
+        ),
+        tables={"patches": table},
+        plots=(_plot(found, of.named("Grey wedge")),),
+        details={of.key("wedge"): found},
     )
 
 

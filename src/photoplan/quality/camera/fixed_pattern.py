@@ -111,29 +111,29 @@ def signed_root(variance: float, sigma: float) -> tuple[float, float]:
     return root, min(sigma / (2 * root), sqrt(sigma))
 
 
-def prnu_percent(bright: PatternVariance, dark: PatternVariance | None) -> tuple[float, float]:
+def prnu_percent(bright: PatternVariance, dark: PatternVariance | float = 0.0) -> tuple[float, float]:
     """Photo response non-uniformity in percent of the signal, and its sigma.
 
     Parameters
     ----------
     bright : PatternVariance
         Of flat frames, at half of saturation by the standard.
-    dark : PatternVariance, optional
-        Of dark frames at the same exposure; None: black is 0 and has no pattern.
+    dark : PatternVariance or float
+        Of dark frames at the same exposure; a number: black is this grey value and has no pattern.
 
     Raises
     ------
     InputError
         The bright frames are not brighter than the dark ones.
     """
-    variance, sigma = bright.total, bright.total_sigma
-    signal = bright.mean
-    if dark is not None:
-        variance, sigma, signal = variance - dark.total, sqrt(sigma**2 + dark.total_sigma**2), signal - dark.mean
+    below, of_dark, of_dark_sigma = (
+        (dark.mean, dark.total, dark.total_sigma) if isinstance(dark, PatternVariance) else (dark, 0.0, 0.0)
+    )
+    signal = bright.mean - below
     if signal <= 0:
         raise InputError(f"flat frames of mean {bright.mean:.4g} DN are not brighter than the dark ones")
-    root, root_sigma = signed_root(variance, sigma)
-    return 100 * root / signal, 100 * root_sigma / signal
+    root, sigma = signed_root(bright.total - of_dark, sqrt(bright.total_sigma**2 + of_dark_sigma**2))
+    return 100 * root / signal, 100 * sigma / signal
 
 
 @dataclass(frozen=True, eq=False)

@@ -91,7 +91,10 @@ class FrameStack:
     """Temporal variance of every pixel; None for a single frame."""
     counted: NDArray[np.bool_] | None
     """Pixels that the summary counts; None: all."""
-    frame_means: tuple[float, ...]
+
+    def only_counted(self, image: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Mean image or variance with NaN where pixels do not count."""
+        return image if self.counted is None else np.where(self.counted, image, np.nan)
 
 
 class StackSums:
@@ -180,4 +183,4 @@ class StackSums:
             smallest=self._smallest,
         )
         variance = squares / (count - 1) if count > 1 else None
-        return FrameStack(level, mean, variance, self._counted, tuple(self._means))
+        return FrameStack(level, mean, variance, self._counted)
