@@ -20,10 +20,10 @@ from photoplan.engine.cluster import Question
 from photoplan.engine.executors import Workers, executor_factory, open_workers
 from photoplan.engine.run import Made, Runner, Tally, Work
 from photoplan.events import SILENT
-from photoplan.geometry.grid import MapGrid, Window
+from photoplan.geometry.grid import MapGrid
 from photoplan.io.product import ProductFile
 from photoplan.io.run_record import versions
-from photoplan.plan.product import Tile
+from photoplan.plan.tiles import Tile, Tiles
 
 SIDE, TILES = 128, 1000
 NOTHING = Made((None,), {"worst_residual": 0.0, "cells": 1})
@@ -55,7 +55,7 @@ def make(name: str, job: object, workers: Workers, folder: Path, count: int = TI
     grid = MapGrid(0.0, 0.0, 1.0, SIDE * across, SIDE * across, "EPSG:32633")
     path = folder / f"{name.replace(' ', '_')}.tif"
     file = ProductFile(path, grid.placement, 3, np.dtype(np.uint8), run_key=name, nodata="mask", tile=SIDE)
-    tiles = tuple(Tile(i, window) for i, window in enumerate(Window(0, 0, grid.width, grid.height).tiles(SIDE)))
+    tiles = Tiles.every(grid.window, SIDE)
     work = Work(
         name=name, job=job, tiles=tiles, count=len(tiles), sinks=(file,), complete=len_of, scratch=folder / ".parcels"
     )

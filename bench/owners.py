@@ -18,7 +18,8 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
 from photoplan.plan.compile import AnchorRule
 from photoplan.plan.owner import GivenOwners
-from photoplan.plan.product import ProductPlan, Tile
+from photoplan.plan.product import ProductPlan
+from photoplan.plan.tiles import Tiles
 from photoplan.surfaces.level import LevelSurface
 from photoplan.targets.map import MapTarget
 
@@ -65,14 +66,14 @@ def seconds(count: int) -> float:
         camera = FrameCamera(Interior.digital(SIZE, (1500.0, 1500.0)), NoLens(), pose)
         sources.append(Source(camera, _Image(rng.integers(0, 255, (3, SIZE[1], SIZE[0]), np.uint8))))
     grid = MapGrid.covering((-51.2, -51.2, 51.2, 51.2), 0.2, "EPSG:32633")
-    tile = Tile(0, grid.window, tuple(range(count)))
+    tiles = Tiles.every(grid.window, SIDE, count)
     rule = GivenOwners(owners(count)) if count > 1 else None
     names = tuple(f"image {k}" for k in range(count))
-    plan = ProductPlan("tile", names, MapTarget(grid), SIDE, AnchorRule(0.02, 2), (tile,), rule)
+    plan = ProductPlan("tile", names, MapTarget(grid), AnchorRule(0.02, 2), tiles, rule)
     best = np.inf
     for _ in range(ROUNDS):
         start = time.process_time()
-        pixels = render(plan, tile, sources, LevelSurface(0.0), "bicubic")
+        pixels = render(plan, tiles[0], sources, LevelSurface(0.0), "bicubic")
         best = min(best, time.process_time() - start)
     assert pixels.valid is not None and pixels.valid.mean() > 0.95
     return float(best)

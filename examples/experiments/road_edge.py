@@ -29,7 +29,8 @@ from photoplan.engine.execute import render
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
 from photoplan.plan.compile import AnchorRule
-from photoplan.plan.product import ProductPlan, Tile
+from photoplan.plan.product import ProductPlan
+from photoplan.plan.tiles import Tiles
 from photoplan.surfaces.base import Surface
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
@@ -231,7 +232,7 @@ def ortho_grid() -> MapGrid:
 def orthophoto(view: FrameCamera, image: NDArray[np.float32], surface: Surface) -> NDArray[np.float32]:
     """The orthophoto, shape (rows, columns), by the package's own chain."""
     grid = ortho_grid()
-    plan = ProductPlan("road_ortho", ("road",), MapTarget(grid), 512, AnchorRule(0.005, 3), (Tile(0, grid.window),))
+    plan = ProductPlan("road_ortho", ("road",), MapTarget(grid), AnchorRule(0.005, 3), Tiles.every(grid.window, 512))
     pixels = render(plan, plan.tiles[0], [Source(view, _Photo(image))], surface, "bicubic")
     assert pixels.values is not None and pixels.valid is not None
     return np.where(pixels.valid, pixels.values[0], np.nan)

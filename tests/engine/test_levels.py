@@ -22,7 +22,8 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.levels import level_size, means, reduced
 from photoplan.geometry.pose import Pose
 from photoplan.io.raster import RasterReader
-from photoplan.plan.product import Tile, compile_tile
+from photoplan.plan.product import compile_tile
+from photoplan.plan.tiles import Tile
 from photoplan.surfaces.level import LevelSurface
 from photoplan.targets.map import MapTarget
 

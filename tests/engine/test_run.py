@@ -14,7 +14,7 @@ from photoplan.engine.executors import Workers, executor_factory
 from photoplan.engine.run import Kept, Made, Runner, Tally, Work, tiles_in_flight
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
-from photoplan.plan.product import Tile
+from photoplan.plan.tiles import Tile
 
 TILES = tuple(Tile(i, Window(i * 4, 0, 4, 4)) for i in range(6))
 

@@ -18,7 +18,8 @@ from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
 from photoplan.plan.owner import GivenOwners
-from photoplan.plan.product import ProductPlan, Tile, compile_tile
+from photoplan.plan.product import ProductPlan, compile_tile
+from photoplan.plan.tiles import Tile
 from photoplan.surfaces.level import LevelSurface
 from photoplan.targets.map import MapTarget
 

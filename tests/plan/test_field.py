@@ -28,7 +28,8 @@ from photoplan.kernels.position import positions
 from photoplan.plan.anchors import Anchors
 from photoplan.plan.compile import AnchorRule, compile_anchors
 from photoplan.plan.field import field_grid
-from photoplan.plan.product import Tile, compile_tile
+from photoplan.plan.product import compile_tile
+from photoplan.plan.tiles import Tile
 from photoplan.surfaces.level import LevelSurface
 from photoplan.targets.map import MapTarget
 

@@ -63,15 +63,16 @@ def test_tiles_that_hold_a_pixel_are_kept(tilt: float) -> None:
     seen = footprint(camera, GROUND, SEARCH)
     assert seen.bounds is not None
     grid = MapGrid.covering(seen.bounds, 2.0, "EPSG:32615")
+    kept = covered_tiles(camera, GROUND, grid, 32)
     tiles = list(grid.window.tiles(32))
-    kept = covered_tiles(camera, GROUND, grid, tiles)
-    for tile, keep in zip(tiles, kept):
+    for index, tile in enumerate(tiles):
         v, u = np.mgrid[tile.row : tile.stop[1], tile.col : tile.stop[0]]
         XY = grid.to_map(np.stack([u, v], axis=-1))
         xy = project(camera, np.concatenate([XY, np.full((*XY.shape[:2], 1), 100.0)], axis=-1))
         inside = ((xy >= -0.5) & (xy <= np.array(camera.size) - 0.5)).all(axis=-1).any()
-        assert keep or not inside
-    assert not all(kept)
+        assert index in kept.indices or not inside
+    assert [tile.window for tile in kept] == [tiles[index] for index in kept.indices]
+    assert 0 < len(kept) < len(tiles)
 
 
 @dataclass(eq=False)
@@ -217,11 +218,10 @@ def test_every_pixel_that_falls_into_the_image_is_in_the_bounds_and_in_a_kept_ti
     inside = (xy >= -0.5).all(axis=-1) & (xy <= np.array(camera.size) - 0.5).all(axis=-1)
     assert inside.sum() > 500
     assert (XY[inside] >= seen.bounds[:2]).all() and (XY[inside] <= seen.bounds[2:]).all()
-    tiles = list(target.window.tiles(30))
-    kept = covered_tiles(camera, surface, target, tiles)
-    for tile, keep in zip(tiles, kept):
-        assert keep or not inside[tile.row : tile.stop[1], tile.col : tile.stop[0]].any()
-    assert sum(kept) < len(tiles)
+    kept = covered_tiles(camera, surface, target, 30)
+    for index, tile in enumerate(target.window.tiles(30)):
+        assert index in kept.indices or not inside[tile.row : tile.stop[1], tile.col : tile.stop[0]].any()
+    assert len(kept) < kept.total
 
 
 def test_a_hundred_ordinary_images_read_the_ground_below_them_once() -> None:

@@ -16,7 +16,7 @@ from photoplan.engine.execute import render
 from photoplan.engine.twin import strict_positions, strict_scales, twin_resample
 from photoplan.geometry.grid import Window
 from photoplan.io.project.file import load_project
-from photoplan.plan.product import Tile
+from photoplan.plan.tiles import Tile
 from photoplan.products.init.run import InitRequest, init_project
 from photoplan.products.orthophoto.plan import plan_orthophotos
 from photoplan.project.scene import open_scene

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from photoplan.geometry.grid import MapGrid
 from photoplan.plan.compile import AnchorRule
-from photoplan.plan.product import ProductPlan, Tile
+from photoplan.plan.product import ProductPlan
+from photoplan.plan.tiles import Tiles
 from photoplan.targets.map import MapTarget
 
 
@@ -18,8 +19,8 @@ def product(
 ) -> ProductPlan:
     """A plan that has every tile of a grid."""
     cut = AnchorRule(**({"tolerance": 0.02, "radius": 3} | rule))
-    tiles = tuple(Tile(i, w, tuple(range(len(names)))) for i, w in enumerate(grid.window.tiles(side)))
-    return ProductPlan("image_ortho", names, MapTarget(grid), side, cut, tiles, owners)
+    tiles = Tiles.every(grid.window, side, len(names))
+    return ProductPlan("image_ortho", names, MapTarget(grid), cut, tiles, owners)
 
 
 def noise(bands: int, rows: int, cols: int, dtype: str, seed: int = 0) -> NDArray[Any]:

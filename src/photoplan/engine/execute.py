@@ -14,7 +14,8 @@ from photoplan.engine.run import Made
 from photoplan.geometry.grid import Window
 from photoplan.kernels.position import ALL_MINE
 from photoplan.kernels.rectify import rectify_tile
-from photoplan.plan.product import CompiledTile, Layer, ProductPlan, Tile, compile_tile
+from photoplan.plan.product import CompiledTile, Layer, ProductPlan, compile_tile
+from photoplan.plan.tiles import Tile
 from photoplan.surfaces.base import Surface
 
 #: A window of the source larger than this (bytes as read) is not read at once; its tile is executed in parts.

@@ -24,7 +24,7 @@ from photoplan.engine.cluster import opened
 from photoplan.engine.executors import PULSE, Workers, run_tiles
 from photoplan.errors import PhotoplanError, UsageError
 from photoplan.events import Events
-from photoplan.plan.product import Tile
+from photoplan.plan.tiles import Tile
 
 Output = tuple[NDArray[Any], NDArray[np.bool_] | None]
 """Values of a tile, shape (bands, height, width), and their validity, (height, width); None: all are valid."""

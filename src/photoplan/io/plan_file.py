@@ -17,6 +17,10 @@ from photoplan.errors import InputError, UsageError
 
 FORMAT = 1
 _HEADER = "photoplan_plan"
+#: What is read of the tiles again.
+_READ = ["product", "tile", "cells", "residual_px"]
+#: Tiles that are written at once: as polygons they take much more memory than as numbers.
+_PIECE = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +55,10 @@ def write_plan_tables(path: Path, plan: PlanTables, overwrite: bool = False) -> 
     partial = path.with_name(f".{path.stem}.partial.gpkg")
     partial.unlink(missing_ok=True)
     try:
-        _write_layer(partial, "tiles", shapely.box(*plan.tile_bounds.T), plan.tiles, plan.crs, "Polygon")
+        for start in range(0, len(plan.tile_bounds), _PIECE):
+            some = slice(start, start + _PIECE)
+            boxes, columns = shapely.box(*plan.tile_bounds[some].T), {k: v[some] for k, v in plan.tiles.items()}
+            _write_layer(partial, "tiles", boxes, columns, plan.crs, "Polygon", append=start > 0)
         outlines = np.array([shapely.Polygon(o) for o in plan.outlines], object)
         _write_layer(partial, "footprints", outlines, plan.footprints, plan.crs, "Polygon", append=True)
         # A table of its own that GIS programs leave alone; GeoPackage is SQLite and allows it as an attribute table.
@@ -94,7 +101,7 @@ def _write_layer(
 
 
 def read_plan_tables(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Header and tile columns of a plan.
+    """Header of a plan, and some columns of its tiles: product, tile, cells, residual_px.
 
     Raises
     ------
@@ -111,5 +118,5 @@ def read_plan_tables(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]
         raise InputError(f"{path}: not a plan of photoplan ({error}); make one with `photoplan ortho`") from error
     if row is None or row[0] != FORMAT:
         raise InputError(f"{path}: plan format {row and row[0]}; this version reads {FORMAT}: make the plan again")
-    meta, _, _, values = pyogrio.raw.read(str(path), layer="tiles", read_geometry=False)
+    meta, _, _, values = pyogrio.raw.read(str(path), layer="tiles", columns=_READ, read_geometry=False)
     return json.loads(row[1]), dict(zip(meta["fields"], values))

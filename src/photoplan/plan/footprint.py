@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.base import CentralCamera
-from photoplan.geometry.grid import MapGrid, Window
+from photoplan.geometry.grid import MapGrid
+from photoplan.plan.tiles import Tiles
 from photoplan.surfaces.base import Terrain
 from photoplan.surfaces.intersect import intersect
 
@@ -164,14 +165,15 @@ def footprint(camera: CentralCamera, terrain: Terrain, bounds: Bounds | None) ->
     return Footprint(outline[:-1], seen, float(np.isfinite(outline[:, 0]).mean()), (low, high))
 
 
-def covered_tiles(camera: CentralCamera, terrain: Terrain, grid: MapGrid, tiles: list[Window]) -> list[bool]:
-    """Which tiles can hold a pixel of the image, judged from the range of heights under each tile."""
-    boxes = np.array([grid.bounds_of(tile) for tile in tiles])
+def covered_tiles(camera: CentralCamera, terrain: Terrain, grid: MapGrid, side: int) -> Tiles:
+    """Tiles that can hold a pixel of the image, judged from the range of heights under each tile."""
+    every = Tiles.every(grid.window, side)
+    boxes = every.bounds(grid)
     ranges = terrain.height_range(boxes)
     if not np.isfinite(ranges).any():
-        return [False] * len(tiles)
+        return every.only(())
     view = View.of(camera, float(np.nanmin(ranges)), float(np.nanmax(ranges)))
-    return [False] * len(tiles) if view is None else view.sees(boxes, ranges).tolist()
+    return every.only(() if view is None else np.flatnonzero(view.sees(boxes, ranges)))
 
 
 def some_height(terrain: Terrain, near: Bounds, x: float, y: float) -> float:

@@ -14,20 +14,9 @@ from photoplan.geometry.grid import Window
 from photoplan.plan.anchors import Anchors
 from photoplan.plan.compile import AnchorRule, compile_anchors
 from photoplan.plan.owner import Ownership
+from photoplan.plan.tiles import Tile, Tiles
 from photoplan.surfaces.base import Surface
 from photoplan.targets.base import Target
-
-
-@dataclass(frozen=True, order=True, slots=True)
-class Tile:
-    """A part of a product that is one task."""
-
-    index: int
-    """Its place among all tiles of the product, row by row: also the empty ones are counted."""
-    window: Window
-    """Its pixels in the product."""
-    sources: tuple[int, ...] = (0,)
-    """Rows of the table of sources that can paint here; all others are never looked at."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +73,10 @@ class ProductPlan:
     """The table of sources: names of the images; tiles and owners count its rows."""
     target: Target
     """The product's own coordinates."""
-    tile_side: int
-    """Side of a tile, target pixels."""
     rule: AnchorRule
     """How finely tiles are cut."""
-    tiles: tuple[Tile, ...]
-    """Tiles that can hold a part of an image; all others stay empty."""
+    tiles: Tiles
+    """Tiles that can hold a part of an image."""
     owners: Ownership | None = None
     """Who paints which pixel; None: there is one source."""
 
@@ -106,12 +93,6 @@ class ProductPlan:
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
         return self.target.window.width, self.target.window.height
-
-    @property
-    def tile_count(self) -> int:
-        """Number of tiles, the empty ones included."""
-        across, down = (-(-s // self.tile_side) for s in self.size)
-        return across * down
 
 
 def compile_tile(product: ProductPlan, tile: Tile, cameras: Sequence[Projection], surface: Surface) -> CompiledTile:

@@ -26,7 +26,8 @@ from photoplan.io.storage import Nodata
 from photoplan.kernels.weights import KERNELS
 from photoplan.plan.compile import AnchorRule
 from photoplan.plan.owner import GivenOwners
-from photoplan.plan.product import ProductPlan, Tile
+from photoplan.plan.product import ProductPlan
+from photoplan.plan.tiles import Tiles
 from photoplan.project.open_terrain import open_terrain
 from photoplan.surfaces.base import Surface
 from photoplan.surfaces.level import LevelSurface
@@ -187,14 +188,12 @@ def rectify(
     sources = _sources(source, camera)
     place = MapTarget(target) if isinstance(target, MapGrid) else target
     names = tuple(f"source {k}" for k in range(1, len(sources) + 1))
-    windows = enumerate(place.window.tiles(tile))
     plan = ProductPlan(
         name="rectified",
         sources=names,
         target=place,
-        tile_side=tile,
         rule=AnchorRule(tolerance, max(1, math.ceil(KERNELS[kernel].taps / 2)), reduces=kernel != "nearest"),
-        tiles=tuple(Tile(i, window, tuple(range(len(names)))) for i, window in windows),
+        tiles=Tiles.every(place.window, tile, len(names)),
         owners=None if owner is None else GivenOwners(_owners(owner, len(names))),
     )
     work = partial(render, plan, sources=sources, surface=_surface(surface, place.placement.crs), kernel=kernel)

@@ -20,7 +20,7 @@ from photoplan.geometry.grid import Placement, Window
 from photoplan.io.disk import free_megabytes
 from photoplan.io.product import ProductFacts, ProductFile, check_output
 from photoplan.io.storage import Nodata
-from photoplan.plan.product import Tile
+from photoplan.plan.tiles import Tile, Tiles
 
 GridTile = NDArray[Any] | tuple[NDArray[Any], NDArray[np.bool_]] | None
 """Values (bands, h, w); or values and validity (h, w), True = valid; or None: nothing is valid."""
@@ -120,7 +120,7 @@ def write_grid(
         resampling=options.resampling,
         colours=options.colours,
     )
-    windows = tuple(Tile(i, window) for i, window in enumerate(file.windows))
+    windows = Tiles.every(file.placement.window, file.tile)
     kept = file.log_path.stat().st_size if file.log_path.exists() else 0
     _check_space(path, max(0, len(windows) * options.tile**2 * bands * dtype.itemsize - kept))
     work = Work(

@@ -182,9 +182,9 @@ def _work(
     )
     return Work(
         name=product.plan.name,
-        job=RenderJob(scene.address, replace(product.plan, tiles=()), settings.kernel),
+        job=RenderJob(scene.address, replace(product.plan, tiles=product.plan.tiles.only(())), settings.kernel),
         tiles=product.plan.tiles,
-        count=product.plan.tile_count,
+        count=product.plan.tiles.total,
         sinks=(file,),
         complete=partial(_complete, plan, product, scene, run, file, _clock(workers)),
         scratch=file.path.with_name(f".{file.path.name}.parcels"),
@@ -222,7 +222,7 @@ def _complete(
         valid_share=0.0 if facts is None else facts.valid_share,
         residual=tally.totals.get("worst_residual", 0.0),
         cells=tally.totals.get("cells", 0),
-        tiles=product.plan.tile_count,
+        tiles=product.plan.tiles.total,
         resumed=tally.resumed,
         failed=tuple(sorted(tally.failed)),
         reason=next(iter(tally.reasons), ""),

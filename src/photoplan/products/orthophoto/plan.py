@@ -24,12 +24,12 @@ from photoplan.io.storage import nodata_for
 from photoplan.kernels.weights import KERNELS
 from photoplan.plan.compile import AnchorRule
 from photoplan.plan.footprint import Footprint, covered_tiles, image_border, some_height
-from photoplan.plan.product import ProductPlan, Tile
+from photoplan.plan.product import ProductPlan
 from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.scene import Scene, SceneAddress, open_scene
 from photoplan.targets.map import MapTarget
 
-#: Tiles of a product: their list is kept in memory.
+#: Tiles of a product.
 MOST_TILES = 1_000_000
 
 
@@ -75,7 +75,7 @@ class OrthoPlan:
         for p in self.products:
             lines.append(
                 f"  {p.plan.name}: {p.grid.width} × {p.grid.height} px of {p.grid.resolution:g} m, "
-                f"{len(p.plan.tiles)} of {p.plan.tile_count} tiles, GSD {p.gsd:.3g} m"
+                f"{len(p.plan.tiles)} of {p.plan.tiles.total} tiles, GSD {p.gsd:.3g} m"
             )
         return "\n".join(lines)
 
@@ -153,14 +153,12 @@ def _plan_one(project: Project, scene: Scene, name: str, settings: OrthoSettings
     grid = MapGrid.covering(bounds, settings.resolution, project.crs)
     _check_storable(scene, name, grid, settings)
     target = MapTarget(grid)
-    windows = list(grid.window.tiles(settings.tile))
-    keep = covered_tiles(scene.camera, scene.surface, grid, windows)
-    tiles = tuple(Tile(i, window) for i, window in enumerate(windows) if keep[i])
-    if not tiles:
+    tiles = covered_tiles(scene.camera, scene.surface, grid, settings.tile)
+    if not len(tiles):
         return None
     radius = max(1, math.ceil(KERNELS[settings.kernel].taps / 2))
     rule = AnchorRule(settings.tolerance, radius, reduces=settings.kernel != "nearest")
-    return ProductPlan(product_name(name), (name,), target, settings.tile, rule, tiles)
+    return ProductPlan(product_name(name), (name,), target, rule, tiles)
 
 
 def product_name(image: str) -> str:
@@ -194,7 +192,7 @@ def product_key(scene: SceneAddress, plan: ProductPlan, settings: OrthoSettings)
         "version": __version__,
         "scene": scene.facts,
         "grid": [grid.left, grid.top, grid.resolution, grid.width, grid.height, grid.crs],
-        "rule": [plan.rule.tolerance, plan.rule.radius, plan.tile_side],
+        "rule": [plan.rule.tolerance, plan.rule.radius, plan.tiles.side],
         "kernel": settings.kernel,
         "nodata": settings.nodata,
     }

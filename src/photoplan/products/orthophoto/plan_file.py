@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import sqlite3
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,8 @@ from photoplan.io.project.file import parse_project
 from photoplan.plain import pick
 from photoplan.plan.compile import AnchorRule
 from photoplan.plan.footprint import Footprint
-from photoplan.plan.product import ProductPlan, Tile, compile_tile
+from photoplan.plan.product import ProductPlan, compile_tile
+from photoplan.plan.tiles import Tiles
 from photoplan.products.orthophoto.plan import MOST_TILES, OrthoPlan, OrthoProduct, product_key, product_name
 from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.scene import input_files, open_scene, scene_address
@@ -32,19 +33,14 @@ from photoplan.targets.map import MapTarget
 
 @dataclass(frozen=True, eq=False)
 class PlanFigures:
-    """What compiling every tile of a plan tells, one row a tile."""
+    """What compiling every tile of a plan tells, one row a tile, in the plan's order."""
 
-    product: NDArray[np.object_]
-    image: NDArray[np.object_]
-    index: NDArray[np.int64]
+    product: NDArray[np.uint32]
+    """Place of the tile's product in the plan."""
     cells_of_tile: NDArray[np.int64]
     residual_of_tile: NDArray[np.float64]
-    source: NDArray[np.int64]
+    source: NDArray[np.int32]
     """Column, row, width, height of the source window; shape (n, 4)."""
-    windows: NDArray[np.int64]
-    """Column, row, width, height of the tile in its product; shape (n, 4)."""
-    bounds: NDArray[np.float64]
-    """Outer edges of the tile in the product's CRS; shape (n, 4)."""
 
     @property
     def tiles(self) -> int:
@@ -65,12 +61,12 @@ class PlanFigures:
         """Figures of a plan and of each of its products."""
         return {
             **pick(self, "tiles", "cells", worst_anchor_residual_px="residual"),
-            "products": [self._product(product) for product in plan.products],
+            "products": [self._product(place, product) for place, product in enumerate(plan.products)],
             "blind": plan.blind,
         }
 
-    def _product(self, product: OrthoProduct) -> dict[str, Any]:
-        mine = self.product == product.plan.name
+    def _product(self, place: int, product: OrthoProduct) -> dict[str, Any]:
+        mine = slice(*np.searchsorted(self.product, (place, place + 1)))
         return {
             **pick(product.plan, "name", "image"),
             **pick(product.grid, "width", "height", "resolution", "bounds"),
@@ -90,42 +86,22 @@ def compile_figures(plan: OrthoPlan, events: Events = SILENT) -> PlanFigures:
     events : Events
         Told of each tile.
     """
-    events.begin("compiling tiles", sum(len(p.plan.tiles) for p in plan.products))
-    rows: list[tuple[Any, ...]] = []
-    for product in plan.products:
-        scene = open_scene(plan.project, product.plan.image)
-        for tile in product.plan.tiles:
-            compiled = compile_tile(product.plan, tile, [scene.camera], scene.surface)
-            read = [_numbers(layer.window(scene.camera.size)) for layer in compiled.layers] or [(0, 0, 0, 0)]
-            bounds = product.grid.bounds_of(tile.window)
-            rows.append(
-                (
-                    product.plan.name,
-                    product.plan.image,
-                    tile.index,
-                    compiled.cells,
-                    compiled.residual,
-                    read[0],
-                    _numbers(tile.window),
-                    bounds,
-                )
-            )
+    counts = [len(p.plan.tiles) for p in plan.products]
+    events.begin("compiling tiles", sum(counts))
+    product = np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
+    cells, residual = np.zeros(len(product), np.int64), np.zeros(len(product))
+    source = np.zeros((len(product), 4), np.int32)
+    rows = iter(range(len(product)))
+    for p in plan.products:
+        scene = open_scene(plan.project, p.plan.image)
+        for tile, row in zip(p.plan.tiles, rows):
+            compiled = compile_tile(p.plan, tile, [scene.camera], scene.surface)
+            cells[row], residual[row] = compiled.cells, compiled.residual
+            for layer in compiled.layers:
+                read = layer.window(scene.camera.size)
+                source[row] = read.col, read.row, read.width, read.height
             events.done(1, tile.window.size)
-    columns = list(zip(*rows))
-    return PlanFigures(
-        product=np.array(columns[0], object),
-        image=np.array(columns[1], object),
-        index=np.array(columns[2], np.int64),
-        cells_of_tile=np.array(columns[3], np.int64),
-        residual_of_tile=np.array(columns[4], float),
-        source=np.array(columns[5], np.int64),
-        windows=np.array(columns[6], np.int64),
-        bounds=np.array(columns[7], float),
-    )
-
-
-def _numbers(window: Any) -> tuple[int, int, int, int]:
-    return window.col, window.row, window.width, window.height
+    return PlanFigures(product, cells, residual, source)
 
 
 def write_plan(path: Path, plan: OrthoPlan, figures: PlanFigures, output: Path, overwrite: bool = False) -> None:
@@ -151,6 +127,7 @@ def write_plan(path: Path, plan: OrthoPlan, figures: PlanFigures, output: Path, 
     """
     check_plan_path(path, plan, overwrite)
     there = figures.cells_of_tile > 0
+    counts = np.bincount(figures.product[there], minlength=len(plan.products))
     header = {
         "photoplan": __version__,
         "project": plan.project.model_dump(mode="json", exclude_none=True),
@@ -158,26 +135,30 @@ def write_plan(path: Path, plan: OrthoPlan, figures: PlanFigures, output: Path, 
         "output": os.path.relpath(output.resolve(), path.resolve().parent),
         "settings": asdict(plan.settings),
         "blind": list(plan.blind),
-        "products": [_product_header(p, int((there & (figures.product == p.plan.name)).sum())) for p in plan.products],
+        "products": [_product_header(p, count) for p, count in zip(plan.products, counts.tolist())],
     }
-    tiles = {
-        "product": figures.product[there],
-        "image": figures.image[there],
-        "tile": figures.index[there],
+    tiles = [p.plan.tiles for p in plan.products]
+    windows = np.concatenate([t.windows for t in tiles])[there]
+    bounds = np.concatenate([t.bounds(p.grid) for t, p in zip(tiles, plan.products)])[there]
+    names, images = (np.array([getattr(p.plan, name) for p in plan.products], object) for name in ("name", "image"))
+    columns = {
+        "product": names[figures.product[there]],
+        "image": images[figures.product[there]],
+        "tile": np.concatenate([t.indices for t in tiles])[there].astype(np.int64),
         "cells": figures.cells_of_tile[there],
         "residual_px": figures.residual_of_tile[there],
-        **{name: figures.windows[there, i] for i, name in enumerate(("col", "row", "width", "height"))},
+        **{name: windows[:, i] for i, name in enumerate(("col", "row", "width", "height"))},
         **{f"source_{name}": figures.source[there, i] for i, name in enumerate(("col", "row", "width", "height"))},
     }
     footprints = {
-        "product": np.array([p.plan.name for p in plan.products], object),
-        "image": np.array([p.plan.image for p in plan.products], object),
+        "product": names,
+        "image": images,
         "gsd": np.array([p.gsd for p in plan.products]),
         "resolution": np.array([p.grid.resolution for p in plan.products]),
         "on_terrain": np.array([p.footprint.on_surface for p in plan.products]),
     }
     outlines = [_outline(p) for p in plan.products]
-    tables = PlanTables(header, tiles, figures.bounds[there], footprints, outlines, plan.project.crs)
+    tables = PlanTables(header, columns, bounds, footprints, outlines, plan.project.crs)
     try:
         write_plan_tables(path, tables, overwrite)
     except OSError as error:
@@ -231,20 +212,21 @@ def read_plan(path: Path | str) -> tuple[OrthoPlan, Path]:
         folder = (path.resolve().parent / header["folder"]).resolve()
         project = parse_project(header["project"], folder, str(path))
         settings = OrthoSettings.from_dict(header["settings"])
-        products = [_product(entry) for entry in header["products"]]
+        listed: dict[str, set[int]] = {}
+        for name, index in zip(tiles["product"].tolist(), tiles["tile"].tolist()):
+            listed.setdefault(name, set()).add(index)
+        products = [_product(entry, listed) for entry in header["products"]]
         changed = [
             p.plan.image
-            for p in products
-            if product_key(scene_address(project, p.plan.image), p.plan, settings) != p.key
+            for p, entry in zip(products, header["products"])
+            if product_key(scene_address(project, p.plan.image), p.plan, settings) != entry["key"]
         ]
         if changed:
             raise InputError(
                 f"{path}: inputs have changed since the plan was written ({', '.join(changed)}); make the plan again "
                 "with `photoplan ortho`"
             )
-        counts = [int(entry["tiles"]) for entry in header["products"]]
-        chosen = [_with_tiles(product, tiles, count) for product, count in zip(products, counts)]
-        plan = OrthoPlan(project, settings, tuple(p for p in chosen if p.plan.tiles), tuple(header["blind"]))
+        plan = OrthoPlan(project, settings, tuple(p for p in products if len(p.plan.tiles)), tuple(header["blind"]))
     except (KeyError, TypeError, ValueError, UsageError) as error:
         raise InputError(f"{path}: the plan is damaged ({error}); make it again with `photoplan ortho`") from error
     if not plan.products:
@@ -260,7 +242,7 @@ def _product_header(product: OrthoProduct, tiles: int) -> dict[str, Any]:
         "key": product.key,
         "gsd": product.gsd,
         "grid": asdict(product.grid),
-        "tile_side": plan.tile_side,
+        "tile_side": plan.tiles.side,
         "rule": asdict(plan.rule),
         "outline": seen.outline.tolist(),
         "bounds": seen.bounds,
@@ -270,27 +252,22 @@ def _product_header(product: OrthoProduct, tiles: int) -> dict[str, Any]:
     }
 
 
-def _product(entry: dict[str, Any]) -> OrthoProduct:
-    """What `_product_header` says; without tiles."""
-    grid = MapGrid(**entry["grid"])
+def _product(entry: dict[str, Any], listed: dict[str, set[int]]) -> OrthoProduct:
+    """What `_product_header` says, with the tiles that the layer lists.
+
+    A person may have deleted some: it is then another product.
+    """
+    grid, name = MapGrid(**entry["grid"]), product_name(entry["image"])
     side = int(entry["tile_side"])
     if side < 1 or -(-grid.width // side) * -(-grid.height // side) > MOST_TILES:
         raise ValueError(f"{grid.width} × {grid.height} pixels in tiles of {side}")
-    rule = AnchorRule(**entry["rule"])
-    plan = ProductPlan(product_name(entry["image"]), (entry["image"],), MapTarget(grid), side, rule, ())
+    every = Tiles.every(grid.window, side)
+    tiles = every.only(sorted(listed.get(name, set()) & set(range(every.total))))
+    key = entry["key"]
+    if len(tiles) != entry["tiles"]:
+        key = hashlib.sha256(f"{key} {tiles.indices.tolist()}".encode()).hexdigest()
+    plan = ProductPlan(name, (entry["image"],), MapTarget(grid), AnchorRule(**entry["rule"]), tiles)
     outline = np.array(entry["outline"], float).reshape(-1, 3)
     bounds = None if entry["bounds"] is None else tuple(entry["bounds"])
     low, high = entry["height_range"]
-    return OrthoProduct(plan, Footprint(outline, bounds, entry["on_surface"], (low, high)), entry["gsd"], entry["key"])
-
-
-def _with_tiles(product: OrthoProduct, tiles: dict[str, NDArray[Any]], planned: int) -> OrthoProduct:
-    """The product with the tiles that the layer lists. A person may have deleted some: it is then another one."""
-    plan = product.plan
-    listed = set(tiles["tile"][tiles["product"] == plan.name].tolist())
-    windows = plan.target.window.tiles(plan.tile_side)
-    chosen = tuple(Tile(i, window) for i, window in enumerate(windows) if i in listed)
-    key = product.key
-    if len(chosen) != planned:
-        key = hashlib.sha256(f"{key} {[t.index for t in chosen]}".encode()).hexdigest()
-    return replace(product, plan=replace(plan, tiles=chosen), key=key)
+    return OrthoProduct(plan, Footprint(outline, bounds, entry["on_surface"], (low, high)), entry["gsd"], key)

@@ -21,7 +21,7 @@ from photoplan.io.quicklook import write_quicklook
 from photoplan.io.run_record import peak_memory_bytes, record_path, run_times, versions, write_run_record
 from photoplan.io.storage import Nodata
 from photoplan.plain import pick
-from photoplan.plan.product import Tile
+from photoplan.plan.tiles import Tile, Tiles
 from photoplan.products.chromatic import model_figures, save_chromatic
 from photoplan.products.restore.request import RestoreRequest
 from photoplan.project.align import AlignStep
@@ -175,7 +175,7 @@ def restoration(job: Job, how: RestoreRequest, events: Events) -> Work[RestoredI
         threads=how.workers,
         form=job.form,
     )
-    tiles = tuple(Tile(i, window) for i, window in enumerate(file.windows))
+    tiles = Tiles.every(file.placement.window, file.tile)
     return Work(
         name=job.target.stem,
         job=RestoreJob(reader),

@@ -1,0 +1,89 @@
+"""The tiles of a product: a few bytes each, however many there are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.geometry.grid import MapGrid, Window
+
+
+@dataclass(frozen=True, order=True, slots=True)
+class Tile:
+    """A part of a product that is one task."""
+
+    index: int
+    """Its place among all tiles of the product, row by row: also the empty ones are counted."""
+    window: Window
+    """Its pixels in the product."""
+    sources: tuple[int, ...] = (0,)
+    """Rows of the table of sources that can paint here; all others are never looked at."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tiles(Sequence[Tile]):
+    """Tiles that can hold a part of a source; all others of the product stay empty. A `Tile` is made when one is asked
+    for."""
+
+    window: Window
+    """All pixels of the product, cut row by row; the last tiles of a row and of a column are smaller."""
+    side: int
+    """Side of a tile, pixels."""
+    indices: NDArray[np.uint32]
+    """`Tile.index` of each, increasing."""
+    sources: tuple[int, ...] = (0,)
+    """Rows of the table of sources that can paint them."""
+
+    @classmethod
+    def every(cls, window: Window, side: int, sources: int = 1) -> Tiles:
+        """All tiles of a product, which every one of its sources can paint."""
+        none = cls(window, side, np.empty(0, np.uint32), tuple(range(sources)))
+        return none.only(range(none.total))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of all tiles, the empty ones included."""
+        return -(-self.window.height // self.side), -(-self.window.width // self.side)
+
+    @property
+    def total(self) -> int:
+        """Number of all tiles, the empty ones included."""
+        return self.shape[0] * self.shape[1]
+
+    def only(self, indices: Iterable[int]) -> Tiles:
+        """Those tiles of the product that have these indices, increasing."""
+        return replace(self, indices=np.fromiter(indices, np.uint32))
+
+    @property
+    def windows(self) -> NDArray[np.int64]:
+        """Column, row, width and height of each, shape (n, 4)."""
+        row, col = np.divmod(self.indices.astype(np.int64), self.shape[1])
+        corner = self.side * np.stack([col, row], axis=1)
+        size = np.minimum(self.side, (self.window.width, self.window.height) - corner)
+        return np.concatenate([np.add(corner, (self.window.col, self.window.row)), size], axis=1)
+
+    def bounds(self, grid: MapGrid) -> NDArray[np.float64]:
+        """Outer edges xmin, ymin, xmax, ymax of each in a map grid, shape (n, 4)."""
+        col, row, width, height = self.windows.T
+        left, right = (grid.left + at * grid.resolution for at in (col, col + width))
+        bottom, top = (grid.top - at * grid.resolution for at in (row + height, row))
+        return np.stack([left, bottom, right, top], axis=1)
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    @overload
+    def __getitem__(self, place: int) -> Tile: ...
+    @overload
+    def __getitem__(self, place: slice) -> Tiles: ...
+    def __getitem__(self, place: int | slice) -> Tile | Tiles:
+        if isinstance(place, slice):
+            return replace(self, indices=self.indices[place])
+        index = int(self.indices[place])
+        row, col = divmod(index, self.shape[1])
+        corner = Window(self.window.col + col * self.side, self.window.row + row * self.side, self.side, self.side)
+        return Tile(index, corner & self.window, self.sources)

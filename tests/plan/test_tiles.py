@@ -1,0 +1,34 @@
+"""Tiles of a product, kept as numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.plan.tiles import Tile, Tiles
+
+GRID = MapGrid(400_000.3, 5_400_000.1, 0.07, 1000, 730, "EPSG:32633")
+
+
+@pytest.mark.parametrize("window", [GRID.window, Window(5, 7, 256, 129), Window(0, 0, 1, 1)])
+def test_they_are_those_of_the_window(window: Window) -> None:
+    every = Tiles.every(window, 128, 3)
+    assert list(every) == [Tile(i, w, (0, 1, 2)) for i, w in enumerate(window.tiles(128))]
+    assert len(every) == every.total
+    np.testing.assert_array_equal(every.windows, [(w.col, w.row, w.width, w.height) for w in window.tiles(128)])
+
+
+def test_some_are_a_part_of_all() -> None:
+    every = Tiles.every(GRID.window, 128)
+    some = every.only([2, 3, 47])
+    assert list(some) == [every[2], every[3], every[47]] == [*some[:2], some[-1]]
+    assert (some.total, len(some), len(every.only(()))) == (48, 3, 0)
+    with pytest.raises(IndexError):
+        some[3]
+    np.testing.assert_array_equal(some.bounds(GRID), [GRID.bounds_of(tile.window) for tile in some])
+
+
+def test_a_large_product_takes_a_few_bytes_for_each() -> None:
+    """500 images have a million tiles; as objects they took 230 bytes each."""
+    assert Tiles.every(Window(0, 0, 1_000_000, 1_000_000), 1000).indices.nbytes <= 8 * 1_000_000
