@@ -11,9 +11,8 @@ import pytest
 import rasterio
 from tools.command import Here
 
-from photoplan.io.simulation_file import SimulationFile, read_simulation
 from photoplan.io.whole_image import write_whole_image
-from photoplan.products.simulate.model import model_of
+from photoplan.products.simulate.model import entry_of, model_of, read_model
 from photoplan.quality.formation.model import ImageModel, form_image
 from photoplan.quality.formation.scenes import PatternScene
 
@@ -59,7 +58,7 @@ def test_frames_are_those_of_the_library(photoplan: Here, model: Path, tmp_path:
     report = json.loads(said.out)
     paths = [Path(image["path"]) for image in report["images"]]
     assert [path.name for path in paths] == ["edge_0001.tif", "edge_0002.tif"]
-    value = model_of(read_simulation(model), "model")
+    value = read_model(model)
     for frame, (path, exposure) in enumerate(zip(paths, (1.0, 0.5))):
         expected = form_image(value, PatternScene("edge", (60, 40), (7.0,)), frame, exposure).values
         assert np.array_equal(pixels(path)[0], expected)
@@ -88,7 +87,7 @@ def test_blur_of_a_file_has_no_seams_between_tiles(photoplan: Here, tmp_path: Pa
     from scipy import ndimage
 
     rows = np.pad(scene[0].astype(float), 40, mode="edge")
-    whole = form_image(model_of(read_simulation(tmp_path / "m.toml"), ""), rows).values[40:-40, 40:-40]
+    whole = form_image(read_model(tmp_path / "m.toml"), rows).values[40:-40, 40:-40]
     assert np.abs(pixels(tmp_path / "out.tif")[0] - whole).max() < 1e-5
     # A sampled Gaussian is close to it too.
     assert np.abs(ndimage.gaussian_filter(rows, np.sqrt(4 + 1 / 6))[40:-40, 40:-40] - whole).max() < 2e-3
@@ -190,7 +189,7 @@ def test_faults_of_a_model(text: str, message: str, photoplan: Here, tmp_path: P
 
 def test_every_entry_is_explained() -> None:
     page = (Path(__file__).parents[2] / "docs" / "reference" / "simulate.md").read_text("utf-8")
-    schema = SimulationFile.model_json_schema()
+    schema = entry_of(ImageModel).model_json_schema()
     tables = schema["$defs"]
     entries = {entry for each in tables.values() for entry in each["properties"]}
     assert not {e for e in entries | {"seed"} if f"`{e}`" not in page}
@@ -202,4 +201,4 @@ def test_the_model_on_the_page_works() -> None:
     text = re.findall(r"^```toml\n(.*?)^```", page, re.M | re.S)[0]
     import tomllib
 
-    assert model_of(SimulationFile.model_validate(tomllib.loads(text)), "page") != ImageModel()
+    assert model_of(entry_of(ImageModel).model_validate(tomllib.loads(text)), "page") != ImageModel()

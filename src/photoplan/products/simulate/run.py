@@ -17,10 +17,9 @@ from photoplan.geometry.grid import Window
 from photoplan.io.product import check_output
 from photoplan.io.raster import RasterReader
 from photoplan.io.run_record import record_path, run_times, versions, write_run_record
-from photoplan.io.simulation_file import read_simulation
 from photoplan.io.whole_image import write_whole_image
 from photoplan.plain import pick
-from photoplan.products.simulate.model import model_of
+from photoplan.products.simulate.model import read_model
 from photoplan.quality.formation.model import MOST_PIXELS, FormedImage, ImageModel, form_series
 from photoplan.quality.formation.scenes import PATTERNS, LightScene, PatternScene, parse_pattern
 from photoplan.quality.formation.sensor_parts import Quantisation
@@ -201,7 +200,7 @@ def _frames(model: ImageModel, scene: LightScene, exposures: list[float]) -> Ite
 
 def _model(request: SimulateRequest) -> tuple[ImageModel, str]:
     """The model, and the type of the files."""
-    model = ImageModel() if request.model is None else model_of(read_simulation(request.model), str(request.model))
+    model = ImageModel() if request.model is None else read_model(request.model)
     if request.seed is not None:
         if not 0 <= request.seed < 2**62:
             raise UsageError(f"seed {request.seed}; a whole number from 0 on is needed")

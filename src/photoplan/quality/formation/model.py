@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import exp
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from scipy import ndimage
 
 from photoplan.errors import InputError
 from photoplan.quality.formation.optics import Optics, falloff_factors, line_displacements, sample_scene
-from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitterPart, Spread, check_range
+from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitterPart, Part, Spread, Within
 from photoplan.quality.formation.scenes import ArrayScene, LightScene
 from photoplan.quality.formation.sensor import Pattern, add_shot_noise, fixed_pattern, moved_charge, overflow
 from photoplan.quality.formation.sensor_parts import (
@@ -84,7 +84,7 @@ def quantised(grey: _Array, quantisation: Quantisation) -> NDArray[np.uint8] | N
 
 
 @dataclass(frozen=True)
-class ImageModel:
+class ImageModel(Part, name="model"):
     """How an image comes about. Each part's default changes nothing."""
 
     spread: Spread = field(default_factory=Spread)
@@ -103,11 +103,11 @@ class ImageModel:
     enhancement: EnhancementPart | None = None
     tone: Tone | None = None
     quantisation: Quantisation | None = None
-    seed: int = 0
+    seed: Annotated[int, Within(0, 2**63)] = 0
     """Of all that is random: the same seed gives the same sensor, the same seed and frame the same image."""
 
     def __post_init__(self) -> None:
-        check_range("model", "seed", self.seed, 0, 2**63)
+        super().__post_init__()
         if len({each.band for each in self.lateral}) < len(self.lateral):
             raise InputError("lateral: a band is described twice")
         if len(self.defects) > 1_000_000:

@@ -133,13 +133,11 @@ def _displacement(
     mine = [each for each in lateral if each.band == band + 1]
     if not mine and moved is None:
         return None
-    width, height = size
-    u = (np.arange(tile.col, tile.stop[0]) - (width - 1) / 2.0)[None, :]
-    v = (np.arange(tile.row, tile.stop[1]) - (height - 1) / 2.0)[:, None]
+    u, v = _from_middle(size, tile)
     dx, dy = np.zeros((tile.height, tile.width)), np.zeros((tile.height, tile.width))
     if moved is not None:
         dx -= moved[:, None]
-    corner = (np.hypot(width, height) / 2.0) ** 2
+    corner = (np.hypot(*size) / 2.0) ** 2
     for each in mine:
         # The place that the optics brings to a pixel, by iterating the displacement (it contracts by its scale).
         px, py = u + dx, v + dy
@@ -239,11 +237,14 @@ def _levels(spread: Spread, size: tuple[int, int], tile: Window) -> list[float]:
 
 def _scales(spread: Spread, size: tuple[int, int], tile: Window) -> _Array:
     """Scale of the spread function at the pixels of a tile."""
-    width, height = size
-    u = (np.arange(tile.col, tile.stop[0]) - (width - 1) / 2.0)[None, :]
-    v = (np.arange(tile.row, tile.stop[1]) - (height - 1) / 2.0)[:, None]
-    square = (u**2 + v**2) / (np.hypot(width, height) / 2.0) ** 2
-    return np.asarray(1.0 + spread.field_square * square + spread.field_fourth * square**2)
+    u, v = _from_middle(size, tile)
+    return np.asarray(spread.scale_at(np.hypot(u, v) / (np.hypot(*size) / 2.0)))
+
+
+def _from_middle(size: tuple[int, int], tile: Window) -> tuple[_Array, _Array]:
+    """Columns and rows of a tile's pixels from the image's middle; they broadcast."""
+    y, x = np.ogrid[tile.row : tile.stop[1], tile.col : tile.stop[0]]
+    return x - (size[0] - 1) / 2.0, y - (size[1] - 1) / 2.0
 
 
 def _level_share(spread: Spread, levels: list[float], index: int, size: tuple[int, int], tile: Window) -> _Array:

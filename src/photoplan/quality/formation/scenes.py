@@ -13,6 +13,7 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.quality.formation.shapes import bar_share, disc_share, edge_share, sector_share, step_mean
 
+_Array = NDArray[np.float64]
 #: Patterns by name: what their numbers mean, how many there may be, and those that are taken if none is given.
 PATTERNS: dict[str, tuple[str, tuple[float, ...]]] = {
     "flat": ("the bright level everywhere", ()),
@@ -47,7 +48,7 @@ class LightScene(Protocol):
         """Whether the cells are means of a continuous scene; else the scene consists of even squares."""
         ...
 
-    def cells(self, window: Window) -> NDArray[np.float64]:
+    def cells(self, window: Window) -> _Array:
         """Cells of a window of pixels, shape (bands, height · k, width · k); it may reach beyond the image."""
         ...
 
@@ -56,7 +57,7 @@ class LightScene(Protocol):
 class ArrayScene:
     """A scene from an array; beyond its border it goes on as at the border."""
 
-    values: NDArray[np.float64]
+    values: _Array
     """Mean values of the cells, shape (rows · k, columns · k) or (bands, rows · k, columns · k)."""
     oversampling: int = 1
     """k: cells along a side of a pixel."""
@@ -95,7 +96,7 @@ class ArrayScene:
         """Number of bands."""
         return int(self.values.shape[0])
 
-    def cells(self, window: Window) -> NDArray[np.float64]:
+    def cells(self, window: Window) -> _Array:
         """Cells of a window of pixels, shape (bands, height · k, width · k)."""
         k = self.oversampling
         rows = np.clip(np.arange(window.row * k, window.stop[1] * k), 0, self.values.shape[1] - 1)
@@ -168,7 +169,7 @@ class PatternScene:
         """Column and row of the pattern's middle."""
         return (self.size[0] - 1) / 2.0 + self.phase[0], (self.size[1] - 1) / 2.0 + self.phase[1]
 
-    def centres(self) -> NDArray[np.float64]:
+    def centres(self) -> _Array:
         """Column and row of the discs whose centres lie in the image, shape (n, 2), row by row."""
         pitch = self.numbers[0]
         axes = []
@@ -178,7 +179,7 @@ class PatternScene:
         y, x = np.meshgrid(axes[1], axes[0], indexing="ij")
         return np.stack([x.ravel(), y.ravel()], 1)
 
-    def cells(self, window: Window) -> NDArray[np.float64]:
+    def cells(self, window: Window) -> _Array:
         """Cells of a window of pixels, shape (bands, height · k, width · k)."""
         k = self.oversampling
         x = (np.arange(window.col * k, window.stop[0] * k) + 0.5) / k - 0.5 - self.middle[0]
@@ -189,39 +190,19 @@ class PatternScene:
         return np.repeat(values[None], self.bands, 0)
 
 
-def _edge(scene: PatternScene, x: NDArray[np.float64], y: NDArray[np.float64], side: float) -> NDArray[np.float64]:
-    return edge_share(x, y, side, scene.numbers[0])
-
-
-def _bars(scene: PatternScene, x: NDArray[np.float64], y: NDArray[np.float64], side: float) -> NDArray[np.float64]:
-    return bar_share(x, y, side, scene.numbers[0], scene.numbers[1])
-
-
-def _star(scene: PatternScene, x: NDArray[np.float64], y: NDArray[np.float64], side: float) -> NDArray[np.float64]:
-    return sector_share(x, y, side, int(scene.numbers[0]))
-
-
-def _wedge(scene: PatternScene, x: NDArray[np.float64], y: NDArray[np.float64], side: float) -> NDArray[np.float64]:
-    return step_mean(x, side, int(scene.numbers[0]), scene.size[0]) + 0.0 * y
-
-
-def _discs(scene: PatternScene, x: NDArray[np.float64], y: NDArray[np.float64], side: float) -> NDArray[np.float64]:
+def _discs(scene: PatternScene, x: _Array, y: _Array, side: float) -> _Array:
     pitch = scene.numbers[0]
     near = [v - np.round(v / pitch) * pitch for v in (x, y)]
     return 1.0 - disc_share(near[0], near[1], side, scene.diameter / 2.0)
 
 
-def _flat(scene: PatternScene, x: NDArray[np.float64], y: NDArray[np.float64], side: float) -> NDArray[np.float64]:
-    return np.ones((1, 1))
-
-
-_Share = Callable[[PatternScene, NDArray[np.float64], NDArray[np.float64], float], NDArray[np.float64]]
-_SHARES: dict[str, _Share] = {
-    "flat": _flat,
-    "edge": _edge,
-    "bars": _bars,
-    "star": _star,
-    "wedge": _wedge,
+#: Share of a pattern's bright part in cells of a side at x and y from its middle.
+_SHARES: dict[str, Callable[[PatternScene, _Array, _Array, float], _Array]] = {
+    "flat": lambda scene, x, y, side: np.ones((1, 1)),
+    "edge": lambda scene, x, y, side: edge_share(x, y, side, scene.numbers[0]),
+    "bars": lambda scene, x, y, side: bar_share(x, y, side, scene.numbers[0], scene.numbers[1]),
+    "star": lambda scene, x, y, side: sector_share(x, y, side, int(scene.numbers[0])),
+    "wedge": lambda scene, x, y, side: step_mean(x, side, int(scene.numbers[0]), scene.size[0]) + 0.0 * y,
     "discs": _discs,
 }
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.quality.formation.kernels import aperture_transfer, spread_transfer
 from photoplan.quality.formation.model import ImageModel
+from photoplan.quality.mtf_curve import MtfCurve
 
 _Array = NDArray[np.float64]
 #: Cycles per pixel up to which a transfer function is summed; what is left there is refused.
@@ -48,13 +49,7 @@ def model_mtf50(model: ImageModel, angle_deg: float = 0.0, radius: float = 0.0, 
     Direction and place are those of `model_transfer`.
     """
     f = np.linspace(0.0, 20.0, 40001)
-    values = model_modulation(model, f, angle_deg, radius)
-    below = np.flatnonzero(values <= modulation)
-    if below.size == 0:
-        return float("nan")
-    i = int(below[0])
-    part = (values[i - 1] - modulation) / (values[i - 1] - values[i])
-    return float(f[i - 1] + part * (f[i] - f[i - 1]))
+    return MtfCurve(f, model_modulation(model, f, angle_deg, radius)).falls_to(modulation)
 
 
 def line_spread(model: ImageModel, offsets: _Array, angle_deg: float = 0.0, radius: float = 0.0) -> _Array:
