@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from photoplan.adjustment.linear import Decomposed
 
@@ -102,3 +102,11 @@ def levenberg(
         if damping > MOST_DAMPING or (small and damping <= FIRST_DAMPING):
             break
     return now
+
+
+def by_differences(values: Callable[[_Floats], _Floats], at: _Floats, step: ArrayLike) -> _Floats:
+    """Derivatives of values (n,) by unknowns (u,), shape (n, u): central differences with a step, or one for each."""
+    steps = np.broadcast_to(np.asarray(step, float), at.shape)
+    ends = [(values(at + move), values(at - move)) for move in np.diag(steps)]
+    found = [(up - down) / (2.0 * h) for (up, down), h in zip(ends, steps)]
+    return np.stack(found, axis=-1) if found else np.empty((len(values(at)), 0))

@@ -15,6 +15,7 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io.chromatic_file import read_chromatic, write_chromatic
 from photoplan.io.raster import RasterReader
+from photoplan.plain import pick, plain
 from photoplan.project.align import AlignStep
 from photoplan.project.stepped import SteppedReader
 from photoplan.quality.colour.discs import DiscSettings, disc_displacements, find_discs
@@ -200,18 +201,9 @@ def load_chromatic(path: Path) -> ChromaticModel:
     """
     entries = read_chromatic(path)
     try:
-        bands = tuple(
-            BandModel(
-                each.band,
-                each.terms,
-                each.sigmas,
-                each.kind,
-                float("nan") if each.residual is None else each.residual,
-                each.count,
-                each.rejected,
-            )
-            for each in entries.bands
-        )
+        nan = float("nan")
+        stated = [{**dict(each), "residual": nan if each.residual is None else each.residual} for each in entries.bands]
+        bands = tuple(BandModel(**each) for each in stated)
         return ChromaticModel(entries.image_size, entries.reference, bands, entries.description)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -219,45 +211,25 @@ def load_chromatic(path: Path) -> ChromaticModel:
 
 def save_chromatic(path: Path, model: ChromaticModel) -> None:
     """Write a model; raises as `photoplan.io.disk.write_atomically`."""
-    contents = {"image_size": model.size, "reference": model.reference, "description": model.description}
-    bands = [
-        {
-            "band": band.band,
-            "kind": band.kind,
-            "terms": band.terms,
-            "sigmas": band.sigmas,
-            "residual": band.residual,
-            "count": band.count,
-            "rejected": band.rejected,
-        }
-        for band in model.bands
-    ]
-    write_chromatic(path, contents, bands)
+    contents = {"image_size": model.size, **pick(model, "reference", "description")}
+    keys = ("band", "kind", "terms", "sigmas", "residual", "count", "rejected")
+    write_chromatic(path, contents, [pick(band, *keys) for band in model.bands])
 
 
 def model_figures(model: ChromaticModel) -> dict[str, Any]:
     """A model as plain values for JSON and records."""
-    return {
-        "description": model.description,
-        "reference": model.reference,
-        "image_size": list(model.size),
-        "bands": [
-            {
-                "band": band.band,
-                "kind": band.kind,
-                "shift": [float(d.item()) for d in _middle(model, band.band)],
-                "corner": model.corner(band.band),
-                "largest": model.largest(band.band),
-                "residual": band.residual if np.isfinite(band.residual) else None,
-                "count": band.count,
-                "rejected": band.rejected,
-                "terms": [list(term) for term in band.terms],
-                "sigmas": [list(pair) for pair in band.sigmas],
-                "tried": [{"kind": t.kind, "unknowns": t.unknowns, "predicted": t.predicted} for t in band.trials],
-            }
-            for band in model.bands
-        ],
-    }
+    keys = ("band", "kind", "residual", "count", "rejected", "terms", "sigmas")
+    bands = [
+        {
+            **pick(band, *keys, tried="trials"),
+            "shift": _middle(model, band.band),
+            "corner": model.corner(band.band),
+            "largest": model.largest(band.band),
+        }
+        for band in model.bands
+    ]
+    found: dict[str, Any] = plain({**pick(model, "description", "reference", image_size="size"), "bands": bands})
+    return found
 
 
 def model_lines(model: ChromaticModel) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,23 +25,12 @@ _CANDIDATES = 80
 _KNOWN = 0.5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Approach:
     """y(t) = end + (start − end) · exp(−t / τ), with t counted from the first value."""
 
     mean: float
     """Weighted mean of all values."""
-    start: float | None
-    """Value at the first time; None: no significant change."""
-    end: float | None
-    """Value that is approached; None: no significant change, or the series ends too early to know it."""
-    change: float | None
-    """End minus start."""
-    sigma_change: float | None
-    time_constant: float | None
-    """τ in the unit of the times; None: not determined, see `verdict`."""
-    sigma_time_constant: float | None
-    sigma_end: float | None
     rms: float
     """Standard deviation of one value of unit weight about the curve (about the mean, if there is no change)."""
     probability: float
@@ -49,6 +38,17 @@ class Approach:
     redundancy: int
     verdict: str
     """What is known and what is not, in words."""
+    start: float | None = None
+    """Value at the first time; None: no significant change."""
+    end: float | None = None
+    """Value that is approached; None: no significant change, or the series ends too early to know it."""
+    change: float | None = None
+    """End minus start."""
+    sigma_change: float | None = None
+    time_constant: float | None = None
+    """τ in the unit of the times; None: not determined, see `verdict`."""
+    sigma_time_constant: float | None = None
+    sigma_end: float | None = None
 
     @property
     def significant(self) -> bool:
@@ -123,54 +123,25 @@ def fit_approach(times: Array, values: Array, sigma: Array | None = None, what: 
     start, end, tau, rss1 = _refined(t, y, w, taus, best)
     probability = _probability(rss0, rss1, n, taus)
     if probability >= LEVEL:
-        verdict = "no significant change"
         rms = math.sqrt(rss0 / (n - 1))
-        return Approach(
-            mean=mean,
-            start=None,
-            end=None,
-            change=None,
-            sigma_change=None,
-            time_constant=None,
-            sigma_time_constant=None,
-            sigma_end=None,
-            rms=rms,
-            probability=probability,
-            redundancy=n - 1,
-            verdict=verdict,
-        )
+        verdict = "no significant change"
+        return Approach(mean=mean, rms=rms, probability=probability, redundancy=n - 1, verdict=verdict)
     rms = math.sqrt(rss1 / (n - 3))
     sigmas = _sigmas(t, w, (start, end, tau), rms)
     verdict = _verdict(t, tau, sigmas[2], (abs(end - start), sigmas[3]))
+    seen = Approach(mean=mean, rms=rms, probability=probability, redundancy=n - 3, verdict=verdict)
     if verdict.startswith("the series"):  # its end is not seen
-        return Approach(
-            mean=mean,
-            start=start,
-            end=None,
-            change=None,
-            sigma_change=None,
-            time_constant=None,
-            sigma_time_constant=None,
-            sigma_end=None,
-            rms=rms,
-            probability=probability,
-            redundancy=n - 3,
-            verdict=verdict,
-        )
-    known = not verdict.startswith("the change")
-    return Approach(
-        mean=mean,
-        start=start if known else None,
-        end=end,
-        change=end - start if known else None,
-        sigma_change=sigmas[3] if known else None,
-        time_constant=tau if known else None,
-        sigma_time_constant=sigmas[2] if known else None,
-        sigma_end=sigmas[1],
-        rms=rms,
-        probability=probability,
-        redundancy=n - 3,
-        verdict=verdict,
+        return replace(seen, start=start)
+    seen = replace(seen, end=end, sigma_end=sigmas[1])
+    if verdict.startswith("the change"):  # neither are its size and time
+        return seen
+    return replace(
+        seen,
+        start=start,
+        change=end - start,
+        sigma_change=sigmas[3],
+        time_constant=tau,
+        sigma_time_constant=sigmas[2],
     )
 
 

@@ -6,13 +6,14 @@ A pixel is compared with the median of its surroundings; what counts as noise is
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import sqrt
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
+from scipy import ndimage, special
 
 from photoplan.adjustment.robust import spread
 from photoplan.errors import InputError
@@ -23,6 +24,8 @@ Kind = Literal["hot", "dark", "blinking", "row", "column"]
 _ALARMS = 0.01
 #: Defects that are listed at most.
 MOST = 5000
+#: Lines to each side with whose running median a line is compared.
+_REACH = 8
 #: Side of the smallest image in which a pixel has surroundings.
 LEAST_SIDE = 16
 
@@ -126,14 +129,22 @@ def find_defects(
         found |= deviation > limit
     if "dark" in kinds:
         found |= deviation < -limit
-    rows, cols = np.nonzero(found)
-    ratio = np.abs(deviation[rows, cols]) / limit[rows, cols]
-    order = np.argsort(-ratio, kind="stable")[:MOST]
-    listed = tuple(
-        Defect("hot" if deviation[r, c] > 0 else "dark", float(c), float(r), float(deviation[r, c]), float(q))
-        for r, c, q in zip(rows[order], cols[order], ratio[order])
+    listed = _strongest(
+        found, lambda r, c: "hot" if deviation[r, c] > 0 else "dark", deviation, np.abs(deviation) / limit
     )
     return DefectList(listed, int(found.sum()), float(np.nanmedian(limit)), scatter, deviation)
+
+
+def _strongest(
+    found: NDArray[np.bool_], kind: Callable[[int, int], Kind], value: NDArray[np.float64], ratio: NDArray[np.float64]
+) -> tuple[Defect, ...]:
+    """The pixels that were found, by how far they are beyond the threshold."""
+    rows, cols = np.nonzero(found)
+    order = np.argsort(-ratio[rows, cols], kind="stable")[:MOST]
+    return tuple(
+        Defect(kind=kind(r, c), col=float(c), row=float(r), value=float(value[r, c]), ratio=float(ratio[r, c]))
+        for r, c in zip(rows[order], cols[order])
+    )
 
 
 def find_blinking(variance: NDArray[np.float64], frames: int, step: float = 1.0) -> DefectList:
@@ -162,14 +173,9 @@ def find_blinking(variance: NDArray[np.float64], frames: int, step: float = 1.0)
     usual = max(usual, float(np.nanmean(np.minimum(variance, 16 * usual))))
     # Shot noise differs from pixel to pixel with its light, so the limit is taken generously.
     limit = 1.5 * usual * float(special.chdtri(frames - 1, _ALARMS / np.isfinite(variance).sum())) / (frames - 1)
-    rows, cols = np.nonzero(variance > limit)
-    sigma = np.sqrt(variance[rows, cols])
-    order = np.argsort(-sigma, kind="stable")[:MOST]
-    listed = tuple(
-        Defect("blinking", float(cols[k]), float(rows[k]), float(sigma[k]), float(sigma[k] / sqrt(limit)))
-        for k in order
-    )
-    return DefectList(listed, len(rows), sqrt(limit), sqrt(usual), None)
+    found, sigma = variance > limit, np.sqrt(variance)
+    listed = _strongest(found, lambda r, c: "blinking", sigma, sigma / sqrt(limit))
+    return DefectList(listed, int(found.sum()), sqrt(limit), sqrt(usual), None)
 
 
 def find_lines(mean: NDArray[np.float64], step: float = 1.0) -> DefectList:
@@ -191,7 +197,7 @@ def find_lines(mean: NDArray[np.float64], step: float = 1.0) -> DefectList:
         around = lines - profile
         most = 3 * _scatter(around, step * sqrt(1 / 12))
         mixed = profile.ravel() + 0.1 * np.nanmean(np.clip(around, -most, most), axis=axis)
-        deviation = mixed - _running_median(mixed)
+        deviation = mixed - ndimage.median_filter(mixed, 2 * min(_REACH, mixed.size - 1) + 1, mode="mirror")
         pixel = _scatter(mean - background(mean), step * sqrt(1 / 12))
         of_pixels = pixel / np.sqrt(count[seen]) + 0.02 * step
         scatter = np.maximum(_scatter(deviation, 0.0), of_pixels)
@@ -204,12 +210,6 @@ def find_lines(mean: NDArray[np.float64], step: float = 1.0) -> DefectList:
         worst_scatter = max(worst_scatter, float(np.median(scatter)))
     listed.sort(key=lambda d: -d.ratio)
     return DefectList(tuple(listed[:MOST]), len(listed), worst_limit, worst_scatter, None)
-
-
-def _running_median(profile: NDArray[np.float64], reach: int = 8) -> NDArray[np.float64]:
-    padded = np.pad(profile, min(reach, profile.size - 1), mode="reflect")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, padded.size - profile.size + 1)
-    return np.asarray(np.median(windows, axis=-1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from photoplan.adjustment.iterate import by_differences
 from photoplan.adjustment.robust import spread
 from photoplan.errors import GeometryError, InputError
 from photoplan.quality.camera.fall_off_adjust import (
+    CONSTANT,
+    POINT,
     FallOffFit,
     FallOffSettings,
     adjust,
-    columns,
+    design,
+    moved,
     separability,
     significant,
     weakest,
 )
 from photoplan.quality.camera.fall_off_blocks import Blocks, to_blocks
-from photoplan.quality.camera.fall_off_model import FallOffModel, half_diagonal
+from photoplan.quality.camera.fall_off_model import FallOffModel
 
 Array = NDArray[np.float64]
 
@@ -146,22 +150,17 @@ def fit_fall_off(
         if rank and settings.artificial == "none":
             raise GeometryError(rank)
         if rank:
-            settings = FallOffSettings(
-                principal_point=settings.principal_point,
-                artificial=settings.artificial,
-                degree=settings.degree,
-                dark=settings.dark,
-            )
+            settings = replace(settings, natural="none", camera_constant=None, estimate_principal_point=False)
             fit = adjust(blocks, settings, terms)
     kept = significant(blocks, fit)
-    if kept != fit.terms:
+    if kept != fit.model.terms:
         fit = adjust(blocks, settings, kept, fit.weights)
     while (weak := weakest(fit)) is not None:
-        fit = adjust(blocks, settings, tuple(term for term in fit.terms if term != weak), fit.weights)
-    symmetric = fit.camera_constant is not None or any(m == 0 for _, m in fit.terms)
+        fit = adjust(blocks, settings, tuple(term for term in fit.model.terms if term != weak), fit.weights)
+    symmetric = fit.model.camera_constant is not None or any(m == 0 for _, m in fit.model.terms)
     # No fall-off was seen: how well that is known, a term of it says.
-    judged = fit if symmetric else adjust(blocks, settings, ((2, 0), *fit.terms), fit.weights)
-    found = _result(blocks, settings, fit, _corner_sigmas(judged, blocks.size), (rank, shares))
+    judged = fit if symmetric else adjust(blocks, settings, ((2, 0), *fit.model.terms), fit.weights)
+    found = _result(blocks, fit, _corner_sigmas(judged), (rank, shares))
     # A surface that is not general leaves asymmetry too; only the general one can say that nothing smooth fits.
     general = settings.artificial == "surface"
     if general and found.residual_rms > _UNEVEN and found.neighbour_correlation > _STRUCTURE:
@@ -197,7 +196,7 @@ def _rank(fit: FallOffFit, shares: dict[str, float], settings: FallOffSettings) 
     sigmas = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
     lost = [
         f"{name} ({100 * (1 - share**2):.2f} % of what it changes, the other unknowns can do as well; its standard "
-        f"deviation would be {100 * sigma:.0f} % of {'it' if name == 'camera constant' else 'half the diagonal'})"
+        f"deviation would be {100 * sigma:.0f} % of {'it' if name == CONSTANT else 'half the diagonal'})"
         for (name, share), sigma in zip(shares.items(), sigmas)
         if share < SEPARABLE or not sigma < _KNOWN
     ]
@@ -211,40 +210,37 @@ def _rank(fit: FallOffFit, shares: dict[str, float], settings: FallOffSettings) 
     )
 
 
-def _result(
-    blocks: Blocks, settings: FallOffSettings, fit: FallOffFit, of_corners: Array, rank: tuple[str, dict[str, float]]
-) -> FallOff:
-    k, level = len(fit.free), float(fit.linear[0])
-    factors = fit.linear[1:] / level
-    c, unit = fit.camera_constant, half_diagonal(blocks.size)
-    model = FallOffModel(blocks.size, fit.point, c, fit.terms, tuple(float(f) for f in factors), settings.dark)
-    C = fit.covariance
+def _result(blocks: Blocks, fit: FallOffFit, of_corners: Array, rank: tuple[str, dict[str, float]]) -> FallOff:
+    k, level, C, model = len(fit.free), float(fit.linear[0]), fit.covariance, fit.model
+    factors, c = np.array(model.coefficients), model.camera_constant
     # a_k = (level · a_k) / level
     L = np.column_stack([-factors / level, np.eye(len(factors)) / level])
     sigmas = np.sqrt(np.maximum(np.diag(L @ C[k:, k:] @ L.T), 0.0))
     free = {name: math.sqrt(max(float(C[i, i]), 0.0)) for i, name in enumerate(fit.free)}
-    constant = free.get("camera constant")
-    across, down = (free.get(f"{side} of the principal point") for side in ("column", "row"))
-    computed = columns(blocks, fit.point, c, fit.terms) @ fit.linear
-    relative = blocks.spread_out(fit.residuals / computed)
-    clean = fit.weights > 0.0
+    constant = free.get(CONSTANT)
+    across, down = (free.get(name) for name in POINT)
+    unit = model.half_diagonal
+    computed = design(blocks, model) @ fit.linear
+    relative, clean = fit.residuals / computed, fit.weights > 0.0
+    field = blocks.spread_out(relative)
     return FallOff(
-        model,
-        level,
-        math.sqrt(float(C[k, k])),
-        tuple(Term(n, m, float(f), float(s)) for (n, m), f, s in zip(fit.terms, factors, sigmas)),
-        c,
-        None if constant is None or c is None else constant * c,
-        None if across is None or down is None else (across * unit, down * unit),
-        _corners(model, of_corners, blocks.size),
-        *rank,
-        float(np.sqrt(np.mean((fit.residuals / computed)[clean] ** 2))),
-        float(np.abs((fit.residuals / computed)[clean]).max()),
-        blocks.neighbour_correlation(np.where(clean, fit.residuals, np.nan)),
-        float(np.ptp(computed)) / level,
-        _dirt(blocks, blocks.spread_out(fit.residuals), relative),
-        blocks,
-        relative,
+        model=model,
+        level=level,
+        sigma_level=math.sqrt(float(C[k, k])),
+        terms=tuple(Term(n, m, float(f), float(s)) for (n, m), f, s in zip(model.terms, factors, sigmas)),
+        camera_constant=c,
+        sigma_camera_constant=None if constant is None or c is None else constant * c,
+        sigma_principal_point=None if across is None or down is None else (across * unit, down * unit),
+        corners=_corners(model, of_corners),
+        rank=rank[0],
+        separability=rank[1],
+        residual_rms=float(np.sqrt(np.mean(relative[clean] ** 2))),
+        residual_largest=float(np.abs(relative[clean]).max()),
+        neighbour_correlation=blocks.neighbour_correlation(np.where(clean, fit.residuals, np.nan)),
+        range_before=float(np.ptp(computed)) / level,
+        dirt=_dirt(blocks, blocks.spread_out(fit.residuals), field),
+        blocks=blocks,
+        residuals=field,
     )
 
 
@@ -254,46 +250,29 @@ def _corner_places(size: tuple[int, int]) -> tuple[Array, Array]:
     return np.array([0.0, right, 0.0, right]), np.array([0.0, 0.0, lower, lower])
 
 
-def _corner_sigmas(fit: FallOffFit, size: tuple[int, int]) -> Array:
+def _corner_sigmas(fit: FallOffFit) -> Array:
     """Standard deviations of the brightness in the corners, by differences."""
-    x, y = _corner_places(size)
-    unit, k = half_diagonal(size), len(fit.free)
-    linear = fit.linear
+    x, y = _corner_places(fit.model.size)
+    k, linear = len(fit.free), fit.linear
 
-    def relative(free: Array, coefficients: Array) -> Array:
-        point, c = list(fit.point), fit.camera_constant
-        for name, value in zip(fit.free, free):
-            if name == "camera constant":
-                c = c * math.exp(value) if c is not None else None
-            else:
-                point[0 if name.startswith("column") else 1] += value * unit
-        factors = tuple(float(v) for v in coefficients[1:] / coefficients[0])
-        return FallOffModel(size, (point[0], point[1]), c, fit.terms, factors).relative(x, y)
+    def relative(unknowns: Array) -> Array:
+        model = moved(fit.model, fit.free, unknowns[:k])
+        return replace(model, coefficients=tuple(unknowns[k + 1 :] / unknowns[k])).relative(x, y)
 
-    J = np.empty((4, k + len(linear)))
-    for i in range(J.shape[1]):
-        step = np.zeros(J.shape[1])
-        step[i] = 1e-5 if i < k else 1e-5 * abs(linear[0])
-        ends = [relative(s * step[:k], linear + s * step[k:]) for s in (1.0, -1.0)]
-        J[:, i] = (ends[0] - ends[1]) / (2.0 * step[i])
+    steps = np.repeat([1e-5, 1e-5 * abs(linear[0])], [k, len(linear)])
+    J = by_differences(relative, np.concatenate([np.zeros(k), linear]), steps)
     return np.asarray(np.sqrt(np.maximum(np.diag(J @ fit.covariance @ J.T), 0.0)))
 
 
-def _corners(model: FallOffModel, sigmas: Array, size: tuple[int, int]) -> tuple[Corner, ...]:
+def _corners(model: FallOffModel, sigmas: Array) -> tuple[Corner, ...]:
     """Fall-off in the centres of the four corner pixels."""
     names = ("upper left", "upper right", "lower left", "lower right")
-    x, y = _corner_places(size)
+    places = _corner_places(model.size)
     apart = model.camera_constant is not None
-    natural, artificial = model.natural(x, y), model.artificial(x, y)
+    parts = zip(names, sigmas, model.natural(*places), model.artificial(*places))
     return tuple(
-        Corner(
-            names[i],
-            float(1.0 - natural[i] * artificial[i]),
-            float(sigmas[i]),
-            float(1.0 - natural[i]) if apart else None,
-            float(1.0 - artificial[i]) if apart else None,
-        )
-        for i in range(4)
+        Corner(n, float(1.0 - a * b), float(s), *((float(1.0 - a), float(1.0 - b)) if apart else (None, None)))
+        for n, s, a, b in parts
     )
 
 

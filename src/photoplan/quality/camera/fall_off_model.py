@@ -59,7 +59,7 @@ class FallOffModel:
     @property
     def half_diagonal(self) -> float:
         """The unit of the radius, pixels."""
-        return half_diagonal(self.size)
+        return math.hypot(*self.size) / 2.0
 
     def natural(self, x: Array, y: Array) -> Array:
         """cos⁴ω at columns and rows; 1 where there is no natural part."""
@@ -81,11 +81,6 @@ class FallOffModel:
     def relative(self, x: Array, y: Array) -> Array:
         """Brightness at columns and rows, 1 at the principal point."""
         return self.natural(x, y) * self.artificial(x, y)
-
-
-def half_diagonal(size: tuple[int, int]) -> float:
-    """Half the diagonal of an image, pixels."""
-    return math.hypot(*size) / 2.0
 
 
 def term_values(u: Array, v: Array, term: tuple[int, int]) -> Array:

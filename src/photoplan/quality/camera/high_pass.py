@@ -72,11 +72,8 @@ def background(image: NDArray[Any]) -> NDArray[np.float64]:
             tuple(ndimage.distance_transform_edt(np.isnan(medians), return_distances=False, return_indices=True))
         ]
     middle_y, middle_x = (y[:-1] + y[1:] - 1) / 2, (x[:-1] + x[1:] - 1) / 2
-    at_y = np.interp(np.arange(height), middle_y, np.arange(rows))
-    at_x = np.interp(np.arange(width), middle_x, np.arange(cols))
-    low_y, low_x = np.minimum(at_y.astype(int), max(rows - 2, 0)), np.minimum(at_x.astype(int), max(cols - 2, 0))
-    high_y, high_x = np.minimum(low_y + 1, rows - 1), np.minimum(low_x + 1, cols - 1)
-    fy, fx = (at_y - low_y)[:, None], (at_x - low_x)[None, :]
-    upper = medians[np.ix_(low_y, low_x)] * (1 - fx) + medians[np.ix_(low_y, high_x)] * fx
-    lower = medians[np.ix_(high_y, low_x)] * (1 - fx) + medians[np.ix_(high_y, high_x)] * fx
-    return np.asarray(upper * (1 - fy) + lower * fy)
+    along = np.array([np.interp(np.arange(width), middle_x, row) for row in medians])
+    at = np.interp(np.arange(height), middle_y, np.arange(rows))
+    low = np.minimum(at.astype(int), max(rows - 2, 0))
+    part = (at - low)[:, None]
+    return np.asarray(along[low] * (1 - part) + along[np.minimum(low + 1, rows - 1)] * part)

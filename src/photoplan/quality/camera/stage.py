@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.adjustment.chances import chance_f, chance_gain
+from photoplan.adjustment.iterate import by_differences
 from photoplan.adjustment.linear import Fit, solve
 from photoplan.cameras.affine_facts import AffineFacts, affine_facts
 from photoplan.cameras.plane import Affine2D
@@ -177,20 +178,20 @@ def _worst(fit: Fit, used: NDArray[np.bool_]) -> int | None:
 def _sigmas(forward: Affine2D, covariance: Array) -> tuple[tuple[float, float], tuple[float, float], float]:
     """Of pixel sizes, directions and shear, by differences."""
     start = np.array([forward.a1, forward.a2, forward.a3, forward.a4, forward.a5, forward.a6])
-    size = float(np.abs(start[[0, 1, 3, 4]]).max())
-    J = np.zeros((5, 6))
-    for k in (0, 1, 3, 4):
-        ends = []
-        for sign in (1.0, -1.0):
-            moved = start.copy()
-            moved[k] += sign * _STEP * size
-            f = affine_facts(Affine2D(*(float(v) for v in moved)))
-            ends.append((*f.pixel_size, f.direction_x, f.direction_y, f.shear))
-        difference = np.array(ends[0]) - np.array(ends[1])
-        difference[2:] = [math.remainder(a, math.tau) for a in difference[2:]]
-        J[:, k] = difference / (2.0 * _STEP * size)
+
+    def figures(elements: Array) -> Array:
+        f = affine_facts(Affine2D(*(float(v) for v in elements)))
+        # Next to their values, whose turn does not matter, angles have no jump.
+        near = [math.remainder(a - b, math.tau) for a, b in zip(_angles(f), _angles(affine_facts(forward)))]
+        return np.array([*f.pixel_size, *near])
+
+    J = by_differences(figures, start, _STEP * float(np.abs(start[[0, 1, 3, 4]]).max()))
     s = [math.sqrt(max(float(v), 0.0)) for v in np.diag(J @ covariance @ J.T)]
     return (s[0], s[1]), (s[2], s[3]), s[4]
+
+
+def _angles(facts: AffineFacts) -> tuple[float, float, float]:
+    return facts.direction_x, facts.direction_y, facts.shear
 
 
 def _systematic(S: Array, residuals: Array) -> float | None:

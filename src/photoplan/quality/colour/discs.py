@@ -140,7 +140,7 @@ def _spots(even: _Array, settings: DiscSettings) -> Iterator[tuple[float, float,
     picture = even if dark else -even
     disc = np.percentile(picture, 1)
     side = max(16, min(picture.shape) // 4)
-    ground = ndimage.zoom(_blocks(picture, side), 1.0, order=0)
+    ground = _blocks(picture, side)
     rows = np.minimum(np.arange(picture.shape[0]) // side, ground.shape[0] - 1)
     columns = np.minimum(np.arange(picture.shape[1]) // side, ground.shape[1] - 1)
     level = ndimage.uniform_filter(ground[rows[:, None], columns[None, :]], side)
@@ -181,14 +181,13 @@ def _located(
     """The disc at a place, or why it is none."""
     x0, y0, radius = start
     reach = _REACH * radius + 2.0
-    top, left = int(np.floor(y0 - reach)), int(np.floor(x0 - reach))
-    bottom, right = int(np.ceil(y0 + reach)) + 1, int(np.ceil(x0 + reach)) + 1
-    if y0 - radius - 2.0 < 0 or x0 - radius - 2.0 < 0:
+    if any(at - radius < 2.0 or at + radius > side - 3.0 for at, side in zip((y0, x0), values.shape)):
         return "too near the border"
-    if y0 + radius + 2.0 > values.shape[0] - 1 or x0 + radius + 2.0 > values.shape[1] - 1:
-        return "too near the border"
-    part = (slice(max(top, 0), bottom), slice(max(left, 0), right))
-    y, x = np.mgrid[part[0].start : min(bottom, values.shape[0]), part[1].start : min(right, values.shape[1])]
+    part = tuple(
+        slice(max(int(np.floor(at - reach)), 0), min(int(np.ceil(at + reach)) + 1, side))
+        for at, side in zip((y0, x0), values.shape)
+    )
+    y, x = np.mgrid[part]
     near = (np.hypot(x - x0, y - y0) <= reach) & (planes[part] >= 0)
     grey, number = values[part][near], planes[part][near]
     if np.isinf(grey).any():
@@ -329,14 +328,14 @@ def disc_displacements(reference: Sequence[Disc], band: Sequence[Disc], farthest
             f"{len(pairs)} discs are the same in both bands (of {len(here)} and {len(there)}, up to {farthest:.1f} "
             "pixels apart); at least 4 are needed"
         )
-    place, direction, value, sigma, group = [], [], [], [], []
-    for number, (i, k) in enumerate(pairs):
-        a, b = reference[i], band[k]
-        spreads = (np.hypot(a.sigma_x, b.sigma_x), np.hypot(a.sigma_y, b.sigma_y))
-        for axis, (difference, spread) in enumerate(zip((b.x - a.x, b.y - a.y), spreads)):
-            place.append((a.x, a.y))
-            direction.append((1.0, 0.0) if axis == 0 else (0.0, 1.0))
-            value.append(difference)
-            sigma.append(float(np.hypot(spread, _FLOOR)))
-            group.append(number)
-    return Displacements(np.array(place), np.array(direction), np.array(value), np.array(sigma), np.array(group))
+    both = [(reference[i], band[k]) for i, k in pairs]
+    value = np.array([(b.x - a.x, b.y - a.y) for a, b in both])
+    spreads = np.array([(np.hypot(a.sigma_x, b.sigma_x), np.hypot(a.sigma_y, b.sigma_y)) for a, b in both])
+    n = len(pairs)
+    return Displacements(
+        place=np.repeat([(a.x, a.y) for a, _ in both], 2, axis=0),
+        direction=np.tile(np.eye(2), (n, 1)),
+        value=value.ravel(),
+        sigma=np.hypot(spreads, _FLOOR).ravel(),
+        group=np.repeat(np.arange(n), 2),
+    )
