@@ -5,8 +5,14 @@ Points of the wanted classes are mass points; points that the file flags as with
 
 from __future__ import annotations
 
+import importlib.util
+import os
+import pickle
 import struct
+import subprocess
+import sys
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +24,17 @@ from photoplan.geometry.crs import canonical_crs, parse_crs, split_compound
 from photoplan.io.terrain.options import ReadOptions
 from photoplan.surfaces.measured import MeasuredTerrain, PointGroup
 
+try:
+    import resource
+except ImportError:  # Windows has no such limits.
+    resource = None  # type: ignore[assignment]
+
 CHUNK = 1_000_000
 """Points that are decoded at once."""
+ROOM = 2 << 30
+"""Memory in bytes that decoding may take besides its points: libraries, and what they hold of the file."""
+KEPT = 32
+"""Bytes of a point that is kept: three coordinates and its number."""
 GROUND = 2
 MAX_RATIO = 250.0
 """Decoded bytes per stored byte of a LAZ file; real ones stay below 50."""
@@ -42,11 +57,15 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
     InputError
         The file is damaged, promises more points than it can hold, or holds none of the wanted classes.
     """
-    try:
-        import laspy  # type: ignore[import-untyped]  # noqa: PLC0415  # an optional package
-    except ImportError:
-        raise UsageError(f"{path}: LAS and LAZ need laspy; install it with `pip install 'photoplan[points]'`") from None
-    promised = _check_header(path)
+    if importlib.util.find_spec("laspy") is None:
+        raise UsageError(f"{path}: LAS and LAZ need laspy; install it with `pip install 'photoplan[points]'`")
+    head = _check_header(path)
+    return _decoded_apart(path, options, head) if head.packed else _decoded(path, options, head)
+
+
+def _decoded(path: Path, options: ReadOptions, head: _Header) -> MeasuredTerrain:
+    import laspy  # type: ignore[import-untyped]  # noqa: PLC0415  # an optional package
+
     try:
         with laspy.open(path) as file:
             header = file.header
@@ -61,16 +80,70 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
         # Damaged files come out of the decoders as many kinds of errors, panics of lazrs (no Exception) among them.
         if isinstance(error, KeyboardInterrupt | SystemExit):
             raise
-        raise InputError(
-            f"{path}: cannot be read ({' '.join(str(error).split())[:200] or type(error).__name__}); "
-            f"the header promises {promised} points: the file is damaged or cut off, get a fresh copy"
-        ) from None
+        raise _unreadable(path, head, " ".join(str(error).split())[:200] or type(error).__name__) from None
     group = PointGroup(path.name, "mass", xyz, records)
     return MeasuredTerrain((group,), (), crs, heights, files=(path,), notes=tuple(notes))
 
 
-def _check_header(path: Path) -> int:
-    """Number of points, after the header's promises were compared with the size of the file."""
+def _unreadable(path: Path, head: _Header, cause: str) -> InputError:
+    return InputError(
+        f"{path}: cannot be read ({cause}); the header promises {head.count} points: the file is damaged or cut off, "
+        "get a fresh copy"
+    )
+
+
+def _decoded_apart(path: Path, options: ReadOptions, head: _Header) -> MeasuredTerrain:
+    """The same in a process of its own with bounded memory.
+
+    A decoder of damaged data may ask for any amount of memory and end the process that it runs in.
+    """
+    command = [sys.executable, "-c", "from photoplan.io.terrain import las; las.decode_from_stdin()"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    pipe, nowhere = subprocess.PIPE, subprocess.DEVNULL
+    with subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, stderr=nowhere) as child:
+        assert child.stdin is not None and child.stdout is not None
+        try:
+            pickle.dump((path, options, head), child.stdin)
+            child.stdin.close()
+            found = pickle.load(child.stdout)
+        except (EOFError, pickle.UnpicklingError, BrokenPipeError):
+            raise _unreadable(path, head, "its decoder ended abnormally") from None
+        except BaseException:
+            child.kill()
+            raise
+    if isinstance(found, BaseException):
+        raise found
+    assert isinstance(found, MeasuredTerrain)
+    return found
+
+
+def decode_from_stdin() -> None:
+    """What the process of `_decoded_apart` does: a request from stdin, the points or the refusal to stdout."""
+    path, options, head = pickle.load(sys.stdin.buffer)
+    if resource is not None:
+        limit = ROOM + head.count * (head.record + 2 * KEPT)
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    found: MeasuredTerrain | Exception
+    try:
+        found = _decoded(path, options, head)
+    except Exception as error:
+        found = error
+    pickle.dump(found, sys.stdout.buffer, pickle.HIGHEST_PROTOCOL)
+
+
+@dataclass(frozen=True)
+class _Header:
+    """What the header promises."""
+
+    count: int
+    record: int
+    """Bytes of a point."""
+    packed: bool
+
+
+def _check_header(path: Path) -> _Header:
+    """What the header promises, after it was compared with the size of the file."""
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(375)
@@ -103,7 +176,7 @@ def _check_header(path: Path) -> int:
             f"{path}: promises {decoded / (1 << 30):.1f} GiB of points, {decoded / max(stored, 1):.0f} times what is "
             f"stored (limit {MAX_RATIO:.0f}); a file that is trusted can be stored again without compression"
         )
-    return int(count)
+    return _Header(int(count), int(record), packed)
 
 
 def _points(path: Path, file: Any, options: ReadOptions) -> tuple[NDArray[np.float64], NDArray[np.int64], list[str]]:
