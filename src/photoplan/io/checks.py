@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from photoplan.errors import InputError
+from photoplan.io.appearance import looks_like
 
 _GIB = 1 << 30
 
@@ -130,7 +131,9 @@ def raster_driver(path: Path) -> str:
             f"{path}: the content is an XML document (a virtual raster or a network source), whatever the name says; "
             f"it is not followed. Make a plain copy of it with `gdal_translate` and give that ({known})"
         )
-    raise InputError(f"{path}: not a raster that is read here; allowed are {known}. Convert it with `gdal_translate`")
+    raise InputError(
+        f"{path}: not a raster that is read here; allowed are {known}, others after `gdal_translate`{looks_like(path)}"
+    )
 
 
 def check_sidecars(path: Path) -> None:

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ValidationError
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
+from photoplan.io.appearance import looks_like
 from photoplan.io.project.errors import explain
 
 #: Levels of nesting that any of our formats could need.
@@ -42,14 +43,26 @@ def read_text(path: Path, max_bytes: int) -> str:
             )
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    return decoded_text(path, raw)
+
+
+def decoded_text(path: Path, raw: bytes, first_line: int = 1) -> str:
+    """UTF-8 text with plain line ends; `raw` begins with the file's line `first_line`.
+
+    Raises
+    ------
+    InputError
+        It is not UTF-8, or holds a zero byte; the message names the line and what the file looks like.
+    """
     try:
-        text = raw.decode("utf-8-sig")
+        text = raw.decode("utf-8-sig" if first_line == 1 else "utf-8")
+        at, wrong = text.find("\0"), "holds a zero byte; this is not a text file"
+        before = text[: max(at, 0)].count("\n")
     except UnicodeDecodeError as error:
-        line = raw[: error.start].count(b"\n") + 1
-        raise InputError(f"{path}:{line}: not UTF-8 (byte {raw[error.start]:#04x}); save the file as UTF-8") from None
-    if "\0" in text:
-        line = text[: text.index("\0")].count("\n") + 1
-        raise InputError(f"{path}:{line}: holds a zero byte; this is not a text file")
+        at, wrong = error.start, f"not UTF-8 (byte {raw[error.start]:#04x}); save the file as UTF-8"
+        before = raw[:at].count(b"\n")
+    if at >= 0:
+        raise InputError(f"{path}:{first_line + before}: {wrong}{looks_like(path)}")
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 

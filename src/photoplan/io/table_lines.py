@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from photoplan.errors import InputError
+from photoplan.io.plain_files import decoded_text
 
 #: In the order in which they are tried.
 DELIMITERS = (";", "\t", ",", " ")
@@ -120,19 +121,7 @@ def line_blocks(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def _lines(path: Path, number: int, raw: bytes) -> list[str]:
-    if number == 1:
-        raw = raw.removeprefix(b"\xef\xbb\xbf")
-    try:
-        text = raw.decode("utf-8")
-    except UnicodeDecodeError as error:
-        at = number + raw[: error.start].count(b"\n")
-        raise InputError(f"{path}:{at}: not UTF-8 (byte {raw[error.start]:#04x}); save the file as UTF-8") from None
-    if "\0" in text:
-        at = number + text[: text.index("\0")].count("\n")
-        raise InputError(f"{path}:{at}: holds a zero byte; this is not a text file")
-    if "\r" in text:
-        text = text.replace("\r\n", "\n").replace("\r", "\n")
-    lines = text.split("\n")
+    lines = decoded_text(path, raw, number).split("\n")
     if not lines[-1]:
         lines.pop()
     return lines

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
+from photoplan.io.appearance import looks_like
 from photoplan.io.disk import disk_error, write_atomically
 from photoplan.io.table_lines import DELIMITERS, NOTHING, Line, decimal, line_blocks, number, split_line
 
@@ -282,7 +283,7 @@ def _delimiter(path: Path, data: Sequence[Line], columns: Columns, dialect: Dial
     line, text = data[0]
     raise InputError(
         f"{path}:{line}: {text.strip()[:80]!r} has fewer than {least} columns by comma, semicolon, tab or space; "
-        f"needed are {', '.join(columns.needed)}"
+        f"needed are {', '.join(columns.needed)}{looks_like(path)}"
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from photoplan.errors import InputError
+from photoplan.io.appearance import looks_like
 from photoplan.io.camera import opencv as camera_opencv
 from photoplan.io.camera import opensfm as camera_opensfm
 from photoplan.io.camera import pix4d as camera_pix4d
@@ -29,7 +30,7 @@ def _text(path: Path) -> dict[str, FrameEntry | FilmCamera]:
         return orientation_colmap.read_cameras(path)
     raise InputError(
         f"{path}: no camera format; of text files, COLMAP's cameras.txt and Pix4D's calibrated_camera_parameters.txt "
-        "describe cameras"
+        f"describe cameras{looks_like(path)}"
     )
 
 
@@ -76,7 +77,8 @@ def read_cameras(path: str | Path) -> CameraFile:
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in CAMERA_FORMATS:
-        raise InputError(f"{path}: no camera format has the suffix {suffix!r}; allowed are {', '.join(CAMERA_FORMATS)}")
+        known = ", ".join(CAMERA_FORMATS)
+        raise InputError(f"{path}: no camera format has the suffix {suffix!r}; allowed are {known}{looks_like(path)}")
     cameras = CAMERA_FORMATS[suffix](path)
     if not cameras:
         raise InputError(f"{path}: describes no camera")

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from photoplan.errors import InputError
+from photoplan.io.appearance import looks_like
 from photoplan.io.camera.model import FilmCamera, FrameEntry
 from photoplan.io.plain_files import build, finite, read_json
 
@@ -45,7 +46,9 @@ def cameras_of(reconstructions: Any, path: Path) -> dict[str, FrameEntry | FilmC
     if not isinstance(reconstructions, list) or not all(
         isinstance(r, dict) and isinstance(r.get("cameras"), dict) for r in reconstructions
     ):
-        raise InputError(f"{path}: neither a reconstruction.json of OpenSfM nor a cameras.json of OpenDroneMap")
+        raise InputError(
+            f"{path}: neither a reconstruction.json of OpenSfM nor a cameras.json of OpenDroneMap{looks_like(path)}"
+        )
     cameras: dict[str, FrameEntry | FilmCamera] = {}
     for reconstruction in reconstructions:
         for name, values in reconstruction["cameras"].items():

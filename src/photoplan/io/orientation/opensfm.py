@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_step
 from photoplan.geometry.earth_poses import enu_of_geodetic, geodetic_of_enu, topocentric_of_map
+from photoplan.io.appearance import looks_like
 from photoplan.io.camera.model import FilmCamera, FrameEntry
 from photoplan.io.camera.opensfm import cameras_of
 from photoplan.io.lens_forms import opencv_form, opencv_losses
@@ -133,7 +134,9 @@ def read(path: Path, form: TableFormat) -> OrientationTable:
     """
     contents = read_json(path)
     if not isinstance(contents, list) or not all(isinstance(r, dict) and "shots" in r for r in contents):
-        raise InputError(f"{path}: not a reconstruction.json of OpenSfM (a list of reconstructions with `shots`)")
+        raise InputError(
+            f"{path}: not a reconstruction.json of OpenSfM (a list of reconstructions with `shots`){looks_like(path)}"
+        )
     origins = {_origin(r, path) for r in contents}
     if len(origins) != 1:
         raise InputError(f"{path}: the reconstructions have {len(origins)} different origins; keep one reconstruction")

@@ -8,6 +8,7 @@ from typing import Any
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_label
+from photoplan.io.appearance import looks_like
 from photoplan.io.filter_file import is_filter
 from photoplan.io.plan_file import read_plan_tables
 from photoplan.io.project.file import load_project
@@ -111,9 +112,9 @@ def _record(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: no readable JSON ({error})") from None
+        raise InputError(f"{path}: no readable JSON ({error}){looks_like(path)}") from None
     if not isinstance(content, dict) or "product" not in content:
-        raise InputError(f"{path}: no run record of photoplan")
+        raise InputError(f"{path}: no run record of photoplan{looks_like(path)}")
     return {
         str(key): value if isinstance(value, (str, int, float)) else json.dumps(value) for key, value in content.items()
     }
