@@ -17,10 +17,20 @@ from numpy.typing import NDArray
 from photoplan.errors import GeometryError
 from photoplan.orientation.bundle.block import Active, Adjusted, AdjustSettings, Block, Correlation
 from photoplan.orientation.bundle.correlation import correlation_of, effects_of_rows
+from photoplan.orientation.bundle.far import along_rays, loose_points
 from photoplan.orientation.bundle.model import Model, build_model
 from photoplan.orientation.bundle.normal import check_rank, reduce_normals
 from photoplan.orientation.bundle.result import Solution, Weighted, result_of, solution_of
-from photoplan.orientation.bundle.robust import first_taken_out, robust_weights, snooped, softened, weights_of
+from photoplan.orientation.bundle.robust import (
+    first_taken_out,
+    judged_control,
+    kinds_of_measurements,
+    robust_weights,
+    scales_of,
+    snooped,
+    softened,
+    weights_of,
+)
 from photoplan.orientation.bundle.rows import linearise, residuals_of, whitened
 from photoplan.orientation.bundle.select import Selection, select, start_points
 from photoplan.orientation.bundle.unknowns import State, start_state
@@ -37,6 +47,16 @@ _ROUNDING = 1e-6
 _ROUGHLY, _LEAST = 0.5, 8
 #: Largest relative change of the sum of squares at the end.
 _SETTLED = 1e-9
+#: Damped steps are short for that reason alone. But where so many of them one after the other lower the sum of squares
+#: by less than this part of a variance each, what is left to go means nothing: an unknown that is off by its whole
+#: standard deviation makes one.
+_FLAT, _FLAT_STEPS = 1e-4, 4
+#: Points farther from the block than this, in units of its largest extent, begin anew.
+_FAR = 10.0
+#: Times that the robust start is made, each without the control that the one before has found wrong.
+_AGAIN = 3
+#: Iterations after which it is looked whether rays of points are parallel.
+_LOOK = 5
 #: Rounds of data snooping, and of variance components.
 _ROUNDS, _COMPONENTS = 8, 6
 #: Whole steps that may make things worse for once: a block that turns as a whole cannot avoid it, since the step is
@@ -68,26 +88,40 @@ def adjust_block(block: Block, settings: AdjustSettings | None = None, progress:
     settings = settings or AdjustSettings()
     loop = _Loop(settings.iterations, progress or (lambda number, rms: None))
     active = Active.all_of(block)
-    selection, XYZ, lost = _selected(block, active, frozenset())
+    alternative: tuple[str, ...] = ()
+    selection, XYZ, lost = _selected(block, active, frozenset(), wait=settings.robust)
     model = build_model(block, selection.images, selection.measured, selection.points)
     state = _started(model, XYZ)
     _check(model, state, active)
-    if settings.robust:
+    for _ in range(_AGAIN if settings.robust else 0):
         state = loop.run(model, state, weights_of(model, active), robust=True)
-        active = first_taken_out(model, state, active, settings.critical)
+        found = first_taken_out(model, state, replace(Active.all_of(block), ground=active.ground), settings.critical)
+        factors = scales_of(model, whitened(model, residuals_of(model, state)))
+        found, alternative = judged_control(model, state, found, factors, settings.critical)
+        again, active = bool((active.ground & ~found.ground).any()), found
+        if not again:
+            active = _returned(model, state, active, factors, settings.critical)
+            break
     for turn in range(_ROUNDS):
-        model, state, selection, lost = _rebuilt(block, model, state, active, lost)
-        state = loop.run(model, state, weights_of(model, active))
+        loose = frozenset() if turn == 0 else lost
+        while True:
+            model, state, selection, lost = _rebuilt(block, model, state, active, loose)
+            state, loose = loop.watched(model, state, weights_of(model, active))
+            if not loose:
+                break
+            loose |= lost
         solution = solution_of(model, state, weights_of(model, active), settings.covariance)
         if not settings.robust or turn == _ROUNDS - 1:
             break
-        next_active = snooped(model, state, solution.judged(), active, settings.critical)
+        judged = solution.judged()
+        next_active = snooped(model, state, judged, active, settings.critical)
+        next_active, alternative = judged_control(model, state, next_active, judged.scales, settings.critical)
         if next_active.equals(active):
             break
         active = next_active
     weighted = _weighted(loop, solution, active, settings)
     check_rank(model, weighted.solution.state, weighted.solution.reduced)
-    return result_of(block, selection, weighted, active, loop.count)
+    return replace(result_of(block, selection, weighted, active, loop.count), other_control=alternative)
 
 
 def _weighted(loop: _Loop, solution: Solution, active: Active, settings: AdjustSettings) -> Weighted:
@@ -113,7 +147,9 @@ def _weighted(loop: _Loop, solution: Solution, active: Active, settings: AdjustS
     return Weighted(solution, solution.factors(factors), correlations)
 
 
-def _selected(block: Block, active: Active, lost: frozenset[str]) -> tuple[Selection, _Floats, frozenset[str]]:
+def _selected(
+    block: Block, active: Active, lost: frozenset[str], wait: bool = False
+) -> tuple[Selection, _Floats, frozenset[str]]:
     """What takes part, start values of its points, and the points whose rays are parallel."""
     while True:
         selection = select(block, active, lost)
@@ -123,7 +159,7 @@ def _selected(block: Block, active: Active, lost: frozenset[str]) -> tuple[Selec
                 f"no image has enough measured points to be adjusted ({reasons or 'no measurements'}); are image "
                 "points and images of the same block?"
             )
-        XYZ, parallel = start_points(block, selection)
+        XYZ, parallel = start_points(block, selection, wait)
         if not parallel:
             return selection, XYZ, lost
         lost |= parallel
@@ -135,11 +171,11 @@ def _check(model: Model, state: State, active: Active) -> None:
 
 
 def _rebuilt(
-    block: Block, model: Model, state: State, active: Active, lost: frozenset[str]
+    block: Block, model: Model, state: State, active: Active, lost: frozenset[str], anew: bool = False
 ) -> tuple[Model, State, Selection, frozenset[str]]:
     """The model without what was taken out; unknowns keep their values, points that come back are intersected.
 
-    Rays that are left may be parallel, so that points can be lost here too.
+    Rays that are left may be parallel, so that points can be lost here too. With `anew` all points are intersected.
     """
     poses = dict(zip(model.image_names, state.poses()))
     block = replace(block, images=tuple(replace(b, pose=poses.get(b.name, b.pose)) for b in block.images))
@@ -147,8 +183,29 @@ def _rebuilt(
     made = build_model(block, selection.images, selection.measured, selection.points)
     before = {name: k for k, name in enumerate(model.point_names)}
     old = np.array([before.get(n, -1) for n in made.point_names], np.int64)
+    # What wrong rays have driven far away is intersected anew, without them.
+    middle = state.images.centers.mean(axis=0)
+    reach = _FAR * np.linalg.norm(np.concatenate([XYZ, state.images.centers]) - middle, axis=1).max()
+    old[anew | (np.linalg.norm(state.XYZ[old] - middle, axis=1) > reach)] = -1
     XYZ[old >= 0] = state.XYZ[old[old >= 0]]
     return made, state.carried(_started(made, XYZ)), selection, lost
+
+
+def _returned(model: Model, state: State, active: Active, factors: _Floats, critical: float) -> Active:
+    """Points that have lost most of their rays while orientations were poor, and that fit now that they are good."""
+    seen = model.block.observations
+    left = np.bincount(seen.point[active.image], minlength=len(seen.points))
+    few = left < np.maximum(2.0, 0.6 * np.bincount(seen.point, minlength=len(seen.points)))
+    tried = replace(active, image=active.image | few[seen.point])
+    made, started, _, parallel = _rebuilt(model.block, model, state, tried, frozenset(), anew=True)
+    scale = factors[kinds_of_measurements(made)[made.observation]]
+    e = np.abs(residuals_of(made, started).image / made.sigma).max(axis=1) / scale
+    worst = np.zeros(len(made.point_names))
+    np.maximum.at(worst, made.point, np.nan_to_num(e, nan=np.inf))
+    image = active.image.copy()
+    image[made.observation[worst[made.point] < critical]] = True
+    image |= (few & np.array([name in parallel for name in seen.points], bool))[seen.point]
+    return replace(active, image=image)
 
 
 def _started(model: Model, XYZ: _Floats) -> State:
@@ -162,13 +219,29 @@ class _Loop:
     def __init__(self, most: int, progress: Progress) -> None:
         self.count = 0
         self._most, self._progress = most, progress
+        self._watch, self._loose = False, frozenset[str]()
+
+    def watched(self, model: Model, state: State, base: _Floats) -> tuple[State, frozenset[str]]:
+        """As `run`, but stopped where the rays of points turn out to be parallel: these points are handed back."""
+        self._watch, self._loose = True, frozenset()
+        try:
+            state = self.run(model, state, base)
+        finally:
+            self._watch = False
+        if not self._loose:
+            e = whitened(model, residuals_of(model, state))
+            behind = np.flatnonzero(~np.isfinite(e[model.parts.image][::2]) & (base[model.parts.image][::2] > 0))
+            self._loose = frozenset(model.point_names[k] for k in model.point[behind])
+            rows, _ = linearise(model, state, np.sqrt(np.where(np.isfinite(e), base, 0.0)))
+            self._loose |= loose_points(model, state, rows)
+        return state, self._loose
 
     def run(self, model: Model, state: State, base: _Floats, robust: bool = False) -> State:
         """The state where the sum of squares with weights `base` (rows,) is least (Levenberg–Marquardt)."""
         if robust:
             base = base * softened(model, state)
         damping, cost = 0.0, np.inf
-        patience, best, least = _PATIENCE, state, np.inf
+        patience, best, least, flat = _PATIENCE, state, np.inf, 0
         for turn in range(self._most):
             e = whitened(model, residuals_of(model, state))
             weight = base * robust_weights(model, e * np.sqrt(base), turn) if robust else base
@@ -180,10 +253,14 @@ class _Loop:
                 state, patience, damping = best, -1, _FIRST_DAMPING
                 continue
             rows, _ = linearise(model, state, np.sqrt(weight))
+            if self._watch and turn % _LOOK == _LOOK - 1:
+                self._loose = loose_points(model, state, rows)
+                if self._loose:
+                    return state
             while True:
                 reduced = reduce_normals(rows, len(model.point_names), damping)
                 step, points = reduced.solve()
-                moved = state.moved(model.columns, step, points)
+                moved = state.moved(model.columns, step, along_rays(model, state, points))
                 after = _cost(whitened(model, residuals_of(model, moved)), weight)
                 if after <= before * (1.0 + 1e-9) + 1e-12:
                     break
@@ -202,8 +279,12 @@ class _Loop:
             self._progress(self.count, float(np.sqrt(after / max(1.0, float((weight > 0).sum())))))
             largest = float(np.abs(step / reduced.scale).max()) if len(step) else 0.0
             settled = abs(cost - after) <= _SETTLED * after or after < 1e-18 * len(e)
+            variance = after / max(1.0, float((weight > 0).sum()) - model.columns.count - 3 * len(model.point_names))
+            flat = flat + 1 if abs(before - after) < _FLAT * variance else 0
             # A damped step is short for that reason alone, unless rounding is all that is left.
             if not robust and ((damping == 0.0 and (largest < _CONVERGED or settled)) or largest < _ROUNDING):
+                return state
+            if flat >= _FLAT_STEPS and not robust:
                 return state
             if robust and turn >= _LEAST and largest < _ROUGHLY:
                 return state

@@ -237,3 +237,5 @@ class Adjusted:
     iterations: int
     correlations: tuple[Correlation, ...] = ()
     """Of cameras whose image points have clearly correlated errors; orientations and their covariances regard it."""
+    other_control: tuple[str, ...] = ()
+    """Control points of the largest other set that agrees within itself; empty where all of it agrees."""

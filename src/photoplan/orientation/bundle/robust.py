@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.adjustment.robust import MEDIAN_1D, MEDIAN_2D, geman_mcclure, huber, spread
-from photoplan.errors import GeometryError
 from photoplan.orientation.bundle.block import Active
+from photoplan.orientation.bundle.control import agreeing, misclosures
 from photoplan.orientation.bundle.model import Model
 from photoplan.orientation.bundle.rows import residuals_of, residuals_of_all, whitened
 from photoplan.orientation.bundle.unknowns import State
-from photoplan.orientation.start.similarity import robust_similarity
 
 _Floats = NDArray[np.float64]
 
@@ -26,8 +25,8 @@ _SOFT = 3.0
 _HUBER = 5
 #: Where the weights begin to fall, in standard deviations.
 _HUBER_LIMIT, _FALL = 2.0, 3.0
-#: Control points from which it is asked with which of them most agree.
-_LEAST_CONTROL = 5
+#: Standard deviation of control in the same units while it is asked which of it agrees.
+_LOOSE = 1000.0
 #: Image points are not judged by less than this part of their stated standard deviation, however small residuals are.
 _BEST = 0.05
 #: An observation that was taken out comes back when its residual is below this part of the critical value.
@@ -96,13 +95,18 @@ def softened(model: Model, state: State) -> _Floats:
     A wrong control point of high weight would otherwise draw its image points along, and these would look wrong.
     """
     out = np.ones(model.parts.known.stop)
-    distance = np.linalg.norm(state.XYZ[model.point] - state.images.centers[model.image], axis=1)
-    pixel = np.sqrt(np.abs(model.plane[:, 0] * model.plane[:, 5] - model.plane[:, 1] * model.plane[:, 4]))
-    c = np.array([state.camera(name).c for name in model.camera_names])[model.camera_of] * pixel
-    blur = _SOFT * float(np.median(model.sigma.mean(axis=1) * distance / c[model.image]))
+    blur = _SOFT * image_on_ground(model, state)
     sigma = 1.0 / np.linalg.norm(model.ground_white, axis=1)
     out[model.parts.ground] = sigma**2 / (sigma**2 + blur**2)
     return out
+
+
+def image_on_ground(model: Model, state: State) -> float:
+    """Standard deviation of an image point on the ground, metres; the median."""
+    distance = np.linalg.norm(state.XYZ[model.point] - state.images.centers[model.image], axis=1)
+    pixel = np.sqrt(np.abs(model.plane[:, 0] * model.plane[:, 5] - model.plane[:, 1] * model.plane[:, 4]))
+    c = np.array([state.camera(name).c for name in model.camera_names])[model.camera_of] * pixel
+    return float(np.median(model.sigma.mean(axis=1) * distance / c[model.image]))
 
 
 def robust_scale(e: _Floats, kind: tuple[str, str]) -> float:
@@ -145,6 +149,13 @@ def robust_weights(model: Model, e: _Floats, turn: int) -> _Floats:
     return np.nan_to_num(weight)
 
 
+def scales_of(model: Model, e: _Floats) -> _Floats:
+    """Standard deviation of the errors of each group (`kinds_of`), of whitened residuals, in a robust way."""
+    kinds, of = kinds_of(model)
+    own = e[: len(of)]
+    return np.array([robust_scale(_joined(own[of == k], kind), kind) for k, kind in enumerate(kinds)]) * _stretch(model)
+
+
 def _stretch(model: Model) -> float:
     """How much longer errors are than residuals, in the mean: unknowns take a part of the errors."""
     rows = model.observed
@@ -163,67 +174,39 @@ def _sizes(model: Model, e: _Floats) -> _Floats:
 def first_taken_out(model: Model, state: State, active: Active, critical: float) -> Active:
     """Take out what does not fit the robust estimate at `state`."""
     e = whitened(model, residuals_of(model, state)) * np.sqrt(softened(model, state))
-    size = np.abs(e)
-    kinds, of = kinds_of(model)
-    for k in range(len(kinds)):
-        mine = np.flatnonzero(of == k)
-        size[mine] /= robust_scale(_joined(e[mine], kinds[k]), kinds[k]) * _stretch(model)
+    size, of = np.abs(e), kinds_of(model)[1]
+    size[: len(of)] /= scales_of(model, e)[of]
     size[~np.isfinite(size)] = np.inf
     # Where residuals are small beside the errors this is too strict, so it takes twice as much here; data snooping does
     # the rest.
     bad = size[: len(of)] > 2.0 * critical
-    out = _without(model, active, bad)
-    if not len(model.position) and not np.array_equal(out.ground, active.ground):
-        out = replace(out, ground=_agreeing(model, state, active.ground, out.ground, 2.0 * critical))
-    return out
+    # Control is judged afterwards, as a set (`judged_control`).
+    return _without(model, active, bad)
 
 
-def _agreeing(
-    model: Model, state: State, before: NDArray[np.bool_], after: NDArray[np.bool_], limit: float
-) -> NDArray[np.bool_]:
-    """Control with which most of it agrees: `after`, or what a similarity transformation of the block finds if more.
+def judged_control(
+    model: Model, state: State, active: Active, factors: _Floats, critical: float
+) -> tuple[Active, tuple[str, ...]]:
+    """Control of which the largest set agrees, and the names of the largest other set.
 
-    Nothing but control says where the block lies. Falling weights may tilt and shift it until it fits wrong control
-    as well, and then the right control is taken out.
+    `factors` are the standard deviations of the groups' residuals (`kinds_of`) in units of the stated ones.
     """
-    ground = model.block.ground
-    full, point = [], []
-    for k in np.unique(model.ground):
-        rows = np.flatnonzero(model.ground == k)
-        if len(rows) == 3 and before[k].all():
-            full.append(int(k))
-            point.append(int(model.ground_point[rows[0]]))
-    if len(full) < _LEAST_CONTROL:
-        return after
-    sigma = np.ones_like(ground.XYZ)
-    white = np.linalg.norm(model.ground_white, axis=1)
-    sigma[model.ground, model.ground_axis] = 1.0 / (white * np.sqrt(softened(model, state)[model.parts.ground]))
-    found, given = state.XYZ[point], ground.XYZ[full]
-    try:
-        moved, _ = robust_similarity(found, given, 0.5 * limit * float(np.median(sigma[full])))
-    except GeometryError:
-        return after
-    fits = np.abs(moved(found) - given) <= limit * sigma[full]
-    if _agreement(fits) <= _agreement(after[full]):
-        return after
-    ground_after = after.copy()
-    ground_after[full] = fits
-    return ground_after
-
-
-def _agreement(fits: NDArray[np.bool_]) -> tuple[int, int]:
-    """Points of which all coordinates (n, 3) fit, which tell more than coordinates do, and coordinates."""
-    return int(fits.all(axis=1).sum()), int(fits.sum())
+    control = np.array([name.startswith("control, ") for name, _ in kinds_of(model)[0]], bool)
+    weight = weights_of(model, active, np.where(control, 1.0, factors))
+    weight[model.parts.image] *= np.repeat(active.image[model.observation], 2)
+    found = misclosures(model, state, weight, _LOOSE * image_on_ground(model, state))
+    if found is None:
+        return active, ()
+    result = agreeing(found, active.ground, critical)
+    return replace(active, ground=result.kept), tuple(model.block.ground.names[k] for k in result.alternative)
 
 
 def _without(model: Model, active: Active, bad: NDArray[np.bool_]) -> Active:
     """Take out the observations whose rows are bad."""
-    image, ground, position = active.image.copy(), active.ground.copy(), active.position.copy()
+    image, position = active.image.copy(), active.position.copy()
     image[model.observation[bad[model.parts.image].reshape(-1, 2).any(axis=1)]] = False
-    rows = np.flatnonzero(bad[model.parts.ground])
-    ground[model.ground[rows], model.ground_axis[rows]] = False
     position[model.position_row[bad[model.parts.position].reshape(-1, 3).any(axis=1)]] = False
-    return Active(image, ground, position)
+    return Active(image, active.ground, position)
 
 
 def snooped(model: Model, state: State, judged: Judged, active: Active, critical: float) -> Active:
@@ -237,6 +220,7 @@ def snooped(model: Model, state: State, judged: Judged, active: Active, critical
     size[judged.weight[: len(of)] == 0] = 0.0
     on = slice(0, model.parts.ground.stop)
     bad = size > critical
+    bad[model.parts.ground] = False
     point = np.concatenate([np.repeat(model.point, 2), model.ground_point])
     worst = np.zeros(len(model.point_names))
     np.maximum.at(worst, point, size[on])
@@ -255,11 +239,8 @@ def _brought_back(model: Model, state: State, judged: Judged, before: Active, af
     with np.errstate(invalid="ignore"):
         size = np.abs(residuals / block.observations.sigma).max(axis=1) / scales[kind]
     image |= ~before.image & (kind >= 0) & (np.nan_to_num(size, nan=np.inf) < limit)
-    ground, position = after.ground.copy(), after.position.copy()
+    position = after.position.copy()
     off = np.abs(judged.e[: len(of)]) / scales[of]
-    fits = off[model.parts.ground] < limit
-    out = ~before.ground[model.ground, model.ground_axis]
-    ground[model.ground[fits & out], model.ground_axis[fits & out]] = True
     fits = off[model.parts.position].reshape(-1, 3).max(axis=1) < limit
     position[model.position_row[fits & ~before.position[model.position_row]]] = True
-    return Active(image, ground, position)
+    return Active(image, after.ground, position)

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from photoplan.adjustment.robust import geman_mcclure
 from photoplan.orientation.bundle.block import Active, Block
+from photoplan.orientation.bundle.far import PARALLEL
 
 _Floats = NDArray[np.float64]
 _Index = NDArray[np.int64]
 
-#: Smallest eigenvalue of the intersection's normal matrix, as part of a ray's weight, below which rays count as
-#: parallel: an angle of 0.006° between two of them.
-_PARALLEL = 5e-9
+#: Angle between rays below which a point waits until orientations are better, radians; points that every image keeps.
+_NARROW, _ENOUGH = 0.02, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,8 @@ def select(block: Block, active: Active, undetermined: frozenset[str] = frozense
         keep = keep_points & ~np.isin(image_of, poor)
     used = np.flatnonzero(enough)
     left = list(images_out.items())
-    left += [(n, "point whose rays are parallel") for n in seen.points if n in undetermined]
+    parallel = "point whose rays are parallel within their accuracy: its distance is not determined"
+    left += [(n, parallel) for n in seen.points if n in undetermined]
     few = np.flatnonzero(~enough)
     left += [(seen.points[k], _reason(int(rays[k]))) for k in few if seen.points[k] not in undetermined]
     images = [k for k in range(len(block.images)) if block.images[k].name not in images_out]
@@ -94,8 +95,12 @@ def _direct(block: Block, active: NDArray[np.bool_]) -> set[int]:
     return {k for k, b in enumerate(block.images) if b.name in both}
 
 
-def start_points(block: Block, selection: Selection) -> tuple[_Floats, frozenset[str]]:
-    """Start values of the selected points (m, 3), and the points whose rays are parallel."""
+def start_points(block: Block, selection: Selection, wait: bool = False) -> tuple[_Floats, frozenset[str]]:
+    """Start values of the selected points (m, 3), and the points whose rays are parallel.
+
+    With `wait`, points of narrow rays count as such, unless an image has too few others: while orientations are only
+    about right, they would fly off and take the adjustment with them.
+    """
     seen = block.observations
     chosen = [block.images[k] for k in selection.images]
     image_index = {b.name: k for k, b in enumerate(chosen)}
@@ -103,6 +108,7 @@ def start_points(block: Block, selection: Selection) -> tuple[_Floats, frozenset
     image = np.array([image_index.get(n, -1) for n in seen.images], np.int64)[seen.image[selection.measured]]
     point = np.array([point_index.get(n, -1) for n in seen.points], np.int64)[seen.point[selection.measured]]
     directions = np.empty((len(image), 3))
+    sigma = np.empty(len(image))
     order = np.argsort(image, kind="stable")
     ends = np.searchsorted(image[order], np.arange(len(chosen) + 1))
     for k, b in enumerate(chosen):
@@ -112,8 +118,23 @@ def start_points(block: Block, selection: Selection) -> tuple[_Floats, frozenset
         t = camera.lens.undistort((plane - camera.principal_point) / camera.c)
         d = np.column_stack([t, -np.ones(len(t))]) @ b.pose.R_ground_camera.T
         directions[mine] = d / np.linalg.norm(d, axis=1, keepdims=True)
+        pixel = np.sqrt(abs(np.linalg.det(b.plane_to_pixel.derivative(np.array(camera.principal_point)))))
+        sigma[mine] = seen.sigma[selection.measured][mine].mean(axis=1) / (camera.c * pixel)
     centers = np.array([b.pose.center for b in chosen])[image]
-    XYZ, determined = intersect(centers, directions, point, len(point_index))
+    XYZ, angle = intersect(centers, directions, point, len(point_index))
+    count = np.maximum(np.bincount(point, minlength=len(point_index)), 1)
+    usual = np.bincount(point, sigma, len(point_index)) / count
+    # An angle between rays that is found with this accuracy tells the distance to the same part; errors of many rays
+    # alone make an angle too. Rays that come from a point behind their cameras are parallel as well.
+    behind = ((XYZ[point] - centers) * directions).sum(axis=1) < 0
+    turned = (np.bincount(point, behind, len(point_index)) > 0.5 * count) & (angle < _NARROW)
+    least = usual * np.sqrt(1.0 + 0.5 * PARALLEL**2 * count) / PARALLEL
+    determined = np.isfinite(XYZ).all(axis=1) & (angle > np.maximum(least, 1e-7)) & ~turned
+    if wait:
+        wide = determined & (angle > _NARROW)
+        kept = np.bincount(image[wide[point]], minlength=len(chosen))
+        if (kept >= np.minimum(_ENOUGH, np.bincount(image, minlength=len(chosen)))).all():
+            determined = wide
     for k, name in enumerate(block.ground.names):
         if name in point_index and not block.ground.check[k]:
             given = block.ground.XYZ[k]
@@ -139,8 +160,8 @@ def _on_ray(center: _Floats, direction: _Floats, given: _Floats) -> _Floats:
 
 def intersect(
     centers: _Floats, directions: _Floats, point: _Index, count: int, rounds: int = 6
-) -> tuple[_Floats, NDArray[np.bool_]]:
-    """Points nearest to their rays, in the robust mean, and whether the rays determine them.
+) -> tuple[_Floats, _Floats]:
+    """Points nearest to their rays, in the robust mean, and the angle at which two such rays would meet, radians.
 
     Parameters
     ----------
@@ -156,7 +177,7 @@ def intersect(
     directions = np.where(good_rays[:, None], directions, 0.0)
     projector = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     XYZ = np.full((count, 3), np.nan)
-    determined = np.zeros(count, bool)
+    meeting = np.zeros(count)
     for turn in range(rounds):
         w = weight * good_rays
         N = np.empty((count, 3, 3))
@@ -167,7 +188,8 @@ def intersect(
         b = np.stack([np.bincount(point, w * from_center[:, i], count) for i in range(3)], axis=-1)
         values = np.linalg.eigvalsh(N)
         if turn == 0:
-            determined = np.asarray(values[:, 0] > _PARALLEL * np.maximum(values[:, 2], 1e-300))
+            # Two rays at the angle a have the eigenvalues 1 − cos a and 2.
+            meeting = np.sqrt(np.maximum(2.0 * values[:, 0], 0.0))
         solvable = values[:, 0] > 1e-14 * np.maximum(values[:, 2], 1e-300)
         N[~solvable] = np.eye(3)
         XYZ = np.where(solvable[:, None], np.linalg.solve(N, b[:, :, None])[:, :, 0], np.nan)
@@ -179,5 +201,4 @@ def intersect(
         scale = max(float(np.nanmedian(angle[good_rays])) if good_rays.any() else 0.0, 1e-12)
         # Far rays count less, as their error across is larger; gross errors hardly count.
         weight = np.nan_to_num(geman_mcclure(angle, 3.0 * scale) / np.maximum(distance, 1e-9) ** 2)
-    good: NDArray[np.bool_] = determined & np.isfinite(XYZ).all(axis=1)
-    return XYZ, good
+    return XYZ, meeting

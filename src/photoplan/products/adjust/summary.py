@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -136,6 +137,16 @@ def _control_out(result: MapResult) -> list[str]:
                 f"{lost} of {total} {name} are taken out as gross errors: nothing tells whether they are wrong or "
                 "those that are left; measure more control"
             )
+    names = [ground.names[k] for k in np.flatnonzero((adjusted.ground_rejected & known).any(axis=1))]
+    if names and adjusted.other_control:
+        others = some(list(adjusted.other_control))
+        out.append(f"control that does not agree with the rest is taken out: {some(names)}; next best agree {others}")
+    place = dict(zip(adjusted.points, result.XYZ))
+    for a, b in combinations([name for name in names if name in place], 2):
+        given = [ground.XYZ[ground.names.index(name)] for name in (a, b)]
+        apart = 0.2 * float(np.linalg.norm(given[0] - given[1]))
+        if max(np.linalg.norm(place[a] - given[1]), np.linalg.norm(place[b] - given[0])) < apart:
+            out.append(f"control points {a!r} and {b!r} look exchanged: each lies where the other is stated")
     return out
 
 
