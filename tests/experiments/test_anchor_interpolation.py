@@ -11,6 +11,7 @@ from photoplan.cameras.lenses.none import NoLens
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
 from photoplan.plan.compile import AnchorRule, compile_anchors
+from photoplan.plan.ground import TileGround
 from photoplan.targets.map import MapTarget
 
 CENTRES = experiment.SAMPLINGS[experiment.PIXEL_CENTRES]
@@ -89,6 +90,8 @@ def test_the_package_needs_one_cell_for_behrs_steepest_mesh(slope):
     window = Window(0, 0, 512, 512)
     grid = MapGrid(left=1000.0, top=100.0, resolution=0.2, width=512, height=512, crs="EPSG:25832")
     relief = np.tan(np.radians(slope)) * np.broadcast_to(0.2 * np.arange(512), (512, 512))
-    anchors = compile_anchors(camera(), MapTarget(grid), window, relief.astype(np.float32), AnchorRule(0.02, 2))
+    anchors = compile_anchors(
+        camera(), TileGround.of(MapTarget(grid), window, relief.astype(np.float32)), AnchorRule(0.02, 2)
+    )
     assert len(anchors.rects) == len(anchors.corners) == 1
     assert anchors.residual < 2e-11

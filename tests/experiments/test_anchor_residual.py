@@ -12,6 +12,7 @@ from photoplan.cameras.lenses.brown import Brown
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
 from photoplan.plan.compile import AnchorRule, compile_anchors
+from photoplan.plan.ground import TileGround
 from photoplan.targets.map import MapTarget
 
 
@@ -69,13 +70,13 @@ def test_the_compiler_cuts_until_the_tolerance_is_met(tolerance):
     pose = Pose(np.array([0.0, 0.0, experiment.FLYING_HEIGHT]), np.eye(3))
     inside = Pinhole(pose, experiment.FOCAL, (10_000, 7_500), experiment.K1)  # its lens is in the anchors
     np.testing.assert_allclose(project(inside, [480.0, 360.0, 7.0]), project(camera(), [480.0, 360.0, 7.0]), atol=1e-9)
-    anchors = compile_anchors(inside, MapTarget(grid), window, relief, AnchorRule(tolerance, 2))
+    anchors = compile_anchors(inside, TileGround.of(MapTarget(grid), window, relief), AnchorRule(tolerance, 2))
     assert 0 < anchors.residual <= tolerance
     layers = np.diff(anchors.box_start)
     wall = (anchors.rects[:, 0] < 100) & (anchors.rects[:, 2] > 100)
     assert (layers[wall] > 1).all()
     assert (layers[~wall] == 1).all()
     # The lens as a field: one box, and the residual is that of the nodes.
-    anchors = compile_anchors(camera(), MapTarget(grid), window, relief, AnchorRule(tolerance, 2))
+    anchors = compile_anchors(camera(), TileGround.of(MapTarget(grid), window, relief), AnchorRule(tolerance, 2))
     assert len(anchors.corners) == 1
     assert 0 < anchors.residual <= tolerance

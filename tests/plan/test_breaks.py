@@ -13,6 +13,7 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.kernels.position import positions
 from photoplan.plan.anchors import Anchors
 from photoplan.plan.compile import AnchorRule, compile_anchors
+from photoplan.plan.ground import TileGround
 from photoplan.targets.map import MapTarget
 
 GRID = MapGrid(-290.0, -5.0, 0.05, 12_000, 12_000, "EPSG:25832")
@@ -38,7 +39,7 @@ def misses(camera: LineCamera, target: MapTarget, window: Window, h: np.ndarray,
 
 def compiled(declared: str, window: Window, tolerance: float = 0.02) -> tuple[Anchors, np.ndarray]:
     camera, target, h = line_camera(declared), MapTarget(GRID), relief(window)
-    anchors = compile_anchors(camera, target, window, h, AnchorRule(tolerance, 2))
+    anchors = compile_anchors(camera, TileGround.of(target, window, h), AnchorRule(tolerance, 2))
     assert anchors is not None
     return anchors, misses(camera, target, window, h, anchors)
 
@@ -83,7 +84,7 @@ class Folded:
 def test_cells_of_a_folded_target_end_where_it_is_bent() -> None:
     camera, target, window = vertical(), Folded(), Folded.window
     h = np.random.default_rng(1).uniform(-0.5, 0.5, (window.height, window.width)).astype(np.float32)
-    anchors = compile_anchors(camera, target, window, h, AnchorRule(0.3, 2))
+    anchors = compile_anchors(camera, TileGround.of(target, window, h), AnchorRule(0.3, 2))
     assert anchors is not None
     v, u = np.mgrid[: window.height, : window.width].astype(float)
     truth = project(camera, target.to_ground(np.stack([u, v, h.astype(float)], axis=-1)))

@@ -16,6 +16,7 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
 from photoplan.plan.anchors import Anchors
 from photoplan.plan.compile import AnchorRule, compile_anchors
+from photoplan.plan.ground import TileGround
 from photoplan.targets.map import MapTarget
 
 GRID = MapGrid(760, 2310, 0.06, 9400, 9300, "EPSG:32615")
@@ -59,7 +60,7 @@ def rough(shape: tuple[int, int], seed: int, wall: float) -> np.ndarray:
 def test_pinhole_is_exact_in_one_cell_of_any_size(side: int) -> None:
     camera, window = vertical(), Window(4000, 4000, side, side)
     relief = rough((side, side), 1, 40)
-    anchors = compile_anchors(camera, TARGET, window, relief, RULE)
+    anchors = compile_anchors(camera, TileGround.of(TARGET, window, relief), RULE)
     assert anchors is not None and len(anchors.rects) == len(anchors.corners) == 1
     assert anchors.residual < 1e-9
     assert np.abs(positions(anchors, relief) - strict(camera, window, relief)).max() < 1e-9
@@ -78,7 +79,9 @@ def test_distorted_lens_meets_the_tolerance_at_every_pixel(
 ) -> None:
     camera, window = vertical(k1=-0.08), Window(col, row, 80, 64)
     relief = rough((64, 80), seed, wall)
-    anchors = compile_anchors(camera, TARGET, window, relief, dataclasses.replace(RULE, tolerance=tolerance))
+    anchors = compile_anchors(
+        camera, TileGround.of(TARGET, window, relief), dataclasses.replace(RULE, tolerance=tolerance)
+    )
     truth = strict(camera, window, relief)
     inside = ((truth >= -0.5) & (truth <= np.array(camera.size) - 0.5)).all(axis=-1)
     if anchors is None:
@@ -96,7 +99,7 @@ def test_residual_falls_with_the_square_of_the_cell() -> None:
     misses = []
     for side in (128, 64, 32, 16):
         window, relief = Window(6628 - side // 2, 4128 - side // 2, side, side), np.full((side, side), 100, np.float32)
-        anchors = compile_anchors(camera, TARGET, window, relief, AnchorRule(1e3, 2))
+        anchors = compile_anchors(camera, TileGround.of(TARGET, window, relief), AnchorRule(1e3, 2))
         assert anchors is not None and len(anchors.rects) == 1
         misses.append(anchors.residual)
     orders = np.log2(np.array(misses[:-1]) / misses[1:])
@@ -106,7 +109,7 @@ def test_residual_falls_with_the_square_of_the_cell() -> None:
 def test_a_wall_is_split_in_height_and_boxes_leave_no_gap() -> None:
     camera = vertical(k1=-0.3, focal=6000)
     relief = rough((64, 64), 3, 150)
-    anchors = compile_anchors(camera, TARGET, Window(2000, 2000, 64, 64), relief, AnchorRule(0.005, 2))
+    anchors = compile_anchors(camera, TileGround.of(TARGET, Window(2000, 2000, 64, 64), relief), AnchorRule(0.005, 2))
     assert anchors is not None
     piles = np.diff(anchors.box_start)
     assert piles.max() > 1
@@ -117,7 +120,7 @@ def test_a_wall_is_split_in_height_and_boxes_leave_no_gap() -> None:
 def test_rectangles_cover_the_tile_once() -> None:
     camera = vertical(k1=-0.08)
     relief = rough((128, 200), 5, 30)
-    anchors = compile_anchors(camera, TARGET, Window(5000, 5000, 200, 128), relief, RULE)
+    anchors = compile_anchors(camera, TileGround.of(TARGET, Window(5000, 5000, 200, 128), relief), RULE)
     assert anchors is not None
     hits = np.zeros(relief.shape, int)
     for c0, r0, c1, r1 in anchors.rects:
@@ -128,7 +131,7 @@ def test_rectangles_cover_the_tile_once() -> None:
 def test_the_source_window_holds_every_position_with_the_kernel() -> None:
     camera, window = vertical(k1=-0.08), Window(3000, 6000, 64, 64)
     relief = rough((64, 64), 7, 25)
-    anchors = compile_anchors(camera, TARGET, window, relief, RULE)
+    anchors = compile_anchors(camera, TileGround.of(TARGET, window, relief), RULE)
     assert anchors is not None
     xy = strict(camera, window, relief)
     w = anchors.source_window
@@ -139,17 +142,17 @@ def test_the_source_window_holds_every_position_with_the_kernel() -> None:
 def test_scale_is_that_of_the_mapping() -> None:
     camera, window = vertical(), Window(3000, 6000, 64, 64)
     relief = np.full((64, 64), 100, np.float32)
-    anchors = compile_anchors(camera, TARGET, window, relief, RULE)
+    anchors = compile_anchors(camera, TileGround.of(TARGET, window, relief), RULE)
     assert anchors is not None
     assert anchors.scales == pytest.approx((12500 / 700 * 0.06,) * 2, rel=0.05)
 
 
 def test_nothing_behind_the_camera_and_nothing_beside_the_image() -> None:
     relief = np.full((64, 64), 100, np.float32)
-    assert compile_anchors(vertical(), TARGET, Window(-90000, 0, 64, 64), relief, RULE) is None
+    assert compile_anchors(vertical(), TileGround.of(TARGET, Window(-90000, 0, 64, 64), relief), RULE) is None
     upward = Pinhole(Pose.from_angles((1000, 2000, 800), (np.pi, 0, 0)), 12500, (800, 600))
-    assert compile_anchors(upward, TARGET, Window(4000, 5000, 64, 64), relief, RULE) is None
-    assert compile_anchors(vertical(), TARGET, Window(4000, 4000, 64, 64), relief * np.nan, RULE) is None
+    assert compile_anchors(upward, TileGround.of(TARGET, Window(4000, 5000, 64, 64), relief), RULE) is None
+    assert compile_anchors(vertical(), TileGround.of(TARGET, Window(4000, 4000, 64, 64), relief * np.nan), RULE) is None
 
 
 def test_horizontal_view_divides_nothing_behind_the_camera() -> None:
@@ -157,7 +160,7 @@ def test_horizontal_view_divides_nothing_behind_the_camera() -> None:
     camera = Pinhole(Pose.from_angles((1000, 2000, 110), (np.pi / 2 - 0.2, 0, 0)), 500, (800, 600))
     grid = MapGrid(968, 2032, 0.5, 128, 128, "EPSG:32615")
     relief = np.full((128, 128), 100, np.float32)
-    anchors = compile_anchors(camera, MapTarget(grid), Window(0, 0, 128, 128), relief, RULE)
+    anchors = compile_anchors(camera, TileGround.of(MapTarget(grid), Window(0, 0, 128, 128), relief), RULE)
     assert anchors is not None
     assert (anchors.corners[..., 2] > 0).all()
     v, u = np.mgrid[:128, :128].astype(float)

@@ -28,6 +28,7 @@ from photoplan.kernels.position import positions
 from photoplan.plan.anchors import Anchors
 from photoplan.plan.compile import AnchorRule, compile_anchors
 from photoplan.plan.field import field_grid
+from photoplan.plan.ground import TileGround
 from photoplan.plan.product import compile_tile
 from photoplan.plan.tiles import Tile
 from photoplan.surfaces.level import LevelSurface
@@ -75,7 +76,7 @@ def test_one_box_a_tile_and_the_engines_positions_keep_the_reported_residual(nam
     for col, row in ((3600, 2600), (2000, 3600), (5600, 1400)):
         window = Window(col, row, 512, 512)
         relief = rough(window)
-        anchors = compile_anchors(camera, TARGET, window, relief, AnchorRule(tolerance, 2))
+        anchors = compile_anchors(camera, TileGround.of(TARGET, window, relief), AnchorRule(tolerance, 2))
         truth = strict(camera, window, relief)
         inside = ((truth >= -0.5) & (truth <= np.array(SIZE) - 0.5)).all(axis=-1)
         if anchors is None:
@@ -96,7 +97,7 @@ def test_one_box_a_tile_and_the_engines_positions_keep_the_reported_residual(nam
 
 def test_without_a_lens_there_is_no_field_and_nothing_is_left() -> None:
     camera, window = oblique(NoLens()), Window(3600, 2600, 512, 512)
-    anchors = compile_anchors(camera, TARGET, window, rough(window), AnchorRule(0.02, 2))
+    anchors = compile_anchors(camera, TileGround.of(TARGET, window, rough(window)), AnchorRule(0.02, 2))
     assert camera.field is None and anchors is not None
     assert anchors.field.size == 0 and len(anchors.corners) == 1
     assert anchors.residual < 1e-11 * max(SIZE)
@@ -108,7 +109,7 @@ def test_bilinear_interior_orientation_is_a_field() -> None:
     camera = FrameCamera(Interior(60.0, (0.02, -0.01), plane, SIZE), NoLens(), pose)
     window = Window(3600, 2600, 256, 256)
     relief = rough(window)
-    anchors = compile_anchors(camera, TARGET, window, relief, AnchorRule(0.02, 2))
+    anchors = compile_anchors(camera, TileGround.of(TARGET, window, relief), AnchorRule(0.02, 2))
     assert anchors is not None and len(anchors.corners) == 1 and anchors.residual <= 0.02
     found = engine_positions(anchors, relief)
     assert np.abs(found - strict(camera, window, relief)).max() <= anchors.residual + 1e-4
@@ -120,7 +121,7 @@ def test_a_fisheye_beyond_the_widest_field_keeps_its_lens_in_the_anchors() -> No
     assert camera.field is None
     window = Window(3600, 2600, 128, 128)
     relief = np.full((128, 128), 20, np.float32)
-    anchors = compile_anchors(camera, TARGET, window, relief, AnchorRule(0.02, 2))
+    anchors = compile_anchors(camera, TileGround.of(TARGET, window, relief), AnchorRule(0.02, 2))
     assert anchors is not None and 0 < anchors.residual <= 0.02
     found = engine_positions(anchors, relief)
     assert np.abs(found - strict(camera, window, relief)).max() <= 0.02 + 1e-4
@@ -145,7 +146,7 @@ def test_the_spacing_of_nodes_keeps_to_the_tolerance_and_is_not_wasteful(name: s
 def test_a_crop_of_a_tile_has_the_same_positions_bit_by_bit() -> None:
     camera, window = oblique(LENSES["barrel"]), Window(3600, 2600, 300, 300)
     relief = rough(window)
-    anchors = compile_anchors(camera, TARGET, window, relief, AnchorRule(0.02, 2))
+    anchors = compile_anchors(camera, TileGround.of(TARGET, window, relief), AnchorRule(0.02, 2))
     assert anchors is not None
     whole = positions(anchors.arrays, relief)
     part = positions(anchors.arrays, np.ascontiguousarray(relief[40:200, 270:300]), (270, 40))

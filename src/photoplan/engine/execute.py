@@ -67,11 +67,11 @@ def execute_tile(tile: CompiledTile, sources: Sequence[Source], kernel: str) -> 
             values = np.zeros((len(pixels), *tile.relief.shape), pixels.dtype)
         if usable is None or usable.any():
             border = _border(layer, reader.size)
-            owned = ALL_MINE if tile.owner is None else (tile.owner, layer.source + 1)
+            owned = ALL_MINE if tile.owner is None else (tile.owner, layer.source + 1, layer.part.tolist())
             rectify_tile(layer.anchors.arrays, tile.relief, pixels, usable, border, kernel, values, valid, owned=owned)
     if not valid.any():
         return Pixels(None, None, None, tile.residual, tile.cells)
-    owner = None if tile.owner is None else np.where(valid, tile.owner, np.uint16(0))
+    owner = None if tile.owner is None else tile.owner * valid
     return Pixels(values, valid, owner, tile.residual, tile.cells)
 
 

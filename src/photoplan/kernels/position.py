@@ -7,6 +7,7 @@ precision holds it to about 1e-5 pixel wherever the run lies in the source.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -258,13 +259,15 @@ def _write_runs(
     runs: NDArray[np.int32],
 ) -> int:
     """Fill `runs` as far as it has room; returns how many there are."""
-    owner, mine = owned
+    owner, mine, (left, top, right, bottom) = owned
+    left, top = max(left, offset[0]), max(top, offset[1])
+    right, bottom = min(right, offset[0] + size[1]), min(bottom, offset[1] + size[0])
     count = 0
     for index in chosen:
-        right, bottom = min(rects[index, 2], offset[0] + size[1]), min(rects[index, 3], offset[1] + size[0])
-        for v in range(max(rects[index, 1], offset[1]), bottom):
-            for u_run in range(rects[index, 0], right, RUN):
-                u, end = max(u_run, offset[0]), min(u_run + RUN, right)
+        last_column = min(rects[index, 2], right)
+        for v in range(max(rects[index, 1], top), min(rects[index, 3], bottom)):
+            for u_run in range(rects[index, 0], last_column, RUN):
+                u, end = max(u_run, left), min(u_run + RUN, last_column)
                 while u < end:
                     last = end
                     if owner.size > 0:
@@ -281,7 +284,11 @@ def _write_runs(
     return count
 
 
-ALL_MINE: tuple[NDArray[np.uint16], int] = (np.empty((0, 0), np.uint16), 0)
+Owned = tuple[NDArray[np.uint16], int, Sequence[int]]
+"""Which pixels a source paints: a raster of owners and its number in it, and the part of the tile where this number is
+found: first column, first row, end column, end row."""
+
+ALL_MINE: Owned = (np.empty((0, 0), np.uint16), 0, (0, 0, 2**31, 2**31))
 """Every pixel belongs to the one source."""
 
 
@@ -290,11 +297,11 @@ def tile_runs(
     chosen: NDArray[np.int64],
     offset: tuple[int, int],
     size: tuple[int, int],
-    owned: tuple[NDArray[np.uint16], int] = ALL_MINE,
+    owned: Owned = ALL_MINE,
 ) -> NDArray[np.int32]:
     """Runs of the rectangles `chosen` inside `size` (rows, columns) pixels from `offset` (column, row) on.
 
-    `owned` is a raster of that size and the number in it whose pixels are wanted. A run that is cut at the border of
+    The raster of `owned` has that size. A run that is cut at the border of
     such pixels keeps the column from which its coefficients hold, and with it every bit of its positions.
 
     Returns (k, 5) int32: rectangle, row, column from which the run's coefficients hold, first and end column; in the

@@ -20,15 +20,12 @@ from photoplan.kernels.gather import gather_runs
 from photoplan.kernels.jit import is_ready
 from photoplan.kernels.pack import as_bytes, pack, solid_patches
 from photoplan.kernels.place import empty_block, place_runs
-from photoplan.kernels.position import ALL_MINE, RUN, tile_runs
+from photoplan.kernels.position import ALL_MINE, RUN, Owned, tile_runs
 from photoplan.kernels.scale import LOOK_CLOSER, largest_scales, stretch_runs
 from photoplan.kernels.weights import KERNELS, weight_table
 
 AnchorArrays = tuple[NDArray[Any], ...]
 """rects (m, 4), box_start (m + 1,), box_heights (n, 2), corners (n, 8, 3), field_frame (5,), field (rows, cols, 2)."""
-
-Owned = tuple[NDArray[np.uint16], int]
-"""A raster of the tile's owners, and the one whose pixels are painted."""
 
 Border = tuple[float, float, float, float]
 """Outer edges of the image x_min, y_min, x_max, y_max in pixels of the source window."""
@@ -89,9 +86,9 @@ def rectify_tile(
     offset : (column, row)
         First pixel of `relief` and `out` in the tile's pixels: part of a tile is the same, byte by byte, as the tile
         cut afterwards.
-    owned : (raster of uint16, number)
-        Pixels that the source paints, of the shape of `relief`; all others are left as they are. Several sources
-        compose a tile one after the other, at the cost of their own pixels.
+    owned : (raster of uint16, number, part)
+        Pixels that the source paints, see `tile_runs`; all others are left as they are. Several sources compose a tile
+        one after the other, at the cost of their own pixels.
 
     Notes
     -----
@@ -131,7 +128,7 @@ def rectify_packed(
         edges = (-0.5, -0.5, width - 0.5, height - 0.5) if border is None else tuple(float(edge) for edge in border)
         image = (_plain(packed, packed.dtype), mask, solid, edges)
         place = (int(offset[0]), int(offset[1]))
-        wanted = (_plain(owned[0], np.uint16), int(owned[1]))
+        wanted = (_plain(owned[0], np.uint16), int(owned[1]), tuple(int(edge) for edge in owned[2]))
         _resample(arrays, _plain(relief, np.float32), image, kernel, (place, wanted), (target, target_valid))
     if target is not out:
         out[...] = target
@@ -141,7 +138,9 @@ def rectify_packed(
 
 def _plain(array: NDArray[Any], dtype: Any) -> NDArray[Any]:
     """The array in the one form that kernels are compiled for: contiguous, aligned, not read-only."""
-    return np.require(array, dtype, ("C", "A", "W"))
+    flags = array.flags
+    ready = array.dtype == dtype and flags.c_contiguous and flags.aligned and flags.writeable
+    return array if ready else np.require(array, dtype, ("C", "A", "W"))
 
 
 def _resample(
@@ -161,6 +160,8 @@ def _resample(
         coarse = ~(stretch * largest_scales(rects, box_start, corners) <= LOOK_CLOSER)
     for averaging in (False, True):
         chosen = np.flatnonzero(coarse == averaging)
+        if not len(chosen):
+            continue
         runs = tile_runs(rects, chosen, offset, relief.shape, owned)
         block = empty_block(min(BLOCK, len(runs)))
         for start in range(0, len(runs), BLOCK):

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from photoplan.geometry.breaks import Breaks
 
+Positions = Callable[[NDArray[np.int64], NDArray[np.float64]], NDArray[np.float64]]
+"""Gives the strict homogeneous positions (k, 3) of places (k, 3) in (h, v, u), 0 to 1, in the boxes numbered (k,)."""
+
 #: A bend that crosses a box askew is missed most between the lines along which it is looked for.
 _BESIDE = 1.25
 #: Crossings that are looked for together.
@@ -38,7 +41,7 @@ _FROM, _TO = _weights(_START), _weights(_START + _ALONG)
 def bend_errors(
     breaks: Breaks,
     corners: NDArray[np.float64],
-    strict: Callable[[NDArray[np.int64], NDArray[np.float64]], NDArray[np.float64]],
+    strict: Positions,
 ) -> NDArray[np.float64]:
     """Residual of boxes at the breaks that cross them, pixels.
 
@@ -49,7 +52,6 @@ def bend_errors(
     corners : ndarray, shape (n, 8, 3)
         Homogeneous corners of the boxes.
     strict : callable
-        Homogeneous positions (k, 3) of places (k, 3) in (h, v, u), 0 to 1, of boxes (k,).
 
     Returns
     -------

@@ -13,6 +13,7 @@ from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.plan.anchors import Anchors
 from photoplan.plan.compile import AnchorRule, compile_anchors
+from photoplan.plan.ground import TileGround
 from photoplan.plan.owner import Ownership
 from photoplan.plan.tiles import Tile, Tiles
 from photoplan.surfaces.base import Surface
@@ -29,6 +30,8 @@ class Layer:
     """The source is read reduced by 2 to the power of this; the anchors refer to pixels of the reduced image."""
     anchors: Anchors
     """Where the tile's pixels lie in it."""
+    part: NDArray[np.int64]
+    """First column, first row, end column, end row in the tile between which are all pixels that it paints."""
 
     def window(self, size: tuple[int, int]) -> Window:
         """What is read of a source of this size, in its pixels at full size."""
@@ -110,11 +113,14 @@ def compile_tile(product: ProductPlan, tile: Tile, cameras: Sequence[Projection]
     """
     relief = surface.relief(product.target, tile.window)
     owner = None if product.owners is None else product.owners.owner(product.target, tile.window, relief)
+    ground = TileGround.of(product.target, tile.window, relief)
+    wanted, parts = ground.ranges[None], np.array([[0, 0, tile.window.width, tile.window.height]])
+    if owner is not None:
+        wanted, parts = ground.owned(owner, tile.sources, len(product.sources))
     layers = []
-    for source in tile.sources:
-        mine = None if owner is None else np.where(owner == source + 1, relief, np.float32(np.nan))
-        anchors = compile_anchors(cameras[source], product.target, tile.window, relief, product.rule, mine)
+    for source, mine, part in zip(tile.sources, wanted, parts):
+        anchors = compile_anchors(cameras[source], ground, product.rule, mine)
         if anchors is not None:
             level = product.rule.level(anchors)
-            layers.append(Layer(source, level, anchors.at_level(level, cameras[source].size)))
+            layers.append(Layer(source, level, anchors.at_level(level, cameras[source].size), part))
     return CompiledTile(tile.window, relief, tuple(layers), owner)
