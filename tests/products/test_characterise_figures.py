@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
+import numpy as np
 import pytest
+from tools.camera_model import Sensor, write_frame
 
-from photoplan.products.characterise.result import Figure
+from photoplan.products.characterise.result import Figure, Listing
+from photoplan.products.characterise.run import CharacteriseRequest, characterise
 
 
 @pytest.mark.parametrize(
@@ -22,3 +26,26 @@ from photoplan.products.characterise.result import Figure
 )
 def test_digits_follow_the_standard_deviation(value: float, sigma: float, text: str):
     assert str(Figure("x", value, sigma, "x")) == f"x: {text}"
+
+
+def test_columns_become_rows() -> None:
+    table = Listing.of(
+        "of them", plane="R", mean_dn=np.array([1.5, 2.5]), used=np.array([True, False]), name=["a", "b"]
+    )
+    assert table == Listing(("plane", "mean_dn", "used", "name"), (("R", 1.5, 1, "a"), ("R", 2.5, 0, "b")), "of them")
+
+
+def test_defects_come_from_the_levels_with_most_frames(tmp_path: Path) -> None:
+    """A mean of two frames hides what one of eight shows; of dark frames only long exposures show hot pixels."""
+    sensor, noise = Sensor(shape=(32, 40)), np.random.default_rng(0)
+    for kind, exposure, photons, frames in (
+        ("dark", 10, 0.0, 12), ("dark", 800, 0.0, 8), ("dark", 1000, 0.0, 2),
+        ("flat", 20, 9000.0, 2), ("flat", 25, 12000.0, 8), ("flat", 2, 500.0, 9),
+    ):  # fmt: skip
+        for k in range(frames):
+            write_frame(tmp_path / f"{kind}_{exposure}ms_{k}.tif", sensor.frame(photons, exposure, noise))
+    entries = "".join(f'[[frames]]\nkind = "{k}"\nfiles = "{k}_{{exposure}}ms_*.tif"\n' for k in ("dark", "flat"))
+    (tmp_path / "s.toml").write_text(f"[camera]\nbits = 12\n{entries}")
+    outcome = characterise(CharacteriseRequest(tmp_path / "s.toml", only=("defects",))).runs[0].outcome
+    assert outcome is not None
+    assert {f.at for f in outcome.figures if f.at} == {"dark 800 ms", "flat 25 ms"}

@@ -37,6 +37,8 @@ class Sensor:
     """Part of the signal."""
     full_well: float = 9000.0
     """Electrons."""
+    compression: float = 0.0
+    """Part of the grey value that a response which bends has lost at the full well."""
     bits: int = 12
     efficiency: float = 0.5
     flicker: float = 0.0
@@ -67,6 +69,7 @@ class Sensor:
         for place in self.blinking:
             electrons[place] += 600.0 * noise.integers(0, 2)
         electrons = np.minimum(electrons, self.full_well)
+        electrons = electrons * (1 - self.compression * electrons / self.full_well)
         electrons = electrons + offsets + self.read_noise * noise.standard_normal(self.shape)
         return np.clip(np.rint(self.bias + self.gain * electrons), 0, 2**self.bits - 1).astype(np.uint16)
 

@@ -47,12 +47,7 @@ def analyse(data: SeriesData) -> Findings:
 
 def _plane(data: SeriesData, plane: Plane) -> Findings:
     of = Subject(plane.name)
-    darks = sorted(data.settings("dark", least=2), key=lambda s: s.exposure)
-    sound = [s for s in darks if data.levels(s)[plane.name].saturated_share <= MOST_SATURATED]
-    dark = next(iter(sound[-1:] or darks[:1]), None)
-    flats = [s for s in data.settings("flat", least=2) if data.levels(s)[plane.name].saturated_share < 1e-3]
-    half = data.saturation_dn(plane.name) / 2
-    flat = min(flats, key=lambda s: abs(data.levels(s)[plane.name].mean - half), default=None)
+    dark, flat = _dark(data, plane), _flat(data, plane)
     outcomes = []
     for setting, kinds, share in ((dark, ("hot",), 0.0), (flat, ("hot", "dark"), _FLAT_SHARE)):
         if setting is not None:
@@ -64,6 +59,26 @@ def _plane(data: SeriesData, plane: Plane) -> Findings:
     if dark is None:
         refused[of.named("hot pixels")] = "no dark frames, two or more at a setting"
     return joined([*outcomes, Findings(refused=refused)])
+
+
+def _dark(data: SeriesData, plane: Plane) -> Setting | None:
+    """The dark frames with most of them, from half of the longest exposure that is not saturated on; the longest."""
+    settings = data.settings("dark", least=2)
+    sound = [s for s in settings if data.levels(s)[plane.name].saturated_share <= MOST_SATURATED]
+    if not sound:
+        return min(settings, key=lambda s: s.exposure, default=None)
+    longest = max(s.exposure for s in sound)
+    long = [s for s in sound if s.exposure >= longest / 2]
+    return max(reversed(long), key=lambda s: (len(s.frames), s.exposure))
+
+
+def _flat(data: SeriesData, plane: Plane) -> Setting | None:
+    """The flat frames with most of them, between 20 % and 80 % of saturation; of those, nearest to its half."""
+    half = data.saturation_dn(plane.name) / 2
+    levels = [(s, data.levels(s)[plane.name]) for s in data.settings("flat", least=2)]
+    away = [(s, abs(level.mean - half)) for s, level in levels if level.saturated_share < 1e-3]
+    middle = [each for each in away if each[1] <= 0.6 * half] or away
+    return min(middle, key=lambda each: (-len(each[0].frames), each[1]), default=(None, 0.0))[0]
 
 
 def _setting(data: SeriesData, setting: Setting, plane: Plane, how: tuple[tuple[Kind, ...], float]) -> Findings:

@@ -69,13 +69,17 @@ def _plane(name: str, bright: list[Level], dark: tuple[list[Level], list[float]]
         of.figure("conversion_e_dn", 1 / f.gain, f.gain_sigma / f.gain**2, "electrons per grey value", "e/DN"),
         of.figure("read_noise_dn", f.read_noise_dn, f.read_noise_dn_sigma, "read noise", "DN"),
         of.figure("read_noise_e", f.read_noise_e, f.read_noise_e_sigma, "read noise", "e"),
-        of.figure("full_well_dn", f.full_well_dn, f.full_well_dn_sigma, "signal at the peak of variance", "DN"),
+        of.figure("full_well_dn", f.full_well_dn, f.full_well_dn_sigma, "signal of full elements", "DN"),
         of.figure("full_well_e", f.full_well_e, f.full_well_e_sigma, "full well", "e"),
     )
+    if f.curve.bend:
+        lost, words = f.compression_percent, "signal lost by a response that bends, brightest level used"
+        figures += (of.figure("compression_percent", lost, f.compression_percent_sigma, words, "%"),)
     caption = "Levels and whether the line uses them"
     table = Listing.of(caption, plane=name, mean_dn=f.mean, variance_dn2=f.variance, used=f.used)
     key = f"photon_transfer{name and f'_{name}'}"
-    return Findings(figures, refused, {"levels": table}, _plots(f, of, data.step), details={key: f})
+    notes = tuple(f"{name}: {note}".lstrip(": ") for note in f.notes)
+    return Findings(figures, refused, {"levels": table}, _plots(f, of, data.step), notes, {key: f})
 
 
 def _plots(found: PhotonTransfer, of: Subject, step: float) -> tuple[Chart, ...]:
@@ -86,10 +90,10 @@ def _plots(found: PhotonTransfer, of: Subject, step: float) -> tuple[Chart, ...]
     least = max(0.1 * step, 1e-5 * float(signal.max()))
     seen = (signal > least) & (variance > 0)
     grid = np.geomspace(max(float(signal[seen].min()), least), float(signal.max()), 100)
-    of_line = found.line.at(grid + bias)
-    line = Trace(grid, of_line, "line", "dashed", colour=1)
+    of_line = found.curve.at(grid + bias)
+    line = Trace(grid, of_line, "parabola" if found.curve.bend else "line", "dashed", colour=1)
     noise = np.sqrt(np.maximum(of_line, 1e-9 * step**2))
-    model = Trace(grid, noise, "√(read² + K · signal)", "dashed", colour=1)
+    model = Trace(grid, noise, "parabola" if found.curve.bend else "√(read² + K · signal)", "dashed", colour=1)
     log = used_and_rest(signal[seen], np.sqrt(variance[seen]), used[seen])
     caption = f"Slope K = {found.gain:.4g} ± {found.gain_sigma:.2g} DN/e; each point is a level of two frames or more."
     points = used_and_rest(signal, variance, used)
