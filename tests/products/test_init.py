@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -362,7 +363,9 @@ def run(files: dict[str, Any], *more: str) -> Result:
         *("--images", files["images"][0], "--camera", str(files["camera"])),
         *("--orientation", str(files["orientation"]), "--terrain", files["terrain"], *more),
     ]
-    return CliRunner().invoke(command, arguments)
+    # Before click 8.2 a runner mixes both streams unless it is told otherwise.
+    apart = {"mix_stderr": False} if "mix_stderr" in signature(CliRunner).parameters else {}
+    return CliRunner(**apart).invoke(command, arguments)
 
 
 def test_the_command_prints_the_path_on_stdout_and_talks_on_stderr(files: dict[str, Any]) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
+import shapely.affinity
 from tools.hybrid_models import model, random_lines
 
 from photoplan.surfaces.units import UnitLayout
