@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
 from scipy import ndimage
-from tools.command import Here, start, wait_for
+from tools.command import Here
 from tools.huge_tiff import write_huge_tiff
 from tools.small_block import texture, write_image
 
@@ -288,50 +286,6 @@ class TestFaults:
         said = photoplan("restore", image, "--filter", weights, *words)
         assert (said.code, said.out) == (code, "")
         assert message in said.err
-
-
-@pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
-class TestInterrupted:
-    """Tiles of a kernel of 101 × 101 take long enough to be interrupted."""
-
-    @pytest.fixture
-    def slow(self, tmp_path: Path) -> list[object]:
-        """Words of a run of sixteen tiles."""
-        pixels = np.tile(texture(bands=1), (1, 14, 10))[:, :2000, :2000]
-        image = write_image(tmp_path / "scan.tif", np.ascontiguousarray(pixels), tiled=True)
-        values = np.random.default_rng(0).normal(size=(101, 101)) * 0.01
-        values[50, 50] += 1 - values.sum()
-        wide = save_filter(tmp_path / "wide.toml", RestorationFilter((FilterKernel(values),)))
-        return ["restore", image, "--filter", wide, "--no-quicklook", "--workers", 1, "--json"]
-
-    def test_fault_03_killed_and_gone_on(self, photoplan: Here, slow: list[object], tmp_path: Path) -> None:
-        """The same bytes and the same count of clipped pixels as without interruption; nothing is left behind."""
-        folder = tmp_path / "out"
-        undisturbed = photoplan(*slow, "--output", tmp_path / "quiet", "--workers", 2)
-        assert undisturbed.code == 0, undisturbed.err
-        for number in (signal.SIGKILL, signal.SIGINT):
-            running = start(*slow, "--output", folder)
-            log = folder / ".scan_restored.tif.tiles"
-            done = log.stat().st_size if log.exists() else 0
-            wait_for(lambda log=log, done=done: log.exists() and log.stat().st_size > done + 300_000, running)
-            if number == signal.SIGKILL:
-                second = photoplan(*slow, "--output", folder)
-                assert second.code == 2
-                assert "is writing this product" in second.err
-            running.send_signal(number)
-            running.communicate(timeout=60)
-            assert running.returncode == (130 if number == signal.SIGINT else -9)
-            assert not (folder / "scan_restored.tif").exists()
-        again = photoplan(*slow, "--output", folder)
-        assert again.code == 0, again.err
-        (facts,), (quiet,) = (json.loads(each.out)["images"] for each in (again, undisturbed))
-        assert 2 <= facts["resumed_tiles"] < facts["tiles"] == 16
-        assert "tiles are finished already" in again.err
-        assert facts["clipped_below"] == quiet["clipped_below"] and facts["clipped_above"] == quiet["clipped_above"]
-        assert sum(quiet["clipped_below"]) > 0
-        made = (folder / "scan_restored.tif").read_bytes()
-        assert made == (tmp_path / "quiet" / "scan_restored.tif").read_bytes()
-        assert not [p for p in folder.iterdir() if p.name.startswith(".")]
 
 
 class TestFilterFiles:

@@ -64,7 +64,7 @@ def test_frames_are_those_of_the_library(photoplan: Here, model: Path, tmp_path:
         assert np.array_equal(pixels(path)[0], expected)
         assert report["images"][frame]["exposure"] == exposure
     record = json.loads((tmp_path / "edge.run.json").read_text())
-    assert record["model"]["spread"]["gaussian"] == [0.6, 0.6]
+    assert record["settings"]["model"]["spread"]["gaussian"] == [0.6, 0.6]
     assert report["model_mtf50"]["x"] == pytest.approx(0.2807, abs=1e-4)
 
 

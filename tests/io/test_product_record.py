@@ -13,7 +13,7 @@ import pytest
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
-from photoplan.io.run_record import peak_memory_bytes, record_path, versions, write_run_record
+from photoplan.io.run_record import input_entry, peak_memory_bytes, record_path, versions, write_run_record
 
 
 def test_values_of_every_kind(tmp_path: Path) -> None:
@@ -28,11 +28,14 @@ def test_values_of_every_kind(tmp_path: Path) -> None:
         "time": datetime(2020, 1, 2, tzinfo=UTC),
         5: (True, None, "ü"),
     }
-    path = record_path(tmp_path / "a_ortho.tif")
+    product = tmp_path / "a_ortho.tif"
+    path = record_path(product)
     assert path == tmp_path / "a_ortho.run.json"
-    write_run_record(path, {"old": 1})
-    write_run_record(path, record)
-    assert json.loads(path.read_text("utf-8")) == {
+    write_run_record(product, key="old", inputs=(), run={})
+    assert write_run_record(product, key="new", inputs=(), run={}, told=record) == path
+    found = json.loads(path.read_text("utf-8"))
+    assert (found["file"], found["key"]) == ("a_ortho.tif", "new")
+    assert found["told"] == {
         "window": {"col": 1, "row": 2, "width": 3, "height": 4},
         "number": 0.5,
         "count": 7,
@@ -48,8 +51,26 @@ def test_values_of_every_kind(tmp_path: Path) -> None:
 
 def test_what_json_cannot_say_is_named(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"record\.a\.b\[1\] is a object"):
-        write_run_record(tmp_path / "a.run.json", {"a": {"b": [1, object()]}})
+        write_run_record(tmp_path / "a.tif", key="k", inputs=(), run={}, a={"b": [1, object()]})
     assert not list(tmp_path.iterdir())
+
+
+def test_inputs_are_named_with_size_and_digest(tmp_path: Path) -> None:
+    (tmp_path / "in.csv").write_text("x,y\n")
+    known = input_entry(tmp_path / "in.csv", "a digest")
+    path = write_run_record(tmp_path / "a.tif", key="k", inputs=[tmp_path / "in.csv", known], run={})
+    one, other = json.loads(path.read_text("utf-8"))["inputs"]
+    assert (one["path"], one["size"], len(one["sampled_sha256"])) == (str(tmp_path / "in.csv"), 4, 64)
+    assert other["sampled_sha256"] == "a digest"
+
+
+def test_a_raster_does_not_take_the_record_of_the_model_beside_it(tmp_path: Path) -> None:
+    """`terrain.gpkg` and `terrain.tif` have a record each; that of a file that is gone is replaced."""
+    for name, record in (("t.gpkg", "t.run.json"), ("t.tif", "t.tif.run.json"), ("t.gpkg", "t.run.json")):
+        (tmp_path / name).touch()
+        assert write_run_record(tmp_path / name, key=name, inputs=(), run={}) == tmp_path / record
+    (tmp_path / "t.gpkg").unlink()
+    assert write_run_record(tmp_path / "t.tif", key="k", inputs=(), run={}) == tmp_path / "t.run.json"
 
 
 def test_versions_and_memory() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections import namedtuple
 from pathlib import Path
@@ -17,9 +18,14 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io import disk
 from photoplan.products.dtm.raster import GridOptions, write_grid
 
-GRID = MapGrid(500_000.0, 5_200_000.0, 0.5, 700, 300, "EPSG:32633")
+PARTS = (500_000.0, 5_200_000.0, 0.5, 700, 300, "EPSG:32633")
+GRID = MapGrid(*PARTS)
 PLACE = GRID.placement
 Usage = namedtuple("Usage", "total used free")
+
+
+def options_of(**how: Any) -> GridOptions:
+    return GridOptions(**{"kind": "a ramp", "settings": {"rise": 1000}, "inputs": ()} | how)
 
 
 def ramp(window: Window) -> np.ndarray:
@@ -40,23 +46,20 @@ def test_values_come_back_with_holes(tmp_path: Path, workers: int) -> None:
         1,
         "auto",
         ramp,
-        GridOptions(tile=128, workers=workers, events=told, tags={"A": "b"}),
+        options_of(tile=128, workers=workers, events=told, tags={"A": "b"}),
     )
     with rasterio.open(tmp_path / "a.tif") as file:
         np.testing.assert_array_equal(file.read(), ramp(GRID.window))
         assert np.isnan(file.nodata)
         assert file.tags()["A"] == "b"
         assert file.bounds == GRID.bounds
-    assert list(tmp_path.iterdir()) == [tmp_path / "a.tif"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.run.json", "a.tif"]
+    record = json.loads((tmp_path / "a.run.json").read_text())
+    assert (record["kind"], record["settings"], record["run"]["workers"]) == ("a ramp", {"rise": 1000}, workers)
+    assert record["grid"]["size"] == [700, 300]
     assert (facts.tiles, facts.empty_tiles) == (18, 1)
     assert told.phases == [("a.tif", 18, "tiles")]
     assert (told.units["a.tif"], told.pixels) == (18, GRID.window.size)
-
-
-def test_one_and_more_workers_write_the_same_bytes(tmp_path: Path) -> None:
-    for workers in (1, 4):
-        write_grid(tmp_path / f"{workers}.tif", PLACE, "float32", 1, "auto", ramp, GridOptions(workers=workers))
-    assert (tmp_path / "1.tif").read_bytes() == (tmp_path / "4.tif").read_bytes()
 
 
 def test_classes_keep_their_colours_and_are_not_averaged(tmp_path: Path) -> None:
@@ -67,7 +70,7 @@ def test_classes_keep_their_colours_and_are_not_averaged(tmp_path: Path) -> None
         return np.broadcast_to(np.where(x % 2, 9, 1).astype(np.uint8), (1, window.height, window.width))
 
     colours = {0: (0, 0, 0), 1: (10, 20, 30), 9: (250, 240, 230)}
-    options = GridOptions(tile=128, resampling="nearest", colours=colours, workers=2)
+    options = options_of(tile=128, resampling="nearest", colours=colours, workers=2)
     write_grid(tmp_path / "a.tif", PLACE, "uint8", 1, "auto", classes, options)
     with rasterio.open(tmp_path / "a.tif") as file:
         table = file.colormap(1)
@@ -86,7 +89,7 @@ def test_mask_and_validity(tmp_path: Path) -> None:
         values = np.zeros((3, window.height, window.width), np.uint8)
         return values, np.ones((window.height, window.width), bool)
 
-    write_grid(tmp_path / "a.tif", PLACE, "uint8", 3, "mask", picture, GridOptions(tile=128))
+    write_grid(tmp_path / "a.tif", PLACE, "uint8", 3, "mask", picture, options_of(tile=128))
     with rasterio.open(tmp_path / "a.tif") as file:
         mask = file.dataset_mask()
     assert mask[:256].all()
@@ -101,22 +104,22 @@ def test_fault_13_an_existing_output_is_refused_before_any_work(tmp_path: Path) 
     path = tmp_path / "a.tif"
     path.write_bytes(b"old")
     with pytest.raises(UsageError, match="exists already"):
-        write_grid(path, PLACE, "uint8", 1, "auto", _no_work, GridOptions())
+        write_grid(path, PLACE, "uint8", 1, "auto", _no_work, options_of())
     with pytest.raises(UsageError, match="is the input"):
         (tmp_path / "b.tif").symlink_to(path)
-        write_grid(tmp_path / "b.tif", PLACE, "uint8", 1, "auto", _no_work, GridOptions(inputs=[path], overwrite=True))
+        write_grid(tmp_path / "b.tif", PLACE, "uint8", 1, "auto", _no_work, options_of(inputs=[path], overwrite=True))
     assert path.read_bytes() == b"old"
 
 
 def test_fault_04_too_little_space_is_seen_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(disk.shutil, "disk_usage", lambda path: Usage(0, 0, 3_000_000))
     with pytest.raises(ResourceError, match=r"needs up to \d+ MB"):
-        write_grid(tmp_path / "a.tif", PLACE, "float32", 1, "auto", _no_work, GridOptions())
+        write_grid(tmp_path / "a.tif", PLACE, "float32", 1, "auto", _no_work, options_of())
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_failed_window_leaves_nothing(tmp_path: Path, workers: int) -> None:
+def test_a_failed_window_leaves_the_finished_ones_alone(tmp_path: Path, workers: int) -> None:
     done = threading.Event()
 
     def failing(window: Window) -> np.ndarray:
@@ -128,12 +131,14 @@ def test_a_failed_window_leaves_nothing(tmp_path: Path, workers: int) -> None:
     with pytest.raises(
         TilesFailed, match=r"a\.tif: tiles .* could not be computed \(tile \d+: RuntimeError: no luck\)"
     ):
-        write_grid(tmp_path / "a.tif", PLACE, "float32", 1, "auto", failing, GridOptions(tile=128, workers=workers))
+        write_grid(tmp_path / "a.tif", PLACE, "float32", 1, "auto", failing, options_of(tile=128, workers=workers))
     assert done.is_set()
-    assert not list(tmp_path.iterdir())
+    assert [p.name for p in tmp_path.iterdir()] == [".a.tif.tiles"]
 
 
-def test_a_run_with_a_key_is_continued(tmp_path: Path) -> None:
+@pytest.mark.parametrize("changed", ["nothing", "settings", "input", "place"])
+def test_a_run_is_continued_with_the_same_inputs_settings_and_place(tmp_path: Path, changed: str) -> None:
+    """Whatever else may decide a value, tiles of the other run are of no use."""
     computed: list[Window] = []
 
     def halfway(window: Window) -> np.ndarray:
@@ -145,13 +150,15 @@ def test_a_run_with_a_key_is_continued(tmp_path: Path) -> None:
         computed.append(window)
         return ramp(window)
 
-    options = GridOptions(tile=128, workers=1, run_key="same inputs")
+    source = tmp_path / "terrain"
+    source.write_text("flat")
     with pytest.raises(TilesFailed):
-        write_grid(tmp_path / "a.tif", PLACE, "float32", 1, "auto", halfway, options)
-    write_grid(tmp_path / "a.tif", PLACE, "float32", 1, "auto", counting, options)
-    assert {w.row for w in computed} == {256}
-    write_grid(tmp_path / "b.tif", PLACE, "float32", 1, "auto", ramp, GridOptions(tile=128))
-    assert (tmp_path / "a.tif").read_bytes() == (tmp_path / "b.tif").read_bytes()
+        write_grid(tmp_path / "a.tif", PLACE, "float32", 1, "auto", halfway, options_of(tile=128, inputs=[source]))
+    source.write_text("steep" if changed == "input" else "flat")
+    more = {"settings": {"rise": 1}} if changed == "settings" else {}
+    place = MapGrid(500_000.5, *PARTS[1:]).placement if changed == "place" else PLACE
+    write_grid(tmp_path / "a.tif", place, "float32", 1, "auto", counting, options_of(tile=128, inputs=[source], **more))
+    assert {w.row for w in computed} == ({256} if changed == "nothing" else {0, 128, 256})
 
 
 @pytest.mark.parametrize(
@@ -166,4 +173,4 @@ def test_a_run_with_a_key_is_continued(tmp_path: Path) -> None:
 )
 def test_wrong_use_is_refused(tmp_path: Path, dtype: str, bands: int, options: dict[str, Any]) -> None:
     with pytest.raises(UsageError):
-        write_grid(tmp_path / "a.tif", PLACE, dtype, bands, "auto", _no_work, GridOptions(**options))
+        write_grid(tmp_path / "a.tif", PLACE, dtype, bands, "auto", _no_work, options_of(**options))

@@ -1,161 +1,257 @@
-"""What must hold for every product that is made by tiles: the same bytes, nothing half-made, nothing made twice."""
+"""Every product that runs, by its command: killed, starved, doubled, by more workers, it is the same in the end.
+
+A product that is added runs by the one loop: an entry of `CASES` is all that it needs here.
+"""
 
 from __future__ import annotations
 
-import random
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+import json
+import os
+import shutil
+import signal
+from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from tools.events import Told
-from tools.small_block import Block, texture, write_image
+from cli.test_dtm_build import ground, ridge
+from tools.forked import QUIET, Mishap, Ran, content, forked
+from tools.landxml import write_landxml
+from tools.real_projects import drone_project
+from tools.small_block import texture, write_block, write_image
 
-from photoplan.engine import run as engine_run
-from photoplan.engine.run import Work
-from photoplan.errors import ResourceError, RunLocked
-from photoplan.events import Events
-from photoplan.io.lock import FileLock
-from photoplan.io.product import ProductFile
-from photoplan.io.project.file import load_project
-from photoplan.products.dtm.shading import PictureRequest, make_picture, shade_picture
-from photoplan.products.orthophoto.execution import Run, execute
-from photoplan.products.orthophoto.plan import plan_orthophotos
-from photoplan.products.restore.request import RestoreRequest
-from photoplan.products.restore.run import restore_images
-from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
-from photoplan.terrain.shading.run import Light
+from photoplan.io.lock import FileLock, lock_of
+from photoplan.io.run_record import record_path
 
-Make = Callable[[Path, int, Events], Path]
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs fork, signals and limits")
 
+Words = Callable[[Path, Path], list[object]]
+"""Words of a command, from the folder of its inputs and one for its output."""
 
-def ortho(block: Block, scratch: Path) -> Make:
-    """Six tiles."""
-    plan = plan_orthophotos(load_project(block.project), ["one"], resolution=1.0, tile=128)
-
-    def make(folder: Path, workers: int, events: Events) -> Path:
-        return execute(plan, folder, Run(workers, quicklook=False, events=events))[0].path
-
-    return make
-
-
-def restored(block: Block, scratch: Path) -> Make:
-    """Four tiles."""
-    pixels = np.tile(texture(bands=1), (1, 5, 4))[:, :700, :700]
-    image = write_image(scratch / "scan.tif", np.ascontiguousarray(pixels), tiled=True)
-    sharper = RestorationFilter((FilterKernel(np.array([[0.0, -0.1, 0.0], [-0.1, 1.4, -0.1], [0.0, -0.1, 0.0]])),))
-
-    def make(folder: Path, workers: int, events: Events) -> Path:
-        request = RestoreRequest((image,), sharper, folder, workers=workers, quicklook=False)
-        report = restore_images(request, events)
-        assert not report.failed, report.failed
-        return report.images[0].path
-
-    return make
+MODEL = """
+seed = 3
+[spread]
+gaussian = 0.6
+[jitter]
+sigma = 0.2
+[exposure]
+light = 5000.0
+[readout]
+shot_noise = true
+[gain]
+factor = 0.04
+[automatic_gain]
+target = 100.0
+least = 0.2
+most = 5.0
+frames = 2.0
+[quantisation]
+bits = 8
+"""
 
 
-def hillshade(block: Block, scratch: Path) -> Make:
-    """A terrain raster; some tiles of 512."""
-
-    def make(folder: Path, workers: int, events: Events) -> Path:
-        folder.mkdir(parents=True, exist_ok=True)
-        request = PictureRequest(block.terrain, folder / "shade.tif", resolution=0.7, workers=workers)
-        return make_picture(request, shade_picture(Light()), events).path
-
-    return make
+def terrain(verb: str, *options: object) -> Words:
+    """A raster of the terrain of the small block, some tiles of 512 or 256."""
+    return lambda inputs, out: ["dtm", verb, inputs / "block" / "dem.tif", "-o", out / "product.tif", *options]
 
 
-@pytest.fixture(scope="module", params=[ortho, restored, hillshade], ids=lambda made: made.__name__)
-def make(request: pytest.FixtureRequest, pristine: Block, tmp_path_factory: pytest.TempPathFactory) -> Make:
-    return request.param(pristine, tmp_path_factory.mktemp("inputs"))
+def ortho(inputs: Path, out: Path) -> list[object]:
+    project = inputs / "block" / "project.toml"
+    return ["ortho", project, "--images", "one", "--resolution", 1, "--tile", 128, "--no-quicklook", "--output", out]
+
+
+def restore(inputs: Path, out: Path) -> list[object]:
+    return ["restore", inputs / "scan.tif", "--filter", inputs / "weights.csv", "--no-quicklook", "--output", out]
+
+
+def build(inputs: Path, out: Path) -> list[object]:
+    return ["dtm", "build", inputs / "survey.xml", "-o", out / "product.gpkg", "--no-report"]
+
+
+def volume(inputs: Path, out: Path) -> list[object]:
+    both = [inputs / "block" / "dem.tif"] * 2
+    words = ["--height-system", "same", "--resolution", 0.7, "--tolerance", 1]
+    return ["dtm", "volume", *both, *words, "--difference", out / "product.tif"]
+
+
+def simulate(inputs: Path, out: Path) -> list[object]:
+    words = ["--model", inputs / "model.toml", "--size", 180, 40, "--frames", 3]
+    return ["simulate", "star:12", *words, "--output", out / "product.tif"]
+
+
+def tie(inputs: Path, out: Path) -> list[object]:
+    project = inputs / "ties" / f"{out.name}.toml"  # the command adds its table
+    if not project.exists():
+        shutil.copy(inputs / "ties" / "project.toml", project)
+    words = ["--features", 600, "--per-image", 60, "--scale", 0.5, "--no-picture"]
+    return ["tie", project, "-o", out / "product.csv", *words]
+
+
+CASES: dict[str, tuple[Words, str]] = {
+    "ortho": (ortho, "one_ortho.tif"),
+    "restore": (restore, "scan_restored.tif"),
+    "simulate": (simulate, "product_0003.tif"),
+    "tie": (tie, "product.csv"),
+    "build": (build, "product.gpkg"),
+    "shade": (terrain("shade", "--resolution", 0.7), "product.tif"),
+    "slope": (terrain("slope", "--resolution", 0.7, "--classes", "5,10"), "product.tif"),
+    "aspect": (terrain("slope", "--aspect", "--resolution", 0.7), "product.tif"),
+    "tint": (terrain("tint", "--resolution", 0.7), "product.tif"),
+    "export": (terrain("export", "--resolution", 0.7), "product.tif"),
+    "visible": (terrain("visible", "--resolution", 0.7, "--from", 500300, 5300200), "product.tif"),
+    "flow": (terrain("flow", "--resolution", 0.7), "product.tif"),
+    "volume": (volume, "product.tif"),
+}
+"""Command and name of the product that comes last."""
 
 
 @pytest.fixture(scope="module")
-def serial(make: Make, tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    return make(tmp_path_factory.mktemp("serial"), 1, Told()).read_bytes()
+def inputs(tmp_path_factory: pytest.TempPathFactory, block: Path) -> Path:
+    folder = tmp_path_factory.mktemp("inputs")
+    write_block(folder / "block")
+    pixels = np.tile(texture(bands=1), (1, 5, 4))[:, :700, :700]
+    write_image(folder / "scan.tif", np.ascontiguousarray(pixels), tiled=True)
+    (folder / "weights.csv").write_text("0,-0.8,0\n-0.8,4.2,-0.8\n0,-0.8,0\n")
+    (folder / "model.toml").write_text(MODEL)
+    write_landxml(folder / "survey.xml", ground(), {"ridge": ridge()})
+    (folder / "ties").mkdir()
+    drone_project(block, folder / "ties", "DJI_0025", "DJI_0026", "DJI_0033")
+    return folder
 
 
-@pytest.mark.parametrize("workers", [2, 8])
-def test_fault_26_any_number_of_workers(make: Make, serial: bytes, tmp_path: Path, workers: int) -> None:
-    assert make(tmp_path, workers, Told()).read_bytes() == serial
+class Product:
+    """One case: runs of its command, each in a folder of its own."""
+
+    def __init__(self, name: str, inputs: Path, folder: Path) -> None:
+        self.words, self.last = CASES[name]
+        self.inputs, self.folder = inputs, folder
+
+    def run(self, out: Path, mishap: Mishap = QUIET, workers: int = 1, *more: object) -> Ran:
+        out.mkdir(parents=True, exist_ok=True)
+        words = [*self.words(self.inputs, out), *more]
+        return forked([*words, "--workers", workers], out / "said", mishap)
+
+    def path(self, out: Path) -> Path:
+        return out / self.last
+
+    def record(self, out: Path) -> dict[str, Any]:
+        """The run record; frames of a simulation have one in common."""
+        own = record_path(self.path(out))
+        text = (own if own.exists() else out / "product.run.json").read_text()
+        found: dict[str, Any] = json.loads(text.replace(str(out), "."))
+        return found
+
+    def figures(self, out: Path) -> dict[str, Any]:
+        """What the record says of the product, but for what the run itself took."""
+        return {k: v for k, v in self.record(out)["product"].items() if k not in ("seconds", "resumed_tiles")}
+
+    def same(self, out: Path, undisturbed: Path) -> bool:
+        """Whether product and figures are what they are without any mishap, and nothing else is left."""
+        assert [p.name for p in out.iterdir() if p.name.startswith(".")] == []
+        assert self.figures(out) == self.figures(undisturbed)
+        return content(self.path(out)) == content(self.path(undisturbed))
 
 
-def test_fault_26_any_order(make: Make, serial: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run_tiles = engine_run.run_tiles
-
-    def shuffled(tasks: Any, *rest: Any) -> Iterator[Any]:
-        tasks = list(tasks)
-        random.Random(1).shuffle(tasks)
-        return run_tiles(tasks, *rest)
-
-    monkeypatch.setattr(engine_run, "run_tiles", shuffled)
-    assert make(tmp_path, 2, Told()).read_bytes() == serial
+@pytest.fixture(scope="module", params=CASES)
+def product(request: pytest.FixtureRequest, inputs: Path, tmp_path_factory: pytest.TempPathFactory) -> Product:
+    return Product(request.param, inputs, tmp_path_factory.mktemp(request.param))
 
 
-def counted(monkeypatch: pytest.MonkeyPatch, fails: Callable[[int], bool] = lambda tile: False) -> list[int]:
-    """Tiles that are computed from now on; some fail when they are tried first."""
-    computed: list[int] = []
-    compute = engine_run.Runner._compute
-
-    def computing(self: Any, work: Work[Any]) -> Any:
-        def watched(tile: Any) -> Any:
-            computed.append(tile.index)
-            if computed.count(tile.index) == 1 and fails(tile.index):
-                raise RuntimeError("the drive is gone for a moment")
-            return work.job(tile)
-
-        return compute(self, replace(work, job=watched))
-
-    monkeypatch.setattr(engine_run.Runner, "_compute", computing)
-    return computed
+@pytest.fixture(scope="module")
+def quiet(product: Product) -> Ran:
+    """A run that nothing happens to."""
+    said = product.run(product.folder / "quiet")
+    assert said.code == 0, said.err
+    assert len(said.tasks) == len(set(said.tasks)) > 2
+    return said
 
 
-def test_fault_04_a_full_disk_costs_no_finished_tile(
-    make: Make, serial: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.fixture
+def undisturbed(product: Product, quiet: Ran) -> Path:
+    return product.folder / "quiet"
+
+
+@pytest.mark.parametrize(
+    ("sign", "share", "code"),
+    [(signal.SIGKILL, 0.5, -9), (signal.SIGKILL, 1.0, -9), (signal.SIGINT, 0.5, 130)],
+    ids=["killed halfway", "killed at the last task", "interrupted"],
+)
+def test_faults_03_25_a_run_that_ended_early_goes_on(
+    product: Product, quiet: Ran, undisturbed: Path, tmp_path: Path, sign: signal.Signals, share: float, code: int
 ) -> None:
-    """Nothing has the product's name, finished tiles are kept, and the next run makes the others alone."""
-    with monkeypatch.context() as patch:
-        append, left = ProductFile.append, iter(range(1))
-
-        def ends(self: ProductFile, *arguments: Any) -> None:
-            if next(left, None) is None:
-                raise ResourceError("the disk is full")
-            append(self, *arguments)
-
-        patch.setattr(ProductFile, "append", ends)
-        before = counted(patch)
-        with pytest.raises(ResourceError):
-            make(tmp_path, 1, Told())
-    assert not list(tmp_path.glob("*.tif"))
-    told = Told()
-    again = counted(monkeypatch)
-    path = make(tmp_path, 1, told)
-    assert path.read_bytes() == serial
-    assert len(before) == 2 and set(before) & set(again) == {before[1]}
-    assert any(f"{path.stem}: 1 of {len(again) + 1} tiles are finished already" in line for line in told.talked)
-    assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
+    """Nothing has the product's name; the same command computes what is missing, and nothing twice."""
+    at = min(round(share * len(quiet.tasks)), len(quiet.tasks) - 1)
+    killed = product.run(tmp_path, Mishap(end_at=at, sign=sign))
+    assert (killed.code, len(killed.tasks)) == (code, at)
+    assert sign == signal.SIGKILL or "same command continues" in killed.err.splitlines()[-1]
+    assert not product.path(tmp_path).exists() and not record_path(product.path(tmp_path)).exists()
+    again = product.run(tmp_path)
+    assert again.code == 0, again.err
+    assert "finished already" in again.err or "of an earlier run are kept" in again.err
+    assert not set(killed.tasks) & set(again.tasks)
+    assert sorted(killed.tasks + again.tasks) == sorted(quiet.tasks)
+    assert product.same(tmp_path, undisturbed)
 
 
-def test_fault_05_a_tile_that_fails_for_a_moment_is_tried_again(
-    make: Make, serial: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_fault_04_a_full_disk(product: Product, undisturbed: Path, tmp_path: Path) -> None:
+    """Exit code 5, which file and what to do; no half product; with more room the same command goes on."""
+    room = product.path(undisturbed).stat().st_size // 2
+    full = product.run(tmp_path, Mishap(most_bytes=room))
+    assert full.code == 5, full.err
+    assert str(tmp_path) in full.err and "free some space" in full.err
+    assert not product.path(tmp_path).exists()
+    assert not [p for p in tmp_path.iterdir() if ".part" in p.name or ".plain" in p.name]
+    again = product.run(tmp_path)
+    assert again.code == 0, again.err
+    assert not set(full.tasks[:-1]) & set(again.tasks)
+    assert product.same(tmp_path, undisturbed)
+
+
+def test_fault_05_a_task_that_fails_for_a_moment_is_tried_again(
+    product: Product, quiet: Ran, undisturbed: Path, tmp_path: Path
 ) -> None:
-    computed = counted(monkeypatch, lambda tile: tile == 1)
-    assert make(tmp_path, 2, Told()).read_bytes() == serial
-    assert computed.count(1) == 2
+    said = product.run(tmp_path, Mishap(fail_at=1))
+    assert said.code == 0, said.err
+    assert sorted(said.tasks) == sorted(quiet.tasks) and product.same(tmp_path, undisturbed)
 
 
-def test_fault_26_a_second_run_is_refused(make: Make, serial: bytes, tmp_path: Path) -> None:
-    path = make(tmp_path / "first", 1, Told())
-    (tmp_path / "second").mkdir()
-    with FileLock(tmp_path / "second" / f".{path.name}.lock"), pytest.raises(RunLocked):
-        make(tmp_path / "second", 1, Told())
+def test_fault_26_more_workers_in_any_order(product: Product, quiet: Ran, undisturbed: Path, tmp_path: Path) -> None:
+    said = product.run(tmp_path, Mishap(shuffled=True), 3)
+    assert said.code == 0, said.err
+    assert sorted(said.tasks) == sorted(quiet.tasks) and product.same(tmp_path, undisturbed)
 
 
-def test_every_phase_is_told(make: Make, serial: bytes, tmp_path: Path) -> None:
-    told = Told()
-    make(tmp_path, 1, told)
-    phase, units, unit = told.phases[-1]
-    assert unit == "tiles" and told.units[phase] == units > 1
-    assert told.pixels > 0
+def test_fault_26_processes(inputs: Path, tmp_path: Path) -> None:
+    """The one command that can have processes for workers."""
+    product = Product("ortho", inputs, tmp_path)
+    for out, more in ((tmp_path / "threads", ()), (tmp_path / "processes", ("--executor", "processes"))):
+        said = product.run(out, QUIET, 2, *more)
+        assert said.code == 0, said.err
+    assert product.same(tmp_path / "processes", tmp_path / "threads")
+
+
+def test_fault_26_a_second_run_is_refused(product: Product, tmp_path: Path) -> None:
+    first = product.path(tmp_path)
+    locked = first.with_name("product.tif") if first.name.startswith("product_") else first
+    with FileLock(lock_of(locked)):
+        said = product.run(tmp_path)
+    assert said.code == 2 and "another run" in said.err and said.tasks == []
+    assert not first.exists()
+
+
+def test_every_phase_counts_to_its_end(product: Product, quiet: Ran) -> None:
+    counted = [(promised, done) for _, promised, done in quiet.phases if promised]
+    assert counted and all(promised == done for promised, done in counted), quiet.phases
+
+
+def test_the_record_answers_for_the_product(product: Product, quiet: Ran, undisturbed: Path) -> None:
+    record = product.record(undisturbed)
+    assert {"file", "product", "settings", "key", "inputs", "run", "versions", "peak_memory_bytes"} <= record.keys()
+    files = [each for each in record["inputs"] if not each["path"].endswith("quiet.toml")]  # `tie` adds its table
+    assert files and all(each["size"] == Path(each["path"]).stat().st_size for each in files)
+    assert all(len(each["sampled_sha256"]) == 64 for each in record["inputs"]) and len(record["key"]) == 64
+    started, finished = (datetime.fromisoformat(record["run"][name]) for name in ("started", "finished"))
+    assert started <= finished and record["run"]["workers"] >= 1
+    assert {"photoplan", "GDAL", "numpy", "numba"} <= record["versions"].keys()

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import random
-from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -16,8 +14,6 @@ from tools.events import Told
 from tools.small_block import CRS, NAMES, SIZE, Block, make_project, texture, write_image
 
 from photoplan.engine import execute as engine_execute
-from photoplan.engine import run as engine_run
-from photoplan.engine.executors import run_tiles
 from photoplan.errors import InputError, ResourceError, TilesFailed, UsageError
 from photoplan.io.product import ProductFile
 from photoplan.io.project.file import load_project
@@ -48,31 +44,6 @@ def products(folder: Path) -> dict[str, bytes]:
 
 
 class TestFault26Equality:
-    @pytest.mark.parametrize("workers", [2, 4, 8])
-    def test_fault_26_threads(self, plan: OrthoPlan, serial: dict[str, bytes], tmp_path: Path, workers: int) -> None:
-        execute(plan, tmp_path, Run(workers, quicklook=False))
-        assert products(tmp_path) == serial
-
-    @pytest.mark.parametrize("seed", range(3))
-    def test_fault_26_shuffled_tiles(
-        self,
-        plan: OrthoPlan,
-        serial: dict[str, bytes],
-        tmp_path: Path,
-        monkeypatch: pytest.MonkeyPatch,
-        seed: int,
-    ) -> None:
-        order = random.Random(seed)
-
-        def shuffled(tasks: Any, *rest: Any) -> Iterator[Any]:
-            tasks = list(tasks)
-            order.shuffle(tasks)
-            return run_tiles(tasks, *rest)
-
-        monkeypatch.setattr(engine_run, "run_tiles", shuffled)
-        execute(plan, tmp_path, Run(2, quicklook=False))
-        assert products(tmp_path) == serial
-
     def test_fault_26_a_dask_cluster(self, plan: OrthoPlan, serial: dict[str, bytes], tmp_path: Path) -> None:
         distributed = pytest.importorskip("distributed")
         with distributed.LocalCluster(

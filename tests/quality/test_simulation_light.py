@@ -162,7 +162,7 @@ def test_tiles_and_transforms_change_nothing(spread, aperture, k, jitter, kept, 
     rng = np.random.default_rng(7)
     scene = ArrayScene(rng.random((27 * k, 38 * k)), k)
     moved = rng.normal(0.0, jitter, 27) if jitter else None
-    light = optics.sample_scene(scene, optics.Optics(spread, aperture), moved)[0]
+    light = optics.Light(scene, optics.Optics(spread, aperture), moved=moved).whole()[0]
     assert np.abs(light - in_one_piece(scene, spread, aperture, moved)).max() < (1e-9 if jitter else 1e-12)
 
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from photoplan.engine.executors import thread_map
+from photoplan.engine.steps import steps
 from photoplan.errors import InputError, UsageError
 from photoplan.terrain.visibility import Observer, SightSettings, curvature_drop, horizon, needed_heights
 
@@ -16,7 +16,7 @@ FLAT_EARTH = SightSettings(curvature=False)
 
 def need(heights, mesh, observer, settings=FLAT_EARTH, only_whether=False, workers=1):
     heights = np.asarray(heights, np.float32)
-    with thread_map(workers) as run:
+    with steps("terrain", workers) as run:
         return needed_heights(heights, mesh, observer, settings, only_whether=only_whether, run=run)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.engine.executors import thread_map
+from photoplan.engine.steps import steps
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
 from photoplan.surfaces.units import MemoryUnits
@@ -29,7 +29,7 @@ def line(xyz: ArrayLike, kind: Any = "breakline", name: str = "line", **more: An
 
 
 def built(measured: MeasuredTerrain, workers: int = 2, **settings: Any) -> Built:
-    with thread_map(workers) as run:
+    with steps("terrain", workers) as run:
         return build_terrain(plan_build(measured, BuildSettings(**settings)), run)
 
 

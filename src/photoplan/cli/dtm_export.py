@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import bounds_option, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import bounds_option, json_option, overwrite_option, quiet_option, workers_option
 from photoplan.cli.output import say, show, show_json
 
 
@@ -18,6 +18,7 @@ from photoplan.cli.output import say, show, show_json
 @bounds_option
 @click.option("--sigma", type=click.Path(path_type=Path), metavar="TIF", help="Write the standard deviations too.")
 @click.option("--crs", help="CRS of a terrain file that does not state it.")
+@workers_option
 @overwrite_option
 @json_option
 @quiet_option

@@ -30,9 +30,11 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     Pits are filled first; how much that was is printed.
     """
+    from photoplan.cli.telling import Telling
     from photoplan.products.dtm.flow import BANDS, FlowRequest, dtm_flow
 
-    found = dtm_flow(FlowRequest(**options))
+    with Telling(quiet) as events:
+        found = dtm_flow(FlowRequest(**options), events)
     if as_json:
         show_json(found)
         return

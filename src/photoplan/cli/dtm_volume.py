@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option, overwrite_option, quiet_option
+from photoplan.cli.options import json_option, overwrite_option, quiet_option, workers_option
 from photoplan.cli.output import say, show, show_json
 
 
@@ -24,6 +24,7 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--bias", type=float, default=0.0, help="Standard deviation of a common height error, metres [0].")
 @click.option("--height-system", metavar="same", help="Declare that both models have the same height system.")
 @click.option("--crs", help="CRS of files that do not state it.")
+@workers_option
 @overwrite_option
 @json_option
 @quiet_option

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import dry_run_option, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import dry_run_option, json_option, overwrite_option, quiet_option, workers_option
 from photoplan.cli.output import say, show, show_json
 
 
@@ -29,6 +29,7 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--oversampling", type=click.IntRange(1, 64), metavar="K",
               help="Cells of the scene along a side of a pixel [1 for files, 8 for patterns].")  # fmt: skip
 @click.option("--dtype", type=click.Choice(["uint8", "uint16", "float32"]), help="Of the files [as the model says].")
+@workers_option
 @overwrite_option
 @dry_run_option("Check everything, say what would be written, write nothing.")
 @json_option
@@ -40,8 +41,10 @@ def command(scene: str, as_json: bool, quiet: bool, **options: Any) -> None:
     discs:PITCH,DIAMETER.
     """
     from photoplan.cli.telling import Telling
+    from photoplan.engine.cpus import available_cpus
     from photoplan.products.simulate.run import SimulateRequest, simulate
 
+    options["workers"] = options["workers"] or available_cpus()
     with Telling(quiet) as events:
         report = simulate(SimulateRequest(scene, **options), events)
     if as_json:

@@ -29,7 +29,7 @@ from typing import Any
 
 from photoplan.engine.cluster import Cluster, Question
 from photoplan.errors import PhotoplanError, ResourceError, UsageError
-from photoplan.events import Events, Map
+from photoplan.events import Events
 
 #: How often a tile is tried again after its worker died or an unforeseen error.
 RETRIES = 2
@@ -132,19 +132,9 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-@contextmanager
-def thread_map(workers: int) -> Iterator[Map]:
-    """A `map` over threads; what has not begun is dropped when an error or an interrupt comes."""
-    if workers == 1:
-        yield map
-        return
-    pool = ThreadPoolExecutor(workers, "photoplan")
-    try:
-        yield pool.map
-    except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
-        raise
-    pool.shutdown()
+def threads(workers: int) -> Workers:
+    """So many threads of this process."""
+    return Workers(executor_factory("threads", workers), workers)
 
 
 def open_workers(kind: str, workers: int, question: Question, events: Events) -> Workers:
@@ -185,6 +175,11 @@ class Workers:
         self._executor: Executor | None = cluster
         self._cluster = cluster
         self.threads = threads
+
+    @property
+    def in_flight(self) -> int:
+        """Tasks that keep all workers busy without one that waits for the next."""
+        return self.threads if self.threads == 1 else 2 * self.threads
 
     @property
     def versions(self) -> list[dict[str, str]] | None:

@@ -2,7 +2,8 @@
 
 A product says what a tile is (`Work.job`), where its outputs go (`Work.sinks`) and what is done when all tiles are
 there (`Work.complete`). Order, retries, resuming and the bound on memory are here. While one product is completed (its
-file assembled, compared and named), the tiles of the next one are computed.
+file assembled, compared and named), the tiles of the next one are computed. A product that comes about in steps, each
+of which needs all of the one before (a terrain model, tie points), runs them through `photoplan.engine.steps`.
 """
 
 from __future__ import annotations
@@ -22,13 +23,27 @@ from numpy.typing import NDArray
 
 from photoplan.engine.cluster import opened
 from photoplan.engine.executors import PULSE, Workers, run_tiles
-from photoplan.errors import PhotoplanError, UsageError
+from photoplan.errors import PhotoplanError, TilesFailed, UsageError
 from photoplan.events import Events
-from photoplan.plan.tiles import Tile
 
-Output = tuple[NDArray[Any], NDArray[np.bool_] | None]
-"""Values of a tile, shape (bands, height, width), and their validity, (height, width); None: all are valid."""
+Output = tuple[Any, NDArray[np.bool_] | None]
+"""Values of a tile, shape (bands, height, width), and their validity, (height, width); None: all are valid. Or any
+result that its sink takes, and None."""
 T = TypeVar("T")
+
+
+class Task(Protocol):
+    """What one call of a job makes: a tile, or an item of a step."""
+
+    @property
+    def index(self) -> int:
+        """Its place in the sinks."""
+        ...
+
+    @property
+    def pixels(self) -> int:
+        """Its pixels, for the rate that is told; 0: it has none."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +71,7 @@ class Sink(Protocol):
         """Indices of the tiles that it has, those of an earlier run among them."""
         ...
 
-    def append(self, index: int, pixels: NDArray[Any], valid: NDArray[np.bool_] | None, record: Any, /) -> None:
+    def append(self, index: int, pixels: Any, valid: NDArray[np.bool_] | None, record: Any, /) -> None:
         """Keep a tile and its record."""
         ...
 
@@ -79,6 +94,18 @@ class Tally:
     failed: list[int] = field(default_factory=list)
     reasons: list[str] = field(default_factory=list)
 
+    def check(self, name: object) -> None:
+        """Refuse to complete what lacks tiles.
+
+        Raises
+        ------
+        TilesFailed
+            Some failed again and again.
+        """
+        if self.failed:
+            failed = ", ".join(map(str, sorted(self.failed)))
+            raise TilesFailed(f"{name}: tiles {failed} could not be computed ({self.reasons[0]}); nothing is written")
+
     def add(self, record: Mapping[str, Any]) -> None:
         """Add a tile's figures: maxima of those that begin with ``worst``, sums of the others."""
         for name, value in record.items():
@@ -98,9 +125,9 @@ class Work(Generic[T]):
     """One product to be made."""
 
     name: str
-    job: Callable[[Tile], Made]
-    """Makes a tile: what a worker is told once, small; it pickles for processes and clusters."""
-    tiles: Sequence[Tile]
+    job: Callable[[Any], Made]
+    """Makes a task: what a worker is told once, small; it pickles for processes and clusters."""
+    tiles: Sequence[Task]
     """Tiles that can hold something."""
     count: int
     """All tiles; those that `tiles` leaves out are empty."""
@@ -153,8 +180,8 @@ class Runner(Generic[T]):
     ----------
     workers : Workers
         Compute tiles.
-    in_flight : int
-        Tiles under way at once.
+    in_flight : int or None
+        Tiles under way at once; None: as many as keep the workers busy.
     events : Events
         Told of tiles that are done, and of each product's result.
     excuse : callable
@@ -165,13 +192,13 @@ class Runner(Generic[T]):
     def __init__(
         self,
         workers: Workers,
-        in_flight: int,
+        in_flight: int | None,
         events: Events,
         excuse: Callable[[Work[T], PhotoplanError], T | None] | None = None,
     ) -> None:
         self.results: list[T] = []
         """In the order of the products; complete when the context ends."""
-        self._workers, self._in_flight, self._events = workers, in_flight, events
+        self._workers, self._in_flight, self._events = workers, in_flight or workers.in_flight, events
         self._excuse = excuse
         self._completing: deque[tuple[Work[T] | Kept[T], Future[T]]] = deque()
         self._pool = ThreadPoolExecutor(1, "photoplan-complete")
@@ -234,7 +261,8 @@ class Runner(Generic[T]):
                 tally.resumed += 1
                 tally.add(work.sinks[0].record(tile.index))
         if tally.resumed:
-            self._events.talk(f"{work.name}: {tally.resumed} of {len(work.tiles)} tiles are finished already")
+            if work.name:
+                self._events.talk(f"{work.name}: {tally.resumed} of {len(work.tiles)} tiles are finished already")
             self._events.done(tally.resumed)
         for index in set(range(work.count)) - {tile.index for tile in work.tiles} - finished:
             for sink in work.sinks:
@@ -250,7 +278,7 @@ class Runner(Generic[T]):
             else:
                 tally.failed.append(tile.index)
                 tally.reasons.append(f"tile {tile.index}: {outcome.error}")
-            self._events.done(1, tile.window.size)
+            self._events.done(1, tile.pixels)
             self._settle_done()
         if work.scratch is not None:
             shutil.rmtree(work.scratch, ignore_errors=True)

@@ -16,6 +16,11 @@ except ImportError:  # Windows
     import msvcrt
 
 
+def lock_of(product: Path) -> Path:
+    """The file whose lock says that a product is being written."""
+    return product.with_name(f".{product.name}.lock")
+
+
 class FileLock:
     """An exclusive lock on a file beside the product; a context manager.
 

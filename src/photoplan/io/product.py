@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
@@ -20,7 +19,7 @@ from photoplan.geometry.grid import Placement, Window
 from photoplan.io.disk import disk_error, free_megabytes, sync_file, sync_folder
 from photoplan.io.gdal import GDAL_ERRORS, first_cause
 from photoplan.io.image_form import ImageForm, dress
-from photoplan.io.lock import FileLock
+from photoplan.io.lock import FileLock, lock_of
 from photoplan.io.plain_tiff import write_plain_tiff
 from photoplan.io.product_check import check_product
 from photoplan.io.storage import PRODUCT_TYPES, BlockCoder, CogOptions, Nodata, nodata_for, write_cog
@@ -98,9 +97,8 @@ class ProductFile:
     dtype: np.dtype[Any]
     """uint8, uint16, int16 or float32."""
     _: KW_ONLY
-    run_key: str | None
-    """A digest of inputs, parameters and version: another key starts afresh. None: no other run can go on with the
-    tiles, they are forgotten when the context ends."""
+    run_key: str
+    """A digest of inputs, parameters and version: another key starts afresh."""
     nodata: Nodata = "auto"
     """A value, `mask` for a mask band, or `auto`: 0 for unsigned integers, -32768 for int16, NaN for float32. JPEG
     always takes a mask."""
@@ -147,7 +145,7 @@ class ProductFile:
         value = nodata_for(self.dtype, self.nodata, self.compress)
         self._coder = BlockCoder(self.tile, self.bands, self.dtype, value, lossy=self.compress == "jpeg")
         self._windows = tuple(self.placement.window.tiles(self.tile))
-        self._lock = FileLock(self.path.with_name(f".{self.path.name}.lock"))
+        self._lock = FileLock(lock_of(self.path))
         self._state = threading.Lock()
 
     def __enter__(self) -> ProductFile:
@@ -157,7 +155,7 @@ class ProductFile:
             # The run before may have finished between the check and the lock.
             check_output(self.path, self.inputs, overwrite=self.overwrite)
             self._remove_parts()
-            key = f"{self.run_key or secrets.token_hex(16)} {self.placement} {self._coder}"
+            key = f"{self.run_key} {self.placement} {self._coder}"
             self._log = TileLog(self.log_path, key)
         except BaseException:
             self._lock.release()
@@ -167,10 +165,8 @@ class ProductFile:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self.run_key is None:
-            self.discard()
         if self._log is not None:
-            self._log.close()
+            self._log.leave()
             self._log = None
         self._lock.release()
 
@@ -277,12 +273,6 @@ class ProductFile:
             log.remove()
             self._log = None
         return facts
-
-    def discard(self) -> None:
-        """Forget the finished tiles: no later run can use them."""
-        if self._log is not None:
-            self._log.remove()
-            self._log = None
 
     def _open_log(self) -> TileLog:
         if self._log is None:

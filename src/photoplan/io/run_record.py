@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import platform
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -15,6 +16,7 @@ import psutil
 import rasterio
 
 from photoplan.io.disk import write_atomically
+from photoplan.io.fingerprint import fingerprint
 from photoplan.plain import json_text
 
 try:
@@ -30,8 +32,29 @@ def record_path(product: Path) -> Path:
     return product.with_name(f"{product.stem}.run.json")
 
 
-def write_run_record(path: Path, record: dict[str, Any]) -> Path:
-    """Write a record as JSON; the name holds the old or the whole new record.
+def input_entry(path: Path | str, digest: str | None = None) -> dict[str, Any]:
+    """How a record names an input; its digest is sampled if it is not known."""
+    return {"path": path, "sampled_sha256": digest or fingerprint(path).digest, "size": Path(path).stat().st_size}
+
+
+def write_run_record(
+    product: Path, /, *, key: str, inputs: Iterable[Path | Mapping[str, Any]], run: Mapping[str, Any], **told: Any
+) -> Path:
+    """Write the record of a product as JSON; the name holds the old or the whole new record.
+
+    Parameters
+    ----------
+    product : Path
+        The record stands beside it, see `record_path`; with the whole name before ``.run.json`` where that would
+        replace the record of another file.
+    key : str
+        The digest of all that decides its content.
+    inputs : iterable
+        Files, or their entries, see `input_entry`.
+    run : mapping
+        Workers and whatever else was chosen without an effect on the content; times, see `run_times`.
+    **told
+        What the kind of product has to say: `product`, `settings`, and more.
 
     Raises
     ------
@@ -40,8 +63,22 @@ def write_run_record(path: Path, record: dict[str, Any]) -> Path:
     ResourceError
         If the disk is full.
     """
-    write_atomically(Path(path), (json_text(record, "record") + "\n").encode())
-    return Path(path)
+    entries = [each if isinstance(each, Mapping) else input_entry(each) for each in inputs]
+    record = {"file": product.name, **told, "key": key, "inputs": entries, "run": run, "versions": versions()}
+    path = record_path(product)
+    if _of_another(path, product):
+        path = product.with_name(f"{product.name}.run.json")
+    write_atomically(path, (json_text(record | {"peak_memory_bytes": peak_memory_bytes()}, "record") + "\n").encode())
+    return path
+
+
+def _of_another(path: Path, product: Path) -> bool:
+    """Whether a record belongs to another file of the same name but for its extension, such as a model and a raster."""
+    try:
+        other = json.loads(path.read_text(encoding="utf-8"))["file"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    return other != product.name and product.with_name(str(other)).exists()
 
 
 def versions() -> dict[str, str]:

@@ -178,6 +178,13 @@ class TileLog:
             os.close(self._descriptor)
             self._descriptor = -1
 
+    def leave(self) -> None:
+        """Close the file; it stays if there is something in it."""
+        if self._places:
+            self.close()
+        else:
+            self.remove()
+
     def remove(self) -> None:
         """Close and delete the file: its product is complete."""
         self.close()

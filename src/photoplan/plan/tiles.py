@@ -23,6 +23,11 @@ class Tile:
     sources: tuple[int, ...] = (0,)
     """Rows of the table of sources that can paint here; all others are never looked at."""
 
+    @property
+    def pixels(self) -> int:
+        """Pixels of the tile."""
+        return self.window.size
+
 
 @dataclass(frozen=True, eq=False)
 class Tiles(Sequence[Tile]):

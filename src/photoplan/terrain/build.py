@@ -17,9 +17,9 @@ from photoplan.surfaces.measured import MeasuredTerrain
 from photoplan.surfaces.mesh.faces import build_faces
 from photoplan.surfaces.mesh.lines import on_grid
 from photoplan.surfaces.mesh.thin import thin
-from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
+from photoplan.surfaces.units import LineElement, MeshFaces, Unit, UnitFigures, UnitLayout
 from photoplan.terrain.clean.borders import domain_of
-from photoplan.terrain.fit import TerrainFit, each, fit
+from photoplan.terrain.fit import TerrainFit, fit
 from photoplan.terrain.observations import Observations, observe
 from photoplan.terrain.predict import Domain, predict_lines, predict_unit
 from photoplan.terrain.settings import BuildSettings
@@ -132,18 +132,13 @@ def build_terrain(plan: BuildPlan, run: Map = map, events: Events = SILENT) -> B
     settings, layout, seen = plan.settings, plan.layout, plan.seen
     local = replace(layout, left=layout.left - seen.origin[0], top=layout.top - seen.origin[1])
     count = layout.columns * layout.rows
-    events.begin("covariance functions and gross errors", 3 * count, "units")
     found = fit(seen, local, settings, run, events)
+    events.begin("lines", unit="units")
     lines = predict_lines(found, run)
     domain = _domain(plan)
     events.begin("heights", count, "units")
     meshes_of = settings.unit_meshes * _finer(plan, lines).ravel()
-    posts = each(
-        lambda u: _thinned(plan, predict_unit(found, u, domain, int(meshes_of[u]), plan.reach)),
-        range(count),
-        run,
-        events,
-    )
+    posts = run(lambda u: _thinned(plan, predict_unit(found, u, domain, int(meshes_of[u]), plan.reach)), range(count))
     units = {(u % layout.columns, u // layout.columns): unit for u, unit in enumerate(posts) if unit is not None}
     meshes = np.zeros((layout.rows, layout.columns), np.int64)
     for (column, row), unit in units.items():
@@ -193,12 +188,11 @@ def _with_faces(
     run: Map,
     events: Events,
 ) -> dict[tuple[int, int], Unit]:
-    layout = plan.layout
     boxes = shapely.STRtree([shapely.LineString(line.xyz[:, :2]) for line in lines])
     keys = list(units)
 
-    def one(number: int) -> Unit:
-        column, row = keys[number]
+    def one(key: tuple[int, int]) -> MeshFaces | None:
+        column, row = key
         unit = units[column, row]
         edge = 1e-6 * unit.side  # a line on the border, rounded by one bit, still touches
         box = shapely.box(unit.left - edge, unit.top - unit.side - edge, unit.left + unit.side + edge, unit.top + edge)
@@ -210,13 +204,10 @@ def _with_faces(
             "east": (column + 1, row),
         }
         neighbours = {side: units[key] for side, key in around.items() if key in units}
-        faces = build_faces(unit, some, neighbours, plan.polygon)
-        return replace(unit, faces=faces)
+        return build_faces(unit, some, neighbours, plan.polygon)
 
     events.begin("triangles", len(keys), "units")
-    done = each(one, range(len(keys)), run, events)
-    assert layout.side > 0
-    return dict(zip(keys, done))
+    return {key: replace(units[key], faces=faces) for key, faces in zip(keys, run(one, keys))}
 
 
 def _figures(

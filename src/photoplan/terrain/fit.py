@@ -5,9 +5,7 @@ The area is cut into squares that hold few points each: every one is the core of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +16,6 @@ from photoplan.surfaces.units import UnitLayout
 from photoplan.terrain.covariance import LADDER, Covariance, Neighbours, estimate_all, estimate_unit, ladder, near_lines
 from photoplan.terrain.observations import Observations
 from photoplan.terrain.settings import BuildSettings
-
-T = TypeVar("T")
 
 #: A patch reaches this many half sides from the middle of its leaf (see the weights in `photoplan.kernels.patch`).
 REACH = 1.5
@@ -152,15 +148,6 @@ class TerrainFit:
         return np.stack([table[unit] for unit in self.leaves.unit[leaves].tolist()])
 
 
-def each(function: Callable[[int], T], items: Sequence[int], run: Map = map, events: Events = SILENT) -> list[T]:
-    """`function` of every item, by workers; results in order."""
-    results = []
-    for result in run(function, items):
-        results.append(result)
-        events.done()
-    return results
-
-
 def patches_at(leaves: Leaves, some: NDArray[np.int64]) -> NDArray[np.float64]:
     """Middle and half side of leaves, shape (n, 3)."""
     return np.column_stack([leaves.middle[some], leaves.half[some]])
@@ -171,17 +158,18 @@ def fit(
 ) -> TerrainFit:
     """Estimate the covariance functions, choose among them in every patch, and flag gross errors.
 
-    `events` are told of each unit three times.
+    What `run` computes is returned to it, so that it can be kept: nothing else changes but by what it gives back.
     """
     vertices = seen.lines.xyz[:, :2]
     leaves = quadtree(np.vstack([seen.xyz[: seen.points, :2], vertices]), layout, settings.unit_meshes)
     order = leaves.order[leaves.order < seen.points]
     neighbours = Neighbours.of(seen.xyz[:, :2], seen.points, order)
     count = layout.columns * layout.rows
+    events.begin("covariance functions and gross errors", 3 * count + 1, "units")
     unit_of_point = _unit_of(seen.xyz[:, :2], layout)
     members = _members(unit_of_point[: seen.points], count)
-    whole = estimate_all(seen, neighbours, members, settings)
-    units = each(lambda u: estimate_unit(seen, neighbours, members[u], whole, settings), range(count), run, events)
+    (whole,) = run(lambda members: estimate_all(seen, neighbours, members, settings), [members])
+    units = list(run(lambda u: estimate_unit(seen, neighbours, members[u], whole, settings), range(count)))
     mass = np.array([unit.noise for unit in units])
     found = TerrainFit(
         seen=seen,
@@ -196,9 +184,11 @@ def fit(
         spread=np.ones(count),
         members=tuple(members),
     )
-    each(lambda u: _choose(found, u), range(count), run, events)
-    each(lambda u: _test(found, leaves.of_unit(u)), range(count), run, events)
+    for u, shares in enumerate(run(lambda u: _choose(found, u), range(count))):
+        found.shares[leaves.of_unit(u)] = shares
+    _test_all(found, [leaves.of_unit(u) for u in range(count)], run)
     if settings.gross > 0:
+        events.begin("gross errors", unit="units")
         _flag(found, settings.gross, run)
     return replace(found, spread=_spread(found))
 
@@ -226,8 +216,8 @@ def lines_of(
     return near_lines(found.seen, low, high)
 
 
-def _choose(found: TerrainFit, unit: int) -> None:
-    """Weights of the ladder's functions in the patches of a unit."""
+def _choose(found: TerrainFit, unit: int) -> NDArray[np.float64]:
+    """Weights of the ladder's functions in the patches of a unit, shape (patches, len(LADDER))."""
     some = found.leaves.of_unit(unit)
     ids = found.neighbours.query(found.leaves.middle[some])
     scores = np.zeros((len(some), len(LADDER)))
@@ -238,19 +228,24 @@ def _choose(found: TerrainFit, unit: int) -> None:
     weight = np.exp(-scores / 2)
     weight = np.where(np.isfinite(weight), weight, 0.0)
     weight[weight.sum(axis=1) == 0] = 1.0
-    found.shares[some] = weight / weight.sum(axis=1, keepdims=True)
+    return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
 
-def _test(found: TerrainFit, some: NDArray[np.int64]) -> None:
-    """Residuals of the points in some leaves, by the best function of each patch."""
-    if not len(some):
-        return
+def _test_all(found: TerrainFit, leaves: list[NDArray[np.int64]], run: Map) -> None:
+    """Residuals of the points in groups of leaves."""
+    for points, residuals in run(lambda some: _test(found, some), leaves):
+        found.residuals[points] = residuals
+
+
+def _test(found: TerrainFit, some: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The points in some leaves and their residuals, by the best function of each patch."""
     leaves, points = found.leaves, found.seen.points
     own = [leaves.order[leaves.first[k] : leaves.first[k] + leaves.count[k]] for k in some]
     own = [numbers[numbers < points] for numbers in own]
     start = np.concatenate([[0], np.cumsum([len(numbers) for numbers in own])])
-    if not start[-1]:
-        return
+    numbers = np.concatenate([np.empty(0, np.int64), *own])
+    if not len(numbers):
+        return numbers, np.empty((0, 3))
     models = found.models(some)[np.arange(len(some)), found.shares[some].argmax(axis=1)]
     ids = found.neighbours.query(leaves.middle[some])
     patches = patches_at(leaves, some)
@@ -259,12 +254,13 @@ def _test(found: TerrainFit, some: NDArray[np.int64]) -> None:
         found.noise,
         ids,
         patches,
-        np.concatenate(own),
+        numbers,
         start,
         *lines_of(found, patches, ids),
         models,
         found.residuals,
     )
+    return numbers, found.residuals[numbers]
 
 
 def _flag(found: TerrainFit, limit: float, run: Map) -> None:
@@ -294,7 +290,8 @@ def _flag(found: TerrainFit, limit: float, run: Map) -> None:
         found.noise[flagged] = -1.0
         touched = np.unique(found.neighbours.near[0].query(found.seen.xyz[flagged, :2]))
         leaves = np.unique(_leaf_of(found)[touched])
-        _test_again(found, leaves, run)
+        unit = found.leaves.unit[leaves]
+        _test_all(found, [leaves[unit == u] for u in np.unique(unit)], run)
 
 
 def _supported(found: TerrainFit, suspect: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -305,11 +302,6 @@ def _supported(found: TerrainFit, suspect: NDArray[np.int64]) -> NDArray[np.bool
     same = found.residuals[near, 2] * np.sign(found.residuals[suspect, 2])[:, None] > _CLEAR
     supported: NDArray[np.bool_] = (close & same).any(axis=1)
     return supported
-
-
-def _test_again(found: TerrainFit, leaves: NDArray[np.int64], run: Map) -> None:
-    unit = found.leaves.unit[leaves]
-    each(lambda u: _test(found, leaves[unit == u]), np.unique(unit).tolist(), run)
 
 
 def _leaf_of(found: TerrainFit) -> NDArray[np.int64]:

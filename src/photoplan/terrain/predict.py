@@ -14,7 +14,7 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 from photoplan.events import Map
 from photoplan.kernels.patch import predict
 from photoplan.surfaces.units import LineElement, Unit
-from photoplan.terrain.fit import REACH, TerrainFit, each, lines_of, patches_at
+from photoplan.terrain.fit import REACH, TerrainFit, lines_of, patches_at
 
 #: A prepared polygon builds its index when it is first asked, and GEOS does not guard that against other threads.
 _ONE_AT_A_TIME = threading.Lock()
@@ -190,15 +190,15 @@ def predict_lines(fit: TerrainFit, run: Map = map) -> list[LineElement]:
     unit = row * columns + column
     left, right = np.full((count, 2), np.nan), np.full((count, 2), np.nan)
 
-    def one(number: int) -> None:
-        some = np.flatnonzero(unit == number)
+    def one(some: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         xy, beside = lines.xyz[some, :2], lines.beside[some]
-        heights, sigmas, _ = heights_at(fit, number, np.vstack([xy + beside, xy - beside]))
+        heights, sigmas, _ = heights_at(fit, int(unit[some[0]]), np.vstack([xy + beside, xy - beside]))
         n = len(some)
-        left[some] = np.column_stack([heights[:n], sigmas[:n]])
-        right[some] = np.column_stack([heights[n:], sigmas[n:]])
+        return np.column_stack([heights[:n], sigmas[:n]]), np.column_stack([heights[n:], sigmas[n:]])
 
-    each(one, np.unique(unit).tolist(), run)
+    groups = [np.flatnonzero(unit == number) for number in np.unique(unit)]
+    for some, sides in zip(groups, run(one, groups)):
+        left[some], right[some] = sides
     return _elements(fit, left, right)
 
 

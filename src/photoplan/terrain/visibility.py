@@ -126,10 +126,16 @@ def needed_heights(
     out = np.empty(heights.shape, np.float32)
     eye = (float(observer.column), float(observer.row), settings.radius / mesh)
 
-    def part(first: int) -> None:
+    def part(first: int) -> NDArray[np.float32]:
         rows_here = (first, min(first + ROWS, rows))
         sight_rows(relative, pyramid, eye, rows_here, float(settings.target_height), only_whether, out)
+        return out[slice(*rows_here)]
 
-    # A list, so that an error of a thread is raised here.
-    list(run(part, range(0, rows, ROWS)))
+    for number, found in enumerate(run(part, range(0, rows, ROWS))):
+        out[number * ROWS : (number + 1) * ROWS] = found
     return out
+
+
+def parts(heights: NDArray[np.float32]) -> int:
+    """Items that `needed_heights` gives to `run`."""
+    return -(-len(heights) // ROWS)

@@ -6,7 +6,6 @@ SABOTAGE_IMAGE   the only image that is held up [all]
 SABOTAGE_BEGUN   a folder; a worker that is held up has a file there, named by its process
 SABOTAGE_DEADLY  image:tile whose worker kills itself whenever it gets there
 SABOTAGE_ONCE    a file; the first worker that finds it removes it and kills itself
-SABOTAGE_BUILD   a file that appears when a terrain model is begun, which then waits for SABOTAGE_HOLD
 """
 
 import os
@@ -40,16 +39,3 @@ def _sabotaged(job, tile):  # type: ignore[no-untyped-def]
 
 
 RenderJob.__call__ = _sabotaged
-
-if os.environ.get("SABOTAGE_BUILD"):
-    from photoplan.terrain import build
-
-    _domain = build._domain
-
-    def _held(plan):  # type: ignore[no-untyped-def]
-        Path(os.environ["SABOTAGE_BUILD"]).touch()
-        while not Path(_how["HOLD"]).exists():
-            time.sleep(0.01)
-        return _domain(plan)
-
-    build._domain = _held

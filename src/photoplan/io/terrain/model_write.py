@@ -23,7 +23,7 @@ from photoplan.errors import PhotoplanError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.disk import disk_error, free_megabytes, sync_file, sync_folder
 from photoplan.io.gdal import GDAL_ERRORS, first_cause
-from photoplan.io.lock import FileLock
+from photoplan.io.lock import FileLock, lock_of
 from photoplan.io.product import check_output
 from photoplan.io.terrain.model_blob import check_unit, inflate, pack_line, pack_unit, unit_of
 from photoplan.io.terrain.model_layers import write_border, write_gross, write_heights, write_lines, write_units
@@ -104,7 +104,7 @@ class ModelWriter:
         if self.path.suffix.lower() != ".gpkg":
             raise UsageError(f"{self.path}: a terrain model is a GeoPackage; give it a name that ends with .gpkg")
         check_layout(self.layout, str(self.path))
-        self._lock = FileLock(self.path.with_name(f".{self.path.name}.lock"))
+        self._lock = FileLock(lock_of(self.path))
 
     def __enter__(self) -> ModelWriter:
         check_output(self.path, self.inputs, overwrite=self.overwrite)
@@ -124,10 +124,7 @@ class ModelWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._log is not None:
-            if self._log.finished:
-                self._log.close()
-            else:
-                self._log.remove()
+            self._log.leave()
             self._log = None
         self._lock.release()
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.observed import GroundPoints, ImagePoints
-from photoplan.engine.executors import thread_map
+from photoplan.engine.steps import steps
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.crs import crs_label, same_crs
@@ -122,12 +122,9 @@ def propose_control(request: ControlRequest, events: Events = SILENT) -> Control
     def work(k: int) -> ImageControl:
         return control_of_image(names[k], photos[k], patches, covariances, settings)
 
-    images = []
     events.begin("matching", len(names), "images")
-    with thread_map(request.workers) as run:
-        for result in run(work, range(len(names))):
-            images.append(result)
-            events.done()
+    with steps(output.name, request.workers, events) as run:
+        images = list(run(work, range(len(names))))
     ground, points = _tables(patches, covariances, images)
     if not len(points):
         found = sum(i.matched for i in images)

@@ -14,13 +14,14 @@ import numpy as np
 import psutil
 
 from photoplan import __version__
-from photoplan.engine.executors import thread_map
+from photoplan.engine.steps import steps
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import check_height_system, height_label
 from photoplan.io.product import check_output
-from photoplan.io.run_record import peak_memory_bytes, record_path, run_times, versions, write_run_record
+from photoplan.io.result_log import ResultLog
+from photoplan.io.run_record import run_times, write_run_record
 from photoplan.io.terrain.files import read_measured
 from photoplan.io.terrain.model_tables import GrossError, ModelHeader, empty_figures, input_facts
 from photoplan.io.terrain.model_write import ModelParts, ModelWriter
@@ -118,8 +119,9 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
     events.talk(describe_plan(plan, measured, crs, system))
     facts = [input_facts(path) for path in request.inputs]
     key = _key(request, facts, plan, crs, system)
-    with ModelWriter(request.output, plan.layout, key, request.overwrite, request.inputs) as writer:
-        with thread_map(request.workers) as run:
+    kept = ResultLog.beside(request.output, key, locked=True)
+    with ModelWriter(request.output, plan.layout, key, request.overwrite, request.inputs) as writer, kept:
+        with steps(request.output.name, request.workers, events, kept) as run:
             built = build_terrain(plan, run, events)
         gross = tuple(_gross(built, measured))
         events.begin("writing the model", len(built.figures), "units")
@@ -135,15 +137,20 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
             crs, system, plan.layout, asdict(request.settings), tuple(facts), built.fit.whole.name, totals
         )
         writer.finish(ModelParts(header, built.lines, gross, plan.polygon))
+        kept.remove()
     ran = times()
     figures = {**totals, "crs": crs_label(crs), "height_system": system, "seconds": ran["seconds"]}
     report = BuildReport(request.output, figures, gross, findings, built, measured)
-    record = {"product": request.output.name, "kind": "terrain model", **report.json_fields()}
-    del record["findings"]
-    record |= {"inputs": facts, "settings": request.settings, "versions": versions()}
-    record |= {"run": {"workers": request.workers, **ran}}
-    record |= {"finding_counts": dict(Counter(f.kind for f in findings)), "peak_memory_bytes": peak_memory_bytes()}
-    write_run_record(record_path(request.output), record)
+    told = report.json_fields() | {"findings": dict(Counter(f.kind for f in findings))}
+    write_run_record(
+        request.output,
+        key=key,
+        inputs=request.inputs,
+        run={"workers": request.workers, **ran},
+        kind="terrain model",
+        product=told,
+        settings=request.settings,
+    )
     return report
 
 

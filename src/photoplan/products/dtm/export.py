@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.heights import crs_with_heights
 from photoplan.io.product import check_output
 from photoplan.io.terrain.export import TIN_SUFFIXES, replacing, write_points, write_tin
-from photoplan.products.dtm.raster import GridOptions, write_grid
+from photoplan.products.dtm.raster import GridOptions, settings_of, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.targets.map import MapTarget
@@ -42,6 +42,7 @@ class ExportRequest:
     """Where to write the raster of standard deviations."""
     crs: str | None = None
     """Of a terrain file that does not state its own."""
+    workers: int | None = None
     overwrite: bool = False
 
 
@@ -121,7 +122,15 @@ def _grid(request: ExportRequest, terrain: OpenTerrain) -> MapGrid:
 def _export_raster(request: ExportRequest, terrain: OpenTerrain, events: Events) -> ExportReport:
     grid, surface = _grid(request, terrain), terrain.surface
     target = MapTarget(grid)
-    options = GridOptions(tile=_TILE, overwrite=request.overwrite, inputs=[request.model], events=events)
+    options = GridOptions(
+        kind="heights",
+        settings=settings_of(request),
+        inputs=[request.model],
+        tile=_TILE,
+        workers=request.workers,
+        overwrite=request.overwrite,
+        events=events,
+    )
 
     def heights(window: Window) -> NDArray[np.float32]:
         return surface.relief(target, window)[None]
@@ -135,7 +144,9 @@ def _export_raster(request: ExportRequest, terrain: OpenTerrain, events: Events)
     facts = write_grid(request.output, grid.placement, np.float32, 1, "auto", heights, options)
     paths = [request.output]
     if request.sigma is not None:
-        write_grid(request.sigma, grid.placement, np.float32, 1, "auto", sigmas, options)
+        write_grid(
+            request.sigma, grid.placement, np.float32, 1, "auto", sigmas, replace(options, kind="standard deviations")
+        )
         paths.append(request.sigma)
     size = {"columns": grid.width, "rows": grid.height, "resolution": grid.resolution}
     return ExportReport(tuple(paths), {**size, "share_with_height": facts.valid_share})

@@ -13,13 +13,14 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError, ResourceError, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.polygons import label_polygons, read_features, write_features
 from photoplan.io.product import check_output
 from photoplan.io.tables import read_table
 from photoplan.plain import pick
-from photoplan.products.dtm.raster import GridOptions, write_grid
+from photoplan.products.dtm.raster import GridOptions, settings_of, write_grid
 from photoplan.products.dtm.visible import COLUMNS, own_grid, read_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.terrain.flow import CELL_BYTES, Flow, FlowMethod, flow_of, snapped
@@ -95,7 +96,7 @@ class FlowReport:
         return {**pick(self, "path", "catchments", "resolution", "area", **more), "bands": BANDS}
 
 
-def dtm_flow(request: FlowRequest) -> FlowReport:
+def dtm_flow(request: FlowRequest, events: Events = SILENT) -> FlowReport:
     """Compute and write flow over a model.
 
     Raises
@@ -118,12 +119,13 @@ def dtm_flow(request: FlowRequest) -> FlowReport:
     terrain = open_terrain(request.model, request.crs)
     points = [] if request.outlets is None else _points(request.outlets, terrain)
     grid = _grid(request, terrain)
+    events.begin("flow")
     heights = read_grid(terrain, grid)
     cells = _cells(request, grid, heights, points)
     flow = flow_of(heights, grid.resolution, cells, request.method)
     rows = [_row(flow, grid, number, name, cell) for number, ((name, _, _), cell) in enumerate(zip(points, cells), 1)]
     depth = flow.filled - heights
-    _write(request, grid, flow, depth, inputs)
+    _write(request, grid, flow, depth, inputs, events)
     if request.catchments is not None:
         _write_catchments(request.catchments, grid, flow, rows, terrain.crs)
     pixel = grid.resolution**2
@@ -200,7 +202,9 @@ def _row(flow: Flow, grid: MapGrid, number: int, name: str, cell: tuple[int, int
     return OutletRow(name, float(X), float(Y), float(flow.area[cell]), own, float(flow.longest[cell]))
 
 
-def _write(request: FlowRequest, grid: MapGrid, flow: Flow, depth: NDArray[np.float32], inputs: Sequence[Path]) -> None:
+def _write(
+    request: FlowRequest, grid: MapGrid, flow: Flow, depth: NDArray[np.float32], inputs: Sequence[Path], events: Events
+) -> None:
     def tile(window: Window) -> NDArray[np.float32]:
         right, bottom = window.stop
         part = slice(window.row, bottom), slice(window.col, right)
@@ -216,10 +220,13 @@ def _write(request: FlowRequest, grid: MapGrid, flow: Flow, depth: NDArray[np.fl
         return np.stack(bands).astype(np.float32)
 
     options = GridOptions(
+        kind="flow",
+        settings=settings_of(request),
+        inputs=inputs,
         tile=TILE,
         workers=request.workers,
         overwrite=request.overwrite,
-        inputs=inputs,
+        events=events,
         resampling="nearest",
         tags={"BANDS": "; ".join(BANDS)},
     )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,15 +12,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan import __version__
 from photoplan.engine.cpus import available_cpus
-from photoplan.engine.executors import Workers, executor_factory
+from photoplan.engine.executors import threads
 from photoplan.engine.run import Made, Runner, Tally, Work
-from photoplan.errors import ResourceError, TilesFailed, UsageError
+from photoplan.errors import ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import Placement, Window
 from photoplan.io.disk import free_megabytes
+from photoplan.io.fingerprint import fingerprint
 from photoplan.io.product import ProductFacts, ProductFile, check_output
+from photoplan.io.run_record import input_entry, run_times, write_run_record
 from photoplan.io.storage import Nodata
+from photoplan.plain import json_text
 from photoplan.plan.tiles import Tile, Tiles
 
 GridTile = NDArray[Any] | tuple[NDArray[Any], NDArray[np.bool_]] | None
@@ -30,17 +35,21 @@ GridTiles = Callable[[Window], GridTile]
 
 @dataclass(frozen=True)
 class GridOptions:
-    """How a grid is written; none of it changes a value."""
+    """How a grid is written, and what is told of it."""
 
     _: KW_ONLY
+    kind: str
+    """What it is, such as "hillshade"."""
+    settings: Mapping[str, Any]
+    """All that decides its values beside the inputs and the place: goes into the record and the run's key."""
+    inputs: Sequence[Path]
+    """Files that decide its values; none may be overwritten, also by a link."""
     tile: int = 512
     """Side of the windows and of the blocks in the file, pixels; a multiple of 16, at least 128."""
     workers: int | None = None
     """Windows computed at once; None: as many as there are cores."""
     overwrite: bool = False
     """Replace an output that exists."""
-    inputs: Sequence[Path | str] = ()
-    """Files that must not be overwritten, also by a link."""
     events: Events = SILENT
     """Told of windows that are finished."""
     compress: str = "deflate"
@@ -53,18 +62,32 @@ class GridOptions:
     """Colour table of one band of uint8: red, green, blue, 0 to 255, of each value."""
     tags: Mapping[str, str] | None = None
     """Tags of the file."""
-    run_key: str | None = None
-    """A digest of inputs, parameters and version: a run that was killed is continued by the next one with the same
-    key. None: the next run starts afresh."""
+
+    @property
+    def key(self) -> str:
+        """The digest of all that decides its values beside the place: a run with another one starts afresh."""
+        digests = [fingerprint(path).digest for path in self.inputs]
+        text = json_text({"by": __version__, "kind": self.kind, "settings": self.settings, "inputs": digests}, "key")
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+#: Fields of requests that decide no value.
+_IDLE = {"output", "preview", "catchments", "sigma", "difference", "memory", "workers", "overwrite", "tolerance"}
+
+
+def settings_of(request: Any) -> dict[str, Any]:
+    """Fields of a request that may decide values of a grid."""
+    return {each.name: getattr(request, each.name) for each in fields(request) if each.name not in _IDLE}
 
 
 def write_grid(
     path: Path, placement: Placement, dtype: Any, bands: int, nodata: Nodata, tiles: GridTiles, options: GridOptions
 ) -> ProductFacts:
-    """Write a raster as a cloud-optimised GeoTIFF, crash-safe, with bounded memory.
+    """Write a raster as a cloud-optimised GeoTIFF with its run record, crash-safe, with bounded memory.
 
     Windows are computed in threads; no more than two for each worker are held at once. The file appears under its name
-    only when it is complete and has been read again (see `ProductFile`).
+    only when it is complete and has been read again (see `ProductFile`). A run that was killed is continued by the
+    next one with the same inputs, settings and version.
 
     Parameters
     ----------
@@ -98,18 +121,19 @@ def write_grid(
     TilesFailed
         A window failed again and again; nothing stays under the name then.
     """
-    path, dtype = Path(path), np.dtype(dtype)
+    path, dtype, times = Path(path), np.dtype(dtype), run_times()
     check_output(path, options.inputs, overwrite=options.overwrite)
     workers = available_cpus() if options.workers is None else options.workers
-    make = executor_factory("threads", workers)
+    pool = threads(workers)
     if options.colours is not None and (dtype != np.uint8 or bands != 1):
         raise UsageError(f"{path}: a colour table for {bands} bands of {dtype}; it needs one band of uint8")
+    key, inputs = options.key, [input_entry(each) for each in options.inputs]
     file = ProductFile(
         path,
         placement,
         bands,
         dtype,
-        run_key=options.run_key,
+        run_key=key,
         nodata=nodata,
         compress=options.compress,
         overviews=options.overviews,
@@ -132,8 +156,18 @@ def write_grid(
         complete=partial(_complete, file, dict(options.tags or {})),
     )
     options.events.begin(path.name, len(windows))
-    with Workers(make) as pool:
-        (facts,) = Runner[ProductFacts](pool, 2 * workers if workers > 1 else 1, options.events).run([work])
+    with pool:
+        (facts,) = Runner[ProductFacts](pool, None, options.events).run([work])
+    write_run_record(
+        path,
+        key=key,
+        inputs=inputs,
+        run={"workers": workers, **times()},
+        kind=options.kind,
+        product=facts,
+        settings=options.settings,
+        grid=placement,
+    )
     return facts
 
 
@@ -158,9 +192,7 @@ class GridJob:
 
 
 def _complete(file: ProductFile, tags: dict[str, str], tally: Tally) -> ProductFacts:
-    if tally.failed:
-        failed = ", ".join(map(str, sorted(tally.failed)))
-        raise TilesFailed(f"{file.path}: tiles {failed} could not be computed ({tally.reasons[0]}); nothing is written")
+    tally.check(file.path)
     return file.complete(tags)
 
 

@@ -15,7 +15,6 @@ from photoplan import __version__
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.io.fingerprint import fingerprint
 from photoplan.io.product import ProductFacts, check_output
 from photoplan.io.quicklook import write_quicklook
 from photoplan.io.storage import Nodata
@@ -117,15 +116,15 @@ def make_picture(
     terrain = open_terrain(request.model, request.crs)
     grid = _grid(request, terrain)
     made = picture(terrain, grid)
-    key = f"{__version__} {fingerprint(request.model).digest} {grid} {made.kind} {made.settings}"
     options = GridOptions(
+        kind=made.kind,
+        settings=made.settings,
         workers=request.workers,
         overwrite=request.overwrite,
         inputs=inputs,
         events=events,
         resampling=made.resampling,
         colours=made.colours,
-        run_key=key,
         tags={"PHOTOPLAN_VERSION": __version__, "PHOTOPLAN_KIND": made.kind}
         | {f"PHOTOPLAN_{name.upper()}": str(value) for name, value in made.settings.items()},
     )

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.engine.cpus import available_cpus
-from photoplan.engine.executors import thread_map
+from photoplan.engine.steps import Steps, steps
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.crs import same_crs, split_compound
@@ -20,12 +20,13 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.local import earth_radius
 from photoplan.io.polygons import read_features
 from photoplan.io.product import check_output
+from photoplan.io.result_log import ResultLog
 from photoplan.io.tables import Columns, read_table
 from photoplan.plain import pick
-from photoplan.products.dtm.raster import GridOptions, write_grid
+from photoplan.products.dtm.raster import GridOptions, settings_of, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.targets.map import MapTarget
-from photoplan.terrain.visibility import Observer, SightSettings, horizon, needed_heights
+from photoplan.terrain.visibility import Observer, SightSettings, horizon, needed_heights, parts
 
 TILE = 512
 #: Bytes of one post while one observer is looked at: heights, those relative to the eye, pyramid, result.
@@ -133,25 +134,31 @@ def dtm_visible(request: VisibleRequest, events: Events = SILENT) -> VisibleRepo
     grid = _grid(request, terrain, places)
     _check_memory(grid, len(places), request)
     heights = read_grid(terrain, grid)
-    events.begin("lines of sight", len(places), "observers")
-    bands, rows = _look(request, terrain, grid, heights, places, sight, events)
-    names = [row.name for row in rows]
-    if len(rows) > 1:
-        names.insert(0, "least of all" if request.minimum_height else "count")
     options = GridOptions(
+        kind="visibility",
+        settings=settings_of(request),
+        inputs=inputs,
         tile=TILE,
         workers=request.workers,
         overwrite=request.overwrite,
-        inputs=inputs,
         events=events,
         resampling="average" if request.minimum_height else "nearest",
     )
+    events.begin("lines of sight", len(places) * parts(heights), "parts")
+    workers = available_cpus() if request.workers is None else request.workers
+    log = ResultLog.beside(request.output, f"{options.key} {grid}", locked=False)
+    with log, steps(request.output.name, workers, events, log) as run:
+        bands, rows = _look(request, terrain, grid, heights, places, sight, run)
+    names = [row.name for row in rows]
+    if len(rows) > 1:
+        names.insert(0, "least of all" if request.minimum_height else "count")
 
     def tile(window: Window) -> NDArray[Any]:
         right, bottom = window.stop
         return bands[:, window.row : bottom, window.col : right]
 
     write_grid(request.output, grid.placement, bands.dtype, len(bands), _nodata(request), tile, options)
+    log.remove()
     far = horizon(rows[0].eye - float(terrain.surface.heights(np.array(places[0][1:3]))), sight)
     return VisibleReport(request.output, tuple(names), grid.resolution, radius, far, tuple(rows))
 
@@ -246,7 +253,7 @@ def _look(
     heights: NDArray[np.float32],
     places: Sequence[Place],
     sight: SightSettings,
-    events: Events,
+    run: Steps,
 ) -> tuple[NDArray[Any], list[VisibleRow]]:
     """Bands of the map (sum or least first if there are several observers), and figures."""
     several = len(places) > 1
@@ -259,15 +266,13 @@ def _look(
             raise InputError(f"observer {name} at {X:.10g} {Y:.10g}: {request.model} has no height there")
         column, row = grid.to_pixel((X, Y))
         observer = Observer(float(column), float(row), ground + above, name)
-        with thread_map(available_cpus() if request.workers is None else request.workers) as run:
-            need = needed_heights(
-                heights, grid.resolution, observer, sight, only_whether=not request.minimum_height, run=run
-            )
+        need = needed_heights(
+            heights, grid.resolution, observer, sight, only_whether=not request.minimum_height, run=run
+        )
         known = np.isfinite(need) | np.isposinf(need)
         seen = need <= request.height_target
         bands[i + several] = need if request.minimum_height else np.where(known, seen, 255)
         rows.append(_row(request, grid, heights, observer, known, seen, (X, Y)))
-        events.done(1, heights.size)
     if several:
         each = bands[1:]
         if request.minimum_height:

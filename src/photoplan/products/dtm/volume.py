@@ -18,7 +18,7 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.polygons import Feature, read_features
 from photoplan.io.product import check_output
 from photoplan.plain import pick
-from photoplan.products.dtm.raster import GridOptions, write_grid
+from photoplan.products.dtm.raster import GridOptions, settings_of, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.targets.map import MapTarget
@@ -53,6 +53,8 @@ class VolumeRequest:
     """Of files that do not state theirs."""
     difference: Path | None = None
     """Where to write the raster of B − A."""
+    workers: int | None = None
+    """Of that raster."""
     overwrite: bool = False
 
 
@@ -125,7 +127,7 @@ def dtm_volume(request: VolumeRequest, events: Events = SILENT) -> VolumeReport:
         rows.append(VolumeRow(item.name, volume, sigma))
     notes += [note for row in rows for note in _notes(row)]
     if request.difference is not None:
-        _write_difference(request, a, b, items, cell, inputs)
+        _write_difference(request, (a, b), items, cell, inputs, events)
     return VolumeReport(tuple(rows), system, tuple(notes), request.difference)
 
 
@@ -199,13 +201,14 @@ def _own(terrain: OpenTerrain) -> Callable[[NDArray[np.float64]], NDArray[np.flo
 
 def _write_difference(
     request: VolumeRequest,
-    a: OpenTerrain,
-    b: OpenTerrain,
+    both: tuple[OpenTerrain, OpenTerrain],
     items: tuple[Feature, ...],
     cell: float,
     inputs: list[Path],
+    events: Events,
 ) -> None:
     """B − A as a raster over all polygons."""
+    a, b = both
     bounds = shapely.total_bounds(np.array([item.geometry for item in items], object))
     grid = MapGrid.covering(tuple(float(v) for v in bounds), cell, a.crs)  # type: ignore[arg-type]
     target = MapTarget(grid)
@@ -214,5 +217,13 @@ def _write_difference(
         return np.asarray(b.surface.relief(target, window) - a.surface.relief(target, window))[None]
 
     assert request.difference is not None
-    options = GridOptions(tile=TILE, overwrite=request.overwrite, inputs=inputs)
+    options = GridOptions(
+        kind="difference",
+        settings=settings_of(request),
+        inputs=inputs,
+        tile=TILE,
+        workers=request.workers,
+        overwrite=request.overwrite,
+        events=events,
+    )
     write_grid(request.difference, grid.placement, np.float32, 1, "auto", tile, options)

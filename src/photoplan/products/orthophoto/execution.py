@@ -18,7 +18,7 @@ from photoplan.errors import TilesFailed, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.product import ProductFile
 from photoplan.io.quicklook import write_overview
-from photoplan.io.run_record import peak_memory_bytes, record_path, run_times, versions, write_run_record
+from photoplan.io.run_record import input_entry, run_times, versions, write_run_record
 from photoplan.kernels.rectify import is_compiled
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct
 from photoplan.products.orthophoto.results import ProductResult, finished_products, product_path
@@ -228,10 +228,14 @@ def _complete(
         reason=next(iter(tally.reasons), ""),
     )
     if facts is not None:
-        record = _record(plan, product, scene, run, result)
-        record["run"] |= ran
         write_run_record(
-            record_path(result.path), {**record, "values_moved_off_nodata": facts.moved_values, "bytes": facts.bytes}
+            result.path,
+            key=product.key,
+            inputs=[input_entry(path, digest) for path, digest in scene.address.digests],
+            run={"workers": run.workers, "executor": run.executor, "memory": run.memory, **ran},
+            values_moved_off_nodata=facts.moved_values,
+            bytes=facts.bytes,
+            **_record(plan, product, scene, result),
         )
     return result
 
@@ -246,16 +250,11 @@ def _tags(plan: OrthoPlan, product: OrthoProduct) -> dict[str, str]:
     }
 
 
-def _record(plan: OrthoPlan, product: OrthoProduct, scene: Scene, run: Run, result: ProductResult) -> dict[str, Any]:
-    """The run record: what a person needs to answer for the product, and to make it again."""
+def _record(plan: OrthoPlan, product: OrthoProduct, scene: Scene, result: ProductResult) -> dict[str, Any]:
+    """What a person needs to answer for the product, and to make it again."""
     center = scene.camera.center
     return {
         "product": result,
-        "key": product.key,
-        "inputs": [
-            {"path": path, "sampled_sha256": digest, "size": Path(path).stat().st_size}
-            for path, digest in scene.address.digests
-        ],
         "project": json.loads(scene.address.text),
         "settings": plan.settings,
         "grid": {
@@ -276,7 +275,4 @@ def _record(plan: OrthoPlan, product: OrthoProduct, scene: Scene, run: Run, resu
         "restored": None if (step := scene.reader.step(RestoreStep)) is None else step.describe(),
         "projection_centre": [float(c) for c in center],
         "gsd_m": product.gsd,
-        "run": {"workers": run.workers, "executor": run.executor, "memory": run.memory},
-        "versions": versions(),
-        "peak_memory_bytes": peak_memory_bytes(),
     }

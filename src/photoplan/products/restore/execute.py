@@ -18,7 +18,7 @@ from photoplan.events import Events
 from photoplan.io.image_form import ImageForm, placement_of
 from photoplan.io.product import ProductFacts, ProductFile
 from photoplan.io.quicklook import write_quicklook
-from photoplan.io.run_record import peak_memory_bytes, record_path, run_times, versions, write_run_record
+from photoplan.io.run_record import input_entry, record_path, run_times, write_run_record
 from photoplan.io.storage import Nodata
 from photoplan.plain import pick
 from photoplan.plan.tiles import Tile, Tiles
@@ -214,9 +214,14 @@ def _complete(
         picture=job.picture if how.quicklook else None,
     )
     # The record first: a disk that is full for the picture does not leave a result without it.
-    record = _record(job, how, result, facts)
-    record["run"] |= ran
-    write_run_record(record_path(job.target), record)
+    others = [path for path in job.inputs if path.resolve() != reader.info.path.resolve()]
+    write_run_record(
+        job.target,
+        key=job.key,
+        inputs=[input_entry(reader.info.path, job.digest), *others],
+        run={"workers": how.workers, "memory": how.memory, **ran},
+        **_record(job, how, result, facts),
+    )
     if how.quicklook:
         write_quicklook(job.target, job.picture)
     return result
@@ -234,14 +239,11 @@ def _tags(job: Job) -> dict[str, str]:
 
 
 def _record(job: Job, how: RestoreRequest, result: RestoredImage, facts: ProductFacts) -> dict[str, Any]:
-    """The run record: what a person needs to answer for the result, and to make it again."""
+    """What a person needs to answer for the result, and to make it again."""
     restorer = restoration_of(job.reader).restorer
     aligned, lit = job.reader.step(AlignStep), job.reader.step(FallOffStep)
     return {
         "product": result,
-        "key": job.key,
-        "inputs": [{"path": job.reader.info.path, "sampled_sha256": job.digest}]
-        + [{"path": path} for path in job.inputs if path.resolve() != job.reader.info.path.resolve()],
         "settings": how.settings,
         "linearisation": restorer.linearisation.describe(),
         "chromatic": None if aligned is None else model_figures(aligned.model),
@@ -257,7 +259,4 @@ def _record(job: Job, how: RestoreRequest, result: RestoredImage, facts: Product
         },
         "values_moved_off_nodata": facts.moved_values,
         "bytes": facts.bytes,
-        "run": {"workers": how.workers, "memory": how.memory},
-        "versions": versions(),
-        "peak_memory_bytes": peak_memory_bytes(),
     }

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,16 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.errors import InputError, ResourceError, UsageError
+from photoplan import __version__
+from photoplan.errors import InputError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import Window
 from photoplan.io.product import check_output
 from photoplan.io.raster import RasterReader
-from photoplan.io.run_record import record_path, run_times, versions, write_run_record
-from photoplan.io.whole_image import write_whole_image
-from photoplan.plain import pick
+from photoplan.io.result_log import ResultLog
+from photoplan.io.run_record import input_entry, run_times, write_run_record
+from photoplan.plain import json_text, pick
 from photoplan.products.simulate.model import read_model
-from photoplan.quality.formation.model import MOST_PIXELS, FormedImage, ImageModel, form_series
+from photoplan.products.simulate.series import Series, SimulatedImage
+from photoplan.quality.formation.model import MOST_PIXELS, ImageModel
 from photoplan.quality.formation.scenes import PATTERNS, LightScene, PatternScene, parse_pattern
 from photoplan.quality.formation.sensor_parts import Quantisation
 from photoplan.quality.formation.truth import model_mtf50
@@ -54,20 +58,9 @@ class SimulateRequest:
     """Cells of the scene along a side of a pixel; 1 for files, 8 for patterns if not given."""
     dtype: str | None = None
     """Of the files: uint8, uint16 or float32; None: as the model's quantisation says, else float32."""
+    workers: int = 1
     overwrite: bool = False
     dry_run: bool = False
-
-
-@dataclass(frozen=True)
-class SimulatedImage:
-    """One frame."""
-
-    path: Path
-    frame: int
-    exposure: float
-    gain: float
-    """Automatic gain."""
-    facts: dict[str, object]
 
 
 @dataclass(frozen=True)
@@ -167,35 +160,42 @@ def simulate(
     model, dtype = _model(request)
     scene = _scene(request, model)
     exposures = _exposures(request)
-    paths = _paths(request)
-    images: list[SimulatedImage] = []
-    record = record_path(paths[0] if len(paths) == 1 else _output(request))
-    if request.dry_run:
-        images = [SimulatedImage(p, n, e, 1.0, {}) for n, (p, e) in enumerate(zip(paths, exposures))]
-    else:
-        events.begin("images", len(paths), "images")
-        for path, exposure, formed in zip(paths, exposures, _frames(model, scene, exposures)):
-            write_whole_image(path, formed.values.astype(dtype, copy=False), _tags(request, model, len(images)))
-            images.append(SimulatedImage(path, len(images), exposure, formed.gain, dict(formed.facts)))
-            events.done(1, scene.size[0] * scene.size[1])
-    mtf50 = (model_mtf50(model, 0.0), model_mtf50(model, 90.0))
-    notes = tuple(_notes(scene, dtype, images))
-    report = SimulateReport(tuple(images), scene.size, scene.bands, dtype, mtf50, notes, record)
-    if request.dry_run:
-        return dataclasses.replace(report, record=None)
-    stated = {"model": dataclasses.asdict(model), "scene": request.scene, "oversampling": scene.oversampling}
-    stated |= {**report.json_fields(), "run": times(), "versions": versions()}
-    write_run_record(record, {"command": "simulate", **stated})
-    return report
-
-
-def _frames(model: ImageModel, scene: LightScene, exposures: list[float]) -> Iterator[FormedImage]:
-    try:
-        yield from form_series(model, scene, exposures)
-    except MemoryError:
-        raise ResourceError(
-            f"too little memory for an image of {scene.bands} × {scene.size[0]} × {scene.size[1]} pixels; cut the scene"
-        ) from None
+    output = _output(request)
+    paths, inputs = _paths(request), _inputs(request)
+    settings = {"model": model, "scene": request.scene, "size": scene.size, "oversampling": scene.oversampling}
+    settings |= {**pick(request, "levels", "phase"), "exposures": exposures, "dtype": dtype}
+    entries = [input_entry(path) for path in inputs]
+    decides = [__version__, settings, [entry["sampled_sha256"] for entry in entries]]
+    key = hashlib.sha256(json_text(decides, "key").encode()).hexdigest()
+    with ExitStack() as stack:
+        log = None if request.dry_run else stack.enter_context(ResultLog.beside(output, key, locked=False))
+        series = Series(model, scene, dtype, exposures, paths, log, Path(request.scene).name)
+        for frame, path in enumerate(paths):
+            check_output(path, inputs, overwrite=request.overwrite or series.earlier(frame) is not None)
+        images = series.made(request.workers, events) if log else [series.image(n) for n in range(len(paths))]
+        mtf50 = (model_mtf50(model, 0.0), model_mtf50(model, 90.0))
+        report = SimulateReport(
+            images=tuple(images),
+            size=scene.size,
+            bands=scene.bands,
+            dtype=dtype,
+            mtf50=mtf50,
+            notes=tuple(_notes(scene, dtype, images)),
+            record=None,
+        )
+        if log is None:
+            return report
+        record = write_run_record(
+            output,
+            key=key,
+            inputs=entries,
+            run={"workers": request.workers, **times()},
+            kind="simulated images",
+            product=report,
+            settings=settings,
+        )
+        log.remove()
+    return dataclasses.replace(report, record=record)
 
 
 def _model(request: SimulateRequest) -> tuple[ImageModel, str]:
@@ -277,26 +277,18 @@ def _output(request: SimulateRequest) -> Path:
 
 
 def _paths(request: SimulateRequest) -> list[Path]:
-    """One file for each frame; refused before any work if one exists."""
+    """One file for each frame."""
     output = _output(request)
     if not output.parent.is_dir():
         raise UsageError(f"{output}: its folder does not exist")
     numbered = [output.with_name(f"{output.stem}_{n:04d}{output.suffix}") for n in range(1, request.frames + 1)]
-    paths = [output] if request.frames == 1 else numbered
-    inputs: list[Path | str] = [each for each in (request.model,) if each is not None]
-    if parse_pattern(request.scene) is None:
-        inputs.append(request.scene)
-    for path in paths:
-        check_output(path, inputs, overwrite=request.overwrite)
-    return paths
+    return [output] if request.frames == 1 else numbered
 
 
-def _tags(request: SimulateRequest, model: ImageModel, frame: int) -> dict[str, str]:
-    return {
-        "PHOTOPLAN_SCENE": Path(request.scene).name,
-        "PHOTOPLAN_SEED": str(model.seed),
-        "PHOTOPLAN_FRAME": str(frame),
-    }
+def _inputs(request: SimulateRequest) -> list[Path]:
+    """Files that decide what is formed."""
+    scene = [] if parse_pattern(request.scene) is not None else [Path(request.scene)]
+    return scene + ([] if request.model is None else [request.model])
 
 
 def _notes(scene: LightScene, dtype: str, images: list[SimulatedImage]) -> Iterator[str]:

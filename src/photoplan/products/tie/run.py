@@ -11,14 +11,17 @@ from typing import Any
 import numpy as np
 
 from photoplan.cameras.observed import ImagePoints
-from photoplan.engine.executors import thread_map
+from photoplan.engine.steps import Steps, steps
 from photoplan.errors import GeometryError, UsageError
-from photoplan.events import SILENT, Events, Map
+from photoplan.events import SILENT, Events
 from photoplan.io.image_points import write_image_points
+from photoplan.io.lock import lock_of
 from photoplan.io.product import check_output
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
+from photoplan.io.result_log import ResultLog
+from photoplan.io.run_record import input_entry, run_times, write_run_record
 from photoplan.matching.features import FeatureSettings, opencv
 from photoplan.matching.grey import Grey, ReducedImage
 from photoplan.matching.loops import Loops, close_loops
@@ -28,14 +31,11 @@ from photoplan.matching.verify import PairMatches, VerifySettings
 from photoplan.plain import pick
 from photoplan.products.init.match import some
 from photoplan.products.tie.inputs import TieImage, chosen_pairs, open_images
-from photoplan.products.tie.work import (
-    FeatureStore,
-    find_features,
-    find_pairs,
-    like_pairs,
-)
+from photoplan.products.tie.work import FeatureStore, digest_of, find_features, find_pairs, like_pairs
 from photoplan.project.scene import input_files
 
+#: Changes when kept results mean something else.
+_FORM = 2
 #: Longer sides are reduced before features are looked for, unless the scale is stated, pixels.
 _LONGEST = 6000
 #: Tracks that go into refinement for each that is wanted: some are lost there.
@@ -127,7 +127,8 @@ class TieReport:
 def find_ties(request: TieRequest, events: Events = SILENT) -> TieReport:
     """Find tie points between the images of a project.
 
-    Features and matches are kept in a folder ``NAME.cache`` beside the output: a run that was interrupted continues.
+    Features, matches and refined places are kept in a file ``NAME.matches`` beside the output: a run that was
+    interrupted continues, and another one with the same features begins with what is known.
 
     Parameters
     ----------
@@ -144,27 +145,31 @@ def find_ties(request: TieRequest, events: Events = SILENT) -> TieReport:
     GeometryError
         No two images have enough in common.
     """
-    project = load_project(request.project)
+    times, project = run_times(), load_project(request.project)
     names = project.select(request.images or None)
     output = _check(request, project, names)
     images, notes = open_images(project, names, request.use_orientation)
     factor = _factor(request, images)
     pairs, chosen = chosen_pairs(images, request.pairs)
-    store = FeatureStore(output.with_suffix(".cache"), tuple(images), FeatureSettings(request.features, factor))
     if request.dry_run:
         return _dry(names, pairs, chosen, factor, notes)
-    with thread_map(request.workers) as run:
+    entry = input_entry(request.project)
+    settings, verify = FeatureSettings(request.features, factor), VerifySettings(threshold=2.0 * factor)
+    log = ResultLog(output.with_suffix(".matches"), f"{_FORM} {settings} {verify}", lock_of(output))
+    with log, steps(output.name, request.workers, events, log) as run:
+        store = FeatureStore(tuple(images), settings, log)
         events.begin("features", len(images), "images")
-        features = find_features(store, run, events)
+        features = find_features(store, run)
         pairs = like_pairs(store) if pairs is None else pairs
         events.begin("matching", len(pairs), "pairs")
-        verify = VerifySettings(threshold=2.0 * factor)
-        verified = [p for p in find_pairs(store, pairs, verify, run, events) if len(p)]
+        verified = [p for p in find_pairs(store, pairs, verify, run) if len(p)]
         _refuse_nothing(request, verified, len(pairs), names)
         found = build_tracks(features, verified, same=1.5 * factor)
         sizes = [image.grey.size for image in images]
         spare = found.tracks.of_tracks(thin_tracks(found.tracks, sizes, round(_SPARE * request.per_image)))
-        tracks, refined, loops = _refine(request, spare, images, factor, run, events)
+        key = digest_of(spare, store.names, factor, request.refine, request.per_image)
+        events.begin("refining", unit="pairs")
+        tracks, refined, loops = _refine(request, spare, images, factor, run.under(key))
     tracks = tracks.of_tracks(thin_tracks(tracks, sizes, request.per_image))
     if not len(tracks):
         raise GeometryError("no tie point is left after refinement; look at the images, or give `refine=False`")
@@ -172,7 +177,17 @@ def find_ties(request: TieRequest, events: Events = SILENT) -> TieReport:
     write_image_points(output, points)
     _enter(request.project, project, output)
     report = _report(names, chosen, factor, (len(pairs), verified), found, tracks, notes)
-    return replace(report, output=output, refined=refined, loops=loops, sources=tuple(images), found=tracks)
+    report = replace(report, output=output, refined=refined, loops=loops, sources=tuple(images), found=tracks)
+    write_run_record(
+        output,
+        key=key,
+        inputs=[entry, *(input_entry(i.path, name[1]) for i, name in zip(images, store.names))],
+        run={"workers": request.workers, **times()},
+        kind="tie points",
+        product=report,
+        settings=pick(request, "pairs", "features", "per_image", "refine", "use_orientation"),
+    )
+    return report
 
 
 def _check(request: TieRequest, project: Project, names: Sequence[str]) -> Path:
@@ -187,7 +202,7 @@ def _check(request: TieRequest, project: Project, names: Sequence[str]) -> Path:
     output = request.table
     points = [project.resolve(file) for file in project.observations.image_points]  # an older run's among them
     inputs = [request.project, *(file for file in input_files(project) if file not in points)]
-    if output.suffix.lower() in (".png", ".cache"):
+    if output.suffix.lower() in (".png", ".matches", ".json"):
         raise UsageError(f"{output}: a table is written; give it a name such as tie_points.csv")
     if not request.dry_run:
         check_output(output, inputs, overwrite=request.overwrite)
@@ -236,7 +251,7 @@ def _refuse_nothing(request: TieRequest, verified: Sequence[PairMatches], tried:
 
 
 def _refine(
-    request: TieRequest, tracks: Tracks, images: Sequence[TieImage], factor: int, run: Map, events: Events
+    request: TieRequest, tracks: Tracks, images: Sequence[TieImage], factor: int, run: Steps
 ) -> tuple[Tracks, Refined | None, Loops | None]:
     """Tracks with standard deviations; first at the scale of the features, then at full resolution."""
     if not request.refine:
@@ -244,7 +259,6 @@ def _refine(
         return replace(tracks, sigma=np.repeat(sigma[:, None], 2, axis=1)), None, None
     greys: list[Grey] = [image.grey for image in images]
     settings = RefineSettings()
-    events.begin("refining", 0)
     if factor > 1:
         small: list[Grey] = [ReducedImage(image.grey, factor) for image in images]
         rough = refine_tracks(_scaled(tracks, 1 / factor), small, replace(settings, sigma=np.inf), run=run)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from photoplan.errors import InputError
-from photoplan.quality.formation.optics import Optics, falloff_factors, line_displacements, sample_scene
+from photoplan.quality.formation.optics import Light, Optics, line_displacements
 from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitterPart, Part, Spread, Within
 from photoplan.quality.formation.scenes import ArrayScene, LightScene
 from photoplan.quality.formation.sensor import Pattern, add_shot_noise, fixed_pattern, moved_charge, overflow
@@ -164,8 +164,7 @@ def form_image(
     scene = _checked(model, scene)
     if not exposure >= 0.0 or not np.isfinite(exposure) or frame < 0:
         raise InputError(f"frame {frame} with exposure {exposure}; neither may be negative")
-    shift, light = _light(model, scene, frame)
-    return _exposed(model, light, shift, _Frame(frame, exposure, gain))
+    return exposed(model, frame_light(model, scene, frame).whole(), Frame(frame, exposure, gain))
 
 
 def form_series(
@@ -195,17 +194,22 @@ def form_series(
         scene = _checked(model, several[frame] if several is not None else scenes)
         # Light that is the same in all frames is sampled once.
         if several is not None or model.jitter.sigma or known is None:
-            known = _light(model, scene, frame)
-        image = _exposed(model, known[1], known[0], _Frame(frame, exposure, gain))
+            known = frame_light(model, scene, frame).whole()
+        image = exposed(model, known, Frame(frame, exposure, gain))
         gain = image.next_gain
         yield image
 
 
 @dataclass(frozen=True)
-class _Frame:
+class Frame:
+    """One of a series."""
+
     number: int
-    exposure: float
-    gain: float
+    """Frames differ in what is random in time."""
+    exposure: float = 1.0
+    """Factor of the light and of the time."""
+    gain: float = 1.0
+    """Automatic gain that earlier frames led to."""
 
 
 def _checked(model: ImageModel, scene: Any) -> LightScene:
@@ -231,17 +235,19 @@ def _random(model: ImageModel, *key: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence([model.seed, *key]))
 
 
-def _light(model: ImageModel, scene: LightScene, frame: int) -> tuple[_Array, _Array]:
-    """Displacement of the lines, and light on the pixels, shape (bands, height, width)."""
-    shift = line_displacements(model.jitter, scene.size[1], _random(model, 1, frame))
-    light = sample_scene(scene, model.optics, shift if shift.any() else None)
-    if model.falloff != Falloff():
-        light *= falloff_factors(model.falloff, scene.size)
-    return shift, light
+def _shift(model: ImageModel, lines: int, frame: int) -> _Array:
+    """By how many pixels each line of a frame is moved to the right."""
+    return line_displacements(model.jitter, lines, _random(model, 1, frame))
 
 
-def _exposed(model: ImageModel, light: _Array, shift: _Array, frame: _Frame) -> FormedImage:
-    """Image of light on the pixels."""
+def frame_light(model: ImageModel, scene: LightScene, frame: int) -> Light:
+    """The light on the pixels of a frame; the same for all frames without random jitter."""
+    shift = _shift(model, scene.size[1], frame)
+    return Light(scene, model.optics, model.falloff, shift if shift.any() else None)
+
+
+def exposed(model: ImageModel, light: _Array, frame: Frame) -> FormedImage:
+    """Image of light on the pixels, shape (bands, height, width), see `frame_light`."""
     bands, height, width = light.shape
     grey = np.empty_like(light)
     facts: dict[str, float] = {"electrons": 0.0, "dark_electrons": 0.0, "overflow": 0.0, "drained": 0.0, "lost": 0.0}
@@ -260,6 +266,7 @@ def _exposed(model: ImageModel, light: _Array, shift: _Array, frame: _Frame) -> 
         facts["black_pixels"] = int((values == 0).sum())
     facts |= {name: facts[name] / light.size for name in ("electrons", "dark_electrons")}
     single = bands == 1
+    shift = _shift(model, height, frame.number)
     return FormedImage(values[0] if single else values, light[0] if single else light, shift, gain, after, facts)
 
 
@@ -294,7 +301,7 @@ def _electrons(
     return np.asarray(charge)
 
 
-def _grey(model: ImageModel, grey: _Array, frame: _Frame) -> NDArray[Any]:
+def _grey(model: ImageModel, grey: _Array, frame: Frame) -> NDArray[Any]:
     """Stored grey values of the amplified signal, shape (bands, height, width)."""
     if model.gain.noise:
         grey = grey + _random(model, 4, frame.number).normal(0.0, model.gain.noise, grey.shape)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from math import ceil
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,29 +68,40 @@ def line_displacements(jitter: LineJitterPart, lines: int, rng: np.random.Genera
     return np.asarray(moved)
 
 
-def sample_scene(scene: LightScene, optics: Optics, moved: _Array | None = None) -> _Array:
-    """Mean light on every pixel's aperture, in the units of the scene.
+@dataclass(frozen=True, eq=False)
+class Light:
+    """Mean light on every pixel's aperture, in the units of the scene: computed tile by tile, in any order."""
 
-    Parameters
-    ----------
-    scene : LightScene
-    optics : Optics
-    moved : (height,), optional
-        By how many pixels each line shows the scene further right.
+    scene: LightScene
+    optics: Optics
+    falloff: Falloff = field(default_factory=Falloff)
+    moved: _Array | None = None
+    """By how many pixels each line shows the scene further right, shape (height,); None: not at all."""
+    _transforms: _Transforms = field(default_factory=lambda: _Transforms(), repr=False)
 
-    Returns
-    -------
-    array of shape (bands, height, width)
-    """
-    width, height = scene.size
-    out = np.empty((scene.bands, height, width))
-    transforms = _Transforms()
-    tiles = Window(0, 0, width, height).tiles(_tile_side(scene, optics))
-    # From the middle outwards: tiles with the same scales of the spread function follow each other.
-    for tile in sorted(tiles, key=lambda t: np.hypot(*(2 * t.col + t.width - width, 2 * t.row + t.height - height))):
-        rows, columns = slice(tile.row, tile.stop[1]), slice(tile.col, tile.stop[0])
-        out[:, rows, columns] = _tile(scene, optics, tile, None if moved is None else moved[rows], transforms)
-    return out
+    @property
+    def tiles(self) -> list[Window]:
+        """The tiles, from the middle outwards: those with the same scales of the spread function follow each other."""
+        width, height = self.scene.size
+        tiles = Window(0, 0, width, height).tiles(_tile_side(self.scene, self.optics))
+        return sorted(tiles, key=lambda t: np.hypot(2 * t.col + t.width - width, 2 * t.row + t.height - height))
+
+    def __call__(self, tile: Window) -> _Array:
+        """Light on a tile, shape (bands, height, width); may be called from several threads."""
+        rows = slice(tile.row, tile.stop[1])
+        moved = None if self.moved is None else self.moved[rows]
+        found = _tile(self.scene, self.optics, tile, moved, self._transforms)
+        if self.falloff != Falloff():
+            found *= falloff_factors(self.falloff, self.scene.size, rows)[:, tile.col : tile.stop[0]]
+        return found
+
+    def whole(self, of: Callable[[Window], _Array] | None = None) -> _Array:
+        """All tiles in their places, shape (bands, height, width), from where they are known already, or computed."""
+        width, height = self.scene.size
+        out = np.empty((self.scene.bands, height, width))
+        for tile in self.tiles:
+            out[:, tile.row : tile.stop[1], tile.col : tile.stop[0]] = (of or self)(tile)
+        return out
 
 
 def _tile_side(scene: LightScene, optics: Optics) -> int:
@@ -108,21 +120,25 @@ class _Transforms:
     """Fourier transforms of kernels; those that fit into a bound of memory are kept."""
 
     kept: dict[tuple[PixelKernel, tuple[int, int]], _Spectrum] = field(default_factory=dict)
+    lock: Lock = field(default_factory=Lock)
 
     def of(self, kernel: PixelKernel, shape: tuple[int, int]) -> _Spectrum:
         """Transform of a kernel; the convolution holds a pixel's value at the first cell of the pixel."""
-        known = self.kept.get((kernel, shape))
-        if known is not None:
-            return known
+        with self.lock:
+            known = self.kept.get((kernel, shape))
+        return self._made(kernel, shape) if known is None else known
+
+    def _made(self, kernel: PixelKernel, shape: tuple[int, int]) -> _Spectrum:
         cells = np.zeros(shape)
         rows, columns = kernel.spread.shape
         cells[:rows, :columns] = kernel.spread
         made = fft.rfft2(np.roll(cells, (-(rows // 2) - kernel.row, -(columns // 2) - kernel.column), (0, 1)))
         if kernel.weights.size > 1:
             made *= np.conj(fft.rfft2(kernel.weights, shape))
-        while self.kept and sum(each.nbytes for each in self.kept.values()) + made.nbytes > _KEPT_BYTES:
-            del self.kept[next(iter(self.kept))]
-        self.kept[kernel, shape] = made
+        with self.lock:
+            while self.kept and sum(each.nbytes for each in self.kept.values()) + made.nbytes > _KEPT_BYTES:
+                del self.kept[next(iter(self.kept))]
+            self.kept[kernel, shape] = made
         return np.asarray(made)
 
 

@@ -1,0 +1,102 @@
+"""Results of tasks that are no tiles of a raster, kept on the disk till their product is complete, or longer."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import pickle
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from dataclasses import is_dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from photoplan.errors import InputError
+from photoplan.io.lock import FileLock, lock_of
+from photoplan.io.tile_log import TileLog
+
+_ARRAYS = {"_reconstruct", "_frombuffer", "scalar", "ndarray", "dtype"}
+
+
+class ResultLog:
+    """A crash-safe log of results by their names, as `photoplan.engine.run.Steps` asks for; a context manager.
+
+    Results are numbers, text, arrays, tuples, lists and dictionaries of them, and data classes of this package: data
+    only. What has other content, or calls anything, is not read.
+
+    Parameters
+    ----------
+    path : Path
+        The log; it stays when the context ends.
+    key : str
+        What makes a run itself: a log with another key is started afresh.
+    lock : Path or None
+        Held while the context lasts; None: whoever opens the log has one.
+
+    Raises
+    ------
+    RunLocked
+        On entry, if another run holds the lock.
+    UsageError, ResourceError
+        The file cannot be made or written; what was kept before is kept.
+    """
+
+    def __init__(self, path: Path, key: str, lock: Path | None) -> None:
+        self._path, self._key = path, key
+        self._lock: AbstractContextManager[Any] = nullcontext() if lock is None else FileLock(lock)
+        self._log: TileLog | None = None
+
+    @classmethod
+    def beside(cls, product: Path, key: str, *, locked: bool) -> ResultLog:
+        """The hidden log beside a product, till it is complete; `locked`: its caller holds the product's lock."""
+        return cls(product.with_name(f".{product.name}.steps"), key, None if locked else lock_of(product))
+
+    def __enter__(self) -> ResultLog:
+        with ExitStack() as stack:
+            stack.enter_context(self._lock)
+            self._log = TileLog(self._path, self._key)
+            stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._open.leave()
+        self._lock.__exit__(kind, error, trace)
+
+    @property
+    def _open(self) -> TileLog:
+        assert self._log is not None, "a log is used inside its context"
+        return self._log
+
+    @property
+    def finished(self) -> frozenset[int]:
+        """Indices of the results that are there."""
+        return self._open.finished
+
+    def index(self, name: object) -> int:
+        """Where the result of a name is kept: the name's digest, 63 bits."""
+        return int.from_bytes(hashlib.blake2b(repr(name).encode(), digest_size=8).digest(), "big") >> 1
+
+    def append(self, index: int, result: Any) -> None:
+        """Keep a result."""
+        self._open.append(index, pickle.dumps(result, protocol=5))
+
+    def __getitem__(self, index: int) -> Any:
+        """A result, read from the disk: a value of its own each time."""
+        return _Data(io.BytesIO(self._open.read(index))).load()
+
+    def remove(self) -> None:
+        """Forget all results: their product is complete."""
+        self._open.remove()
+
+
+class _Data(pickle.Unpickler):
+    """Reads values, and nothing that does anything."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        found = super().find_class(module, name) if module.split(".")[0] in ("numpy", "photoplan") else None
+        good = name in _ARRAYS if module.startswith("numpy") else isinstance(found, type) and is_dataclass(found)
+        if not good:
+            raise InputError(f"a kept result holds {module}.{name}, which is no data; delete the log, and run again")
+        return found

@@ -1,0 +1,10 @@
+"""What the server of `tools.forked` loads before it forks: every command, and the libraries that they wait for."""
+
+import importlib
+
+from tools.command import verbs
+
+for name in ("orthophoto.execution", "restore.run", "simulate.run", "tie.run", "dtm.build", "dtm.export", "dtm.flow",
+             "dtm.shading", "dtm.visible", "dtm.volume"):  # fmt: skip
+    importlib.import_module(f"photoplan.products.{name}")
+verbs()
