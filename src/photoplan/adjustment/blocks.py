@@ -118,4 +118,9 @@ class Layout:
                 for block in np.flatnonzero(share[:, k] > 1e-6).tolist():
                     column = kind.columns(block)[k]
                     parts.append((1.0, f"{kind.called(k, (block,))} ({direction[column] * scale[column]:+.2g})"))
+        if not parts:
+            column = int(np.argmax(np.abs(direction)))
+            kind = next(kind for kind in self.kinds if column < kind.part.stop)
+            block, k = divmod(column - kind.first, kind.width)
+            parts.append((1.0, kind.called(k, (block,))))
         return " with ".join(text for _, text in sorted(parts, key=lambda p: -p[0]))

@@ -28,6 +28,7 @@ _SHOWN = 20
 @click.option("--critical", type=float, default=4.0, show_default=True, help="Normalised residual of a gross error.")
 @click.option("--no-variance-components", is_flag=True, help="Weight groups as stated, not as their residuals show.")
 @click.option("--no-correlation", is_flag=True, help="Take errors of neighbouring image points as independent.")
+@click.option("--iterations", type=click.IntRange(1), default=40, show_default=True, help="Most of each solution.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Report [PROJECT/adjustment].")
 @dry_run_option("Adjust and print the figures; write nothing.")
 @overwrite_option

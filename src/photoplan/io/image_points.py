@@ -31,7 +31,13 @@ _COLUMNS = Columns(
 )
 
 
-def read_image_points(path: Path, *, columns: str | None = None, decimal_comma: bool = False) -> ImagePoints:
+#: Part of the measurements that may be of a point in an image in which it is measured once more.
+_FEW = 0.02
+
+
+def read_image_points(
+    path: Path, *, columns: str | None = None, decimal_comma: bool = False, doubtful: list[str] | None = None
+) -> ImagePoints:
     """Measured image points of a table.
 
     Parameters
@@ -41,6 +47,9 @@ def read_image_points(path: Path, *, columns: str | None = None, decimal_comma: 
         Columns in their order, as in ``"image,point,-,x,y"``, where the table does not say.
     decimal_comma : bool
         Whether numbers are written 1,5.
+    doubtful : list of str, optional
+        Takes a note where a few points are measured twice in an image, and these measurements are set aside; without
+        it they are an error.
 
     Returns
     -------
@@ -62,8 +71,11 @@ def read_image_points(path: Path, *, columns: str | None = None, decimal_comma: 
     image_at = {key: k for k, key in enumerate(spelled)}
     image = np.array([image_at[key] for key in keys], np.int64)
     point = np.array([point_at[name] for name in points], np.int64)
-    _refuse_twice(table, image * len(point_at) + point, points, images)
-    return ImagePoints(tuple(spelled.values()), tuple(point_at), image, point, table.numbers("x", "y"), _sigma(table))
+    found = table.numbers("x", "y"), _sigma(table)
+    keep = _once(table, image * len(point_at) + point, (points, images), doubtful)
+    return ImagePoints(
+        tuple(spelled.values()), tuple(point_at), image[keep], point[keep], found[0][keep], found[1][keep]
+    )
 
 
 def _sigma(table: Table) -> np.ndarray:
@@ -77,15 +89,22 @@ def _sigma(table: Table) -> np.ndarray:
     return np.asarray(sigma, float)
 
 
-def _refuse_twice(table: Table, key: np.ndarray, points: Sequence[str], images: Sequence[str]) -> None:
-    order = np.argsort(key, kind="stable")
-    same = np.flatnonzero(np.diff(key[order]) == 0)
-    if len(same):
-        first, second = order[same[0]], order[same[0] + 1]
-        raise InputError(
-            f"{table.where(second)}: point {points[second]!r} is measured in image {images[second]!r} in line "
-            f"{table.lines[first]} already; keep one of the measurements"
+def _once(
+    table: Table, key: np.ndarray, names: tuple[Sequence[str], Sequence[str]], doubtful: list[str] | None
+) -> np.ndarray:
+    """Measurements of a point in an image that are the only ones, (n,): of several nothing says which is right."""
+    _, of, count = np.unique(key, return_inverse=True, return_counts=True)
+    twice = np.asarray(count[of.reshape(-1)] > 1)
+    if twice.any():
+        first, second = np.flatnonzero(key == key[np.flatnonzero(twice)[0]])[:2]
+        what = (
+            f"{table.where(second)}: point {names[0][second]!r} is measured in image {names[1][second]!r} in line "
+            f"{table.lines[first]} already"
         )
+        if doubtful is None or twice.sum() > max(2.0, _FEW * len(key)) or len(key) < 20:
+            raise InputError(f"{what}; keep one of the measurements")
+        doubtful.append(f"{what}; {int(twice.sum())} such measurements take no part, as nothing says which is right")
+    return ~twice
 
 
 def named_as(points: ImagePoints, names: Sequence[str]) -> tuple[ImagePoints, tuple[str, ...]]:

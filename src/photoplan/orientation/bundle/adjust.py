@@ -259,7 +259,7 @@ class _Loop:
                     return state
             while True:
                 reduced = reduce_normals(rows, len(model.point_names), damping)
-                step, points = reduced.solve()
+                step, points = reduced.solved(model, state)
                 moved = state.moved(model.columns, step, along_rays(model, state, points))
                 after = _cost(whitened(model, residuals_of(model, moved)), weight)
                 if after <= before * (1.0 + 1e-9) + 1e-12:

@@ -47,6 +47,14 @@ class Reduced:
     n_p: _Floats
     """(points, 3)."""
 
+    def solved(self, model: Model, state: State) -> tuple[_Floats, _Floats]:
+        """As `solve`; what is not determined is named."""
+        try:
+            return self.solve()
+        except GeometryError:
+            check_rank(model, state, self)
+            raise
+
     @cached_property
     def factor(self) -> SuperLU:
         """Factorisation without pivoting.
@@ -189,6 +197,7 @@ def check_rank(model: Model, state: State, reduced: Reduced) -> None:
     # Back from scaled unknowns to metres, radians and the cameras' units.
     directions = vectors[:, null] * reduced.scale[:, None]
     names = _datum(model, state, directions, reduced.scale)
+    names = names or _one_motion(model, state, directions)
     names = names or [model.columns.spelled(d, reduced.scale) for d in vectors[:, null].T]
     raise GeometryError(
         f"the observations leave {int(null.sum())} direction{'s' if null.sum() > 1 else ''} of the unknowns free: "
@@ -230,3 +239,29 @@ def _datum(model: Model, state: State, directions: _Floats, reduced_scale: _Floa
         if length > 0 and np.linalg.norm(basis.T @ v) > 0.98 * length:
             named.append(name)
     return named if len(named) >= directions.shape[1] else []
+
+
+def _one_motion(model: Model, state: State, directions: _Floats) -> list[str]:
+    """A turn of the whole block about a line, where the one undetermined direction is that; otherwise empty."""
+    if directions.shape[1] != 1:
+        return []
+    size, motions = state.images.motions()
+    images, unit = model.columns.kinds[0].part, np.array([size] * 3 + [1.0] * 3)
+    v = (directions[images, 0].reshape(-1, 6) / unit).ravel()
+    A = np.column_stack([(motion / unit).ravel() for motion in motions.values()])
+    parts, *_ = np.linalg.lstsq(A, v, rcond=None)
+    if np.linalg.norm(A @ parts - v) > 0.05 * np.linalg.norm(v):
+        return []
+    part = dict(zip(motions, parts))
+    turn = np.array([part[f"rotation of the block about {axis}"] for axis in "XYZ"])
+    shift = size * np.array([part[f"position of the block in {axis}"] for axis in "XYZ"])
+    if np.linalg.norm(turn) < 10.0 * abs(part["scale of the block"]):
+        return []
+    turn_square = float(turn @ turn)
+    on = state.images.centers.mean(axis=0) + np.cross(turn, shift) / turn_square
+    along = turn / np.sqrt(turn_square)
+    along = along if along[np.argmax(np.abs(along))] > 0 else -along
+    return [
+        "rotation of the block about the line through X {:.0f}, Y {:.0f}, Z {:.0f} ".format(*on)
+        + "in the direction {:.2f}, {:.2f}, {:.2f}, on which all that places it lies".format(*along)
+    ]

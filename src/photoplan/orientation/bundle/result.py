@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.adjustment.components import variance_factors
+from photoplan.errors import GeometryError
 from photoplan.geometry.rotation import rotation_vector
 from photoplan.orientation.bundle.block import (
     Active,
@@ -19,7 +20,7 @@ from photoplan.orientation.bundle.block import (
     Group,
 )
 from photoplan.orientation.bundle.model import Model
-from photoplan.orientation.bundle.normal import Inverse, Reduced, reduce_normals
+from photoplan.orientation.bundle.normal import Inverse, Reduced, check_rank, reduce_normals
 from photoplan.orientation.bundle.robust import Judged, kinds_of, kinds_of_measurements, robust_scale
 from photoplan.orientation.bundle.rows import Residuals, linearise, residuals_of_all, whitened
 from photoplan.orientation.bundle.select import Selection
@@ -132,7 +133,11 @@ def solution_of(
             redundancies=none,
             point_cofactors=np.full((len(model.point_names), 3, 3), np.nan),
         )
-    inverse = Inverse(reduced)
+    try:
+        inverse = Inverse(reduced)
+    except GeometryError:
+        check_rank(model, state, reduced)
+        raise
     points, variance = inverse.variances()
     redundancies = np.clip(1.0 - variance, 0.0, 1.0)
     if effects is not None:

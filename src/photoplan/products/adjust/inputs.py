@@ -22,6 +22,9 @@ from photoplan.io.project.cameras import image_size
 from photoplan.io.project.model import Image, Project
 from photoplan.products.init.match import some
 
+#: Part of the measurements that may be wrong in a way that makes one think of the whole file.
+_FEW = 0.02
+
 
 @dataclass(frozen=True, eq=False)
 class AdjustInputs:
@@ -69,7 +72,7 @@ def read_inputs(project: Project, names: Sequence[str]) -> AdjustInputs:
         path = project.resolve(file)
         if path not in files:
             files.append(path)
-            parts.append((path, read_image_points(path)))
+            parts.append((path, read_image_points(path, doubtful=notes)))
     points = _image_points(project, parts, names, notes)
     ground = _ground(project, ground_parts)
     measured = set(points.points)
@@ -146,26 +149,33 @@ def _image_points(
             f"{', '.join(str(path) for path, _ in parts)}: none of the images is in the project: measured are "
             f"{some(unknown)}; the project has {some(every)}"
         )
-    _refuse_outside(project, merged)
+    merged = _inside(project, merged, notes)
     if unknown:
         notes.append(f"{len(unknown)} images of the measurements are not in the project: {some(unknown)}")
     return _with_sigma(merged, project.observations.sigma_image)
 
 
-def _refuse_outside(project: Project, points: ImagePoints) -> None:
-    """Measurements outside their image, by more than half a pixel beyond its border: of another size, or exchanged."""
+def _inside(project: Project, points: ImagePoints, notes: list[str]) -> ImagePoints:
+    """The measurements in their images; a few outside (half a pixel beyond the border) are set aside by name.
+
+    Many are of images of another size, or columns and rows are exchanged.
+    """
     sizes = np.array([image_size(project.cameras[i.camera], i) for i in map(project.image, points.images)])
     width_height = sizes[points.image]
     outside = np.flatnonzero(((points.xy < -1.0) | (points.xy > width_height)).any(axis=1))
-    if len(outside):
-        k = int(outside[0])
-        width, height = width_height[k]
-        x, y = points.xy[k]
+    if not len(outside):
+        return points
+    k = int(outside[0])
+    width, height = width_height[k]
+    x, y = points.xy[k]
+    what = f"{points.label(k)}: column {x:g}, row {y:g} lies outside the image of {width} × {height} pixels"
+    if len(outside) > _FEW * len(points):
         raise InputError(
-            f"{points.label(k)}: column {x:g}, row {y:g} lies outside the image of {width} × {height} pixels "
-            f"({len(outside)} of {len(points)} measurements do); were they measured in images of another size, or are "
-            "x and y exchanged?"
+            f"{what} ({len(outside)} of {len(points)} measurements do); were they measured in images of another size, "
+            "or are x and y exchanged?"
         )
+    notes.append(f"{what}; {len(outside)} such measurements take no part")
+    return points.where(np.setdiff1d(np.arange(len(points)), outside))
 
 
 def _with_sigma(points: ImagePoints, sigma: float) -> ImagePoints:

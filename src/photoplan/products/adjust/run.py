@@ -6,14 +6,14 @@ import math
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from photoplan.errors import UsageError
+from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.disk import disk_error, write_atomically
 from photoplan.io.fingerprint import fingerprint
@@ -24,7 +24,7 @@ from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
 from photoplan.io.run_record import versions
 from photoplan.orientation.bundle.adjust import adjust_block
-from photoplan.orientation.bundle.block import AdjustSettings
+from photoplan.orientation.bundle.block import Adjusted, AdjustSettings
 from photoplan.orientation.check_points import CheckAccuracy
 from photoplan.plain import json_text, pick
 from photoplan.products.adjust.block import (
@@ -37,7 +37,8 @@ from photoplan.products.adjust.block import (
 from photoplan.products.adjust.cameras import Calibrated, Free, camera_entries, parse_calibrate
 from photoplan.products.adjust.figures import AdjustFigures, GroundFigures, NamedMeasurement
 from photoplan.products.adjust.inputs import AdjustInputs, read_inputs
-from photoplan.products.adjust.start import started
+from photoplan.products.adjust.judged import refuse_impossible
+from photoplan.products.adjust.start import known_poses, started
 from photoplan.products.adjust.summary import point_layers, summarise
 from photoplan.project.scene import input_files
 
@@ -116,6 +117,8 @@ def _positions(figures: AdjustFigures) -> dict[str, Any] | None:
     }
 
 
+#: Part of the measurements that take no part, from which on the start is doubted.
+_POOR = 0.1
 #: Files of the output folder.
 OUTPUTS = ("report.json", "points.gpkg", "image_points.csv")
 
@@ -135,6 +138,8 @@ class AdjustRequest:
     """Whether each group of observations gets the accuracy that its residuals show."""
     correlation: bool = True
     """Whether errors of neighbouring image points may be alike."""
+    iterations: int = 40
+    """Most iterations of each least-squares solution."""
     output: Path | None = None
     """Folder; None: ``adjustment`` beside the project file."""
     dry_run: bool = False
@@ -179,7 +184,7 @@ def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustRep
     InputError
         The project or its measurements cannot be used.
     GeometryError
-        The observations do not determine what is asked; the parameters are named.
+        The observations do not determine what is asked (the parameters are named), or the result cannot be right.
     ResourceError
         The disk is full.
     """
@@ -194,24 +199,62 @@ def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustRep
     if not request.dry_run:
         _refuse_inputs(request, inputs.files)
     begun = time.perf_counter()
-    inputs, starts = started(inputs)
-    prepared = prepare(inputs, starts, free)
-    events.talk(_used(prepared))
     settings = AdjustSettings(
-        request.robust, request.critical, request.variance_components, correlation=request.correlation
+        request.robust,
+        request.critical,
+        request.variance_components,
+        correlation=request.correlation,
+        iterations=request.iterations,
     )
-
-    def iterated(number: int, rms: float) -> None:
-        events.begin(f"iteration {number} · weighted residuals {rms:.4g}")
-
-    prepared, adjusted = adjust_prepared(prepared, settings, partial(adjust_block, progress=iterated))
+    prepared, adjusted = _adjusted(inputs, free, settings, events)
     result = map_result(prepared, adjusted)
+    refuse_impossible(result)
     title = f"Bundle adjustment of {request.project.resolve().parent.name}"
     figures = summarise(title, result, settings, time.perf_counter() - begun)
     data = block_json(figures, result)
     if request.dry_run:
         return AdjustReport((), figures, 0, data)
     return _write(request, result, figures, data)
+
+
+def _adjusted(inputs: AdjustInputs, free: Free, settings: AdjustSettings, events: Events) -> tuple[Prepared, Adjusted]:
+    """The block adjusted from its approximate orientations; if that fails, from control and tie points alone."""
+
+    def iterated(number: int, rms: float) -> None:
+        events.begin(f"iteration {number} · weighted residuals {rms:.4g}")
+
+    def tried(known: bool) -> tuple[Prepared, Adjusted]:
+        prepared = prepare(*started(inputs, known=known), free)
+        events.talk(_used(prepared))
+        return adjust_prepared(prepared, settings, partial(adjust_block, progress=iterated))
+
+    first: tuple[Prepared, Adjusted] | None = None
+    why = "many measurements do not fit them"
+    try:
+        first = tried(known=True)
+        few = _used_of(first[1]) < (1.0 - _POOR) * len(inputs.points) or len(first[1].images) < len(inputs.images)
+        if not (settings.robust and few and known_poses(inputs)):
+            return first
+    except GeometryError as error:
+        if not known_poses(inputs):
+            raise
+        failure, why = error, "from them the adjustment does not converge"
+    events.talk(f"{why}: starting again without approximate orientations")
+    try:
+        prepared, adjusted = tried(known=False)
+    except (GeometryError, InputError):
+        if first is not None:
+            return first
+        raise failure from None
+    if first is not None and _used_of(first[1]) >= _used_of(adjusted):
+        return first
+    note = f"the stated orientations were no start ({why}); the block began with control and tie points alone"
+    return replace(prepared, inputs=replace(prepared.inputs, notes=(*prepared.inputs.notes, note))), adjusted
+
+
+def _used_of(adjusted: Adjusted) -> int:
+    """Measurements that take part."""
+    return int((np.isfinite(adjusted.residuals[:, 0]) & ~adjusted.rejected).sum())
 
 
 def _free(project: Project, options: Sequence[str]) -> Free:

@@ -36,8 +36,10 @@ def known_poses(inputs: AdjustInputs) -> dict[str, Pose]:
     return found
 
 
-def started(inputs: AdjustInputs) -> tuple[AdjustInputs, dict[str, Pose]]:
+def started(inputs: AdjustInputs, *, known: bool = True) -> tuple[AdjustInputs, dict[str, Pose]]:
     """A map pose for every image; images that cannot be oriented are taken out, with a note that names them.
+
+    Without `known`, orientations that are stated are not used.
 
     Raises
     ------
@@ -46,11 +48,11 @@ def started(inputs: AdjustInputs) -> tuple[AdjustInputs, dict[str, Pose]]:
     InputError
         An interior orientation cannot be made (fiducial marks missing), or height systems cannot be joined.
     """
-    known = known_poses(inputs)
-    _refuse_far(inputs, known)
-    if len(known) == len(inputs.images):
-        return inputs, known
-    found, reasons = _found(inputs, known)
+    poses = known_poses(inputs) if known else {}
+    _refuse_far(inputs, poses)
+    if len(poses) == len(inputs.images):
+        return inputs, poses
+    found, reasons = _found(inputs, poses)
     images = tuple(image for image in inputs.images if image.name in found)
     if not images:
         why = "; ".join(f"{name}: {reason}" for name, reason in list(reasons.items())[:3])
@@ -59,7 +61,7 @@ def started(inputs: AdjustInputs) -> tuple[AdjustInputs, dict[str, Pose]]:
             "angles to start from"
         )
     notes = list(inputs.notes)
-    without = [image.name for image in inputs.images if image.name not in known]
+    without = [image.name for image in inputs.images if image.name not in poses]
     oriented = [name for name in without if name in found]
     if oriented:
         notes.append(f"{len(oriented)} images were oriented from control and tie points to begin with")

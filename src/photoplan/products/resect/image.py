@@ -13,12 +13,14 @@ from photoplan.cameras.base import CentralCamera
 from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
+from photoplan.errors import GeometryError
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import angles_from_rotation
 from photoplan.io.project.cameras import interior_of, lens_of
 from photoplan.io.project.model import ANGLE_UNITS, Image, Project
 from photoplan.orientation.bundle.block import AdjustedCamera
 from photoplan.orientation.bundle.frame import angle_derivatives
+from photoplan.orientation.judgement import fitting, impossible, of_resection
 from photoplan.orientation.resection.adjust import resect
 from photoplan.orientation.resection.model import MeasuredPoints, Resected, ResectSettings
 from photoplan.plain import pick
@@ -147,14 +149,21 @@ def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -
     described = project.cameras[image.camera]
     interior, lens = interior_of(described, image), lens_of(described)
     rows = control_rows(inputs, image.name)
-    given = _measured(inputs, rows)
+    given = measured_control(inputs, rows)
     frame = block_frame(project, given.XYZ if rows else np.zeros((1, 3)))
     working = given
     if frame.local is not None and rows:
         XYZ = given.XYZ.copy()
         XYZ[:, 2] = frame.inward(XYZ)
         working = MeasuredPoints(given.names, given.xy, given.sigma, XYZ, given.covariance)
-    found = _resected(project, image, working, (interior, lens), settings)
+    found = resected(project, image, working, (interior, lens), settings)
+    terrain = float(nadir_heights(project, found.pose.center[None, :2], np.nan)[0])
+    wrong = impossible(of_resection(working, found, terrain))
+    if wrong is not None:
+        fits = fitting(
+            working, interior.size[1], lambda other: resected(project, image, other, (interior, lens), settings)
+        )
+        raise GeometryError(f"image {image.name!r}: {wrong}; its orientation is not written: {fits}")
     center = found.pose.center.copy()
     if frame.local is not None:
         center[2] = frame.outward(center)
@@ -194,7 +203,8 @@ def _notes(of_angles: Array) -> Sequence[str]:
     return []
 
 
-def _measured(inputs: AdjustInputs, rows: list[tuple[int, int]]) -> MeasuredPoints:
+def measured_control(inputs: AdjustInputs, rows: list[tuple[int, int]]) -> MeasuredPoints:
+    """The points of `control_rows`."""
     points, ground = inputs.points, inputs.ground
     k, g = np.array(rows, np.int64).reshape(-1, 2).T
     covariance = np.zeros((len(g), 3, 3))
@@ -204,7 +214,7 @@ def _measured(inputs: AdjustInputs, rows: list[tuple[int, int]]) -> MeasuredPoin
     return MeasuredPoints(tuple(ground.names[i] for i in g), points.xy[k], points.sigma[k], ground.XYZ[g], covariance)
 
 
-def _resected(
+def resected(
     project: Project, image: Image, points: MeasuredPoints, camera: tuple[Interior, Lens], settings: ResectSettings
 ) -> Resected:
     """Resection with the earth curvature and refraction of the project."""
