@@ -385,3 +385,26 @@ def test_threads_share_one_decoding() -> None:
         decoded_picture((other,), make_one)
     decoded_picture(("threads",), make_one)
     assert len(made) == 5, "the two used last are kept"
+
+
+@pytest.mark.parametrize("dtype", ["float32", "int16"])
+def test_usual_nodata_values_that_are_not_declared_are_refused(tmp_path: Path, dtype: str) -> None:
+    pixels = scene(2, dtype)
+    pixels[0, 8, 9] = -9999  # in one band alone it is a value
+    assert part(pixels).min() == -9999
+    kept, _ = RasterReader(make(tmp_path / "one.tif", pixels)).read(WINDOW)
+    assert np.array_equal(kept, part(pixels))
+    pixels[1, 8, 9] = -9999
+    if dtype == "float32":
+        pixels[:, 9, 9] = np.nan
+    reader = RasterReader(make(tmp_path / "both.tif", pixels))
+    with pytest.raises(InputError, match=r"both\.tif: 1 pixels in window .* are -9999, .*gdal_edit -a_nodata -9999"):
+        reader.read(WINDOW)
+    assert reader.read(Window(20, 20, 10, 10))[1] is None
+    _, valid = RasterReader(make(tmp_path / "declared.tif", pixels, nodata=-9999)).read(WINDOW)
+    assert valid is not None and not valid[8 - WINDOW.row, 9 - WINDOW.col]
+    mask = np.full(pixels.shape[1:], 255, np.uint8)
+    mask[8, 9] = 0
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True):
+        masked = make(tmp_path / "masked.tif", pixels, mask=mask)
+    assert RasterReader(masked).read(WINDOW)[1] is not None

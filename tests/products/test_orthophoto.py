@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+import rasterio.enums
 from numpy.typing import NDArray
 from tools.small_block import FOCAL, NAMES, SIZE, X0, Y0, YAML, Z0, Block, make_project, write_image, write_terrain
 
@@ -243,3 +244,16 @@ class TestRender:
         np.testing.assert_array_equal(corner, values[:, :30, :40])
         nothing, _ = render(plan, "one", (xmin - 50, ymax + 30, xmin - 40, ymax + 50))
         assert nothing.size == 0
+
+
+def test_bands_keep_their_names_and_colours(small: Block) -> None:
+    pixels = np.random.default_rng(1).integers(1, 255, (4, SIZE[1], SIZE[0])).astype(np.uint8)
+    alone(small, pixels, (0, 0, 0))
+    colours = [rasterio.enums.ColorInterp[name] for name in ("blue", "green", "red", "undefined")]
+    with rasterio.open(small.images[0], "r+") as file:
+        file.descriptions = ("B", "G", "R", "near infrared")
+        file.colorinterp = colours
+    path, _, _ = made(small, resolution=2.0)
+    with rasterio.open(path) as file:
+        assert file.descriptions == ("B", "G", "R", "near infrared")
+        assert list(file.colorinterp) == colours

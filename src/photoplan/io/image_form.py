@@ -66,6 +66,12 @@ def form_of(info: RasterInfo) -> ImageForm:
     return ImageForm(colours, () if info.palette else names, tuple(kept.items())[:_MOST_TAGS], xmp)
 
 
+def bands_of(info: RasterInfo) -> ImageForm:
+    """What holds for a product of an image too: colours and names of its bands."""
+    form = form_of(info)
+    return ImageForm(form.colours, form.descriptions)
+
+
 def _add_pitch(info: RasterInfo, tags: dict[str, str]) -> None:
     """State the resolution of a scan as a TIFF does."""
     unit = tags.get("TIFFTAG_RESOLUTIONUNIT")

@@ -13,6 +13,7 @@ from photoplan.geometry.levels import Pixels, level_size, means
 from photoplan.io.gdal import gdal_settings, handle
 from photoplan.io.raster_info import RasterInfo
 from photoplan.io.raster_pixels import read_pixels
+from photoplan.io.validity import refuse_undeclared
 
 _SIDE = 64
 """Side of the places where an overview is compared with what it should be."""
@@ -46,7 +47,10 @@ class Overview:
 
     def read(self, window: Window) -> Pixels:
         """Pixels of a window and their validity."""
-        return read_pixels(self.info, window, overview=(self.number, self.size))
+        pixels, valid = read_pixels(self.info, window, overview=(self.number, self.size))
+        if self.info.nodata is None:
+            refuse_undeclared(self.info.path, window, pixels, valid)
+        return pixels, valid
 
 
 @lru_cache(maxsize=256)

@@ -19,7 +19,7 @@ from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.raster_pixels import both, missing_blocks, read_pixels
 from photoplan.io.reduced_blocks import reduced_by_blocks
 from photoplan.io.tiff_layout import read_tiff_layout
-from photoplan.io.validity import MissingBlocks
+from photoplan.io.validity import MissingBlocks, refuse_undeclared
 
 IMAGE_TYPES = ("uint8", "uint16", "int16", "float32")
 """Types of the pixels of source images."""
@@ -87,6 +87,8 @@ class RasterReader:
         if self.info.palette:
             pixels, opaque = _expand(self.info, pixels[0])
             valid = both(valid, opaque)
+        if self.info.nodata is None:
+            refuse_undeclared(self.path, window, pixels, valid)
         return pixels, valid
 
 

@@ -14,12 +14,18 @@ One black band is therefore still a colour, and statements that disagree make a 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
+
+USUAL_NODATA = (-9999.0, -32768.0, -32767.0, -99999.0)
+"""Values that mean "nothing here" in files that do not declare it."""
+_LOWEST_FLOAT = float(np.finfo(np.float32).min)
 
 
 def not_nodata(pixels: NDArray[Any], nodata: float | None) -> NDArray[np.bool_] | None:
@@ -40,6 +46,32 @@ def not_nodata(pixels: NDArray[Any], nodata: float | None) -> NDArray[np.bool_] 
             return None
         empty &= band == value
     return ~empty if empty.any() else None
+
+
+def refuse_undeclared(path: Path, window: Window, pixels: NDArray[Any], valid: NDArray[np.bool_] | None) -> None:
+    """Refuse valid pixels (bands, h, w) of signed type that are one of the usual nodata values in all bands.
+
+    Resampled as grey values they would spoil their surroundings without a word.
+
+    Raises
+    ------
+    InputError
+        With the value and how it is declared.
+    """
+    if (
+        pixels.dtype.kind not in "if"
+        or not pixels.size
+        or not np.fmin.reduce(pixels[0], axis=None) <= max(USUAL_NODATA)
+    ):
+        return
+    for value in (*USUAL_NODATA, _LOWEST_FLOAT) if pixels.dtype.kind == "f" else USUAL_NODATA:
+        kept = not_nodata(pixels, value)
+        count = 0 if kept is None else int((~kept if valid is None else ~kept & valid).sum())
+        if count:
+            raise InputError(
+                f"{path}: {count} pixels in window col {window.col} row {window.row} {window.width} × "
+                f"{window.height} are {value:g}, the usual nodata; declare it (`gdal_edit -a_nodata {value:g}`)"
+            )
 
 
 def finite(pixels: NDArray[Any]) -> NDArray[np.bool_] | None:

@@ -21,9 +21,10 @@ from photoplan.io.terrain import text as terrain_text
 from photoplan.io.terrain import vector as terrain_vector
 from photoplan.io.terrain.options import ReadOptions
 from photoplan.io.terrain.reader import HIGHEST, LOWEST
+from photoplan.io.validity import USUAL_NODATA
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup, Tin
 
-_USUAL_NODATA = (-9999.0, -32768.0, -32767.0, -99999.0, -999.0)
+_USUAL_NODATA = (*USUAL_NODATA, -999.0)
 _RASTERS = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+", b"\x89PNG", b"\xff\xd8\xff", b"ncols", b"NCOLS")
 _Reader = Callable[[Path, ReadOptions], MeasuredTerrain]
 

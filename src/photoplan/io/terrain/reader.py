@@ -16,7 +16,7 @@ from photoplan.io.block_cache import BlockCache
 from photoplan.io.checks import TERRAIN_LIMITS, RasterLimits
 from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.raster_pixels import missing_blocks, read_pixels
-from photoplan.io.validity import MissingBlocks
+from photoplan.io.validity import USUAL_NODATA, MissingBlocks
 
 LOWEST, HIGHEST = -12_000.0, 9_000.0
 """Heights of the Earth, metres: below the deepest sea, above the highest mountain."""
@@ -28,7 +28,6 @@ _VOID = 1e30
 """Numbers of this size (±3.4e38 of many programs) are never heights."""
 _PLAIN = -9_000.0
 """Above this, metres, no value can be a usual nodata value."""
-_USUAL_NODATA = (-9999.0, -32768.0, -32767.0, -99999.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +153,7 @@ class TerrainReader:
         metres = self.info.metres_per_unit or 1.0
         wrong = ~void & ((heights * metres < LOWEST) | (heights * metres > HIGHEST))
         if self.info.nodata is None:
-            wrong |= ~void & np.isin(stored, _USUAL_NODATA)
+            wrong |= ~void & np.isin(stored, USUAL_NODATA)
         if not wrong.any():
             return
         if not self.void_outside:

@@ -16,6 +16,7 @@ from photoplan.engine.executors import Workers, executor_factory, open_workers
 from photoplan.engine.run import Kept, Runner, Tally, Work, tiles_in_flight
 from photoplan.errors import TilesFailed, UsageError
 from photoplan.events import SILENT, Events
+from photoplan.io.image_form import bands_of
 from photoplan.io.product import ProductFile
 from photoplan.io.quicklook import write_overview
 from photoplan.io.run_record import input_entry, run_times, versions, write_run_record
@@ -179,6 +180,7 @@ def _work(
         overwrite=run.overwrite,
         inputs=scene.files,
         threads=run.workers,
+        form=bands_of(scene.reader.info),
     )
     return Work(
         name=product.plan.name,
