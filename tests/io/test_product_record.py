@@ -5,6 +5,7 @@ from __future__ import annotations
 import getpass
 import json
 import platform
+import re
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -75,7 +76,8 @@ def test_a_raster_does_not_take_the_record_of_the_model_beside_it(tmp_path: Path
 
 def test_versions_and_memory() -> None:
     found = versions()
-    assert {"photoplan", "python", "numpy", "numba", "rasterio", "GDAL", "PROJ"} <= set(found)
+    assert {"photoplan", "python", "numpy", "numba", "rasterio", "GDAL", "PROJ", "JPEG decoder"} <= set(found)
+    assert re.fullmatch(r"(libjpeg.*|another) \([0-9a-f]{12}\)", found["JPEG decoder"])
     assert found["numpy"] == np.__version__
     text = json.dumps(found)
     assert platform.node() not in text or not platform.node()
