@@ -10,17 +10,18 @@ import rasterio
 from tools.command import process
 
 from photoplan.quality.formation.model import ImageModel, form_image
-from photoplan.quality.formation.optics_parts import Falloff, Spread
-from photoplan.quality.formation.scenes import PatternScene
-from photoplan.quality.formation.sensor_parts import (
+from photoplan.quality.formation.parts import (
     DarkCurrentPart,
     DefectPart,
     Exposure,
+    Falloff,
     Gain,
     Quantisation,
     Readout,
+    Spread,
     Well,
 )
+from photoplan.quality.formation.scenes import PatternScene
 
 SIZE = (96, 80)
 FULL_DN = 64 + 0.33 * 8000

@@ -13,9 +13,8 @@ from tools.command import Here
 from photoplan.io.whole_image import write_whole_image
 from photoplan.products.chromatic import load_chromatic
 from photoplan.quality.formation.model import ImageModel, form_image
-from photoplan.quality.formation.optics_parts import Lateral, Spread
+from photoplan.quality.formation.parts import Gain, Lateral, Quantisation, Spread
 from photoplan.quality.formation.scenes import PatternScene
-from photoplan.quality.formation.sensor_parts import Gain, Quantisation
 
 CAMERA = ImageModel(
     Spread(gaussian=(0.8, 0.8)),

@@ -24,9 +24,8 @@ from photoplan.project.align import AlignStep
 from photoplan.project.stepped import SteppedReader
 from photoplan.quality.colour.model import BandModel, ChromaticModel
 from photoplan.quality.formation.model import ImageModel, form_image
-from photoplan.quality.formation.optics_parts import Lateral, Spread
+from photoplan.quality.formation.parts import Gain, Lateral, Quantisation, Spread
 from photoplan.quality.formation.scenes import PatternScene
-from photoplan.quality.formation.sensor_parts import Gain, Quantisation
 
 LATERAL = (Lateral(1, (0.6, -0.4), 0.004, 0.0), Lateral(3, (-0.5, 0.2), -0.003, 0.0))
 SCENE = PatternScene("discs", (300, 220), (24.0, 11.0), 4, bands=3)

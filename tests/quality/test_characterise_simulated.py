@@ -13,16 +13,18 @@ from photoplan.quality.camera.gain_control import gain_control
 from photoplan.quality.camera.line_jitter import line_jitter
 from photoplan.quality.camera.plumb_edge import correlate_edge, fit_edge
 from photoplan.quality.formation.model import ImageModel, form_image, form_series
-from photoplan.quality.formation.optics_parts import Falloff, LineJitterPart, Spread
-from photoplan.quality.formation.scenes import PatternScene
-from photoplan.quality.formation.sensor_parts import (
+from photoplan.quality.formation.parts import (
     AutomaticGain,
     Exposure,
+    Falloff,
     FixedPattern,
     Gain,
+    LineJitterPart,
     Quantisation,
     Readout,
+    Spread,
 )
+from photoplan.quality.formation.scenes import PatternScene
 
 
 def camera(**parts: object) -> ImageModel:

@@ -11,9 +11,8 @@ from photoplan.quality.colour.model import BandModel, ChromaticModel, Displaceme
 from photoplan.quality.colour.patch_displacements import patch_displacements
 from photoplan.quality.edges.find import EdgePicture, find_edges
 from photoplan.quality.formation.model import ImageModel, form_image
-from photoplan.quality.formation.optics_parts import Falloff, Lateral, Spread
+from photoplan.quality.formation.parts import Falloff, Gain, Lateral, Quantisation, Spread
 from photoplan.quality.formation.scenes import ArrayScene, PatternScene
-from photoplan.quality.formation.sensor_parts import Gain, Quantisation
 
 LATERAL = (Lateral(1, (0.3, -0.2), 0.002, 0.001), Lateral(3, (-0.15, 0.05), -0.001, 0.0))
 #: Contrast 200 with noise 4: a signal-to-noise ratio of 50.

@@ -5,10 +5,7 @@ import pytest
 
 from photoplan.errors import InputError
 from photoplan.quality.formation.model import ImageModel, form_image, form_series
-from photoplan.quality.formation.optics_parts import Spread
-from photoplan.quality.formation.scenes import PatternScene
-from photoplan.quality.formation.sensor import overflow
-from photoplan.quality.formation.sensor_parts import (
+from photoplan.quality.formation.parts import (
     AutomaticGain,
     DarkCurrentPart,
     DefectPart,
@@ -18,9 +15,12 @@ from photoplan.quality.formation.sensor_parts import (
     Gain,
     Quantisation,
     Readout,
+    Spread,
     Tone,
     Well,
 )
+from photoplan.quality.formation.scenes import PatternScene
+from photoplan.quality.formation.sensor import overflow
 
 FLAT = np.ones((400, 500))
 

@@ -9,7 +9,7 @@ from photoplan.geometry.grid import Window
 from photoplan.quality.formation import optics
 from photoplan.quality.formation.kernels import pixel_kernel
 from photoplan.quality.formation.model import ImageModel, form_image
-from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitterPart, Spread
+from photoplan.quality.formation.parts import Aperture, Falloff, Lateral, LineJitterPart, Spread
 from photoplan.quality.formation.scenes import ArrayScene, PatternScene, parse_pattern
 from photoplan.quality.formation.truth import line_spread_width, model_modulation, model_mtf50
 from photoplan.quality.spread import GAUSSIAN_WIDTH

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, Strict
 
@@ -65,21 +66,12 @@ def fall_off_text(entry: FallOffEntry) -> str:
         "# Light fall-off: grey values are multiplied by 1 / (cos⁴ω · (1 + sum of terms)) after dark_dn is taken off.",
         "# A term is coefficient · r^n · cos(m θ), for negative m r^n · sin(|m| θ); r in half diagonals from the",
         "# principal point, θ from columns to rows.",
-        f'format = "{entry.format}"',
-        f"size = [{entry.size[0]}, {entry.size[1]}]",
+        *_stated((name, value) for name, value in entry if name != "terms"),
     ]
-    if entry.plane:
-        lines.append(f"plane = {toml_value(entry.plane)}")
-    lines.append(f"principal_point_px = {toml_value(entry.principal_point_px)}")
-    if entry.camera_constant_px is not None:
-        lines.append(f"camera_constant_px = {entry.camera_constant_px!r}")
-    lines.append(f"dark_dn = {entry.dark_dn!r}")
-    if entry.gain_image is not None:
-        lines.append(f"gain_image = {toml_value(entry.gain_image)}")
-    if entry.gain_reduction is not None:
-        lines.append(f"gain_reduction = {entry.gain_reduction}")
     for term in entry.terms:
-        lines += ["", "[[terms]]", f"n = {term.n}", f"m = {term.m}", f"coefficient = {term.coefficient!r}"]
-        if term.sigma is not None:
-            lines.append(f"sigma = {term.sigma!r}")
+        lines += ["", "[[terms]]", *_stated(term)]
     return "\n".join(lines) + "\n"
+
+
+def _stated(entries: Iterable[tuple[str, Any]]) -> list[str]:
+    return [f"{name} = {toml_value(value)}" for name, value in entries if value not in (None, "")]

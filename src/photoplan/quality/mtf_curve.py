@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
 
@@ -32,6 +32,12 @@ class MtfCurve:
             raise InputError("the frequencies of an MTF increase from 0")
         object.__setattr__(self, "frequency", frequency)
         object.__setattr__(self, "modulation", modulation)
+
+    @classmethod
+    def from_zero(cls, frequency: ArrayLike, modulation: ArrayLike, sigma: ArrayLike) -> MtfCurve:
+        """Curve of measured frequencies, with modulation 1 at frequency 0 before them."""
+        rest = zip((0.0, 1.0, 0.0), (frequency, modulation, sigma))
+        return cls(*(np.concatenate([[first], np.asarray(values, float)]) for first, values in rest))
 
     def at(self, frequency: float) -> float:
         """Modulation at a frequency in cycles per pixel, linear between its neighbours; NaN beyond the last one."""

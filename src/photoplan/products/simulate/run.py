@@ -25,8 +25,8 @@ from photoplan.plain import json_text, pick
 from photoplan.products.simulate.model import read_model
 from photoplan.products.simulate.series import Series, SimulatedImage
 from photoplan.quality.formation.model import MOST_PIXELS, ImageModel
+from photoplan.quality.formation.parts import Quantisation
 from photoplan.quality.formation.scenes import PATTERNS, LightScene, PatternScene, parse_pattern
-from photoplan.quality.formation.sensor_parts import Quantisation
 from photoplan.quality.formation.truth import model_mtf50
 
 _MOST_FRAMES = 10_000

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.iterate import levenberg
 from photoplan.adjustment.linear import solve
 
 Array = NDArray[np.float64]
@@ -171,26 +172,22 @@ def adjust_periods(t: Array, y: Array, base: Array, frequencies: list[float], ch
     """
     # About its middle, frequency and phase of an oscillation are nearly uncorrelated.
     middle = float(t.mean())
-    f = np.array(frequencies)
-    limit = 0.5 / (float(t[-1] - t[0]) + 1.0)
-    k = base.shape[1]
-    for _ in range(12):
+    limit, k = 0.5 / (float(t[-1] - t[0]) + 1.0), base.shape[1]
+
+    def equations(f: Array) -> tuple[Array, Array]:
         A = _design(t - middle, base, f)
         found = solve(A, y)
-        if not len(f):
-            break
-        J = np.column_stack([A, _by_frequency(t - middle, f, found.unknowns[k:])])
-        change = np.clip(solve(J, -found.residuals).unknowns[A.shape[1] :], -limit, limit)
-        f = np.clip(f + change, 1e-6, 0.5 - 1e-6)
-        if np.abs(change).max() < 1e-12:
-            break
-    A = _design(t - middle, base, f)
-    found = solve(A, y)
-    J = np.column_stack([A, _by_frequency(t - middle, f, found.unknowns[k:])])
-    sigma0 = math.sqrt(found.square / max(len(t) - J.shape[1], 1))
-    covariance = solve(J, y).cofactors * sigma0**2
-    harmonics = tuple(_harmonic(i, k, f, found.unknowns, covariance, middle, chances) for i in range(len(f)))
-    return AdjustedPeriod(found.unknowns[:k], np.sqrt(np.diag(covariance)[:k]), harmonics, found.residuals, sigma0)
+        return np.column_stack([A, _by_frequency(t - middle, f, found.unknowns[k:])]), found.residuals
+
+    def moved(f: Array, step: Array) -> Array:
+        return np.clip(f + np.clip(step[len(step) - len(f) :], -limit, limit), 1e-6, 0.5 - 1e-6)
+
+    found = levenberg(np.array(frequencies), equations, moved)
+    f, cofactors = found.state, solve(found.A, y).cofactors
+    unknowns = solve(_design(t - middle, base, f), y).unknowns
+    covariance = cofactors * found.sigma0**2
+    harmonics = tuple(_harmonic(i, k, f, unknowns, covariance, middle, chances) for i in range(len(f)))
+    return AdjustedPeriod(unknowns[:k], np.sqrt(np.diag(covariance)[:k]), harmonics, found.v, found.sigma0)
 
 
 def _design(t: Array, base: Array, f: Array) -> Array:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import signal, special
 
 from photoplan.errors import InputError
-from photoplan.quality.formation.optics_parts import Aperture, Spread
+from photoplan.quality.formation.parts import Aperture, Spread
 from photoplan.quality.formation.shapes import disc_share
 
 _Array = NDArray[np.float64]

@@ -18,22 +18,28 @@ from scipy import ndimage
 
 from photoplan.errors import InputError
 from photoplan.quality.formation.optics import Light, Optics, line_displacements
-from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitterPart, Part, Spread, Within
-from photoplan.quality.formation.scenes import ArrayScene, LightScene
-from photoplan.quality.formation.sensor import Pattern, add_shot_noise, fixed_pattern, moved_charge, overflow
-from photoplan.quality.formation.sensor_parts import (
+from photoplan.quality.formation.parts import (
+    Aperture,
     AutomaticGain,
     DarkCurrentPart,
     DefectPart,
     EnhancementPart,
     Exposure,
+    Falloff,
     FixedPattern,
     Gain,
+    Lateral,
+    LineJitterPart,
+    Part,
     Quantisation,
     Readout,
+    Spread,
     Tone,
     Well,
+    Within,
 )
+from photoplan.quality.formation.scenes import ArrayScene, LightScene
+from photoplan.quality.formation.sensor import Pattern, add_shot_noise, fixed_pattern, moved_charge, overflow
 
 _Array = NDArray[np.float64]
 #: Pixels × bands of an image that is formed: it is held in memory several times as float64.

@@ -13,7 +13,7 @@ from scipy import fft, ndimage
 
 from photoplan.geometry.grid import Window
 from photoplan.quality.formation.kernels import PixelKernel, pixel_kernel
-from photoplan.quality.formation.optics_parts import Aperture, Falloff, Lateral, LineJitterPart, Spread
+from photoplan.quality.formation.parts import Aperture, Falloff, Lateral, LineJitterPart, Spread
 from photoplan.quality.formation.scenes import LightScene
 
 _Array = NDArray[np.float64]

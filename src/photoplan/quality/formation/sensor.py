@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, special
 
 from photoplan.errors import InputError
-from photoplan.quality.formation.sensor_parts import DarkCurrentPart, DefectPart, FixedPattern, Readout, Well
+from photoplan.quality.formation.parts import DarkCurrentPart, DefectPart, FixedPattern, Readout, Well
 
 _Array = NDArray[np.float64]
 #: Times that circular overflow spreads again where it meets full elements; what is left then goes along the columns.

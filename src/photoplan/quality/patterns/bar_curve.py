@@ -78,8 +78,8 @@ def bar_curve(groups: Sequence[BarContrast], levels: tuple[float, float] | None 
         low,
         high,
         source,
-        _curve(frequency, contrast, contrast_sigma),
-        _curve(frequency, transfer, transfer_sigma),
+        MtfCurve.from_zero(frequency, contrast, contrast_sigma),
+        MtfCurve.from_zero(frequency, transfer, transfer_sigma),
     )
 
 
@@ -116,12 +116,6 @@ def _fundamental(duty: float, low: float, high: float) -> float:
     return (high - low) * fundamental_of_square(duty) / (low + duty * (high - low))
 
 
-def _curve(frequency: Array, transfer: Array, sigma: Array) -> MtfCurve:
-    return MtfCurve(
-        np.concatenate([[0.0], frequency]), np.concatenate([[1.0], transfer]), np.concatenate([[0.0], sigma])
-    )
-
-
 def coltman_factor(k: int) -> float:
     """Factor of the contrast at k times the frequency in Coltman's series; 0 for even k and those with a square.
 
@@ -130,15 +124,10 @@ def coltman_factor(k: int) -> float:
     """
     if k % 2 == 0:
         return 0.0
-    primes, rest, p = 0, k, 3
-    while rest > 1:
-        if rest % p == 0:
-            rest //= p
-            primes += 1
-            if rest % p == 0:
-                return 0.0
-        p += 2
-    return float((-1.0) ** primes * (-1.0) ** ((k - 1) // 2) / k)
+    primes = [p for p in range(3, k + 1, 2) if k % p == 0 and all(p % q for q in range(3, p, 2))]
+    if any(k % (p * p) == 0 for p in primes):
+        return 0.0
+    return float((-1.0) ** len(primes) * (-1.0) ** ((k - 1) // 2) / k)
 
 
 def coltman_mtf(contrast: MtfCurve) -> MtfCurve:
@@ -152,19 +141,18 @@ def coltman_mtf(contrast: MtfCurve) -> MtfCurve:
     contrast : MtfCurve
         Contrast transfer, 1 at frequency 0.
     """
-    modulation, sigma = [1.0], [0.0]
     given = np.zeros(contrast.frequency.size) if contrast.sigma is None else contrast.sigma
     last, end = float(contrast.frequency[-1]), float(contrast.modulation[-1])
+    factors = {k: coltman_factor(k) for k in range(1, 32, 2)}
+    modulation, sigma = [], []
     for f in contrast.frequency[1:]:
-        total, variance, missed = 0.0, 0.0, 0.0
-        for k in range(1, 32, 2):
-            factor = coltman_factor(k)
-            if k * f <= last * (1.0 + 1e-12):
-                total += factor * float(np.interp(k * f, contrast.frequency, contrast.modulation))
-                variance += (factor * float(np.interp(k * f, contrast.frequency, given))) ** 2
-            elif factor and not missed:
-                # Contrast falls on, at least in proportion to the frequency.
-                missed = abs(factor) * end * last / (k * f)
-        modulation.append(pi / 4.0 * total)
-        sigma.append(pi / 4.0 * hypot(float(np.sqrt(variance)), missed))
-    return MtfCurve(contrast.frequency, np.array(modulation), np.array(sigma))
+        seen = {k: factor for k, factor in factors.items() if k * f <= last * (1.0 + 1e-12)}
+        at, weights = np.array(list(seen)) * f, pi / 4.0 * np.array(list(seen.values()))
+        # Contrast falls on, at least in proportion to the frequency.
+        missed = next(
+            (abs(factor) * end * last / (k * f) for k, factor in factors.items() if factor and k not in seen), 0.0
+        )
+        modulation.append(weights @ np.interp(at, contrast.frequency, contrast.modulation))
+        noise = np.linalg.norm(weights * np.interp(at, contrast.frequency, given))
+        sigma.append(hypot(float(noise), pi / 4.0 * missed))
+    return MtfCurve.from_zero(contrast.frequency[1:], modulation, sigma)

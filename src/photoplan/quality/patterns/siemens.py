@@ -277,6 +277,4 @@ def _curve(rings: list[StarRing], sectors: int, object_wave: tuple[float, float]
     frequency = np.array([sectors / (2.0 * pi * ring.radius) for ring in rings])
     modulation = np.array([ring.amplitude / ring.mean / full for ring in rings])
     sigma = np.hypot([ring.sigma / ring.mean / full for ring in rings], modulation * uncertain)
-    return MtfCurve(
-        np.concatenate([[0.0], frequency]), np.concatenate([[1.0], modulation]), np.concatenate([[0.0], sigma])
-    )
+    return MtfCurve.from_zero(frequency, modulation, sigma)
