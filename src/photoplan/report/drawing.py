@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import io
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -84,8 +85,13 @@ def png(fig: Any, dpi: int = _DPI, **options: Any) -> bytes:
     return buffer.getvalue()
 
 
-def round_down(value: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not larger; 1e-12 at least."""
+def round_down(value: float, steps: Sequence[float] = (1.0, 2.0, 5.0)) -> float:
+    """The largest of 1, 2, 5 (or other steps) times a power of ten that is not larger; 1e-12 at least."""
     value = max(value, 1e-12)
     power = 10.0 ** np.floor(np.log10(value))
-    return float(round(max(f for f in (1.0, 2.0, 5.0) if f <= value / power * (1 + 1e-9)) * power, 12))
+    return float(round(max(f for f in steps if f <= value / power * (1 + 1e-9)) * power, 12))
+
+
+def shortened(name: str, most: int = 14) -> str:
+    """A name that fits into a picture."""
+    return name if len(name) <= most else name[: most - 1] + "…"

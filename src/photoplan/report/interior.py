@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from photoplan.products.interior import ImageInterior, InteriorResult
-from photoplan.report.drawing import BLUE, INK, RED, SOFT, STYLE, png
+from photoplan.report.drawing import BLUE, INK, RED, SOFT, STYLE, png, round_down, shortened
 from photoplan.report.page import cells, figure, headline, number, page, section, table
 
 #: In the units of the axes; heads in widths of their shafts.
@@ -23,6 +23,8 @@ _VECTORS = {
     "headaxislength": 3.8,
     "minlength": 0.6,
 }
+#: Scales and lengths are one of these times a power of ten.
+_STEPS = (1.0, 2.0, 3.0, 5.0, 7.0)
 #: Panels side by side, and at most in one picture.
 _COLUMNS, _PANELS = 3, 24
 #: The longest vector is drawn about so long, as a part of the film's side.
@@ -33,7 +35,7 @@ def vector_scale(scans: Sequence[ImageInterior]) -> float:
     """One round scale for all panels: how much longer vectors are drawn than they are."""
     longest = max(float(np.linalg.norm(p.residuals_um, axis=1).max()) for p in scans) / 1000
     side = max(float(np.ptp(p.plane_mm, axis=0).max()) for p in scans)
-    return _nice(_LENGTH * side / max(longest, 1e-5))
+    return round_down(_LENGTH * side / max(longest, 1e-5), _STEPS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,14 +88,14 @@ class InteriorPlots:
                 for name, px, py in zip(panel.fit.names, x, y):
                     # Towards the middle, where a vector does not often go.
                     dx, dy = -np.sign(px - middle[0]) * 0.13 * half, -np.sign(py - middle[1]) * 0.13 * half
-                    ax.annotate(_short(name), (px + dx, py + dy), ha="center", va="center", color=INK, fontsize=8)
-        length = _nice(0.3 * half / scale * 1000)
+                    ax.annotate(shortened(name), (px + dx, py + dy), ha="center", va="center", color=INK, fontsize=8)
+        length = round_down(0.3 * half / scale * 1000, _STEPS)
         left, base = middle[0] - 0.15 * half, middle[1]
         ax.quiver(left, base, length * scale / 1000, 0, color=BLUE, width=width, **_VECTORS)
         ax.annotate(f"{length:g} µm", (left, base), (0, 5), textcoords="offset points", color=BLUE, fontsize=8)
         reach = 1.55 * half
         ax.set(
-            title=_short(title, 30),
+            title=shortened(title, 30),
             aspect="equal",
             xlim=(middle[0] - reach, middle[0] + reach),
             ylim=(middle[1] - reach, middle[1] + reach),
@@ -150,13 +152,3 @@ def _mark_table(scans: Sequence[ImageInterior]) -> str:
         for name, um, px in zip(scan.fit.names, scan.residuals_um, scan.fit.residuals):
             rows.append(cells([scan.image, name, *(f"{v:+.1f}" for v in um), *(f"{v:+.3f}" for v in px)], 2))
     return table(["scan", "mark", "vx µm", "vy µm", "column px", "row px"], rows)
-
-
-def _nice(length: float) -> float:
-    """1, 2, 3, 5 or 7 times a power of ten, not above a length."""
-    power = 10.0 ** math.floor(math.log10(length))
-    return power * max(m for m in (1, 2, 3, 5, 7) if m * power <= length * (1 + 1e-12))
-
-
-def _short(text: str, most: int = 14) -> str:
-    return text if len(text) <= most else text[: most - 1] + "…"

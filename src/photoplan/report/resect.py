@@ -9,7 +9,7 @@ import numpy as np
 
 from photoplan.products.resect.image import ResectedImage
 from photoplan.products.resect.run import ResectResult
-from photoplan.report.drawing import BLUE, INK, RED, SOFT, STYLE, axes_of, png, round_down
+from photoplan.report.drawing import BLUE, INK, RED, SOFT, STYLE, axes_of, png, round_down, shortened
 from photoplan.report.page import Cell, cells, figure, headline, number, page, section, table, text
 
 _WIDTH = 6.2
@@ -45,10 +45,10 @@ class ResectPlots:
                 axes.annotate("", ends[k], xy[k], arrowprops=arrow, annotation_clip=False)
             for k in range(min(len(names), _NAMED)):
                 aside = (-4, 5) if found.residuals[k, 0] > 0 else (4, 5)
-                name = names[k] if len(names[k]) <= 14 else names[k][:13] + "…"
                 side = "right" if aside[0] < 0 else "left"
                 colour = RED if found.rejected[k] else INK
-                axes.annotate(name, xy[k], aside, textcoords="offset points", fontsize=8, color=colour, ha=side)
+                label = shortened(names[k])
+                axes.annotate(label, xy[k], aside, textcoords="offset points", fontsize=8, color=colour, ha=side)
             self._key(axes, image.size, scale, typical)
             axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="column px", ylabel="row px")
             axes.set_aspect("equal")

@@ -74,8 +74,19 @@ def _run(data: SeriesData, run: SettingsRun, plane: Plane, of: Subject) -> Findi
     for k in np.flatnonzero(plain_mean):
         response, sigma_k = float(found.response[k]), float(found.response_sigma[k])
         figures.append(at[k].figure("response_at", response, sigma_k, "signal over exposure", unit))
-    table = Listing.of(
-        f"Signal and response; slopes in {unit}",
+    return Findings(
+        tuple(figures),
+        {at[k].named("signal over exposure"): str(cut_off([levels[k]])) for k in np.flatnonzero(hidden)},
+        {"levels": _table(found, run, of)},
+        _plots(found, run, of, full),
+        tuple(f"{of.named()}: {rule}".lstrip(": ") for rule in rules if "cut off" in rule),
+        {of.key("linearity"): found},
+    )
+
+
+def _table(found: Linearity, run: SettingsRun, of: Subject) -> Listing:
+    return Listing.of(
+        f"Signal and response; slopes in DN/{run.unit}",
         plane=of.plane,
         run=of.at,
         **{run.name: found.exposure},
@@ -84,14 +95,6 @@ def _run(data: SeriesData, run: SettingsRun, plane: Plane, of: Subject) -> Findi
         segment_slope=found.segment,
         deviation_percent=found.deviation_percent,
         used=found.used,
-    )
-    return Findings(
-        tuple(figures),
-        {at[k].named("signal over exposure"): str(cut_off([levels[k]])) for k in np.flatnonzero(hidden)},
-        {"levels": table},
-        _plots(found, run, of, full),
-        tuple(f"{of.named()}: {rule}".lstrip(": ") for rule in rules if "cut off" in rule),
-        {of.key("linearity"): found},
     )
 
 

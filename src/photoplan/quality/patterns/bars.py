@@ -7,13 +7,13 @@ extremes give the contrast transfer of square waves (CTF), the fundamental wave 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import atan2, cos, degrees, hypot, log, pi, sin, sqrt
+from math import atan2, degrees, hypot, log, pi, sin, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.quality.patterns.pixels import least_squares, pattern_window, white_noise
+from photoplan.quality.patterns.pixels import least_squares, pattern_window, waves, white_noise
 
 Array = NDArray[np.float64]
 
@@ -155,7 +155,7 @@ def _fit(values: Array, phase: Array, wave: BarWave) -> tuple[Array, Array, Arra
     return flat, solution, covariance, residuals, hidden
 
 
-def _levels(flat: Array, turn: Array, solution: Array, waves: tuple[int, ...]) -> tuple[float, float, float, float]:
+def _levels(flat: Array, turn: Array, solution: Array, harmonics: tuple[int, ...]) -> tuple[float, float, float, float]:
     """Levels of dark and bright bars in their middle, the standard deviation of their difference, and their bend."""
     found = []
     start = atan2(float(solution[4]), float(solution[3]))
@@ -165,7 +165,7 @@ def _levels(flat: Array, turn: Array, solution: Array, waves: tuple[int, ...]) -
         near = np.abs(away) <= _REACH
         x, y = away[near], flat[near]
         if np.unique(np.floor((x / _REACH + 1.0) * 5.999)).size < 7:
-            found.append(_few_level(x, y, middle + start / (2.0 * pi), solution, waves))
+            found.append(_few_level(x, middle + start / (2.0 * pi), solution, harmonics))
             continue
         columns = np.stack([np.ones_like(x), x**2], axis=1)
         keep = np.ones(x.size, bool)
@@ -178,22 +178,18 @@ def _levels(flat: Array, turn: Array, solution: Array, waves: tuple[int, ...]) -
     return low, high, hypot(low_sigma, high_sigma), (low_bend - high_bend) / 2.0
 
 
-def _few_level(x: Array, y: Array, phase: float, solution: Array, waves: tuple[int, ...]) -> tuple[float, float, float]:
+def _few_level(x: Array, phase: float, solution: Array, harmonics: tuple[int, ...]) -> tuple[float, float, float]:
     """Level of bars that meet the pixels at few phases: what the waves add up to; its deviation from the pixels there
     as standard deviation; and the bend of the waves."""
 
-    def at(turn: float) -> float:
-        value = float(solution[0])
-        for k, wave in enumerate(waves):
-            value += float(solution[3 + 2 * k]) * cos(2.0 * pi * wave * turn)
-            value += float(solution[4 + 2 * k]) * sin(2.0 * pi * wave * turn)
-        return value
+    def at(turn: float | Array) -> Array:
+        return np.asarray(solution[0] + waves(turn, harmonics) @ solution[3:])
 
-    level = at(phase)
-    beside = (at(phase - _REACH) + at(phase + _REACH)) / 2.0
+    level = float(at(phase))
+    beside = float(at(phase - _REACH) + at(phase + _REACH)) / 2.0
     if x.size == 0:
         return level, abs(level - beside), beside - level
-    return level, abs(float(np.mean([at(phase + t) for t in x[:200]])) - level) / 2.0, beside - level
+    return level, abs(float(at(phase + x[:200]).mean()) - level) / 2.0, beside - level
 
 
 def _alias(hidden: tuple[int, ...], amplitude: float) -> float:
@@ -274,11 +270,8 @@ def wave_columns(shape: tuple[int, ...], phase: Array, harmonics: tuple[int, ...
     """
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]]
     x, y = x / max(shape[1] - 1, 1) - 0.5, y / max(shape[0] - 1, 1) - 0.5
-    columns = [np.ones(phase.size), x.ravel(), y.ravel()]
-    for k in harmonics:
-        turn = 2.0 * pi * k * phase.ravel()
-        columns += [np.cos(turn), np.sin(turn)]
-    return np.stack(columns, axis=1)
+    plane = np.stack([np.ones(phase.size), x.ravel(), y.ravel()], axis=1)
+    return np.hstack([plane, waves(phase.ravel(), harmonics)])
 
 
 def find_wave(values: Array, what: str) -> BarWave:
@@ -314,13 +307,11 @@ def _refined(values: Array, wave: BarWave) -> BarWave:
     x = (x - (values.shape[1] - 1) / 2.0).ravel()
     y = (y - (values.shape[0] - 1) / 2.0).ravel()
     for k in range(16):
-        waves = (1,) if k < 4 else (1, *wave.harmonics(values.shape)[0])
-        columns = wave_columns(values.shape, wave.phases(values.shape), waves)
+        harmonics = np.array((1,) if k < 4 else (1, *wave.harmonics(values.shape)[0]))
+        columns = wave_columns(values.shape, wave.phases(values.shape), tuple(harmonics))
         solution, _, _ = least_squares(columns, values.ravel())
-        slope = np.zeros(values.size)
-        for place, harmonic in enumerate(waves):
-            a, b = solution[3 + 2 * place : 5 + 2 * place]
-            slope += 2.0 * pi * harmonic * (b * columns[:, 3 + 2 * place] - a * columns[:, 4 + 2 * place])
+        a, b = 2.0 * pi * harmonics * solution[3::2], 2.0 * pi * harmonics * solution[4::2]
+        slope = columns[:, 3::2] @ b - columns[:, 4::2] @ a
         solution, _, _ = least_squares(
             np.concatenate([columns, (slope * x)[:, None], (slope * y)[:, None]], axis=1), values.ravel()
         )

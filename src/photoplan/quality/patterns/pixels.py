@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from math import pi
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from photoplan.adjustment.linear import solve
 from photoplan.errors import InputError
@@ -101,6 +103,12 @@ def white_noise(values: Array) -> float:
     rows = values[:-2] - 2.0 * values[1:-1] + values[2:]
     both = rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]
     return float(np.sqrt((both**2).mean())) / 6.0
+
+
+def waves(turn: ArrayLike, harmonics: Sequence[int]) -> Array:
+    """Cosine and sine of each harmonic wave, shape (…, 2 · harmonics), at phases of shape (…) in periods."""
+    angle = 2.0 * pi * np.multiply.outer(turn, np.asarray(harmonics, float))
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1).reshape(*angle.shape[:-1], -1)
 
 
 def least_squares(columns: Array, values: Array) -> tuple[Array, Array, Array]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.quality.patterns.pixels import least_squares
+from photoplan.quality.patterns.pixels import least_squares, waves
 
 Array = NDArray[np.float64]
 
@@ -98,17 +98,11 @@ def fit_ring(values: Array, angle: Array, radius: float, sectors: int, *, whole:
         The pixels go all around; else they are around one or two opposite directions.
     """
     frequency = sectors / (2.0 * pi * radius)
-    turn = sectors * angle
-    columns = [np.ones_like(angle), np.cos(angle), np.sin(angle)]
-    if whole:
-        columns += [np.cos(2.0 * angle), np.sin(2.0 * angle)]
-    start = len(columns)
-    columns += [np.cos(turn), np.sin(turn)]
-    high = [k for k in (2, 3, 4, 5, 7, 9, 11) if k * frequency < 1.3]
-    high = [k for k in high if len(columns) + 2 * k < angle.size / 4]
-    for k in high:
-        columns += [np.cos(k * turn), np.sin(k * turn)]
-    solution, covariance, residuals = least_squares(np.stack(columns, axis=1), values)
+    around = angle / (2.0 * pi)
+    slow = np.hstack([np.ones((angle.size, 1)), waves(around, (1, 2) if whole else (1,))])
+    start = slow.shape[1]
+    high = [k for k in (2, 3, 4, 5, 7, 9, 11) if k * frequency < 1.3 and start + 2 + 2 * k < angle.size / 4]
+    solution, covariance, residuals = least_squares(np.hstack([slow, waves(sectors * around, (1, *high))]), values)
     third = None
     if 3 in high:
         place = start + 2 + 2 * high.index(3)
