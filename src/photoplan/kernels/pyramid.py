@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,7 +13,7 @@ Pyramid = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]
 """Lowest and highest posts of all levels, and start, rows, columns of each level: see `pyramid_of`."""
 
 
-@kernel
+@inner
 def _ranges(
     posts: NDArray[np.float32],
     vertices: NDArray[np.float64],
@@ -40,7 +42,7 @@ def _ranges(
             low[j, i], high[j, i] = bottom, top
 
 
-@kernel
+@inner
 def _halve(fine: NDArray[np.float32], coarse: NDArray[np.float32], sign: float) -> None:
     """Of four blocks each the highest for sign 1, the lowest for −1."""
     for j in range(coarse.shape[0]):
@@ -51,6 +53,30 @@ def _halve(fine: NDArray[np.float32], coarse: NDArray[np.float32], sign: float) 
                     value = np.float32(sign) * fine[row, col]
                     best = value if value > best else best
             coarse[j, i] = np.float32(sign) * best
+
+
+@kernel
+def _fill(
+    posts: NDArray[np.float32],
+    vertices: NDArray[np.float64],
+    corners: NDArray[np.int32],
+    start: NDArray[np.int64],
+    levels: NDArray[np.int64],
+    low: NDArray[np.float32],
+    high: NDArray[np.float32],
+) -> None:
+    """Ranges of the meshes, then of each level from the one below."""
+    for n in range(levels.shape[0]):
+        first, rows, columns = levels[n]
+        here = slice(first, first + rows * columns)
+        bottom, top = low[here].reshape(rows, columns), high[here].reshape(rows, columns)
+        if n == 0:
+            _ranges(posts, vertices, corners, start, bottom, top)
+            continue
+        first, rows, columns = levels[n - 1]
+        below = slice(first, first + rows * columns)
+        _halve(low[below].reshape(rows, columns), bottom, -1.0)
+        _halve(high[below].reshape(rows, columns), top, 1.0)
 
 
 def pyramid_of(
@@ -75,20 +101,23 @@ def pyramid_of(
     levels : ndarray, shape (n, 3), int64
         Start in `low` and `high`, rows and columns of each level.
     """
-    rows, columns = posts.shape[0] - 1, posts.shape[1] - 1
-    parts = [(np.empty((rows, columns), np.float32), np.empty((rows, columns), np.float32))]
     if vertices is None or corners is None or start is None:
         vertices, corners, start = np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty(0, np.int64)
-    _ranges(posts, vertices, corners, start, *parts[0])
-    while max(rows, columns) > 1:
-        rows, columns = (rows + 1) // 2, (columns + 1) // 2
-        parts.append((np.empty((rows, columns), np.float32), np.empty((rows, columns), np.float32)))
-        _halve(parts[-2][0], parts[-1][0], -1.0)
-        _halve(parts[-2][1], parts[-1][1], 1.0)
-    start_of = np.cumsum([0, *(part[0].size for part in parts[:-1])])
-    levels = np.array([(s, *part[0].shape) for s, part in zip(start_of, parts)], np.int64)
-    low, high = (np.concatenate([part[k].ravel() for part in parts]) for k in (0, 1))
+    levels = _levels(posts.shape[0] - 1, posts.shape[1] - 1)
+    low, high = np.empty((2, int(levels[-1].sum()) - 1), np.float32)
+    _fill(posts, vertices, corners, start, levels, low, high)
     return low, high, levels
+
+
+@lru_cache(maxsize=64)
+def _levels(rows: int, columns: int) -> NDArray[np.int64]:
+    """Start, rows and columns of each level; the last one has one block."""
+    levels = [(0, rows, columns)]
+    while max(rows, columns) > 1:
+        start = levels[-1][0] + rows * columns
+        rows, columns = (rows + 1) // 2, (columns + 1) // 2
+        levels.append((start, rows, columns))
+    return np.array(levels, np.int64)
 
 
 @inner

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -154,6 +155,17 @@ def open_scene(project: Project, name: str) -> Scene:
         declared or cannot be joined exactly.
     """
     return _open(scene_address(project, name))
+
+
+def map_order(project: Project, names: Sequence[str]) -> list[int]:
+    """Places in `names` such that images that are near on the map come soon after each other (a curve of Morton).
+
+    What was read of the terrain for one is then at hand for the next; along strips each strip would read its own.
+    """
+    XY = np.array([(project.image(name).center or (0.0, 0.0))[:2] for name in names])
+    cell = (1023 * (XY - XY.min(axis=0)) / max(1e-9, float(np.ptp(XY, axis=0).max()))).astype(int)
+    code = sum((cell[:, axis] >> bit & 1) << (2 * bit + axis) for bit in range(10) for axis in (0, 1))
+    return [int(place) for place in np.argsort(code, kind="stable")]
 
 
 def scene_address(project: Project, name: str) -> SceneAddress:

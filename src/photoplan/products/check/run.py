@@ -14,7 +14,7 @@ from photoplan.orientation.plausibility import ImagePlausibility, look, other_re
 from photoplan.plain import pick
 from photoplan.products.check.view import view_of
 from photoplan.products.orthophoto.plan import mean_gsd, two_figures
-from photoplan.project.scene import Scene, ground_of, open_scene, pose_of
+from photoplan.project.scene import Scene, ground_of, map_order, open_scene, pose_of
 
 EARTH_RADIUS = 6_380_000.0
 #: Terrain displacements of curvature above this deserve a strict model, pixels.
@@ -114,14 +114,15 @@ def check_project(project: Project, images: Sequence[str] | None = None) -> Proj
         view_of(image, project.cameras[image.camera], project.orientation, pose_of(project, image, ground).center)
         for image in entries
     ]
-    looks, checks = [], []
-    for name, view in zip(names, views):
+    looked: dict[int, tuple[ImagePlausibility, ImageCheck]] = {}
+    for place in map_order(project, names):
         # All that is asked of the terrain for one image, before the next: its blocks are then at hand.
-        looks.append(look(view, ground.surface.heights))
-        checks.append(_check_image(open_scene(project, name), looks[-1]))
+        found = look(views[place], ground.surface.heights)
+        looked[place] = found, _check_image(open_scene(project, names[place]), found)
+    looks, checks = zip(*(looked[place] for place in range(len(names))))
     gsds = [c.gsd for c in checks if np.isfinite(c.gsd)]
     return ProjectCheck(
-        tuple(checks),
+        checks,
         two_figures(float(np.mean(gsds))) if gsds else float("nan"),
         (*ground.height_systems, ground.working_system),
         project.crs,
@@ -176,7 +177,7 @@ def _sensitivity(scene: Scene) -> tuple[float, float]:
     return float(np.nanmax(per_metre)), float(np.nanmax(per_metre * drop))
 
 
-def _advice(project: Project, checks: list[ImageCheck]) -> tuple[str, ...]:
+def _advice(project: Project, checks: Sequence[ImageCheck]) -> tuple[str, ...]:
     lines = []
     curvature = np.nanmax([c.curvature_px for c in checks] + [0.0])
     if project.orientation.earth_curvature == "none" and curvature > _CURVATURE_MATTERS:

@@ -26,7 +26,7 @@ from photoplan.plan.compile import AnchorRule
 from photoplan.plan.footprint import Footprint, covered_tiles, image_border, some_height
 from photoplan.plan.product import ProductPlan
 from photoplan.products.orthophoto.settings import OrthoSettings
-from photoplan.project.scene import Scene, SceneAddress, open_scene
+from photoplan.project.scene import Scene, SceneAddress, map_order, open_scene
 from photoplan.targets.map import MapTarget
 
 #: Tiles of a product.
@@ -119,13 +119,17 @@ def plan_orthophotos(
     names = project.select(images)
     # Each image is looked at twice: where it lies, and which tiles it needs.
     events.begin("planning", 2 * len(names), "steps")
+    scenes: dict[str, Scene] = {}
+    for place in map_order(project, names):
+        scene = scenes[names[place]] = open_scene(project, names[place])
+        _ = scene.footprint
+        events.done()
     for name in names:
-        scene = open_scene(project, name)
+        scene = scenes[name]
         if scene.footprint.bounds is None:
             blind.append(_sees_no_terrain(scene, name))
         else:
             looks.append((name, scene, mean_gsd(scene.camera, scene.footprint)))
-        events.done()
     resolution = chosen.resolution or (two_figures(float(np.mean([look[2] for look in looks]))) if looks else 1.0)
     products = []
     for name, scene, gsd in looks:
