@@ -26,9 +26,8 @@ from photoplan.engine.executors import PULSE, Workers, run_tiles
 from photoplan.errors import PhotoplanError, TilesFailed, UsageError
 from photoplan.events import Events
 
-Output = tuple[Any, NDArray[np.bool_] | None]
-"""Values of a tile, shape (bands, height, width), and their validity, (height, width); None: all are valid. Or any
-result that its sink takes, and None."""
+Output = tuple[NDArray[Any], NDArray[np.bool_] | None]
+"""Values of a tile, shape (bands, height, width), and their validity, (height, width); None: all are valid."""
 T = TypeVar("T")
 
 
@@ -71,7 +70,7 @@ class Sink(Protocol):
         """Indices of the tiles that it has, those of an earlier run among them."""
         ...
 
-    def append(self, index: int, pixels: Any, valid: NDArray[np.bool_] | None, record: Any, /) -> None:
+    def append(self, index: int, pixels: NDArray[Any], valid: NDArray[np.bool_] | None, record: Any, /) -> None:
         """Keep a tile and its record."""
         ...
 
@@ -255,14 +254,13 @@ class Runner(Generic[T]):
     def _compute(self, work: Work[T]) -> Tally:
         """Bring every tile of a product into its sinks: those of an earlier run are there, the others are computed."""
         tally = Tally()
-        finished = frozenset.intersection(*(sink.finished for sink in work.sinks))
+        finished = frozenset.intersection(*(sink.finished for sink in work.sinks)) if work.sinks else frozenset()
         for tile in work.tiles:
             if tile.index in finished:
                 tally.resumed += 1
                 tally.add(work.sinks[0].record(tile.index))
         if tally.resumed:
-            if work.name:
-                self._events.talk(f"{work.name}: {tally.resumed} of {len(work.tiles)} tiles are finished already")
+            self._events.talk(f"{work.name}: {tally.resumed} of {len(work.tiles)} tiles are finished already")
             self._events.done(tally.resumed)
         for index in set(range(work.count)) - {tile.index for tile in work.tiles} - finished:
             for sink in work.sinks:

@@ -26,7 +26,7 @@ class Store(Protocol):
         ...
 
     def append(self, index: int, result: Any, /) -> None:
-        """Keep a result."""
+        """Keep a result; called by workers."""
         ...
 
     def __getitem__(self, index: int, /) -> Any:
@@ -49,36 +49,6 @@ class Item:
     index: int
     value: Any
     pixels: int = 0
-
-
-@dataclass(frozen=True)
-class StoreSink:
-    """A store as the sink of one step or one product; it stays open."""
-
-    store: Store
-
-    def __enter__(self) -> StoreSink:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        return None
-
-    @property
-    def finished(self) -> frozenset[int]:
-        """Indices of what the store has."""
-        return self.store.finished
-
-    def append(self, index: int, result: Any, valid: Any = None, record: Any = None) -> None:
-        """Keep a result."""
-        self.store.append(index, result)
-
-    def append_empty(self, index: int, record: Any = None) -> None:
-        """Keep that there is no result."""
-        self.store.append(index, None)
-
-    def record(self, index: int) -> dict[str, Any]:
-        """Results of steps have no figures beside them."""
-        return {}
 
 
 class Steps:
@@ -137,15 +107,16 @@ class Steps:
         # Numbers, where they suffice: two of them are never the same, other than two digests.
         first = (store.index(self._root) if self._root else 0) ^ self._calls << 32
         at = [first ^ k for k in range(len(values))] if names is None else [store.index(name) for name in names]
-        tasks = [Item(index, value, pixels(value)) for index, value in zip(at, values, strict=True)]
-        work: Work[None] = Work(
-            name="",
-            job=lambda task: Made(((function(task.value), None),)),
-            tiles=tasks,
-            count=0,
-            sinks=(StoreSink(store),),
-            complete=self._check,
-        )
+        finished = store.finished
+        tasks = [Item(k, value, pixels(value)) for k, value in zip(at, values, strict=True) if k not in finished]
+        self._events.done(len(values) - len(tasks))
+
+        def job(task: Item) -> Made:
+            store.append(task.index, function(task.value))
+            return Made(())
+
+        # Whoever computes a result keeps it: there is no sink, and what was kept before is no task.
+        work: Work[None] = Work(name=self._name, job=job, tiles=tasks, count=0, sinks=(), complete=self._check)
         Runner[None](self._workers, None, self._events).run([work])
         return (store[index] for index in at)
 
@@ -157,16 +128,10 @@ class Steps:
             )
 
 
-def tell_kept(name: str, store: Store, events: Events) -> None:
-    """Tell how much an earlier run has left."""
-    if store.finished:
-        events.talk(f"{name}: {len(store.finished)} results of an earlier run are kept")
-
-
 @contextmanager
 def steps(name: str, workers: int, events: Events = SILENT, store: Store | None = None) -> Iterator[Steps]:
     """Steps by threads of this process, which end with the context."""
-    if store is not None:
-        tell_kept(name, store, events)
+    if store is not None and store.finished:
+        events.talk(f"{name}: {len(store.finished)} results of an earlier run are kept")
     with threads(workers) as pool:
         yield Steps(name, pool, events, store)

@@ -31,6 +31,20 @@ def free_megabytes(path: Path) -> int:
         return -1
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder for products, if it is not there.
+
+    Raises
+    ------
+    UsageError
+        It cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder}: no such folder, and it cannot be made ({error.strerror})") from None
+
+
 def write_all(descriptor: int, *parts: bytes | memoryview) -> None:
     """Write all parts, however many calls the system needs."""
     waiting = [memoryview(part).cast("B") for part in parts if len(memoryview(part).cast("B"))]

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from functools import cache
+from hashlib import sha256
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from typing import Any
 import psutil
 import rasterio
 
+from photoplan import __version__
 from photoplan.io.disk import write_atomically
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.gdal import gdal_settings, not_georeferenced
@@ -50,6 +52,12 @@ def record_path(product: Path) -> Path:
 def input_entry(path: Path | str, digest: str | None = None) -> dict[str, Any]:
     """How a record names an input; its digest is sampled if it is not known."""
     return {"path": path, "sampled_sha256": digest or fingerprint(path).digest, "size": Path(path).stat().st_size}
+
+
+def run_key(kind: str, settings: object, inputs: Iterable[Path]) -> str:
+    """The digest of all that decides a product: a run with another one starts afresh."""
+    known = {"by": __version__, "kind": kind, "settings": settings, "inputs": [fingerprint(p).digest for p in inputs]}
+    return sha256(json_text(known, "settings").encode()).hexdigest()
 
 
 def write_run_record(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, fields
 from functools import partial
@@ -12,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan import __version__
 from photoplan.engine.cpus import available_cpus
 from photoplan.engine.executors import threads
 from photoplan.engine.run import Made, Runner, Tally, Work
@@ -20,11 +18,9 @@ from photoplan.errors import ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import Placement, Window
 from photoplan.io.disk import free_megabytes
-from photoplan.io.fingerprint import fingerprint
 from photoplan.io.product import ProductFacts, ProductFile, check_output
-from photoplan.io.run_record import input_entry, run_times, write_run_record
+from photoplan.io.run_record import input_entry, run_key, run_times, write_run_record
 from photoplan.io.storage import Nodata
-from photoplan.plain import json_text
 from photoplan.plan.tiles import Tile, Tiles
 
 GridTile = NDArray[Any] | tuple[NDArray[Any], NDArray[np.bool_]] | None
@@ -65,10 +61,8 @@ class GridOptions:
 
     @property
     def key(self) -> str:
-        """The digest of all that decides its values beside the place: a run with another one starts afresh."""
-        digests = [fingerprint(path).digest for path in self.inputs]
-        text = json_text({"by": __version__, "kind": self.kind, "settings": self.settings, "inputs": digests}, "key")
-        return hashlib.sha256(text.encode()).hexdigest()
+        """The digest of all that decides its values beside the place."""
+        return run_key(self.kind, self.settings, self.inputs)
 
 
 #: Fields of requests that decide no value.

@@ -16,6 +16,7 @@ from photoplan.engine.executors import Workers, executor_factory, open_workers
 from photoplan.engine.run import Kept, Runner, Tally, Work, tiles_in_flight
 from photoplan.errors import TilesFailed, UsageError
 from photoplan.events import SILENT, Events
+from photoplan.io.disk import make_folder
 from photoplan.io.image_form import bands_of
 from photoplan.io.product import ProductFile
 from photoplan.io.quicklook import write_overview
@@ -113,7 +114,7 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     picture = folder / "overview.png"
     _refuse_inputs(plan, [*(product_path(folder, p) for p in plan.products), *([picture] if run.quicklook else [])])
     kept = finished_products(plan, folder, run.overwrite)
-    _make_folder(folder)
+    make_folder(folder)
     if kept:
         run.events.talk(f"{len(kept)} of {len(plan.products)} products are finished already")
     run.events.begin("tiles", sum(len(p.plan.tiles) for p in plan.products))
@@ -147,13 +148,6 @@ def _identity(path: Path) -> object:
         return state.st_dev, state.st_ino
     except OSError:
         return path.resolve()
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"{folder}: no such folder, and it cannot be made ({error.strerror})") from None
 
 
 def _work(

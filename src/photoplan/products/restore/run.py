@@ -12,10 +12,11 @@ from typing import Any, Literal
 import numpy as np
 
 from photoplan import __version__
-from photoplan.engine.executors import Workers, executor_factory
+from photoplan.engine.executors import threads
 from photoplan.engine.run import Kept, Runner, Work, tiles_in_flight
 from photoplan.errors import InputError, PhotoplanError, ResourceError, RunLocked, UsageError
 from photoplan.events import SILENT, Events
+from photoplan.io.disk import make_folder
 from photoplan.io.filter_file import filter_text
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.image_form import ImageForm, form_of
@@ -199,7 +200,7 @@ def _check_outputs(job: Job, request: RestoreRequest) -> None:
 
 
 def _in_flight(request: RestoreRequest, jobs: list[Job]) -> int:
-    wanted = request.workers if request.workers == 1 else 2 * request.workers
+    wanted = threads(request.workers).in_flight
     each = max((memory_of_a_tile(job.reader) for job in jobs), default=0)
     return tiles_in_flight(wanted, request.memory if jobs else None, BASE_MEMORY, each)
 
@@ -226,7 +227,7 @@ def restore_images(request: RestoreRequest, events: Events = SILENT) -> RestoreR
     if plan.jobs and all(kept.get(job.target) for job in plan.jobs):
         first = plan.jobs[0].target
         raise UsageError(f"{first}: exists already; choose another output or say `overwrite`")
-    _make_folder(request.folder)
+    make_folder(request.folder)
     failed = dict(plan.failed)
 
     def works() -> Iterator[Work[RestoredImage | None] | Kept[RestoredImage | None]]:
@@ -247,13 +248,6 @@ def restore_images(request: RestoreRequest, events: Events = SILENT) -> RestoreR
         failed[next(job.reader.info.path.name for job in plan.jobs if job.target.stem == work.name)] = str(error)
 
     events.begin("restoring", plan.tiles)
-    with Workers(executor_factory("threads", request.workers)) as workers:
+    with threads(request.workers) as workers:
         results = Runner(workers, plan.in_flight, events, excuse).run(works())
     return RestoreReport(tuple(r for r in results if r is not None), failed, plan.filter, request.folder)
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"{folder}: no such folder, and it cannot be made ({error.strerror})") from None

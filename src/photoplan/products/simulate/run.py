@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 from collections.abc import Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,17 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan import __version__
-from photoplan.errors import InputError, UsageError
+from photoplan.engine.steps import steps
+from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import Window
 from photoplan.io.product import check_output
 from photoplan.io.raster import RasterReader
 from photoplan.io.result_log import ResultLog
-from photoplan.io.run_record import input_entry, run_times, write_run_record
-from photoplan.plain import json_text, pick
+from photoplan.io.run_record import run_key, run_times, write_run_record
+from photoplan.plain import pick
 from photoplan.products.simulate.model import read_model
-from photoplan.products.simulate.series import Series, SimulatedImage
+from photoplan.products.simulate.series import SimulatedImage, count_parts, form_frames, is_kept
 from photoplan.quality.formation.model import MOST_PIXELS, ImageModel
 from photoplan.quality.formation.parts import Quantisation
 from photoplan.quality.formation.scenes import PATTERNS, LightScene, PatternScene, parse_pattern
@@ -164,38 +162,42 @@ def simulate(
     paths, inputs = _paths(request), _inputs(request)
     settings = {"model": model, "scene": request.scene, "size": scene.size, "oversampling": scene.oversampling}
     settings |= {**pick(request, "levels", "phase"), "exposures": exposures, "dtype": dtype}
-    entries = [input_entry(path) for path in inputs]
-    decides = [__version__, settings, [entry["sampled_sha256"] for entry in entries]]
-    key = hashlib.sha256(json_text(decides, "key").encode()).hexdigest()
-    with ExitStack() as stack:
-        log = None if request.dry_run else stack.enter_context(ResultLog.beside(output, key, locked=False))
-        series = Series(model, scene, dtype, exposures, paths, log, Path(request.scene).name)
+    key = run_key("simulated images", settings, inputs)
+    if request.dry_run:
+        for path in paths:
+            check_output(path, inputs, overwrite=request.overwrite)
+        images = [SimulatedImage(p, n, e, 1.0, {}) for n, (p, e) in enumerate(zip(paths, exposures))]
+        return _report(model, scene, dtype, images)
+    with ResultLog.beside(output, key, locked=False) as log:
         for frame, path in enumerate(paths):
-            check_output(path, inputs, overwrite=request.overwrite or series.earlier(frame) is not None)
-        images = series.made(request.workers, events) if log else [series.image(n) for n in range(len(paths))]
-        mtf50 = (model_mtf50(model, 0.0), model_mtf50(model, 90.0))
-        report = SimulateReport(
-            images=tuple(images),
-            size=scene.size,
-            bands=scene.bands,
-            dtype=dtype,
-            mtf50=mtf50,
-            notes=tuple(_notes(scene, dtype, images)),
-            record=None,
-        )
-        if log is None:
-            return report
+            check_output(path, inputs, overwrite=request.overwrite or is_kept(log, frame, path))
+        tags = {"PHOTOPLAN_SCENE": Path(request.scene).name, "PHOTOPLAN_SEED": str(model.seed)}
+        with steps(output.name, request.workers, events, log) as run:
+            events.begin("images", count_parts(model, scene, len(paths)), "parts")
+            try:
+                images = form_frames(model, scene, list(zip(paths, exposures)), (dtype, tags), run, log)
+            except MemoryError:
+                text = f"{scene.bands} × {scene.size[0]} × {scene.size[1]}"
+                raise ResourceError(f"too little memory for an image of {text} pixels; cut the scene") from None
+        report = _report(model, scene, dtype, images)
+        ran = {"workers": request.workers, **times()}
         record = write_run_record(
-            output,
-            key=key,
-            inputs=entries,
-            run={"workers": request.workers, **times()},
-            kind="simulated images",
-            product=report,
-            settings=settings,
+            output, key=key, inputs=inputs, run=ran, kind="simulated images", product=report, settings=settings
         )
         log.remove()
     return dataclasses.replace(report, record=record)
+
+
+def _report(model: ImageModel, scene: LightScene, dtype: str, images: list[SimulatedImage]) -> SimulateReport:
+    return SimulateReport(
+        images=tuple(images),
+        size=scene.size,
+        bands=scene.bands,
+        dtype=dtype,
+        mtf50=(model_mtf50(model, 0.0), model_mtf50(model, 90.0)),
+        notes=tuple(_notes(scene, dtype, images)),
+        record=None,
+    )
 
 
 def _model(request: SimulateRequest) -> tuple[ImageModel, str]:

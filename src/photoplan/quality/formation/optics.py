@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from math import ceil
 from threading import Lock
@@ -95,12 +95,12 @@ class Light:
             found *= falloff_factors(self.falloff, self.scene.size, rows)[:, tile.col : tile.stop[0]]
         return found
 
-    def whole(self, of: Callable[[Window], _Array] | None = None) -> _Array:
-        """All tiles in their places, shape (bands, height, width), from where they are known already, or computed."""
+    def whole(self, known: Iterable[_Array] | None = None) -> _Array:
+        """All tiles in their places, shape (bands, height, width); those of `tiles` that are known, or computed now."""
         width, height = self.scene.size
         out = np.empty((self.scene.bands, height, width))
-        for tile in self.tiles:
-            out[:, tile.row : tile.stop[1], tile.col : tile.stop[0]] = (of or self)(tile)
+        for tile, values in zip(self.tiles, map(self, self.tiles) if known is None else known):
+            out[:, tile.row : tile.stop[1], tile.col : tile.stop[0]] = values
         return out
 
 
