@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage
 
 from photoplan.errors import GeometryError, InputError
-from photoplan.quality.colour.discs import DiscSettings, disc_displacements, find_discs
+from photoplan.quality.colour.discs import disc_displacements, find_discs
 from photoplan.quality.colour.edge_displacements import edge_displacements
 from photoplan.quality.colour.model import BandModel, ChromaticModel, Displacements, fit_band
 from photoplan.quality.colour.patch_displacements import patch_displacements
@@ -76,10 +76,10 @@ def test_bright_discs_and_mosaics(chart):
     # A mosaic whose planes have levels of their own: no interpolation, no bias.
     planes = np.add.outer(2 * (np.arange(240) % 2), np.arange(320) % 2)
     mosaic = bands[1] * np.array([0.3, 1.0, 0.6, 0.3])[planes]
-    errors = near(find_discs(mosaic, DiscSettings(saturation=300.0), planes), scene.centres())
+    errors = near(find_discs(mosaic, 300.0, planes), scene.centres())
     assert abs(errors.mean()) < 0.002 and errors.std() < 0.012
     green = np.where((planes == 0) | (planes == 3), planes, -1)
-    assert near(find_discs(mosaic, DiscSettings(), green), scene.centres()).std() < 0.02
+    assert near(find_discs(mosaic, None, green), scene.centres()).std() < 0.02
 
 
 def test_displacements_of_discs_within_two_hundredths_of_a_pixel(chart):

@@ -18,7 +18,7 @@ from photoplan.io.raster import RasterReader
 from photoplan.plain import pick, plain
 from photoplan.project.align import AlignStep
 from photoplan.project.stepped import SteppedReader
-from photoplan.quality.colour.discs import DiscSettings, disc_displacements, find_discs
+from photoplan.quality.colour.discs import disc_displacements, find_discs
 from photoplan.quality.colour.edge_displacements import edge_displacements
 from photoplan.quality.colour.model import BandModel, ChromaticModel, Displacements, fit_band
 from photoplan.quality.colour.patch_displacements import patch_displacements
@@ -123,14 +123,13 @@ def _by_discs(source: RasterReader, reference: int, others: list[int], least: in
             f"{width} × {height} pixels; discs are sought in at most {_MOST_DISC_PIXELS:,} at once: measure a part"
         )
     pixels, valid = source.read(Window(0, 0, width, height))
-    settings = DiscSettings(saturation=_saturation(source))
     found = {}
     for band in (reference, *others):
         grey: NDArray[Any] = pixels[band - 1]
         if valid is not None:
             grey = np.where(valid, grey.astype(np.float64), np.nan)
         try:
-            found[band] = find_discs(grey, settings)
+            found[band] = find_discs(grey, _saturation(source))
         except InputError as error:
             raise InputError(f"band {band}: {error}") from None
         if len(found[band]) < least:

@@ -30,9 +30,9 @@ class Approach:
     """y(t) = end + (start − end) · exp(−t / τ), with t counted from the first value."""
 
     mean: float
-    """Weighted mean of all values."""
+    """Of all values."""
     rms: float
-    """Standard deviation of one value of unit weight about the curve (about the mean, if there is no change)."""
+    """Standard deviation of one value about the curve (about the mean, if there is no change)."""
     probability: float
     """Chance that noise alone would look as much like a change."""
     redundancy: int
@@ -95,7 +95,7 @@ def check_times(times: Array, what: str) -> Array:
     return t
 
 
-def fit_approach(times: Array, values: Array, sigma: Array | None = None, what: str = "series") -> Approach:
+def fit_approach(times: Array, values: Array, what: str = "series") -> Approach:
     """Exponential by least squares, tested against a constant.
 
     Parameters
@@ -103,8 +103,6 @@ def fit_approach(times: Array, values: Array, sigma: Array | None = None, what: 
     times : ndarray, shape (n,)
         Increasing.
     values : ndarray, shape (n,)
-    sigma : ndarray, shape (n,), optional
-        Their standard deviations, which give weights only: their level is estimated from the residuals.
     what : str
         What is measured, for messages.
 
@@ -113,21 +111,21 @@ def fit_approach(times: Array, values: Array, sigma: Array | None = None, what: 
     InputError
         Less than `LEAST_VALUES` values, a value that is not finite, times that do not increase.
     """
-    t, y, w = _checked(times, values, sigma, what)
+    t, y = _checked(times, values, what)
     t = t - t[0]
-    mean, rss0 = _constant(y, w)
-    n = len(y)
+    mean, n = float(y.mean()), len(y)
+    rss0 = float(((y - mean) ** 2).sum())
     taus = np.geomspace(0.3 * float(np.diff(t).min()), 10.0 * t[-1], _CANDIDATES)
-    rss = np.array([_for_tau(t, y, w, tau)[1] for tau in taus])
+    rss = np.array([_for_tau(t, y, tau)[1] for tau in taus])
     best = int(rss.argmin())
-    start, end, tau, rss1 = _refined(t, y, w, taus, best)
+    start, end, tau, rss1 = _refined(t, y, taus, best)
     probability = _probability(rss0, rss1, n, taus)
     if probability >= LEVEL:
         rms = math.sqrt(rss0 / (n - 1))
         verdict = "no significant change"
         return Approach(mean=mean, rms=rms, probability=probability, redundancy=n - 1, verdict=verdict)
     rms = math.sqrt(rss1 / (n - 3))
-    sigmas = _sigmas(t, w, (start, end, tau), rms)
+    sigmas = _sigmas(t, (start, end, tau), rms)
     verdict = _verdict(t, tau, sigmas[2], (abs(end - start), sigmas[3]))
     seen = Approach(mean=mean, rms=rms, probability=probability, redundancy=n - 3, verdict=verdict)
     if verdict.startswith("the series"):  # its end is not seen
@@ -145,7 +143,7 @@ def fit_approach(times: Array, values: Array, sigma: Array | None = None, what: 
     )
 
 
-def _checked(times: Array, values: Array, sigma: Array | None, what: str) -> tuple[Array, Array, Array]:
+def _checked(times: Array, values: Array, what: str) -> tuple[Array, Array]:
     t, y = check_times(times, what), np.asarray(values, float)
     if y.shape != t.shape:
         raise InputError(f"{what}: {y.size} values at {t.size} times; as many of both are needed")
@@ -153,35 +151,26 @@ def _checked(times: Array, values: Array, sigma: Array | None, what: str) -> tup
         raise InputError(f"{what}: {len(y)} measurements; at least {LEAST_VALUES} are needed to follow a change")
     if not np.isfinite(y).all():
         raise InputError(f"{what}: measurement {int(np.flatnonzero(~np.isfinite(y))[0]) + 1} has no value")
-    s = np.ones_like(y) if sigma is None else np.asarray(sigma, float)
-    if s.shape != y.shape or not (np.isfinite(s).all() and (s > 0.0).all()):
-        raise InputError(f"{what}: standard deviations must be positive numbers, one per value")
-    return t, y, 1.0 / s
+    return t, y
 
 
-def _constant(y: Array, w: Array) -> tuple[float, float]:
-    mean = float((w**2 @ y) / (w @ w))
-    return mean, float(((w * (y - mean)) ** 2).sum())
-
-
-def _for_tau(t: Array, y: Array, w: Array, tau: float) -> tuple[Array, float]:
+def _for_tau(t: Array, y: Array, tau: float) -> tuple[Array, float]:
     """Start and end for a given time constant, and the sum of squares that remains."""
     decay = np.exp(-t / tau)
-    A = w[:, None] * np.column_stack([decay, 1.0 - decay])
-    fit = solve(A, w * y)
+    fit = solve(np.column_stack([decay, 1.0 - decay]), y)
     return fit.unknowns, fit.square
 
 
-def _refined(t: Array, y: Array, w: Array, taus: Array, best: int) -> tuple[float, float, float, float]:
+def _refined(t: Array, y: Array, taus: Array, best: int) -> tuple[float, float, float, float]:
     low, high = taus[max(best - 1, 0)], taus[min(best + 1, len(taus) - 1)]
     found = optimize.minimize_scalar(
-        lambda log_tau: _for_tau(t, y, w, math.exp(log_tau))[1],
+        lambda log_tau: _for_tau(t, y, math.exp(log_tau))[1],
         bounds=(math.log(low), math.log(high)),
         method="bounded",
         options={"xatol": 1e-7},
     )
     tau = math.exp(float(found.x))
-    (start, end), rss = _for_tau(t, y, w, tau)
+    (start, end), rss = _for_tau(t, y, tau)
     return float(start), float(end), tau, rss
 
 
@@ -193,11 +182,11 @@ def _probability(rss0: float, rss1: float, n: int, taus: Array) -> float:
     return min(1.0, trials * chance_gain(rss0, rss1, 2, n - 3))
 
 
-def _sigmas(t: Array, w: Array, found: tuple[float, float, float], rms: float) -> tuple[float, float, float, float]:
+def _sigmas(t: Array, found: tuple[float, float, float], rms: float) -> tuple[float, float, float, float]:
     """Of start, end, time constant and change."""
     start, end, tau = found
     decay = np.exp(-t / tau)
-    J = w[:, None] * np.column_stack([decay, 1.0 - decay, (start - end) * decay * t / tau**2])
+    J = np.column_stack([decay, 1.0 - decay, (start - end) * decay * t / tau**2])
     fit = solve(J, np.zeros(len(t)))
     if fit.condition < 1e-8:
         return math.inf, math.inf, math.inf, math.inf

@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 _OVERSAMPLING = 4
 _LONGEST = 1.5
 """Least number of periods in the series: fewer cannot be told from a curve."""
+_ALARM = 0.001
+"""Chance of a false alarm, for `Spectrum.level`."""
 _AT_ONCE = 256
 _KEPT = 4_000_000
 """Cosines that are kept in memory."""
@@ -87,7 +89,7 @@ class Waves:
             yield part, np.cos(angle), np.sin(angle)
 
 
-def spectrum(waves: Waves, y: Array, base: Array, chance: float = 0.001) -> Spectrum:
+def spectrum(waves: Waves, y: Array, base: Array) -> Spectrum:
     """Least-squares spectrum: at every frequency the base functions are adjusted anew (Lomb, Scargle).
 
     Parameters
@@ -98,8 +100,6 @@ def spectrum(waves: Waves, y: Array, base: Array, chance: float = 0.001) -> Spec
         Values.
     base : ndarray, shape (n, k)
         Functions that are adjusted with every oscillation: the trend, the offset of the fields, other oscillations.
-    chance : float
-        Of a false alarm, for `Spectrum.level`.
     """
     frequency = waves.frequency
     Q, _ = np.linalg.qr(base)
@@ -110,7 +110,7 @@ def spectrum(waves: Waves, y: Array, base: Array, chance: float = 0.001) -> Spec
         power[part] = _explained(c, s, Q, rest) / rss0
     freedom = len(y) - base.shape[1] - 3
     trials = max(1.0, float(frequency[-1] - frequency[0]) * waves.extent)
-    single = -math.expm1(math.log1p(-chance) / trials)
+    single = -math.expm1(math.log1p(-_ALARM) / trials)
     return Spectrum(frequency, np.clip(power, 0.0, 1.0), 1.0 - single ** (2.0 / freedom))
 
 

@@ -83,8 +83,6 @@ def find_saturation(
         Exposure (increasing) and mean grey value.
     black : float
         Grey value without light; NaN: not known, that of the line through the darker levels is taken.
-    black : float
-        Grey value without light.
     saturated_share : array, shape (n,)
         Share of samples at the largest grey value. Where it stays below a half, a bright spot is saturated, and not the
         area whose mean grey value is given.

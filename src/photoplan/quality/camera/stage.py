@@ -67,10 +67,10 @@ class StageCalibration:
         return -(self.facts.direction_x + self.facts.direction_y) * _GON
 
 
-def stage_calibration(
-    names: Iterable[str], stage: Array, measured: Array, *, gross_errors: bool = True
-) -> StageCalibration:
+def stage_calibration(names: Iterable[str], stage: Array, measured: Array) -> StageCalibration:
     """Adjust the affine transformation from a stage's coordinates to columns and rows.
+
+    A point whose studentised residual is beyond chance is left out, one after the other.
 
     Parameters
     ----------
@@ -80,8 +80,6 @@ def stage_calibration(
         Stage coordinates, any unit; y up, unless the stage says otherwise.
     measured : ndarray, shape (n, 2)
         Columns and rows of the target, pixels.
-    gross_errors : bool
-        Whether a point whose studentised residual is beyond chance is left out (one after the other).
 
     Raises
     ------
@@ -96,7 +94,7 @@ def stage_calibration(
         A = np.column_stack([S, np.ones(len(S))])
         fit = solve(A[used], P[used])
         residuals = P - A @ fit.unknowns
-        worst = _worst(fit, used) if gross_errors else None
+        worst = _worst(fit, used)
         if worst is None:
             break
         used[worst] = False

@@ -48,7 +48,7 @@ class StraightLine:
         return sqrt(max(c00 + 2 * x * c01 + x * x * c11, 0.0))
 
 
-def fit_line(x: ArrayLike, y: ArrayLike, sigma: ArrayLike, *, through_origin: bool = False) -> StraightLine:
+def fit_line(x: ArrayLike, y: ArrayLike, sigma: ArrayLike) -> StraightLine:
     """Line by weighted least squares.
 
     Where the residuals are significantly (1 %) larger than the standard deviations allow, those of the result are
@@ -58,8 +58,6 @@ def fit_line(x: ArrayLike, y: ArrayLike, sigma: ArrayLike, *, through_origin: bo
     ----------
     x, y, sigma : array, shape (n,)
         Points and the standard deviations of y, all positive.
-    through_origin : bool
-        Whether the offset is 0.
 
     Raises
     ------
@@ -69,25 +67,19 @@ def fit_line(x: ArrayLike, y: ArrayLike, sigma: ArrayLike, *, through_origin: bo
     x, y, sigma = (np.asarray(v, np.float64) for v in (x, y, sigma))
     if not (np.isfinite(x).all() and np.isfinite(y).all() and np.isfinite(sigma).all() and (sigma > 0).all()):
         raise InputError("a straight line needs finite points with positive standard deviations")
-    unknowns = 1 if through_origin else 2
-    if len(x) < unknowns or (through_origin and not x.any()) or (not through_origin and np.ptp(x) == 0):
-        raise InputError(f"{len(x)} points with {len(set(x.tolist()))} different abscissas; a line needs {unknowns}")
+    if len(x) < 2 or np.ptp(x) == 0:
+        raise InputError(f"{len(x)} points with {len(set(x.tolist()))} different abscissas; a line needs 2")
     # Shifted and scaled, so that the normal equations are well conditioned whatever the unit of x.
-    shift = 0.0 if through_origin else float(np.average(x, weights=sigma**-2.0))
+    shift = float(np.average(x, weights=sigma**-2.0))
     scale = float(np.abs(x - shift).max()) or 1.0
-    u = (x - shift) / scale
-    design = u[:, None] if through_origin else np.column_stack([np.ones_like(u), u])
-    fit = solve(design, y, sigma**-2.0)
-    solution, chi_square, degrees = fit.unknowns, fit.square, fit.redundancy
-    cofactor = fit.covariance if degrees and chance_chi_square(chi_square, degrees) < _SIGNIFICANT else fit.cofactors
-    if through_origin:
-        slope = float(solution[0]) / scale
-        return StraightLine(0.0, slope, (0.0, 0.0, float(cofactor[0, 0]) / scale**2), chi_square, degrees)
+    fit = solve(np.column_stack([np.ones_like(x), (x - shift) / scale]), y, sigma**-2.0)
+    scattered = fit.redundancy and chance_chi_square(fit.square, fit.redundancy) < _SIGNIFICANT
     back = np.array([[1.0, -shift / scale], [0.0, 1.0 / scale]])
-    offset, slope = back @ solution
-    c = back @ cofactor @ back.T
+    offset, slope = back @ fit.unknowns
+    c = back @ (fit.covariance if scattered else fit.cofactors) @ back.T
+    covariance = float(c[0, 0]), float(c[0, 1]), float(c[1, 1])
     return StraightLine(
-        float(offset), float(slope), (float(c[0, 0]), float(c[0, 1]), float(c[1, 1])), chi_square, degrees
+        offset=float(offset), slope=float(slope), covariance=covariance, chi_square=fit.square, degrees=fit.redundancy
     )
 
 

@@ -77,13 +77,12 @@ def warm_up(
     *,
     model: str | None = None,
     reference: str = "first",
-    centre: tuple[float, float] | None = None,
 ) -> WarmUp:
     """Separate shift, scale and rotation of targets over time.
 
     Every epoch is transformed from the reference by least squares: x' = x + t + M (x − c), with the shift t at the
-    centre c. One target gives a shift only: what moves it, shift or scale, then stays open. Two give scale and
-    rotation too, three (not on a line) the scales of columns and rows apart.
+    middle c of the targets. One target gives a shift only: what moves it, shift or scale, then stays open. Two give
+    scale and rotation too, three (not on a line) the scales of columns and rows apart.
 
     Parameters
     ----------
@@ -95,8 +94,6 @@ def warm_up(
         shift, similarity or affine; None: similarity from two targets on, else shift.
     reference : str
         `first` epoch, or the `mean` of all.
-    centre : (float, float), optional
-        Point to which the shift refers; None: the middle of the targets.
 
     Raises
     ------
@@ -118,7 +115,7 @@ def warm_up(
         raise InputError(
             f"warm-up: target {', '.join(lost)} is not measured in the first epoch; leave it out, or refer to the mean"
         )
-    middle = tuple(float(v) for v in (base.mean(axis=0) if centre is None else np.asarray(centre, float)))
+    middle = tuple(float(v) for v in base.mean(axis=0))
     moved = mean - base[:, None]
     values, cofactors, rest = _epochs(base - middle, moved, chosen, repeat)
     sigmas, sigma0 = _sigmas(cofactors, rest, (repeat, P), reference)

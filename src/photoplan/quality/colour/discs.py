@@ -25,24 +25,14 @@ _ROUNDS = 25
 _MOST_AXES = 2.5
 
 
-@dataclass(frozen=True)
-class DiscSettings:
-    """What counts as a disc."""
-
-    dark: bool | None = None
-    """Dark on bright ground; False: bright on dark; None: whichever covers less of the image."""
-    least_radius: float = 2.5
-    """Pixels."""
-    most_radius: float = 500.0
-    """Pixels."""
-    saturation: float | None = None
-    """Grey values from here on are saturated; None: the largest of the image's type, none for floats."""
-    least_contrast: float = 8.0
-    """Times the noise of a pixel that the step at the border has at least."""
-    most_sigma: float = 0.1
-    """Standard deviation of a coordinate, pixels; a centre known less well is left out."""
-    most: int = 20_000
-    """More spots than this are no chart."""
+#: Radii of what counts as a disc, pixels.
+_RADII = (2.5, 500.0)
+#: Times the noise of a pixel that the step at the border has at least.
+_LEAST_CONTRAST = 8.0
+#: Standard deviation of a coordinate, pixels; a centre known less well is left out.
+_MOST_SIGMA = 0.1
+#: More spots than this are no chart.
+_MOST_SPOTS = 20_000
 
 
 @dataclass(frozen=True)
@@ -68,15 +58,16 @@ class Disc:
 
 
 def find_discs(
-    grey: NDArray[Any], settings: DiscSettings | None = None, planes: NDArray[np.int_] | None = None
+    grey: NDArray[Any], saturation: float | None = None, planes: NDArray[np.int_] | None = None
 ) -> tuple[Disc, ...]:
-    """Locate all discs that lie wholly in an image.
+    """Locate all discs that lie wholly in an image, dark on bright ground or bright on dark.
 
     Parameters
     ----------
     grey : (height, width)
         Grey values; NaN where there is none.
-    settings : DiscSettings, optional
+    saturation : float, optional
+        Grey values from here on are saturated; None: the largest of the image's type, none for floats.
     planes : (height, width) int, optional
         Of a colour mosaic: number of the plane that each pixel belongs to, negative: not used. Every plane gets grey
         values of its own and all share one geometry, so nothing is interpolated and no pixel is moved.
@@ -90,8 +81,7 @@ def find_discs(
     InputError
         No disc is found, or all that are found are saturated or too weak; the message counts them.
     """
-    settings = settings or DiscSettings()
-    limit = settings.saturation
+    limit = saturation
     if limit is None:
         limit = float(np.iinfo(grey.dtype).max) if grey.dtype.kind in "iu" else float("inf")
     values = np.asarray(grey, np.float64)
@@ -99,8 +89,8 @@ def find_discs(
     numbers = np.zeros(values.shape, int) if planes is None else planes
     found: list[Disc] = []
     refused: dict[str, int] = {}
-    for start in _spots(_even(values, numbers), settings):
-        result = _located(values, numbers, start, settings)
+    for start in _spots(_even(values, numbers)):
+        result = _located(values, numbers, start)
         if isinstance(result, Disc):
             found.append(result)
         else:
@@ -109,7 +99,7 @@ def find_discs(
         told = "; ".join(f"{count} spots: {why}" for why, count in refused.items()) or "no round spot at all"
         raise InputError(
             f"no disc was found in {values.shape[1]} × {values.shape[0]} pixels ({told}); needed are round, "
-            f"unsaturated spots of {settings.least_radius:g} to {settings.most_radius:g} pixels radius on even ground"
+            f"unsaturated spots of {_RADII[0]:g} to {_RADII[1]:g} pixels radius on even ground"
         )
     return tuple(found)
 
@@ -131,13 +121,11 @@ def _even(values: _Array, planes: NDArray[np.int_]) -> _Array:
     return np.asarray(smooth / np.maximum(weight, 1e-9))
 
 
-def _spots(even: _Array, settings: DiscSettings) -> Iterator[tuple[float, float, float]]:
+def _spots(even: _Array) -> Iterator[tuple[float, float, float]]:
     """Centre and radius of round spots: connected parts beyond the middle between ground and disc."""
     low, high = np.percentile(even, [1, 99])
-    dark = settings.dark
-    if dark is None:
-        dark = bool((even < (low + high) / 2.0).mean() < 0.5)
-    picture = even if dark else -even
+    # Discs cover less of the image than the ground.
+    picture = even if (even < (low + high) / 2.0).mean() < 0.5 else -even
     disc = np.percentile(picture, 1)
     side = max(16, min(picture.shape) // 4)
     ground = _blocks(picture, side)
@@ -145,10 +133,8 @@ def _spots(even: _Array, settings: DiscSettings) -> Iterator[tuple[float, float,
     columns = np.minimum(np.arange(picture.shape[1]) // side, ground.shape[1] - 1)
     level = ndimage.uniform_filter(ground[rows[:, None], columns[None, :]], side)
     labels, count = ndimage.label(picture < (level + disc) / 2.0)
-    if count > settings.most:
-        raise InputError(
-            f"{count} spots in the image; at most {settings.most} are a chart of discs: choose a part of it"
-        )
+    if count > _MOST_SPOTS:
+        raise InputError(f"{count} spots in the image; at most {_MOST_SPOTS} are a chart of discs: choose a part of it")
     for index, box in enumerate(ndimage.find_objects(labels), 1):
         area = labels[box] == index
         height, width = area.shape
@@ -157,7 +143,7 @@ def _spots(even: _Array, settings: DiscSettings) -> Iterator[tuple[float, float,
         inside &= box[0].stop < even.shape[0] and box[1].stop < even.shape[1]
         long = max(height, width) / max(min(height, width), 1)
         full = area.sum() / (np.pi / 4.0 * height * width)
-        if not inside or not settings.least_radius <= radius <= settings.most_radius or long > _MOST_AXES:
+        if not inside or not _RADII[0] <= radius <= _RADII[1] or long > _MOST_AXES:
             continue
         if 0.8 < full < 1.2:
             y, x = ndimage.center_of_mass(area)
@@ -175,9 +161,7 @@ def _blocks(picture: _Array, side: int) -> _Array:
     )
 
 
-def _located(
-    values: _Array, planes: NDArray[np.int_], start: tuple[float, float, float], settings: DiscSettings
-) -> Disc | str:
+def _located(values: _Array, planes: NDArray[np.int_], start: tuple[float, float, float]) -> Disc | str:
     """The disc at a place, or why it is none."""
     x0, y0, radius = start
     reach = _REACH * radius + 2.0
@@ -196,7 +180,7 @@ def _located(
         return "pixels without value"
     used, index = np.unique(number, return_inverse=True)
     fit = _DiscFit(x[near] - x0, y[near] - y0, grey, index, used.size)
-    return fit.run(start, settings)
+    return fit.run(start)
 
 
 class _DiscFit:
@@ -209,13 +193,13 @@ class _DiscFit:
         self.x, self.y, self.grey, self.plane, self.planes = x, y, grey, plane, planes
         self.share = np.stack([plane == k for k in range(planes)], 1).astype(float)
 
-    def run(self, start: tuple[float, float, float], settings: DiscSettings) -> Disc | str:
+    def run(self, start: tuple[float, float, float]) -> Disc | str:
         """The disc, or why it is none."""
         first = np.array([0.0, 0.0, np.log(start[2]), 0.0, 0.0, np.log(0.08 * start[2] + 0.5)])
         found = levenberg(
             first, self._equations, lambda shape, step: shape + np.clip(step[:6], *_bounds(start[2])), _ROUNDS
         )
-        return self._disc(found, start, settings)
+        return self._disc(found, start)
 
     def _cover(self, shape: _Array) -> _Array:
         """Share of the disc in each pixel: the normal distribution of the distance from the ellipse."""
@@ -245,7 +229,7 @@ class _DiscFit:
             columns.append((self._basis(self._cover(moved)) - basis) @ fit.unknowns / 1e-5)
         return np.column_stack([*columns, basis]), fit.residuals
 
-    def _disc(self, found: Equations[_Array], start: tuple[float, float, float], settings: DiscSettings) -> Disc | str:
+    def _disc(self, found: Equations[_Array], start: tuple[float, float, float]) -> Disc | str:
         shape, noise = found.state, found.sigma0
         if found.redundancy < 10:
             return "too few pixels"
@@ -264,9 +248,9 @@ class _DiscFit:
             return "no disc"
         if not 0.5 * start[2] < radius < 2.0 * start[2] or np.exp(shape[5]) > 0.7 * radius:
             return "too blurred"
-        if abs(contrast) < settings.least_contrast * max(noise, 1.0 / np.sqrt(12.0) if _whole(self.grey) else 0.0):
+        if abs(contrast) < _LEAST_CONTRAST * max(noise, 1.0 / np.sqrt(12.0) if _whole(self.grey) else 0.0):
             return "too weak"
-        if sigma.max() > settings.most_sigma:
+        if sigma.max() > _MOST_SIGMA:
             return "centre too uncertain"
         x, y = start[0] + float(shape[0]), start[1] + float(shape[1])
         return Disc(
@@ -295,16 +279,15 @@ def _bounds(radius: float) -> tuple[_Array, _Array]:
 _FLOOR = 0.002
 
 
-def disc_displacements(reference: Sequence[Disc], band: Sequence[Disc], farthest: float | None = None) -> Displacements:
+def disc_displacements(reference: Sequence[Disc], band: Sequence[Disc]) -> Displacements:
     """Match discs of two bands, each with its nearest in the other, and difference their centres.
+
+    Two can be the same up to a third of the distance of nearest neighbours in the chart, at most 30 pixels.
 
     Parameters
     ----------
     reference, band : sequence of Disc
         Discs of the reference band, and of the band whose displacement is sought.
-    farthest : float, optional
-        Distance up to which two discs can be the same, pixels; None: a third of the distance of the nearest
-        neighbours in the chart, at most 30.
 
     Raises
     ------
@@ -313,10 +296,9 @@ def disc_displacements(reference: Sequence[Disc], band: Sequence[Disc], farthest
     """
     here = np.array([[d.x, d.y] for d in reference]).reshape(-1, 2)
     there = np.array([[d.x, d.y] for d in band]).reshape(-1, 2)
-    if farthest is None:
-        farthest = 30.0
-        if len(here) > 1:
-            farthest = min(farthest, float(np.median(cKDTree(here).query(here, 2)[0][:, 1])) / 3.0)
+    farthest = 30.0
+    if len(here) > 1:
+        farthest = min(farthest, float(np.median(cKDTree(here).query(here, 2)[0][:, 1])) / 3.0)
     pairs = []
     if len(here) and len(there):
         apart, nearest = cKDTree(there).query(here)

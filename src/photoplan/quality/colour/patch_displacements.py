@@ -11,6 +11,8 @@ from photoplan.errors import InputError
 from photoplan.quality.colour.model import Displacements
 
 _Array = NDArray[np.float64]
+#: Side of the windows, pixels.
+_SIDE = 48
 #: Steps of a match at most.
 _ROUNDS = 15
 #: Least correlation of both bands in a window: below it they do not show the same structure.
@@ -24,7 +26,7 @@ _MARGIN = 6
 
 
 def patch_displacements(
-    reference: _Array, band: _Array, saturation: float = float("inf"), side: int = 48, most: int = 400
+    reference: _Array, band: _Array, saturation: float = float("inf"), most: int = 400
 ) -> Displacements:
     """Displacements of a band in windows, by least squares matching with brightness and contrast as unknowns.
 
@@ -37,8 +39,6 @@ def patch_displacements(
         Grey values; NaN where there is none.
     saturation : float
         Windows with grey values from here on are left out.
-    side : int
-        Of the windows, pixels.
     most : int
         Windows at most, evenly spread.
 
@@ -48,9 +48,9 @@ def patch_displacements(
         Fewer than four windows match.
     """
     height, width = reference.shape
-    reach = side + 2 * _MARGIN
-    rows = np.arange(0, height - reach + 1, side)
-    columns = np.arange(0, width - reach + 1, side)
+    reach = _SIDE + 2 * _MARGIN
+    rows = np.arange(0, height - reach + 1, _SIDE)
+    columns = np.arange(0, width - reach + 1, _SIDE)
     corners = [(int(r), int(c)) for r in rows for c in columns]
     step = max(1, -(-len(corners) // most))
     found = []
@@ -67,8 +67,8 @@ def patch_displacements(
             found.append((column + middle, row + middle, *match))
     if len(found) < 4:
         raise InputError(
-            f"{len(found)} of {len(corners[::step])} windows of {side} × {side} pixels show the same structure in both "
-            "bands (correlation from 0.9); at least 4 are needed"
+            f"{len(found)} of {len(corners[::step])} windows of {_SIDE} × {_SIDE} pixels show the same structure in "
+            "both bands (correlation from 0.9); at least 4 are needed"
         )
     table = np.array(found)
     n = len(found)
