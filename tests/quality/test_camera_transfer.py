@@ -366,7 +366,7 @@ def test_line_through_exact_points_and_its_standard_deviations():
     # Textbook: variance of the slope is s² / Σ (x − x̄)², of the offset s² (1/n + x̄² / Σ (x − x̄)²).
     assert line.slope_sigma == pytest.approx(0.1 / np.sqrt(5))
     assert line.offset_sigma == pytest.approx(0.1 * np.sqrt(1 / 4 + 2.5**2 / 5))
-    assert line.sigma_at(2.5) == pytest.approx(0.05)
+    assert np.sqrt(line.covariance @ np.array([1, 2 * 2.5, 2.5**2])) == pytest.approx(0.05)
     scattered = fit_line([1.0, 2, 3, 4], [3.0, 6, 6, 9], [0.001] * 4)
     assert scattered.slope_sigma > 0.1
     with pytest.raises(InputError):

@@ -9,10 +9,11 @@ import pytest
 from tools.camera_series import edge_lines
 
 from photoplan.errors import InputError
-from photoplan.quality.camera.line_jitter import grey_error, line_jitter, position_error
+from photoplan.quality.camera.line_jitter import line_jitter
 from photoplan.quality.camera.line_period import Harmonic, Waves, spectrum
 from photoplan.quality.camera.parallel_edges import above_control, compare_edges
 from photoplan.quality.camera.plumb_edge import correlate_edge, fit_edge
+from photoplan.quality.sensor.figures import jitter_grey, jitter_pixels
 
 LINES = np.arange(400.0)
 
@@ -28,12 +29,12 @@ def window(
 
 def test_position_error_of_eq_4_5() -> None:
     """20 ns at 10 MHz are 0.2 pixel: the product, though eq. 4.5 prints a quotient."""
-    assert position_error(20e-9, 10e6) == pytest.approx(0.2)
+    assert jitter_pixels(20e-9, 10e6) == pytest.approx(0.2)
 
 
 def test_grey_error_of_eq_4_6_and_4_7() -> None:
     """Eq. 4.7 prints 20 grey values; its formula gives 51, and a step of 100, which the text names, gives 20."""
-    formula, text = grey_error(20e-9, 255 / 100e-9), grey_error(20e-9, 100 / 100e-9)
+    formula, text = jitter_grey(20e-9, 255, 100e-9), jitter_grey(20e-9, 100, 100e-9)
     print(f"\neq. 4.7: formula {formula:.0f}, printed 20; with the text's step of 100: {text:.0f}")
     assert formula == pytest.approx(51.0) and text == pytest.approx(20.0)
 

@@ -18,9 +18,10 @@ from photoplan.io.series.pixels import frame_pixels
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
 from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Subject, Trace, joined
-from photoplan.quality.camera.line_jitter import LineJitter, grey_error, line_jitter
+from photoplan.quality.camera.line_jitter import LineJitter, line_jitter
 from photoplan.quality.camera.parallel_edges import EdgePair, above_control, compare_edges
 from photoplan.quality.camera.plumb_edge import EdgeLines, correlate_edge, fit_edge
+from photoplan.quality.sensor.figures import jitter_grey
 
 #: Frames that are drawn.
 _CHARTS = 4
@@ -210,7 +211,7 @@ def _figures(data: SeriesData, group: FrameGroup, edges: list[Edge], control: li
         offset = _mean([e.field_offset for e in edges], [j.sigma_field_offset for j in jitters])
         remark = "significant" if any(j.fields_differ for j in jitters) else "not significant"
         figures.append(of.figure("field_offset_px", *offset, "odd rows minus even rows", "px", remark))
-        greys = [grey_error(e.jitter.sigma, e.fitted.gradient) for e in edges]
+        greys = [jitter_grey(e.jitter.sigma, e.fitted.gradient, 1.0) for e in edges]
         grey = _mean(greys, [math.nan] * len(edges))
         figures.append(of.figure("grey_error_dn", *grey, "grey error at the edge by jitter (eq. 4.6)", "DN"))
         if group.has("pixel_frequency_hz"):

@@ -48,7 +48,6 @@ class Approach:
     time_constant: float | None = None
     """τ in the unit of the times; None: not determined, see `verdict`."""
     sigma_time_constant: float | None = None
-    sigma_end: float | None = None
 
     @property
     def significant(self) -> bool:
@@ -130,7 +129,7 @@ def fit_approach(times: Array, values: Array, what: str = "series") -> Approach:
     seen = Approach(mean=mean, rms=rms, probability=probability, redundancy=n - 3, verdict=verdict)
     if verdict.startswith("the series"):  # its end is not seen
         return replace(seen, start=start)
-    seen = replace(seen, end=end, sigma_end=sigmas[1])
+    seen = replace(seen, end=end)
     if verdict.startswith("the change"):  # neither are its size and time
         return seen
     return replace(

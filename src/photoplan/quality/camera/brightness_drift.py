@@ -41,8 +41,6 @@ class BrightnessDrift:
     """The figures of table 4.1, and what of them is flicker, drift and trend."""
 
     count: int
-    duration: float
-    """Seconds."""
     mean: float
     """Ī"""
     minimum: float
@@ -130,7 +128,6 @@ def brightness_drift(
     trend, sigma_trend, probability = _trend(t, y)
     return BrightnessDrift(
         count=n,
-        duration=float(t[-1] - t[0]),
         mean=float(y.mean()),
         minimum=float(y.min()),
         maximum=float(y.max()),

@@ -94,24 +94,6 @@ class LineJitter:
         return self.field_probability < LEVEL
 
 
-def position_error(time_error: float, frequency: float) -> float:
-    """Displacement in pixels that an error of the sampling time makes (Behr 1989, eq. 4.5, as a product).
-
-    The source prints the quotient Δt / f_D; its figures, 20 ns and 10 MHz, give the printed 0.2 pixel as the product.
-    """
-    return time_error * frequency
-
-
-def grey_error(time_error: float, gradient: float) -> float:
-    """Largest error of a grey value, Δg = Δt · g'(t) (Behr 1989, eq. 4.6).
-
-    Time and gradient in matching units: seconds and grey values per second, or pixels and grey values per pixel. The
-    source's eq. 4.7, 20 ns · 255 / 100 ns, is 51 grey values; it prints 20, which a step of 100 grey values, named in
-    its text, would make.
-    """
-    return time_error * abs(gradient)
-
-
 def line_jitter(position: Array, name: str = "edge", degree: int | None = None) -> LineJitter:
     """Adjust a straight line to the positions of an edge, and take apart what is left.
 

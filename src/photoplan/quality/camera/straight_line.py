@@ -42,11 +42,6 @@ class StraightLine:
         """y at x, same shape."""
         return np.asarray(self.offset + self.slope * np.asarray(x, float))
 
-    def sigma_at(self, x: float) -> float:
-        """Standard deviation of y at x."""
-        c00, c01, c11 = self.covariance
-        return sqrt(max(c00 + 2 * x * c01 + x * x * c11, 0.0))
-
 
 def fit_line(x: ArrayLike, y: ArrayLike, sigma: ArrayLike) -> StraightLine:
     """Line by weighted least squares.

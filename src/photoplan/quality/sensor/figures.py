@@ -66,22 +66,25 @@ def quantisation_sigma(step: float) -> float:
 
 
 def jitter_pixels(jitter_s: float, sampling_hz: float) -> float:
-    """Error of position by an error of the time of sampling, pixels.
+    """Error of position by an error of the time of sampling, pixels (Behr 1989, eq. 4.5, as a product).
 
-    Behr 1989, eq. 4.5 prints a quotient of both; its value, 0.2 pixels for 20 ns at 10 MHz, is the product.
+    The source prints the quotient; its figures, 20 ns and 10 MHz, give the printed 0.2 pixel as the product.
     """
     return jitter_s * sampling_hz
 
 
 def jitter_grey(jitter_s: float, grey_step: float, rise_s: float) -> float:
-    """Error of grey by an error of the time of sampling (Behr 1989, eq. 4.6).
+    """Largest error of grey by an error of the time of sampling, or of the place (Behr 1989, eq. 4.6).
+
+    The source's eq. 4.7, 20 ns · 255 / 100 ns, is 51 grey values; it prints 20, which a step of 100 grey values, named
+    in its text, would make.
 
     Parameters
     ----------
     jitter_s : float
-        Error of the time.
+        Error of the time, or in pixels.
     grey_step, rise_s : float
-        The steepest change of grey and the time that it takes: one period of sampling in eq. 4.7.
+        The steepest change of grey and the time (or pixels) that it takes: one period of sampling in eq. 4.7.
     """
     return jitter_s * grey_step / rise_s
 
