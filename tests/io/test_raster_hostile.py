@@ -15,6 +15,7 @@ from tools.effort import at_most
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
+from photoplan.io import raster_pixels
 from photoplan.io.checks import RasterLimits, check_plain_file
 from photoplan.io.raster import RasterReader
 from photoplan.io.raster_info import read_info
@@ -332,3 +333,40 @@ class TestFault08Damage:
         path.write_text(head + "\n".join(["1 2 3 4 5"] * 2))
         with pytest.raises(InputError, match=r"a\.asc"):
             TerrainReader(path).read(Window(0, 0, 5, 4))
+
+
+@pytest.mark.parametrize(
+    ("dtype", "predictor"), [("float32", 1), ("float32", 3), ("float64", 3), ("int16", 2), ("float32", 2)]
+)
+class TestHeightsAreNotDecodedTwice:
+    """A block of one band is compared with its checksum by its pixels; only what does not agree is decoded again."""
+
+    def heights(self, path: Path, dtype: str, predictor: int) -> np.ndarray:
+        values = np.random.default_rng(3).normal(400, 30, (128, 192)).round(1).astype(dtype)
+        profile = {"width": 192, "height": 128, "count": 1, "dtype": dtype, "compress": "deflate"}
+        place = {"crs": "EPSG:32633", "transform": rasterio.Affine(2, 0, 4e5, 0, -2, 5e6)}
+        tiles = {"tiled": True, "blockxsize": 64, "blockysize": 64, "predictor": predictor}
+        with rasterio.open(path, "w", **profile, **place, **tiles) as file:
+            file.write(values, 1)
+        return values
+
+    def test_whole_blocks(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dtype: str, predictor: int) -> None:
+        path = tmp_path / "heights.tif"
+        values = self.heights(path, dtype, predictor)
+        info = read_info(path)
+        monkeypatch.setattr(raster_pixels, "_whole", None)
+        for window in Window(0, 0, 192, 128).tiles(64):
+            got, _ = raster_pixels.read_pixels(info, window)
+            np.testing.assert_array_equal(got[0], values[window.slices(Window(0, 0, 192, 128))])
+
+    def test_flipped_bits(self, tmp_path: Path, dtype: str, predictor: int) -> None:
+        self.heights(tmp_path / "heights.tif", dtype, predictor)
+        raw, layout = (tmp_path / "heights.tif").read_bytes(), read_tiff_layout(tmp_path / "heights.tif")
+        rng = np.random.default_rng(5)
+        for i in range(12):
+            changed = bytearray(raw)
+            changed[int(layout.offsets[1]) + int(rng.integers(2, int(layout.counts[1])))] ^= 1 << int(rng.integers(8))
+            path = tmp_path / f"{i}.tif"
+            path.write_bytes(changed)
+            with pytest.raises(InputError, match="damaged"):
+                raster_pixels.read_pixels(read_info(path), Window(64, 0, 64, 64))

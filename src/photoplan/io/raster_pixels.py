@@ -49,11 +49,12 @@ def _blocks(path: Path, mtime_ns: int, inode: int) -> _Blocks | None:
     return _Blocks(layout, layout.present.copy()) if layout.compression in _DEFLATE else None
 
 
-def damaged_block(path: Path, window: Window) -> str | None:
+def damaged_block(path: Path, window: Window, pixels: NDArray[Any]) -> str | None:
     """What is wrong with the first damaged block under a window of a TIFF; None if all are whole.
 
-    Each block is decoded once per process for this, and not kept. Files with another compression have no checksum and
-    pass.
+    `pixels` (bands, h, w) are what was read of the window. If they are one block, they are compared with its checksum;
+    any other block, and one that does not agree, is decoded once per process for this, and not kept. Files with another
+    compression have no checksum and pass.
 
     Raises
     ------
@@ -75,12 +76,37 @@ def damaged_block(path: Path, window: Window) -> str | None:
     with path.open("rb") as file:
         for plane, row, col in todo.tolist():
             index = (plane * down + row) * across + col
-            file.seek(int(layout.offsets[index]))
-            if not _whole(file.read(int(layout.counts[index]))):
+            start, count = int(layout.offsets[index]), int(layout.counts[index])
+            file.seek(start + count - 4)
+            if window == Window(col * width, row * height, *layout.block) and _agree(pixels, layout, file.read(4)):
+                blocks.todo[plane, row, col] = False
+                continue
+            file.seek(start)
+            if not _whole(file.read(count)):
                 band = f" of band {plane + 1}" if layout.planar else ""
                 return f"the block at column {col * width}, row {row * height}{band} does not agree with its checksum"
             blocks.todo[plane, row, col] = False
     return None
+
+
+def _agree(pixels: NDArray[Any], layout: TiffLayout, checksum: bytes) -> bool:
+    """Whether the pixels of a block of one band are surely those that a checksum (Adler-32) was made of.
+
+    They are brought into the order and the differences that were compressed, which is faster than decoding.
+    """
+    bands, height, width = pixels.shape
+    if bands != 1 or layout.samples != 1:
+        return False
+    stored = pixels[0].view(f"u{pixels.itemsize}")
+    if layout.predictor == 3:
+        # The bytes of a line, those of all signs and exponents first.
+        planes = stored.view(np.uint8).reshape(height, width, -1)[..., ::-1]
+        stored = np.ascontiguousarray(planes.transpose(0, 2, 1)).reshape(height, -1)
+    if layout.predictor > 1:
+        differences = stored.copy()
+        differences[:, 1:] -= stored[:, :-1]
+        stored = differences
+    return zlib.adler32(np.ascontiguousarray(stored).data) == int.from_bytes(checksum, "big")
 
 
 def _whole(stored: bytes) -> bool:
@@ -246,11 +272,6 @@ def _from_file(
     """Colour bands, then alpha bands, shape (bands, h, w), and the mask of the file (None: there is none)."""
     area = rasterio.windows.Window(window.col, window.row, window.width, window.height)
     band, mask = "all", None
-    torn = None
-    if overview is None and info.driver == "GTiff" and info.path.is_file():
-        torn = damaged_block(info.path, window)
-    if torn is not None:
-        raise _damaged(info.path, window, band, [torn])
     try:
         with gdal_settings(), warnings_of_gdal() as found:
             dataset = handle(info.path, info.driver if info.driver in DRIVER_NAMES else None, overview)
@@ -261,8 +282,10 @@ def _from_file(
     except (*GDAL_ERRORS, OSError) as error:
         raise _damaged(info.path, window, band, all_causes(error)) from error
     damage = damage_in(found)
+    if not damage and overview is None and info.driver == "GTiff" and info.path.is_file():
+        damage = damaged_block(info.path, window, pixels)
     if damage:
-        raise _damaged(info.path, window, band, [damage])
+        raise _damaged(info.path, window, "all", [damage])
     return pixels, mask
 
 

@@ -20,7 +20,7 @@ _CODES = {1: "u1", 3: "u2", 4: "u4", 13: "u4", 16: "u8", 18: "u8"}
 _MAX_TAGS = 4096
 
 _WIDTH, _HEIGHT, _BITS, _COMPRESSION, _PHOTOMETRIC, _ORIENTATION = 256, 257, 258, 259, 262, 274
-_STRIP_OFFSETS, _SAMPLES, _ROWS, _STRIP_COUNTS, _PLANAR = 273, 277, 278, 279, 284
+_STRIP_OFFSETS, _SAMPLES, _ROWS, _STRIP_COUNTS, _PLANAR, _PREDICTOR = 273, 277, 278, 279, 284, 317
 _TILE_WIDTH, _TILE_HEIGHT, _TILE_OFFSETS, _TILE_COUNTS = 322, 323, 324, 325
 
 
@@ -48,6 +48,8 @@ class TiffLayout:
     """Bits per sample."""
     compression: int
     """Code of the compression; 1 = none."""
+    predictor: int
+    """1 = none, 2 = differences of neighbours, 3 = differences of the bytes of floats."""
     photometric: int
     """Code of the photometric interpretation: 0 white is zero, 5 CMYK, 8 CIELab …"""
     orientation: int
@@ -214,6 +216,7 @@ def _layout(tags: _Directory, file_size: int) -> TiffLayout:
         samples=samples,
         bits=tags.one(_BITS, 1),
         compression=tags.one(_COMPRESSION, 1),
+        predictor=tags.one(_PREDICTOR, 1),
         photometric=tags.one(_PHOTOMETRIC, 1),
         orientation=tags.one(_ORIENTATION, 1),
         planar=planar,
