@@ -7,7 +7,6 @@ import subprocess
 import sys
 
 import pytest
-from numba import njit
 
 from photoplan.errors import PhotoplanWarning
 from photoplan.kernels import jit, numba_parts
@@ -43,6 +42,25 @@ def test_second_process_loads_what_the_first_compiled(tmp_path):
     assert talk[0].split() == ["False", "True", "1", "1"]
     # What lies on the disk is asked of numba's inside; where that is not leaned on, the answer is no.
     assert talk[1].split() == [str(numba_parts.USABLE), "True", "0", "0"]
+
+
+LOADED = """
+import sys
+import numpy as np
+from photoplan.kernels.extent import height_ranges
+ranges = height_ranges(np.ones((2, 3), np.float32), np.array([[0, 0, 3, 2]], np.int32))
+print(ranges[0], "numba.np.linalg" in sys.modules)
+"""
+
+
+@pytest.mark.skipif(not numba_parts.USABLE, reason="nothing is compiled, or by numba's documented ways")
+def test_what_is_compiled_is_loaded_without_the_compiler_s_libraries(tmp_path):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    for compiles in (True, False):
+        talk = subprocess.run(
+            [sys.executable, "-c", LOADED], env=environment, check=True, capture_output=True, text=True
+        )
+        assert talk.stdout.split() == ["[1.", "1.]", str(compiles)]
 
 
 def test_is_compiled_knows_all_kinds():
@@ -121,15 +139,13 @@ def test_a_temporary_folder_that_others_can_write_is_not_trusted(nowhere, tmp_pa
 
 @pytest.mark.skipif(not COMPILED, reason="nothing is compiled")
 def test_without_any_folder_kernels_work_and_it_is_said(monkeypatch):
-    def refuse(*options, cache=False, **more):
-        if cache:
-            raise RuntimeError("cannot cache function")
-        return njit(*options, **more)
+    def refuse(dispatcher):
+        raise RuntimeError("cannot cache function")
 
     def no_folder():
         raise FileNotFoundError("No usable temporary directory found")
 
-    monkeypatch.setattr(jit, "njit", refuse)
+    monkeypatch.setattr(jit, "keep", refuse)
     monkeypatch.setattr(jit.tempfile, "gettempdir", no_folder)
     with pytest.warns(PhotoplanWarning, match="NUMBA_CACHE_DIR"):
         twice = jit.kernel(lambda x: 2 * x)

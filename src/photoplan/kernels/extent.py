@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from photoplan.kernels.jit import kernel
 
-@njit(nogil=True, cache=True)
+
+@kernel
 def height_ranges(relief: NDArray[np.float32], rects: NDArray[np.int32]) -> NDArray[np.float64]:
     """Lowest and highest finite relief of each rectangle.
 

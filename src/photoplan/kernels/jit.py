@@ -13,7 +13,7 @@ from typing import Any
 from numba import config, njit, typeof
 
 from photoplan.errors import PhotoplanWarning
-from photoplan.kernels.numba_parts import INNER_OPTIONS, KERNEL_OPTIONS, is_cached, stamp
+from photoplan.kernels.numba_parts import INNER_OPTIONS, KERNEL_OPTIONS, is_cached, keep
 
 COMPILED: bool = not config.DISABLE_JIT
 """False when `NUMBA_DISABLE_JIT=1`: everything then runs as plain Python, slowly, with the same results."""
@@ -28,18 +28,18 @@ def kernel(function: Callable[..., Any]) -> Any:
     """Compile `function` on its first call for each set of types; later processes load it from the disk."""
     if not COMPILED:
         return function
+    dispatcher = njit(**_OPTIONS, **KERNEL_OPTIONS)(function)
     try:
-        dispatcher = njit(cache=True, **_OPTIONS, **KERNEL_OPTIONS)(function)
+        keep(dispatcher)
     except RuntimeError:  # neither the package's folder nor the user's can be written
         folder = _temporary_folder()
         if folder is None:
             warnings.warn(_NOWHERE, PhotoplanWarning, stacklevel=2)
-            return njit(**_OPTIONS, **KERNEL_OPTIONS)(function)
+            return dispatcher
         # For the kernels after this one, and for processes that this one starts.
         config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = folder
         warnings.warn(_ELSEWHERE.format(folder), PhotoplanWarning, stacklevel=2)
-        dispatcher = njit(cache=True, **_OPTIONS, **KERNEL_OPTIONS)(function)
-    stamp(dispatcher)
+        keep(dispatcher)
     return dispatcher
 
 

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
@@ -173,6 +172,8 @@ class ModelReader:
         (content,) = next(iter(self._rows(f"SELECT domain FROM {HEADER}")), (None,))
         if content is None:
             return None
+        import shapely  # noqa: PLC0415 - 10 ms of each start, and only here
+
         try:
             shape = shapely.from_wkb(content)
         except (shapely.errors.ShapelyError, TypeError, ValueError) as error:
