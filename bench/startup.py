@@ -4,7 +4,7 @@
 
 Prints processor seconds (user + system), the least of some runs: imports alone, a product, and its quick look. Start-up
 is what the first product of a process costs more than the second: imports and loading of compiled kernels, and the
-start of Python. As for a user, modules are not compiled anew by every process: `PYTHONDONTWRITEBYTECODE` is not handed on.
+start of Python. As for a user, no process compiles all modules anew: PYTHONDONTWRITEBYTECODE is not handed on.
 """
 
 from __future__ import annotations

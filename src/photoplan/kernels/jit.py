@@ -13,7 +13,7 @@ from typing import Any
 from numba import config, njit, typeof
 
 from photoplan.errors import PhotoplanWarning
-from photoplan.kernels.numba_parts import INNER_OPTIONS, KERNEL_OPTIONS, is_cached, keep
+from photoplan.kernels.numba_parts import INNER_OPTIONS, KERNEL_OPTIONS, MAKER_OPTIONS, is_cached, keep
 
 COMPILED: bool = not config.DISABLE_JIT
 """False when `NUMBA_DISABLE_JIT=1`: everything then runs as plain Python, slowly, with the same results."""
@@ -71,9 +71,15 @@ def _temporary_folder() -> str | None:
 def inner(function: Callable[..., Any]) -> Any:
     """Compile a part of a kernel: called by kernels only, and always inlined there where numba can be told to.
 
-    Arrays are many machine words each; a real call would spend more time on passing them than some parts need.
+    Arrays are many machine words each; a real call would spend more time on passing them than some parts need. It makes
+    no arrays and returns none, not even those that it is given: it does not count who holds them.
     """
     return njit(**_OPTIONS, **INNER_OPTIONS)(function)
+
+
+def maker(function: Callable[..., Any]) -> Any:
+    """As `inner`, for a part of a kernel that makes arrays."""
+    return njit(**_OPTIONS, **MAKER_OPTIONS)(function)
 
 
 def is_ready(dispatcher: Any, arguments: tuple[Any, ...]) -> bool:

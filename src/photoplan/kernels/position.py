@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.kernels.jit import inner, kernel
+from photoplan.kernels.jit import inner, kernel, maker
 
 RUN = 256
 """Columns of a rectangle that share one set of coefficients."""
@@ -131,7 +131,7 @@ def _keep_from(
             dx[i], dy[i] = higher_x[i], higher_y[i]
 
 
-@inner
+@maker
 def cell_space() -> tuple[Any, ...]:
     """Working space of `find_cells` for one run."""
     return np.empty(RUN, np.int32), np.empty(RUN, np.float32), np.empty(RUN, np.float32)
@@ -194,7 +194,7 @@ def _add_field(
         dy[i] = dy[i] if cell[i] >= 0 else nowhere
 
 
-@inner
+@maker
 def locate_run(
     anchors: tuple[Any, ...],
     run: NDArray[np.int32],

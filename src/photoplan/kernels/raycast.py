@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.kernels.hybrid import Frame, _weights
-from photoplan.kernels.jit import inner, kernel
+from photoplan.kernels.jit import inner, kernel, maker
 from photoplan.kernels.pyramid import Pyramid, leave
 
 #: What a ray has met last: no ground, ground below it, ground above it, or a block that lies below it as a whole.
@@ -142,7 +142,7 @@ def _on_plane(vertices: NDArray[np.float64], corners: NDArray[np.int32], f: int,
     return vertices[a, 2] + ((px * vy - py * vx) * uz + (ux * py - uy * px) * vz) / area
 
 
-@inner
+@maker
 def _cut_points(
     faces: Faces, first: int, last: int, ray: NDArray[np.float64], span: tuple[float, float]
 ) -> NDArray[np.float64]:
@@ -172,7 +172,7 @@ def _cut_points(
     return found[:count]
 
 
-@inner
+@maker
 def _through_faces(
     faces: Faces, m: int, ray: NDArray[np.float64], span: tuple[float, float], state: int
 ) -> tuple[float, Any, Any]:

@@ -14,7 +14,7 @@ from numba.extending import overload
 from numpy.typing import NDArray
 
 from photoplan.kernels import numba_parts
-from photoplan.kernels.jit import inner
+from photoplan.kernels.jit import inner, maker
 
 
 def _limits(pixels: NDArray[Any]) -> tuple[np.float32, np.float32, np.float32]:
@@ -45,7 +45,7 @@ def _weight(coefficients: NDArray[np.float32], column: int, g: Any) -> Any:
     return value
 
 
-@inner
+@maker
 def gather_loops(
     source: NDArray[Any],
     first: Any,
@@ -97,7 +97,7 @@ def gather_loops(
         out[at * lanes + lane] = value
 
 
-@inner
+@maker
 def add_block_loops(
     source: NDArray[Any],
     place: tuple[Any, ...],
