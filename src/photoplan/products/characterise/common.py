@@ -15,7 +15,6 @@ from photoplan.io.series.pixels import Plane
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.result import Findings, Subject, Trace, joined
 from photoplan.quality.camera.frame_statistics import Level
-from photoplan.quality.camera.photon_transfer import is_clipped_dark
 from photoplan.quality.camera.saturation import Saturation, find_saturation
 
 #: Share of saturated samples up to which a mean grey value is one.
@@ -133,8 +132,8 @@ def black_of(data: SeriesData, setting: Setting, plane: Plane) -> Black:
         if not of_one_temperature(dark, setting):
             continue
         level = data.levels(dark)[plane.name]
-        clipped = clipped or is_clipped_dark(level)
-        if is_clipped_dark(level) or level.saturated_share > MOST_SATURATED:
+        clipped = clipped or level.is_cut_off
+        if level.is_cut_off or level.saturated_share > MOST_SATURATED:
             continue
         if dark.first.exposure_ms == setting.first.exposure_ms:
             return Black(level.mean, _sigma(level), level, "dark frames of the same exposure")
@@ -202,12 +201,6 @@ def saturation_of(data: SeriesData, plane: Plane, levels: Sequence[Level]) -> fl
     """Grey value at which grey values stop: that of the series, or the largest that was seen of a clipped level."""
     stated = data.saturation_dn(plane.name)
     return stated if stated < inf else max((level.largest for level in levels), default=nan)
-
-
-def cut_off(levels: Sequence[Level], of: str = "") -> str | None:
-    """That black is cut off in some levels, as the beginning of a refusal; None: it is not."""
-    share = max((level.zero_share for level in levels if is_clipped_dark(level)), default=None)
-    return None if share is None else f"black is cut off: {100 * share:.3g} % of the samples{of} are zero"
 
 
 def tried(what: str, make: Callable[..., Findings], *given: Any) -> Findings:

@@ -24,7 +24,6 @@ from photoplan.products.characterise.result import (
 )
 from photoplan.quality.camera.defects import DefectList, Kind, find_blinking, find_defects, find_lines, log_histogram
 from photoplan.quality.camera.frame_statistics import FrameStack
-from photoplan.quality.camera.photon_transfer import is_clipped_dark
 
 #: Hot pixels whose growth with the exposure is followed, and whose places are drawn.
 _FOLLOWED = 40
@@ -85,8 +84,7 @@ def _setting(data: SeriesData, setting: Setting, plane: Plane, how: tuple[tuple[
     (kinds, share), of = how, Subject(plane.name, setting.label)
     stack = data.stacks(setting)[plane.name]
     level, mean = stack.level, stack.only_counted(stack.mean)
-    cut = is_clipped_dark(level)
-    pixels = find_defects(mean, level.temporal_variance, level.frames, kinds, share, data.step, cut)
+    pixels = find_defects(mean, level.temporal_variance, level.frames, kinds, share, data.step, level.is_cut_off)
     lists = {"pixels": pixels, "lines": find_lines(mean, data.step)}
     refused: dict[str, str] = {}
     try:

@@ -11,7 +11,6 @@ from photoplan.io.series.statistics import ReducedPoint
 from photoplan.products.characterise import dark, pattern
 from photoplan.products.characterise.common import (
     SettingsRun,
-    cut_off,
     exposure_runs,
     of_one_temperature,
     tried,
@@ -22,7 +21,7 @@ from photoplan.products.characterise.result import Chart, Figure, Findings, List
 from photoplan.products.characterise.transfer import reduced_level
 from photoplan.quality.camera.dark_signal import dark_current
 from photoplan.quality.camera.emva import EmvaPoints, EmvaSheet, emva_sheet
-from photoplan.quality.camera.frame_statistics import Level
+from photoplan.quality.camera.frame_statistics import Level, cut_off
 
 _LEAST = 5
 #: Figures of other analyses that belong to the sheet: name there, name here, words, unit, and whether K divides them.

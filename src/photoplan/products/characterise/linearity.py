@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import hypot, isfinite, sqrt
+from math import hypot
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from photoplan.products.characterise.common import (
     MOST_SATURATED,
     SettingsRun,
     black_of,
-    cut_off,
     no_run,
     of_runs,
     saturation_of,
@@ -20,9 +19,8 @@ from photoplan.products.characterise.common import (
 )
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace
-from photoplan.quality.camera.frame_statistics import check_level
+from photoplan.quality.camera.frame_statistics import check_level, cut_off
 from photoplan.quality.camera.linearity import HIGH, Linearity, linearity
-from photoplan.quality.camera.photon_transfer import is_clipped_dark
 
 _KINDS = ("flat", "scene")
 _LEAST = 3
@@ -44,13 +42,7 @@ def _run(data: SeriesData, run: SettingsRun, plane: Plane, of: Subject) -> Findi
         check_level(level)
     blacks = [black_of(data, setting, plane) for setting in run.settings]
     signal = [level.mean - black.mean for level, black in zip(levels, blacks)]
-    # A single frame says nothing of its noise: shot noise is not known either, so that rounding and the scatter between
-    # pixels stand in for it.
-    sigmas = [
-        level.mean_sigma if isfinite(level.mean_sigma) else sqrt(level.spatial_variance / level.pixels)
-        for level in levels
-    ]
-    sigma = [hypot(s, black.sigma) for s, black in zip(sigmas, blacks)]
+    sigma = [hypot(level.sigma_of_mean(data.step), black.sigma) for level, black in zip(levels, blacks)]
     # Where this run shows saturation, else what the camera can write.
     seen = run.saturation(data, plane) if len(levels) >= 4 else None
     top = saturation_of(data, plane, levels) if seen is None else seen.level_dn
@@ -61,7 +53,7 @@ def _run(data: SeriesData, run: SettingsRun, plane: Plane, of: Subject) -> Findi
     found = linearity(run.values, signal, sigma, full, ~partly)
     rules = dict.fromkeys(black.rule for black in blacks)
     # Where black hides a part of the pixels, the mean of the others is not the signal.
-    hidden = np.array([is_clipped_dark(level) for level in levels])
+    hidden = np.array([level.is_cut_off for level in levels])
     unit = f"DN/{run.unit}"
     at = [of.under(f"{x:g} {run.unit}") for x in found.exposure]
     plain_mean = (found.signal < HIGH * full) & ~hidden & ~partly
@@ -76,7 +68,7 @@ def _run(data: SeriesData, run: SettingsRun, plane: Plane, of: Subject) -> Findi
         figures.append(at[k].figure("response_at", response, sigma_k, "signal over exposure", unit))
     return Findings(
         tuple(figures),
-        {at[k].named("signal over exposure"): str(cut_off([levels[k]])) for k in np.flatnonzero(hidden)},
+        {at[k].named("signal over exposure"): cut_off([levels[k]]) for k in np.flatnonzero(hidden)},
         {"levels": _table(found, run, of)},
         _plots(found, run, of, full),
         tuple(f"{of.named()}: {rule}".lstrip(": ") for rule in rules if "cut off" in rule),

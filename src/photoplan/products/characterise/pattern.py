@@ -10,7 +10,7 @@ import numpy as np
 from photoplan.errors import InputError
 from photoplan.io.series.pixels import Plane
 from photoplan.plain import plain
-from photoplan.products.characterise.common import black_of, cut_off, dark_like, of_one_temperature, tried
+from photoplan.products.characterise.common import black_of, dark_like, of_one_temperature, tried
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.result import Chart, Findings, Listing, Subject, Trace, joined
 from photoplan.quality.camera.fixed_pattern import (
@@ -21,7 +21,7 @@ from photoplan.quality.camera.fixed_pattern import (
     signed_root,
     spectrogram,
 )
-from photoplan.quality.camera.frame_statistics import FrameStack, check_level
+from photoplan.quality.camera.frame_statistics import FrameStack, check_level, cut_off
 
 #: Share of saturation that the standard asks of bright frames.
 _HALF = 0.5

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite, nan, sqrt
+from math import nan
 
 import numpy as np
 
@@ -83,12 +83,7 @@ def _patches(data: SeriesData, setting: Setting, plane: Plane) -> list[_Patch]:
 def _curve(data: SeriesData, patches: list[_Patch], plane: Plane, of: Subject) -> Findings:
     blacks = [black_of(data, patch.setting, plane) for patch in patches]
     signal = [patch.level.mean - black.mean for patch, black in zip(patches, blacks)]
-    sigma = [
-        patch.level.mean_sigma
-        if isfinite(patch.level.mean_sigma)
-        else sqrt(max(patch.level.spatial_variance, data.step**2 / 12) / patch.level.pixels)
-        for patch in patches
-    ]
+    sigma = [patch.level.sigma_of_mean(data.step) for patch in patches]
     full = saturation_of(data, plane, [patch.level for patch in patches]) - blacks[0].mean
     found = grey_wedge([patch.density for patch in patches], signal, sigma, full)
     table = Listing.of(

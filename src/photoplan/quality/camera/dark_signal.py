@@ -13,8 +13,7 @@ from math import log, sqrt
 import numpy as np
 
 from photoplan.errors import InputError
-from photoplan.quality.camera.frame_statistics import Level, check_level
-from photoplan.quality.camera.photon_transfer import is_clipped_dark
+from photoplan.quality.camera.frame_statistics import Level, check_level, cut_off
 from photoplan.quality.camera.straight_line import StraightLine, fit_line
 
 
@@ -52,12 +51,10 @@ def dark_current(exposures_ms: Sequence[float], levels: Sequence[Level]) -> Dark
     InputError
         Black is cut off at zero, a level is saturated, or there are fewer than three different exposures.
     """
-    clipped = [level for level in levels if is_clipped_dark(level)]
-    if clipped:
-        share = 100 * max(level.zero_share for level in clipped)
+    cut = cut_off(levels, " of the dark frames")
+    if cut:
         raise InputError(
-            f"black is cut off: {share:.3g} % of the samples of the dark frames are zero, so that their mean and noise "
-            "are not those of the signal; raise the camera's black level"
+            f"{cut}, so that their mean and noise are not those of the signal; raise the camera's black level"
         )
     if any(level.saturated_share > 1e-2 for level in levels):
         raise InputError("over 1 % of the samples of dark frames are saturated; take shorter exposures")

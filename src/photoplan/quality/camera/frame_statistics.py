@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 
+#: Share of zeros beyond which black is cut off, and mean and variance are not those of the signal.
+ZERO_SHARE = 0.005
 #: Pixels below which no figure is derived.
 LEAST_PIXELS = 64
 
@@ -42,6 +44,11 @@ class Level:
     smallest: float
 
     @property
+    def is_cut_off(self) -> bool:
+        """Whether black is cut off: more zeros than noise about a positive bias would give."""
+        return self.zero_share > ZERO_SHARE
+
+    @property
     def mean_sigma(self) -> float:
         """Standard deviation of `mean`: by the noise of pixels, or of whole frames where that is clearly larger."""
         if self.frames < 2:
@@ -52,6 +59,12 @@ class Level:
         usual = of_pixels * (1 + 4 * np.sqrt(2 / (self.frames - 1)))
         return float(np.sqrt((of_frames if of_frames > usual else of_pixels) / self.frames))
 
+    def sigma_of_mean(self, step: float) -> float:
+        """The same; of a single frame, which says nothing of its noise, by rounding and the scatter between pixels."""
+        if np.isfinite(self.mean_sigma):
+            return self.mean_sigma
+        return float(np.sqrt(max(self.spatial_variance, step**2 / 12) / self.pixels))
+
     @property
     def degrees(self) -> int:
         """Degrees of freedom of the temporal variance."""
@@ -61,6 +74,12 @@ class Level:
     def variance_sigma(self) -> float:
         """Standard deviation of the temporal variance, for noise that is nearly Gaussian."""
         return float(self.temporal_variance * np.sqrt(2.0 / self.degrees)) if self.degrees else float("nan")
+
+
+def cut_off(levels: Iterable[Level], of: str = "") -> str:
+    """That black is cut off in some levels, as the beginning of a refusal; empty: it is not."""
+    share = max((level.zero_share for level in levels if level.is_cut_off), default=0.0)
+    return f"black is cut off: {100 * share:.3g} % of the samples{of} are zero" if share else ""
 
 
 def check_level(level: Level) -> None:

@@ -21,15 +21,13 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.adjustment.chances import chance_chi_square, chance_t
 from photoplan.adjustment.linear import solve
 from photoplan.errors import InputError
-from photoplan.quality.camera.frame_statistics import Level, check_level
+from photoplan.quality.camera.frame_statistics import Level, check_level, cut_off
 from photoplan.quality.camera.straight_line import fit_line
 
 #: Variance of rounding to whole grey values (Behr 1989, eq. 3.14); of other steps times their square.
 QUANTISATION = 1.0 / 12.0
 #: Below this variance rounding hides the noise (EMVA 1288 release 4 linear, eq. 53, 54).
 LEAST_VARIANCE = 0.24
-#: Share of zeros beyond which black is cut off and mean and variance are not those of the signal.
-ZERO_SHARE = 0.005
 #: Share of saturated samples beyond which the variance is cut off.
 _SATURATED_SHARE = 1e-3
 #: Chance of a false alarm below which a response is called bent, and levels scattered beyond their noise.
@@ -143,11 +141,6 @@ class PhotonTransfer:
         return float(self.mean[self.used].max()) - self.curve.origin
 
 
-def is_clipped_dark(level: Level) -> bool:
-    """Whether black is cut off: more zeros than noise about a positive bias would give."""
-    return level.zero_share > ZERO_SHARE
-
-
 def photon_transfer(
     bright: Sequence[Level],
     dark: Sequence[Level] = (),
@@ -180,14 +173,13 @@ def photon_transfer(
         raise InputError(f"{len(bright) - len(levels)} levels have a single frame; variance needs two or more of each")
     for level in levels:
         check_level(level)
-    clipped = [level for level in dark if is_clipped_dark(level)]
-    usable = [k for k, level in enumerate(dark) if level.frames >= 2 and not is_clipped_dark(level)]
+    usable = [k for k, level in enumerate(dark) if level.frames >= 2 and not level.is_cut_off]
     usable_dark = [dark[k] for k in usable]
     everything = [*levels, *usable_dark]
     mean = np.array([x.mean for x in everything])
     variance = np.array([x.temporal_variance for x in everything])
     degrees = np.array([x.degrees for x in everything])
-    sound = np.array([x.saturated_share <= _SATURATED_SHARE and x.zero_share <= ZERO_SHARE for x in everything])
+    sound = np.array([x.saturated_share <= _SATURATED_SHARE and not x.is_cut_off for x in everything])
     peak = _peak(mean[: len(levels)], variance[: len(levels)], degrees[: len(levels)])
     # Behind the peak of the variance the brightest level shows where elements are full.
     top = levels[-1].mean if peak is not None else mean.max(initial=0.0)
@@ -207,7 +199,7 @@ def photon_transfer(
             f"the variance does not grow with the mean (slope {curve.slope:.3g} ± {gain_sigma:.2g}); these are "
             "not raw frames of a linear sensor, or their levels are too close together"
         )
-    read = _read_noise(curve, bias, bias_sigma, clipped, step)
+    read = _read_noise(curve, bias, bias_sigma, dark, step)
     well = _full_well(levels, peak, curve)
     return PhotonTransfer(curve.slope, gain_sigma, *read, *well, bias, curve, mean, variance, used)
 
@@ -279,14 +271,11 @@ def _bias(dark: Sequence[Level], exposures_ms: Sequence[float], black_level: flo
     return dark[0].mean, dark[0].mean_sigma
 
 
-def _no_read_noise(total: float, total_sigma: float, bias: float, clipped: Sequence[Level], step: float) -> str:
+def _no_read_noise(total: float, total_sigma: float, bias: float, dark: Sequence[Level], step: float) -> str:
     """Why there is no read noise; empty: there is."""
-    if clipped:
-        share = 100 * max(level.zero_share for level in clipped)
-        return (
-            f"black is cut off: {share:.3g} % of the samples of the dark frames are zero, so that their noise is not "
-            "that of the sensor; raise the camera's black level"
-        )
+    cut = cut_off(dark, " of the dark frames")
+    if cut:
+        return f"{cut}, so that their noise is not that of the sensor; raise the camera's black level"
     if not np.isfinite(bias):
         return "the grey value without light is not known; add dark frames or camera.black_level_dn"
     if total < LEAST_VARIANCE * step**2:
@@ -300,12 +289,12 @@ def _no_read_noise(total: float, total_sigma: float, bias: float, clipped: Seque
 
 
 def _read_noise(
-    curve: VarianceCurve, bias: float, bias_sigma: float, clipped: Sequence[Level], step: float
+    curve: VarianceCurve, bias: float, bias_sigma: float, dark: Sequence[Level], step: float
 ) -> tuple[float, float, float, float, str]:
     """Read noise in grey values and electrons with sigmas, and why there is none."""
     total, C, K = curve.value, curve.covariance, curve.slope
     total_sigma = sqrt(C[0][0] + (K * bias_sigma) ** 2)
-    refused = _no_read_noise(total, total_sigma, bias, clipped, step)
+    refused = _no_read_noise(total, total_sigma, bias, dark, step)
     if refused:
         return nan, nan, nan, nan, refused
     read = sqrt(total - QUANTISATION * step**2)
