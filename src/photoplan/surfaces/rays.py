@@ -26,8 +26,11 @@ from photoplan.kernels.raycast import (
 
 #: Bytes of parts, with their pyramids, that are kept while rays are followed, if all are as large as the last one.
 CACHE = 64 << 20
-#: Pieces of rays longer than this, metres, are not straight in another CRS, or where heights are shifted.
-CHORD = 200.0
+#: Pieces of rays in another CRS, or where heights are shifted, are halved until their middles are no further than this
+#: from where the rays are, metres …
+STRAIGHT = 1e-3
+#: … or there are so many of them.
+MOST_CHORDS = 1024
 #: How far before a place ground is looked for, metres, to tell a wall from the border of a hole.
 _BEFORE = 1e-6
 
@@ -114,13 +117,39 @@ class Parts(Protocol):
         ...
 
 
-def divided(paths: NDArray[np.float64], most: float) -> NDArray[np.float64]:
-    """Paths (n, k, 3) with more points, so that no piece is longer than `most` on the map; (n, (k − 1)·m + 1, 3)."""
-    length = np.linalg.norm(np.diff(paths[..., :2], axis=1), axis=-1)
-    times = max(1, int(np.ceil(np.nanmax(length, initial=0.0) / most)))
-    part = np.arange(times)[:, None] / times
-    inner = paths[:, :-1, None] + part * np.diff(paths, axis=1)[:, :, None]
-    return np.concatenate([inner.reshape(len(paths), -1, 3), paths[:, -1:]], axis=1)
+def chords(paths: NDArray[np.float64], bend: float, carry: Carry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Paths cut into pieces so short that in other coordinates they are straight, to a quarter of `STRAIGHT`.
+
+    Parameters
+    ----------
+    paths : ndarray, shape (n, k, 3)
+        Map coordinates and heights.
+    bend : float
+        See `Terrain.first_hit`.
+    carry : callable
+        Takes points (..., 3) to the other coordinates.
+
+    Returns
+    -------
+    fine, carried : ndarrays, shape (n, (k − 1)·m + 1, 3)
+        The points that cut them, here and there.
+    """
+    # What a metre to the east and one to the north are there.
+    corner = carry(paths[:, :1])
+    metres = np.stack([(carry(paths[:, :1] + step) - corner)[:, 0, :2] for step in np.eye(3)[:2]], axis=-1)
+    there = np.isfinite(metres).all(axis=(1, 2))
+    times = 2
+    while True:
+        part = np.arange(times)[:, None] / times
+        inner = paths[:, :-1, None] + part * np.diff(paths, axis=1)[:, :, None]
+        fine = bent(np.concatenate([inner.reshape(len(paths), -1, 3), paths[:, -1:]], axis=1), bend)
+        carried = carry(fine)
+        off = (carried[there, 1::2] - (carried[there, :-1:2] + carried[there, 2::2]) / 2).swapaxes(1, 2)
+        off[:, :2] = np.linalg.solve(metres[there], off[:, :2])
+        # Twice as many chords have a fourth of the error of those that were measured at their middles.
+        if np.nanmax(np.linalg.norm(off, axis=1), initial=0.0) <= STRAIGHT or times >= MOST_CHORDS:
+            return fine, carried
+        times *= 2
 
 
 def bent(paths: NDArray[np.float64], bend: float) -> NDArray[np.float64]:
@@ -169,14 +198,14 @@ def follow(parts: Parts, paths: ArrayLike, bend: float = 0.0) -> Hits:
 def carried_hits(
     parts: Parts,
     paths: NDArray[np.float64],
-    carry: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None,
+    carry: Carry | None,
     bend: float,
 ) -> Hits:
     """First hits of rays over parts that lie in another CRS, to which `carry` takes map points; None: in the same."""
     if carry is None:
         return follow(parts, paths, bend)
-    fine = bent(divided(paths, CHORD), bend)
-    hits = follow(parts, np.concatenate([carry(fine[..., :2]), fine[..., 2:]], axis=-1))
+    fine, carried = chords(paths, bend, lambda XYZ: np.concatenate([carry(XYZ[..., :2]), XYZ[..., 2:]], axis=-1))
+    hits = follow(parts, carried)
     there = np.flatnonzero(np.isfinite(hits.along))
     piece = np.minimum(hits.along[there].astype(int), fine.shape[1] - 2)
     a, b = fine[there, piece], fine[there, piece + 1]

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.geometry.grid import Window
 from photoplan.surfaces.base import Terrain
-from photoplan.surfaces.rays import CHORD, Hits, bent, divided
+from photoplan.surfaces.rays import Hits, chords
 from photoplan.targets.base import Target
 
 
@@ -53,10 +53,13 @@ class ShiftedSurface:
     def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
         """Where rays first come down onto the surface; see `Terrain.first_hit`."""
         given = np.asarray(paths, float)
-        fine = bent(divided(given, CHORD), bend)
-        fine[..., 2] -= self.shift(fine[..., :2])
-        hits = self.surface.first_hit(fine)
+        fine, carried = chords(given, bend, self._lowered)
+        hits = self.surface.first_hit(carried)
         there = np.isfinite(hits.along)
         hits.XYZ[there, 2] += self.shift(hits.XYZ[there, :2])
         hits.along[there] *= (given.shape[1] - 1) / (fine.shape[1] - 1)
         return hits
+
+    def _lowered(self, XYZ: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points as the surface that was shifted has them."""
+        return np.concatenate([XYZ[..., :2], XYZ[..., 2:] - self.shift(XYZ[..., :2])[..., None]], axis=-1)
