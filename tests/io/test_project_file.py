@@ -87,7 +87,9 @@ def usable(name: str) -> bool:
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     name=st.text(min_size=1, max_size=30).filter(usable),
-    numbers=st.tuples(*[st.floats(allow_nan=False, allow_infinity=False)] * 6),
+    numbers=st.tuples(
+        *[st.floats(-1e8, 1e8)] * 2, st.floats(-12_000.0, 1e6), *[st.floats(-360.0, 360.0, allow_nan=False)] * 3
+    ),
 )
 def test_any_name_and_number_survives(tmp_path: Path, name: str, numbers: tuple[float, ...]) -> None:
     image = Image(name=name, file="a.jpg", camera=name, center=numbers[:3], angles=numbers[3:])

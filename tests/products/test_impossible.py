@@ -105,3 +105,15 @@ def test_a_block_with_exchanged_axes_is_refused(tmp_path: Path) -> None:
     with pytest.raises(GeometryError, match="below its ground points and looks up"):
         adjust_project(AdjustRequest(made.path))
     assert made.path.read_text() == before
+
+
+def test_a_camera_constant_wrong_by_a_factor_of_two_is_refused(tmp_path: Path) -> None:
+    from tools.adjust_project import Make, write_project
+
+    from photoplan.errors import GeometryError
+    from photoplan.products.adjust.run import AdjustRequest, adjust_project
+
+    wrong = {"focal_px": 7200.0}
+    made = write_project(tmp_path, Make(pixel_noise=0.3, curvature="none", stated=wrong))
+    with pytest.raises(GeometryError, match=r"camera constant of camera 'cam': 0\.5.* times what is stated"):
+        adjust_project(AdjustRequest(made.path))

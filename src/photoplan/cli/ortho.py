@@ -22,6 +22,7 @@ from photoplan.cli.options import bounds_option, dry_run_option, executing, imag
 @click.option("--overviews/--no-overviews", default=None, help="Whether the file holds overviews [yes].")
 @click.option("--tile", type=int, metavar="PX", help="Side of a tile [512].")
 @click.option("--output", type=click.Path(path_type=Path), help="Folder of the products [PROJECT's folder/products].")
+@click.option("--force", is_flag=True, help="Also of orientations with a FAULT, and finer than a quarter of the GSD.")
 @click.option("--plan", "plan_file", type=click.Path(path_type=Path), help="Write the plan (GeoPackage) and stop.")
 @dry_run_option("Compile the plan, print it, and stop.")
 @executing

@@ -58,6 +58,27 @@ class Window:
                 yield Window(col, row, min(side, right - col), min(side, bottom - row))
 
 
+#: Tiles of one raster at most.
+MOST_TILES = 1_000_000
+
+
+def refuse_absurd(size: tuple[float, float], tile: int, where: str) -> None:
+    """Refuse a raster that no one means, before any work; `where` names it and its resolution in the message.
+
+    Raises
+    ------
+    UsageError
+        It has more than `MOST_TILES` tiles.
+    """
+    width, height = size
+    tiles = -(-width // tile) * -(-height // tile)
+    if tiles > MOST_TILES:
+        raise UsageError(
+            f"{where} gives {width:.3g} × {height:.3g} pixels in {tiles:.3g} tiles, more than {MOST_TILES}; choose a "
+            "larger `resolution` or `tile`, or smaller `bounds`"
+        )
+
+
 @dataclass(frozen=True)
 class Placement:
     """Size of a raster, and how its pixels lie in a plane.

@@ -21,6 +21,7 @@ from pyogrio.errors import DataSourceError, FieldError, GeometryError
 
 from photoplan.cameras.observed import GroundPoints
 from photoplan.errors import InputError
+from photoplan.geometry.bounds import odd_place
 from photoplan.geometry.crs import crs_label, same_crs, split_compound
 from photoplan.io.checks import check_plain_file
 from photoplan.io.plain_files import crs_beside
@@ -96,6 +97,9 @@ def _points(
             raise InputError(f"{where(k)}: role {role[:40]!r} of ground point {name!r}; allowed are control and check")
         check[k] = _CHECK[role.strip().casefold()]
         known = np.isfinite(XYZ[k])
+        odd = odd_place(XYZ[k].tolist(), camera=False)
+        if odd is not None:
+            raise InputError(f"{where(k)}: ground point {name!r}: {odd}")
         if known[0] != known[1] or not known.any():
             raise InputError(
                 f"{where(k)}: ground point {name!r} has {'X' if known[0] else 'Y' if known[1] else 'nothing'} alone; "

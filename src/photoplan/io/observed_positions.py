@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from photoplan.cameras.observed import ObservedAttitudes, ObservedPositions
 from photoplan.errors import InputError
+from photoplan.geometry.bounds import odd_angles, odd_place
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.rotation import rotation_from_angles
 from photoplan.io.names import match_key
@@ -25,7 +26,6 @@ from photoplan.io.orientation.exif import map_positions, read_folder
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.orientation.table import TableFormat, angle_in_radians
 from photoplan.io.plain_files import crs_beside
-from photoplan.io.project.model import ANGLE_UNITS
 from photoplan.io.tables import Columns, Dialect, Table, read_table
 
 _ROLES = {
@@ -139,6 +139,10 @@ def read_observed_positions(
                 f"{table.where(k)}: image {name!r} is given in line {table.lines[at]} already; keep one of the lines"
             )
     XYZ = table.numbers("x", "y", "z")
+    for k, place in enumerate(XYZ.tolist()):
+        odd = odd_place(place, camera=True)
+        if odd is not None:
+            raise InputError(f"{table.where(k)}: image {names[k]!r}: {odd}")
     strips = tuple(text or "all" for text in table.texts("strip"))
     sigma_angle = angle_in_radians(table.numbers("sigma_angle", empty=True), form.angle_unit)
     _positive(table, "sigma_angle", sigma_angle)
@@ -180,13 +184,10 @@ def _rotations(table: Table, form: TableFormat) -> NDArray[np.float64] | None:
     if len(there) < 3:
         raise InputError(f"{table.path}: columns {', '.join(there)} alone; omega, phi and kappa go together")
     angles = {role[0]: table.numbers(role) for role in roles}
-    for letter, values in angles.items():
-        far = np.flatnonzero(np.abs(values) > ANGLE_UNITS[form.angle_unit] * (1 + 1e-9))
-        if len(far):
-            raise InputError(
-                f"{table.where(int(far[0]))}: angle {letter} = {values[far[0]]:g} is more than a full circle in "
-                f"{form.angle_unit}; state the unit as angle_unit in [orientation]"
-            )
+    for k in range(len(table.rows)):
+        odd = odd_angles([float(values[k]) for values in angles.values()], form.angle_unit, list(angles))
+        if odd is not None:
+            raise InputError(f"{table.where(k)}: {odd.split(';')[0]}; state the unit as angle_unit in [orientation]")
     stated = angle_in_radians(np.stack([angles[letter] for letter in form.rotation], axis=1), form.angle_unit)
     R = np.stack([rotation_from_angles(a, form.rotation) for a in stated])
     return R if form.direction == "camera-to-ground" else np.swapaxes(R, 1, 2)

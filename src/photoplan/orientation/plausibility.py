@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from photoplan.geometry.bounds import HIGHEST_FLIGHT
 from photoplan.geometry.rotation import rotation_from_angles
 from photoplan.orientation.other_readings import CIRCLE, DECLARED, Reading, readings
 
@@ -135,6 +136,8 @@ def _look(view: View, center: NDArray[np.float64], R: NDArray[np.float64], heigh
     fault = None
     if center[2] <= below:
         fault = f"projection centre {below - center[2]:.1f} m below the terrain; are the height systems the same?"
+    elif center[2] - below > HIGHEST_FLIGHT:
+        fault = f"projection centre {center[2] - below:.3g} m above the terrain; are heights in millimetres?"
     elif not seen.any():
         fault = f"sees nothing of the terrain (tilt {tilt:.1f}°)"
     return ImagePlausibility(

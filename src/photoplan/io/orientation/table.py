@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
+from photoplan.geometry.bounds import odd_angles, odd_place
 from photoplan.geometry.rotation import ROTATION_ORDERS, opk_from_rotation, rotation_from_angles
 from photoplan.io.project.model import ANGLE_UNITS
 
@@ -130,6 +131,12 @@ class OrientationTable:
                 where = f" (lines {' and '.join(lines)})" if lines else ""
                 raise InputError(f"{self.file}: image {image.name!r} is given twice{where}; keep one of them")
             first[image.name] = image
+            odd = odd_angles(image.angles, self.angle_unit)
+            if odd is None and self.crs is not None:
+                odd = odd_place(image.center, camera=True)
+            if odd is not None:
+                line = f":{image.line}" if image.line is not None else ""
+                raise InputError(f"{self.file}{line}: image {image.name!r}: {odd}")
 
     @cached_property
     def centers(self) -> NDArray[np.float64]:

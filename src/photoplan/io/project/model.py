@@ -12,6 +12,7 @@ from pydantic.json_schema import SkipJsonSchema
 
 from photoplan.cameras.fiducials_fit import MODELS
 from photoplan.errors import InputError, UsageError
+from photoplan.geometry.bounds import odd_angles, odd_place
 from photoplan.io.camera.model import (
     Camera,
     Entry,
@@ -213,6 +214,10 @@ class Project(Entry):
                 known = ", ".join(map(repr, self.cameras)) or "none"
                 raise ValueError(f"{where}: camera {image.camera!r} is not described; cameras are {known}")
             _check_film(image, self.cameras[image.camera], where)
+            if image.center is not None and image.angles is not None:
+                odd = odd_angles(image.angles, self.orientation.angle_unit) or odd_place(image.center, camera=True)
+                if odd is not None:
+                    raise ValueError(f"{where}: {odd}")
         unknown = [name for name in self.adjustment.calibrate if name not in self.cameras]
         if unknown:
             raise ValueError(f"[adjustment] calibrate: camera {unknown[0]!r} is not described")

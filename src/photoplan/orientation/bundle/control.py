@@ -27,11 +27,13 @@ _Floats = NDArray[np.float64]
 _Mask = NDArray[np.bool_]
 
 #: Sets that are begun with at most, and of these those that grow to the end.
-_BEGINNINGS, _GROWN = 150, 12
+_BEGINNINGS, _GROWN = 150, 8
 #: Chance of a set that fits as badly as it does, below which its accuracy counts as stated too well.
 _UNLIKELY = 0.02
 #: Chance of a part of a point (its place, or its height) below which it goes out with the rest of the point.
 _PART = 0.01
+#: Factor for the variances of what nothing but control places.
+_LOOSER = 1e4
 #: How far a point may be from its given place, in distances between camera and ground.
 _FAR = 10.0
 #: By how much standard deviations are widened while less than half of the points agree, and how often at most.
@@ -64,8 +66,8 @@ def misclosures(model: Model, state: State, weight: _Floats, loose: float) -> Mi
     weight : ndarray, shape (rows,)
         Weights of all rows; those of control are not used.
     loose : float
-        Standard deviation that control gets instead, so that the block lies somewhere: large against all that is
-        measured, metres.
+        Standard deviation that control gets instead, so that the block lies somewhere, metres: some hundred times that
+        of image points on the ground.
     """
     names, of = np.unique(model.ground, return_inverse=True)
     if not len(names):
@@ -95,7 +97,11 @@ def misclosures(model: Model, state: State, weight: _Floats, loose: float) -> Mi
         return None
     if not np.isfinite(Q).all():
         return None
-    defect = int((np.linalg.eigvalsh(Q) > (0.01 * loose) ** 2).sum())
+    # More would be lost by rounding in the equations; so what only that control holds is made loose here.
+    values, vectors = np.linalg.eigh(Q)
+    free = values > (0.1 * loose) ** 2
+    values[free] *= _LOOSER
+    Q, defect = (vectors * values) @ vectors.T, int(free.sum())
     known = np.zeros((len(names), 3), bool)
     known[of, model.ground_axis] = True
     for k in range(len(names)):
@@ -175,7 +181,7 @@ def _largest(found: Misclosures, critical: float, wide: float) -> tuple[_Mask, _
         size = _sizes(found, mask) / limit
         near.append((-int((size <= 1.0).sum()), float(np.minimum(size, 1.0).sum()), (size <= 1.0) | mask))
     near.sort(key=lambda item: item[:2])
-    masks = [mask for _, _, mask in near]
+    masks = list({mask.tobytes(): mask for _, _, mask in near}.values())
     best = _ranked(found, [every, *(_grown(found, mask, limit, wide) for mask in masks[:_GROWN])])[0]
     others = sorted((mask for mask in masks if (mask & ~best).any()), key=lambda mask: -int((mask & ~best).sum()))
     second = [_grown(found, mask, limit, wide) for mask in others[:_GROWN]]
@@ -214,24 +220,24 @@ def _sizes(found: Misclosures, mask: _Mask) -> _Floats:
     own = P.reshape(len(inside), 3, len(inside), 3)[range(len(inside)), :, range(len(inside))]
     v3 = v.reshape(-1, 3)
     out[inside] = np.einsum("ni,ni->n", v3, np.linalg.solve(own, v3[:, :, None])[:, :, 0])
-    for k in np.flatnonzero(~mask):
-        out[k] = _against(found, mask, np.arange(3 * k, 3 * k + 3), (a, P, w))[0]
+    others = np.flatnonzero(~mask)
+    b = (3 * others[:, None] + np.arange(3)).ravel()
+    across = found.Q[np.ix_(b, a)]
+    G = across @ P
+    off = (w[b] - G @ w[a]).reshape(-1, 3)
+    rows = 3 * others[:, None] + np.arange(3)
+    R = found.Q[rows[:, :, None], rows[:, None, :]] - np.einsum(
+        "nik,njk->nij", G.reshape(len(others), 3, len(a)), across.reshape(len(others), 3, len(a))
+    )
+    out[others] = np.einsum("ni,ni->n", off, np.linalg.solve(R, off[:, :, None])[:, :, 0])
     return out
 
 
-def _against(
-    found: Misclosures,
-    mask: _Mask,
-    rows: NDArray[np.int64],
-    known: tuple[NDArray[np.int64], _Floats, _Floats] | None = None,
-) -> tuple[float, int]:
+def _against(found: Misclosures, mask: _Mask, rows: NDArray[np.int64]) -> tuple[float, int]:
     """Squared misclosure of coordinates outside a set, in standard deviations, and how many of them are known."""
-    if known is None:
-        a = (3 * np.flatnonzero(mask)[:, None] + np.arange(3)).ravel()
-        known = a, np.linalg.inv(found.Q[np.ix_(a, a)]), found.w.ravel()
-    a, P, w = known
-    G = found.Q[np.ix_(rows, a)] @ P
-    off = w[rows] - G @ w[a]
+    a = (3 * np.flatnonzero(mask)[:, None] + np.arange(3)).ravel()
+    G = np.linalg.solve(found.Q[np.ix_(a, a)], found.Q[np.ix_(a, rows)]).T
+    off = found.w.ravel()[rows] - G @ found.w.ravel()[a]
     square = float(off @ np.linalg.solve(found.Q[np.ix_(rows, rows)] - G @ found.Q[np.ix_(a, rows)], off))
     return square, int(found.known.ravel()[rows].sum())
 

@@ -26,7 +26,7 @@ _HUBER = 5
 #: Where the weights begin to fall, in standard deviations.
 _HUBER_LIMIT, _FALL = 2.0, 3.0
 #: Standard deviation of control in the same units while it is asked which of it agrees.
-_LOOSE = 1000.0
+_LOOSE = 100.0
 #: Image points are not judged by less than this part of their stated standard deviation, however small residuals are.
 _BEST = 0.05
 #: An observation that was taken out comes back when its residual is below this part of the critical value.
@@ -193,7 +193,11 @@ def judged_control(
     """
     control = np.array([name.startswith("control, ") for name, _ in kinds_of(model)[0]], bool)
     weight = weights_of(model, active, np.where(control, 1.0, factors))
-    weight[model.parts.image] *= np.repeat(active.image[model.observation], 2)
+    used = active.image[model.observation]
+    # A tie point of one ray says nothing, and its equations are singular.
+    alone = np.bincount(model.point[used], minlength=len(model.point_names)) < 2
+    alone[model.ground_point] = False
+    weight[model.parts.image] *= np.repeat(used & ~alone[model.point], 2)
     found = misclosures(model, state, weight, _LOOSE * image_on_ground(model, state))
     if found is None:
         return active, ()

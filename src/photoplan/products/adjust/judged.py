@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from photoplan.errors import GeometryError
 from photoplan.io.project.cameras import interior_of, lens_of
+from photoplan.orientation.bundle.causes import Cause
 from photoplan.orientation.judgement import Evidence, fitting, impossible
 from photoplan.orientation.resection.model import ResectSettings
 from photoplan.products.adjust.block import MapResult
 from photoplan.products.adjust.frame import nadir_heights
 from photoplan.products.resect.image import control_rows, measured_control, resected
+
+#: Change of a camera constant, and part of the squared residuals that it explains, from which the block is refused.
+_FAR, _ALL = 0.1, 0.9
+#: Found over stated accuracy of positions that is worth a word.
+_WORSE = 2.0
 
 
 def refuse_impossible(result: MapResult) -> None:
@@ -50,6 +58,39 @@ def refuse_impossible(result: MapResult) -> None:
     name, fault = wrong[0]
     more = f" (so in {len(wrong)} images)" if len(wrong) > 1 else ""
     raise GeometryError(f"image {name!r}: {fault}{more}; the orientations are not written: {_hint(result)}")
+
+
+def refuse_cause(causes: Sequence[Cause]) -> None:
+    """Refuse a block that only another camera constant makes one.
+
+    Raises
+    ------
+    GeometryError
+        The likeliest cause is a camera constant that is far off.
+    """
+    if causes and abs(causes[0].change) > _FAR and causes[0].explains > _ALL:
+        cause = causes[0]
+        raise GeometryError(
+            f"the observations contradict {cause.name}: {1 + cause.change:.3f} times what is stated takes away "
+            f"{cause.explains:.1%} of the squared residuals; the orientations are not written: {cause.remedy}"
+        )
+
+
+def cause_notes(causes: Sequence[Cause], result: MapResult) -> tuple[str, ...]:
+    """What may be behind observations that do not fit, the likeliest first."""
+    if causes:
+        words = ("likeliest cause of what does not fit", "next")
+        return tuple(
+            f"{word}: {cause.name}, which explains {cause.explains:.0%} of the squared residuals; {cause.remedy}"
+            for word, cause in zip(words, causes)
+        )
+    positions = [g.factor for g in result.adjusted.groups if g.name.startswith("observed positions")]
+    if max(positions, default=1.0) > _WORSE and not result.adjusted.correlations:
+        return (
+            "observed positions fit worse than stated: they are, or errors of neighbouring image points are alike "
+            "(too few points to tell); no shift, drift or camera explains it",
+        )
+    return ()
 
 
 def _hint(result: MapResult) -> str:

@@ -25,6 +25,7 @@ from photoplan.io.project.model import Project
 from photoplan.io.run_record import versions
 from photoplan.orientation.bundle.adjust import adjust_block
 from photoplan.orientation.bundle.block import Adjusted, AdjustSettings
+from photoplan.orientation.bundle.causes import weighed_causes
 from photoplan.orientation.check_points import CheckAccuracy
 from photoplan.plain import json_text, pick
 from photoplan.products.adjust.block import (
@@ -37,7 +38,7 @@ from photoplan.products.adjust.block import (
 from photoplan.products.adjust.cameras import Calibrated, Free, camera_entries, parse_calibrate
 from photoplan.products.adjust.figures import AdjustFigures, GroundFigures, NamedMeasurement
 from photoplan.products.adjust.inputs import AdjustInputs, read_inputs
-from photoplan.products.adjust.judged import refuse_impossible
+from photoplan.products.adjust.judged import cause_notes, refuse_cause, refuse_impossible
 from photoplan.products.adjust.start import known_poses, started
 from photoplan.products.adjust.summary import point_layers, summarise
 from photoplan.project.scene import input_files
@@ -210,7 +211,10 @@ def adjust_project(request: AdjustRequest, events: Events = SILENT) -> AdjustRep
     result = map_result(prepared, adjusted)
     refuse_impossible(result)
     title = f"Bundle adjustment of {request.project.resolve().parent.name}"
+    causes = weighed_causes(prepared.block, adjusted)
+    refuse_cause(causes)
     figures = summarise(title, result, settings, time.perf_counter() - begun)
+    figures = replace(figures, notes=(*cause_notes(causes, result), *figures.notes))
     data = block_json(figures, result)
     if request.dry_run:
         return AdjustReport((), figures, 0, data)

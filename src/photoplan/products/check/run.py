@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from photoplan.geometry.bounds import area_fault
 from photoplan.geometry.crs import crs_label
 from photoplan.io.project.model import Project
 from photoplan.orientation.plausibility import ImagePlausibility, look, other_reading
 from photoplan.plain import pick
+from photoplan.products.check.positions import position_fault, turned_against_positions
 from photoplan.products.check.view import view_of
 from photoplan.products.orthophoto.plan import mean_gsd, two_figures
 from photoplan.project.scene import Scene, ground_of, map_order, open_scene, pose_of
@@ -118,6 +120,8 @@ def check_project(project: Project, images: Sequence[str] | None = None) -> Proj
     for place in map_order(project, names):
         # All that is asked of the terrain for one image, before the next: its blocks are then at hand.
         found = look(views[place], ground.surface.heights)
+        odd = area_fault(project.crs, views[place].center) or position_fault(project, entries[place])
+        found = found if odd is None else replace(found, fault=odd)
         looked[place] = found, _check_image(open_scene(project, names[place]), found)
     looks, checks = zip(*(looked[place] for place in range(len(names))))
     gsds = [c.gsd for c in checks if np.isfinite(c.gsd)]
@@ -178,7 +182,7 @@ def _sensitivity(scene: Scene) -> tuple[float, float]:
 
 
 def _advice(project: Project, checks: Sequence[ImageCheck]) -> tuple[str, ...]:
-    lines = []
+    lines = list(turned_against_positions(project, [check.image for check in checks]))
     curvature = np.nanmax([c.curvature_px for c in checks] + [0.0])
     if project.orientation.earth_curvature == "none" and curvature > _CURVATURE_MATTERS:
         lines.append(

@@ -16,7 +16,7 @@ from photoplan.engine.executors import threads
 from photoplan.engine.run import Made, Runner, Tally, Work
 from photoplan.errors import ResourceError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.geometry.grid import Placement, Window
+from photoplan.geometry.grid import Placement, Window, refuse_absurd
 from photoplan.io.disk import free_megabytes
 from photoplan.io.product import ProductFacts, ProductFile, check_output
 from photoplan.io.run_record import input_entry, run_key, run_times, write_run_record
@@ -117,6 +117,7 @@ def write_grid(
     """
     path, dtype, times = Path(path), np.dtype(dtype), run_times()
     check_output(path, options.inputs, overwrite=options.overwrite)
+    refuse_absurd(placement.size, options.tile, f"{path}: pixels of {abs(placement.coefficients[0]):g} m")
     workers = available_cpus() if options.workers is None else options.workers
     pool = threads(workers)
     if options.colours is not None and (dtype != np.uint8 or bands != 1):

@@ -17,20 +17,23 @@ from photoplan.cameras.base import CentralCamera
 from photoplan.engine.execute import render as render_tiles
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.geometry.grid import MapGrid, Window
+from photoplan.geometry.bounds import area_fault
+from photoplan.geometry.grid import MapGrid, Window, refuse_absurd
 from photoplan.io.names import safe_stem
 from photoplan.io.project.model import Project
 from photoplan.io.storage import nodata_for
 from photoplan.kernels.weights import KERNELS
+from photoplan.orientation.plausibility import look
 from photoplan.plan.compile import AnchorRule
 from photoplan.plan.footprint import Footprint, covered_tiles, image_border, some_height
 from photoplan.plan.product import ProductPlan
+from photoplan.products.check.view import view_of
 from photoplan.products.orthophoto.settings import OrthoSettings
-from photoplan.project.scene import Scene, SceneAddress, map_order, open_scene
+from photoplan.project.scene import Scene, SceneAddress, ground_of, map_order, open_scene, pose_of
 from photoplan.targets.map import MapTarget
 
-#: Tiles of a product.
-MOST_TILES = 1_000_000
+#: A product is at most so many times finer than its images see the ground.
+_FINER = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +89,7 @@ def plan_orthophotos(
     settings: OrthoSettings | None = None,
     *,
     events: Events = SILENT,
+    force: bool = False,
     **changes: Any,
 ) -> OrthoPlan:
     """Plan an orthophoto for each image; no pixel is touched.
@@ -99,6 +103,8 @@ def plan_orthophotos(
         The project's own if it is None.
     events : Events
         Told of each image.
+    force : bool
+        Plan also what `photoplan check` calls a fault, and resolutions that are much finer than the images.
     **changes
         Single settings by name, for example ``resolution=0.1``.
 
@@ -107,9 +113,9 @@ def plan_orthophotos(
     InputError
         An input cannot be used.
     GeometryError
-        No image sees the terrain (the extents of both are printed).
+        No image sees the terrain (the extents of both are printed), or an orientation cannot be right.
     UsageError
-        An unknown image or setting, or bounds that hold nothing.
+        An unknown image or setting, bounds that hold nothing, or a resolution that is much too fine.
     """
     chosen = settings or project_settings(project)
     if changes:
@@ -131,6 +137,9 @@ def plan_orthophotos(
         else:
             looks.append((name, scene, mean_gsd(scene.camera, scene.footprint)))
     resolution = chosen.resolution or (two_figures(float(np.mean([look[2] for look in looks]))) if looks else 1.0)
+    if looks and not force:
+        _refuse_faults(project, [name for name, _, _ in looks])
+        _refuse_too_fine(project, resolution, chosen, looks)
     products = []
     for name, scene, gsd in looks:
         plan = _plan_one(project, scene, name, replace(chosen, resolution=resolution))
@@ -144,6 +153,47 @@ def plan_orthophotos(
         raise GeometryError(f"no image sees {where} (xmin ymin xmax ymax in metres):\n  " + "\n  ".join(blind))
     _refuse_equal_names(products)
     return OrthoPlan(project, replace(chosen, resolution=resolution), tuple(products), tuple(blind))
+
+
+def _refuse_faults(project: Project, names: Sequence[str]) -> None:
+    """Refuse orientations that cannot be right; images that see no terrain are told otherwise."""
+    ground = ground_of(project)
+    faults = {}
+    for place in map_order(project, names):
+        image = project.image(names[place])
+        center = pose_of(project, image, ground).center
+        view = view_of(image, project.cameras[image.camera], project.orientation, center)
+        fault = area_fault(project.crs, center) or look(view, ground.surface.heights).fault
+        if fault is not None:
+            faults[names[place]] = fault
+    if faults:
+        name, fault = next(iter(faults.items()))
+        raise GeometryError(
+            f"image {name!r}: {fault} ({len(faults)} of {len(names)} images have such faults, `photoplan check` lists "
+            "them); nothing is made of them unless you say `force`"
+        )
+
+
+def _refuse_too_fine(
+    project: Project, resolution: float, settings: OrthoSettings, looks: Sequence[tuple[str, Scene, float]]
+) -> None:
+    """Refuse a resolution at which most pixels would be made up."""
+    finest = min((gsd for _, _, gsd in looks if gsd > 0), default=0.0)
+    if not resolution * _FINER < finest:
+        return
+    pixels = tiles = 0.0
+    for name, scene, _ in looks:
+        bounds = settings.bounds or scene.footprint.bounds
+        assert bounds is not None
+        width, height = ((bounds[k + 2] - bounds[k]) / resolution for k in (0, 1))
+        refuse_absurd((width, height), settings.tile, f"{name}: resolution {resolution:g} m")
+        pixels += width * height
+        tiles += math.ceil(width / settings.tile) * math.ceil(height / settings.tile)
+    raise UsageError(
+        f"resolution {resolution:g} m is {finest / resolution:.3g} times finer than the images see the ground "
+        f"({finest:.3g} m): {pixels:.3g} pixels in {tiles:.3g} tiles, most of them made up; choose {finest / 2:.2g} m "
+        "or more, or say `force`"
+    )
 
 
 def project_settings(project: Project) -> OrthoSettings:
@@ -172,12 +222,7 @@ def product_name(image: str) -> str:
 
 def _check_storable(scene: Scene, name: str, grid: MapGrid, settings: OrthoSettings) -> None:
     """Refuse a product that cannot be written, before any is."""
-    tiles = -(-grid.width // settings.tile) * -(-grid.height // settings.tile)
-    if tiles > MOST_TILES:
-        raise UsageError(
-            f"{name}: resolution {settings.resolution:g} m gives {grid.width:.3g} × {grid.height:.3g} pixels in "
-            f"{tiles:.3g} tiles, more than {MOST_TILES}; choose a larger `resolution` or `tile`, or smaller `bounds`"
-        )
+    refuse_absurd((grid.width, grid.height), settings.tile, f"{name}: resolution {settings.resolution:g} m")
     nodata_for(scene.reader.dtype, settings.nodata_value, settings.compress)
     if settings.compress == "jpeg" and (scene.reader.dtype != np.uint8 or scene.reader.bands not in (1, 3)):
         raise UsageError(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from photoplan import __version__
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.geometry.grid import MapGrid
+from photoplan.geometry.grid import MOST_TILES, MapGrid
 from photoplan.io.disk import disk_error, free_megabytes
 from photoplan.io.plan_file import PlanTables, read_plan_tables, write_plan_tables
 from photoplan.io.product import check_output
@@ -25,7 +25,7 @@ from photoplan.plan.compile import AnchorRule
 from photoplan.plan.footprint import Footprint
 from photoplan.plan.product import ProductPlan, compile_tile
 from photoplan.plan.tiles import Tiles
-from photoplan.products.orthophoto.plan import MOST_TILES, OrthoPlan, OrthoProduct, product_key, product_name
+from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, product_key, product_name
 from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.scene import input_files, open_scene, scene_address
 from photoplan.targets.map import MapTarget
