@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -177,10 +175,11 @@ def _group(data: SeriesData, group: FrameGroup, found: dict[str, list[Edge]], co
     if control is None:
         parts.append(Findings(notes=(f"{group.label}: without a horizontal edge the method's noise is not checked",)))
     plots = [_charts([edges[k] for edges in found.values()]) for k in range(min(_CHARTS, len(group.frames)))]
-    table = _table([edge for edges in found.values() for edge in edges])
+    every = [edge for edges in found.values() for edge in edges]
+    table = _table(every)
     charts = tuple(chart for each in plots for chart in each)
     name = f"line_jitter_lines_{group.group.index + 1}.csv"
-    return joined([*parts, Findings(tables={"edges": table}, plots=charts, files={name: _lines_text(found)})])
+    return joined([*parts, Findings(tables={"edges": table}, plots=charts, files={name: _lines(every)})])
 
 
 def _mean(values: list[float], sigmas: list[float]) -> tuple[float, float]:
@@ -316,13 +315,13 @@ def _table(edges: Sequence[Edge]) -> Listing:
     )
 
 
-def _lines_text(found: Mapping[str, Sequence[Edge]]) -> bytes:
-    """Every line of every edge as CSV."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("edge", "frame", "line", "position_px", "deviation_px", "regular_px", "used"))
-    for edge in (edge for edges in found.values() for edge in edges):
-        j, where = edge.jitter, (edge.entry.name, edge.frame.file.name)
-        for line, p, d, r, u in zip(j.line, j.position, j.deviation, j.regular, j.used):
-            writer.writerow((*where, edge.first_line + int(line), f"{p:.5f}", f"{d:.5f}", f"{r:.5f}", int(u)))
-    return text.getvalue().encode()
+def _lines(edges: Sequence[Edge]) -> Listing:
+    """Every line of every edge."""
+    rows = [
+        (e.entry.name, e.frame.file.name, e.first_line + int(line), f"{p:.5f}", f"{d:.5f}", f"{r:.5f}", int(used))
+        for e in edges
+        for line, p, d, r, used in zip(
+            e.jitter.line, e.jitter.position, e.jitter.deviation, e.jitter.regular, e.jitter.used
+        )
+    ]
+    return Listing(("edge", "frame", "line", "position_px", "deviation_px", "regular_px", "used"), tuple(rows))

@@ -206,8 +206,8 @@ class Findings:
     notes: tuple[str, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
     """More plain values for JSON."""
-    files: Mapping[str, bytes | NDArray[Any]] = field(default_factory=dict)
-    """More files by name, written beside the tables: contents, or an image of type float32."""
+    files: Mapping[str, bytes | Listing | NDArray[Any]] = field(default_factory=dict)
+    """More files by name, written beside the tables: contents, a table, or an image of type float32."""
 
 
 def joined(outcomes: Sequence[Findings]) -> Findings:

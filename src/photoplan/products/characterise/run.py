@@ -248,6 +248,8 @@ def _write_tables(request: CharacteriseRequest, series: Series, runs: Sequence[A
         check_output(path, list(series.inputs), overwrite=request.overwrite)
         if isinstance(content, bytes):
             write_atomically(path, content)
+        elif isinstance(content, Listing):
+            write_table(path, content.head, content.rows)
         else:
             write_whole_image(path, content)
     return [*(request.csv / f"{name}.csv" for name in tables), *files]

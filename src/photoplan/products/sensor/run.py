@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from photoplan.io.disk import write_atomically
 from photoplan.io.product import check_output
 from photoplan.io.sensor_file import SensorDescription, read_sensor
+from photoplan.io.tables import write_table
+from photoplan.plain import pick
 from photoplan.products.sensor.figures import SensorFigure, sensor_figures
 
 
@@ -77,16 +75,7 @@ def describe_sensor(request: SensorRequest) -> SensorReport:
     figures = sensor_figures(described, str(request.file))
     written = None if request.dry_run else request.csv
     if written is not None:
-        write_atomically(written, _table(figures).encode("utf-8"))
+        head = ("section", "name", "value", "unit", "stated", "meaning", "source")
+        rows = (pick(figure, *head).values() for figure in figures)
+        write_table(written, head, [["" if value is None else value for value in row] for row in rows])
     return SensorReport(described, figures, written)
-
-
-def _table(figures: Sequence[SensorFigure]) -> str:
-    """Figures as comma-separated values."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["section", "name", "value", "unit", "stated", "meaning", "source"])
-    for f in figures:
-        stated = "" if f.stated is None else repr(f.stated)
-        writer.writerow([f.section, f.name, repr(f.value), f.unit, stated, f.meaning, f.source])
-    return out.getvalue()
