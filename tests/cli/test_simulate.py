@@ -13,7 +13,7 @@ from tools.command import Here
 
 from photoplan.io.whole_image import write_whole_image
 from photoplan.products.simulate.model import entry_of, model_of, read_model
-from photoplan.quality.formation.model import ImageModel, form_image
+from photoplan.quality.formation.model import ImageModel, form_image, form_series
 from photoplan.quality.formation.scenes import PatternScene
 
 MODEL = """
@@ -66,6 +66,23 @@ def test_frames_are_those_of_the_library(photoplan: Here, model: Path, tmp_path:
     record = json.loads((tmp_path / "edge.run.json").read_text())
     assert record["settings"]["model"]["spread"]["gaussian"] == [0.6, 0.6]
     assert report["model_mtf50"]["x"] == pytest.approx(0.2807, abs=1e-4)
+
+
+def test_a_series_is_that_of_the_library(photoplan: Here, model: Path, tmp_path: Path) -> None:
+    """Jitter of its own for each frame, and automatic gain that runs through them."""
+    with model.open("a") as file:
+        file.write("[jitter]\nsigma = 0.5\n[automatic_gain]\ntarget = 60.0\nleast = 0.1\nmost = 9.0\nframes = 2.0\n")
+    output = tmp_path / "s.tif"
+    said = photoplan(
+        "simulate", "edge:7", "--model", model, "--size", 60, 40, "--frames", 4, "--output", output, "--json"
+    )
+    assert said.code == 0, said.err
+    value, scene = read_model(model), PatternScene("edge", (60, 40), (7.0,))
+    images = json.loads(said.out)["images"]
+    for image, formed in zip(images, form_series(value, scene, [1.0] * 4), strict=True):
+        assert np.array_equal(pixels(Path(image["path"]))[0], formed.values)
+        assert image["automatic_gain"] == formed.gain
+    assert len({image["automatic_gain"] for image in images}) == 4
 
 
 def test_an_image_file_is_a_scene(photoplan: Here, tmp_path: Path) -> None:
