@@ -217,8 +217,11 @@ def test_fault_05_a_task_that_fails_for_a_moment_is_tried_again(
     assert sorted(said.tasks) == sorted(quiet.tasks) and product.same(tmp_path, undisturbed)
 
 
-def test_fault_26_more_workers_in_any_order(product: Product, quiet: Ran, undisturbed: Path, tmp_path: Path) -> None:
-    said = product.run(tmp_path, Mishap(shuffled=True), 3)
+@pytest.mark.parametrize("workers", [2, 4])
+def test_fault_26_more_workers_in_any_order(
+    product: Product, quiet: Ran, undisturbed: Path, tmp_path: Path, workers: int
+) -> None:
+    said = product.run(tmp_path, Mishap(shuffled=True), workers)
     assert said.code == 0, said.err
     assert sorted(said.tasks) == sorted(quiet.tasks) and product.same(tmp_path, undisturbed)
 

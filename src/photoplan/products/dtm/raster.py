@@ -66,12 +66,13 @@ class GridOptions:
 
 
 #: Fields of requests that decide no value.
-_IDLE = {"output", "preview", "catchments", "sigma", "difference", "memory", "workers", "overwrite", "tolerance"}
+_IDLE = {"memory", "workers", "overwrite", "tolerance"}
 
 
 def settings_of(request: Any) -> dict[str, Any]:
-    """Fields of a request that may decide values of a grid."""
-    return {each.name: getattr(request, each.name) for each in fields(request) if each.name not in _IDLE}
+    """Fields of a request that may decide values of a grid; its files are inputs or outputs."""
+    found = {each.name: getattr(request, each.name) for each in fields(request)}
+    return {name: value for name, value in found.items() if name not in _IDLE and not isinstance(value, Path)}
 
 
 def write_grid(

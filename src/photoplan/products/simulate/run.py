@@ -160,7 +160,12 @@ def simulate(
     exposures = _exposures(request)
     output = _output(request)
     paths, inputs = _paths(request), _inputs(request)
-    settings = {"model": model, "scene": request.scene, "size": scene.size, "oversampling": scene.oversampling}
+    settings = {
+        "model": model,
+        "scene": Path(request.scene).name,
+        "size": scene.size,
+        "oversampling": scene.oversampling,
+    }
     settings |= {**pick(request, "levels", "phase"), "exposures": exposures, "dtype": dtype}
     key = run_key("simulated images", settings, inputs)
     if request.dry_run:
