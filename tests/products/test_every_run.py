@@ -72,7 +72,7 @@ def build(inputs: Path, out: Path) -> list[object]:
 
 def volume(inputs: Path, out: Path) -> list[object]:
     both = [inputs / "block" / "dem.tif"] * 2
-    words = ["--height-system", "same", "--resolution", 0.7, "--tolerance", 1]
+    words = ["--height-system", "same", "--resolution", 1.1, "--tolerance", 1]
     return ["dtm", "volume", *both, *words, "--difference", out / "product.tif"]
 
 
@@ -95,13 +95,13 @@ CASES: dict[str, tuple[Words, str]] = {
     "simulate": (simulate, "product_0003.tif"),
     "tie": (tie, "product.csv"),
     "build": (build, "product.gpkg"),
-    "shade": (terrain("shade", "--resolution", 0.7), "product.tif"),
-    "slope": (terrain("slope", "--resolution", 0.7, "--classes", "5,10"), "product.tif"),
-    "aspect": (terrain("slope", "--aspect", "--resolution", 0.7), "product.tif"),
-    "tint": (terrain("tint", "--resolution", 0.7), "product.tif"),
-    "export": (terrain("export", "--resolution", 0.7), "product.tif"),
-    "visible": (terrain("visible", "--resolution", 0.7, "--from", 500300, 5300200), "product.tif"),
-    "flow": (terrain("flow", "--resolution", 0.7), "product.tif"),
+    "shade": (terrain("shade", "--resolution", 1.1), "product.tif"),
+    "slope": (terrain("slope", "--resolution", 1.1, "--classes", "5,10"), "product.tif"),
+    "aspect": (terrain("slope", "--aspect", "--resolution", 1.1), "product.tif"),
+    "tint": (terrain("tint", "--resolution", 1.1), "product.tif"),
+    "export": (terrain("export", "--resolution", 1.1), "product.tif"),
+    "visible": (terrain("visible", "--resolution", 1.1, "--from", 500300, 5300200), "product.tif"),
+    "flow": (terrain("flow", "--resolution", 1.1), "product.tif"),
     "volume": (volume, "product.tif"),
 }
 """Command and name of the product that comes last."""
