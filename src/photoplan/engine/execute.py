@@ -40,11 +40,6 @@ class Pixels:
     cells: int
     """Boxes that the anchors have."""
 
-    @property
-    def valid_count(self) -> int:
-        """Number of valid pixels."""
-        return 0 if self.valid is None else int(np.count_nonzero(self.valid))
-
 
 def execute_tile(tile: CompiledTile, sources: Sequence[Source], kernel: str) -> Pixels:
     """Compose one compiled tile: each source paints the pixels that it owns, and nothing else is computed.
