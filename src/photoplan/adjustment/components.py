@@ -10,7 +10,7 @@ _Floats = NDArray[np.float64]
 #: Smallest variance factor: data without noise would otherwise get weights that no arithmetic bears.
 _LEAST = 0.02
 #: Redundancy from which the variance factor of a group is worth estimating.
-_ENOUGH = 10.0
+ENOUGH = 10.0
 
 
 def variance_factors(e: _Floats, redundancies: _Floats, groups: NDArray[np.int64], before: _Floats) -> _Floats:
@@ -31,5 +31,5 @@ def variance_factors(e: _Floats, redundancies: _Floats, groups: NDArray[np.int64
     """
     total = np.bincount(groups, redundancies, len(before))
     square = np.bincount(groups, e**2, len(before))
-    found = np.maximum(np.sqrt(square / np.maximum(total, _ENOUGH)), _LEAST)
-    return np.asarray(np.where(total > _ENOUGH, found, before), float)
+    found = np.maximum(np.sqrt(square / np.maximum(total, ENOUGH)), _LEAST)
+    return np.asarray(np.where(total > ENOUGH, found, before), float)

@@ -76,7 +76,9 @@ def _figures(report: AdjustReport) -> list[str]:
     ]
     width = max((len(g.name) for g in f.groups), default=0)
     for g in f.groups:
-        lines.append(f"  {g.name:<{width}}  {g.count:>7}  rms {g.rms:>9.4g} {g.unit:<3}  found/stated {g.factor:.2f}")
+        known = math.isfinite(g.factor)
+        ratio = f"found/stated {g.factor:.2f}" if known else f"as stated (redundancy {g.redundancy:.1f}: not estimated)"
+        lines.append(f"  {g.name:<{width}}  {g.count:>7}  rms {g.rms:>9.4g} {g.unit:<3}  {ratio}")
     for camera in f.cameras:
         for k, name in enumerate(camera.parameters):
             change = camera.after[k] - camera.before[k]

@@ -134,7 +134,8 @@ class Group:
     """Root mean square of the residuals in the unit of the observations."""
     unit: str
     factor: float
-    """Standard deviation found divided by the one that was stated (root of vᵀPv / redundancy)."""
+    """Standard deviation found divided by the one that was stated (root of vᵀPv / redundancy); NaN where too little
+    checks the group to estimate it, and it counts as stated."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,8 +17,8 @@ from photoplan.errors import InputError, UsageError
 from photoplan.orientation.bundle.block import PARAMETERS, Block, BlockCamera
 from photoplan.orientation.bundle.unknowns import LEVER, CameraState, layout_of
 
-#: Standard deviation of coordinates that are held fixed, metres: small against anything that is measured, and large
-#: enough for the arithmetic.
+#: Standard deviation of coordinates that are held fixed, in units of an image point's on the ground: small against
+#: anything that is measured, in any unit of length, and large enough for the arithmetic.
 FIXED = 1e-5
 
 _Index = NDArray[np.int64]
@@ -200,9 +200,25 @@ def _strips(block: Block, rows: _Index) -> tuple[tuple[str, ...], _Index, NDArra
     return strips, of, time - epochs[of] if len(of) else np.empty(0), epochs
 
 
+def _on_ground(block: Block) -> float:
+    """About the standard deviation of an image point on the ground, from the start orientations; metres."""
+    known = block.ground.XYZ[np.isfinite(block.ground.XYZ).all(axis=1)]
+    if not len(known):
+        return 1.0
+    angles, away = [], []
+    sigma = float(np.median(block.observations.sigma)) if len(block.observations) else 1.0
+    for image in block.images:
+        camera = block.cameras[image.camera]
+        pixel = np.sqrt(abs(np.linalg.det(image.plane_to_pixel.derivative(np.array(camera.principal_point)))))
+        angles.append(sigma / (camera.c * pixel))
+        away.append(np.median(np.linalg.norm(known - image.pose.center, axis=1)))
+    return float(np.median(np.array(angles) * np.array(away)))
+
+
 def _ground_rows(block: Block, point_index: dict[str, int]) -> tuple[_Index, _Index, _Index, NDArray[np.float64]]:
     """Control rows: ground point, coordinate, point, and the whitening of their residuals."""
     ground = block.ground
+    fixed = FIXED * _on_ground(block)
     rows: list[tuple[int, int, int]] = []
     white: list[NDArray[np.float64]] = []
     for k, name in enumerate(ground.names):
@@ -211,10 +227,10 @@ def _ground_rows(block: Block, point_index: dict[str, int]) -> tuple[_Index, _In
         known = np.flatnonzero(np.isfinite(ground.XYZ[k]))
         W = np.zeros((3, 3))
         if ground.covariance is not None and np.isfinite(ground.covariance[k][np.ix_(known, known)]).all():
-            Q = ground.covariance[k][np.ix_(known, known)] + FIXED**2 * np.eye(len(known))
+            Q = ground.covariance[k][np.ix_(known, known)] + fixed**2 * np.eye(len(known))
             W[np.ix_(known, known)] = np.linalg.inv(np.linalg.cholesky(Q))
         else:
-            sigma = np.maximum(ground.sigma[k][known], FIXED)
+            sigma = np.maximum(ground.sigma[k][known], fixed)
             if not np.isfinite(sigma).all():
                 raise InputError(f"control point {name!r} has no standard deviation; state one for each coordinate")
             W[known, known] = 1.0 / sigma

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.adjustment.components import variance_factors
+from photoplan.adjustment.components import ENOUGH, variance_factors
 from photoplan.errors import GeometryError
 from photoplan.geometry.rotation import rotation_vector
 from photoplan.orientation.bundle.block import (
@@ -322,5 +322,6 @@ def _groups(solution: Solution, factors: _Floats) -> tuple[Group, ...]:
         if mine.any():
             rms = float(np.sqrt((raw[mine] ** 2).mean()))
             r = float(solution.redundancies[: len(of)][mine].sum())
-            groups.append(Group(name, int(mine.sum()), r, rms, unit, float(factors[k])))
+            factor = float(factors[k]) if r > ENOUGH else float("nan")
+            groups.append(Group(name, int(mine.sum()), r, rms, unit, factor))
     return tuple(groups)

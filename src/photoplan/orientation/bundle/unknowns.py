@@ -42,7 +42,7 @@ class Poses:
         """What moves all images together: the size of the block, and steps (n, 6) by their names."""
         n = len(self.centers)
         away = self.centers - self.centers.mean(axis=0)
-        size = max(1.0, float(np.abs(away).max()))
+        size = float(np.abs(away).max()) or 1.0
         motions: dict[str, _Floats] = {}
         for k, axis in enumerate("XYZ"):
             motions[f"position of the block in {axis}"] = np.tile(size * np.eye(6)[k], (n, 1))

@@ -35,7 +35,7 @@ def refuse_impossible(result: MapResult) -> None:
     centers = np.array([pose.center for pose in result.poses])
     terrain = nadir_heights(inputs.project, centers[:, :2], np.nan)
     residuals = adjusted.residuals[np.isfinite(adjusted.residuals[:, 0]) & ~adjusted.rejected]
-    factors = [group.factor for group in adjusted.groups if group.unit == "px"]
+    factors = [group.factor for group in adjusted.groups if group.unit == "px" and np.isfinite(group.factor)]
     wrong = []
     for k, name in enumerate(adjusted.images):
         mine = at[(points.image == points.images.index(name)) & (at >= 0)] if name in points.images else at[:0]
@@ -84,7 +84,9 @@ def cause_notes(causes: Sequence[Cause], result: MapResult) -> tuple[str, ...]:
             f"{word}: {cause.name}, which explains {cause.explains:.0%} of the squared residuals; {cause.remedy}"
             for word, cause in zip(words, causes)
         )
-    positions = [g.factor for g in result.adjusted.groups if g.name.startswith("observed positions")]
+    positions = [
+        g.factor for g in result.adjusted.groups if g.name.startswith("observed positions") and np.isfinite(g.factor)
+    ]
     if max(positions, default=1.0) > _WORSE and not result.adjusted.correlations:
         return (
             "observed positions fit worse than stated: they are, or errors of neighbouring image points are alike "

@@ -32,6 +32,7 @@ from photoplan.products.adjust.block import (
     MapResult,
     Prepared,
     adjust_prepared,
+    decimals_of,
     map_result,
     prepare,
 )
@@ -65,7 +66,11 @@ def block_json(figures: AdjustFigures, result: MapResult) -> dict[str, Any]:
         "largest_normalised": [_measurement(m) for m in figures.worst],
         "positions": _positions(figures),
         "images": [
-            {**pick(of, *image, largest_normalised="worst"), "angles": result.angles[k]}
+            {
+                **pick(of, *image, largest_normalised="worst"),
+                "angles": result.angles[k],
+                "covariance_rotation": result.adjusted.pose_covariance[k, 3:, 3:],
+            }
             for k, of in enumerate(figures.images)
         ],
         "left_out": [{"name": name, "reason": reason} for name, reason in figures.left_out],
@@ -326,7 +331,7 @@ def _changes(result: MapResult) -> ProjectChanges:
     images: dict[str, dict[str, Any]] = {}
     for k, name in enumerate(result.adjusted.images):
         images[name] = {
-            "center": _rounded(result.poses[k].center, 5),
+            "center": _rounded(result.poses[k].center, decimals_of(result.sigma_center[k])),
             "angles": _rounded(result.angles[k], 10),
             "sigma_center": _figures(result.sigma_center[k]),
             "sigma_angles": _figures(result.sigma_angles[k]),

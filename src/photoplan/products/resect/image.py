@@ -24,6 +24,7 @@ from photoplan.orientation.judgement import fitting, impossible, of_resection
 from photoplan.orientation.resection.adjust import resect
 from photoplan.orientation.resection.model import MeasuredPoints, Resected, ResectSettings
 from photoplan.plain import pick
+from photoplan.products.adjust.block import decimals_of
 from photoplan.products.adjust.cameras import Calibrated, block_camera, calibrated, camera_entries
 from photoplan.products.adjust.frame import block_frame, nadir_heights
 from photoplan.products.adjust.inputs import AdjustInputs
@@ -31,8 +32,8 @@ from photoplan.project.scene import stated_pose
 
 Array = NDArray[np.float64]
 
-#: Decimals of what is written: metres, and units of the angles.
-_CENTER_DECIMALS, _ANGLE_DECIMALS = 5, 10
+#: Decimals of angles that are written.
+_ANGLE_DECIMALS = 10
 _GREEK = {"o": "ω", "p": "φ", "k": "κ"}
 
 
@@ -68,9 +69,9 @@ class ResectedImage:
     def image_entries(self) -> dict[str, Any]:
         """Entries of the image in the project."""
         return {
-            "center": _rounded(self.center, _CENTER_DECIMALS),
+            "center": _rounded(self.center, decimals_of(self.sigma_center)),
             "angles": _rounded(self.angles, _ANGLE_DECIMALS),
-            "sigma_center": _rounded(self.sigma_center, 4),
+            "sigma_center": [float(f"{v:.4g}") for v in self.sigma_center],
             "sigma_angles": [float(f"{v:.4g}") for v in self.sigma_angles],
         }
 
@@ -95,6 +96,7 @@ class ResectedImage:
             "image": self.image.name,
             **self.image_entries,
             **pick(found, "sigma0", "redundancy", rms_px="rms"),
+            "covariance_rotation": found.covariance[3:6, 3:6],
             "camera": None if self.calibrated is None else _camera_fields(self.calibrated),
             "points": [
                 {

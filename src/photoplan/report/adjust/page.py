@@ -131,7 +131,7 @@ def _groups(facts: AdjustFigures, plots: AdjustPlots) -> list[str]:
                 cell(plain(g.redundancy, 1)),
                 cell(plain(100 * share, 0) + " %" if np.isfinite(share) else "–"),
                 cell(f"{figures(shown)} {unit}"),
-                cell(plain(g.factor, 2)),
+                cell(plain(g.factor, 2) if np.isfinite(g.factor) else "–"),
             ]
         )
     head = ["observations", "number", "redundancy", "controlled", "residuals, rms", "found ÷ stated"]
