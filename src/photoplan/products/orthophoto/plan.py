@@ -126,9 +126,15 @@ def plan_orthophotos(
     # Each image is looked at twice: where it lies, and which tiles it needs.
     events.begin("planning", 2 * len(names), "steps")
     scenes: dict[str, Scene] = {}
+    faults: dict[str, str] = {}
     for place in map_order(project, names):
-        scene = scenes[names[place]] = open_scene(project, names[place])
-        _ = scene.footprint
+        # All that is asked of the terrain for one image, before the next: its blocks are then at hand.
+        name = names[place]
+        scene = scenes[name] = open_scene(project, name)
+        seen = scene.footprint.bounds is not None
+        fault = _fault(project, name) if seen and not force else None
+        if fault is not None:
+            faults[name] = fault
         events.done()
     for name in names:
         scene = scenes[name]
@@ -137,8 +143,13 @@ def plan_orthophotos(
         else:
             looks.append((name, scene, mean_gsd(scene.camera, scene.footprint)))
     resolution = chosen.resolution or (two_figures(float(np.mean([look[2] for look in looks]))) if looks else 1.0)
+    if faults:
+        name, fault = next(iter(faults.items()))
+        raise GeometryError(
+            f"image {name!r}: {fault} ({len(faults)} of {len(looks)} images have such faults, `photoplan check` lists "
+            "them); nothing is made of them unless you say `force`"
+        )
     if looks and not force:
-        _refuse_faults(project, [name for name, _, _ in looks])
         _refuse_too_fine(project, resolution, chosen, looks)
     products = []
     for name, scene, gsd in looks:
@@ -155,23 +166,12 @@ def plan_orthophotos(
     return OrthoPlan(project, replace(chosen, resolution=resolution), tuple(products), tuple(blind))
 
 
-def _refuse_faults(project: Project, names: Sequence[str]) -> None:
-    """Refuse orientations that cannot be right; images that see no terrain are told otherwise."""
-    ground = ground_of(project)
-    faults = {}
-    for place in map_order(project, names):
-        image = project.image(names[place])
-        center = pose_of(project, image, ground).center
-        view = view_of(image, project.cameras[image.camera], project.orientation, center)
-        fault = area_fault(project.crs, center) or look(view, ground.surface.heights).fault
-        if fault is not None:
-            faults[names[place]] = fault
-    if faults:
-        name, fault = next(iter(faults.items()))
-        raise GeometryError(
-            f"image {name!r}: {fault} ({len(faults)} of {len(names)} images have such faults, `photoplan check` lists "
-            "them); nothing is made of them unless you say `force`"
-        )
+def _fault(project: Project, name: str) -> str | None:
+    """Why an orientation cannot be right; None: it can. Images that see no terrain are told otherwise."""
+    ground, image = ground_of(project), project.image(name)
+    center = pose_of(project, image, ground).center
+    view = view_of(image, project.cameras[image.camera], project.orientation, center)
+    return area_fault(project.crs, center) or look(view, ground.surface.heights).fault
 
 
 def _refuse_too_fine(
