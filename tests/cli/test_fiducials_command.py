@@ -145,6 +145,16 @@ def test_pictures_are_drawn_and_not_replaced(scans, tmp_path: Path, photoplan: H
     assert photoplan(*words, "--overwrite").code == 0
 
 
+def test_pictures_show_where_marks_were_sought_and_not_found(scans, tmp_path: Path, photoplan: Here) -> None:  # type: ignore[no-untyped-def]
+    pytest.importorskip("matplotlib")
+    folder, _ = scans
+    said = photoplan("fiducials", folder / "none.tif", "--camera", folder / "camera.toml", "--pictures", tmp_path)
+    assert said.code == 3
+    picture = tmp_path / "none.fiducials.png"
+    assert f"none.tif: where its marks were sought: {picture}" in said.err
+    assert picture.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
 def test_a_missing_library_is_told_before_any_work(scans, tmp_path: Path, photoplan: Here) -> None:  # type: ignore[no-untyped-def]
     folder, _ = scans
     words = ("fiducials", folder / "none.tif", "--camera", folder / "camera.toml", "--pictures", tmp_path / "new")

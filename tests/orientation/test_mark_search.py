@@ -12,7 +12,7 @@ from tools.thinned import thinned
 
 from photoplan.cameras.mark_pattern import MarkPart, MarkPattern
 from photoplan.errors import InputError
-from photoplan.orientation.marks.fiducials import FiducialResult, FiducialSearch, find_fiducials
+from photoplan.orientation.marks.fiducials import FiducialResult, FiducialSearch, MarksNotFound, find_fiducials
 from photoplan.orientation.marks.layout import TURNS, MarkLayout, fit_placement
 
 PATTERN = ring_cross_pattern()
@@ -153,8 +153,19 @@ def test_fault_15_a_covered_mark_is_named_and_three_marks_are_said_to_be_uncheck
 
 def test_fault_15_two_covered_marks_are_an_error_that_names_them() -> None:
     grey, _ = simulate(Simulated(covered=("3", "4")), 6)
-    with pytest.raises(InputError, match=r"2 of 4 .*Found: '1'.*'2'.*Not found: '3'.*'4'"):
+    with pytest.raises(MarksNotFound, match=r"2 of 4 .*Found: '1'.*'2'.*Not found: '3'.*'4'") as refused:
         find_fiducials(ArrayScan(grey), LAYOUT, FiducialSearch(0.1, 0, False))
+    assert {mark.name: mark.found for mark in refused.value.sought} == {"1": True, "2": True, "3": False, "4": False}
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.3])
+def test_marks_of_another_size_than_described_are_found_and_said(factor: float) -> None:
+    grey, truth = simulate(Simulated(), 6)
+    found = find_fiducials(ArrayScan(grey), LAYOUT.with_marks(factor), FiducialSearch(0.1, 0, False))
+    assert "not found as described" in found.notes[0]
+    assert np.abs(errors(found, truth)).max() < 0.2
+    as_described = find_fiducials(ArrayScan(grey), LAYOUT, FiducialSearch(0.1, 0, False))
+    assert not any("as described" in note for note in as_described.notes)
 
 
 def test_fault_15_a_scan_without_marks_is_refused() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,12 @@ class MarkPattern:
         if not (np.isfinite(self.window).all() and x0 < x1 and y0 < y1):
             raise InputError(f"mark {self.name!r}: window {self.window} mm; xmin < xmax and ymin < ymax are needed")
 
+    def scaled(self, factor: float) -> MarkPattern:
+        """The same mark in another size."""
+        x0, y0, x1, y1 = (factor * side for side in self.window)
+        parts = tuple(MarkPart(factor * part.outline, part.tone) for part in self.parts)
+        return MarkPattern(self.name, parts, self.background, (x0, y0, x1, y1))
+
 
 @dataclass(frozen=True, eq=False)
 class MarkExample:
@@ -56,3 +62,7 @@ class MarkExample:
             raise InputError(f"example of mark {self.name!r}: shape {self.values.shape}; a grey image is needed")
         if not (np.isfinite(self.pixel_mm) and self.pixel_mm > 0):
             raise InputError(f"example of mark {self.name!r}: pixel of {self.pixel_mm} mm; a positive one is needed")
+
+    def scaled(self, factor: float) -> MarkExample:
+        """The same mark in another size."""
+        return replace(self, pixel_mm=factor * self.pixel_mm)

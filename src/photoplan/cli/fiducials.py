@@ -42,7 +42,7 @@ def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any)
     from photoplan.io.names import unique_stems
     from photoplan.plain import plain
     from photoplan.products.fiducials.run import FiducialsRequest, locate_fiducials, scans_of
-    from photoplan.report.fiducials import marks_picture
+    from photoplan.report.fiducials import marks_picture, unfound_picture
     from photoplan.report.page import open_picture
 
     folder, overwrite = options.pop("pictures"), options.pop("overwrite")
@@ -59,6 +59,10 @@ def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any)
     for image in report.images:
         picture = pictures.get(image.name)
         drawn[image.name] = None if picture is None else picture.write(marks_picture(image, picture.mpl))
+    for lost in report.unfound:
+        picture = pictures.get(lost.name)
+        if picture is not None:
+            say(f"{lost.name}: where its marks were sought: {picture.write(unfound_picture(lost, picture.mpl))}")
     if as_json:
         images = [{**plain(image), "picture": drawn[image.name]} for image in report.images]
         show_json(report, images=images)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from photoplan.adjustment.linear import solve
 from photoplan.cameras.fiducials_fit import FiducialFit, fit_affine
-from photoplan.errors import InputError
+from photoplan.errors import InputError, PhotoplanError
 from photoplan.orientation.marks.layout import TURNS, MarkLayout, MarkPlacement, ScanTurn
 from photoplan.orientation.marks.locate import LEAST_CORRELATION, Location
 from photoplan.orientation.marks.measure import Measured, measure_marks
@@ -27,6 +27,8 @@ DEFORMED_MM = 0.1
 """Residuals in millimetres from which a mark may be a false one: office scanners leave 0.07."""
 RIVALS = 4
 """Look-alikes that are named."""
+OTHER_SIZES = (0.8, 0.9, 1.12, 1.25)
+"""Sizes of the marks against the description that are tried where the described one is not found."""
 STATED_TOLERANCE = 0.03
 """Part by which the resolution that a file states may be wrong."""
 
@@ -123,24 +125,76 @@ class FiducialResult:
         return self.fit.sigma0 * self.pixel_mm * 1000.0
 
 
+@dataclass(frozen=True)
+class SoughtMark:
+    """Where a mark of a scan was sought that cannot be oriented."""
+
+    name: str
+    x: float
+    y: float
+    """Column and row: where it was found, or where it is expected."""
+    found: bool
+    correlation: float
+    """The best there; NaN: none."""
+
+
+class MarksNotFound(InputError):
+    """Fewer than three marks of a scan were found."""
+
+    def __init__(self, message: str, sought: tuple[SoughtMark, ...]) -> None:
+        super().__init__(message)
+        self.sought = sought
+
+
 def find_fiducials(scan: Scan, layout: MarkLayout, known: FiducialSearch = FiducialSearch()) -> FiducialResult:
     """All marks of a scan, without any approximate values.
 
-    Coarse pixels are searched for what correlates with the marks as they look in each possible turn and tone; the
-    similarity that joins the most and best candidates says where each mark must lie; there it is measured twice, the
-    second time with the mark drawn as the affine transformation and the blur of the first have it.
+    Where none is found though the scan's resolution is known, marks of neighbouring sizes are tried.
 
     Raises
     ------
-    InputError
+    MarksNotFound
         Fewer than three marks are found; the message names the others.
     GeometryError
         The marks that were found lie on a line.
     """
+    try:
+        return _find(scan, layout, known)
+    except MarksNotFound as error:
+        # A search for every size among all resolutions would take minutes.
+        if known.pixel_mm is None or any(mark.found for mark in error.sought):
+            raise
+        others = [(factor, found) for factor in OTHER_SIZES if (found := _resized(scan, layout, known, factor))]
+        if not others:
+            raise
+        factor, found = max(others, key=lambda other: sum(mark.correlation for mark in other[1].marks))
+        said = (
+            f"the marks are not found as described, but {factor:g} times as large; mend their sizes in the camera's "
+            "description"
+        )
+        return replace(found, notes=(said, *found.notes))
+
+
+def _resized(scan: Scan, layout: MarkLayout, known: FiducialSearch, factor: float) -> FiducialResult | None:
+    """Marks of another size, where so many of them agree that it cannot be chance."""
+    try:
+        found = _find(scan, layout.with_marks(factor), known, wide=False)
+    except PhotoplanError:
+        return None
+    return found if found.fit.redundancy and found.sigma0_um < 1000 * DEFORMED_MM else None
+
+
+def _find(scan: Scan, layout: MarkLayout, known: FiducialSearch, wide: bool = True) -> FiducialResult:
+    """Marks of the described size.
+
+    Coarse pixels are searched for what correlates with the marks as they look in each possible turn and tone; the
+    similarity that joins the most and best candidates says where each mark must lie; there it is measured twice, the
+    second time with the mark drawn as the affine transformation and the blur of the first have it.
+    """
     turns = tuple(t for t in TURNS if known.rotation in (None, t.rotation) and known.mirrored in (None, t.mirrored))
-    placements, notes = _search(scan, layout, known, turns)
+    placements, notes = _search(scan, layout, known, turns, wide)
     if not placements:
-        raise InputError(_nothing(layout, scan, known))
+        raise MarksNotFound(_nothing(layout, scan, known), _expected(layout, scan, known))
     ties = _ties(placements)
     chosen = _usual(ties, known)
     measured = measure_marks(scan, layout, chosen, known.least_correlation)
@@ -148,21 +202,21 @@ def find_fiducials(scan: Scan, layout: MarkLayout, known: FiducialSearch = Fiduc
     if better is not None:
         notes.append(better)
     if len(measured.found) < 3:
-        raise InputError(_too_few(layout, measured, better))
+        raise MarksNotFound(_too_few(layout, measured, better), _sought(measured))
     measured, dropped = _without_false(layout, measured, chosen.turn)
     turn, fit, names, said = _decide(layout, measured, ties, chosen, known)
     return _result(layout, measured, (turn, fit, names), (*notes, *said, *dropped))
 
 
 def _search(
-    scan: Scan, layout: MarkLayout, known: FiducialSearch, turns: tuple[ScanTurn, ...]
+    scan: Scan, layout: MarkLayout, known: FiducialSearch, turns: tuple[ScanTurn, ...], everywhere: bool
 ) -> tuple[list[MarkPlacement], list[str]]:
-    """Placements, best first; a resolution that is stated but does not fit is said and left."""
+    """Placements, best first; a resolution that is stated but does not fit is said and left, if `everywhere`."""
     negatives = (False, True) if known.negative is None else (known.negative,)
     notes: list[str] = []
     if known.pixel_mm is not None:
         found = search_placements(Search(scan, layout, turns, negatives, STATED_TOLERANCE), [known.pixel_mm])
-        if found and _convincing(found[0], layout):
+        if not everywhere or (found and _convincing(found[0], layout)):
             return found, notes
     wide = search_placements(Search(scan, layout, turns, negatives), pixel_sizes(layout, scan.size))
     if known.pixel_mm is not None and not (wide and _convincing(wide[0], layout)):
@@ -351,6 +405,21 @@ def _nothing(layout: MarkLayout, scan: Scan, known: FiducialSearch) -> str:
         f"{', '.join(layout.names)}. Check that the camera's marks look as described and that the scan shows them; "
         "state its resolution with `scan_resolution`"
     )
+
+
+def _expected(layout: MarkLayout, scan: Scan, known: FiducialSearch) -> tuple[SoughtMark, ...]:
+    """Where the marks of an upright scan of usual size would lie."""
+    pixel_mm = known.pixel_mm or pixel_sizes(layout, scan.size)[0]
+    turn = next(t for t in TURNS if known.rotation in (None, t.rotation) and known.mirrored in (None, t.mirrored))
+    places = layout.mm @ turn.matrix.T / pixel_mm
+    places += (np.array(scan.size) - 1) / 2 - (places.min(axis=0) + places.max(axis=0)) / 2
+    return tuple(SoughtMark(n, float(x), float(y), False, math.nan) for n, (x, y) in zip(layout.names, places))
+
+
+def _sought(measured: Measured) -> tuple[SoughtMark, ...]:
+    found = (SoughtMark(name, at.x, at.y, True, at.correlation) for name, at in measured.found.items())
+    lost = (SoughtMark(name, *measured.expected[name], False, r) for name, (r, _) in measured.missed.items())
+    return (*found, *lost)
 
 
 def _better_turn(scan: Scan, layout: MarkLayout, known: FiducialSearch, measured: Measured) -> str | None:

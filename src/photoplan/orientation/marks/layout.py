@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,10 @@ class MarkLayout:
             raise InputError(f"fiducial mark {', '.join(map(repr, bare))}: what it looks like is not described")
         mm = np.array([marks[n] for n in marks], float).reshape(-1, 2)
         return cls(tuple(marks), mm, tuple(patterns[n] for n in marks))
+
+    def with_marks(self, factor: float) -> MarkLayout:
+        """The same places with marks of another size."""
+        return replace(self, patterns=tuple(pattern.scaled(factor) for pattern in self.patterns))
 
     @property
     def extent(self) -> float:

@@ -18,7 +18,13 @@ from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
 from photoplan.io.scan_pitch import parse_pitch
-from photoplan.orientation.marks.fiducials import FiducialResult, FiducialSearch, find_fiducials
+from photoplan.orientation.marks.fiducials import (
+    FiducialResult,
+    FiducialSearch,
+    MarksNotFound,
+    SoughtMark,
+    find_fiducials,
+)
 from photoplan.orientation.marks.layout import MarkLayout
 from photoplan.orientation.marks.locate import LEAST_CORRELATION
 from photoplan.plain import pick
@@ -89,12 +95,26 @@ class ImageFiducials:
 
 
 @dataclass(frozen=True, eq=False)
+class UnfoundFiducials:
+    """A scan on which fewer than three marks were found."""
+
+    name: str
+    file: Path
+    band: int | None
+    """Band that was used; None: luminance."""
+    layout: MarkLayout
+    sought: tuple[SoughtMark, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class FiducialsReport:
     """Marks of all images."""
 
     images: tuple[ImageFiducials, ...]
     failed: dict[str, str]
     """Reasons, by image."""
+    unfound: tuple[UnfoundFiducials, ...]
+    """Of the failed ones those on which marks were sought and not found, to be looked at."""
     written: Path | None
     """Project file that received the marks."""
 
@@ -161,6 +181,7 @@ def locate_fiducials(
     pixel_mm = sum(parse_pitch(request.scan_resolution)) / 2 if request.scan_resolution else None
     results: list[ImageFiducials] = []
     failed: dict[str, str] = {}
+    unfound: list[UnfoundFiducials] = []
     events.begin("fiducial marks", len(jobs), "images")
     for job in jobs:
         try:
@@ -168,13 +189,15 @@ def locate_fiducials(
         except ResourceError:
             raise
         except PhotoplanError as error:
-            failed[job.name] = str(error)
+            failed[job.name] = f"{job.file}: {error}" if isinstance(error, MarksNotFound) else str(error)
+            if isinstance(error, MarksNotFound):
+                unfound.append(UnfoundFiducials(job.name, job.file, request.band, job.layout, error.sought))
         events.done()
     written = None
     if project is not None and results and not request.dry_run:
         written = request.images[0]
         edit_project(written, ProjectChanges(images={r.name: _entries(project, r) for r in results}))
-    return FiducialsReport(tuple(results), failed, written)
+    return FiducialsReport(tuple(results), failed, tuple(unfound), written)
 
 
 def scans_of(request: FiducialsRequest) -> dict[str, Path]:
@@ -267,6 +290,8 @@ def _locate(
     )
     try:
         found = find_fiducials(scan, job.layout, known)
+    except MarksNotFound:
+        raise
     except InputError as error:
         raise type(error)(f"{job.file}: {error}") from None
     if in_project and found.turn.mirrored != job.camera.mirrored:
