@@ -77,7 +77,7 @@ def test_reduced_sources_make_the_same_product_as_whole_ones(scale: float, kerne
         image += np.cos(2 * np.pi * (x * np.cos(angle) + y * np.sin(angle)) / length + rng.uniform(0, 6))
     image = (128 + 100 * image / np.abs(image).max())[None].astype(np.float32)
     plan = product(grid, reduces=True)
-    assert {layer.level for layer in compile_tile(plan, plan.tiles[0], [cam], surface).layers} == {
+    assert {layer.level for layer in compile_tile(plan, plan.tiles[0], {0: cam}, surface).layers} == {
         {4.5: 1, 10.0: 2, 30.0: 3}[scale]
     }
     got = render(plan, plan.tiles[0], [Source(cam, ArrayReader(image))], surface, kernel)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
@@ -21,7 +23,6 @@ from photoplan.plan.owner import GivenOwners
 from photoplan.plan.product import ProductPlan, compile_tile
 from photoplan.plan.tiles import Tile
 from photoplan.surfaces.level import LevelSurface
-from photoplan.targets.map import MapTarget
 
 KERNELS = ["nearest", "bilinear", "bicubic", "bicubic-1", "lanczos3"]
 SIZE = (90, 70)
@@ -43,7 +44,7 @@ def composed(plan: ProductPlan, tile: Tile, cameras: list[Pinhole], readers: lis
     """A tile by the engine and by the twin."""
     surface = LevelSurface(0.0)
     got = render(plan, tile, [Source(*pair) for pair in zip(cameras, readers)], surface, kernel)
-    compiled = compile_tile(plan, tile, cameras, surface)
+    compiled = compile_tile(plan, tile, dict(enumerate(cameras)), surface)
     levels = {layer.source: layer.level for layer in compiled.layers}
     twins = [TwinSource(r.image, r.valid, c, levels.get(i, 0)) for i, (c, r) in enumerate(zip(cameras, readers))]
     want, good = twin_compose(plan.target, tile.window, surface, twins, compiled.owner, kernel)
@@ -184,6 +185,26 @@ def test_owners_of_another_size_are_refused() -> None:
     grid = MapGrid.covering((-25, -25, 25, 25), 0.8, "EPSG:32615")
     owners = GivenOwners(np.ones((3, 3), np.uint16))
     with pytest.raises(UsageError, match=r"owners of shape \(3, 3\)"):
-        owners.owner(MapTarget(grid), grid.window, np.zeros((grid.height, grid.width), np.float32))
+        compile_tile(product(grid, owners=owners), Tile(0, grid.window), {0: camera(0.3)}, LevelSurface(0.0))
     with pytest.raises(UsageError, match="say which of them paints"):
         product(grid, names=("a", "b"))
+
+
+def test_owners_are_chosen_among_the_sources_of_the_tile_and_nobody_else_is_opened() -> None:
+    """A rule (visibility, best image) gets the cameras that can paint in the tile, and what may hide its pixels."""
+    asked: list[tuple[Any, ...]] = []
+
+    class LastCamera:
+        def owner(self, ground: Any, cameras: Any, surface: Any) -> np.ndarray:
+            asked.append((ground.window, dict(cameras), surface))
+            return np.full(ground.relief.shape, max(cameras) + 1, np.uint16)
+
+    grid, surface = MapGrid.covering((-25, -25, 25, 25), 0.8, "EPSG:32615"), LevelSurface(0.0)
+    one, two = (Source(camera(k), ArrayReader(noise(1, SIZE[1], SIZE[0], "uint8", int(k)))) for k in (0.0, 1.0))
+    table: list[Any] = [None, one, None, two]
+    plan = product(grid, names=("a", "b", "c", "d"), owners=LastCamera())
+    got = render(plan, Tile(0, grid.window, (1, 3)), table, surface, "bilinear")
+    assert asked == [(grid.window, {1: one.camera, 3: two.camera}, surface)]
+    alone = render(product(grid), Tile(0, grid.window), [two], surface, "bilinear")
+    np.testing.assert_array_equal(got.values, alone.values)
+    np.testing.assert_array_equal(got.owner, 4 * alone.valid)

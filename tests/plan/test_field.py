@@ -169,7 +169,7 @@ def test_every_pixel_as_the_twin_says(name: str, kappa: float, resolution: float
     plan, tile, surface = product(grid, tolerance=1e-3), Tile(0, grid.window), LevelSurface(0.0)
     reader = ArrayReader(noise(3, 140, 180, "float32"))
     got = render(plan, tile, [Source(camera, reader)], surface, kernel)
-    level = compile_tile(plan, tile, [camera], surface).layers[0].level
+    level = compile_tile(plan, tile, {0: camera}, surface).layers[0].level
     assert (level > 0) == (resolution == 9.0)
     twin = TwinSource(reader.image, None, camera, level)
     want, good = twin_compose(plan.target, tile.window, surface, [twin], None, kernel)

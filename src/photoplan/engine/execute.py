@@ -77,7 +77,7 @@ def render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface:
     memory, workers or order.
     """
     window = tile.window
-    compiled = compile_tile(product, tile, [source.camera for source in sources], surface)
+    compiled = compile_tile(product, tile, {row: sources[row].camera for row in tile.sources}, surface)
     needed = max((_bytes(layer, sources[layer.source]) for layer in compiled.layers), default=0)
     if needed <= MOST_SOURCE_BYTES or max(window.width, window.height) <= SMALLEST_PART:
         return execute_tile(compiled, sources, kernel)

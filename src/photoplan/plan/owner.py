@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.cameras.base import Projection
 from photoplan.errors import UsageError
-from photoplan.geometry.grid import Window
-from photoplan.targets.base import Target
+from photoplan.plan.ground import TileGround
+from photoplan.surfaces.base import Surface
 
 
 class Ownership(Protocol):
@@ -19,16 +21,17 @@ class Ownership(Protocol):
     What a pixel gets depends on the pixel alone, never on the window in which it is asked for, so that tiles join.
     """
 
-    def owner(self, target: Target, window: Window, relief: NDArray[np.float32]) -> NDArray[np.uint16]:
-        """Row of the table of sources, plus one, for every pixel of a window; 0: no source.
+    def owner(self, ground: TileGround, cameras: Mapping[int, Projection], surface: Surface) -> NDArray[np.uint16]:
+        """Row of the table of sources, plus one, for every pixel of a tile; 0: no source.
 
         Parameters
         ----------
-        target : Target
-        window : Window
-            Pixels of the product.
-        relief : ndarray, shape (height, width), float32
-            h of each pixel; NaN where there is no surface.
+        ground : TileGround
+            The tile: its target, its window, and the depth of each pixel.
+        cameras : mapping
+            By row of the table of sources, of those that can paint in the tile: nobody else may be chosen.
+        surface : Surface
+            What the depth was taken from; what hides a pixel may lie beyond the tile.
 
         Returns
         -------
@@ -48,8 +51,9 @@ class GivenOwners:
         if self.raster.ndim != 2 or self.raster.dtype != np.uint16:
             raise UsageError(f"owners of shape {self.raster.shape} and type {self.raster.dtype}; a raster of uint16")
 
-    def owner(self, target: Target, window: Window, relief: NDArray[np.float32]) -> NDArray[np.uint16]:
-        """The part of the raster that lies in the window."""
+    def owner(self, ground: TileGround, cameras: Mapping[int, Projection], surface: Surface) -> NDArray[np.uint16]:
+        """The part of the raster that lies in the tile's window."""
+        target, window = ground.target, ground.window
         right, bottom = window.stop
         if window & target.window != window or self.raster.shape != (target.window.height, target.window.width):
             raise UsageError(f"owners of shape {self.raster.shape} do not cover {window} of {target.window}")

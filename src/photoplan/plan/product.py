@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,7 +98,7 @@ class ProductPlan:
         return self.target.window.width, self.target.window.height
 
 
-def compile_tile(product: ProductPlan, tile: Tile, cameras: Sequence[Projection], surface: Surface) -> CompiledTile:
+def compile_tile(product: ProductPlan, tile: Tile, cameras: Mapping[int, Projection], surface: Surface) -> CompiledTile:
     """Relief, owner, anchors and field of a tile of a product. Pure: the same inputs give the same bytes.
 
     Parameters
@@ -106,14 +106,14 @@ def compile_tile(product: ProductPlan, tile: Tile, cameras: Sequence[Projection]
     product : ProductPlan
     tile : Tile
         A tile of the product, or a part of one.
-    cameras : sequence of Projection
-        One for each row of the product's table of sources.
+    cameras : mapping
+        By row of the product's table of sources, of those that can paint in the tile.
     surface : Surface
         What the target's depth is taken from.
     """
     relief = surface.relief(product.target, tile.window)
-    owner = None if product.owners is None else product.owners.owner(product.target, tile.window, relief)
     ground = TileGround.of(product.target, tile.window, relief)
+    owner = None if product.owners is None else product.owners.owner(ground, cameras, surface)
     wanted, parts = ground.ranges[None], np.array([[0, 0, tile.window.width, tile.window.height]])
     if owner is not None:
         wanted, parts = ground.owned(owner, tile.sources, len(product.sources))

@@ -95,7 +95,7 @@ def compile_figures(plan: OrthoPlan, events: Events = SILENT) -> PlanFigures:
     for p in plan.products:
         scene = open_scene(plan.project, p.plan.image)
         for tile, row in zip(p.plan.tiles, rows):
-            compiled = compile_tile(p.plan, tile, [scene.camera], scene.surface)
+            compiled = compile_tile(p.plan, tile, {0: scene.camera}, scene.surface)
             cells[row], residual[row] = compiled.cells, compiled.residual
             for layer in compiled.layers:
                 read = layer.window(scene.camera.size)
