@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.engine.base import Source
+from photoplan.engine.base import Reader, Source
 from photoplan.engine.run import Made
 from photoplan.geometry.grid import Window
 from photoplan.kernels.position import ALL_MINE
@@ -25,7 +25,7 @@ SMALLEST_PART = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Pixels:
+class Painted:
     """Pixels of a window of a product."""
 
     values: NDArray[Any] | None
@@ -41,7 +41,7 @@ class Pixels:
     """Boxes that the anchors have."""
 
 
-def execute_tile(tile: CompiledTile, sources: Sequence[Source], kernel: str) -> Pixels:
+def execute_tile(tile: CompiledTile, sources: Sequence[Source], kernel: str) -> Painted:
     """Compose one compiled tile: each source paints the pixels that it owns, and nothing else is computed.
 
     Parameters
@@ -65,12 +65,12 @@ def execute_tile(tile: CompiledTile, sources: Sequence[Source], kernel: str) -> 
             owned = ALL_MINE if tile.owner is None else (tile.owner, layer.source + 1, layer.part.tolist())
             rectify_tile(layer.anchors.arrays, tile.relief, pixels, usable, border, kernel, values, valid, owned=owned)
     if not valid.any():
-        return Pixels(None, None, None, tile.residual, tile.cells)
+        return Painted(None, None, None, tile.residual, tile.cells)
     owner = None if tile.owner is None else tile.owner * valid
-    return Pixels(values, valid, owner, tile.residual, tile.cells)
+    return Painted(values, valid, owner, tile.residual, tile.cells)
 
 
-def render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface: Surface, kernel: str) -> Pixels:
+def render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface: Surface, kernel: str) -> Painted:
     """Compile and execute a tile of a product, in parts if it needs too much of a source at once.
 
     Whether and how it is cut depends on the tile and the sources alone, so that the result does not depend on
@@ -82,8 +82,10 @@ def render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface:
     if needed <= MOST_SOURCE_BYTES or max(window.width, window.height) <= SMALLEST_PART:
         return execute_tile(compiled, sources, kernel)
     side = max(SMALLEST_PART, -(-max(window.width, window.height) // 2))
-    parts = [replace(tile, window=part) for part in window.tiles(side)]
-    return _joined(window, [(part.window, render(product, part, sources, surface, kernel)) for part in parts])
+    cut = [replace(tile, window=part) for part in window.tiles(side)]
+    parts = ((part.window, render(product, part, sources, surface, kernel)) for part in cut)
+    whole = joined(window, parts, sources[tile.sources[0]].reader, product.owners is not None)
+    return whole if np.any(whole.valid) else Painted(None, None, None, whole.residual, whole.cells)
 
 
 def _bytes(layer: Layer, source: Source) -> int:
@@ -91,23 +93,25 @@ def _bytes(layer: Layer, source: Source) -> int:
     return layer.anchors.source_window.size * source.reader.bands * source.reader.dtype.itemsize
 
 
-def _joined(window: Window, parts: list[tuple[Window, Pixels]]) -> Pixels:
-    residual, cells = max(p.residual for _, p in parts), sum(p.cells for _, p in parts)
-    some = next((p for _, p in parts if p.values is not None), None)
-    if some is None or some.values is None:
-        return Pixels(None, None, None, residual, cells)
+def joined(window: Window, parts: Iterable[tuple[Window, Painted]], reader: Reader, owned: bool) -> Painted:
+    """A window of a product from painted parts of the product; what none of them holds is 0 and not valid.
+
+    `reader` tells bands and type of the pixels, `owned` whether there are owners.
+    """
     shape = (window.height, window.width)
-    values, valid = np.zeros((len(some.values), *shape), some.values.dtype), np.zeros(shape, bool)
-    owner = None if some.owner is None else np.zeros(shape, np.uint16)
-    for part, pixels in parts:
-        if pixels.values is None or pixels.valid is None:
+    values, valid = np.zeros((reader.bands, *shape), reader.dtype), np.zeros(shape, bool)
+    owner = np.zeros(shape, np.uint16) if owned else None
+    residual, cells = 0.0, 0
+    for at, part in parts:
+        residual, cells = max(residual, part.residual), cells + part.cells
+        common = at & window
+        if part.values is None or part.valid is None or not common.size:
             continue
-        rows, cols = part.slices(window)
-        values[:, rows, cols] = pixels.values
-        valid[rows, cols] = pixels.valid
-        if owner is not None and pixels.owner is not None:
-            owner[rows, cols] = pixels.owner
-    return Pixels(values, valid, owner, residual, cells)
+        to, of = common.slices(window), common.slices(at)
+        values[:, to[0], to[1]], valid[to] = part.values[:, of[0], of[1]], part.valid[of]
+        if owner is not None and part.owner is not None:
+            owner[to] = part.owner[of]
+    return Painted(values, valid, owner, residual, cells)
 
 
 def _border(layer: Layer, size: tuple[int, int]) -> tuple[float, float, float, float]:

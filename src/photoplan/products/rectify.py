@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.cameras.base import Projection
 from photoplan.engine.arrays import ArrayReader
 from photoplan.engine.base import Reader, Source
-from photoplan.engine.execute import Pixels, render
-from photoplan.engine.executors import Workers, executor_factory, run_tiles
+from photoplan.engine.execute import Painted, joined, render
+from photoplan.engine.executors import Outcome, Workers, executor_factory, run_tiles
 from photoplan.errors import PhotoplanError, UsageError
 from photoplan.geometry.crs import parse_crs
 from photoplan.geometry.grid import MapGrid, Placement
@@ -201,25 +201,18 @@ def rectify(
 
 
 def _collected(plan: ProductPlan, reader: Reader, work: Any, workers: int) -> Raster:
-    width, height = plan.size
-    values = np.zeros((reader.bands, height, width), reader.dtype)
-    valid = np.zeros((height, width), bool)
-    owner = None if plan.owners is None else np.zeros((height, width), np.uint16)
-    residual, place = 0.0, plan.target.window
-    with Workers(executor_factory("threads", workers)) as pool:
-        for outcome in run_tiles(plan.tiles, work, pool, 2 * workers):
-            if outcome.error is not None:
-                raise PhotoplanError(f"tile {outcome.task.index}: {outcome.error}")
-            window, pixels = outcome.task.window, outcome.result
-            assert isinstance(pixels, Pixels)
-            residual = max(residual, pixels.residual)
-            if pixels.values is None or pixels.valid is None:
-                continue
-            part = window.slices(place)
-            values[:, part[0], part[1]], valid[part] = pixels.values, pixels.valid
-            if owner is not None and pixels.owner is not None:
-                owner[part] = pixels.owner
-    return Raster(values, valid, plan.target.placement, owner, residual)
+    with Workers(executor_factory("threads", workers), workers) as pool:
+        parts = ((each.task.window, _painted(each)) for each in run_tiles(plan.tiles, work, pool, pool.in_flight))
+        whole = joined(plan.target.window, parts, reader, plan.owners is not None)
+    assert whole.values is not None and whole.valid is not None
+    return Raster(whole.values, whole.valid, plan.target.placement, whole.owner, whole.residual)
+
+
+def _painted(outcome: Outcome) -> Painted:
+    if outcome.error is not None:
+        raise PhotoplanError(f"tile {outcome.task.index}: {outcome.error}")
+    assert isinstance(outcome.result, Painted)
+    return outcome.result
 
 
 def _sources(source: Any, camera: Projection | Sequence[Projection]) -> list[Source]:

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from photoplan import __version__
 from photoplan.cameras.base import CentralCamera
-from photoplan.engine.execute import render as render_tiles
+from photoplan.engine.execute import joined
+from photoplan.engine.execute import render as render_tile
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.bounds import area_fault
@@ -326,19 +327,14 @@ def render(
     product = plan[name]
     window = product.grid.window if bounds is None else window_of(product.grid, bounds)
     scene = open_scene(plan.project, product.plan.image)
-    values = np.zeros((scene.reader.bands, window.height, window.width), scene.reader.dtype)
-    valid = np.zeros((window.height, window.width), bool)
-    for tile in product.plan.tiles:
-        common = tile.window & window
-        if not common.size:
-            continue
-        pixels = render_tiles(product.plan, tile, scene.sources, scene.surface, plan.settings.kernel)
-        if pixels.values is None or pixels.valid is None:
-            continue
-        to, of = common.slices(window), common.slices(tile.window)
-        values[:, to[0], to[1]] = pixels.values[:, of[0], of[1]]
-        valid[to] = pixels.valid[of]
-    return values, valid
+    tiles = (tile for tile in product.plan.tiles if (tile.window & window).size)
+    parts = (
+        (tile.window, render_tile(product.plan, tile, scene.sources, scene.surface, plan.settings.kernel))
+        for tile in tiles
+    )
+    whole = joined(window, parts, scene.reader, owned=False)
+    assert whole.values is not None and whole.valid is not None
+    return whole.values, whole.valid
 
 
 def window_of(grid: MapGrid, bounds: tuple[float, float, float, float]) -> Window:
