@@ -7,6 +7,7 @@ import pytest
 from tools.plain_block import Make, plain_block
 from tools.thinned import thinned
 
+from photoplan.errors import GeometryError
 from photoplan.orientation.bundle.adjust import adjust_block
 from photoplan.orientation.bundle.block import Adjusted
 
@@ -33,14 +34,21 @@ def test_wrong_control_takes_no_right_control_with_it(count: int, gnss: float | 
     """Asked: in 95 % of 200 blocks no right point is lost."""
     lost = missed = wrongs = 0
     for seed in range(count):
-        wrong, result = disturbed(seed, gnss)
+        try:
+            wrong, result = disturbed(seed, gnss)
+        except GeometryError as error:
+            print(f"\nblock {seed}: {error}")
+            lost += 1
+            continue
         out = set(np.flatnonzero(result.ground_rejected.any(axis=1)).tolist())
         seen = {k for k in wrong if np.isfinite(result.ground_residuals[k]).all()}
         lost += bool(out - wrong)
         missed += len(seen - out)
         wrongs += len(seen)
         assert 0.85 < result.sigma0 < 1.15
-    print(f"\nGNSS {gnss}: right points lost in {lost} of {count} blocks, {missed} of {wrongs} wrong ones kept")
+    print(
+        f"\nGNSS {gnss}: right points, or all, lost in {lost} of {count} blocks, {missed} of {wrongs} wrong ones kept"
+    )
     assert lost <= 0.05 * count
     # Of ten standard deviations upwards, hardly any wrong point fits all the others.
     assert missed <= 0.05 * wrongs

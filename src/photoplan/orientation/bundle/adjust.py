@@ -93,6 +93,7 @@ def adjust_block(block: Block, settings: AdjustSettings | None = None, progress:
     model = build_model(block, selection.images, selection.measured, selection.points)
     state = _started(model, XYZ)
     _check(model, state, active)
+    passes: list[tuple[State, Active, tuple[str, ...]]] = []
     for _ in range(_AGAIN if settings.robust else 0):
         state = loop.run(model, state, weights_of(model, active), robust=True)
         found = first_taken_out(model, state, replace(Active.all_of(block), ground=active.ground), settings.critical)
@@ -102,6 +103,11 @@ def adjust_block(block: Block, settings: AdjustSettings | None = None, progress:
         if not again:
             active = _returned(model, state, active, factors, settings.critical)
             break
+        passes.append((state, active, alternative))
+    else:
+        # Judgements that do not settle: the one that most measurements fit, of equal ones the first.
+        if passes:
+            state, active, alternative = max(passes, key=lambda item: int(item[1].image.sum()))
     for turn in range(_ROUNDS):
         loose = frozenset() if turn == 0 else lost
         while True:
