@@ -11,7 +11,9 @@ import pytest
 
 from photoplan.errors import InputError
 from photoplan.io.camera.file import read_cameras
-from photoplan.io.camera.model import FilmCamera, FrameEntry, IdealLens, OpenCVFisheyeLens, OpenCVLens
+from photoplan.io.camera.film import FilmEntry
+from photoplan.io.camera.frame import FrameEntry
+from photoplan.io.camera.model import IdealLens, OpenCVFisheyeLens, OpenCVLens
 from photoplan.io.camera.opensfm import resized
 
 
@@ -27,8 +29,8 @@ def test_the_drone_blocks_camera(block: Path) -> None:
     camera = cameras["DJI FC300S half-res"]
     assert isinstance(camera, FrameEntry)
     assert camera.size == (2000, 1125)
-    assert camera.focal == (1435.5077, 1432.9259)
-    assert camera.principal_point == (999.5, 562.0)
+    assert camera.pixels.focal == (1435.5077, 1432.9259)
+    assert camera.pixels.point == (999.5, 562.0)
     assert camera.lens == OpenCVLens(type="opencv", k1=0.01358910, k2=0.03861561, p1=-0.00167842, p2=0.00106552)
 
 
@@ -36,8 +38,8 @@ def test_the_dmc_camera(shared: Path) -> None:
     camera = read_cameras(shared / "data" / "ngi_dmc" / "eo" / "ngi_int_param.yaml").cameras["Integraph DMC"]
     assert isinstance(camera, FrameEntry)
     # 120 mm over pixels of 92.16 mm / 640 = 0.144 mm.
-    np.testing.assert_allclose(camera.focal, 120 / 0.144, rtol=1e-14)
-    assert camera.principal_point == (319.5, 575.5)
+    np.testing.assert_allclose(camera.pixels.focal, 120 / 0.144, rtol=1e-14)
+    assert camera.pixels.point == (319.5, 575.5)
     assert camera.lens == IdealLens()
 
 
@@ -67,12 +69,12 @@ Fish:
 """
     cameras: Any = read_cameras(write(tmp_path, "int.yaml", text)).cameras
     pinhole, brown, fish = cameras.values()
-    assert pinhole.focal == (240.0, 240.0)
+    assert pinhole.pixels.focal == (240.0, 240.0)
     # Middle (149/2, 199/2), larger side 200; x right, y down.
-    np.testing.assert_allclose(pinhole.principal_point, (74.5 - 2.0, 99.5 + 4.0))
-    np.testing.assert_allclose(brown.focal, 0.8333 * 400)
+    np.testing.assert_allclose(pinhole.pixels.point, (74.5 - 2.0, 99.5 + 4.0))
+    np.testing.assert_allclose(brown.pixels.focal, 0.8333 * 400)
     assert brown.lens == OpenCVLens(type="opencv", k1=-0.25, k2=0.2, p1=0.01, p2=0.02, k3=-0.1)
-    assert fish.focal == (200.0, 240.0)
+    assert fish.pixels.focal == (200.0, 240.0)
     # An equidistant lens is one even where all coefficients are zero.
     assert fish.lens == OpenCVFisheyeLens(type="opencv_fisheye")
 
@@ -145,7 +147,7 @@ size = [100, 80]
 focal_px = 90
 """
     cameras = read_cameras(write(tmp_path, "c.toml", text)).cameras
-    assert isinstance(cameras["RC10"], FilmCamera)
+    assert isinstance(cameras["RC10"], FilmEntry)
     assert cameras["RC10"].fiducials_mm["1"] == (105.999, -106.016)
     assert isinstance(cameras["drone"], FrameEntry)
     with pytest.raises(InputError, match=r"c\.toml:10: cameras\.drone\.focal_px: -90 given"):
@@ -181,18 +183,18 @@ def test_opensfm_brown_is_opencvs_in_parts_of_the_larger_side(tmp_path: Path) ->
     file = read_cameras(write(tmp_path, "cameras.json", ODM))
     assert file.normalised
     camera: Any = file.cameras["v2 dji 5472 3648 brown"]
-    np.testing.assert_allclose(camera.focal, 0.6664614123723713 * 1368)
+    np.testing.assert_allclose(camera.pixels.focal, 0.6664614123723713 * 1368)
     np.testing.assert_allclose(
-        camera.principal_point,
+        camera.pixels.point,
         (1367 / 2 - 0.0015460447606643697 * 1368, 911 / 2 + 0.004751874732641298 * 1368),
     )
     assert camera.lens == OpenCVLens(type="opencv", k1=-0.26, k2=0.10, p1=0.0007, p2=0.0002, k3=-0.025)
     # A world of the same sensor at four times the resolution: the edge of the image stays where it was.
     big = resized(camera, (5472, 3648), "x")
     for axis in (0, 1):
-        edge = (camera.principal_point[axis] + 0.5) / camera.size[axis]
-        assert abs((big.principal_point[axis] + 0.5) / big.size[axis] - edge) < 1e-12
-        assert abs(big.focal[axis] / big.size[axis] - camera.focal[axis] / camera.size[axis]) < 1e-12
+        edge = (camera.pixels.point[axis] + 0.5) / camera.size[axis]
+        assert abs((big.pixels.point[axis] + 0.5) / big.size[axis] - edge) < 1e-12
+        assert abs(big.pixels.focal[axis] / big.size[axis] - camera.pixels.focal[axis] / camera.size[axis]) < 1e-12
     with pytest.raises(InputError, match="another aspect ratio"):
         resized(camera, (5472, 3078), "x")
 
@@ -205,8 +207,8 @@ def test_opensfm_models(tmp_path: Path) -> None:
     }
     good = {k: cameras[k] for k in "pf"}
     read: Any = read_cameras(write(tmp_path, "a.json", [{"cameras": good, "shots": {}}])).cameras
-    assert read["p"].focal == (320.0, 320.0)
-    assert read["p"].principal_point == (199.5, 149.5)
+    assert read["p"].pixels.focal == (320.0, 320.0)
+    assert read["p"].pixels.point == (199.5, 149.5)
     assert read["p"].lens == OpenCVLens(type="opencv", k1=-0.1, k2=0.02)
     assert read["f"].lens == OpenCVFisheyeLens(type="opencv_fisheye", k1=0.01)
     with pytest.raises(InputError, match="'spherical' is not supported"):

@@ -159,7 +159,7 @@ def test_json_by_hand_with_rows(tmp_path: Path) -> None:
         "camera_matrix": [[657.5, 0, 319.25], [0, 655.0, 241.5], [0, 0, 1]],
     }
     camera: Any = read_cameras(write(tmp_path, json.dumps(content | {"dist_coeffs": [D5]}), "c.json")).cameras["c"]
-    assert camera.principal_point == (319.25, 241.5)
+    assert camera.pixels.point == (319.25, 241.5)
     assert (camera.lens.k1, camera.lens.k3, camera.lens.p2) == (-0.41, -1.1, -2.0e-3)
     assert not read_cameras(tmp_path / "c.json").normalised
 

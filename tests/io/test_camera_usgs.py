@@ -12,7 +12,7 @@ import pytest
 from photoplan.cameras.interior import Interior
 from photoplan.errors import InputError
 from photoplan.io.camera.file import read_cameras
-from photoplan.io.camera.model import FilmCamera
+from photoplan.io.camera.film import FilmEntry
 from photoplan.io.camera.usgs import distance_differences
 from photoplan.io.project.cameras import lens_of
 
@@ -25,9 +25,9 @@ ANGLES, MEAN = [7.5, 15, 22.7, 30, 35, 40], [3, 4, 1, -3, -4, 3]
 PPS = (0.006, -0.010)
 
 
-def template() -> FilmCamera:
+def template() -> FilmEntry:
     (camera,) = read_cameras(TEMPLATE).cameras.values()
-    assert isinstance(camera, FilmCamera)
+    assert isinstance(camera, FilmEntry)
     return camera
 
 
@@ -62,7 +62,7 @@ def test_lines_between_marks_meet_in_the_printed_points() -> None:
         assert abs(degrees - (angle[0] + angle[1] / 60 + angle[2] / 3600)) * 3600 < 4
 
 
-def plane_points(camera: FilmCamera, t: np.ndarray) -> np.ndarray:
+def plane_points(camera: FilmEntry, t: np.ndarray) -> np.ndarray:
     """Points of the image plane in the system of the fiducial marks, millimetres."""
     interior = Interior.metric((1, 1), camera.camera_constant_mm, 1.0, camera.principal_point_mm)
     assert interior.principal_point == camera.principal_point_mm

@@ -14,7 +14,7 @@ from pydantic import TypeAdapter, ValidationError
 from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
 from photoplan.errors import InputError
 from photoplan.io.camera.file import read_cameras
-from photoplan.io.camera.model import FilmCamera
+from photoplan.io.camera.film import FilmEntry
 from photoplan.io.mark_model import Mark
 from photoplan.io.project.write import camera_lines
 from photoplan.project.camera_marks import mark_pattern, mark_patterns
@@ -43,10 +43,10 @@ BASE: dict[str, Any] = {
     "camera_constant_mm": 153.0,
     "fiducials_mm": {"1": (110.0, 110.0), "2": (-110.0, 110.0), "3": (0.0, -110.0)},
 }
-CAMERA = TypeAdapter(FilmCamera)
+CAMERA = TypeAdapter(FilmEntry)
 
 
-def camera(marks: Any) -> FilmCamera:
+def camera(marks: Any) -> FilmEntry:
     return CAMERA.validate_python({**BASE, "marks": marks})
 
 
@@ -58,13 +58,13 @@ def test_every_kind_becomes_a_pattern(entry: dict[str, Any]) -> None:
 
 
 def test_one_description_serves_all_marks() -> None:
-    made = mark_patterns(camera(KINDS[0]), Path())
+    made = mark_patterns(camera(KINDS[0]).fiducial_system, Path())
     assert list(made) == ["1", "2", "3"]
     assert made["1"] is made["3"]
 
 
 def test_each_mark_may_have_its_own() -> None:
-    made = mark_patterns(camera({"1": KINDS[0], "2": KINDS[1], "3": KINDS[6]}), Path())
+    made = mark_patterns(camera({"1": KINDS[0], "2": KINDS[1], "3": KINDS[6]}).fiducial_system, Path())
     assert [each.name for each in made.values()] == ["cross", "dot", "block"]
 
 
@@ -103,12 +103,12 @@ def test_wrong_descriptions_are_refused(marks: Any, message: str) -> None:
 def test_impossible_numbers_name_the_mark() -> None:
     given = camera({"1": KINDS[0], "2": {"type": "ring", "diameter": 1.0, "width": 0.6}, "3": KINDS[0]})
     with pytest.raises(InputError, match=r"fiducial mark .2.: ring: width 0\.6 mm"):
-        mark_patterns(given, Path())
+        mark_patterns(given.fiducial_system, Path())
 
 
 def test_a_camera_without_descriptions_says_how_to_add_them() -> None:
     with pytest.raises(InputError, match="add `marks`"):
-        mark_patterns(CAMERA.validate_python(BASE), Path())
+        mark_patterns(CAMERA.validate_python(BASE).fiducial_system, Path())
 
 
 def write(path: Path, values: np.ndarray) -> None:
@@ -131,7 +131,7 @@ def test_an_example_is_read_and_turned_with_its_reference(tmp_path: Path, rotati
         "rotation": rotation,
         "mirrored": mirrored,
     }
-    made = mark_patterns(camera(entry), tmp_path)["1"]
+    made = mark_patterns(camera(entry).fiducial_system, tmp_path)["1"]
     assert isinstance(made, MarkExample)
     assert made.pixel_mm == pytest.approx(0.02)
     column, row = (int(each) for each in made.reference)
@@ -146,12 +146,12 @@ def test_an_example_is_read_and_turned_with_its_reference(tmp_path: Path, rotati
 def test_examples_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
     entry = {"type": "example", "file": "mark.png", "reference": (22.0, 4.0), "pixel_um": 20.0}
     with pytest.raises(InputError, match=r"mark\.png"):
-        mark_patterns(camera(entry), tmp_path)
+        mark_patterns(camera(entry).fiducial_system, tmp_path)
     write(tmp_path / "mark.png", np.zeros((8, 5000), np.uint8))
     with pytest.raises(InputError, match="up to 4096"):
-        mark_patterns(camera(entry), tmp_path)
+        mark_patterns(camera(entry).fiducial_system, tmp_path)
     write(tmp_path / "mark.png", np.zeros((9, 9), np.uint8))
     with pytest.raises(InputError, match="far outside"):
-        mark_patterns(camera({**entry, "reference": (500.0, 4.0)}), tmp_path)
+        mark_patterns(camera({**entry, "reference": (500.0, 4.0)}).fiducial_system, tmp_path)
     with pytest.raises(InputError, match="virtual file systems"):
-        mark_patterns(camera({**entry, "file": "/vsicurl/http://a.org/b.png"}), tmp_path)
+        mark_patterns(camera({**entry, "file": "/vsicurl/http://a.org/b.png"}).fiducial_system, tmp_path)

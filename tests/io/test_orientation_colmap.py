@@ -51,9 +51,9 @@ def test_the_documentations_sample(tmp_path: Path) -> None:
     assert [i.name for i in block.table.images] == ["P1180141.JPG", "P1180142.JPG"]
     assert list(block.cameras) == ["1"]  # the others are of no image
     camera: Any = block.cameras["1"]
-    assert (camera.size, camera.focal, camera.lens.type) == ((3072, 2304), (2559.81, 2559.81), "none")
+    assert (camera.size, camera.pixels.focal, camera.lens.type) == ((3072, 2304), (2559.81, 2559.81), "none")
     # 1536 of 3072 px from the corner is the middle of the image, half a pixel less from the first pixel's centre.
-    assert camera.principal_point == (1535.5, 1151.5)
+    assert camera.pixels.point == (1535.5, 1151.5)
     # The projection centre is −Rᵀ T: R of the quaternion written out after Hamilton.
     w, x, y, z = np.array([0.851773, 0.0165051, 0.503764, -0.142941]) / np.linalg.norm(
         [0.851773, 0.0165051, 0.503764, -0.142941]

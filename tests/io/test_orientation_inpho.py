@@ -7,7 +7,9 @@ import pytest
 from tools.orientation_blocks import CAMERA, CENTERS, GROUND, NAMES, block, our_pixels, pixels_of_matrix
 
 from photoplan.errors import InputError
-from photoplan.io.camera.model import BrownLens, FilmCamera, FrameEntry
+from photoplan.io.camera.film import FilmEntry
+from photoplan.io.camera.frame import FrameEntry
+from photoplan.io.camera.model import BrownLens
 from photoplan.io.orientation.block import without_lenses
 from photoplan.io.orientation.file import orientation_format, read_orientation_block, write_orientation
 from photoplan.io.orientation.table import TableFormat
@@ -82,7 +84,7 @@ def test_camera_image_and_orientation(tmp_path):
     assert camera.size == CAMERA.size
     assert camera.camera_constant_mm == CAMERA.camera_constant_mm
     assert camera.pixel_size_um == pytest.approx(12.0, rel=1e-12)
-    np.testing.assert_allclose(camera.principal_point, CAMERA.principal_point, atol=1e-9)
+    np.testing.assert_allclose(camera.pixels.point, CAMERA.pixels.point, atol=1e-9)
     assert any("1 images have no $EXT_ORI" in n for n in table.notes)
     np.testing.assert_allclose(our_pixels(table, camera)[0], pixels_of_matrix(MATRIX, CENTER), atol=1e-6)
     other = read_orientation_block(write(tmp_path), TO_CAMERA)
@@ -160,7 +162,7 @@ def test_what_is_lost_is_said(tmp_path):
     assert [loss.kind for loss in losses(lens) if loss.kind == "lens"] == ["lens"]
     assert not [loss for loss in losses(without_lenses(lens)) if loss.kind == "lens"]
     marks = {str(k): (float(x), float(y)) for k, (x, y) in enumerate([(-106, -106), (106, -106), (106, 106)])}
-    film = block(FilmCamera(type="film", camera_constant_mm=153.0, fiducials_mm=marks, size=(8000, 8000)))
+    film = block(FilmEntry(type="film", camera_constant_mm=153.0, fiducials_mm=marks, size=(8000, 8000)))
     assert "film" in [loss.kind for loss in losses(film)]
     # Orientation and camera constant are written, and read without a camera.
     (path,) = write_orientation(film, tmp_path / "film.prj", "inpho")

@@ -264,8 +264,8 @@ def test_losses_and_refusals_in_writing(tmp_path: Path) -> None:
 def test_cameras_alone(tmp_path: Path) -> None:
     (tmp_path / "cameras.xml").write_text(document(None))
     camera: Any = read_cameras(tmp_path / "cameras.xml")["M3M (12.29mm)"]
-    assert camera.focal == (3705.5, 3705.5)
-    np.testing.assert_allclose(camera.principal_point, (5279 / 2 + 11.7, 3955 / 2 - 27.7))
+    assert camera.pixels.focal == (3705.5, 3705.5)
+    np.testing.assert_allclose(camera.pixels.point, (5279 / 2 + 11.7, 3955 / 2 - 27.7))
     assert (camera.lens.k4, camera.lens.b1) == (-0.076, 0.53 / 3705.5)
 
 

@@ -109,8 +109,8 @@ def test_the_published_inpho_camera_counts_from_the_middle_of_the_image() -> Non
     x, y = (float(words[len(words) - words[::-1].index(key)]) for key in ("XPOFF", "YPOFF"))
     focal = float(words[words.index("FOCAL") + 1])
     (camera,) = read_orientation_block(PUBLISHED / "test_calibrated_camera_parameters.txt").cameras.values()
-    np.testing.assert_allclose(camera.principal_point, (5472 / 2 - x - 0.5, 3648 / 2 - y - 0.5), atol=1e-9)
-    np.testing.assert_allclose(camera.focal, focal / 12.825 * 5472, rtol=1e-12)
+    np.testing.assert_allclose(camera.pixels.point, (5472 / 2 - x - 0.5, 3648 / 2 - y - 0.5), atol=1e-9)
+    np.testing.assert_allclose(camera.pixels.focal, focal / 12.825 * 5472, rtol=1e-12)
 
 
 def lens(x: Any, y: Any, k: Any, t: Any) -> Any:
@@ -182,10 +182,8 @@ def test_the_cam_file(tmp_path: Path) -> None:
     camera: Any = read_cameras(path).cameras["camera 0"]
     assert camera.size == (4608, 3456)
     pixel = 17.49998592 / 4608
-    np.testing.assert_allclose(camera.focal, 15.01175404934517487732 / pixel, rtol=1e-12)
-    np.testing.assert_allclose(
-        camera.principal_point, (8.482105119704199 / pixel - 0.5, 6.334346299780423 / pixel - 0.5)
-    )
+    np.testing.assert_allclose(camera.pixels.focal, 15.01175404934517487732 / pixel, rtol=1e-12)
+    np.testing.assert_allclose(camera.pixels.point, (8.482105119704199 / pixel - 0.5, 6.334346299780423 / pixel - 0.5))
     lens = camera.lens
     assert (lens.k1, lens.k2, lens.k3) == (0.03833474118270804865, -0.01750917966495743258, 0.02049798716391852335)
     assert (lens.p1, lens.p2) == (0.00240851666319534747, 0.00292562392135245920)
@@ -209,8 +207,8 @@ def test_round_trip(tmp_path: Path, lens: str, crs: str | None) -> None:
     cam = read_cameras(tmp_path / "q_pix4d_calibrated_internal_camera_parameters.cam").cameras
     assert [c.size for c in cam.values()] == [(4000, 3000), (2000, 1000)]
     first: Any = cam["camera 0"]
-    np.testing.assert_allclose(first.focal, 3100.0, rtol=1e-12)
-    np.testing.assert_allclose(first.principal_point, (2010.25, 1480.5), rtol=1e-12)
+    np.testing.assert_allclose(first.pixels.focal, 3100.0, rtol=1e-12)
+    np.testing.assert_allclose(first.pixels.point, (2010.25, 1480.5), rtol=1e-12)
 
 
 def test_losses() -> None:

@@ -5,7 +5,7 @@ import pytest
 from tools.orientation_blocks import CAMERA, block, our_pixels
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io.camera.model import FilmCamera
+from photoplan.io.camera.film import FilmEntry
 from photoplan.io.orientation import file as orientation_file
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation.file import (
@@ -83,7 +83,7 @@ def test_csv_holds_every_digit(tmp_path):
     assert again.images[0].camera == "c,1"
 
 
-@pytest.mark.parametrize("camera", [CAMERA, FilmCamera(type="film", camera_constant_mm=153.0, fiducials_mm=MARKS)])
+@pytest.mark.parametrize("camera", [CAMERA, FilmEntry(type="film", camera_constant_mm=153.0, fiducials_mm=MARKS)])
 def test_own_toml_holds_everything(tmp_path, camera):
     made = block(camera, crs="EPSG:25832")
     path = write_orientation(made, tmp_path / "o.toml", "toml")[0]

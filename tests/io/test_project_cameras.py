@@ -11,13 +11,15 @@ from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera as ComputingCamera
 from photoplan.errors import InputError
 from photoplan.geometry.pose import Pose
-from photoplan.io.camera.model import BrownLens, FilmCamera, FrameEntry, OpenCVLens, RadialTableLens
+from photoplan.io.camera.film import FilmEntry
+from photoplan.io.camera.frame import FrameEntry
+from photoplan.io.camera.model import BrownLens, OpenCVLens, RadialTableLens
 from photoplan.io.project.cameras import fiducial_fit, image_size, interior_of, lens_of
 from photoplan.io.project.model import Image
 
 IMAGE = Image(name="a", file="a.tif", camera="c", center=(0, 0, 0), angles=(0, 0, 0))
 # Ecker 1991, §8.1; rows counted upwards there, so the film counts as mirrored.
-QUARRY = FilmCamera(
+QUARRY = FilmEntry(
     type="film",
     camera_constant_mm=153.24,
     principal_point_mm=(-0.001, 0.003),
@@ -51,8 +53,8 @@ def test_one_camera_described_in_pixels_and_in_millimetres() -> None:
     expected = [[321.5, 578.5], [321.5 + 0.1 * c / pixel, 578.5 - 0.2 * c / pixel]]
     for camera in ways:
         np.testing.assert_allclose(project_at(camera, points)[:2], expected, atol=1e-9)
-        np.testing.assert_allclose(camera.focal, c / pixel, rtol=1e-12)
-        np.testing.assert_allclose(camera.principal_point, (321.5, 578.5), atol=1e-9)
+        np.testing.assert_allclose(camera.pixels.focal, c / pixel, rtol=1e-12)
+        np.testing.assert_allclose(camera.pixels.point, (321.5, 578.5), atol=1e-9)
 
 
 def test_the_default_principal_point_is_the_middle() -> None:

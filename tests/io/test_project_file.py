@@ -12,14 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from photoplan.errors import HeightSystemError, InputError, UsageError
-from photoplan.io.camera.model import (
-    BrownLens,
-    FilmCamera,
-    FrameEntry,
-    OpenCVFisheyeLens,
-    OpenCVLens,
-    RadialTableLens,
-)
+from photoplan.io.camera.film import FilmEntry
+from photoplan.io.camera.frame import FrameEntry
+from photoplan.io.camera.model import BrownLens, OpenCVFisheyeLens, OpenCVLens, RadialTableLens
 from photoplan.io.names import safe_stem
 from photoplan.io.project.file import load_project, parse_project, project_schema, write_project
 from photoplan.io.project.model import Image, Orientation, OrthoDefaults, Project, Terrain
@@ -27,7 +22,7 @@ from photoplan.io.project.model import Image, Orientation, OrthoDefaults, Projec
 MARKS = {"1": (105.999, -106.016), "2": (-106.012, -106.006), "3": (-105.997, 105.993), "4": (106.007, 105.993)}
 SCAN = {"1": (68.0, 131.5), "2": (62.0, 2248.0), "3": (2182.0, 2253.0), "4": (2189.0, 141.0)}
 DRONE = FrameEntry(size=(2000, 1125), focal_px=(1435.5077, 1432.9259), lens=OpenCVLens(type="opencv", k1=0.0136))
-FILM = FilmCamera(type="film", camera_constant_mm=153.24, fiducials_mm=MARKS, size=(2300, 2300))
+FILM = FilmEntry(type="film", camera_constant_mm=153.24, fiducials_mm=MARKS, size=(2300, 2300))
 
 
 def project(folder: Path, **changes: Any) -> Project:
@@ -269,4 +264,4 @@ def test_radial_tables_are_complete(table: dict[str, Any], says: str) -> None:
 
 def test_fiducials_of_one_place_are_refused() -> None:
     with pytest.raises(ValueError, match="1, 2 have the same coordinates"):
-        FilmCamera(type="film", camera_constant_mm=150.0, fiducials_mm={**MARKS, "2": MARKS["1"]})
+        FilmEntry(type="film", camera_constant_mm=150.0, fiducials_mm={**MARKS, "2": MARKS["1"]})

@@ -9,7 +9,7 @@ from tools.orientation_blocks import ANGLES, CAMERA, CENTERS, GROUND, NAMES, blo
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles
-from photoplan.io.camera.model import FilmCamera
+from photoplan.io.camera.film import FilmEntry
 from photoplan.io.orientation.file import FORMATS, orientation_format, read_orientation_block, write_orientation
 from photoplan.io.orientation.table import TableFormat
 from photoplan.orientation.readings import Reading
@@ -226,7 +226,7 @@ def test_fault_14_readings_of_matrices(tmp_path, toml, measured):
 def test_readings_of_film_scans_use_their_marks(tmp_path):
     """Three scans of different position and turn; the one whose marks are not measured is left out and named."""
     marks = {"a": (-106.0, -106.0), "b": (106.0, -106.0), "c": (106.0, 106.0), "d": (-106.0, 106.0)}
-    camera = FilmCamera(
+    camera = FilmEntry(
         type="film", camera_constant_mm=153.1, fiducials_mm=marks, principal_point_mm=(0.01, -0.02), size=(9600, 9600)
     )
     made = block(camera)

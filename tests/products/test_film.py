@@ -27,8 +27,8 @@ def digital(block: Path, tmp_path_factory: pytest.TempPathFactory) -> Project:
 def as_film(project: Project, marks: dict[str, tuple[float, float]], interior: str = "affine") -> Project:
     """The same image described as the scan of a film with pixels of about 10 µm and four fiducial marks."""
     camera = project.cameras[CAMERA]
-    fx, fy = camera.focal  # type: ignore[union-attr]
-    col, row = camera.principal_point  # type: ignore[union-attr]
+    fx, fy = camera.pixels.focal  # type: ignore[union-attr]
+    col, row = camera.pixels.point  # type: ignore[union-attr]
     data = project.model_dump(mode="json", exclude_none=True)
     data["cameras"][CAMERA] = {
         "type": "film",

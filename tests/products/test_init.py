@@ -19,7 +19,8 @@ from photoplan.cli.init import command
 from photoplan.errors import HeightSystemError, InputError, PhotoplanError, UsageError
 from photoplan.geometry.crs import crs_step
 from photoplan.geometry.rotation import rotation_opk
-from photoplan.io.camera.model import FilmCamera, FrameEntry
+from photoplan.io.camera.film import FilmEntry
+from photoplan.io.camera.frame import FrameEntry
 from photoplan.io.orientation.table import TableFormat
 from photoplan.io.project.file import load_project
 from photoplan.products.init.run import InitRequest, init_project, make_project
@@ -288,7 +289,7 @@ def test_film_takes_the_size_of_its_scans(files: dict[str, Any], tmp_path: Path)
     one.write_text(toml)
     made = init_project(InitRequest(**{**files, "camera": one, "orientation": one}))
     assert load_project(made.path) == made.project
-    assert isinstance(made.project.cameras["RC30"], FilmCamera)
+    assert isinstance(made.project.cameras["RC30"], FilmEntry)
     assert [i.size for i in made.project.images] == [(40, 30), (40, 30)]
     assert made.project.images[0].fiducials == {"1": (39, 29), "2": (0, 29), "3": (0, 0), "4": (39, 0)}
 
@@ -315,7 +316,7 @@ def test_opensfm_goes_into_the_terrains_crs_at_the_images_resolution(files: dict
     assert project.crs == "EPSG:32632"
     made = project.cameras["c"]
     assert isinstance(made, FrameEntry)
-    assert (made.size, made.focal, made.principal_point) == ((40, 30), (50.0, 50.0), (19.5, 14.5))
+    assert (made.size, made.pixels.focal, made.pixels.point) == ((40, 30), (50.0, 50.0), (19.5, 14.5))
     a, b = project.images
     np.testing.assert_allclose(a.center, (x, y, 500.0), atol=1e-6)
     np.testing.assert_allclose(a.angles, 0, atol=1e-9)  # on the central meridian

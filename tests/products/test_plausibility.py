@@ -11,7 +11,7 @@ import pytest
 
 from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles, rotation_opk
 from photoplan.io.camera.file import read_cameras
-from photoplan.io.camera.model import FrameEntry
+from photoplan.io.camera.frame import FrameEntry
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.project.model import Image, Orientation
 from photoplan.io.terrain.reader import TerrainReader

@@ -13,8 +13,8 @@ from photoplan.cameras.base import Camera, project
 from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.frame import FrameCamera
 from photoplan.geometry.pose import Pose
-from photoplan.io.camera import model as described
-from photoplan.io.camera.model import BrownLens, OpenCVFisheyeLens, OpenCVLens
+from photoplan.io.camera.frame import FrameEntry
+from photoplan.io.camera.model import BrownLens, IdealLens, OpenCVFisheyeLens, OpenCVLens
 from photoplan.io.orientation.block import OrientationBlock
 from photoplan.io.orientation.file import read_orientation_block, write_orientation
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
@@ -22,7 +22,7 @@ from photoplan.io.project.cameras import interior_of, lens_of
 from photoplan.io.project.model import Image
 
 LENSES: dict[str, Any] = {
-    "none": described.IdealLens(),
+    "none": IdealLens(),
     "brown": BrownLens(type="brown", k1=-0.05, k2=0.01, k3=-0.002, p1=3e-4, p2=-2e-4),
     "brown with shear": BrownLens(type="brown", k1=-0.05, k2=0.01, p1=3e-4, p2=-2e-4, b1=4e-4, b2=-3e-4, k4=1e-3),
     "brown with affinity": BrownLens(type="brown", k1=-0.05, k2=0.01, p1=3e-4, p2=-2e-4, b1=4e-4),
@@ -32,18 +32,18 @@ LENSES: dict[str, Any] = {
 }
 
 
-def frame(lens: str = "none", **more: Any) -> described.FrameEntry:
+def frame(lens: str = "none", **more: Any) -> FrameEntry:
     """A camera of 4000 × 3000 px that lies about its middle."""
     values: dict[str, Any] = {
         "size": (4000, 3000),
         "focal_px": (3100.0, 3102.5),
         "principal_point_px": (2010.25, 1480.5),
     }
-    return described.FrameEntry(**(values | {"lens": LENSES[lens]} | more))
+    return FrameEntry(**(values | {"lens": LENSES[lens]} | more))
 
 
 def block_of(
-    cameras: Mapping[str, described.FrameEntry],
+    cameras: Mapping[str, FrameEntry],
     n: int = 5,
     middle: Any = (500_000.0, 5_400_000.0, 900.0),
     **table: Any,

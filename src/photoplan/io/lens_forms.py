@@ -13,9 +13,9 @@ from photoplan.cameras.lenses.fisheye import Fisheye
 from photoplan.cameras.lenses.none import NoLens
 from photoplan.cameras.lenses.opencv import OpenCV
 from photoplan.errors import InputError
-from photoplan.io.camera.model import FilmCamera, FrameEntry
+from photoplan.io.camera.frame import frame_in_pixels
+from photoplan.io.camera.model import CameraEntry, InPixels
 from photoplan.io.orientation.block import Loss, OrientationBlock
-from photoplan.io.plain_files import build
 from photoplan.io.project.cameras import lens_of
 
 
@@ -39,11 +39,11 @@ class OpenCVForm:
         return not self.fisheye and any(self.k[3:])
 
 
-def opencv_form(camera: FrameEntry | FilmCamera) -> OpenCVForm | None:
+def opencv_form(camera: CameraEntry) -> OpenCVForm | None:
     """OpenCV's form of a camera; None for film, and for lenses that OpenCV does not have."""
-    if not isinstance(camera, FrameEntry):
+    if camera.pixels is None:
         return None
-    (fx, fy), lens = camera.focal, lens_of(camera)
+    (fx, fy), lens = camera.pixels.focal, lens_of(camera)
     k: tuple[float, ...] = (0.0,) * 6
     p, fisheye = (0.0, 0.0), False
     if isinstance(lens, OpenCV):
@@ -56,7 +56,7 @@ def opencv_form(camera: FrameEntry | FilmCamera) -> OpenCVForm | None:
         fx *= 1.0 + lens.b1
     elif not isinstance(lens, NoLens):
         return None
-    return OpenCVForm(camera.size, (fx, fy), camera.principal_point, fisheye, k, p)
+    return OpenCVForm(camera.pixels.size, (fx, fy), camera.pixels.point, fisheye, k, p)
 
 
 def opencv_losses(block: OrientationBlock, *, rational: bool = True, fisheye: bool = True) -> list[Loss]:
@@ -70,7 +70,7 @@ def opencv_losses(block: OrientationBlock, *, rational: bool = True, fisheye: bo
     """
     lost = []
     for name, camera in block.cameras.items():
-        if isinstance(camera, FilmCamera):
+        if camera.pixels is None:
             lost.append(Loss("camera", f"no camera {name!r}: film has no pixels of its own"))
             continue
         form = opencv_form(camera)
@@ -98,11 +98,11 @@ class AgisoftForm:
     fisheye: bool = False
 
 
-def agisoft_form(camera: FrameEntry | FilmCamera) -> AgisoftForm | None:
+def agisoft_form(camera: CameraEntry) -> AgisoftForm | None:
     """Agisoft's form of a camera; None for film, and for lenses that it does not have."""
-    if not isinstance(camera, FrameEntry):
+    if camera.pixels is None:
         return None
-    (fx, fy), lens = camera.focal, lens_of(camera)
+    (fx, fy), lens = camera.pixels.focal, lens_of(camera)
     k, p, b, fisheye = (0.0, 0.0, 0.0, 0.0), (0.0, 0.0), (0.0, 0.0), False
     if isinstance(lens, OpenCV) and not (lens.k4 or lens.k5 or lens.k6):
         k, p = (lens.k1, lens.k2, lens.k3, 0.0), (lens.p2, lens.p1)
@@ -114,12 +114,12 @@ def agisoft_form(camera: FrameEntry | FilmCamera) -> AgisoftForm | None:
         return None
     # x fx (1 + b1) = x (f + B1) with f = fy: square pixels of the height, and their affinity.
     in_pixels = fx * (1.0 + b[0]) - fy if b[0] or fx != fy else 0.0, fx * b[1]
-    col, row = camera.principal_point
-    offset = col - (camera.size[0] - 1) / 2, row - (camera.size[1] - 1) / 2
-    return AgisoftForm(camera.size, fy, offset, k, p, in_pixels, fisheye)
+    (col, row), size = camera.pixels.point, camera.pixels.size
+    offset = col - (size[0] - 1) / 2, row - (size[1] - 1) / 2
+    return AgisoftForm(size, fy, offset, k, p, in_pixels, fisheye)
 
 
-def frame_camera(form: OpenCVForm | AgisoftForm, where: str) -> FrameEntry:
+def frame_camera(form: OpenCVForm | AgisoftForm, where: str) -> CameraEntry:
     """The description of a camera in one of the two forms; `where` begins messages.
 
     Raises
@@ -138,13 +138,7 @@ def frame_camera(form: OpenCVForm | AgisoftForm, where: str) -> FrameEntry:
         lens, (fx, fy) = _agisoft_lens(form, where)
     if lens["type"] != "opencv_fisheye" and not any(v for key, v in lens.items() if key[0] in "kpb"):
         lens = {"type": "none"}
-    values = {
-        "size": form.size,
-        "focal_px": fx if fx == fy else (fx, fy),
-        "principal_point_px": point,
-        "lens": lens,
-    }
-    return build(FrameEntry, values, where)
+    return frame_in_pixels(InPixels(form.size, (fx, fy), point), lens, where)
 
 
 def _agisoft_lens(form: AgisoftForm, where: str) -> tuple[dict[str, Any], tuple[float, float]]:

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from photoplan.cameras.affine_facts import AffineFacts, Shrinkage, affine_facts, film_shrinkage, residuals_on_film
 from photoplan.cameras.fiducials_fit import MODELS, FiducialFit
 from photoplan.errors import GeometryError, InputError, UsageError
-from photoplan.io.camera.model import FilmCamera
 from photoplan.io.project.cameras import fiducial_fit
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
@@ -168,7 +167,7 @@ def interior_orientations(request: InteriorRequest) -> InteriorResult:
 
 def _scans(project: Project, request: InteriorRequest) -> list[Image]:
     chosen = [project.image(name) for name in project.select(request.images)]
-    scans = [image for image in chosen if isinstance(project.cameras[image.camera], FilmCamera)]
+    scans = [image for image in chosen if project.cameras[image.camera].fiducial_system]
     if not scans:
         raise InputError(
             f'{request.project}: none of {len(chosen)} images is the scan of a film (camera with type = "film"); '
@@ -179,16 +178,15 @@ def _scans(project: Project, request: InteriorRequest) -> list[Image]:
 
 def _interior(project: Project, image: Image, model: str | None, pitch: tuple[float, float] | None) -> ImageInterior:
     camera = project.cameras[image.camera]
-    assert isinstance(camera, FilmCamera)
-    if model is not None:
-        if len(camera.fiducials_mm) < MODELS[model]:
-            raise GeometryError(
-                f"image {image.name!r}: camera {image.camera!r} has {len(camera.fiducials_mm)} fiducial marks; "
-                f"{model} needs {MODELS[model]}"
-            )
-        camera = camera.model_copy(update={"interior": model})
-    fit = fiducial_fit(camera, image)
-    plane = np.array([camera.fiducials_mm[name] for name in fit.names])
+    assert camera.fiducial_system is not None
+    places = camera.fiducial_system.places_mm
+    if model is not None and len(places) < MODELS[model]:
+        raise GeometryError(
+            f"image {image.name!r}: camera {image.camera!r} has {len(places)} fiducial marks; "
+            f"{model} needs {MODELS[model]}"
+        )
+    fit = fiducial_fit(camera, image, model)
+    plane = np.array([places[name] for name in fit.names])
     on_film = 1000 * residuals_on_film(fit.transformation, plane, fit.residuals)
     facts = affine_facts(fit.transformation)
     plain = ImageInterior(

@@ -12,7 +12,7 @@ from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io import mark_model as described
-from photoplan.io.camera.model import FilmCamera
+from photoplan.io.camera.model import FiducialSystem
 from photoplan.io.names import resolve_input
 from photoplan.io.raster import RasterReader
 from photoplan.io.scan_pitch import read_pitch
@@ -101,13 +101,13 @@ _LARGEST = 4096
 """Side of an example in pixels beyond which it must be a whole scan."""
 
 
-def mark_patterns(camera: FilmCamera, folder: Path) -> dict[str, MarkPattern | MarkExample]:
+def mark_patterns(system: FiducialSystem, folder: Path) -> dict[str, MarkPattern | MarkExample]:
     """What each of a camera's fiducial marks looks like, by name.
 
     Parameters
     ----------
-    camera : FilmCamera
-        Description of the camera.
+    system : FiducialSystem
+        Marks of the camera.
     folder : Path
         Where relative names of examples start.
 
@@ -116,13 +116,13 @@ def mark_patterns(camera: FilmCamera, folder: Path) -> dict[str, MarkPattern | M
     InputError
         Nothing is described, a mark is not, or a description is not possible; the mark is named.
     """
-    marks = camera.marks
+    marks = system.looks
     if marks is None:
         raise InputError(
             "what the camera's fiducial marks look like is not described; add `marks`, such as "
             '`marks = { type = "cross", arm = 1.0, width = 0.1 }`'
         )
-    names = list(camera.fiducials_mm)
+    names = list(system.places_mm)
     if not isinstance(marks, described.EachMark):
         one = mark_pattern(marks, folder)
         return dict.fromkeys(names, one)

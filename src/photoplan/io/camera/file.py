@@ -13,7 +13,7 @@ from photoplan.io.camera import opensfm as camera_opensfm
 from photoplan.io.camera import pix4d as camera_pix4d
 from photoplan.io.camera import toml as camera_toml
 from photoplan.io.camera import yaml as camera_yaml
-from photoplan.io.camera.model import FilmCamera, FrameEntry
+from photoplan.io.camera.model import CameraEntry
 from photoplan.io.orientation import colmap as orientation_colmap
 from photoplan.io.orientation import metashape as orientation_metashape
 from photoplan.io.orientation import pix4d as orientation_pix4d
@@ -21,7 +21,7 @@ from photoplan.io.orientation.table import TableFormat
 from photoplan.io.plain_files import read_head
 
 
-def _text(path: Path) -> dict[str, FrameEntry | FilmCamera]:
+def _text(path: Path) -> dict[str, CameraEntry]:
     """Cameras of one of the formats whose files end in ``.txt``."""
     head = read_head(path)
     if head.lstrip().lower().startswith("filename imagewidth"):
@@ -34,16 +34,16 @@ def _text(path: Path) -> dict[str, FrameEntry | FilmCamera]:
     )
 
 
-def _yaml(path: Path) -> dict[str, FrameEntry | FilmCamera]:
+def _yaml(path: Path) -> dict[str, CameraEntry]:
     return camera_opencv.read(path) if camera_opencv.is_opencv(path) else camera_yaml.read(path)
 
 
-def _json(path: Path) -> dict[str, FrameEntry | FilmCamera]:
+def _json(path: Path) -> dict[str, CameraEntry]:
     return camera_opencv.read(path) if camera_opencv.is_opencv(path) else camera_opensfm.read(path)
 
 
 #: Reader of every format, by file suffix.
-CAMERA_FORMATS: dict[str, Callable[[Path], dict[str, FrameEntry | FilmCamera]]] = {
+CAMERA_FORMATS: dict[str, Callable[[Path], dict[str, CameraEntry]]] = {
     ".toml": camera_toml.read,
     ".yaml": _yaml,
     ".yml": _yaml,
@@ -59,7 +59,7 @@ class CameraFile:
     """Cameras of a file."""
 
     file: Path
-    cameras: dict[str, FrameEntry | FilmCamera]
+    cameras: dict[str, CameraEntry]
     """Descriptions by name."""
     normalised: bool
     """Whether the format relates everything to the image's size, so that a camera fits its images at any resolution."""

@@ -1,28 +1,37 @@
-"""Descriptions of cameras and lenses, as checked and frozen values.
+"""Descriptions of lenses, and what is common to those of cameras, as checked and frozen values.
 
-`photoplan.io.project.cameras` turns them into the interior orientation and lens that compute.
+Each knows the lens or the interior orientation that computes.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
-    Discriminator,
     Field,
     Strict,
-    Tag,
     field_validator,
     model_validator,
 )
 
-from photoplan.cameras.fiducials_fit import MODELS
+from photoplan.cameras.fiducials_fit import FiducialFit, fit_marks
+from photoplan.cameras.interior import Interior
+from photoplan.cameras.lenses.base import Lens
+from photoplan.cameras.lenses.brown import Brown
+from photoplan.cameras.lenses.fisheye import Fisheye
+from photoplan.cameras.lenses.none import NoLens
+from photoplan.cameras.lenses.opencv import OpenCV
+from photoplan.cameras.lenses.radial_table import RadialTable
+from photoplan.cameras.lenses.reversed import Reversed
 from photoplan.errors import InputError
-from photoplan.io.mark_model import EachMark, Marks
+from photoplan.io.mark_model import Marks
 from photoplan.io.names import check_input_name
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
@@ -40,13 +49,32 @@ class Entry(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class IdealLens(Entry):
+class LensEntry(Entry, ABC):
+    """A lens, of whatever kind."""
+
+    type: str
+
+    @property
+    def needs(self) -> Literal["mm", "px"] | None:
+        """Unit in which the camera must be stated for the coefficients to have a meaning; None: they are ratios."""
+        return None
+
+    @abstractmethod
+    def made(self, camera: CameraEntry) -> Lens:
+        """The lens that computes; raises InputError where the coefficients cannot be a lens's."""
+
+
+class IdealLens(LensEntry):
     """A lens without distortion."""
 
     type: Literal["none"] = "none"
 
+    def made(self, camera: CameraEntry) -> Lens:
+        """No distortion."""
+        return NoLens()
 
-class BrownLens(Entry):
+
+class BrownLens(LensEntry):
     """Brown's lens: radial k1–k4, decentring p1–p2, affinity b1 and shear b2."""
 
     type: Literal["brown"]
@@ -65,8 +93,27 @@ class BrownLens(Entry):
     b2: Number = 0.0
     k4: Number = 0.0
 
+    @property
+    def needs(self) -> Literal["mm", "px"] | None:
+        """Its unit, unless that is the tangent."""
+        return None if self.unit == "tangent" else self.unit
 
-class OpenCVLens(Entry):
+    def made(self, camera: CameraEntry) -> Lens:
+        """Brown's lens; reversed where the coefficients correct."""
+        c = 1.0
+        if self.unit == "mm":
+            c = camera.constant_mm
+        elif camera.pixels is not None and self.unit == "px":
+            c = camera.pixels.focal[0]
+        k, p, b = (self.k1, self.k2, self.k3, self.k4), (self.p1, self.p2), (self.b1, self.b2)
+        made = Brown.from_image_units(c, k=k, p=p, b=b)
+        if self.y_axis == "down":
+            k = (made.k1, made.k2, made.k3, made.k4)
+            made = Brown.from_y_down(k=k, p=(made.p1, made.p2), b=(made.b1, made.b2))
+        return Reversed(made) if self.meaning == "correction" else made
+
+
+class OpenCVLens(LensEntry):
     """OpenCV's lens with eight coefficients: rational radial k1–k6 and tangential p1–p2."""
 
     type: Literal["opencv"]
@@ -79,8 +126,12 @@ class OpenCVLens(Entry):
     k5: Number = 0.0
     k6: Number = 0.0
 
+    def made(self, camera: CameraEntry) -> Lens:
+        """OpenCV's lens."""
+        return OpenCV(**self.model_dump(exclude={"type"}))
 
-class OpenCVFisheyeLens(Entry):
+
+class OpenCVFisheyeLens(LensEntry):
     """OpenCV's fisheye lens: a polynomial k1–k4 of the angle of incidence."""
 
     type: Literal["opencv_fisheye"]
@@ -89,8 +140,12 @@ class OpenCVFisheyeLens(Entry):
     k3: Number = 0.0
     k4: Number = 0.0
 
+    def made(self, camera: CameraEntry) -> Lens:
+        """OpenCV's fisheye."""
+        return Fisheye(self.k1, self.k2, self.k3, self.k4)
 
-class RadialTableLens(Entry):
+
+class RadialTableLens(LensEntry):
     """Radial distortion of a calibration report: micrometres at field angles (degrees) or at radii (millimetres)."""
 
     type: Literal["radial_table"]
@@ -114,12 +169,22 @@ class RadialTableLens(Entry):
             raise ValueError(f"field angle {at[-1]}°; a radial table ends below 90°")
         return self
 
+    @property
+    def needs(self) -> Literal["mm", "px"] | None:
+        """Millimetres."""
+        return "mm"
 
-Lens = Annotated[IdealLens | BrownLens | OpenCVLens | OpenCVFisheyeLens | RadialTableLens, Field(discriminator="type")]
+    def made(self, camera: CameraEntry) -> Lens:
+        """The table, divided by the camera constant."""
+        if self.angles_deg is not None:
+            return RadialTable.from_angles(self.angles_deg, self.distortion_um, camera.constant_mm)
+        return RadialTable.from_radii(self.radii_mm or (), self.distortion_um, camera.constant_mm)
 
 
-def _in_mm(lens: Lens) -> bool:
-    return lens.type == "radial_table" or (lens.type == "brown" and lens.unit == "mm")
+#: The registry of lenses.
+AnyLens = Annotated[
+    IdealLens | BrownLens | OpenCVLens | OpenCVFisheyeLens | RadialTableLens, Field(discriminator="type")
+]
 
 
 class Restoration(Entry):
@@ -153,127 +218,98 @@ def _restoration(value: Any) -> Any:
 Restore = Annotated[Restoration, BeforeValidator(_restoration)]
 
 
-class FrameEntry(Entry):
-    """A digital frame camera: by its focal length in pixels, or by camera constant and pixel or sensor size."""
+@dataclass(frozen=True)
+class InPixels:
+    """A camera in pixels."""
 
-    type: Literal["frame"] = "frame"
-    size: tuple[Pixels, Pixels]
-    """Width and height in pixels."""
-    focal_px: Positive | tuple[Positive, Positive] | None = None
-    """Camera constant in pixels; two numbers where pixels are not square (x, y)."""
-    camera_constant_mm: Positive | None = None
-    pixel_size_um: Positive | tuple[Positive, Positive] | None = None
-    sensor_size_mm: tuple[Positive, Positive] | None = None
-    principal_point_px: Pair | None = None
-    """Column and row of the principal point, (0, 0) the centre of the upper-left pixel; default the image's middle."""
-    principal_point_mm: Pair | None = None
-    """The same as x0 to the right and y0 upwards from the image's middle, millimetres."""
-    lens: Lens = IdealLens()
+    size: tuple[int, int]
+    focal: tuple[float, float]
+    """Camera constant in x and y."""
+    point: tuple[float, float]
+    """Column and row of the principal point, (0, 0) the centre of the upper-left pixel."""
+
+
+@dataclass(frozen=True)
+class FiducialSystem:
+    """The fiducial marks of a camera whose images are scans."""
+
+    places_mm: Fiducials
+    """Calibrated marks by name, x right and y upwards."""
+    model: str
+    """Transformation from them to a scan: one of `photoplan.cameras.fiducials_fit.MODELS`."""
+    mirrored: bool
+    """Whether the film was scanned through its back."""
+    looks: Marks | None
+    """What they look like; None: not described."""
+
+    def fit(self, measured: Fiducials | None, model: str | None = None) -> FiducialFit:
+        """Adjustment of the marks of a scan, with residuals and sigma0; `model` in place of the camera's.
+
+        Raises
+        ------
+        InputError
+            Marks are missing, exchanged, far off or mirrored.
+        GeometryError
+            The marks lie on a line.
+        """
+        if not measured:
+            raise InputError("the fiducial marks of its scan are not measured; `photoplan fiducials` finds them")
+        return fit_marks(model or self.model, self.places_mm, measured, mirrored=self.mirrored)
+
+
+class CameraEntry(Entry, ABC):
+    """A camera, of whatever kind: those that there are stand in `photoplan.io.camera.kinds`."""
+
+    type: str
+    size: tuple[Pixels, Pixels] | None
+    camera_constant_mm: Positive | None
+    principal_point_mm: Pair | None
+    lens: AnyLens = IdealLens()
     restore: Restore | None = None
     """Filter that its images are restored with, where they state no other."""
 
-    @model_validator(mode="after")
-    def _one_way(self) -> Self:
-        if (self.focal_px is None) == (self.camera_constant_mm is None):
-            raise ValueError("give either focal_px or camera_constant_mm")
-        sizes = (self.pixel_size_um is not None) + (self.sensor_size_mm is not None)
-        if self.camera_constant_mm is not None and sizes != 1:
-            raise ValueError("camera_constant_mm needs either pixel_size_um or sensor_size_mm")
-        if self.focal_px is not None and sizes:
-            raise ValueError("focal_px stands alone: leave out pixel_size_um and sensor_size_mm")
-        if self.principal_point_mm is not None and self.focal_px is not None:
-            raise ValueError("principal_point_mm goes with camera_constant_mm; with focal_px give principal_point_px")
-        if self.principal_point_mm is not None and self.principal_point_px is not None:
-            raise ValueError("give either principal_point_px or principal_point_mm")
-        if self.camera_constant_mm is None and _in_mm(self.lens):
-            raise ValueError("a radial table and a lens in unit mm need camera_constant_mm instead of focal_px")
-        return self
+    comments: ClassVar[Mapping[str, str]]
+    """Entries in the order in which they are written, each with its comment; lens and filter follow."""
 
     @property
-    def focal(self) -> tuple[float, float]:
-        """Camera constant in pixels, in x and in y."""
-        if self.focal_px is not None:
-            return self.focal_px if isinstance(self.focal_px, tuple) else (self.focal_px, self.focal_px)
-        assert self.camera_constant_mm is not None
-        px, py = self.pixel_mm
-        return self.camera_constant_mm / px, self.camera_constant_mm / py
+    @abstractmethod
+    def pixels(self) -> InPixels | None:
+        """The camera in pixels; None where each image has its own."""
 
     @property
-    def pixel_mm(self) -> tuple[float, float]:
-        """Side lengths of a pixel in millimetres; InputError where the camera is described in pixels alone."""
-        if self.sensor_size_mm is not None:
-            return self.sensor_size_mm[0] / self.size[0], self.sensor_size_mm[1] / self.size[1]
-        if self.pixel_size_um is None:
-            raise InputError("the camera is described in pixels; its pixel size is not known")
-        pair = self.pixel_size_um if isinstance(self.pixel_size_um, tuple) else (self.pixel_size_um,) * 2
-        return pair[0] / 1000, pair[1] / 1000
+    @abstractmethod
+    def states_pixels(self) -> bool:
+        """Whether its interior orientation is computed in pixels; else in millimetres."""
 
     @property
-    def principal_point(self) -> tuple[float, float]:
-        """Column and row of the principal point in pixels."""
-        if self.principal_point_px is not None:
-            return self.principal_point_px
-        col, row = (self.size[0] - 1) / 2, (self.size[1] - 1) / 2
-        if self.principal_point_mm is None:
-            return col, row
-        px, py = self.pixel_mm
-        return col + self.principal_point_mm[0] / px, row - self.principal_point_mm[1] / py
+    @abstractmethod
+    def fiducial_system(self) -> FiducialSystem | None:
+        """The marks that place an image; None: it needs none."""
 
+    @abstractmethod
+    def interior_orientation(self, size: tuple[int, int], fiducials: Fiducials | None) -> Interior:
+        """Interior orientation of an image of `size` with these measured marks.
 
-def _all_described(fiducials: Fiducials, marks: EachMark) -> None:
-    described = set(marks.__pydantic_extra__)
-    unknown, bare = sorted(described - set(fiducials)), sorted(set(fiducials) - described)
-    if unknown:
-        raise ValueError(f"marks describes {', '.join(unknown)}; fiducials_mm has {', '.join(fiducials)}")
-    if bare:
-        raise ValueError(f"marks does not describe fiducial mark {', '.join(bare)}")
+        Raises
+        ------
+        InputError, GeometryError
+            The marks of a scan are not measured, or cannot be right.
+        """
 
+    @abstractmethod
+    def check_fiducials(self, fiducials: Fiducials, sized: bool, name: str) -> None:
+        """Refuse measured marks that an image of this camera, called `name`, cannot have, with ValueError.
 
-class FilmCamera(Entry):
-    """A film camera whose photographs were scanned; each image states where its fiducial marks are in the scan."""
+        `sized` tells whether the size of the scan is stated.
+        """
 
-    type: Literal["film"]
-    camera_constant_mm: Positive
-    fiducials_mm: Fiducials
-    """Calibrated fiducial marks: name = [x, y], x right and y upwards, millimetres."""
-    principal_point_mm: Pair = (0.0, 0.0)
-    """Principal point of the calibration report in the system of the fiducial marks."""
-    interior: Literal["similarity", "affine", "bilinear"] = "affine"
-    mirrored: Annotated[bool, Strict()] = False
-    """Whether the film was scanned through its back, so that left and right are exchanged."""
-    size: tuple[Pixels, Pixels] | None = None
-    """Width and height of the scans in pixels, where all are equal."""
-    marks: Marks | None = None
-    """What the fiducial marks look like: one description for all, or one for each by name."""
-    lens: Lens = IdealLens()
-    restore: Restore | None = None
-    """Filter that its scans are restored with, where they state no other."""
+    def places(self, fiducials: Fiducials | None) -> bool:
+        """Whether the interior orientation of an image with these measured marks is known."""
+        return bool(fiducials) or self.fiducial_system is None
 
-    @field_validator("fiducials_mm")
-    @classmethod
-    def _marks(cls, marks: dict[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
-        if len(set(marks.values())) != len(marks):
-            twice = sorted(n for n, at in marks.items() if list(marks.values()).count(at) > 1)
-            raise ValueError(f"fiducial marks {', '.join(twice)} have the same coordinates")
-        return marks
-
-    @model_validator(mode="after")
-    def _enough(self) -> Self:
-        if self.lens.type == "brown" and self.lens.unit == "px":
-            raise ValueError("unit px has no meaning for the lens of a film camera; allowed are tangent and mm")
-        if isinstance(self.marks, EachMark):
-            _all_described(self.fiducials_mm, self.marks)
-        needed = MODELS[self.interior]
-        if len(self.fiducials_mm) < needed:
-            raise ValueError(f"{len(self.fiducials_mm)} fiducial marks; {self.interior} needs at least {needed}")
-        return self
-
-
-def _camera_type(value: Any) -> str:
-    found = value.get("type", "frame") if isinstance(value, dict) else getattr(value, "type", "frame")
-    return found if isinstance(found, str) else repr(found)
-
-
-Camera = Annotated[
-    Annotated[FrameEntry, Tag("frame")] | Annotated[FilmCamera, Tag("film")], Discriminator(_camera_type)
-]
+    @property
+    def constant_mm(self) -> float:
+        """Camera constant in millimetres; raises InputError where it is not stated so."""
+        if self.camera_constant_mm is None:
+            raise InputError("the lens is described in millimetres; give camera_constant_mm")
+        return self.camera_constant_mm

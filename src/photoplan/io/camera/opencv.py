@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from photoplan.errors import InputError
-from photoplan.io.camera.model import FilmCamera, FrameEntry
+from photoplan.io.camera.model import CameraEntry
 from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
 from photoplan.io.names import unique_stems
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat
@@ -35,7 +35,7 @@ def is_opencv(path: Path) -> bool:
     return re.search(r"camera_?matrix", read_head(path), re.I) is not None
 
 
-def read(path: Path) -> dict[str, FrameEntry | FilmCamera]:
+def read(path: Path) -> dict[str, CameraEntry]:
     """The camera of a calibration file; it has the name that the file states, or the file's own.
 
     Raises
@@ -116,7 +116,7 @@ def _coefficients(d: tuple[float, ...], fisheye: bool, where: str) -> tuple[tupl
     return (k1, k2, k3, k4, k5, k6), (p1, p2)
 
 
-def render(camera: FrameEntry | FilmCamera, path: Path, name: str) -> dict[Path, str]:
+def render(camera: CameraEntry, path: Path, name: str) -> dict[Path, str]:
     """Text of a calibration file: JSON if the path says so, else YAML, both as OpenCV's `FileStorage` reads them.
 
     Raises

@@ -14,8 +14,9 @@ from typing import Any
 
 from photoplan.errors import InputError
 from photoplan.io.appearance import looks_like
-from photoplan.io.camera.model import FilmCamera, FrameEntry
-from photoplan.io.plain_files import build, finite, read_json
+from photoplan.io.camera.frame import frame_in_pixels
+from photoplan.io.camera.model import CameraEntry, InPixels
+from photoplan.io.plain_files import finite, read_json
 
 _COEFFICIENTS = {
     "perspective": ("k1", "k2"),
@@ -27,7 +28,7 @@ _COEFFICIENTS = {
 }
 
 
-def read(path: Path) -> dict[str, FrameEntry | FilmCamera]:
+def read(path: Path) -> dict[str, CameraEntry]:
     """Cameras of a JSON file by name; sizes are those that the file states.
 
     Raises
@@ -41,7 +42,7 @@ def read(path: Path) -> dict[str, FrameEntry | FilmCamera]:
     return cameras_of(contents, path)
 
 
-def cameras_of(reconstructions: Any, path: Path) -> dict[str, FrameEntry | FilmCamera]:
+def cameras_of(reconstructions: Any, path: Path) -> dict[str, CameraEntry]:
     """Cameras of the parsed contents of a ``reconstruction.json``."""
     if not isinstance(reconstructions, list) or not all(
         isinstance(r, dict) and isinstance(r.get("cameras"), dict) for r in reconstructions
@@ -49,7 +50,7 @@ def cameras_of(reconstructions: Any, path: Path) -> dict[str, FrameEntry | FilmC
         raise InputError(
             f"{path}: neither a reconstruction.json of OpenSfM nor a cameras.json of OpenDroneMap{looks_like(path)}"
         )
-    cameras: dict[str, FrameEntry | FilmCamera] = {}
+    cameras: dict[str, CameraEntry] = {}
     for reconstruction in reconstructions:
         for name, values in reconstruction["cameras"].items():
             camera = _camera(values, f"{path}: camera {name!r}")
@@ -62,7 +63,7 @@ def _is_camera(values: Any) -> bool:
     return isinstance(values, dict) and "projection_type" in values
 
 
-def _camera(values: Any, where: str) -> FrameEntry:
+def _camera(values: Any, where: str) -> CameraEntry:
     if not _is_camera(values):
         raise InputError(f"{where}: projection_type is missing")
     kind = values["projection_type"]
@@ -76,17 +77,10 @@ def _camera(values: Any, where: str) -> FrameEntry:
     for key in ("p1", "p2", "k3", "k4", "k5", "k6", "s0", "s1", "s2", "s3"):
         if key not in _COEFFICIENTS[kind] and _number(values, key, where) != 0:
             raise InputError(f"{where}: {key} = {values[key]} is not supported for projection_type {kind!r}")
-    lens = {k: _number(values, k, where) for k in _COEFFICIENTS[kind]}
-    plain: dict[str, Any] = {
-        "size": (w, h),
-        "focal_px": focal_x * side if focal_x == focal_y else (focal_x * side, focal_y * side),
-        "principal_point_px": (
-            (w - 1) / 2 + _number(values, "c_x", where) * side,
-            (h - 1) / 2 + _number(values, "c_y", where) * side,
-        ),
-        "lens": {"type": "opencv_fisheye" if kind.startswith("fisheye") else "opencv", **lens},
-    }
-    return build(FrameEntry, plain, where)
+    lens: dict[str, Any] = {k: _number(values, k, where) for k in _COEFFICIENTS[kind]}
+    point = (w - 1) / 2 + _number(values, "c_x", where) * side, (h - 1) / 2 + _number(values, "c_y", where) * side
+    lens = {"type": "opencv_fisheye" if kind.startswith("fisheye") else "opencv", **lens}
+    return frame_in_pixels(InPixels((w, h), (focal_x * side, focal_y * side), point), lens, where)
 
 
 def _number(values: dict[str, Any], key: str, where: str, default: float = 0.0) -> float:
@@ -94,7 +88,7 @@ def _number(values: dict[str, Any], key: str, where: str, default: float = 0.0) 
     return number
 
 
-def resized(camera: FrameEntry, size: tuple[int, int], where: str) -> FrameEntry:
+def resized(camera: CameraEntry, size: tuple[int, int], where: str) -> CameraEntry:
     """The camera for images of another resolution, as normalised coordinates define it.
 
     Raises
@@ -102,25 +96,17 @@ def resized(camera: FrameEntry, size: tuple[int, int], where: str) -> FrameEntry
     InputError
         The aspect ratio differs by more than rounding to whole pixels allows: the images are another crop.
     """
-    if size == camera.size:
+    if size == camera.size or camera.pixels is None:
         return camera
-    factor = max(size) / max(camera.size)
-    expected = tuple(s * factor for s in camera.size)
+    given = camera.pixels
+    factor = max(size) / max(given.size)
+    expected = tuple(s * factor for s in given.size)
     if max(abs(a - b) for a, b in zip(expected, size)) > max(1.0, factor):
         raise InputError(
-            f"{where}: image of {size[0]} × {size[1]} px, camera of {camera.size[0]} × {camera.size[1]} px; "
+            f"{where}: image of {size[0]} × {size[1]} px, camera of {given.size[0]} × {given.size[1]} px; "
             "another aspect ratio means another camera or crop"
         )
-    fx, fy = camera.focal
-    col, row = camera.principal_point
-    middle = [(s - 1) / 2 for s in camera.size]
-    return camera.model_copy(
-        update={
-            "size": size,
-            "focal_px": fx * factor if fx == fy else (fx * factor, fy * factor),
-            "principal_point_px": (
-                (size[0] - 1) / 2 + (col - middle[0]) * factor,
-                (size[1] - 1) / 2 + (row - middle[1]) * factor,
-            ),
-        }
-    )
+    (fx, fy), middle = given.focal, [(s - 1) / 2 for s in given.size]
+    point = tuple((s - 1) / 2 + (p - m) * factor for s, p, m in zip(size, given.point, middle))
+    focal = fx * factor if fx == fy else (fx * factor, fy * factor)
+    return camera.model_copy(update={"size": size, "focal_px": focal, "principal_point_px": point})

@@ -16,7 +16,7 @@ import re
 from pathlib import Path
 
 from photoplan.errors import InputError
-from photoplan.io.camera.model import FilmCamera, FrameEntry
+from photoplan.io.camera.model import CameraEntry
 from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form
 from photoplan.io.plain_files import finite, read_text
 
@@ -33,7 +33,7 @@ def camera_files(stem: Path) -> tuple[Path, Path]:
     return stem.with_name(f"{stem.name}_{_SUFFIX}"), stem.with_name(f"{stem.name}_{_SUFFIX.removeprefix('pix4d_')}")
 
 
-def read(path: Path) -> dict[str, FrameEntry | FilmCamera]:
+def read(path: Path) -> dict[str, CameraEntry]:
     """Cameras of a ``.cam`` file: ``camera 0``, ``camera 1`` … as the file numbers them.
 
     Raises
@@ -48,7 +48,7 @@ def read(path: Path) -> dict[str, FrameEntry | FilmCamera]:
             "PROJECT_calibrated_camera_parameters.txt"
         )
     sizes = _image_sizes(path)
-    cameras: dict[str, FrameEntry | FilmCamera] = {}
+    cameras: dict[str, CameraEntry] = {}
     for number, section in _sections(text):
         where = f"{path}: camera {number}"
         if number not in sizes:
@@ -81,7 +81,7 @@ def _image_sizes(path: Path) -> dict[str, tuple[int, int]]:
     return sizes
 
 
-def _camera(section: str, size: tuple[int, int], where: str) -> FrameEntry:
+def _camera(section: str, size: tuple[int, int], where: str) -> CameraEntry:
     v = dict.fromkeys(_KEYS, 0.0)
     for line in section.split("\n"):
         words = line.split()
@@ -107,7 +107,7 @@ def _camera(section: str, size: tuple[int, int], where: str) -> FrameEntry:
     return frame_camera(OpenCVForm(size, focal, point, False, k, (v["T1"], v["T2"])), where)
 
 
-def render(cameras: dict[str, FrameEntry | FilmCamera], stem: Path, pixel_mm: float = 0.001) -> dict[Path, str]:
+def render(cameras: dict[str, CameraEntry], stem: Path, pixel_mm: float = 0.001) -> dict[Path, str]:
     """Text of the two camera files of a project; millimetres are made with pixels of `pixel_mm`.
 
     Raises

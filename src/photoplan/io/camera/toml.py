@@ -10,15 +10,16 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from photoplan.errors import InputError
-from photoplan.io.camera.model import Camera, FilmCamera, FrameEntry
+from photoplan.io.camera.kinds import Camera
+from photoplan.io.camera.model import CameraEntry
 from photoplan.io.camera.usgs import check_report
 from photoplan.io.project.errors import explain
 from photoplan.io.toml_file import read_toml
 
-_CAMERAS: TypeAdapter[dict[str, FrameEntry | FilmCamera]] = TypeAdapter(dict[str, Camera])
+_CAMERAS = TypeAdapter(dict[str, Camera])
 
 
-def read(path: Path) -> dict[str, FrameEntry | FilmCamera]:
+def read(path: Path) -> dict[str, CameraEntry]:
     """Cameras of a TOML file by name.
 
     Raises
@@ -31,7 +32,7 @@ def read(path: Path) -> dict[str, FrameEntry | FilmCamera]:
     if not isinstance(cameras, dict) or not cameras:
         raise InputError(f"{path}: holds no [cameras.NAME] table")
     try:
-        described = _CAMERAS.validate_python(cameras)
+        described: dict[str, CameraEntry] = {**_CAMERAS.validate_python(cameras)}
     except ValidationError as error:
         raise InputError(explain(error, cameras, str(path), text, ("cameras",))) from None
     check_report(contents, described, str(path))

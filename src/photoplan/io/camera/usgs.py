@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from photoplan.errors import InputError
-from photoplan.io.camera.model import FilmCamera, FrameEntry
+from photoplan.io.camera.model import CameraEntry
 from photoplan.io.plain_files import finite
 
 #: Coordinates and distances are printed to a micrometre each; rounding makes 2 µm, and the least-squares solution that
@@ -53,7 +53,7 @@ def distance_differences(
     return found
 
 
-def check_report(contents: Mapping[str, Any], cameras: Mapping[str, FrameEntry | FilmCamera], where: str) -> None:
+def check_report(contents: Mapping[str, Any], cameras: Mapping[str, CameraEntry], where: str) -> None:
     """Compare the ``[report]`` of a TOML file, if it has one, with the camera that it is about.
 
     Raises
@@ -69,9 +69,10 @@ def check_report(contents: Mapping[str, Any], cameras: Mapping[str, FrameEntry |
         raise InputError(f"{where}: needed is distances_mm = {{ 1-2 = 311.128, … }} and, of several cameras, camera")
     name = report.get("camera", next(iter(cameras)) if len(cameras) == 1 else None)
     camera = cameras.get(name) if isinstance(name, str) else None
-    if not isinstance(camera, FilmCamera):
+    system = camera.fiducial_system if camera is not None else None
+    if system is None:
         raise InputError(f"{where}: camera = {name!r}; name one of the film cameras: {', '.join(map(repr, cameras))}")
-    differences = distance_differences(camera.fiducials_mm, report["distances_mm"], where)
+    differences = distance_differences(system.places_mm, report["distances_mm"], where)
     wrong = {pair: d for pair, d in differences.items() if abs(d) > TOLERANCE_UM}
     if wrong:
         told = ", ".join(f"{pair} by {d:+.0f} µm" for pair, d in wrong.items())

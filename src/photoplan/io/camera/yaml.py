@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from photoplan.errors import InputError
-from photoplan.io.camera.model import FilmCamera, FrameEntry
-from photoplan.io.plain_files import build, finite, read_yaml
+from photoplan.io.camera.frame import frame_in_pixels
+from photoplan.io.camera.model import CameraEntry, InPixels
+from photoplan.io.plain_files import finite, read_yaml
 
 _COEFFICIENTS = {
     "pinhole": (),
@@ -32,7 +33,7 @@ _COMMON = ("type", "im_size", "focal_len", "sensor_size", "cx", "cy")
 _UNSUPPORTED = ("s1", "s2", "s3", "s4", "tx", "ty")
 
 
-def read(path: Path) -> dict[str, FrameEntry | FilmCamera]:
+def read(path: Path) -> dict[str, CameraEntry]:
     """Cameras of a YAML file by name.
 
     Raises
@@ -49,7 +50,7 @@ def read(path: Path) -> dict[str, FrameEntry | FilmCamera]:
     return {str(name): _camera(values, f"{path}: camera {str(name)!r}") for name, values in contents.items()}
 
 
-def _camera(values: Any, where: str) -> FrameEntry:
+def _camera(values: Any, where: str) -> CameraEntry:
     if not isinstance(values, dict):
         raise InputError(f"{where}: {values!r} given; needed are `type`, `im_size` and `focal_len`")
     kind = values.get("type")
@@ -67,13 +68,9 @@ def _camera(values: Any, where: str) -> FrameEntry:
     w, h = int(size[0]), int(size[1])
     fx, fy = _focal(values, (w, h), where)
     cx, cy = (finite(values.get(k) or 0.0, f"{where}: {k}") for k in ("cx", "cy"))
-    plain: dict[str, Any] = {
-        "size": (w, h),
-        "focal_px": fx if abs(fx - fy) < 1e-9 * fx else (fx, fy),
-        "principal_point_px": ((w - 1) / 2 + cx * max(w, h), (h - 1) / 2 + cy * max(w, h)),
-        "lens": _lens(kind, values, where),
-    }
-    return build(FrameEntry, plain, where)
+    focal = (fx, fx) if abs(fx - fy) < 1e-9 * fx else (fx, fy)
+    point = (w - 1) / 2 + cx * max(w, h), (h - 1) / 2 + cy * max(w, h)
+    return frame_in_pixels(InPixels((w, h), focal, point), _lens(kind, values, where), where)
 
 
 def _focal(values: dict[str, Any], size: tuple[int, int], where: str) -> tuple[float, float]:

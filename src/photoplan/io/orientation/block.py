@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.rotation import angles_from_rotation
-from photoplan.io.camera.model import FilmCamera, FrameEntry, IdealLens
+from photoplan.io.camera.model import CameraEntry, IdealLens
 from photoplan.io.orientation.table import Direction, OrientationTable, OrientedImage, TableFormat
 from photoplan.io.project.model import ANGLE_UNITS
 
@@ -40,7 +40,7 @@ class OrientationBlock:
 
     table: OrientationTable
     """Poses and the names of the images and of their cameras."""
-    cameras: Mapping[str, FrameEntry | FilmCamera] = field(default_factory=dict)
+    cameras: Mapping[str, CameraEntry] = field(default_factory=dict)
     """Descriptions by name; empty where the file holds none. With one camera, images need not name it."""
     files: Mapping[str, str] = field(default_factory=dict)
     """Image files by image name, as stated (relative to the orientation file, or absolute); not all are known."""
@@ -80,7 +80,7 @@ class OrientationBlock:
             )
         return image.camera
 
-    def camera(self, image: OrientedImage) -> FrameEntry | FilmCamera:
+    def camera(self, image: OrientedImage) -> CameraEntry:
         """Description of an image's camera; raises as `camera_name`."""
         return self.cameras[self.camera_name(image)]
 
@@ -186,7 +186,7 @@ def common_losses(
         lost.append(Loss("camera", f"no cameras ({names}): keep the file that describes them"))
     if cameras:
         for name, camera in block.cameras.items():
-            if isinstance(camera, FilmCamera) and not film:
+            if camera.fiducial_system is not None and not film:
                 lost.append(Loss("film", f"no fiducial marks (camera {name!r})"))
             if camera.lens.type != "none" and camera.lens.type not in lenses:
                 lost.append(Loss("lens", f"no lens of type {camera.lens.type} (camera {name!r})"))

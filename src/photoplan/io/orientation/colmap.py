@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from photoplan.cameras.observed import ImagePoints
 from photoplan.errors import InputError
-from photoplan.io.camera.model import FilmCamera, FrameEntry
+from photoplan.io.camera.model import CameraEntry
 from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, require_cameras
 from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
@@ -71,7 +71,7 @@ def _folder(path: Path) -> Path:
     return folder
 
 
-def read_cameras(path: Path) -> dict[str, FrameEntry | FilmCamera]:
+def read_cameras(path: Path) -> dict[str, CameraEntry]:
     """Cameras of a ``cameras.txt`` by their number, as text.
 
     Raises
@@ -79,7 +79,7 @@ def read_cameras(path: Path) -> dict[str, FrameEntry | FilmCamera]:
     InputError
         A line is not of the format, or the model is not supported.
     """
-    cameras: dict[str, FrameEntry | FilmCamera] = {}
+    cameras: dict[str, CameraEntry] = {}
     for number, line in _lines(path):
         words = line.split()
         where = f"{path}:{number}"
@@ -92,7 +92,7 @@ def read_cameras(path: Path) -> dict[str, FrameEntry | FilmCamera]:
     return cameras
 
 
-def _camera(model: str, words: list[str], where: str) -> FrameEntry:
+def _camera(model: str, words: list[str], where: str) -> CameraEntry:
     width, height, *values = _floats(words, where, 2 + len(_MODELS[model]))
     v = dict(zip(_MODELS[model], values))
     focal = (v.get("fx", v.get("f", 0.0)), v.get("fy", v.get("f", 0.0)))
@@ -210,7 +210,7 @@ def _render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     return {path / name: "\n".join([*lines, ""]) for name, lines in texts.items()}
 
 
-def _camera_line(name: str, camera: FrameEntry | FilmCamera, path: Path) -> str:
+def _camera_line(name: str, camera: CameraEntry, path: Path) -> str:
     form = opencv_form(camera)
     if form is None:
         raise InputError(f"{path}: camera {name!r} has no form in COLMAP; write without its lens, or another format")

@@ -33,7 +33,8 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.geometry.rotation import rotation_opk
-from photoplan.io.camera.model import FilmCamera, FrameEntry
+from photoplan.io.camera.frame import FrameEntry
+from photoplan.io.camera.model import CameraEntry
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation.inpho_write import losses, render
 from photoplan.io.orientation.table import Direction, OrientationTable, TableFormat
@@ -152,7 +153,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     poses = [_Pose(photo, path) for photo in photos]
     direction, reason = _direction(poses, file, form, path)
     notes.append(f"{path.name}: rotation matrices read as {DIRECTIONS[direction]}{reason}")
-    cameras: dict[str, FrameEntry | FilmCamera] = {}
+    cameras: dict[str, CameraEntry] = {}
     turns: dict[str, NDArray[np.float64]] = {}
     for section in file.cameras:
         name, camera, turn, why = _camera(section, path)
@@ -239,7 +240,7 @@ def _between(A: NDArray[np.float64], B: NDArray[np.float64]) -> float:
     return float(np.degrees(np.arctan2(sine, np.trace(S) - 1)))
 
 
-def _camera(section: _Section, path: Path) -> tuple[str, FrameEntry | None, NDArray[np.float64], str | None]:
+def _camera(section: _Section, path: Path) -> tuple[str, CameraEntry | None, NDArray[np.float64], str | None]:
     """Name, camera, rotation from the file's image axes to those of the pixels, and why there is no camera."""
     name = section.text("$CAMERA_ID", "$ID", "$TYPE")
     if name is None:
@@ -290,7 +291,7 @@ def _frame(
     t: NDArray[np.float64],
     pixel: NDArray[np.float64],
     path: Path,
-) -> FrameEntry:
+) -> CameraEntry:
     where = f"{path}:{section.line}: camera {name!r}"
     ppa = numbers((section.text("$PRINCIPAL_POINT_PPA") or "0 0").split(), where, "$PRINCIPAL_POINT_PPA", 2)
     col, row = (A @ ppa + t).tolist()

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from photoplan.errors import InputError
-from photoplan.io.camera.model import FilmCamera, FrameEntry
+from photoplan.io.camera.model import CameraEntry, InPixels
 from photoplan.io.orientation.block import Loss, OrientationBlock, common_losses, require_map
 from photoplan.io.orientation.table import Direction, OrientedImage
 from photoplan.io.orientation.text import DIRECTIONS
@@ -29,7 +29,7 @@ def losses(block: OrientationBlock) -> list[Loss]:
         Loss("other", f"no word on what the rotation matrix does; it is written {direction}, the angles as $INS")
     )
     for name, camera in block.cameras.items():
-        if isinstance(camera, FrameEntry) and camera.camera_constant_mm is None:
+        if camera.camera_constant_mm is None:
             lost.append(
                 Loss("other", f"no camera in pixels: {name!r} is written with pixels of {ASSUMED_PIXEL * 1000:g} µm")
             )
@@ -55,8 +55,8 @@ def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     for image, R in zip(block.table.images, matrices):
         lines += _photo(block, image, R.T if (block.matrix or DEFAULT) == "ground-to-camera" else R)
     for name, camera in block.cameras.items():
-        if isinstance(camera, FrameEntry):
-            lines += _camera(name, camera)
+        if camera.pixels is not None:
+            lines += _camera(name, camera.pixels, _constant(camera))
     lines.append("$NAVIGATION")
     for image, angles in zip(block.table.images, block.angles("opk", "deg")):
         lines.append(f"  $PHOTO_NUM : {_word(image.name)}")
@@ -88,17 +88,14 @@ def _photo(block: OrientationBlock, image: OrientedImage, M: np.ndarray) -> list
     return lines
 
 
-def _constant(camera: FrameEntry | FilmCamera) -> float:
-    if isinstance(camera, FilmCamera) or camera.camera_constant_mm is not None:
-        return float(camera.camera_constant_mm or 0.0)
-    return camera.focal[0] * ASSUMED_PIXEL
+def _constant(camera: CameraEntry) -> float:
+    if camera.camera_constant_mm is not None or camera.pixels is None:
+        return camera.constant_mm
+    return camera.pixels.focal[0] * ASSUMED_PIXEL
 
 
-def _camera(name: str, camera: FrameEntry) -> list[str]:
-    c = _constant(camera)
-    fx, fy = camera.focal
-    col, row = camera.principal_point
-    width, height = camera.size
+def _camera(name: str, camera: InPixels, c: float) -> list[str]:
+    (fx, fy), (col, row), (width, height) = camera.focal, camera.point, camera.size
     # The image coordinates have their origin in the principal point: then PPA is zero.
     return [
         "$CAMERA",

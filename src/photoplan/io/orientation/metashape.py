@@ -28,7 +28,7 @@ from photoplan.geometry.earth_poses import (
     is_wgs84_geographic,
     map_poses,
 )
-from photoplan.io.camera.model import FilmCamera, FrameEntry
+from photoplan.io.camera.model import CameraEntry
 from photoplan.io.lens_forms import AgisoftForm, frame_camera
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation.metashape_write import losses, render
@@ -99,7 +99,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     return OrientationBlock(table, _unique(cameras, path))
 
 
-def read_cameras(path: Path) -> dict[str, FrameEntry | FilmCamera]:
+def read_cameras(path: Path) -> dict[str, CameraEntry]:
     """The cameras alone: sensors with a calibration, by label.
 
     Raises
@@ -163,7 +163,7 @@ def _camera_pose(camera: Element, where: str) -> tuple[_Floats, _Floats]:
     return _rotation(M[:3, :3], where), M[:3, 3]
 
 
-def _sensor(sensor: Element | None, key: str, path: Path) -> tuple[str, FrameEntry]:
+def _sensor(sensor: Element | None, key: str, path: Path) -> tuple[str, CameraEntry]:
     if sensor is None:
         raise InputError(f"{path}: sensor {key!r}, which a camera refers to, is not described")
     label = sensor.get("label") or f"sensor {key}"
@@ -200,8 +200,8 @@ def _has(element: Element, name: str) -> bool:
     return element.find(name) is not None
 
 
-def _unique(cameras: Mapping[str, tuple[str, FrameEntry]], path: Path) -> dict[str, FrameEntry | FilmCamera]:
-    by_name: dict[str, FrameEntry | FilmCamera] = {}
+def _unique(cameras: Mapping[str, tuple[str, CameraEntry]], path: Path) -> dict[str, CameraEntry]:
+    by_name: dict[str, CameraEntry] = {}
     for key, (label, camera) in cameras.items():
         if by_name.setdefault(label, camera) != camera:
             raise InputError(

@@ -21,7 +21,7 @@ from photoplan.geometry.earth_poses import (
     geodetic_of_geocentric,
     legacy_wkt,
 )
-from photoplan.io.camera.model import FilmCamera, FrameEntry
+from photoplan.io.camera.model import CameraEntry
 from photoplan.io.lens_forms import agisoft_form
 from photoplan.io.orientation.block import Loss, OrientationBlock, height_losses, require_cameras
 from photoplan.io.orientation.table import FLIP
@@ -34,7 +34,7 @@ _Floats = NDArray[np.float64]
 def losses(block: OrientationBlock) -> Iterable[Loss]:
     """What of a block the format cannot hold."""
     for name, camera in block.cameras.items():
-        if isinstance(camera, FilmCamera):
+        if camera.pixels is None:
             yield Loss("camera", f"no camera {name!r}: film has no pixels of its own")
         elif agisoft_form(camera) is None:
             yield Loss("lens", f"no lens of type {camera.lens.type} as camera {name!r} has it")
@@ -93,7 +93,7 @@ def _placed(block: OrientationBlock) -> tuple[_Floats, _Floats, str, _Floats, _F
     return np.eye(3), np.zeros(3), _LOCAL, table.centers, table.rotations
 
 
-def _sensor(name: str, key: str, camera: FrameEntry | FilmCamera, path: Path) -> list[str]:
+def _sensor(name: str, key: str, camera: CameraEntry, path: Path) -> list[str]:
     form = agisoft_form(camera)
     if form is None:
         raise InputError(

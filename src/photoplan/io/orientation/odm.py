@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.crs import canonical_crs, crs_label, crs_step, utm_codes
 from photoplan.io.camera import opensfm as camera_opensfm
-from photoplan.io.camera.model import FilmCamera, FrameEntry
+from photoplan.io.camera.model import CameraEntry
 from photoplan.io.lens_forms import opencv_form
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, common_losses
 from photoplan.io.orientation.opensfm import axis_angle, rotation_from_axis_angle
@@ -88,7 +88,7 @@ def _utm_zone(lonlat: NDArray[np.float64], XYZ: NDArray[np.float64], path: Path)
     return None, [f"{path.name}: no UTM zone makes positions agree with longitude and latitude; declare the CRS"]
 
 
-def _cameras_beside(path: Path, images: list[OrientedImage]) -> tuple[dict[str, FrameEntry | FilmCamera], Path | None]:
+def _cameras_beside(path: Path, images: list[OrientedImage]) -> tuple[dict[str, CameraEntry], Path | None]:
     """Cameras of the project's ``cameras.json``, if it describes those of all images."""
     for folder in (path.parent, path.parent.parent):
         file = folder / "cameras.json"

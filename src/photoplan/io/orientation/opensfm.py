@@ -22,7 +22,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_step
 from photoplan.geometry.earth_poses import enu_of_geodetic, geodetic_of_enu, topocentric_of_map
 from photoplan.io.appearance import looks_like
-from photoplan.io.camera.model import FilmCamera, FrameEntry
+from photoplan.io.camera.model import CameraEntry
 from photoplan.io.camera.opensfm import cameras_of
 from photoplan.io.lens_forms import opencv_form, opencv_losses
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, height_losses, require_cameras
@@ -91,7 +91,7 @@ def _tangential(
     return origin, enu, np.swapaxes(R_map_enu, 1, 2) @ table.rotations
 
 
-def normalised_camera(name: str, camera: FrameEntry | FilmCamera, path: Path) -> dict[str, Any]:
+def normalised_camera(name: str, camera: CameraEntry, path: Path) -> dict[str, Any]:
     """Entry of a camera in ``cameras``.
 
     Raises

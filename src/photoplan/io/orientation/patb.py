@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from photoplan.errors import InputError
-from photoplan.io.camera.model import FilmCamera
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, common_losses, require_map
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.orientation.text import (
@@ -92,10 +91,7 @@ def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
 
 
 def _constant(block: OrientationBlock, image: OrientedImage) -> float | None:
-    if not block.cameras:
-        return None
-    camera = block.camera(image)
-    return camera.camera_constant_mm if isinstance(camera, FilmCamera) or camera.camera_constant_mm else None
+    return block.camera(image).camera_constant_mm if block.cameras else None
 
 
 def _losses(block: OrientationBlock) -> list[Loss]:

@@ -21,7 +21,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.geometry.earth_poses import is_local_crs, legacy_wkt
 from photoplan.io.camera import pix4d as camera_pix4d
-from photoplan.io.camera.model import FilmCamera, FrameEntry
+from photoplan.io.camera.model import CameraEntry
 from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat
 from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
@@ -62,7 +62,7 @@ def _stem(path: Path) -> Path:
 
 
 def _block(
-    path: Path, images: list[OrientedImage], cameras: dict[str, FrameEntry | FilmCamera], notes: list[str]
+    path: Path, images: list[OrientedImage], cameras: dict[str, CameraEntry], notes: list[str]
 ) -> OrientationBlock:
     side = path.with_name(f"{_stem(path).name}_wkt.prj")
     side = side if side.is_file() else path.with_suffix(".prj")
@@ -96,9 +96,7 @@ def _external(line: str, number: int, path: Path) -> OrientedImage:
     return OrientedImage(words[0].strip(), values[:3], values[3:], None, number)
 
 
-def _cameras_beside(
-    path: Path, names: list[str]
-) -> tuple[dict[str, FrameEntry | FilmCamera], dict[str, str | None], list[str]]:
+def _cameras_beside(path: Path, names: list[str]) -> tuple[dict[str, CameraEntry], dict[str, str | None], list[str]]:
     """Cameras by name, the camera of every image, and notes."""
     stem = _stem(path)
     full = stem.with_name(stem.name + _NAMES[1])
@@ -125,7 +123,7 @@ def _read_full(lines: list[str], path: Path) -> OrientationBlock:
         last = rows[-1][0] if rows else 1
         raise InputError(f"{path}:{last}: {len(rows)} lines follow the description; ten for each image are needed")
     offset, notes = _offset(path)
-    cameras: dict[FrameEntry, str] = {}
+    cameras: dict[CameraEntry, str] = {}
     images = []
     for k in range(0, len(rows), 10):
         name, camera, t, R_camera_world = _ten_lines(rows[k : k + 10], path)
@@ -149,7 +147,7 @@ def _offset(path: Path) -> tuple[NDArray[np.float64], list[str]]:
 
 def _ten_lines(
     rows: list[tuple[int, str]], path: Path
-) -> tuple[str, FrameEntry, NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[str, CameraEntry, NDArray[np.float64], NDArray[np.float64]]:
     """Name, camera, position and R_camera_world of an image."""
     where = f"{path}:{rows[0][0]}"
     words = rows[0][1].rsplit(maxsplit=2)
@@ -222,7 +220,7 @@ def _render_full(block: OrientationBlock, stem: Path) -> dict[Path, str]:
     }
 
 
-def _square(camera: FrameEntry | FilmCamera) -> bool:
+def _square(camera: CameraEntry) -> bool:
     """Whether pixels are square, as in Pix4D."""
     form = opencv_form(camera)
     return form is None or abs(form.focal[0] - form.focal[1]) <= 1e-9 * form.focal[0]

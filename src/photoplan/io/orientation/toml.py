@@ -14,7 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
-from photoplan.io.camera.model import Camera, Fiducials, Name, Pixels, Triple
+from photoplan.io.camera.kinds import Camera
+from photoplan.io.camera.model import Fiducials, Name, Pixels, Triple
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, require_map
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.project.errors import explain

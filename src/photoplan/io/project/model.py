@@ -10,15 +10,12 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, Strict, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
-from photoplan.cameras.fiducials_fit import MODELS
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.bounds import odd_angles, odd_place
+from photoplan.io.camera.kinds import Camera
 from photoplan.io.camera.model import (
-    Camera,
     Entry,
     Fiducials,
-    FilmCamera,
-    FrameEntry,
     Name,
     Number,
     Pixels,
@@ -213,7 +210,12 @@ class Project(Entry):
             if image.camera not in self.cameras:
                 known = ", ".join(map(repr, self.cameras)) or "none"
                 raise ValueError(f"{where}: camera {image.camera!r} is not described; cameras are {known}")
-            _check_film(image, self.cameras[image.camera], where)
+            camera = self.cameras[image.camera]
+            if image.fiducials is not None:
+                try:
+                    camera.check_fiducials(image.fiducials, bool(image.size or camera.size), image.camera)
+                except ValueError as error:
+                    raise ValueError(f"{where}: {error}") from None
             if image.center is not None and image.angles is not None:
                 odd = odd_angles(image.angles, self.orientation.angle_unit) or odd_place(image.center, camera=True)
                 if odd is not None:
@@ -299,28 +301,3 @@ def _plain_file(text: str) -> str:
         return check_input_name(text)
     except InputError as error:
         raise ValueError(str(error)) from None
-
-
-def _check_film(image: Image, camera: FrameEntry | FilmCamera, where: str) -> None:
-    """Marks of a film scan are the camera's, and enough or not yet measured; a digital image has none."""
-    if isinstance(camera, FrameEntry):
-        if image.fiducials is not None:
-            raise ValueError(f'{where}: fiducials are given, but camera {image.camera!r} is digital (type = "frame")')
-        return
-    if image.fiducials is None:
-        return
-    if image.size is None and camera.size is None:
-        raise ValueError(f"{where}: size = [width, height] of the scan is stated neither here nor for its camera")
-    unknown = [n for n in image.fiducials if n not in camera.fiducials_mm]
-    if unknown:
-        raise ValueError(
-            f"{where}: fiducial marks {', '.join(unknown)} are not among those of camera {image.camera!r}:"
-            f" {', '.join(camera.fiducials_mm)}"
-        )
-    needed = MODELS[camera.interior]
-    if len(image.fiducials) < needed:
-        missing = [n for n in camera.fiducials_mm if n not in image.fiducials]
-        raise ValueError(
-            f"{where}: {len(image.fiducials)} fiducial marks measured, {camera.interior} needs {needed}; "
-            f"missing {', '.join(missing)}"
-        )

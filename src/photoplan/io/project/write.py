@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from photoplan.io.camera.model import FilmCamera, FrameEntry
+from photoplan.io.camera.model import CameraEntry
 from photoplan.io.project.model import (
     Adjustment,
     Image,
@@ -175,53 +175,18 @@ def _ortho(ortho: OrthoDefaults) -> list[str]:
     ]
 
 
-def camera_lines(name: str, camera: FrameEntry | FilmCamera) -> list[str]:
+def camera_lines(name: str, camera: CameraEntry) -> list[str]:
     """The ``[cameras.NAME]`` table of a camera."""
-    return _frame(name, camera) if isinstance(camera, FrameEntry) else _film(name, camera)
+    comments = {**camera.comments, "restore": "filter that its images are restored with", "lens": ""}
+    rows = [(entry, _stated(entry, getattr(camera, entry)), comment) for entry, comment in comments.items()]
+    return [f"[cameras.{toml_key(name)}]", *_entries(r for r in rows if r[1] is not None), ""]
 
 
-def _frame(name: str, camera: FrameEntry) -> list[str]:
-    rows: list[tuple[str, Any, str]] = [
-        ("type", camera.type, "digital frame camera"),
-        ("size", camera.size, "width and height, pixels"),
-        ("focal_px", camera.focal_px, "camera constant in pixels; [x, y] if they differ"),
-        ("camera_constant_mm", camera.camera_constant_mm, ""),
-        ("pixel_size_um", camera.pixel_size_um, ""),
-        ("sensor_size_mm", camera.sensor_size_mm, ""),
-        ("principal_point_px", camera.principal_point_px, "column, row"),
-        ("principal_point_mm", camera.principal_point_mm, "x right, y up, from the middle of the image"),
-        *_restore(camera),
-    ]
-    head = f"[cameras.{toml_key(name)}]"
-    return [head, *_entries(r for r in rows if r[1] is not None), *_lens(camera.lens), ""]
-
-
-def _film(name: str, camera: FilmCamera) -> list[str]:
-    rows: list[tuple[str, Any, str]] = [
-        ("type", camera.type, "scanned film; each image states its measured fiducial marks"),
-        ("camera_constant_mm", camera.camera_constant_mm, ""),
-        ("principal_point_mm", camera.principal_point_mm, "in the system of the fiducial marks, x right, y up"),
-        ("interior", camera.interior, '"similarity", "affine" or "bilinear": from the marks to the scan'),
-        ("mirrored", camera.mirrored, "true if the film was scanned through its back"),
-        ("size", camera.size, "width and height of the scans, pixels"),
-        ("fiducials_mm", camera.fiducials_mm, "calibrated marks: name = [x, y]"),
-        (
-            "marks",
-            camera.marks and camera.marks.model_dump(exclude_none=True, exclude_defaults=True),
-            "what the marks look like, mm",
-        ),
-        *_restore(camera),
-    ]
-    head = f"[cameras.{toml_key(name)}]"
-    return [head, *_entries(r for r in rows if r[1] is not None), *_lens(camera.lens), ""]
-
-
-def _restore(camera: FrameEntry | FilmCamera) -> list[tuple[str, Any, str]]:
-    return [("restore", camera.restore and camera.restore.model_dump(), "filter that its images are restored with")]
-
-
-def _lens(lens: BaseModel) -> list[str]:
-    return [f"lens = {toml_value(lens.model_dump(exclude_none=True))}"]
+def _stated(entry: str, value: Any) -> Any:
+    """A value with its inner entries as a table."""
+    if not isinstance(value, BaseModel):
+        return value
+    return value.model_dump(exclude_none=True, exclude_defaults=entry == "marks")
 
 
 def _image(image: Image) -> list[str]:

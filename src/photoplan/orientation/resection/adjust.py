@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from photoplan.adjustment.iterate import levenberg
 from photoplan.adjustment.robust import spread
 from photoplan.cameras.base import project
-from photoplan.cameras.frame import FrameCamera
+from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
 from photoplan.cameras.lenses.field import field_limited
@@ -180,7 +180,7 @@ def _pixels_per_unit(interior: Interior) -> float:
 
 def _pixels(task: _Task, state: _State) -> Array:
     """Residuals without covariances: computed minus measured, (n, 2)."""
-    frame = FrameCamera(state.interior, task.lens, state.pose)
+    frame = oriented_camera(state.interior, task.lens, state.pose)
     camera = frame if task.camera_of is None else task.camera_of(state.interior, task.lens, state.pose)
     return project(camera, task.points.XYZ) - task.points.xy
 
@@ -266,7 +266,7 @@ def _cleaned(task: _Task, state: _State, use: NDArray[np.bool_]) -> Resected:
 def _why_not(task: _Task, state: _State, use: NDArray[np.bool_]) -> str:
     """Why an adjustment ended with points that have no image."""
     lost = use & ~np.isfinite(_pixels(task, state)).all(axis=1)
-    central = project(FrameCamera(state.interior, task.lens, state.pose), task.points.XYZ)
+    central = project(oriented_camera(state.interior, task.lens, state.pose), task.points.XYZ)
     if task.camera_of is not None and np.isfinite(central[lost]).all():
         names = ", ".join(task.points.names[k] for k in np.flatnonzero(lost)[:5])
         return (

@@ -17,11 +17,9 @@ from photoplan.cameras.lenses.none import NoLens
 from photoplan.cameras.lenses.opencv import OpenCV
 from photoplan.cameras.lenses.reversed import Reversed
 from photoplan.errors import UsageError
-from photoplan.io.camera import model as described
+from photoplan.io.camera.model import BrownLens, CameraEntry, RadialTableLens
 from photoplan.io.project.cameras import lens_of
 from photoplan.orientation.bundle.block import PARAMETERS, AdjustedCamera, BlockCamera
-
-Description = described.FrameEntry | described.FilmCamera
 
 #: Parameters that every camera has; the others are its lens's.
 INTERIOR = ("c", "x0", "y0")
@@ -101,7 +99,7 @@ def _prior(option: str, colon: str, text: str) -> float | None:
 
 
 def block_camera(
-    name: str, camera: Description, interior: Interior, free: Mapping[str, float | None] | None = None
+    name: str, camera: CameraEntry, interior: Interior, free: Mapping[str, float | None] | None = None
 ) -> BlockCamera:
     """A camera of the block.
 
@@ -109,7 +107,7 @@ def block_camera(
     ----------
     name : str
         For messages.
-    camera : FrameCamera or FilmCamera
+    camera : CameraEntry
         Its description in the project.
     interior : Interior
         Interior orientation of one of its images.
@@ -147,7 +145,7 @@ def block_camera(
     return BlockCamera(interior.c, interior.principal_point, lens, ordered, prior)
 
 
-def calibrated(camera: Description, start: BlockCamera, found: AdjustedCamera) -> Calibrated:
+def calibrated(camera: CameraEntry, start: BlockCamera, found: AdjustedCamera) -> Calibrated:
     """The result of a camera that had free parameters."""
     lens = found.lens
     names, units, before, after, scales = [], [], [], [], []
@@ -183,20 +181,20 @@ def calibrated(camera: Description, start: BlockCamera, found: AdjustedCamera) -
     )
 
 
-def camera_entries(camera: Description, start: BlockCamera, found: AdjustedCamera) -> dict[str, Any]:
+def camera_entries(camera: CameraEntry, start: BlockCamera, found: AdjustedCamera) -> dict[str, Any]:
     """Entries of the camera in the project file after the adjustment: they give the adjusted camera exactly."""
     if not found.free:
         return {}
     _, new = _interior(camera, start, found)
     entries: dict[str, Any] = {}
     constant, x0, y0 = new
-    if isinstance(camera, described.FrameEntry) and camera.focal_px is not None:
-        fx, fy = camera.focal
+    if camera.camera_constant_mm is None and camera.pixels is not None:
+        fx, fy = camera.pixels.focal
         entries["focal_px"] = constant if fx == fy else [constant, constant * fy / fx]
     else:
         entries["camera_constant_mm"] = constant
     if {"x0", "y0"} & set(found.free):
-        entries["principal_point_px" if _in_pixels(camera) else "principal_point_mm"] = [x0, y0]
+        entries["principal_point_px" if camera.states_pixels else "principal_point_mm"] = [x0, y0]
     if "c" not in found.free:
         entries = {k: v for k, v in entries.items() if k.startswith("principal")}
     lens = _lens_entry(camera, start, found)
@@ -205,35 +203,26 @@ def camera_entries(camera: Description, start: BlockCamera, found: AdjustedCamer
     return entries
 
 
-def _in_pixels(camera: Description) -> bool:
-    """Whether the interior orientation is computed in pixels; see `photoplan.io.project.cameras.interior_of`."""
-    if isinstance(camera, described.FilmCamera):
-        return False
-    return camera.camera_constant_mm is None or camera.principal_point_px is not None
+def _constant_in_pixels_of_mm(camera: CameraEntry) -> bool:
+    return camera.states_pixels and camera.camera_constant_mm is not None
 
 
-def _constant_in_pixels_of_mm(camera: Description) -> bool:
-    return _in_pixels(camera) and isinstance(camera, described.FrameEntry) and camera.camera_constant_mm is not None
-
-
-def _unit(camera: Description) -> tuple[dict[str, str], float]:
+def _unit(camera: CameraEntry) -> tuple[dict[str, str], float]:
     """Unit of c, x0, y0 in the project, and what turns y0 into rows."""
-    if not _in_pixels(camera):
+    if not camera.states_pixels or camera.pixels is None:
         return dict.fromkeys(INTERIOR, "mm"), 1.0
-    assert isinstance(camera, described.FrameEntry)
-    fx, fy = camera.focal
+    fx, fy = camera.pixels.focal
     c = "mm" if _constant_in_pixels_of_mm(camera) else "px"
     return {"c": c, "x0": "px", "y0": "px"}, -fy / fx
 
 
 def _interior(
-    camera: Description, start: BlockCamera, found: AdjustedCamera
+    camera: CameraEntry, start: BlockCamera, found: AdjustedCamera
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """c, x0, y0 before and after, as the project states them: principal point as column and row, or in millimetres."""
-    if not _in_pixels(camera):
+    if not camera.states_pixels or camera.pixels is None:
         return (start.c, *start.principal_point), (found.c, *found.principal_point)
-    assert isinstance(camera, described.FrameEntry)
-    col, row = camera.principal_point
+    col, row = camera.pixels.point
     _, to_row = _unit(camera)
     factor = 1.0
     if _constant_in_pixels_of_mm(camera):
@@ -245,7 +234,7 @@ def _interior(
     return old, (found.c * factor, col + x - x_start, row + to_row * (y - y_start))
 
 
-def _lens_entry(camera: Description, start: BlockCamera, found: AdjustedCamera) -> dict[str, Any] | None:
+def _lens_entry(camera: CameraEntry, start: BlockCamera, found: AdjustedCamera) -> dict[str, Any] | None:
     """The lens as the project file states it; None where its entry stays right."""
     lens = camera.lens
     own = [p for p in found.free if p not in INTERIOR]
@@ -257,12 +246,12 @@ def _lens_entry(camera: Description, start: BlockCamera, found: AdjustedCamera) 
     if found.c == start.c:
         return None
     # The lens stays; entries that depend on the camera constant are written for the new one.
-    if isinstance(lens, described.BrownLens) and lens.unit != "tangent":
+    if isinstance(lens, BrownLens) and lens.unit != "tangent":
         inner = found.lens.lens if isinstance(found.lens, Reversed) else found.lens
         assert isinstance(inner, Brown)
         meaning = {"meaning": "correction"} if isinstance(found.lens, Reversed) else {}
         return {**_brown(inner), **meaning}
-    if isinstance(lens, described.RadialTableLens):
+    if isinstance(lens, RadialTableLens):
         factor = found.c / start.c
         entry: dict[str, Any] = {"type": lens.type, "distortion_um": [v * factor for v in lens.distortion_um]}
         if lens.radii_mm is not None:

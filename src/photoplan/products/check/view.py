@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from photoplan.io.camera.model import FilmCamera, FrameEntry
+from photoplan.io.camera.model import CameraEntry
 from photoplan.io.orientation.table import angle_in_radians
 from photoplan.io.project.cameras import interior_of, lens_of
 from photoplan.io.project.model import Image, Orientation
@@ -15,13 +15,13 @@ from photoplan.orientation.plausibility import View
 POINTS = 5
 
 
-def view_of(image: Image, camera: FrameEntry | FilmCamera, orientation: Orientation, center: ArrayLike) -> View:
+def view_of(image: Image, camera: CameraEntry, orientation: Orientation, center: ArrayLike) -> View:
     """View of a project's image.
 
     Parameters
     ----------
     image : Image
-    camera : FrameEntry or FilmCamera
+    camera : CameraEntry
         Description of its camera.
     orientation : Orientation
         What its angles mean.

@@ -11,7 +11,6 @@ import numpy as np
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
 from photoplan.errors import InputError, UsageError
-from photoplan.io.camera.model import FilmCamera
 from photoplan.io.ground_points import read_ground_points
 from photoplan.io.image_points import named_as, read_image_points
 from photoplan.io.orientation.block import OrientationBlock
@@ -135,7 +134,7 @@ def _cameras(block: OrientationBlock) -> tuple[dict[str, tuple[Interior, Lens]],
     missing = []
     for image in block.table.images:
         camera = block.camera(image)
-        if isinstance(camera, FilmCamera) and not image.fiducials:
+        if not camera.places(image.fiducials):
             missing.append(image.name)
             continue
         # Only the marks and the size of the image matter here; no file is opened.

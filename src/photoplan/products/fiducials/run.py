@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 from photoplan.errors import InputError, PhotoplanError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.camera.file import read_cameras
-from photoplan.io.camera.model import FilmCamera, FrameEntry
+from photoplan.io.camera.model import FiducialSystem
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
@@ -152,7 +151,7 @@ class _Job:
     name: str
     file: Path
     camera_name: str
-    camera: FilmCamera
+    mirrored: bool
     layout: MarkLayout
 
 
@@ -229,33 +228,41 @@ def _project(request: FiducialsRequest) -> Project | None:
 def _jobs(request: FiducialsRequest, project: Project | None) -> list[_Job]:
     if project is None:
         assert request.camera is not None
-        name, camera = _film_camera(request.camera, request.camera_name)
-        layout = _layout(camera, name, request.camera.resolve().parent)
+        name, system = _film_camera(request.camera, request.camera_name)
+        layout = _layout(system, name, request.camera.resolve().parent)
         files = [str(path) for path in request.images]
         twice = sorted({f for f in files if files.count(f) > 1})
         if twice:
             raise UsageError(f"image {twice[0]} is given twice")
-        return [_Job(path.name, path, name, camera, layout) for path in request.images]
+        return [_Job(path.name, path, name, system.mirrored, layout) for path in request.images]
     jobs = []
     layouts: dict[str, MarkLayout] = {}
     for name in project.select(request.select or None):
         image = project.image(name)
-        described = project.cameras[image.camera]
-        if not isinstance(described, FilmCamera):
+        marks = project.cameras[image.camera].fiducial_system
+        if marks is None:
             if request.select:
                 raise UsageError(f"image {name!r}: its camera {image.camera!r} is digital and has no fiducial marks")
             continue
         if image.camera not in layouts:
-            layouts[image.camera] = _layout(described, image.camera, project.folder)
-        jobs.append(_Job(name, project.resolve(image.file), image.camera, described, layouts[image.camera]))
+            layouts[image.camera] = _layout(marks, image.camera, project.folder)
+        jobs.append(
+            _Job(
+                name,
+                project.resolve(image.file),
+                image.camera,
+                marks.mirrored,
+                layouts[image.camera],
+            )
+        )
     if not jobs:
         raise InputError(f"{request.images[0]}: none of its images was taken with a film camera")
     return jobs
 
 
-def _film_camera(path: Path, wanted: str | None) -> tuple[str, FilmCamera]:
-    cameras: Mapping[str, FilmCamera | FrameEntry] = read_cameras(path).cameras
-    film = {name: camera for name, camera in cameras.items() if isinstance(camera, FilmCamera)}
+def _film_camera(path: Path, wanted: str | None) -> tuple[str, FiducialSystem]:
+    marks = {name: camera.fiducial_system for name, camera in read_cameras(path).cameras.items()}
+    film = {name: system for name, system in marks.items() if system is not None}
     listed = ", ".join(map(repr, film)) or "none"
     if wanted is not None:
         if wanted not in film:
@@ -266,9 +273,9 @@ def _film_camera(path: Path, wanted: str | None) -> tuple[str, FilmCamera]:
     return next(iter(film.items()))
 
 
-def _layout(camera: FilmCamera, name: str, folder: Path) -> MarkLayout:
+def _layout(system: FiducialSystem, name: str, folder: Path) -> MarkLayout:
     try:
-        return MarkLayout.of(camera.fiducials_mm, mark_patterns(camera, folder))
+        return MarkLayout.of(system.places_mm, mark_patterns(system, folder))
     except InputError as error:
         raise InputError(f"camera {name!r}: {error}") from None
 
@@ -284,7 +291,7 @@ def _locate(
         pixel_mm if pixel_mm is not None else stated_pixel_mm(job.file),
         request.rotation,
         request.mirrored,
-        job.camera.mirrored,
+        job.mirrored,
         request.negative,
         request.least_correlation,
     )
@@ -294,10 +301,10 @@ def _locate(
         raise
     except InputError as error:
         raise type(error)(f"{job.file}: {error}") from None
-    if in_project and found.turn.mirrored != job.camera.mirrored:
+    if in_project and found.turn.mirrored != job.mirrored:
         raise InputError(
             f"{job.file}: the scan is {'' if found.turn.mirrored else 'not '}mirrored, but its camera "
-            f"{job.camera_name!r} states mirrored = {str(job.camera.mirrored).lower()}; correct that entry, or give "
+            f"{job.camera_name!r} states mirrored = {str(job.mirrored).lower()}; correct that entry, or give "
             "scans of the other kind a camera of their own"
         )
     return ImageFiducials(

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 from photoplan.io.camera.file import CameraFile
-from photoplan.io.camera.model import FilmCamera
 from photoplan.io.names import check_input_name, match_key
 from photoplan.io.orientation.table import OrientationTable, OrientedImage
 
@@ -125,7 +124,7 @@ def camera_by_size(file: Path, size: tuple[int, int], cameras: CameraFile) -> st
     """
     if len(cameras.cameras) == 1:
         return next(iter(cameras.cameras))
-    of_size = [n for n, c in cameras.cameras.items() if c.size == size and not isinstance(c, FilmCamera)]
+    of_size = [n for n, c in cameras.cameras.items() if c.size == size and c.fiducial_system is None]
     if len(of_size) == 1:
         return of_size[0]
     known = ", ".join(map(repr, cameras.cameras))

@@ -14,7 +14,7 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import height_label
 from photoplan.io.camera.file import CameraFile, read_cameras
-from photoplan.io.camera.model import FilmCamera, FrameEntry, Triple
+from photoplan.io.camera.model import CameraEntry, Triple
 from photoplan.io.camera.opensfm import resized
 from photoplan.io.names import check_input_name, match_key, relative_path
 from photoplan.io.orientation.file import read_orientation
@@ -164,7 +164,7 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
     for file, oriented in pairs:
         camera, described = used[oriented.name]
         center, turned = poses.get(oriented.name, (None, None))
-        size = infos[file].size if isinstance(described, FilmCamera) and described.size is None else None
+        size = infos[file].size if described.size is None else None
         images.append(
             Image(
                 name=match_key(file.name),
@@ -189,10 +189,10 @@ def _cameras(
     cameras: CameraFile,
     infos: dict[Path, RasterInfo],
     table: Path | None,
-) -> dict[str, tuple[str, FrameEntry | FilmCamera]]:
+) -> dict[str, tuple[str, CameraEntry]]:
     """Camera (name and description) of every image name; sizes agree with the files'."""
-    used: dict[str, tuple[str, FrameEntry | FilmCamera]] = {}
-    sizes: dict[str, tuple[tuple[int, int], Path]] = {}
+    used: dict[str, tuple[str, CameraEntry]] = {}
+    sizes: dict[str, tuple[int, int]] = {}
     for file, image in pairs:
         size = infos[file].size
         if table is None or isinstance(image, Unoriented):
@@ -200,10 +200,8 @@ def _cameras(
         else:
             name = camera_name(image, cameras, table)
         camera = cameras.cameras[name]
-        if isinstance(camera, FrameEntry):
-            before = sizes.setdefault(name, (size, file))
-            if cameras.normalised and size == before[0]:
-                camera = resized(camera, size, f"{file}: camera {name!r}")
+        if cameras.normalised and size == sizes.setdefault(name, size):
+            camera = resized(camera, size, f"{file}: camera {name!r}")
         if camera.size is not None and camera.size != size:
             raise InputError(
                 f"{file}: {size[0]} × {size[1]} px, but camera {name!r} of {cameras.file} has "
@@ -218,7 +216,7 @@ def _checked(
     terrain: Terrain | None,
     systems: tuple[str | None, str],
     crs: str,
-    cameras: dict[str, FrameEntry | FilmCamera],
+    cameras: dict[str, CameraEntry],
     images: list[Image],
 ) -> Project:
     """The project, checked as if it had been read."""
@@ -262,7 +260,7 @@ def _present(file: Path, folder: Path, *, or_folder: bool = False) -> str:
 
 
 def _summary(
-    used: dict[str, tuple[str, FrameEntry | FilmCamera]],
+    used: dict[str, tuple[str, CameraEntry]],
     pairs: Sequence[tuple[Path, OrientedImage | Unoriented]],
     crs: str,
     lonely: tuple[list[Path], list[str]],
@@ -272,7 +270,7 @@ def _summary(
     parts = [f"{len(pairs)} images" + ("" if table else " without orientation")]
     for name, camera in dict(used.values()).items():
         size = f", {camera.size[0]} × {camera.size[1]} px" if camera.size is not None else ""
-        film = "film, " if isinstance(camera, FilmCamera) else ""
+        film = "film, " if camera.fiducial_system is not None else ""
         parts.append(f'camera "{name}"{size}, {film}{LENS_NAMES[camera.lens.type]}')
     lines = ["  " + " · ".join([*parts, crs])]
     if lonely[0]:

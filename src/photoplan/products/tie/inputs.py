@@ -17,7 +17,7 @@ from photoplan.io.observed_positions import read_observed_positions
 from photoplan.io.orientation.table import TableFormat
 from photoplan.io.plain_files import read_text
 from photoplan.io.project.cameras import interior_of, lens_of
-from photoplan.io.project.model import FilmCamera, Image, Project
+from photoplan.io.project.model import Image, Project
 from photoplan.io.raster import RasterReader
 from photoplan.matching.grey import GreyImage
 from photoplan.matching.pairs import Guide, all_pairs, pairs_by_distance, pairs_by_footprints
@@ -94,7 +94,7 @@ def _calibration(project_: Project, image: Image, size: tuple[int, int]) -> Cali
             f"{image.file}: {size[0]} × {size[1]} pixels, but camera {image.camera!r} has {stated[0]} × {stated[1]}; "
             "an image that was cropped or scaled needs a camera of its own"
         )
-    if isinstance(description, FilmCamera) and not image.fiducials:
+    if not description.places(image.fiducials):
         return None
     return Calibration(interior_of(description, image, size), lens_of(description))
 
@@ -129,9 +129,9 @@ def _placed(project_: Project, images: Sequence[Image]) -> tuple[list[CentralCam
         return cameras, levels.tolist()
     ground = ground_of(project_)
     for k, image in enumerate(images):
-        if image.center is None or (isinstance(project_.cameras[image.camera], FilmCamera) and not image.fiducials):
-            continue
         description = project_.cameras[image.camera]
+        if image.center is None or not description.places(image.fiducials):
+            continue
         pose = pose_of(project_, image, ground)
         cameras[k] = oriented_camera(interior_of(description, image), lens_of(description), pose)
         levels[k] = float(ground.surface.heights(pose.center[:2]))

@@ -1,0 +1,65 @@
+"""A camera kind is one file and a registry line: everything else asks the camera."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+import photoplan
+from photoplan.cameras import corrected, curved, frame, warped
+from photoplan.io.camera.kinds import Camera
+from photoplan.io.camera.model import CameraEntry
+
+ROOT = Path(photoplan.__file__).parent
+#: Classes of the registry.
+DESCRIBED = [get_args(kind)[0] for kind in get_args(get_args(Camera)[0])]
+#: All classes of kinds, described and computing, and their makers.
+KINDS = {"FrameCamera", "WarpedCamera", "corrected_camera", "curved_camera", "LineCamera", "FilmCamera"} | {
+    kind.__name__ for kind in DESCRIBED
+}
+#: Files that may name a kind, and why.
+ALLOWED = {
+    "__init__.py": "public names",
+    "cameras/__init__.py": "public names",
+    "cameras/frame.py": "a kind",
+    "cameras/warped.py": "a kind",
+    "cameras/corrected.py": "a kind",
+    "cameras/curved.py": "a kind",
+    "cameras/build.py": "registry of cameras that compute",
+    "io/camera/frame.py": "a kind",
+    "io/camera/film.py": "a kind",
+    "io/camera/kinds.py": "registry of cameras that are described",
+    "io/orientation/inpho.py": "reads a format that knows frames in millimetres alone",
+}
+
+
+def named(file: Path) -> set[str]:
+    """Kinds that the code of a file names, strings included (they may be imports by name)."""
+    words: set[str] = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        for value in (getattr(node, field, None) for field in ("id", "attr", "name", "value")):
+            if isinstance(value, str) and "\n" not in value:
+                words.update(value.replace(".", " ").split())
+    return words & KINDS
+
+
+def test_only_a_kinds_own_file_and_the_registries_name_it() -> None:
+    naming = {file.relative_to(ROOT).as_posix() for file in ROOT.rglob("*.py") if named(file)}
+    assert naming == set(ALLOWED)
+
+
+def test_the_names_are_those_of_the_code() -> None:
+    assert {c.__name__ for c in DESCRIBED} == {"FrameEntry", "FilmEntry"}
+    assert all(hasattr(module, name) for module, name in ((frame, "FrameCamera"), (warped, "WarpedCamera")))
+    assert all(hasattr(module, name) for module, name in ((corrected, "corrected_camera"), (curved, "curved_camera")))
+
+
+@pytest.mark.parametrize("kind", DESCRIBED)
+def test_a_kind_is_complete(kind: type[CameraEntry]) -> None:
+    """It has no abstract part, and a comment for every entry that is written."""
+    assert not inspect.isabstract(kind)
+    assert set(kind.comments) | {"lens", "restore"} == set(kind.model_fields)
