@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from tools.format_examples import assert_same, block_of, frame, pixels, round_trip
 
 from photoplan.errors import InputError
-from photoplan.io.orientation.colmap import read_points
 from photoplan.io.orientation.file import orientation_format, read_orientation_block
 
 CAMERAS = """# Camera list with one line of data per camera:
@@ -72,15 +71,6 @@ def test_the_documentations_sample(tmp_path: Path) -> None:
     seen = np.array([2559.81 * p[0] / p[2] + 1536, 2559.81 * p[1] / p[2] + 1152]) - 0.5
     np.testing.assert_allclose(pixels(block, X), seen, atol=1e-8)
     assert "states no CRS" in block.table.notes[0]
-
-
-def test_the_samples_points(tmp_path: Path) -> None:
-    points = read_points(model(tmp_path))
-    assert points.XYZ["63376"] == (2.01848, 0.108877, -0.0260841)
-    assert points.measured.points == ("58396", "59027", "23056", "59070")
-    np.testing.assert_allclose(points.measured.xy[0], [2361.89, 247.998])
-    twice = IMAGES.replace("268.254 -1", "268.254 58396")
-    assert read_points(model(tmp_path, images=twice)).repeated == 1
 
 
 P = {"f": 900.0, "fx": 900.0, "fy": 905.0, "cx": 503.0, "cy": 371.5, "k1": -0.08, "k2": 0.02, "p1": 1e-3, "p2": -2e-3}

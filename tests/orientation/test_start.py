@@ -109,10 +109,6 @@ def test_images_with_enough_control_are_resected() -> None:
     names = block.observations.points
     some = [n for n in names if n.startswith("T")][::20][:15]
     rng = np.random.default_rng(4)
-    truth = {}
-    for n in some:
-        rows = block.observations.of_points([n])
-        truth[n] = rows
     whole = start_block(CAMERA, block.images(tuple(block.poses)), block.observations, NOTHING)
     control = [n for n in some if n in whole.points]
     XYZ = np.array([whole.points[n] for n in control]) + rng.normal(0, 0.02, (len(control), 3))

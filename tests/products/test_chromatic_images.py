@@ -13,7 +13,6 @@ from photoplan.io.raster import RasterReader
 from photoplan.io.whole_image import write_whole_image
 from photoplan.products.chromatic import (
     ChromaticRequest,
-    correct_chromatic,
     load_chromatic,
     measure_chromatic,
     model_figures,
@@ -50,7 +49,7 @@ def test_bands_lie_on_each_other_after_correction(image: Path, model: ChromaticM
     assert model.reference == 2 and model.description == "discs of chart.tif"
     source = RasterReader(image)
     before, _ = source.read(Window(0, 0, 300, 220))
-    after, valid = correct_chromatic(source, model).read(Window(0, 0, 300, 220))
+    after, valid = SteppedReader(source, (AlignStep(model),)).read(Window(0, 0, 300, 220))
     assert valid is None
     assert np.array_equal(after[1], before[1])
     inside = (slice(20, -20), slice(20, -20))

@@ -10,7 +10,7 @@ from tools.edge_scenes import blocks, half_plane, noisy
 
 from photoplan.errors import InputError
 from photoplan.quality.edges.candidates import find_lines, noise_of
-from photoplan.quality.edges.find import EdgePicture, EdgeRegion, EdgeRules, cut_region, find_edges
+from photoplan.quality.edges.find import EdgePicture, EdgeRegion, EdgeRules, find_edges
 
 
 def one_edge(angle: float = 8.0, sigma: float = 0.8, snr: float = 50.0, size: tuple[int, int] = (90, 80)) -> np.ndarray:
@@ -47,8 +47,8 @@ class TestFound:
     def test_pixels_of_the_mask(self) -> None:
         """They lie within half a width of the line, between its ends, outside gaps; both sides are equal in number."""
         region = find_edges(EdgePicture(one_edge(20.0)))[0][0]
-        _, mask, (col, row) = cut_region(EdgePicture(one_edge(20.0)), region)
-        i, j = np.nonzero(mask)
+        col, row, *_ = window = region.window((90, 80))
+        i, j = np.nonzero(region.mask(window))
         dx, dy = j + col - region.line.x, i + row - region.line.y
         across = dy * region.line.tx - dx * region.line.ty
         along = dx * region.line.tx + dy * region.line.ty

@@ -11,7 +11,7 @@ from photoplan.quality.formation.kernels import pixel_kernel
 from photoplan.quality.formation.model import ImageModel, form_image
 from photoplan.quality.formation.parts import Aperture, Falloff, Lateral, LineJitterPart, Spread
 from photoplan.quality.formation.scenes import ArrayScene, PatternScene, parse_pattern
-from photoplan.quality.formation.truth import line_spread_width, model_modulation, model_mtf50
+from photoplan.quality.formation.truth import line_spread, model_modulation, model_mtf50
 from photoplan.quality.spread import GAUSSIAN_WIDTH
 
 
@@ -168,7 +168,8 @@ def test_tiles_and_transforms_change_nothing(spread, aperture, k, jitter, kept, 
 
 def test_figures_of_a_gaussian_with_its_pixel():
     model = ImageModel(Spread(gaussian=(0.8, 0.8)), Aperture("point"))
-    assert line_spread_width(model) == pytest.approx(GAUSSIAN_WIDTH * 0.8, rel=1e-4)
+    top, half = line_spread(model, np.array([0.0, GAUSSIAN_WIDTH * 0.4]))
+    assert half / top == pytest.approx(0.5, rel=1e-4)
     assert model_mtf50(model) == pytest.approx(np.sqrt(np.log(2) / 2) / (np.pi * 0.8), rel=1e-6)
     assert model_mtf50(ImageModel()) == pytest.approx(0.60335, abs=1e-4)  # sinc f = 1/2
 

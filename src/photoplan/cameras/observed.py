@@ -95,11 +95,6 @@ class ImagePoints:
         wanted = set(names)
         return self.where(np.array([n in wanted for n in self.images], bool)[self.image])
 
-    def of_points(self, names: Sequence[str]) -> ImagePoints:
-        """The measurements of these points."""
-        wanted = set(names)
-        return self.where(np.array([n in wanted for n in self.points], bool)[self.point])
-
     @staticmethod
     def merged(parts: Sequence[ImagePoints]) -> ImagePoints:
         """All measurements of several sets; points and images of one name are the same."""

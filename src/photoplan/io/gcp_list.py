@@ -19,8 +19,7 @@ import numpy as np
 
 from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.errors import InputError
-from photoplan.geometry.crs import canonical_crs, crs_label, crs_step, parse_crs, same_crs, split_compound
-from photoplan.io.disk import write_atomically
+from photoplan.geometry.crs import crs_label, crs_step, parse_crs, same_crs, split_compound
 from photoplan.io.names import match_key
 from photoplan.io.plain_files import read_text
 from photoplan.io.table_lines import NUMBER
@@ -100,33 +99,6 @@ def read_gcp_list(path: Path, crs: str | None = None) -> GcpList:
     ground = GroundPoints(tuple(places), XYZ, np.full((len(places), 3), np.nan), np.zeros(len(places), bool))
     table = [(name, spelled[match_key(row.image)], *row.xy) for row, name in zip(rows, names)]
     return GcpList(own, ground, ImagePoints.from_rows(table))
-
-
-def write_gcp_list(path: Path, gcps: GcpList) -> None:
-    """Write such a file; ground points without a measurement are left out, as the file has no place for them.
-
-    Raises
-    ------
-    InputError
-        A name holds white space, which separates columns here, or a point has no horizontal position.
-    ResourceError, UsageError
-        The disk is full, or the folder cannot be written to.
-    """
-    points, place = gcps.points, dict(zip(gcps.ground.names, gcps.ground.XYZ))
-    lines = [canonical_crs(gcps.crs)]
-    for k in range(len(points)):
-        name, image = points.points[points.point[k]], points.images[points.image[k]]
-        if name not in place:
-            continue
-        if re.search(r"\s", name + image):
-            raise InputError(f"{points.label(k)}: gcp_list.txt has no names with white space; rename it")
-        if np.isnan(place[name][:2]).any():
-            raise InputError(f"ground point {name!r} has no horizontal position; gcp_list.txt needs one")
-        X, Y, Z = (f"{v:.4f}" if np.isfinite(v) else "NaN" for v in place[name])
-        col, row = (f"{v:.10g}" for v in points.xy[k])
-        lines.append(" ".join([X, Y, Z, col, row, image, name]))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, ("\n".join(lines) + "\n").encode())
 
 
 def _crs(where: str, text: str) -> str:

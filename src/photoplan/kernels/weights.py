@@ -88,8 +88,6 @@ def _exact(name: str, taps: int, degree: int) -> NDArray[np.float64]:
     return np.round(_fit(name, taps, degree) * 64.0) / 64.0
 
 
-DEFAULT_KERNEL = "bicubic"
-
 KERNELS: MappingProxyType[str, Kernel] = MappingProxyType(
     {
         each.name: each

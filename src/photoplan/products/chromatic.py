@@ -16,8 +16,6 @@ from photoplan.geometry.grid import Window
 from photoplan.io.chromatic_file import read_chromatic, write_chromatic
 from photoplan.io.raster import RasterReader
 from photoplan.plain import pick, plain
-from photoplan.project.align import AlignStep
-from photoplan.project.stepped import SteppedReader
 from photoplan.quality.colour.discs import disc_displacements, find_discs
 from photoplan.quality.colour.edge_displacements import edge_displacements
 from photoplan.quality.colour.model import BandModel, ChromaticModel, Displacements, fit_band
@@ -183,11 +181,6 @@ def _joined(parts: list[Displacements]) -> Displacements:
     return Displacements(
         *(np.concatenate([getattr(p, n) for p in parts]) for n in ("place", "direction", "value", "sigma", "group"))
     )
-
-
-def correct_chromatic(source: RasterReader, model: ChromaticModel) -> SteppedReader:
-    """An image whose bands are brought to the place of the reference band while it is read; see `AlignStep`."""
-    return SteppedReader(source, (AlignStep(model),))
 
 
 def load_chromatic(path: Path) -> ChromaticModel:

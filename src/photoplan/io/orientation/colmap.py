@@ -9,14 +9,12 @@ pixel is (0, 0), its centre (0.5, 0.5). The world has no CRS.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from photoplan.cameras.observed import ImagePoints
 from photoplan.errors import InputError
 from photoplan.io.camera.model import CameraEntry
 from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
@@ -54,7 +52,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     """
     folder = _folder(path)
     cameras = read_cameras(folder / "cameras.txt")
-    images = tuple(image for image, _ in _images(folder / "images.txt"))
+    images = tuple(_images(folder / "images.txt"))
     note = "a COLMAP model states no CRS; unless it was georeferenced, position, scale and axes are its own"
     table = OrientationTable(folder / "images.txt", images, notes=(note,))
     used = {i.camera for i in images}
@@ -118,8 +116,8 @@ def _floats(words: list[str], where: str, count: int) -> tuple[float, ...]:
     return checked
 
 
-def _images(path: Path) -> Iterator[tuple[OrientedImage, str]]:
-    """Every image with the line of its points, which may be empty."""
+def _images(path: Path) -> Iterator[OrientedImage]:
+    """Every image; the line of its points, which may be empty, is passed over."""
     lines = enumerate(read_text(path, MAX_BYTES).split("\n"), 1)
     for number, line in lines:
         if not line.strip() or line.startswith("#"):
@@ -140,51 +138,8 @@ def _images(path: Path) -> Iterator[tuple[OrientedImage, str]]:
         R_camera_world = Rotation.from_quat(np.roll(q, -1)).as_matrix()
         x, y, z = (-R_camera_world.T @ t).tolist()
         a = degrees_of((R_camera_world.T @ FLIP)[None])[0].tolist()
-        image = OrientedImage(words[9].strip(), (x, y, z), (a[0], a[1], a[2]), words[8], number)
-        yield image, next(lines, (0, ""))[1]
-
-
-@dataclass(frozen=True, eq=False)
-class ColmapPoints:
-    """Tie points of a model."""
-
-    measured: ImagePoints
-    """Their measured positions; points are named by their number."""
-    XYZ: dict[str, tuple[float, float, float]]
-    """Their places in the model's system."""
-    repeated: int
-    """Measurements left out because the image has another of the same point."""
-
-
-def read_points(path: Path) -> ColmapPoints:
-    """Tie points of a model's folder.
-
-    Raises
-    ------
-    InputError
-        See `read`.
-    """
-    folder = _folder(path)
-    places: dict[str, tuple[float, float, float]] = {}
-    points = folder / "points3D.txt"
-    for number, line in _lines(points) if points.is_file() else ():
-        words = line.split(maxsplit=4)
-        x, y, z = _floats(words[1:4], f"{points}:{number}", 3)
-        places[words[0]] = (x, y, z)
-    rows: dict[tuple[str, str], tuple[float, float]] = {}
-    repeated = 0
-    for image, text in _images(folder / "images.txt"):
-        words = text.split()
-        where = f"{folder / 'images.txt'}:{(image.line or 0) + 1}"
-        if len(words) % 3:
-            raise InputError(f"{where}: {len(words)} values; X, Y and POINT3D_ID of every point are needed")
-        for k in range(0, len(words), 3):
-            x, y = _floats(words[k : k + 2], where, 2)
-            if words[k + 2] != "-1":
-                repeated += (words[k + 2], image.name) in rows
-                rows.setdefault((words[k + 2], image.name), (x - 0.5, y - 0.5))
-    measured = ImagePoints.from_rows((point, image, x, y) for (point, image), (x, y) in rows.items())
-    return ColmapPoints(measured, places, repeated)
+        yield OrientedImage(words[9].strip(), (x, y, z), (a[0], a[1], a[2]), words[8], number)
+        next(lines, None)
 
 
 def _render(block: OrientationBlock, path: Path) -> dict[Path, str]:

@@ -247,26 +247,3 @@ def _longest(good: NDArray[np.bool_]) -> tuple[int, int]:
 def _is_aligned(line: StraightEdge) -> bool:
     """Whether the edge crosses less than one row or column of pixels along its length."""
     return min(abs(line.tx), abs(line.ty)) * line.length < 1.0
-
-
-def cut_region(
-    picture: EdgePicture, region: EdgeRegion
-) -> tuple[NDArray[np.float64], NDArray[np.bool_], tuple[int, int]]:
-    """What a measurement needs of an edge.
-
-    Returns
-    -------
-    array
-        Pixels of its window, shape (h, w).
-    array
-        Which of them belong to it and are valid.
-    tuple of int
-        Column and row of the window in the picture.
-    """
-    height, width = picture.grey.shape
-    window = region.window((width, height))
-    part = (slice(window[1], window[1] + window[3]), slice(window[0], window[0] + window[2]))
-    mask = region.mask(window)
-    if picture.valid is not None:
-        mask &= picture.valid[part]
-    return picture.grey[part].astype(float), mask, window[:2]

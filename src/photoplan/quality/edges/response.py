@@ -127,11 +127,6 @@ class EdgeMeasurement:
         """Step from dark to bright relative to the noise of a pixel."""
         return (self.bright - self.dark) / self.noise if self.noise > 0.0 else float("inf")
 
-    @property
-    def slant_deg(self) -> float:
-        """Smallest angle between the edge and the pixel grid, −45 to 45 degrees."""
-        return (self.angle_deg + 45.0) % 90.0 - 45.0
-
 
 def measure_edge(
     pixels: NDArray[np.float64],

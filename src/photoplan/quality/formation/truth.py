@@ -73,21 +73,3 @@ def line_spread(model: ImageModel, offsets: _Array, angle_deg: float = 0.0, radi
     weights = np.full(f.size, f[1])
     weights[[0, -1]] /= 2.0
     return np.asarray(2.0 * (waves * transfer).real @ weights)
-
-
-def line_spread_width(model: ImageModel, angle_deg: float = 0.0, radius: float = 0.0) -> float:
-    """Full width at half maximum of the line spread function, pixels; raises as `line_spread`."""
-    step = 0.01
-    coarse_offsets = np.asarray(np.arange(-200, 201) * (10.0 * step), np.float64)
-    coarse = line_spread(model, coarse_offsets, angle_deg, radius)
-    near = coarse_offsets[coarse > 0.25 * coarse.max()]
-    fine = np.asarray(np.arange(near[0] - 0.2, near[-1] + 0.2, step), np.float64)
-    values = line_spread(model, fine, angle_deg, radius)
-    above = np.flatnonzero(values >= values.max() / 2.0)
-    first, last = int(above[0]), int(above[-1])
-    if first == 0 or last == fine.size - 1:
-        return float("nan")
-    half = values.max() / 2.0
-    left = fine[first] - step * (values[first] - half) / (values[first] - values[first - 1])
-    right = fine[last] + step * (values[last] - half) / (values[last] - values[last + 1])
-    return float(right - left)
