@@ -55,6 +55,6 @@ def test_an_orthophoto_loads_nothing_that_it_does_not_need(tmp_path: Path) -> No
             ).stdout
     product, modules, threads = talk.splitlines()
     assert Path(product).name == f"{first}_ortho.tif"
-    heavy = [name for name in HEAVY if USABLE or name != "scipy.linalg"]
+    heavy = [name for name in HEAVY if USABLE or not name.startswith("scipy")]  # else numba loads it
     assert [name for name in heavy if name in modules.split()] == []
     assert threads == "1"
