@@ -499,7 +499,8 @@ class TestInterruption:
         assert said.code == 0, said.err
         before = (tmp_path / "project.toml").read_bytes()
         running = start("tie", tmp_path / "project.toml", "--workers", 1)
-        wait_for(lambda: any(tmp_path.glob("*.cache/*")), running)
+        kept = tmp_path / "tie_points.matches"
+        wait_for(lambda: kept.is_file() and kept.stat().st_size > 0, running)
         os.killpg(running.pid, signal.SIGINT)
         out, err = running.communicate(timeout=120)
         assert running.returncode == 130, (out, err)
