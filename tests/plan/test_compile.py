@@ -175,3 +175,10 @@ def test_horizontal_view_divides_nothing_behind_the_camera() -> None:
 def test_tolerance_must_be_positive() -> None:
     with pytest.raises(UsageError, match="tolerance"):
         AnchorRule(0, 2)
+
+
+def test_the_rule_of_a_kernel_has_half_its_support_and_nearest_keeps_grey_values() -> None:
+    rules = [AnchorRule.of(name, 0.5) for name in ("nearest", "bilinear", "bicubic", "bicubic-1", "lanczos3")]
+    assert [rule.radius for rule in rules] == [1, 1, 2, 2, 3]
+    assert [rule.reduces for rule in rules] == [False, True, True, True, True]
+    assert {rule.tolerance for rule in rules} == {0.5}

@@ -144,7 +144,7 @@ def test_fault_05_failed_tiles_cost_their_product_only(
     render = engine_execute.render
 
     def failing(product: Any, tile: Any, *rest: Any) -> Any:
-        if product.image == "three" and tile.index in (2, 5):
+        if product.sources == ("three",) and tile.index in (2, 5):
             raise RuntimeError("out of luck")
         return render(product, tile, *rest)
 

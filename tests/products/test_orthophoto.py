@@ -159,7 +159,7 @@ class TestCrops:
 class TestPlan:
     def test_a_plan_says_what_will_be_made(self, pristine: Block) -> None:
         plan = plan_orthophotos(load_project(pristine.project), resolution=1.0, tile=128)
-        assert [p.plan.image for p in plan.products] == sorted(NAMES)
+        assert [p.image for p in plan.products] == sorted(NAMES)
         text = str(plan)
         for product in plan.products:
             assert f"{product.plan.name}: {product.grid.width} × {product.grid.height} px of 1 m" in text

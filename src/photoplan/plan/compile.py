@@ -12,6 +12,7 @@ from photoplan.cameras.base import Projection
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.boxes import blocks_in_image, judge_boxes
+from photoplan.kernels.weights import KERNELS
 from photoplan.plan.anchors import Anchors
 from photoplan.plan.bends import Positions, bend_errors
 from photoplan.plan.field import FieldGrid, FieldTable, field_grid
@@ -40,6 +41,11 @@ class AnchorRule:
     def __post_init__(self) -> None:
         if not self.tolerance > 0:
             raise UsageError(f"tolerance {self.tolerance} px; a positive number is needed (default 0.02)")
+
+    @classmethod
+    def of(cls, kernel: str, tolerance: float) -> AnchorRule:
+        """The rule of a resampling kernel, by its name; ``nearest`` keeps grey values as they are."""
+        return cls(tolerance, max(1, math.ceil(KERNELS[kernel].taps / 2)), reduces=kernel != "nearest")
 
     def level(self, anchors: Anchors) -> int:
         """How often a source is halved before it is resampled.

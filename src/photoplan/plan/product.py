@@ -88,11 +88,6 @@ class ProductPlan:
             raise UsageError(f"product {self.name!r} of {len(self.sources)} sources; say which of them paints a pixel")
 
     @property
-    def image(self) -> str:
-        """Name of the first source: the only one of an orthophoto of one image."""
-        return self.sources[0]
-
-    @property
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
         return self.target.window.width, self.target.window.height

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -192,7 +191,7 @@ def rectify(
         name="rectified",
         sources=names,
         target=place,
-        rule=AnchorRule(tolerance, max(1, math.ceil(KERNELS[kernel].taps / 2)), reduces=kernel != "nearest"),
+        rule=AnchorRule.of(kernel, tolerance),
         tiles=Tiles.every(place.window, tile, len(names)),
         owners=None if owner is None else GivenOwners(_owners(owner, len(names))),
     )

@@ -20,7 +20,7 @@ _how = {name: os.environ.get(f"SABOTAGE_{name}", "") for name in ("HOLD", "QUICK
 
 
 def _sabotaged(job, tile):  # type: ignore[no-untyped-def]
-    image = job.product.image
+    (image,) = job.product.sources
     if _how["HOLD"] and _how["IMAGE"] in ("", image) and tile.index >= int(_how["QUICK"] or 0):
         if _how["BEGUN"]:
             (Path(_how["BEGUN"]) / str(os.getpid())).touch()

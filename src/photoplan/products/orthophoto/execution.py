@@ -156,7 +156,7 @@ def _work(
     """What there is to do for a product."""
     if kept is not None:
         return Kept(kept, len(product.plan.tiles))
-    settings, scene = plan.settings, open_scene(plan.project, product.plan.image)
+    settings, scene = plan.settings, open_scene(plan.project, product.image)
     for note in scene.notes:
         run.events.talk(f"note: {note}")
     if not is_compiled(scene.reader.dtype, scene.reader.bands, settings.kernel):
@@ -189,7 +189,7 @@ def _work(
 
 def _pixel_files(plan: OrthoPlan) -> list[Path]:
     """Files that workers open."""
-    addresses = (scene_address(plan.project, p.plan.image) for p in plan.products)
+    addresses = (scene_address(plan.project, p.image) for p in plan.products)
     return [Path(path) for path in dict.fromkeys(path for a in addresses for path, _ in a.digests)]
 
 
@@ -213,7 +213,7 @@ def _complete(
     ran = times()
     result = ProductResult(
         path=file.path,
-        image=product.plan.image,
+        image=product.image,
         seconds=ran["seconds"],
         valid_share=0.0 if facts is None else facts.valid_share,
         residual=tally.totals.get("worst_residual", 0.0),
@@ -240,7 +240,7 @@ def _tags(plan: OrthoPlan, product: OrthoProduct) -> dict[str, str]:
     """What the file itself says of its origin."""
     return {
         "PHOTOPLAN_VERSION": __version__,
-        "PHOTOPLAN_IMAGE": product.plan.image,
+        "PHOTOPLAN_IMAGE": product.image,
         "PHOTOPLAN_KERNEL": plan.settings.kernel,
         "PHOTOPLAN_KEY": product.key,
     }

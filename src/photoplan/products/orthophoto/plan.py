@@ -23,7 +23,6 @@ from photoplan.geometry.grid import MapGrid, Window, refuse_absurd
 from photoplan.io.names import safe_stem
 from photoplan.io.project.model import Project
 from photoplan.io.storage import nodata_for
-from photoplan.kernels.weights import KERNELS
 from photoplan.orientation.plausibility import look
 from photoplan.plan.compile import AnchorRule
 from photoplan.plan.footprint import Footprint, covered_tiles, image_border, some_height
@@ -51,6 +50,12 @@ class OrthoProduct:
     """Hash of all that decides the pixels: inputs, orientation, settings, version."""
 
     @property
+    def image(self) -> str:
+        """Name of the image."""
+        (name,) = self.plan.sources
+        return name
+
+    @property
     def grid(self) -> MapGrid:
         """Map grid of the product."""
         assert isinstance(self.plan.target, MapTarget)
@@ -69,9 +74,9 @@ class OrthoPlan:
 
     def __getitem__(self, name: str) -> OrthoProduct:
         for product in self.products:
-            if name in (product.plan.name, product.plan.image):
+            if name in (product.plan.name, product.image):
                 return product
-        raise KeyError(f"{name}; the plan has {', '.join(p.plan.image for p in self.products)}")
+        raise KeyError(f"{name}; the plan has {', '.join(p.image for p in self.products)}")
 
     def __str__(self) -> str:
         tiles = sum(len(p.plan.tiles) for p in self.products)
@@ -211,9 +216,7 @@ def _plan_one(project: Project, scene: Scene, name: str, settings: OrthoSettings
     tiles = covered_tiles(scene.camera, scene.surface, grid, settings.tile)
     if not len(tiles):
         return None
-    radius = max(1, math.ceil(KERNELS[settings.kernel].taps / 2))
-    rule = AnchorRule(settings.tolerance, radius, reduces=settings.kernel != "nearest")
-    return ProductPlan(product_name(name), (name,), target, rule, tiles)
+    return ProductPlan(product_name(name), (name,), target, AnchorRule.of(settings.kernel, settings.tolerance), tiles)
 
 
 def product_name(image: str) -> str:
@@ -299,10 +302,9 @@ def _refuse_equal_names(products: Iterable[OrthoProduct]) -> None:
         name = product.plan.name.casefold()
         if name in seen:
             raise UsageError(
-                f"images {seen[name]} and {product.plan.image} would both be written as {product.plan.name}.tif; "
-                "rename one"
+                f"images {seen[name]} and {product.image} would both be written as {product.plan.name}.tif; rename one"
             )
-        seen[name] = product.plan.image
+        seen[name] = product.image
 
 
 def render(
@@ -326,7 +328,7 @@ def render(
     """
     product = plan[name]
     window = product.grid.window if bounds is None else window_of(product.grid, bounds)
-    scene = open_scene(plan.project, product.plan.image)
+    scene = open_scene(plan.project, product.image)
     tiles = (tile for tile in product.plan.tiles if (tile.window & window).size)
     parts = (
         (tile.window, render_tile(product.plan, tile, scene.sources, scene.surface, plan.settings.kernel))

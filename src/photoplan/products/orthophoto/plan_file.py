@@ -68,7 +68,8 @@ class PlanFigures:
     def _product(self, place: int, product: OrthoProduct) -> dict[str, Any]:
         mine = slice(*np.searchsorted(self.product, (place, place + 1)))
         return {
-            **pick(product.plan, "name", "image"),
+            "name": product.plan.name,
+            "image": product.image,
             **pick(product.grid, "width", "height", "resolution", "bounds"),
             "gsd": product.gsd,
             "tiles": (self.cells_of_tile[mine] > 0).sum(),
@@ -93,7 +94,7 @@ def compile_figures(plan: OrthoPlan, events: Events = SILENT) -> PlanFigures:
     source = np.zeros((len(product), 4), np.int32)
     rows = iter(range(len(product)))
     for p in plan.products:
-        scene = open_scene(plan.project, p.plan.image)
+        scene = open_scene(plan.project, p.image)
         for tile, row in zip(p.plan.tiles, rows):
             compiled = compile_tile(p.plan, tile, {0: scene.camera}, scene.surface)
             cells[row], residual[row] = compiled.cells, compiled.residual
@@ -140,7 +141,7 @@ def write_plan(path: Path, plan: OrthoPlan, figures: PlanFigures, output: Path, 
     tiles = [p.plan.tiles for p in plan.products]
     windows = np.concatenate([t.windows for t in tiles])[there]
     bounds = np.concatenate([t.bounds(p.grid) for t, p in zip(tiles, plan.products)])[there]
-    names, images = (np.array([getattr(p.plan, name) for p in plan.products], object) for name in ("name", "image"))
+    names, images = (np.array(each, object) for each in zip(*((p.plan.name, p.image) for p in plan.products)))
     columns = {
         "product": names[figures.product[there]],
         "image": images[figures.product[there]],
@@ -217,9 +218,9 @@ def read_plan(path: Path | str) -> tuple[OrthoPlan, Path]:
             listed.setdefault(name, set()).add(index)
         products = [_product(entry, listed) for entry in header["products"]]
         changed = [
-            p.plan.image
+            p.image
             for p, entry in zip(products, header["products"])
-            if product_key(scene_address(project, p.plan.image), p.plan, settings) != entry["key"]
+            if product_key(scene_address(project, p.image), p.plan, settings) != entry["key"]
         ]
         if changed:
             raise InputError(
@@ -238,7 +239,7 @@ def _product_header(product: OrthoProduct, tiles: int) -> dict[str, Any]:
     """All of a product but its tiles, as plain values."""
     plan, seen = product.plan, product.footprint
     return {
-        "image": plan.image,
+        "image": product.image,
         "key": product.key,
         "gsd": product.gsd,
         "grid": asdict(product.grid),

@@ -75,7 +75,7 @@ def _kept(plan: OrthoPlan, product: OrthoProduct, folder: Path) -> ProductResult
         made = record["product"]
         return ProductResult(
             path=path,
-            image=product.plan.image,
+            image=product.image,
             seconds=made["seconds"],
             valid_share=made["valid_share"],
             residual=made["worst_anchor_residual_px"],
