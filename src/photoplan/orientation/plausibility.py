@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from photoplan.geometry.bounds import HIGHEST_FLIGHT
 from photoplan.geometry.rotation import rotation_from_angles
@@ -320,6 +319,8 @@ def _alignment(views: list[View], reading: Reading) -> tuple[float, float]:
     XY = np.array([center[:2] for center, _ in posed])
     if len(XY) < 2:
         return 1.0, 0.0
+    from scipy.spatial import cKDTree  # noqa: PLC0415 - a quarter second of each start, and only for readings in doubt
+
     nearest = np.asarray(cKDTree(XY).query(XY, k=2)[1])[:, 1]
     to = XY[nearest] - XY
     line = np.arctan2(to[:, 1], to[:, 0])
