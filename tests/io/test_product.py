@@ -76,7 +76,7 @@ def test_pixels_and_validity_come_back(tmp_path: Path, compress: str, nodata: An
     np.testing.assert_array_equal(found[:, valid], expected[:, valid])
     np.testing.assert_array_equal(masks > 0, np.broadcast_to(valid, masks.shape))
     assert facts.valid_share == pytest.approx(valid.mean(), abs=1e-12)
-    assert (facts.tiles, facts.empty_tiles, facts.missing_tiles) == (20, 1, ())
+    assert (facts.tiles, facts.empty_tiles) == (20, 1)
     assert facts.bytes == (tmp_path / "a.tif").stat().st_size
 
 
@@ -209,22 +209,6 @@ def test_a_run_continues_with_its_own_key_only(tmp_path: Path) -> None:
         facts = file.complete({"SOURCE": "test"})
     assert path.read_bytes() == undisturbed
     assert facts.moved_values == (pixels[:, valid] == 0).sum()
-
-
-def test_missing_tiles_are_nodata_and_the_log_stays(tmp_path: Path) -> None:
-    path = tmp_path / "a.tif"
-    pixels, _ = scene(1, "uint8")
-    with ProductFile(path, PLACE, 1, pixels.dtype, run_key="k", tile=128) as file:
-        fill(file, pixels, None, iter(i for i in range(20) if i not in (3, 12)))
-        facts = file.complete(allow_missing=True)
-    assert facts.missing_tiles == (3, 12)
-    with rasterio.open(path) as opened:
-        assert (opened.read(1)[:128, 384:512] == 0).all()
-    with ProductFile(path, PLACE, 1, pixels.dtype, run_key="k", tile=128, overwrite=True) as file:
-        assert file.finished == set(range(20)) - {3, 12}
-        fill(file, pixels, None, iter([3, 12]))
-        assert file.complete().missing_tiles == ()
-    assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize(

@@ -101,12 +101,13 @@ def test_grey_is_the_one_of_the_stated_rule() -> None:
     np.testing.assert_allclose(grey(four).read(Window(0, 0, 5, 4)), 3000)
 
 
-def test_windows_beyond_the_image_have_no_values_there() -> None:
+def test_windows_beyond_the_image_have_no_values_there(monkeypatch: pytest.MonkeyPatch) -> None:
     image = grey(np.arange(20.0).reshape(4, 5))
     part = image.read(Window(-1, 2, 3, 4))
     np.testing.assert_array_equal(part, [[np.nan, 10, 11], [np.nan, 15, 16], [np.nan] * 3, [np.nan] * 3])
     corners = np.array([[-1, 2], [3, -2], [0, 0]])
-    for patch, corner in zip(patches_at(image, corners, 3, tile=4), corners):
+    monkeypatch.setattr("photoplan.matching.grey.TILE", 4)
+    for patch, corner in zip(patches_at(image, corners, 3), corners):
         np.testing.assert_array_equal(patch, image.read(Window(*corner.tolist(), 3, 3)))
 
 

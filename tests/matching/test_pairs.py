@@ -38,14 +38,16 @@ def strip(count: int, base: float) -> list[NDArray]:
 
 def test_images_with_common_ground_are_paired() -> None:
     assert pairs_by_footprints(strip(5, 40.0)) == [(0, 1), (0, 2), (1, 2), (1, 3), (2, 3), (2, 4), (3, 4)]
-    assert pairs_by_footprints(strip(5, 40.0), least=0.3) == [(0, 1), (1, 2), (2, 3), (3, 4)]
+    assert pairs_by_footprints(strip(5, 90.0)) == [(0, 1), (1, 2), (2, 3), (3, 4)]
+    assert pairs_by_footprints(strip(5, 96.0)) == []
     assert pairs_by_footprints([strip(1, 1.0)[0], strip(1, 1.0)[0] + 1000]) == []
 
 
-def test_neighbours_by_position_are_paired() -> None:
+def test_neighbours_by_position_are_paired(monkeypatch: pytest.MonkeyPatch) -> None:
     X = np.array([[0, 0, 0], [10, 0, 0], [20, 0, 0], [1000, 0, 0.0]])
     assert pairs_by_distance(X) == [(0, 1), (0, 2), (1, 2)]
-    assert pairs_by_distance(X, neighbours=1) == [(0, 1), (1, 2)]
+    monkeypatch.setattr("photoplan.matching.pairs._NEIGHBOURS", 1)
+    assert pairs_by_distance(X) == [(0, 1), (1, 2)]
     assert pairs_by_distance(X[:1]) == [] and all_pairs(3) == [(0, 1), (0, 2), (1, 2)]
 
 

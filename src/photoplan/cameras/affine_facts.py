@@ -59,16 +59,9 @@ class Shrinkage:
         return (self.x + self.y) / 2
 
 
-def affine_facts(transformation: Affine2D | Bilinear2D, at: ArrayLike = (0.0, 0.0)) -> AffineFacts:
-    """Take a transformation from image plane (y up) to scan (rows down) apart.
-
-    Parameters
-    ----------
-    transformation : Affine2D or Bilinear2D
-    at : array_like, shape (2,)
-        Where in the plane; an affine transformation is the same everywhere.
-    """
-    x, y = transformation.derivative(np.asarray(at, float)).T
+def affine_facts(transformation: Affine2D | Bilinear2D) -> AffineFacts:
+    """Take a transformation from image plane (y up) to scan (rows down) apart, at the plane's origin."""
+    x, y = transformation.derivative(np.zeros(2)).T
     scale = float(np.hypot(*x)), float(np.hypot(*y))
     direction_x, direction_y = (math.atan2(v[1], v[0]) % math.tau for v in (x, y))
     mirrored = bool(transformation.determinant > 0)

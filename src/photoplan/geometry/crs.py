@@ -231,14 +231,18 @@ def area_of(crs: CRS, bounds: tuple[float, float, float, float] | None) -> Any:
     return AreaOfInterest(west, south, east, north) if np.isfinite([west, south, east, north]).all() else None
 
 
-def grid_rotation(step: CrsStep, XY: ArrayLike, reach: float = 50.0) -> NDArray[np.float64]:
+#: Derivatives of a step between systems are taken over this distance to either side, metres.
+_REACH = 50.0
+
+
+def grid_rotation(step: CrsStep, XY: ArrayLike) -> NDArray[np.float64]:
     """Rotation from the source CRS's axes to the target CRS's axes at points X, Y (..., 2), shape (..., 3, 3).
 
     It is the difference of the meridian convergences: the nearest rotation to the derivatives of the step, taken
-    over ±`reach` metres. Heights keep their axis.
+    over ±50 metres. Heights keep their axis.
     """
     XY = np.asarray(XY, float)
-    right, up = np.array([reach, 0.0]), np.array([0.0, reach])
+    right, up = np.array([_REACH, 0.0]), np.array([0.0, _REACH])
     along_x = step(XY + right) - step(XY - right)
     along_y = step(XY + up) - step(XY - up)
     # Of a 2 × 2 matrix [[a, b], [c, d]] the nearest rotation has the angle atan2(c − b, a + d).
@@ -252,7 +256,7 @@ def grid_rotation(step: CrsStep, XY: ArrayLike, reach: float = 50.0) -> NDArray[
 
 
 def topocentric_poses(
-    origin: tuple[float, float, float], target: str, centers: ArrayLike, reach: float = 50.0
+    origin: tuple[float, float, float], target: str, centers: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Points of a local tangential system brought into a projected CRS, with the rotation of the axes there.
 
@@ -287,7 +291,7 @@ def topocentric_poses(
         return np.concatenate([to_map(np.stack([lon_, lat_], axis=-1)), np.asarray(h_)[..., None]], axis=-1)
 
     enu = np.asarray(centers, float).reshape(-1, 3)
-    J = np.stack([to_ground(enu + d) - to_ground(enu - d) for d in np.eye(3) * reach], axis=-1) / (2 * reach)
+    J = np.stack([to_ground(enu + d) - to_ground(enu - d) for d in np.eye(3) * _REACH], axis=-1) / (2 * _REACH)
     # The nearest rotation: the map's scale stretches rows of J and does not turn it.
     U, _, Vt = np.linalg.svd(J)
     return to_ground(enu), U @ Vt

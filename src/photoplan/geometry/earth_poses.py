@@ -193,9 +193,9 @@ def is_wgs84_geographic(text: str, where: str) -> bool:
     return same and abs((crs.ellipsoid.inverse_flattening or 0.0) - 298.2572) < 1e-3
 
 
-def legacy_wkt(text: str, where: str = "CRS") -> str:
+def legacy_wkt(text: str) -> str:
     """WKT of the first version on one line, which older programs read; where there is none, of the second."""
-    crs = parse_crs(text, where)
+    crs = parse_crs(text, "CRS")
     try:
         return str(crs.to_wkt("WKT1_GDAL"))
     except Exception:  # pyproj raises different errors for what WKT 1 cannot express

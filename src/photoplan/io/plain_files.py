@@ -66,7 +66,7 @@ def decoded_text(path: Path, raw: bytes, first_line: int = 1) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def read_head(path: Path, max_bytes: int = 65_536) -> str:
+def read_head(path: Path) -> str:
     """The beginning of a text file, to tell formats apart; bytes that are not UTF-8 are replaced.
 
     Raises
@@ -76,13 +76,13 @@ def read_head(path: Path, max_bytes: int = 65_536) -> str:
     """
     try:
         with path.open("rb") as file:
-            raw = file.read(max_bytes)
+            raw = file.read(65_536)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
     return raw.decode("utf-8-sig", errors="replace").replace("\r\n", "\n").replace("\r", "\n")
 
 
-def read_yaml(path: Path, max_bytes: int = 200_000) -> Any:
+def read_yaml(path: Path) -> Any:
     """Plain contents of a YAML file.
 
     Aliases (which let a small file unfold without bound), deep nesting and repeated keys are refused before anything
@@ -93,7 +93,7 @@ def read_yaml(path: Path, max_bytes: int = 200_000) -> Any:
     InputError
         The file is not such YAML.
     """
-    return parse_yaml(read_text(path, max_bytes), path)
+    return parse_yaml(read_text(path, 200_000), path)
 
 
 def parse_yaml(text: str, path: Path) -> Any:

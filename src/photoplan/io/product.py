@@ -41,8 +41,6 @@ class ProductFacts:
     """Tiles of the product."""
     empty_tiles: int
     """Tiles without a valid pixel; they are not stored."""
-    missing_tiles: tuple[int, ...]
-    """Tiles that were never delivered."""
     valid_share: float
     """Share of valid pixels, 0 to 1."""
     moved_values: int
@@ -235,19 +233,11 @@ class ProductFile:
             raise UsageError(f"{self.path}: tile {index}; the product has tiles 0 to {len(self._windows) - 1}")
         self._open_log().append(index, figures=record)
 
-    def complete(self, tags: dict[str, str] | None = None, *, allow_missing: bool = False) -> ProductFacts:
-        """Make the product and give it its name.
-
-        Parameters
-        ----------
-        tags
-            Tags of the file.
-        allow_missing
-            Make it although tiles were not delivered: they stay nodata, and the log stays for a later run.
-        """
+    def complete(self, tags: dict[str, str] | None = None) -> ProductFacts:
+        """Make the product, with these tags, and give it its name; all tiles must have been delivered."""
         log = self._open_log()
-        missing = tuple(sorted(set(range(len(self._windows))) - log.finished))
-        if missing and not allow_missing:
+        missing = sorted(set(range(len(self._windows))) - log.finished)
+        if missing:
             raise PhotoplanError(f"{self.path}: {len(missing)} tiles are missing, the first is {missing[0]}")
         try:
             try:
@@ -268,10 +258,9 @@ class ProductFile:
             raise
         except PhotoplanError as error:
             raise self._unwritten(str(error)) from error
-        facts = self._facts(log, missing)
-        if not missing:
-            log.remove()
-            self._log = None
+        facts = self._facts(log)
+        log.remove()
+        self._log = None
         return facts
 
     def _open_log(self) -> TileLog:
@@ -357,14 +346,13 @@ class ProductFile:
             overviews=self.overviews and max(self.placement.size) > self.tile,
         )
 
-    def _facts(self, log: TileLog, missing: tuple[int, ...]) -> ProductFacts:
+    def _facts(self, log: TileLog) -> ProductFacts:
         notes = [log.notes(i) for i in log.finished]
         return ProductFacts(
             self.path,
             self.path.stat().st_size,
             len(self._windows),
             sum(log.place(i)[1] == 0 for i in log.finished),
-            missing,
             sum(count for _, count in notes) / self.placement.window.size,
             sum(moved for moved, _ in notes),
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,13 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
+from photoplan.geometry.levels import FullSize, Pixels, level_size, reduced
+from photoplan.io.block_cache import BlockCache
 from photoplan.io.checks import IMAGE_LIMITS, RasterLimits
 from photoplan.io.gdal import gdal_settings, handle
 from photoplan.io.overviews import best_overview
 from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.raster_pixels import both, missing_blocks, read_pixels
-from photoplan.io.reduced_blocks import reduced_by_blocks
 from photoplan.io.tiff_layout import read_tiff_layout
 from photoplan.io.validity import MissingBlocks, refuse_undeclared
 
@@ -26,6 +28,45 @@ IMAGE_TYPES = ("uint8", "uint16", "int16", "float32")
 
 _NOT_RGB = (5, 8, 9, 10)
 """TIFF photometric interpretations: CMYK and the kinds of CIELab."""
+_SIDE = 256
+"""Of a block of a reduced image. Each is made once: tiles of a coarse product overlap in the source."""
+_blocks = BlockCache(48 << 20)
+
+
+def reduced_by_blocks(key: Hashable, reader: FullSize, window: Window, level: int) -> Pixels:
+    """A window of an image that is reduced by 2^level, see `geometry.levels.reduced`.
+
+    Parameters
+    ----------
+    key : hashable
+        What tells the file and its state from all others.
+    reader : FullSize
+    window : Window
+        Of the reduced image.
+    level : int
+        0: nothing is reduced, nor kept.
+    """
+    if level == 0:
+        return reader.read(window)
+    whole = Window(0, 0, *level_size(reader.size, level))
+    values = np.empty((reader.bands, window.height, window.width), reader.dtype)
+    valid = np.ones((window.height, window.width), bool)
+    for row in range(window.row // _SIDE, -(-window.stop[1] // _SIDE)):
+        for col in range(window.col // _SIDE, -(-window.stop[0] // _SIDE)):
+            block = Window(col * _SIDE, row * _SIDE, _SIDE, _SIDE) & whole
+
+            def load(block: Window = block) -> np.ndarray:
+                pixels, good = reduced(reader, block, level)
+                # The validity travels as one band more.
+                return pixels if good is None else np.concatenate([pixels, good[None].astype(pixels.dtype)])
+
+            kept = _blocks.get((key, level, block), load)
+            part = block & window
+            to, of = part.slices(window), part.slices(block)
+            values[:, to[0], to[1]] = kept[: reader.bands, of[0], of[1]]
+            if len(kept) > reader.bands:
+                valid[to] = kept[-1][of] > 0
+    return values, None if valid.all() else valid
 
 
 @dataclass(frozen=True, eq=False)

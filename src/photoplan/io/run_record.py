@@ -14,11 +14,12 @@ from functools import cache
 from hashlib import sha256
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import rasterio
 
 from photoplan import __version__
+from photoplan.errors import UsageError
 from photoplan.io.disk import write_atomically
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.gdal import gdal_settings, not_georeferenced
@@ -40,7 +41,17 @@ _PICTURE = base64.b64decode(
 )
 #: Decoders by the beginning of the digest of what they make of it.
 _DECODERS = {"dda6fb8a7330": "libjpeg 9 of the IJG", "0626c3e14946": "libjpeg-turbo"}
+T = TypeVar("T")
 _PACKAGES = ("photoplan", "numpy", "numba", "scipy", "rasterio", "pyproj", "pyogrio", "shapely")
+
+
+def recorded_result(product: Path, key: str, result: Callable[[dict[str, Any], Any], T | None]) -> T | None:
+    """What `result` makes of the entries product and settings of a product's record; None if it has no such key."""
+    try:
+        record = json.loads(record_path(product).read_text(encoding="utf-8"))
+        return result(record["product"], record["settings"]) if record["key"] == key else None
+    except (OSError, ValueError, KeyError, TypeError, UsageError):
+        return None
 
 
 def record_path(product: Path) -> Path:

@@ -86,11 +86,11 @@ class GreyImage:
         )
         return full.reshape(window.height, factor, window.width, factor).mean(axis=(1, 3))
 
-    def stretch(self, samples: int = 9, side: int = 128) -> tuple[float, float]:
-        """Grey values at 0.5 and 99.5 percent of some windows spread over the image."""
-        width, height = self.size
+    def stretch(self) -> tuple[float, float]:
+        """Grey values at 0.5 and 99.5 percent of nine windows spread over the image."""
+        (width, height), side = self.size, 128
         found = [np.zeros(1, np.float32)]
-        for k in range(samples):
+        for k in range(9):
             col = int((k % 3 + 0.5) / 3 * max(0, width - side))
             row = int((k // 3 + 0.5) / 3 * max(0, height - side))
             values = self.read(Window(col, row, min(side, width), min(side, height)))
@@ -138,7 +138,7 @@ def to_bytes(grey: NDArray[np.float32], low: float, high: float) -> NDArray[np.u
     return np.rint(scaled).astype(np.uint8)
 
 
-def patches_at(image: Grey, corner: NDArray[np.int64], side: int, tile: int = TILE) -> NDArray[np.float32]:
+def patches_at(image: Grey, corner: NDArray[np.int64], side: int) -> NDArray[np.float32]:
     """Square windows of grey values, shape (n, side, side); NaN where there are none.
 
     The image is read once, in tiles that hold the windows; what is in memory is a tile and the result.
@@ -150,13 +150,11 @@ def patches_at(image: Grey, corner: NDArray[np.int64], side: int, tile: int = TI
         Column and row of the upper-left pixel of each window.
     side : int
         Columns and rows of a window.
-    tile : int
-        Side of the tiles.
     """
     out = np.empty((len(corner), side, side), np.float32)
     if not len(corner):
         return out
-    cell = corner // tile
+    cell = corner // TILE
     _, first, which = np.unique(cell, axis=0, return_index=True, return_inverse=True)
     which = which.reshape(-1)
     for t in range(len(first)):

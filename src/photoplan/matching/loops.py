@@ -27,6 +27,8 @@ SQUARE = 6
 WIDER = 1.5
 #: Fewer loops than this tell nothing.
 LEAST = 30
+#: Tracks that are tried.
+_MOST = 600
 #: Factor where there are too few loops: a third ray is missing, or texture.
 ASSUMED = 3.0
 #: Median of the squared length of a two-dimensional normal vector of unit variance.
@@ -41,8 +43,6 @@ class Loops:
     """By which standard deviations of the fit are to be multiplied; never below 1."""
     count: int
     """Loops that could be closed."""
-    closure: float
-    """Median length of what is missing, pixels; NaN without loops."""
 
     @property
     def measured(self) -> bool:
@@ -78,7 +78,6 @@ def close_loops(
     reference: NDArray[np.int64],
     images: Sequence[Grey],
     settings: RefineSettings,
-    most: int = 600,
     run: Map = map,
 ) -> Loops:
     """Measure the factor on some of the tracks with three rays or more.
@@ -89,12 +88,12 @@ def close_loops(
     start = np.concatenate([[0], np.cumsum(tracks.rays)])
     rows = []
     long = np.flatnonzero(tracks.rays >= 3)
-    for t in long[np.linspace(0, len(long) - 1, min(most, len(long))).astype(int)] if len(long) else long:
+    for t in long[np.linspace(0, len(long) - 1, min(_MOST, len(long))).astype(int)] if len(long) else long:
         a = int(reference[t])
         b, c = [k for k in range(start[t], start[t + 1]) if k != a][:2]
         rows.append((a, b, c))
     if len(rows) < LEAST:
-        return Loops(ASSUMED, len(rows), float("nan"))
+        return Loops(ASSUMED, len(rows))
     table = np.array(rows)
     triples, which = np.unique(tracks.image[table], axis=0, return_inverse=True)
     tasks = [(tuple(int(i) for i in t), table[which.reshape(-1) == k]) for k, t in enumerate(triples)]
@@ -104,11 +103,11 @@ def close_loops(
     covariance = np.concatenate([f[1] for f in found])
     good = np.isfinite(gap).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
     if good.sum() < LEAST:
-        return Loops(ASSUMED, int(good.sum()), float("nan"))
+        return Loops(ASSUMED, int(good.sum()))
     gap, covariance = gap[good], covariance[good]
     square = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(covariance), gap)
     factor = float(np.sqrt(np.median(square) / _MEDIAN))
-    return Loops(max(1.0, factor), int(good.sum()), float(np.median(np.linalg.norm(gap, axis=1))))
+    return Loops(max(1.0, factor), int(good.sum()))
 
 
 def _close(

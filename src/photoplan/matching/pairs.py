@@ -14,6 +14,16 @@ from photoplan.matching.features import DESCRIPTOR_UNIT, Features
 
 Pair = tuple[int, int]
 
+#: Smaller part of a footprint that a pair shares.
+_LEAST_SHARE = 0.05
+#: Nearest or most similar images that an image is compared with, at most.
+_NEIGHBOURS = 20
+#: Farthest of the nearest images, in median distances to the nearest one.
+_REACH = 6.0
+#: Coarse features that a pair shares at least.
+_LEAST_SHARED = 6
+#: Distance of descriptors as a part of that to the second best, at most (Lowe 2004, section 7.1).
+_RATIO = 0.85
 #: Rows of the table of similarities that are in memory at once.
 _ROWS = 1024
 
@@ -33,8 +43,8 @@ def all_pairs(count: int) -> list[Pair]:
     return list(itertools.combinations(range(count), 2))
 
 
-def pairs_by_footprints(footprints: Sequence[NDArray[np.float64]], least: float = 0.05) -> list[Pair]:
-    """Pairs whose footprints share at least this part of the smaller one.
+def pairs_by_footprints(footprints: Sequence[NDArray[np.float64]]) -> list[Pair]:
+    """Pairs whose footprints share at least 5 % of the smaller one.
 
     Parameters
     ----------
@@ -47,69 +57,55 @@ def pairs_by_footprints(footprints: Sequence[NDArray[np.float64]], least: float 
     for i, area in enumerate(areas):
         for j in sorted(int(k) for k in tree.query(area) if k > i):
             smaller = min(area.area, areas[j].area)
-            if smaller > 0 and area.intersection(areas[j]).area >= least * smaller:
+            if smaller > 0 and area.intersection(areas[j]).area >= _LEAST_SHARE * smaller:
                 found.append((i, j))
     return found
 
 
-def pairs_by_distance(positions: NDArray[np.float64], neighbours: int = 20, reach: float = 6.0) -> list[Pair]:
-    """Each image with its nearest ones, as far as `reach` times the median distance to the nearest one.
+def pairs_by_distance(positions: NDArray[np.float64]) -> list[Pair]:
+    """Each image with its 20 nearest ones, as far as six times the median distance to the nearest one.
 
     Parameters
     ----------
     positions : ndarray, shape (n, 3)
         Projection centres, metres.
-    neighbours : int
-        Nearest images at most.
     """
     n = len(positions)
     if n < 2:
         return []
     distance = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
     np.fill_diagonal(distance, np.inf)
-    limit = reach * float(np.median(distance.min(axis=1)))
-    near = np.argsort(distance, axis=1, kind="stable")[:, :neighbours]
+    limit = _REACH * float(np.median(distance.min(axis=1)))
+    near = np.argsort(distance, axis=1, kind="stable")[:, :_NEIGHBOURS]
     found = {
         (min(i, int(j)), max(i, int(j))) for i in range(n) for k, j in enumerate(near[i]) if distance[i, j] <= limit
     }
     return sorted(found)
 
 
-def pairs_by_likeness(
-    features: Sequence[Features], largest: int = 500, neighbours: int = 20, least: int = 6
-) -> list[Pair]:
+def pairs_by_likeness(coarse: Sequence[Features]) -> list[Pair]:
     """Pairs that share some of their coarsest features: a quick look for images of which nothing is known.
 
-    Parameters
-    ----------
-    features : sequence of Features
-    largest : int
-        Features of each image that are compared, the ones of the largest scale.
-    neighbours : int
-        Each image keeps so many of the images that it shares most with …
-    least : int
-        … if they share at least so many features.
+    Each image keeps the 20 images that it shares most with, if they share six features or more.
     """
-    coarse = [f.where(np.argsort(-f.scale, kind="stable")[:largest]) for f in features]
-    shared = np.zeros((len(features), len(features)), int)
-    for i, j in all_pairs(len(features)):
+    shared = np.zeros((len(coarse), len(coarse)), int)
+    for i, j in all_pairs(len(coarse)):
         shared[i, j] = shared[j, i] = len(match_features(coarse[i], coarse[j]))
     found: set[Pair] = set()
     for i, row in enumerate(shared):
-        best = np.argsort(-row, kind="stable")[:neighbours]
-        found |= {(min(i, int(j)), max(i, int(j))) for j in best if row[j] >= least}
+        best = np.argsort(-row, kind="stable")[:_NEIGHBOURS]
+        found |= {(min(i, int(j)), max(i, int(j))) for j in best if row[j] >= _LEAST_SHARED}
     return sorted(found)
 
 
-def match_features(a: Features, b: Features, ratio: float = 0.85, guide: Guide | None = None) -> NDArray[np.int64]:
+def match_features(a: Features, b: Features, guide: Guide | None = None) -> NDArray[np.int64]:
     """Features that are each other's most similar one, and clearly more similar than the next.
+
+    Second best are features at other places only: one place may have several directions.
 
     Parameters
     ----------
     a, b : Features
-    ratio : float
-        The distance of the descriptors must be less than this part of that of the second best (Lowe 2004, section 7.1).
-        Second best are features at other places only: one place may have several directions.
     guide : Guide, optional
         Features of b are compared only where those of a are expected.
 
@@ -134,7 +130,7 @@ def match_features(a: Features, b: Features, ratio: float = 0.85, guide: Guide |
         value = likeness[top, columns]
         better = value > back_value
         back[better], back_value[better] = top[better] + start, value[better]
-        best[rows] = _clear_best(likeness, b, ratio)
+        best[rows] = _clear_best(likeness, b)
     i = np.flatnonzero(best >= 0)
     i = i[back[best[i]] == i]
     return np.stack([i, best[i]], axis=1)
@@ -147,7 +143,7 @@ def _far(guide: Guide, rows: slice, b: Features) -> NDArray[np.bool_]:
     return ~(dx * dx + dy * dy <= np.float32(guide.radius**2))
 
 
-def _clear_best(likeness: NDArray[np.float32], b: Features, ratio: float) -> NDArray[np.int64]:
+def _clear_best(likeness: NDArray[np.float32], b: Features) -> NDArray[np.int64]:
     """Column of the best of each row, −1 where the second best is nearly as good or nothing may be compared."""
     rows = np.arange(len(likeness))
     few = min(4, likeness.shape[1])
@@ -160,5 +156,5 @@ def _clear_best(likeness: NDArray[np.float32], b: Features, ratio: float) -> NDA
     distance = 2.0 - 2.0 * np.minimum(value, 1.0)
     elsewhere = np.linalg.norm(b.xy[top] - b.xy[best][:, None], axis=-1) > 2.0
     next_best = np.where(elsewhere, distance, np.inf).min(axis=1)
-    clear = (value[rows, 0] > -0.5) & (distance[:, 0] < ratio**2 * next_best)
+    clear = (value[rows, 0] > -0.5) & (distance[:, 0] < _RATIO**2 * next_best)
     return np.where(clear, best, -1)

@@ -164,21 +164,17 @@ def common_losses(
     *,
     cameras: bool,
     crs: bool = False,
-    height_system: bool = False,
     film: bool = True,
-    lenses: tuple[str, ...] = (),
 ) -> list[Loss]:
-    """Losses of a format that holds what is True.
+    """Losses of a format that holds what is True, and no lens nor height system.
 
     Parameters
     ----------
     block : OrientationBlock
-    cameras, crs, height_system : bool
-        Whether the format holds cameras, a coordinate system, a height system.
+    cameras, crs : bool
+        Whether the format holds cameras, a coordinate system.
     film : bool
         Whether a format with cameras can hold scanned film (marks and their measurement in each image).
-    lenses : tuple of str
-        Types of lenses (`photoplan.io.camera.model`) that a format with cameras holds without loss.
     """
     lost: list[Loss] = []
     if block.cameras and not cameras:
@@ -188,11 +184,11 @@ def common_losses(
         for name, camera in block.cameras.items():
             if camera.fiducial_system is not None and not film:
                 lost.append(Loss("film", f"no fiducial marks (camera {name!r})"))
-            if camera.lens.type != "none" and camera.lens.type not in lenses:
+            if camera.lens.type != "none":
                 lost.append(Loss("lens", f"no lens of type {camera.lens.type} (camera {name!r})"))
     if block.table.crs is not None and not crs:
         lost.append(Loss("crs", "no coordinate system: state it to whoever reads the file"))
-    if block.table.height_system is not None and not height_system:
+    if block.table.height_system is not None:
         lost.append(Loss("height_system", f"no height system ({block.table.height_system})"))
     return lost
 

@@ -35,9 +35,9 @@ class Words:
     words: tuple[str, ...]
 
 
-def word_lines(path: Path, max_bytes: int = MAX_BYTES) -> list[Words]:
+def word_lines(path: Path) -> list[Words]:
     """Lines of a text file that are not empty; raises InputError as `read_text`."""
-    lines = read_text(path, max_bytes).split("\n")
+    lines = read_text(path, MAX_BYTES).split("\n")
     return [Words(f"{path}:{n}", n, tuple(text.split())) for n, text in enumerate(lines, 1) if text.strip()]
 
 

@@ -202,9 +202,9 @@ def _finish_heights(path: Path) -> None:
 
 
 def base_posts(
-    layout: UnitLayout, meshes: int, unit: Callable[[int, int], Unit | None], area: Window, sigmas: bool = False
+    layout: UnitLayout, meshes: int, unit: Callable[[int, int], Unit | None], area: Window
 ) -> NDArray[np.float32] | None:
-    """Heights (or their standard deviations) of a window of the raster, NaN where there is none; None: all are."""
+    """Heights of a window of the raster, NaN where there is none; None: all are."""
     out = np.full((area.height, area.width), np.nan, np.float32)
     right, bottom = area.stop
     found = False
@@ -216,7 +216,7 @@ def base_posts(
             found = True
             place = Window(column * meshes, row * meshes, meshes + 1, meshes + 1)
             part = place & area
-            values = _resampled(one, meshes, sigmas)[part.row - place.row :, part.col - place.col :]
+            values = _resampled(one, meshes)[part.row - place.row :, part.col - place.col :]
             target = out[part.row - area.row :, part.col - area.col :][: part.height, : part.width]
             values = values[: part.height, : part.width]
             # Posts on the edge of two units are in both; where one has none the other's is taken.
@@ -224,12 +224,12 @@ def base_posts(
     return out if found else None
 
 
-def _resampled(unit: Unit, meshes: int, sigmas: bool) -> NDArray[np.float32]:
-    values = unit.sigmas if sigmas else unit.heights
+def _resampled(unit: Unit, meshes: int) -> NDArray[np.float32]:
+    values = unit.heights
     if unit.meshes != meshes:
         step = unit.meshes / meshes
         values = sample_lattice(np.ascontiguousarray(values), 0, step, meshes + 1, 0, step, meshes + 1)
-    return values if sigmas else (values.astype(np.float64) + unit.datum).astype(np.float32)
+    return (values.astype(np.float64) + unit.datum).astype(np.float32)
 
 
 def _chunks(items: Iterable[T], count: int) -> Iterator[list[T]]:

@@ -7,13 +7,13 @@ import sqlite3
 import struct
 import threading
 import zlib
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,14 +29,49 @@ from photoplan.io.terrain.model_tables import (
     ModelHeader,
     header_from_json,
 )
-from photoplan.io.unit_cache import UnitCache
 from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
 
+T = TypeVar("T")
 _CHECKED = struct.Struct("<QQdd")
 _DAMAGED = (sqlite3.Error, UnicodeDecodeError)
 """What SQLite raises for a damaged file; its message may quote bytes that are no text."""
 _HIGHEST = 1e6
 """No height of any body is beyond this, metres."""
+
+
+class UnitCache(Generic[T]):
+    """Values by key, at most `limit` bytes of them; safe to use from several threads.
+
+    Other than in a `BlockCache`, arrays of the values stay writable: kernels are compiled anew for arrays that are not.
+    A value that two threads want at once may be loaded twice; it is kept once.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._held: OrderedDict[Hashable, tuple[T, int]] = OrderedDict()
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    @property
+    def bytes(self) -> int:
+        """Bytes held now; never above the limit."""
+        return self._bytes
+
+    def get(self, key: Hashable, load: Callable[[], tuple[T, int]]) -> T:
+        """The value of a key; `load` makes it, and says its bytes, when it is not held. It must not be changed."""
+        with self._lock:
+            held = self._held.get(key)
+            if held is not None:
+                self._held.move_to_end(key)
+                return held[0]
+        value, size = load()
+        with self._lock:
+            if key not in self._held and size <= self._limit:
+                self._held[key] = value, size
+                self._bytes += size
+                while self._bytes > self._limit:
+                    self._bytes -= self._held.popitem(last=False)[1][1]
+        return value
 
 
 def unit_checksum(number: int, size: int, low: float, high: float, packed: bytes) -> int:

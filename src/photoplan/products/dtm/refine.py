@@ -13,7 +13,6 @@ import shapely
 
 from photoplan import __version__
 from photoplan.errors import HeightSystemError, InputError, UsageError
-from photoplan.events import SILENT, Events
 from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.heights import check_height_system, height_label
 from photoplan.io.polygons import read_features
@@ -61,7 +60,7 @@ class RefineReport:
         return pick(self, "units", "changed", "lines", model="path", largest_change="largest")
 
 
-def dtm_refine(request: RefineRequest, events: Events = SILENT) -> RefineReport:
+def dtm_refine(request: RefineRequest) -> RefineReport:
     """Write the coarse model with the fine one inside the polygons.
 
     Raises
@@ -94,8 +93,7 @@ def dtm_refine(request: RefineRequest, events: Events = SILENT) -> RefineReport:
         )
         if not units:
             raise InputError(f"{request.polygons}: the polygons touch no unit of {coarse.path}")
-        events.begin("units", coarse.layout.rows * coarse.layout.columns, "units")
-        _add(writer, coarse, units, lines, events)
+        _add(writer, coarse, units, lines)
         reader = writer.finish(_parts(request, coarse, fine, system, polygons, width, lines))
     there = int(np.isfinite(reader.ranges[..., 0]).sum())
     return RefineReport(request.output, there, len(units), len(lines), _largest(coarse, units))
@@ -151,7 +149,6 @@ def _add(
     coarse: ModelReader,
     units: dict[tuple[int, int], Unit],
     lines: tuple[LineElement, ...],
-    events: Events,
 ) -> None:
     """All units into the new model."""
     done = writer.done()
@@ -165,7 +162,6 @@ def _add(
                 old, new = coarse.unit(column, row), units.get(at)
                 figures = known.get(at, empty_figures(column, row))
                 writer.add(new or old, figures if new is None else _figures(new, old, figures, boxes))
-            events.done()
 
 
 def _figures(unit: Unit, old: Unit | None, before: UnitFigures, lines: shapely.STRtree) -> UnitFigures:

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import UsageError
-from photoplan.events import SILENT, Events
 from photoplan.io.product import check_output
 from photoplan.io.terrain.export import replacing
 from photoplan.io.terrain.points import PointTable, PointTableFormat
@@ -64,7 +63,7 @@ class SampleReport:
         return pick(self, *own, file="path")
 
 
-def dtm_sample(request: SampleRequest, events: Events = SILENT) -> SampleReport:
+def dtm_sample(request: SampleRequest) -> SampleReport:
     """Write the points' table with two more columns, part by part.
 
     Raises
@@ -84,7 +83,6 @@ def dtm_sample(request: SampleRequest, events: Events = SILENT) -> SampleReport:
     if taken:
         raise UsageError(f"{request.points}: has a column {taken[0]} already; name the new ones: `names` HEIGHT SIGMA")
     count = outside = known = 0
-    events.begin("points", 0, "points")
     low, high, squares = np.inf, -np.inf, 0.0
     delimiter = table.delimiter
     with (
@@ -104,7 +102,6 @@ def dtm_sample(request: SampleRequest, events: Events = SILENT) -> SampleReport:
                 low, high = min(low, float(heights[there].min())), max(high, float(heights[there].max()))
             good = sigmas[np.isfinite(sigmas)]
             known, squares = known + len(good), squares + float((good**2).sum())
-            events.done(len(heights))
     sigma = float(np.sqrt(squares / known)) if known else np.nan
     if outside == count:
         low = high = np.nan

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from photoplan.errors import UsageError
-from photoplan.io.run_record import record_path
+from photoplan.io.run_record import recorded_result
 from photoplan.plain import pick
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct
 from photoplan.products.orthophoto.settings import OrthoSettings
@@ -68,11 +67,10 @@ def finished_products(plan: OrthoPlan, folder: Path, overwrite: bool) -> dict[st
 def _kept(plan: OrthoPlan, product: OrthoProduct, folder: Path) -> ProductResult | None:
     """The result of an earlier run with the same key and settings; None if the product is not one."""
     path = product_path(folder, product)
-    try:
-        record = json.loads(record_path(path).read_text(encoding="utf-8"))
-        if record["key"] != product.key or OrthoSettings.from_dict(record["settings"]) != plan.settings:
+
+    def result(made: dict[str, Any], recorded: dict[str, Any]) -> ProductResult | None:
+        if OrthoSettings.from_dict(recorded) != plan.settings:
             return None
-        made = record["product"]
         return ProductResult(
             path=path,
             image=product.image,
@@ -84,5 +82,5 @@ def _kept(plan: OrthoPlan, product: OrthoProduct, folder: Path) -> ProductResult
             resumed=made["tiles"],
             failed=(),
         )
-    except (OSError, ValueError, KeyError, TypeError, UsageError):
-        return None
+
+    return recorded_result(path, product.key, result)

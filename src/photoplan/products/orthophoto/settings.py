@@ -6,7 +6,9 @@ from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args
 
 from photoplan.errors import UsageError
-from photoplan.products.choices import Compression, Kernel
+
+Kernel = Literal["nearest", "bilinear", "bicubic", "bicubic-1", "lanczos3"]
+Compression = Literal["deflate", "zstd", "lzw", "jpeg", "none"]
 
 
 @dataclass(frozen=True)

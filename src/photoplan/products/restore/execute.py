@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -18,7 +17,7 @@ from photoplan.events import Events
 from photoplan.io.image_form import ImageForm, placement_of
 from photoplan.io.product import ProductFacts, ProductFile
 from photoplan.io.quicklook import write_quicklook
-from photoplan.io.run_record import input_entry, record_path, run_times, write_run_record
+from photoplan.io.run_record import input_entry, recorded_result, run_times, write_run_record
 from photoplan.io.storage import Nodata
 from photoplan.plain import pick
 from photoplan.plan.tiles import Tile, Tiles
@@ -112,10 +111,9 @@ def memory_of_a_tile(reader: SteppedReader) -> int:
 
 def earlier_result(job: Job, settings: dict[str, Any]) -> RestoredImage | None:
     """The result of an earlier run with the same image, filter and settings; None if there is none."""
-    try:
-        record = json.loads(record_path(job.target).read_text(encoding="utf-8"))
-        made = record["product"]
-        if record["key"] != job.key or record["settings"] != settings or not job.target.is_file():
+
+    def result(made: dict[str, Any], recorded: object) -> RestoredImage | None:
+        if recorded != settings or not job.target.is_file():
             return None
         return RestoredImage(
             image=made["image"],
@@ -131,8 +129,8 @@ def earlier_result(job: Job, settings: dict[str, Any]) -> RestoredImage | None:
             seconds=made["seconds"],
             picture=job.picture if job.picture.is_file() else None,
         )
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+
+    return recorded_result(job.target, job.key, result)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,8 @@ from photoplan.matching.verify import PairMatches, VerifySettings, verify_pair
 from photoplan.products.tie.inputs import TieImage, guide_of
 
 #: Images whose features are in memory with their descriptors.
+#: Features of an image that are compared to find pairs, those of the largest scale.
+_LARGEST = 800
 _IN_MEMORY = 64
 
 
@@ -53,13 +55,13 @@ def find_features(store: FeatureStore, run: Steps) -> list[Features]:
     return [Features(f.xy, f.scale, f.angle, f.strength, np.empty((len(f), 0), np.uint8)) for f in found]
 
 
-def like_pairs(store: FeatureStore, largest: int = 800) -> list[tuple[int, int]]:
+def like_pairs(store: FeatureStore) -> list[tuple[int, int]]:
     """Pairs that share large features."""
     coarse = []
     for k in range(len(store.images)):
         f = store[k]
-        coarse.append(f.where(np.argsort(-f.scale, kind="stable")[:largest]))
-    return pairs_by_likeness(coarse, largest)
+        coarse.append(f.where(np.argsort(-f.scale, kind="stable")[:_LARGEST]))
+    return pairs_by_likeness(coarse)
 
 
 def find_pairs(

@@ -36,8 +36,6 @@ _KNOWN = 0.1
 _DIRTY = 5.5
 #: Stains that are listed, the deepest.
 _MOST_DIRT = 100
-#: Share of saturated pixels from which on the brightest part of the image says nothing of the light.
-_SATURATED = 0.001
 _UNEVEN, _STRUCTURE = 0.02, 0.5
 """Residual as part of the brightness, and correlation of neighbours, above which the surface is not even."""
 
@@ -116,9 +114,7 @@ class FallOff:
         return max(totals) - min(totals)
 
 
-def fit_fall_off(
-    flat: NDArray[np.floating], settings: FallOffSettings | None = None, saturation: float | None = None
-) -> FallOff:
+def fit_fall_off(flat: NDArray[np.floating], settings: FallOffSettings | None = None) -> FallOff:
     """Fit a model of light fall-off to the image of an evenly lit surface.
 
     The image is reduced to blocks, each the mean of the middle half of its values, and adjusted with weights that
@@ -130,18 +126,16 @@ def fit_fall_off(
     flat : ndarray, shape (h, w)
         Mean of flat frames, dark frame subtracted; NaN: pixels not to be used.
     settings : FallOffSettings, optional
-    saturation : float, optional
-        Grey value (above dark) of saturated pixels.
 
     Raises
     ------
     InputError
-        The image is too small or dark, saturated, mostly unknown, or shows a structure.
+        The image is too small or dark, mostly unknown, or shows a structure.
     GeometryError
         Nothing of what was asked can be estimated.
     """
     settings = settings or FallOffSettings()
-    blocks = _checked(flat, saturation)
+    blocks = _checked(flat)
     terms, rank, shares = settings.terms(), "", {}
     fit = adjust(blocks, settings, terms)
     if fit.free:
@@ -172,14 +166,9 @@ def fit_fall_off(
     return found
 
 
-def _checked(flat: NDArray[np.floating], saturation: float | None) -> Blocks:
+def _checked(flat: NDArray[np.floating]) -> Blocks:
     if flat.ndim != 2 or min(flat.shape) < 16:
         raise InputError(f"flat image of shape {flat.shape}; at least 16 × 16 pixels are needed")
-    if saturation is not None and float((flat >= saturation).mean()) > _SATURATED:
-        raise InputError(
-            f"flat image: {100 * float((flat >= saturation).mean()):.1f} % of its pixels are saturated "
-            f"({saturation:g}); their fall-off is hidden. Take it with less light"
-        )
     blocks = to_blocks(flat)
     known = blocks.values[np.isfinite(blocks.values)]
     if known.size < 0.5 * blocks.values.size or known.size < 64:

@@ -81,7 +81,6 @@ def gain_control(
     *,
     step_time: float | None = None,
     name: str = "series",
-    saturation: float | None = None,
 ) -> GainControl:
     """Follow the grey values after a step of brightness.
 
@@ -97,13 +96,11 @@ def gain_control(
         From which time on frames are after the step; None: the largest difference of two frames is the step.
     name : str
         Of the series, for messages.
-    saturation : float, optional
-        Grey value at and above which pixels are saturated.
 
     Raises
     ------
     InputError
-        Too few frames after the step, no step that stands out, saturated values, times missing or backwards.
+        Too few frames after the step, no step that stands out, times missing or backwards.
     """
     t, y = check_times(times, name), np.asarray(values, float)
     if y.shape != t.shape or not np.isfinite(y).all():
@@ -112,11 +109,6 @@ def gain_control(
     if len(y) - first < LEAST_VALUES:
         raise InputError(
             f"{name}: {len(y) - first} frames after the step; at least {LEAST_VALUES} are needed to follow the control"
-        )
-    if saturation is not None and (y[first:] >= saturation).any():
-        raise InputError(
-            f"{name}: grey values after the step reach {y[first:].max():.1f}, the saturation ({saturation:g}); what "
-            "the control does is hidden there. Take the series with less light"
         )
     approach = fit_approach(t[first:], y[first:], what=f"{name} after the step")
     ahead = y[:first]
