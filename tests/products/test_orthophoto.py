@@ -14,8 +14,9 @@ from tools.small_block import FOCAL, NAMES, SIZE, X0, Y0, YAML, Z0, Block, make_
 from photoplan.cameras.base import project
 from photoplan.errors import GeometryError, UsageError
 from photoplan.io.project.file import load_project
+from photoplan.plan.footprint import mean_gsd
 from photoplan.products.orthophoto.execution import Run, execute
-from photoplan.products.orthophoto.plan import mean_gsd, plan_orthophotos, render, two_figures
+from photoplan.products.orthophoto.plan import plan_orthophotos, render, two_figures
 from photoplan.project.scene import open_scene
 from photoplan.surfaces.intersect import intersect
 

@@ -11,13 +11,11 @@ from photoplan.cameras.lenses.base import Lens
 from photoplan.cameras.refraction import Refraction
 from photoplan.cameras.warped import Warp, WarpedCamera
 from photoplan.errors import UsageError
-from photoplan.geometry.local import LocalFrame, earth_radius
+from photoplan.geometry.local import MEAN_RADIUS, LocalFrame, earth_radius
 from photoplan.geometry.pose import Pose
 
 #: How earth curvature may be regarded.
 EARTH_CURVATURE = ("none", "correction", "strict")
-#: Earth radius where no CRS tells a better one, metres (Ecker 1991, table 4.2).
-MEAN_RADIUS = 6_380_000.0
 
 
 def oriented_camera(

@@ -13,6 +13,8 @@ from pyproj import Transformer
 from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_label, require_projected_metres
 
+#: Earth radius where no CRS tells a better one, metres (Ecker 1991, table 4.2).
+MEAN_RADIUS = 6_380_000.0
 #: Half the distance over which the mapping's derivative is taken, metres: the mapping is so smooth (its third
 #: derivative is of the order 1/R²) that truncation and rounding both stay below 1e-10.
 _REACH = 100.0

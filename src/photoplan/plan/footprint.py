@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import CentralCamera
+from photoplan.cameras.base import Camera, CentralCamera
 from photoplan.geometry.grid import MapGrid
 from photoplan.plan.tiles import Tiles
 from photoplan.surfaces.base import Terrain
@@ -163,6 +163,20 @@ def footprint(camera: CentralCamera, terrain: Terrain, bounds: Bounds | None) ->
     border = np.concatenate([image_border(camera.size), [[(s - 1) / 2 for s in camera.size]]])
     outline = intersect(camera, border, terrain, (low, high))
     return Footprint(outline[:-1], seen, float(np.isfinite(outline[:, 0]).mean()), (low, high))
+
+
+def mean_gsd(camera: Camera, seen: Footprint) -> float:
+    """Mean ground sampling distance of an image over its footprint, metres.
+
+    At each footprint point it is the square root of the ground area of one image pixel on level ground.
+    """
+    points = seen.outline[np.isfinite(seen.outline).all(axis=1)]
+    if not len(points):
+        xmin, ymin, xmax, ymax = seen.bounds or (0, 0, 0, 0)
+        return math.sqrt((xmax - xmin) * (ymax - ymin) / (camera.size[0] * camera.size[1]))
+    points = np.concatenate([points, points.mean(axis=0, keepdims=True)])
+    area = np.abs(np.linalg.det(camera.derivatives(points)[..., :2]))
+    return float(np.nanmean(1 / np.sqrt(area)))
 
 
 def covered_tiles(camera: CentralCamera, terrain: Terrain, grid: MapGrid, side: int) -> Tiles:

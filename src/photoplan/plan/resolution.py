@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import UsageError
+from photoplan.geometry.local import MEAN_RADIUS
 
 #: Distance of an image corner from the principal point, 23 cm film format, metres (Ecker 1991, tables 4.2, 4.3).
 FILM_CORNER = 0.140
-#: Earth radius of Ecker 1991, table 4.2, metres.
-EARTH_RADIUS = 6_380_000.0
 
 
 def resolution_on_ground(scale_number: ArrayLike, aperture: ArrayLike) -> NDArray[np.float64]:
@@ -145,7 +144,7 @@ def orientation_effect(
 
 
 def curvature_displacement(
-    radius: ArrayLike, c: ArrayLike, Z0: ArrayLike, Z: ArrayLike = 0.0, earth_radius: float = EARTH_RADIUS
+    radius: ArrayLike, c: ArrayLike, Z0: ArrayLike, Z: ArrayLike = 0.0, earth_radius: float = MEAN_RADIUS
 ) -> NDArray[np.float64]:
     """Radial displacement in the image if earth curvature is neglected (Ecker 1991, eq. 4.17, table 4.2).
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.events import Map
+from photoplan.geometry.local import MEAN_RADIUS
 from photoplan.kernels.pyramid import pyramid_of
 from photoplan.kernels.visibility import sight_rows
 
@@ -41,7 +42,7 @@ class SightSettings:
     """Whether the earth is round."""
     refraction: float = 0.13
     """Coefficient of refraction k = earth radius / radius of the line of sight (Ecker 1991, §5.7.6)."""
-    earth_radius: float = 6_380_000.0
+    earth_radius: float = MEAN_RADIUS
     """Metres."""
 
     def __post_init__(self) -> None:

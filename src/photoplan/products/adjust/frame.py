@@ -7,12 +7,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.build import MEAN_RADIUS
 from photoplan.cameras.corrected import CurvatureCorrection
 from photoplan.cameras.refraction import Refraction
 from photoplan.errors import HeightSystemError
 from photoplan.geometry.heights import OPTIONS, check_height_system, declared_pair, height_step
-from photoplan.geometry.local import LocalFrame, earth_radius
+from photoplan.geometry.local import MEAN_RADIUS, LocalFrame, earth_radius
 from photoplan.geometry.pose import Pose
 from photoplan.io.project.model import Project
 from photoplan.orientation.bundle.block import Bend, BlockCamera, BlockImage

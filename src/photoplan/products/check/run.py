@@ -10,15 +10,16 @@ import numpy as np
 
 from photoplan.geometry.bounds import area_fault
 from photoplan.geometry.crs import crs_label
+from photoplan.geometry.local import MEAN_RADIUS
 from photoplan.io.project.model import Project
 from photoplan.orientation.plausibility import ImagePlausibility, look, other_reading
 from photoplan.plain import pick
+from photoplan.plan.footprint import mean_gsd
 from photoplan.products.check.positions import position_fault, turned_against_positions
 from photoplan.products.check.view import view_of
-from photoplan.products.orthophoto.plan import mean_gsd, two_figures
+from photoplan.products.orthophoto.plan import two_figures
 from photoplan.project.scene import Scene, ground_of, map_order, open_scene, pose_of
 
-EARTH_RADIUS = 6_380_000.0
 #: Terrain displacements of curvature above this deserve a strict model, pixels.
 _CURVATURE_MATTERS = 0.3
 
@@ -177,7 +178,7 @@ def _sensitivity(scene: Scene) -> tuple[float, float]:
         return float("nan"), float("nan")
     per_metre = np.linalg.norm(scene.camera.derivatives(points)[..., 2], axis=-1)
     # Ecker 1991, eq. 4.17 with Z̄ = 0: the ground falls away from the tangential plane by d² / 2R.
-    drop = ((points[:, :2] - scene.camera.center[:2]) ** 2).sum(axis=1) / (2 * EARTH_RADIUS)
+    drop = ((points[:, :2] - scene.camera.center[:2]) ** 2).sum(axis=1) / (2 * MEAN_RADIUS)
     return float(np.nanmax(per_metre)), float(np.nanmax(per_metre * drop))
 
 

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan import __version__
-from photoplan.cameras.base import CentralCamera
 from photoplan.engine.execute import joined
 from photoplan.engine.execute import render as render_tile
 from photoplan.errors import GeometryError, UsageError
@@ -25,7 +24,7 @@ from photoplan.io.project.model import Project
 from photoplan.io.storage import nodata_for
 from photoplan.orientation.plausibility import look
 from photoplan.plan.compile import AnchorRule
-from photoplan.plan.footprint import Footprint, covered_tiles, image_border, some_height
+from photoplan.plan.footprint import Footprint, covered_tiles, image_border, mean_gsd, some_height
 from photoplan.plan.product import ProductPlan
 from photoplan.products.check.view import view_of
 from photoplan.products.orthophoto.settings import OrthoSettings
@@ -250,20 +249,6 @@ def product_key(scene: SceneAddress, plan: ProductPlan, settings: OrthoSettings)
         "nodata": settings.nodata,
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
-
-
-def mean_gsd(camera: CentralCamera, seen: Footprint) -> float:
-    """Mean ground sampling distance of an image over its footprint, metres.
-
-    At each footprint point it is the square root of the ground area of one image pixel on level ground.
-    """
-    points = seen.outline[np.isfinite(seen.outline).all(axis=1)]
-    if not len(points):
-        xmin, ymin, xmax, ymax = seen.bounds or (0, 0, 0, 0)
-        return math.sqrt((xmax - xmin) * (ymax - ymin) / (camera.size[0] * camera.size[1]))
-    points = np.concatenate([points, points.mean(axis=0, keepdims=True)])
-    area = np.abs(np.linalg.det(camera.derivatives(points)[..., :2]))
-    return float(np.nanmean(1 / np.sqrt(area)))
 
 
 def two_figures(value: float) -> float:
