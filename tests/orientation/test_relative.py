@@ -75,7 +75,6 @@ def test_pairs_with_gross_errors_flat_and_hilly(relief: float, wrong: float) -> 
         off = np.linalg.norm(found.points - X, axis=1)[found.inliers & ~bad]
         assert np.median(off) < 5e-3
         assert np.isnan(found.points[~found.inliers]).all()
-        assert abs(found.base_height - 0.6) < 0.06
         assert found.rms < 1.5 * SIGMA
 
 

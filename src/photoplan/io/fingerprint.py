@@ -24,8 +24,6 @@ class Fingerprint:
 
     size: int
     """Bytes of the file."""
-    mtime_ns: int
-    """Time of the last change, nanoseconds."""
     digest: str
     """SHA-256 as 64 hexadecimal digits."""
 
@@ -51,18 +49,4 @@ def fingerprint(path: str | os.PathLike[str]) -> Fingerprint:
                 digest.update(file.read(_BLOCK))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check that it is there and readable") from error
-    return Fingerprint(state.st_size, state.st_mtime_ns, digest.hexdigest())
-
-
-def unchanged(path: str | os.PathLike[str], before: Fingerprint) -> bool:
-    """Whether a file is still what `before` says. Size and content decide; a new time alone is no change.
-
-    With the size and time of `before` the content is not read again. A file that is gone has changed.
-    """
-    try:
-        state = Path(path).stat()
-    except OSError:
-        return False
-    if state.st_size != before.size:
-        return False
-    return state.st_mtime_ns == before.mtime_ns or fingerprint(path).digest == before.digest
+    return Fingerprint(state.st_size, digest.hexdigest())

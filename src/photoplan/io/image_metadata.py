@@ -41,14 +41,11 @@ class ImageMetadata:
     """Latitude, longitude (degrees) and altitude (metres)."""
     datum: str | None = None
     """Datum that EXIF names; None: WGS 84 as it is customary."""
-    relative_altitude: float | None = None
-    """Height above the place of take-off, metres."""
     sigma: tuple[float, float, float] | None = None
     """Standard deviation of east, north and height, metres, as the receiver states them."""
     yaw_pitch_roll: tuple[float, float, float] | None = None
     """Of the viewing direction, degrees: yaw clockwise from north, pitch −90 straight down and 0 to the horizon, roll
     clockwise about the viewing direction."""
-    focal_length_mm: float | None = None
     sensor_size_mm: tuple[float, float] | None = None
     """From the resolution in the focal plane, or from the 35 mm equivalent of the focal length (to about 1 %)."""
     camera: str | None = None
@@ -72,18 +69,15 @@ def read_image_metadata(path: str | Path) -> ImageMetadata:
     exif, packet = read_exif(path)
     dji, schema = _xmp(packet, path)
     size = _size(exif)
-    focal = _number(exif, "FocalLength")
     names = [n for n in (_text(exif, "Make"), _text(exif, "Model")) if n]
     return ImageMetadata(
         file=path,
         size=size,
         position=_position(exif, dji, path),
         datum=_text(exif, "GPSMapDatum"),
-        relative_altitude=_float(dji.get("RelativeAltitude")),
         sigma=_sigma(exif, dji, schema),
         yaw_pitch_roll=_attitude(dji),
-        focal_length_mm=focal,
-        sensor_size_mm=_sensor(exif, size, focal),
+        sensor_size_mm=_sensor(exif, size, _number(exif, "FocalLength")),
         camera=" ".join(names) or None,
         time=_time(exif),
         display=int(_number(exif, "Orientation") or 1),

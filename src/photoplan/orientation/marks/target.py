@@ -33,7 +33,7 @@ class MarkTarget:
     """Whether it is brighter than what surrounds it."""
 
 
-def locate_target(image: NDArray[np.floating], *, bright: bool = True, least: float = LEAST_CORRELATION) -> MarkTarget:
+def locate_target(image: NDArray[np.floating], *, bright: bool = True) -> MarkTarget:
     """Middle and diameter of the one round target in a window (Behr 1989, §4.1.1, eq. 4.1–4.4).
 
     Halfway between the extreme grey values lies the threshold; the largest extent of what exceeds it, in rows and
@@ -47,8 +47,6 @@ def locate_target(image: NDArray[np.floating], *, bright: bool = True, least: fl
         Grey values; NaN: not compared.
     bright : bool
         Whether the target is brighter than its surroundings.
-    least : float
-        Correlation below which there is no target.
 
     Raises
     ------
@@ -86,9 +84,9 @@ def locate_target(image: NDArray[np.floating], *, bright: bool = True, least: fl
     tried = best_blur(grey, disc, one, near, False)
     blur = _BLURS[int(np.nanargmax(tried))] if np.isfinite(tried).any() else 0.7
     at = locate_mark(grey, disc, one, blur_px=blur, near=(*near, half))
-    if not at.correlation >= least:
+    if not at.correlation >= LEAST_CORRELATION:
         raise InputError(
-            f"{where}: correlates by {at.correlation:.2f} with a disc, less than {least:g}: no round target"
+            f"{where}: correlates by {at.correlation:.2f} with a disc, less than {LEAST_CORRELATION:g}: no round target"
         )
     return MarkTarget(at, diameter, bright)
 

@@ -48,13 +48,11 @@ class RelativeOrientation:
     """Model coordinates of these, (n, 3); NaN for the others."""
     angle: float
     """Median angle under which the two rays of a point meet, radians."""
-    base_height: float
-    """Base divided by the median depth of the points below the base's middle."""
     rms: float
     """Root mean square of the points' distances from their epipolar lines, in tangent coordinates."""
 
 
-def relate(first: ArrayLike, second: ArrayLike, sigma: float = 1e-4, seed: int = 1) -> RelativeOrientation:
+def relate(first: ArrayLike, second: ArrayLike, sigma: float = 1e-4) -> RelativeOrientation:
     """Relative orientation without start values; half of the points may be wrong, and the scene flat.
 
     Essential matrices of five points (`five_point_essentials`) are judged by the points' distances from their epipolar
@@ -67,8 +65,6 @@ def relate(first: ArrayLike, second: ArrayLike, sigma: float = 1e-4, seed: int =
         Ideal tangent coordinates (x, y) / c of each point in both images, x right, y up.
     sigma : float
         Standard deviation of a tangent coordinate.
-    seed : int
-        Of the samples.
 
     Raises
     ------
@@ -79,7 +75,7 @@ def relate(first: ArrayLike, second: ArrayLike, sigma: float = 1e-4, seed: int =
     if len(a) < _LEAST:
         raise GeometryError(f"{len(a)} common points; relative orientation needs {_LEAST} or more")
     limit = 4.0 * sigma
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     judges = rng.permutation(len(a))[:_JUDGES]
     candidates = _candidates(a, b, judges, limit, rng)
     pose = _finalist(candidates, a[judges], b[judges], limit)
@@ -212,10 +208,8 @@ def _completed(pose: Pose, a: Array, b: Array, inliers: NDArray[np.bool_], sigma
         raise GeometryError(
             f"rays of common points meet under {np.degrees(angle):.2g}° only: the images were taken from one place"
         )
-    axis = pose.R_ground_camera[:, 2] + (0.0, 0.0, 1.0)
-    depth = np.abs((away - pose.center / 2.0) @ (axis / np.linalg.norm(axis)))
     r = _misses(_essential(pose)[None], a[inliers], b[inliers])[0]
-    return RelativeOrientation(pose, inliers, XYZ, angle, float(1.0 / np.median(depth)), float(np.sqrt((r * r).mean())))
+    return RelativeOrientation(pose, inliers, XYZ, angle, float(np.sqrt((r * r).mean())))
 
 
 def five_point_essentials(first: ArrayLike, second: ArrayLike) -> Array:

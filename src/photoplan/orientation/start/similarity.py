@@ -36,13 +36,12 @@ class Similarity:
         return Pose(self(pose.center), self.R @ pose.R_ground_camera)
 
 
-def fit_similarity(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> Similarity:
+def fit_similarity(source: ArrayLike, target: ArrayLike) -> Similarity:
     """Least-squares similarity in closed form (Horn 1987; by singular values: Umeyama 1991, IEEE PAMI 13).
 
     Parameters
     ----------
     source, target : array_like, shape (n, 3)
-    weights : array_like, shape (n,), optional
 
     Raises
     ------
@@ -50,10 +49,9 @@ def fit_similarity(source: ArrayLike, target: ArrayLike, weights: ArrayLike | No
         Fewer than three points, or points on a line.
     """
     a, b = np.asarray(source, float), np.asarray(target, float)
-    w = np.ones(len(a)) if weights is None else np.asarray(weights, float)
     if len(a) < 3:
         raise GeometryError(f"{len(a)} points known in both systems; a similarity transformation needs 3")
-    w = w / w.sum()
+    w = np.full(len(a), 1.0 / len(a))
     ma, mb = w @ a, w @ b
     a, b = a - ma, b - mb
     for extent in (np.linalg.svd(points, compute_uv=False) for points in (a, b)):
@@ -68,9 +66,7 @@ def fit_similarity(source: ArrayLike, target: ArrayLike, weights: ArrayLike | No
     return Similarity(scale, R, mb - scale * R @ ma)
 
 
-def robust_similarity(
-    source: ArrayLike, target: ArrayLike, tolerance: float, seed: int = 1
-) -> tuple[Similarity, NDArray[np.bool_]]:
+def robust_similarity(source: ArrayLike, target: ArrayLike, tolerance: float) -> tuple[Similarity, NDArray[np.bool_]]:
     """Similarity that less than half of the points being wrong does not disturb, and the points that agree (n,).
 
     Three points each make a transformation; the one with the least median of distances decides which points agree.
@@ -91,7 +87,7 @@ def robust_similarity(
         return fit_similarity(a, b), np.ones(len(a), bool)
     triples = list(combinations(range(len(a)), 3)) if comb(len(a), 3) <= _TRIPLES else None
     if triples is None:
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(1)
         triples = [tuple(rng.choice(len(a), 3, replace=False)) for _ in range(_TRIPLES)]
     best = fit_similarity(a, b)
     h = min(len(a), max(4, len(a) // 2 + 1)) - 1

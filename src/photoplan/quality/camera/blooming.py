@@ -51,10 +51,6 @@ class Blooming:
     """The same along rows."""
     extent_exposure: float
     """The longest exposure at which lifted pixels can be told."""
-    threshold_dn: float
-    """Excess from which on a pixel counts as lifted."""
-    object_pixels: int
-    neighbour_pixels: int
 
 
 def find_blooming(
@@ -138,9 +134,6 @@ def find_blooming(
         extent_rows=rows,
         extent_columns=columns,
         extent_exposure=float(times[last_told]),
-        threshold_dn=float(thresholds[last_told]),
-        object_pixels=int(bright.sum()),
-        neighbour_pixels=int(near.sum()),
     )
 
 

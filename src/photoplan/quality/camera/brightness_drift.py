@@ -51,8 +51,6 @@ class BrightnessDrift:
     """σ_I: standard deviation of one measurement, of all about their mean."""
     largest_step: float
     """Δ_I: largest difference of two successive measurements."""
-    largest_step_at: int
-    """Index of the later one of them."""
     short_sigma: float
     """Standard deviation within the interval of two measurements, from successive differences."""
     long_sigma: float
@@ -119,7 +117,6 @@ def brightness_drift(
             f"{name}: all {n} measurements are exactly {y[0]:g}: saturated, or the same frame again; nothing drifts"
         )
     steps = np.diff(y)
-    k = int(np.abs(steps).argmax())
     squares = float((steps**2).mean())
     short = math.sqrt(squares / 2.0)
     neumann = squares / (sigma**2 * (n - 1) / n)
@@ -132,8 +129,7 @@ def brightness_drift(
         minimum=float(y.min()),
         maximum=float(y.max()),
         sigma=sigma,
-        largest_step=float(abs(steps[k])),
-        largest_step_at=k + 1,
+        largest_step=float(np.abs(steps).max()),
         short_sigma=short,
         long_sigma=math.sqrt(max(sigma**2 - short**2, 0.0)),
         # Of n−1 differences that overlap: variance of their mean square is (3n−4)/(n−1)² σ⁴ for white noise.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import log, sqrt
+from math import log
 
 import numpy as np
 
@@ -40,7 +40,6 @@ class DoublingTemperature:
     """Mean temperature."""
     current_at_reference: float
     """In the unit that was given."""
-    current_at_reference_sigma: float
 
 
 def dark_current(exposures_ms: Sequence[float], levels: Sequence[Level]) -> DarkCurrent:
@@ -103,6 +102,4 @@ def doubling_temperature(
         raise InputError("the dark current does not grow with temperature; check the temperatures of the frames")
     doubling = log(2.0) / line.slope
     current = float(np.exp(line.offset))
-    return DoublingTemperature(
-        doubling, doubling * line.slope_sigma / line.slope, reference, current, current * sqrt(line.covariance[0])
-    )
+    return DoublingTemperature(doubling, doubling * line.slope_sigma / line.slope, reference, current)

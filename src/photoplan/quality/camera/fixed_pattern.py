@@ -37,8 +37,6 @@ class PatternVariance:
     pixel_sigma: float
     mean: float
     """Grey value."""
-    temporal_rest: float
-    """Temporal variance of the mean image, which was taken out."""
     filtered: bool
     """Whether the slow variation was taken out."""
 
@@ -98,7 +96,6 @@ def pattern_variance(
         pixel=pixel,
         pixel_sigma=pixel_sigma,
         mean=float(mean.mean()),
-        temporal_rest=rest,
         filtered=filtered,
     )
 

@@ -125,11 +125,11 @@ def _between(v: Array, s: Array, keep: Array) -> float:
     return (low + high) / 2
 
 
-def mean_curve(curves: Sequence[MtfCurve], highest: float = 1.0) -> MtfCurve:
+def mean_curve(curves: Sequence[MtfCurve]) -> MtfCurve:
     """Mean of MTF curves at common frequencies, with the standard deviation of the mean.
 
     Weights are those of the curves' standard deviations, as in `combine`; the frequencies end where the first curve
-    does, at `highest` at the latest.
+    does, at 1 at the latest.
 
     Raises
     ------
@@ -138,7 +138,7 @@ def mean_curve(curves: Sequence[MtfCurve], highest: float = 1.0) -> MtfCurve:
     """
     if not curves:
         raise InputError("a mean of MTF curves needs one curve at least")
-    end = min(highest, *(float(c.frequency[-1]) for c in curves))
+    end = min(1.0, *(float(c.frequency[-1]) for c in curves))
     frequency = np.linspace(0.0, end, max(2, round(_FINE * end) + 1))
     values = np.array([np.interp(frequency, c.frequency, c.modulation) for c in curves])
     sigmas = np.array(

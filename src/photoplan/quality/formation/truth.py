@@ -43,13 +43,13 @@ def model_modulation(model: ImageModel, frequency: _Array, angle_deg: float = 0.
     return np.abs(model_transfer(model, frequency, angle_deg, radius))
 
 
-def model_mtf50(model: ImageModel, angle_deg: float = 0.0, radius: float = 0.0, modulation: float = 0.5) -> float:
-    """First frequency at which the MTF falls to a modulation, cycles per pixel; NaN if it does not below 20.
+def model_mtf50(model: ImageModel, angle_deg: float = 0.0, radius: float = 0.0) -> float:
+    """First frequency at which the MTF falls to one half, cycles per pixel; NaN if it does not below 20.
 
     Direction and place are those of `model_transfer`.
     """
     f = np.linspace(0.0, 20.0, 40001)
-    return MtfCurve(f, model_modulation(model, f, angle_deg, radius)).falls_to(modulation)
+    return MtfCurve(f, model_modulation(model, f, angle_deg, radius)).falls_to(0.5)
 
 
 def line_spread(model: ImageModel, offsets: _Array, angle_deg: float = 0.0, radius: float = 0.0) -> _Array:

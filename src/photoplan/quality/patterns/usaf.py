@@ -85,8 +85,6 @@ class UsafResult:
     """Size of a pixel on the target, from the number of the group, micrometres."""
     full: float
     """Difference of light between wide bars and gaps, mean."""
-    full_from: int
-    """Threes of bars that it is the mean of."""
 
     @property
     def groups(self) -> tuple[int, ...]:
@@ -149,11 +147,11 @@ def measure_usaf(
         three = measure_three(sign * values, clipped, place, item)
         if three is not None and three.frequency < 0.75:
             found.append((item, three))
-    full, count = _full(found, what)
+    full = _full(found, what)
     bars = tuple(_bars(item, three, full, first, rules) for item, three in found)
     pixel = 1000.0 / usaf_frequency(first, 1) / float(np.sqrt(abs(np.linalg.det(place.matrix))))
     mean = float(np.mean([full @ np.array([1.0, *three.centre]) for _, three in found]))
-    return UsafResult(place, bars, pixel, mean, count)
+    return UsafResult(place, bars, pixel, mean)
 
 
 def _first_group(place: UsafPlace, rules: UsafRules, what: str) -> int:
@@ -185,8 +183,8 @@ def _first_group(place: UsafPlace, rules: UsafRules, what: str) -> int:
     return rules.group
 
 
-def _full(found: Sequence[tuple[UsafElement, ThreeBars]], what: str) -> tuple[Array, int]:
-    """Difference of light between wide bars and gaps as level and slopes over the picture, and from how many threes."""
+def _full(found: Sequence[tuple[UsafElement, ThreeBars]], what: str) -> Array:
+    """Difference of light between wide bars and gaps as level and slopes over the picture."""
     flat = [three for _, three in found if three.flat]
     if not flat:
         raise InputError(
@@ -204,8 +202,8 @@ def _full(found: Sequence[tuple[UsafElement, ThreeBars]], what: str) -> tuple[Ar
     if len(flat) >= 6:
         columns = np.array([[1.0, *three.centre] for three in flat])
         if np.linalg.matrix_rank(columns - [0.0, *columns[:, 1:].mean(axis=0)], 1.0) == 3:
-            return solve(columns, levels).unknowns, len(flat)
-    return np.array([float(levels.mean()), 0.0, 0.0]), len(flat)
+            return solve(columns, levels).unknowns
+    return np.array([float(levels.mean()), 0.0, 0.0])
 
 
 def _bars(item: UsafElement, three: ThreeBars, full: Array, first: int, rules: UsafRules) -> UsafBars:

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from photoplan.errors import GeometryError, InputError, UsageError
+from photoplan.errors import GeometryError, InputError
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain
 from photoplan.terrain.clean.borders import Finding, closed, domain_of, outside, unfit_rings
 from photoplan.terrain.clean.heights import Joined, Meeting, cut_at_walls, one_height
@@ -32,23 +32,24 @@ MAX_FINDINGS = 10_000
 """Findings of one kind that are listed; the others are counted."""
 ROUNDS = 10
 """Rounds of joining points with lines; two are usual."""
+TOLERANCE = 0.001
+"""Distance in plan below which places are one, metres."""
+HEIGHT_TOLERANCE = 0.05
+"""Difference of heights at one place above which it is reported, metres."""
 _FARTHEST = 1e8
 """Coordinates beyond this are in no projected CRS, metres."""
 
 
 def clean(
     measured: MeasuredTerrain,
-    *,
-    tolerance: float = 0.001,
-    height_tolerance: float = 0.05,
     sigmas: Mapping[str, float] | None = None,
 ) -> tuple[MeasuredTerrain, tuple[Finding, ...]]:
     """The terrain without contradictions, and what was found.
 
-    - Points and vertices closer than `tolerance` become one; a point keeps the weighted mean of the heights, and the
+    - Points and vertices closer than `TOLERANCE` become one; a point keeps the weighted mean of the heights, and the
       class of the one measured best.
     - Lines that meet, cross, touch or run along each other get common vertices there. All heights that meet at one
-      place become their mean, weighted by 1/σ²; those that differ by more than `height_tolerance` are reported one by
+      place become their mean, weighted by 1/σ²; those that differ by more than `HEIGHT_TOLERANCE` are reported one by
       one. Border lines and holes follow the heights of other lines and never change them.
     - Points on a breakline or form line become vertices of it.
     - At a two-sided breakline (wall), lines with one height are cut; each part takes the height of its side.
@@ -61,10 +62,6 @@ def clean(
     ----------
     measured : MeasuredTerrain
         As it was read; not changed.
-    tolerance : float
-        Distance in plan below which places are one, metres.
-    height_tolerance : float
-        Difference of heights at one place above which it is reported, metres.
     sigmas : mapping of str to float, optional
         Standard deviation of the heights of each class, metres, for groups and lines that have none of their own;
         default `CLASS_SIGMAS`.
@@ -83,24 +80,20 @@ def clean(
     InputError
         Coordinates that are in no projected CRS.
     """
-    if not (0 < tolerance <= 1 and height_tolerance >= 0):
-        raise UsageError(
-            f"tolerances {tolerance} and {height_tolerance} m; above 0 to 1 m, and zero or more, are allowed"
-        )
     _check_range(measured)
     sigmas = {**CLASS_SIGMAS, **(sigmas or {})}
     lines, found = closed(measured.lines)
-    points, more = without_coincident(Points.of(measured.points, sigmas), tolerance, height_tolerance)
+    points, more = without_coincident(Points.of(measured.points, sigmas), TOLERANCE, HEIGHT_TOLERANCE)
     found += more
-    net, more = _network(lines, tolerance, height_tolerance)
+    net, more = _network(lines)
     found += more
-    net, points, joined, more = _meet(net, lines, points, tolerance)
+    net, points, joined, more = _meet(net, lines, points)
     found += more
     found += _without_length(net, lines)
     sigma = np.array([sigmas[line.kind] if line.sigma is None else line.sigma for line in lines])
-    net, meetings = one_height(net, lines, sigma, joined, height_tolerance)
+    net, meetings = one_height(net, lines, sigma, joined, HEIGHT_TOLERANCE)
     found += [_meeting(m) for m in meetings]
-    lines, meetings = cut_at_walls(net, lines, height_tolerance)
+    lines, meetings = cut_at_walls(net, lines, HEIGHT_TOLERANCE)
     found += [_meeting(m) for m in meetings]
     lines, more = unfit_rings(lines)
     found += more
@@ -109,8 +102,8 @@ def clean(
     if domain is not None:
         if domain.is_empty:
             raise GeometryError(f"{_files(measured)}: border lines and holes leave no area; check which are holes")
-        found += outside(cleaned, domain, tolerance)
-    _check_rank(cleaned, tolerance)
+        found += outside(cleaned, domain, TOLERANCE)
+    _check_rank(cleaned)
     return cleaned, _capped(found)
 
 
@@ -129,12 +122,12 @@ def _check_range(measured: MeasuredTerrain) -> None:
             )
 
 
-def _network(lines: Sequence[MeasuredLine], tolerance: float, height_tolerance: float) -> tuple[Network, list[Finding]]:
+def _network(lines: Sequence[MeasuredLine]) -> tuple[Network, list[Finding]]:
     """Network of lines without repeated vertices, and what these were."""
-    net, places, spread = without_repeats(make_network(lines, tolerance))
+    net, places, spread = without_repeats(make_network(lines, TOLERANCE))
     found = []
     for place, difference in zip(places.tolist(), spread.tolist()):
-        if difference > height_tolerance:
+        if difference > HEIGHT_TOLERANCE:
             X, Y = net.xy[net.vertex[place]].tolist()
             line = lines[net.line[place]]
             text = (
@@ -145,26 +138,24 @@ def _network(lines: Sequence[MeasuredLine], tolerance: float, height_tolerance: 
     return net, found
 
 
-def _meet(
-    net: Network, lines: Sequence[MeasuredLine], points: Points, tolerance: float
-) -> tuple[Network, Points, Joined, list[Finding]]:
+def _meet(net: Network, lines: Sequence[MeasuredLine], points: Points) -> tuple[Network, Points, Joined, list[Finding]]:
     """Lines noded, and points on them made vertices."""
     found: list[Finding] = []
     parts: list[Joined] = []
-    near = points_near(net, points, 4 * tolerance)
-    reach = tolerance
+    near = points_near(net, points, 4 * TOLERANCE)
+    reach = TOLERANCE
     for _ in range(ROUNDS):
         net, points, joined, more = join_to_lines(net, lines, points, near, reach)
         found += more
-        net, places = noded(net, tolerance)
+        net, places = noded(net, TOLERANCE)
         for X, Y in places:
-            text = f"lines too dense near X {X:.3f}, Y {Y:.3f}; vertices there were joined beyond {tolerance} m"
+            text = f"lines too dense near X {X:.3f}, Y {Y:.3f}; vertices there were joined beyond {TOLERANCE} m"
             found.append(Finding("joined vertices", text, X, Y))
         if joined is None:
             break
         parts.append(joined)
         # Lines that were led through points and crossings moved a little: points may have come to lie on them.
-        reach = tolerance / 4
+        reach = TOLERANCE / 4
     joined = Joined.all(parts)
     if joined.labels:
         text = f"{len(joined.labels)} points lie on breaklines or form lines and became vertices of them"
@@ -199,7 +190,7 @@ def _meeting(meeting: Meeting) -> Finding:
     return Finding("crossing heights", text, meeting.X, meeting.Y, meeting.names)
 
 
-def _check_rank(measured: MeasuredTerrain, tolerance: float) -> None:
+def _check_rank(measured: MeasuredTerrain) -> None:
     """Refuse data that determine no surface: fewer than three places, or all on one straight line."""
     lines = [line.xyz[np.isfinite(line.xyz[:, 2]), :2] for line in measured.lines]
     xy = np.concatenate([np.empty((0, 2)), *(g.xyz[:, :2] for g in measured.points), *lines])
@@ -212,7 +203,7 @@ def _check_rank(measured: MeasuredTerrain, tolerance: float) -> None:
     local = xy - xy.mean(axis=0)
     _, axes = np.linalg.eigh(local.T @ local)
     across = local @ axes[:, 0]
-    if np.ptp(across) <= tolerance:
+    if np.ptp(across) <= TOLERANCE:
         raise GeometryError(
             f"{_files(measured)}: all {len(xy)} places lie on one straight line (within {np.ptp(across):.4f} m); the "
             "slope across it is not determined: add points beside it"
