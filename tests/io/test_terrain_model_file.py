@@ -95,7 +95,7 @@ def test_figures_lines_gross_border_and_header_come_back(model: ModelReader) -> 
     assert model.header.settings == {"filter": 0.1, "nan": None}
     assert model.header.crs == CRS and model.header.height_system == "EPSG:5773"
     assert model.header.family == "gaussian" and model.header.made_by.startswith("photoplan ")
-    assert model.finest == 2.5 and model.base_meshes == 8
+    assert model.finest == 2.5
 
 
 def test_lines_of_a_part(model: ModelReader) -> None:

@@ -78,44 +78,6 @@ class ImagePlausibility:
     """What cannot be right; None if the image is plausible."""
 
 
-@dataclass(frozen=True)
-class Plausibility:
-    """Result for a block of images."""
-
-    images: tuple[ImagePlausibility, ...]
-    alternative: str | None
-    """The reading of the orientation that would fit, as a sentence; None if the declared one fits or none does."""
-
-    @property
-    def implausible(self) -> tuple[ImagePlausibility, ...]:
-        """Images with a fault."""
-        return tuple(i for i in self.images if i.fault is not None)
-
-    def __str__(self) -> str:
-        lines = [f"{i.name}: {i.fault}" for i in self.implausible]
-        if self.alternative is not None:
-            lines.append(self.alternative)
-        return "\n".join(lines) or f"all {len(self.images)} images are plausible"
-
-
-def assess(views: Sequence[View], heights: Heights) -> Plausibility:
-    """Look at every image; where something cannot be right, try other readings of the whole block.
-
-    Parameters
-    ----------
-    views : sequence of View
-    heights : callable
-        Terrain heights at map points (n, 2), shape (n,); NaN where there is no terrain.
-
-    Returns
-    -------
-    Plausibility
-        Oblique images are plausible as long as they see the terrain.
-    """
-    images = tuple(look(view, heights) for view in views)
-    return Plausibility(images, other_reading(views, images, heights))
-
-
 def look(view: View, heights: Heights) -> ImagePlausibility:
     """Look at one image as its orientation is declared."""
     return _look(view, view.center, view.R_ground_camera, heights)

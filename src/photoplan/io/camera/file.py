@@ -6,19 +6,26 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from pydantic import TypeAdapter, ValidationError
+
 from photoplan.errors import InputError
 from photoplan.io.appearance import looks_like
 from photoplan.io.camera import opencv as camera_opencv
 from photoplan.io.camera import opensfm as camera_opensfm
 from photoplan.io.camera import pix4d as camera_pix4d
-from photoplan.io.camera import toml as camera_toml
 from photoplan.io.camera import yaml as camera_yaml
+from photoplan.io.camera.kinds import Camera
 from photoplan.io.camera.model import CameraEntry
+from photoplan.io.camera.usgs import check_report
 from photoplan.io.orientation import colmap as orientation_colmap
 from photoplan.io.orientation import metashape as orientation_metashape
 from photoplan.io.orientation import pix4d as orientation_pix4d
 from photoplan.io.orientation.table import TableFormat
 from photoplan.io.plain_files import read_head
+from photoplan.io.project.errors import explain
+from photoplan.io.toml_file import read_toml
+
+_CAMERAS = TypeAdapter(dict[str, Camera])
 
 
 def _text(path: Path) -> dict[str, CameraEntry]:
@@ -34,6 +41,28 @@ def _text(path: Path) -> dict[str, CameraEntry]:
     )
 
 
+def _toml(path: Path) -> dict[str, CameraEntry]:
+    """Cameras of the ``[cameras.NAME]`` tables of a project file, alone or in a whole project.
+
+    A table ``[report]`` beside them is compared with them; see `photoplan.io.camera.usgs`.
+
+    Raises
+    ------
+    InputError
+        There is no ``[cameras.NAME]`` table, or an entry is wrong; the message names its line.
+    """
+    contents, text = read_toml(path)
+    cameras = contents.get("cameras")
+    if not isinstance(cameras, dict) or not cameras:
+        raise InputError(f"{path}: holds no [cameras.NAME] table")
+    try:
+        described: dict[str, CameraEntry] = {**_CAMERAS.validate_python(cameras)}
+    except ValidationError as error:
+        raise InputError(explain(error, cameras, str(path), text, ("cameras",))) from None
+    check_report(contents, described, str(path))
+    return described
+
+
 def _yaml(path: Path) -> dict[str, CameraEntry]:
     return camera_opencv.read(path) if camera_opencv.is_opencv(path) else camera_yaml.read(path)
 
@@ -44,7 +73,7 @@ def _json(path: Path) -> dict[str, CameraEntry]:
 
 #: Reader of every format, by file suffix.
 CAMERA_FORMATS: dict[str, Callable[[Path], dict[str, CameraEntry]]] = {
-    ".toml": camera_toml.read,
+    ".toml": _toml,
     ".yaml": _yaml,
     ".yml": _yaml,
     ".json": _json,

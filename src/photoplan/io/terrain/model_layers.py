@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from rasterio.errors import RasterioError
 from rasterio.windows import Window as GdalWindow
 
-from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import Window
 from photoplan.io.gdal import gdal_settings
 from photoplan.io.terrain.model_tables import GrossError
@@ -125,12 +124,7 @@ def _write(path: Path, layer: str, shapes: NDArray[Any], columns: dict[str, NDAr
 
 
 def write_heights(
-    path: Path,
-    layout: UnitLayout,
-    meshes: int,
-    unit: Callable[[int, int], Unit | None],
-    crs: str,
-    events: Events = SILENT,
+    path: Path, layout: UnitLayout, meshes: int, unit: Callable[[int, int], Unit | None], crs: str
 ) -> None:
     """Layer `heights`: the posts as a raster of one grid width, in the extension for gridded coverages.
 
@@ -146,8 +140,6 @@ def write_heights(
         Gives the units.
     crs
         CRS of the layer.
-    events
-        Told of each unit.
     """
     width, height = layout.columns * meshes + 1, layout.rows * meshes + 1
     step = layout.side / meshes
@@ -173,7 +165,6 @@ def write_heights(
                     rounded = np.round(posts / np.float32(HEIGHTS_STEP)) * np.float32(HEIGHTS_STEP)
                     stored = np.where(np.isnan(rounded), np.float32(HEIGHTS_NODATA), rounded)
                     file.write(stored, 1, window=GdalWindow(area.col, area.row, area.width, area.height))
-                events.done()
     except TypeError:
         # rasterio stumbles over its own message where GDAL cannot write the place of a raster.
         raise RasterioError("GDAL could not place the raster of heights") from None

@@ -7,7 +7,7 @@ import sqlite3
 import struct
 import threading
 import zlib
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, fields
@@ -113,8 +113,6 @@ class ModelReader:
     """What the model is."""
     ranges: NDArray[np.float64] = field(init=False, repr=False)
     """Lowest and highest height of every unit, shape (rows, columns, 2); NaN for empty units."""
-    base_meshes: int = field(init=False)
-    """Meshes along a side that most units have."""
     finest: float = field(init=False)
     """Smallest grid width, metres."""
     _cache: UnitCache[Unit] = field(init=False, repr=False)
@@ -133,10 +131,9 @@ class ModelReader:
         header = header_from_json(text, self.path)
         object.__setattr__(self, "header", header)
         self._own.expect(header.identity)
-        ranges, meshes = self._read_ranges(header.layout)
+        ranges, finest = self._read_ranges(header.layout)
         object.__setattr__(self, "ranges", ranges)
-        object.__setattr__(self, "base_meshes", meshes.most_common(1)[0][0] if meshes else 1)
-        object.__setattr__(self, "finest", header.layout.side / max(meshes, default=1))
+        object.__setattr__(self, "finest", header.layout.side / finest)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _reopen, (self.path, self.cache_bytes, self.header.identity)
@@ -240,21 +237,22 @@ class ModelReader:
         check_unit(unit, where)
         return unit, buffer.nbytes
 
-    def _read_ranges(self, layout: UnitLayout) -> tuple[NDArray[np.float64], Counter[int]]:
+    def _read_ranges(self, layout: UnitLayout) -> tuple[NDArray[np.float64], int]:
+        """Heights of the units, and meshes along a side of the finest."""
         missing = {HEADER, UNITS, LINES, "units"} - self._tables()
         if missing:
             raise self._no_model(f"the table {min(missing)} is missing")
         ranges = np.full((layout.rows, layout.columns, 2), np.nan)
-        meshes: Counter[int] = Counter()
+        finest = 1
         flat = ranges.reshape(-1, 2)
         for number, low, high, count in self._each(f"SELECT id, low, high, meshes FROM {UNITS}"):
             good = isinstance(number, int) and isinstance(count, int) and 0 <= number < len(flat) and count > 0
             if not (good and isinstance(low, float) and isinstance(high, float) and -_HIGHEST < low <= high < _HIGHEST):
                 raise InputError(f"{self.path}: unit {number}: heights {low} to {high}; get a fresh copy of the file")
             flat[number] = low, high
-            meshes[count] += 1
+            finest = max(finest, count)
         ranges.setflags(write=False)
-        return ranges, meshes
+        return ranges, finest
 
     def _tables(self) -> set[str]:
         try:

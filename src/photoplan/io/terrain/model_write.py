@@ -20,7 +20,6 @@ import shapely
 
 from photoplan import __version__
 from photoplan.errors import PhotoplanError, ResourceError, UsageError
-from photoplan.events import SILENT, Events
 from photoplan.io.disk import disk_error, free_megabytes, sync_file, sync_folder
 from photoplan.io.gdal import GDAL_ERRORS, first_cause
 from photoplan.io.lock import FileLock, lock_of
@@ -173,15 +172,8 @@ class ModelWriter:
         buffer = inflate(stored.packed, stored.size, f"{self.path}: unit column {column} row {row}")
         return unit_of(buffer, self.layout, column, row)
 
-    def finish(self, parts: ModelParts, events: Events = SILENT) -> ModelReader:
-        """Make the file, give it its name, and open it.
-
-        Parameters
-        ----------
-        parts
-            Header, lines, gross errors, border.
-        events
-        Told of each unit.
+    def finish(self, parts: ModelParts) -> ModelReader:
+        """Make the file of all units and these parts, give it its name, and open it.
 
         Raises
         ------
@@ -197,7 +189,7 @@ class ModelWriter:
         part = self.path.with_name(f".{self.path.name}.part.gpkg")
         try:
             try:
-                identity = self._assemble(part, parts, events)
+                identity = self._assemble(part, parts)
                 self._check(part, identity)
                 sync_file(part)
                 # The last look before the name is taken: another program may have made the file meanwhile.
@@ -214,7 +206,7 @@ class ModelWriter:
         self._log = None
         return ModelReader(self.path)
 
-    def _assemble(self, part: Path, parts: ModelParts, events: Events) -> str:
+    def _assemble(self, part: Path, parts: ModelParts) -> str:
         """Make the file under a temporary name; returns its identity."""
         crs = parts.header.crs
         write_units(part, self.layout, self.figures(), crs)
@@ -224,7 +216,7 @@ class ModelWriter:
             write_border(part, parts.domain, crs)
         meshes = self._base_meshes()
         if meshes:
-            write_heights(part, self.layout, meshes, self.unit, crs, events)
+            write_heights(part, self.layout, meshes, self.unit, crs)
         with closing(sqlite3.connect(part)) as db:
             # The file is nothing until it is complete: no journal is needed, and it is synchronised once at the end.
             db.execute("PRAGMA journal_mode = OFF")
