@@ -77,11 +77,7 @@ class _Section(dict[str, _Entry]):
 
     def text(self, *keys: str) -> str | None:
         """Value of the first of `keys` that is stated."""
-        return next((_plain(self[k].value) for k in keys if k in self and self[k].value), None)
-
-
-def _plain(text: str) -> str:
-    return text.replace("\\ ", " ").strip()
+        return next((self[k].value.replace("\\ ", " ").strip() for k in keys if k in self and self[k].value), None)
 
 
 class _InphoFile:

@@ -81,17 +81,13 @@ def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     lines = []
     for image, R in zip(block.table.images, block.table.rotations):
         M = R.T if block.matrix == "ground-to-camera" else R
-        c = _constant(block, image)
+        c = block.camera(image).camera_constant_mm if block.cameras else None
         constant = " " * 16 if c is None else f"{c:16.5f}"
         X, Y, Z = image.center
         lines.append(f"{one_word(image.name, path):>16}{constant} {X:15.5f} {Y:15.5f} {Z:15.5f}")
         a = [f"{v + 0.0:16.12f}" for v in np.round(M, 12).ravel()]
         lines += ["".join(a[:5]), "".join(a[5:])]
     return {path: "\n".join(lines) + "\n"}
-
-
-def _constant(block: OrientationBlock, image: OrientedImage) -> float | None:
-    return block.camera(image).camera_constant_mm if block.cameras else None
 
 
 def _losses(block: OrientationBlock) -> list[Loss]:

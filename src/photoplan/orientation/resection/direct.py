@@ -187,7 +187,8 @@ def _best(R: Array, centers: Array, points: tuple[Array, Array], scale: float, n
     fitting = [pose for _, fits, pose in kept if fits] if few and sure else []
     if fitting and near is not None:
         # Where the camera lies on the cylinder about three points, noise may leave no closed solution there.
-        there = _settled(near, t, X)
+        # The minimum next to it, also where the points hardly determine it.
+        there = polished_pose(near, t, X, np.ones(len(t), bool), 200)
         if (_distances(there.R_ground_camera[None], there.center[None], t, X)[0] / (3.0 * scale) < _FITS).all():
             fitting.append(there)
     if len(fitting) < 2:
@@ -198,11 +199,6 @@ def _best(R: Array, centers: Array, points: tuple[Array, Array], scale: float, n
             "or an approximate orientation, is needed"
         )
     return min(fitting, key=lambda pose: _apart(pose, near, size))
-
-
-def _settled(pose: Pose, t: Array, X: Array) -> Pose:
-    """The minimum next to a pose, also where the points hardly determine it (Levenberg and Marquardt's method)."""
-    return polished_pose(pose, t, X, np.ones(len(t), bool), 200)
 
 
 def _apart(a: Pose, b: Pose, size: float) -> float:

@@ -100,7 +100,7 @@ def make_bend(
     refraction = project.orientation.refraction
     if not (correction or refraction):
         return None
-    radii = [_radius(project.crs, image, correction) for image in images]
+    radii = [earth_radius(project.crs, image.pose.center[:2]) if correction else MEAN_RADIUS for image in images]
 
     def warp_of(k: int, center: _Floats) -> Callable[[_Floats], _Floats]:
         X, Y, Z = (float(v) for v in center)
@@ -131,10 +131,6 @@ def make_bend(
         return shift
 
     return bend
-
-
-def _radius(crs: str, image: BlockImage, correction: bool) -> float:
-    return earth_radius(crs, image.pose.center[:2]) if correction else MEAN_RADIUS
 
 
 def _pixels(image: BlockImage, camera: BlockCamera, pose: Pose, points: _Floats) -> _Floats:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,7 +89,7 @@ def summarise(title: str, result: MapResult, settings: AdjustSettings, seconds: 
         point_sigma=_triple(np.sqrt(np.mean(sigma[tie] ** 2, axis=0)) if tie.any() else np.full(3, np.nan)),
         fields=residual_fields(result, used),
         notes=(*inputs.notes, *_advice(result, used)),
-        inputs=_inputs(inputs.files),
+        inputs=tuple((path.name, str(path)) for path in inputs.files),
         settings=_settings(result, settings, seconds),
     )
 
@@ -295,10 +294,6 @@ def _measurement(result: MapResult, k: int, rejected: bool) -> NamedMeasurement:
     axis = int(np.argmax(np.abs(np.nan_to_num(normalised))))
     text = f"{dx:+.2f} {dy:+.2f} px" if np.isfinite([dx, dy]).all() else "without it, one image sees the point"
     return NamedMeasurement(result.prepared.inputs.points.label(k), text, float(normalised[axis]), rejected)
-
-
-def _inputs(files: Sequence[Path]) -> tuple[tuple[str, str], ...]:
-    return tuple((path.name, str(path)) for path in files)
 
 
 def _settings(result: MapResult, settings: AdjustSettings, seconds: float) -> tuple[tuple[str, str], ...]:

@@ -12,7 +12,6 @@ from photoplan.io.appearance import looks_like
 from photoplan.io.filter_file import is_filter
 from photoplan.io.plan_file import read_plan_tables
 from photoplan.io.project.file import load_project
-from photoplan.io.project.model import Terrain
 from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
 from photoplan.products.describe.model import describe_model
@@ -83,16 +82,14 @@ def _project(path: Path) -> dict[str, Any]:
     return {
         "project": str(path),
         "crs": crs_label(project.crs),
-        "terrain": _terrain(project.terrain),
+        "terrain": (
+            "none" if project.terrain is None else project.terrain.file or f"one height, {project.terrain.height} m"
+        ),
         "cameras": [f"{name}: {camera.type}, lens {camera.lens.type}" for name, camera in project.cameras.items()],
         "orientation": f"{project.orientation.rotation}, {project.orientation.angle_unit}, "
         f"earth curvature {project.orientation.earth_curvature}",
         "images": [f"{image.name}: {image.file}" for image in project.images],
     }
-
-
-def _terrain(terrain: Terrain | None) -> str:
-    return "none" if terrain is None else terrain.file or f"one height, {terrain.height} m"
 
 
 def _plan(path: Path) -> dict[str, Any]:

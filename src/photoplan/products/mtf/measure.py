@@ -137,14 +137,15 @@ def _measure_all(
             try:
                 edges.append(_measured(image, channel, number, region, how))
             except InputError as error:
-                if _damaged(error, image):
+                if str(error).startswith(str(image.reader.path)):
                     raise
                 if _bent(error) and channel == channels[0] and region.line.length > 2 * _SHORT:
                     waiting += reversed(parted(region, 2))
                     break
                 if how.rois and channel == channels[0]:
                     raise type(error)(f"{_place(image, region, channel)}: {error}") from None
-                refusals[_reason(error)] += 1
+                # Without its figures.
+                refusals[re.split(r"[:;,(]", str(error), maxsplit=1)[0].strip()] += 1
                 if channel == channels[0]:
                     break
         if left > 1:
@@ -152,11 +153,6 @@ def _measure_all(
             left -= 1
     advance(left, 0)
     return edges, refusals
-
-
-def _reason(error: InputError) -> str:
-    """The kind of a refusal, without its figures."""
-    return re.split(r"[:;,(]", str(error), maxsplit=1)[0].strip()
 
 
 def _regions(
@@ -196,11 +192,6 @@ def _nothing(image: LightImage, rejected: Counter[str], how: Measuring, refusals
         f"{how.rules.least_length:g} px, with even sides, contrast over noise above {how.rules.least_snr:g}, and not "
         "saturated; give an image with roofs, markings or a chart"
     )
-
-
-def _damaged(error: InputError, image: LightImage) -> bool:
-    """Whether an error is one of the file."""
-    return str(error).startswith(str(image.reader.path))
 
 
 def _place(image: LightImage, region: EdgeRegion, channel: int) -> str:

@@ -179,9 +179,9 @@ class ImageMtf:
         """All edges of the first channel."""
         return self.groups[0]
 
-    def groups_of(self, channel: int, cells: bool = False) -> list[EdgeGroup]:
-        """Groups of a channel: of the whole field, or of its cells."""
-        return [g for g in self.groups if g.channel == channel and (g.cell is not None) == cells]
+    def cells_of(self, channel: int) -> list[EdgeGroup]:
+        """Groups of a channel in the cells of the field."""
+        return [g for g in self.groups if g.channel == channel and g.cell is not None]
 
     def json_fields(self) -> dict[str, Any]:
         """With the point spread function of both directions together."""

@@ -232,14 +232,10 @@ def design_filter(
 def _exact(x: SpreadFunction, y: SpreadFunction, asked: DesignOptions) -> NDArray[np.float64]:
     """Two-dimensional filter of the exact inverses, large enough, sum 1."""
     for half in _HALVES if asked.half is None else (asked.half,):
-        inverses = [exact_inverse(_symmetric(s), half, 8 * half + 41) for s in (x, y)]
+        # Both sides averaged: a filter turned about its centre has no other.
+        inverses = [exact_inverse(SpreadFunction.symmetric(s.side()), half, 8 * half + 41) for s in (x, y)]
         cut = max(float(abs(i.sum() - 1.0)) + abs(float(i[0])) for i in inverses)
         if cut < _CUT_OFF * sqrt(2.0 * half + 1.0):
             break
     ones = [inverse / inverse.sum() for inverse in inverses]
     return radial_filter(*ones) if asked.rotation == "radial" else separable_filter(*ones)
-
-
-def _symmetric(spread: SpreadFunction) -> SpreadFunction:
-    """Both sides averaged: a filter turned about its centre has no other."""
-    return SpreadFunction.symmetric(spread.side())

@@ -84,7 +84,7 @@ def _plots(image: ImageMtf, whole: list[EdgeGroup], plots: MtfPlots) -> list[str
     if len(channels) > 1:
         caption = "Means of each channel over all directions, with two standard deviations."
         parts.insert(2, figure(plots.curves(channels, image.total), "Channels", caption))
-    cells_of = image.groups_of(channel, cells=True)
+    cells_of = image.cells_of(channel)
     if cells_of:
         caption = "MTF50 by position in the image, half of its 95 % interval, and the number of edges."
         parts.append(figure(plots.field(cells_of, image.grid), "Sharpness over the field", caption))
