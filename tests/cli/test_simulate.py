@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import rasterio
 from tools.command import Here
+from tools.formed import form_series
 
 from photoplan.io.whole_image import write_whole_image
 from photoplan.products.simulate.model import entry_of, model_of, read_model
-from photoplan.quality.formation.model import ImageModel, form_image, form_series
+from photoplan.quality.formation.model import ImageModel, form_image
 from photoplan.quality.formation.scenes import PatternScene
 
 MODEL = """
@@ -79,7 +80,7 @@ def test_a_series_is_that_of_the_library(photoplan: Here, model: Path, tmp_path:
     assert said.code == 0, said.err
     value, scene = read_model(model), PatternScene("edge", (60, 40), (7.0,))
     images = json.loads(said.out)["images"]
-    for image, formed in zip(images, form_series(value, scene, [1.0] * 4), strict=True):
+    for image, formed in zip(images, form_series(value, [scene] * 4), strict=True):
         assert np.array_equal(pixels(Path(image["path"]))[0], formed.values)
         assert image["automatic_gain"] == formed.gain
     assert len({image["automatic_gain"] for image in images}) == 4

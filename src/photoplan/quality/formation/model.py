@@ -7,7 +7,7 @@ parts returns the scene.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import exp
 from typing import Annotated, Any
@@ -160,7 +160,7 @@ def form_image(
     exposure : float
         Factor of the light and of the time.
     gain : float
-        Automatic gain that earlier frames led to; see `form_series`.
+        Automatic gain that earlier frames led to, `FormedImage.next_gain`.
 
     Raises
     ------
@@ -171,39 +171,6 @@ def form_image(
     if not exposure >= 0.0 or not np.isfinite(exposure) or frame < 0:
         raise InputError(f"frame {frame} with exposure {exposure}; neither may be negative")
     return exposed(model, frame_light(model, scene, frame).whole(), Frame(frame, exposure, gain))
-
-
-def form_series(
-    model: ImageModel, scenes: LightScene | Sequence[LightScene], exposures: Sequence[float] = (1.0,)
-) -> Iterator[FormedImage]:
-    """Form the frames of a series one after the other; automatic gain runs through them.
-
-    Parameters
-    ----------
-    model : ImageModel
-    scenes : LightScene or sequence of Scene
-        One for all frames, or one for each frame.
-    exposures : sequence of float
-        One for each frame; with several scenes a single one holds for all.
-
-    Raises
-    ------
-    InputError
-        There are several scenes and another number of exposures, or a frame cannot be formed.
-    """
-    several = list(scenes) if isinstance(scenes, list | tuple) else None
-    factors = list(exposures) * len(several) if several and len(exposures) == 1 else list(exposures)
-    if several is not None and len(several) != len(factors):
-        raise InputError(f"{len(several)} scenes and {len(factors)} exposures; needed are equal numbers")
-    gain, known = 1.0, None
-    for frame, exposure in enumerate(factors):
-        scene = _checked(model, several[frame] if several is not None else scenes)
-        # Light that is the same in all frames is sampled once.
-        if several is not None or model.jitter.sigma or known is None:
-            known = frame_light(model, scene, frame).whole()
-        image = exposed(model, known, Frame(frame, exposure, gain))
-        gain = image.next_gain
-        yield image
 
 
 @dataclass(frozen=True)
