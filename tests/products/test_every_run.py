@@ -175,8 +175,11 @@ def undisturbed(product: Product, quiet: Ran) -> Path:
 
 @pytest.mark.parametrize(
     ("sign", "share", "code"),
-    [(signal.SIGKILL, 0.5, -9), (signal.SIGKILL, 1.0, -9), (signal.SIGINT, 0.5, 130)],
-    ids=["killed halfway", "killed at the last task", "interrupted"],
+    [
+        pytest.param(signal.SIGKILL, 0.5, -9, id="killed halfway"),
+        pytest.param(signal.SIGKILL, 1.0, -9, id="killed at the last task", marks=pytest.mark.slow),
+        pytest.param(signal.SIGINT, 0.5, 130, id="interrupted", marks=pytest.mark.slow),
+    ],
 )
 def test_faults_03_25_a_run_that_ended_early_goes_on(
     product: Product, quiet: Ran, undisturbed: Path, tmp_path: Path, sign: signal.Signals, share: float, code: int
@@ -209,6 +212,7 @@ def test_fault_04_a_full_disk(product: Product, undisturbed: Path, tmp_path: Pat
     assert product.same(tmp_path, undisturbed)
 
 
+@pytest.mark.slow
 def test_fault_05_a_task_that_fails_for_a_moment_is_tried_again(
     product: Product, quiet: Ran, undisturbed: Path, tmp_path: Path
 ) -> None:
@@ -217,7 +221,7 @@ def test_fault_05_a_task_that_fails_for_a_moment_is_tried_again(
     assert sorted(said.tasks) == sorted(quiet.tasks) and product.same(tmp_path, undisturbed)
 
 
-@pytest.mark.parametrize("workers", [2, 4])
+@pytest.mark.parametrize("workers", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_fault_26_more_workers_in_any_order(
     product: Product, quiet: Ran, undisturbed: Path, tmp_path: Path, workers: int
 ) -> None:

@@ -13,6 +13,7 @@ import re
 import signal
 import sqlite3
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -102,6 +103,8 @@ def _run(words: list[str], folder: Path, mishap: Mishap) -> None:
     from photoplan.cli.main import run
     from photoplan.engine import run as engine_run
 
+    # A shell that runs the tests in the background ignores it, and so would all of its children.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     told = os.open(folder / "told", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     for stream, name in ((1, "out"), (2, "err")):
         os.dup2(os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
@@ -117,7 +120,9 @@ def _run(words: list[str], folder: Path, mishap: Mishap) -> None:
             nonlocal done, failed
             if done == mishap.end_at:
                 os.kill(os.getpid(), mishap.sign)
-                signal.pause()
+                for _ in range(6000):  # another thread may get the signal: it ends a sleep of this one only afterwards
+                    time.sleep(0.01)
+                raise RuntimeError("the signal did not come")
             if done == mishap.fail_at and not failed:
                 failed = True
                 raise RuntimeError("the drive is gone for a moment")
