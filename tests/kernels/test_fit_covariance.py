@@ -22,16 +22,17 @@ def block(n: int, seed: int, family: int, variance: float, length: float) -> tup
     root = np.linalg.cholesky(variance * covariance(d / length, family) + 1e-9 * variance * np.eye(n))
     z = root @ rng.normal(size=n) + rng.normal(0, np.sqrt(NOISE), n)
     b = np.column_stack([z, np.ones(n), xy - xy.mean(axis=0)])
-    return d**2, np.zeros((n, n)), b, np.tile([0.0, 1.0], (n, 1))
+    return d**2, np.zeros((n, n)), b, np.tile([0.0, 1.0, 1.0], (n, 1))
 
 
 @pytest.mark.parametrize("family", [GAUSSIAN, MATERN, EXPONENTIAL])
 def test_the_score_is_that_of_leave_one_out(family: int) -> None:
-    """Points of lines (with a share of the noise, or a known one) take part, but are not predicted."""
+    """Points are predicted, also those of known noise; lines (with a share of it, or a known one) only take part."""
     variance, length, noise2, scored = 4e-4, 3.0, 1e-4, 14
     d2, sides, b, noise = block(20, 3, family, 1e-3, 3.0)
-    noise[scored:17, 1] = 0.09
-    noise[17:] = (3e-5, 0.0)
+    noise[:5, :2] = 4e-5, 0.0
+    noise[scored:17, 1:] = 0.09, 0.0
+    noise[17:] = (3e-5, 0.0, 0.0)
     total = 0.0
     all_noise = noise[:, 0] + noise[:, 1] * noise2
     xyz = np.column_stack([b[:, 2:], b[:, 0]])

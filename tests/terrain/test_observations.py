@@ -93,9 +93,11 @@ def test_groups_keep_their_own_filter_values_and_numbers() -> None:
         PointGroup("c", "mass", GROUND[1500:], np.arange(100)),
     )
     got = observe(MeasuredTerrain(groups), BuildSettings(filters={"mass": 0.1}))
-    sigma = np.sqrt(got.noise(np.full(1600, 9.0)))
-    assert set(sigma[got.group == 1]) == {0.0}
-    np.testing.assert_allclose(sigma[got.group != 1], 0.1)
+    for together in (0.1, 0.5):  # what was stated, and what measuring and stubble make together
+        sigma = np.sqrt(got.noise(np.full(1600, together)))
+        assert set(sigma[got.group == 1]) == {0.0}
+        np.testing.assert_allclose(sigma[got.group != 1], together)
+    np.testing.assert_allclose(np.sqrt(got.noise(np.full(1600, 0.0)))[got.group == 1], 0.0)
     assert got.record[got.group == 2].tolist() == list(range(100))
 
 

@@ -31,9 +31,9 @@ def block_score(
         Squared distances of the side coordinates, in units of the half-value distance squared.
     b : ndarray, shape (n, 4)
         Heights, and the columns of the trend 1, x, y.
-    noise : ndarray, shape (n, 2)
-        Variance of each height = noise[:, 0] + noise[:, 1] · (third parameter). The first rows, as long as the second
-        column is exactly 1, are mass points: they are the ones predicted.
+    noise : ndarray, shape (n, 3)
+        Variance of each height = noise[:, 0] + noise[:, 1] · (third parameter). The first rows, as long as the third
+        column is not 0, are the ones predicted: whether their variance is known does not matter.
     parameters : ndarray, shape (3,)
         Variance of the signal, half-value distance, variance of mass points.
     family : int
@@ -54,7 +54,7 @@ def block_score(
     if not factorise(u):
         return np.inf
     scored = 0
-    while scored < n and noise[scored, 1] == 1.0:
+    while scored < n and noise[scored, 2] != 0.0:
         scored += 1
     w = np.zeros((n, 4 + scored))
     w[:, :4] = b
@@ -108,47 +108,49 @@ def minimise(
 
     Parameters
     ----------
-    d2, sides, b, noise : ndarrays, shapes (k, n, n), (k, n, n), (k, n, 4), (k, n, 2)
+    d2, sides, b, noise : ndarrays, shapes (k, n, n), (k, n, n), (k, n, 4), (k, n, 3)
         As in `block_score`, for k blocks.
     prior : ndarray, shape (4, 3)
         Mean, weight, lowest and highest value of the logarithms. Equal bounds hold a parameter fixed.
     first : ndarray, shape (3,)
         Where to start.
     """
-    simplex, values = np.empty((4, 3)), np.empty(4)
-    for i in range(4):
-        for p in range(3):
-            simplex[i, p] = first[p]
+    # A simplex of the free parameters only: one with a corner too many in a plane collapses onto a line.
+    free = np.flatnonzero(prior[3] > prior[2])
+    last = len(free)
+    simplex, values = np.empty((last + 1, 3)), np.empty(last + 1)
+    for i in range(last + 1):
+        simplex[i] = first
         if i > 0:
-            step = min(0.7, prior[3, i - 1] - prior[2, i - 1])
-            up = first[i - 1] + step <= prior[3, i - 1]
-            simplex[i, i - 1] += step if up else -step
+            p = free[i - 1]
+            step = min(0.7, prior[3, p] - prior[2, p])
+            simplex[i, p] += step if first[p] + step <= prior[3, p] else -step
         values[i] = _objective(d2, sides, b, noise, prior, simplex[i], family)
     for _ in range(120):
         order = np.argsort(values)
         simplex, values = simplex[order], values[order]
-        if values[3] - values[0] < 0.02 and values[3] < np.inf:
+        if last == 0 or (values[last] - values[0] < 0.02 and values[last] < np.inf):
             break
-        middle = (simplex[0] + simplex[1] + simplex[2]) / 3.0
-        reflected = middle + (middle - simplex[3])
+        middle = simplex[:last].sum(axis=0) / last
+        reflected = middle + (middle - simplex[last])
         at = _objective(d2, sides, b, noise, prior, reflected, family)
         if at < values[0]:
-            further = middle + 2.0 * (middle - simplex[3])
+            further = middle + 2.0 * (middle - simplex[last])
             there = _objective(d2, sides, b, noise, prior, further, family)
             if there < at:
-                simplex[3], values[3] = further, there
+                simplex[last], values[last] = further, there
             else:
-                simplex[3], values[3] = reflected, at
+                simplex[last], values[last] = reflected, at
             continue
-        if at < values[2]:
-            simplex[3], values[3] = reflected, at
+        if at < values[max(last - 1, 0)]:
+            simplex[last], values[last] = reflected, at
             continue
-        nearer = middle + 0.5 * ((reflected if at < values[3] else simplex[3]) - middle)
+        nearer = middle + 0.5 * ((reflected if at < values[last] else simplex[last]) - middle)
         there = _objective(d2, sides, b, noise, prior, nearer, family)
-        if there < min(at, values[3]):
-            simplex[3], values[3] = nearer, there
+        if there < min(at, values[last]):
+            simplex[last], values[last] = nearer, there
             continue
-        for i in range(1, 4):
+        for i in range(1, last + 1):
             simplex[i] = simplex[0] + 0.5 * (simplex[i] - simplex[0])
             values[i] = _objective(d2, sides, b, noise, prior, simplex[i], family)
     best = np.argmin(values)

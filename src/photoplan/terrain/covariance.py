@@ -248,9 +248,7 @@ def _block(seen: Observations, numbers: NDArray[np.int64]) -> _PointBlocks:
     apart = ((sides[:, None] - sides[None]) ** 2).sum(axis=2)
     scale = max(float(np.sqrt(d2.max())), 1e-9)
     b = np.column_stack([xyz[:, 2] - xyz[:, 2].mean(), np.ones(len(xy)), xy / scale])
-    given = seen.given[numbers]
-    known = ~np.isnan(given)
-    noise = np.column_stack([np.where(known, given, 0.0) ** 2, np.where(known, 0.0, seen.share[numbers]) ** 2])
+    noise = np.column_stack([seen.parts[numbers], numbers < seen.points])
     rest = -solve(b[:, 1:], b[:, 0]).residuals
     size = spread(rest, None)
     wild = np.abs(rest - np.median(rest)) > _OUTLIER * size
@@ -296,7 +294,9 @@ def _start(
     # On level ground the whole variance is noise: 2.2 times the square of the median deviation, and more by chance.
     high = np.log([1e4 * variance, _LONGEST * seen.spacing, _MOST_NOISE * variance])
     first = np.log([0.3 * variance, 4 * seen.spacing, 0.01 * variance])
-    given = settings.filters.get("mass")
+    known = seen.known_noise
+    given = settings.filters.get("mass") if known is None else known
     if given is not None:
-        low[2] = high[2] = first[2] = np.log(max(given, 1e-9) ** 2)
+        low[2] = first[2] = np.log(max(given, 1e-9) ** 2)
+        high[2] = max(high[2], low[2]) if known else low[2]
     return first, (low, high)

@@ -47,10 +47,14 @@ class Observations:
     """Data, shape (n, 3), metres."""
     points: int
     """How many of them are mass points and spot heights."""
-    given: NDArray[np.float64]
-    """Standard deviations that are known, shape (n,), metres; NaN where the share of the mass points' is used."""
-    share: NDArray[np.float64]
-    """Standard deviation as a part of that of mass points, shape (n,)."""
+    parts: NDArray[np.float64]
+    """Variance of each datum = the first column (m²) + the second · the variance of mass points, shape (n, 2)."""
+    known_noise: float | None
+    """Standard deviation of mass points where that of each is known, the root of the mean square, metres; None: else.
+
+    What is known is the accuracy of measuring. Stubble and stones, which neighbours do not share either, come on top
+    of it: the variance of mass points is that of both, and not below what is known.
+    """
     group: NDArray[np.int32]
     """Group of each point, shape (points,)."""
     record: NDArray[np.int64]
@@ -65,7 +69,34 @@ class Observations:
 
     def noise(self, mass: NDArray[np.float64]) -> NDArray[np.float64]:
         """Variances of all data, shape (n,), m², from the standard deviation of mass points at each of them."""
-        return np.where(np.isnan(self.given), self.share * mass, self.given) ** 2
+        return np.maximum(self.parts[:, 0] + self.parts[:, 1] * mass**2, 0.0)
+
+
+def _variances(
+    given: NDArray[np.float64], share: NDArray[np.float64], points: int
+) -> tuple[NDArray[np.float64], float | None]:
+    """Variances as `Observations.parts` has them, and the known noise of mass points.
+
+    Parameters
+    ----------
+    given : ndarray, shape (n,)
+        Standard deviations that are known, metres; NaN: the share of the mass points' is used.
+    share : ndarray, shape (n,)
+        Standard deviation as a part of that of mass points.
+    points : int
+        Data that are points.
+    """
+    unknown = np.isnan(given)
+    fixed, factor = np.where(unknown, 0.0, given) ** 2, np.where(unknown, share, 0.0) ** 2
+    mass = given[:points][share[:points] == 1]
+    if not len(mass) or np.isnan(mass).any():
+        return np.column_stack([fixed, factor]), None
+    noise = float(np.sqrt(np.mean(mass**2)))
+    if noise > 0:  # a point of noise zero is to be met
+        ground = np.flatnonzero(given[:points] > 0)
+        factor[ground] = share[ground] ** 2
+        fixed[ground] -= factor[ground] * noise**2
+    return np.column_stack([fixed, factor]), noise
 
 
 def observe(measured: MeasuredTerrain, settings: BuildSettings) -> Observations:
@@ -93,12 +124,15 @@ def observe(measured: MeasuredTerrain, settings: BuildSettings) -> Observations:
     group_given = [_sigma(g.sigma, settings.filters.get(g.kind)) for g in measured.points]
     sizes = [len(g.xyz) for g in measured.points]
     barriers = _straight_pieces(table.xyz[: table.start[table.separating], :2], table.start[: table.separating + 1])
+    known = np.concatenate([np.repeat(group_given, sizes), given])
+    shares = np.concatenate([np.repeat([SHARE[g.kind] for g in measured.points], sizes), share])
+    parts, known_noise = _variances(known, shares, len(points))
     return Observations(
         origin=origin,
         xyz=np.vstack([points, data]),
         points=len(points),
-        given=np.concatenate([np.repeat(group_given, sizes), given]),
-        share=np.concatenate([np.repeat([SHARE[g.kind] for g in measured.points], sizes), share]),
+        parts=parts,
+        known_noise=known_noise,
         group=np.repeat(np.arange(len(sizes), dtype=np.int32), sizes),
         record=np.concatenate([np.arange(n) for n in sizes]) if sizes else np.empty(0, np.int64),
         lines=table,
