@@ -12,7 +12,8 @@ from tools.thinned import thinned
 
 from photoplan.cameras.mark_pattern import MarkPart, MarkPattern
 from photoplan.errors import InputError
-from photoplan.orientation.marks.fiducials import FiducialResult, FiducialSearch, MarksNotFound, find_fiducials
+from photoplan.orientation.marks.fiducials import FiducialSearch, find_fiducials
+from photoplan.orientation.marks.found import FiducialResult, MarksNotFound
 from photoplan.orientation.marks.layout import TURNS, MarkLayout, fit_placement
 
 PATTERN = ring_cross_pattern()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from photoplan.geometry.grid import Window
-from photoplan.orientation.marks.fiducials import FiducialResult, LocatedMark, MissingMark
+from photoplan.orientation.marks.found import FiducialResult, LocatedMark, MissingMark
 from photoplan.orientation.marks.layout import MarkLayout
 from photoplan.orientation.marks.measure import mark_window
 from photoplan.orientation.marks.search import Scan

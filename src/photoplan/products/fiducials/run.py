@@ -17,13 +17,8 @@ from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
 from photoplan.io.scan_pitch import parse_pitch
-from photoplan.orientation.marks.fiducials import (
-    FiducialResult,
-    FiducialSearch,
-    MarksNotFound,
-    SoughtMark,
-    find_fiducials,
-)
+from photoplan.orientation.marks.fiducials import FiducialSearch, find_fiducials
+from photoplan.orientation.marks.found import FiducialResult, MarksNotFound, SoughtMark
 from photoplan.orientation.marks.layout import MarkLayout
 from photoplan.orientation.marks.locate import LEAST_CORRELATION
 from photoplan.plain import pick
