@@ -33,7 +33,8 @@ class BuildSettings:
     """Family of the covariance function; auto: the one that predicts the points best from each other."""
     filters: dict[str, float] = field(default_factory=dict)
     """Filter value (standard deviation of measurement, metres) by class of points or lines. Mass points that have none
-    are estimated from the data, other classes take their share (`SHARE`) of it."""
+    are estimated from the data, other classes take their share (`SHARE`) of it. Where all mass points have one, what
+    the ground adds to it is estimated; zero stays zero."""
     gross: float = 5.0
     """Normalised residual beyond which a point is a gross error and left out; 0: none is sought."""
     reach: float | None = None
