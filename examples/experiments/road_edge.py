@@ -232,7 +232,7 @@ def ortho_grid() -> MapGrid:
 def orthophoto(view: FrameCamera, image: NDArray[np.float32], surface: Surface) -> NDArray[np.float32]:
     """The orthophoto, shape (rows, columns), by the package's own chain."""
     grid = ortho_grid()
-    plan = ProductPlan("road_ortho", ("road",), MapTarget(grid), AnchorRule(0.005, 3), Tiles.every(grid.window, 512))
+    plan = ProductPlan("road_ortho", ("road",), MapTarget(grid), AnchorRule(0.005, 3), Tiles.every(grid.window, 1024))
     pixels = render(plan, plan.tiles[0], [Source(view, _Photo(image))], surface, "bicubic")
     assert pixels.values is not None and pixels.valid is not None
     return np.where(pixels.valid, pixels.values[0], np.nan)

@@ -107,7 +107,7 @@ class TestBuilt:
         )
         said = photoplan("dtm", "build", survey, "-o", out, *words, "--gross", 0, "--json", "--no-report")
         facts = json.loads(said.out)
-        assert facts["grid_widths"].keys() == {"1"} and facts["noise"] == pytest.approx(0.08)
+        assert facts["grid_widths"].keys() == {"1"} and facts["noise"] == pytest.approx(0.08, rel=1e-4)
         assert facts["covariance"] == "matern" and facts["gross"] == 0
         assert ModelReader(out).layout.side == 16
 

@@ -41,6 +41,8 @@ class Job:
     nodata: Nodata
     digest: str
     """Of the image."""
+    tools: tuple[Path, ...]
+    """Files of the filter and of corrections: with the image they are what the result is made from."""
     inputs: tuple[Path, ...]
     """Files that must not be overwritten."""
 
@@ -212,11 +214,10 @@ def _complete(
         picture=job.picture if how.quicklook else None,
     )
     # The record first: a disk that is full for the picture does not leave a result without it.
-    others = [path for path in job.inputs if path.resolve() != reader.info.path.resolve()]
     write_run_record(
         job.target,
         key=job.key,
-        inputs=[input_entry(reader.info.path, job.digest), *others],
+        inputs=[input_entry(reader.info.path, job.digest), *job.tools],
         run={"workers": how.workers, "memory": how.memory, **ran},
         **_record(job, how, result, facts),
     )

@@ -132,9 +132,8 @@ def plan_restoration(request: RestoreRequest) -> RestorePlan:
     if twice:
         raise UsageError(f"image {twice[0]} is given twice")
     stems = unique_stems(path.name for path in request.images)
-    inputs = [*request.images, *([given] if isinstance(given, Path) else [])]
-    inputs += [path for path in (request.chromatic, request.fall_off) if isinstance(path, Path)]
-    inputs += [] if request.linearisation in ("linear", "srgb") else [Path(request.linearisation)]
+    tools = [path for path in (given, request.chromatic, request.fall_off) if isinstance(path, Path)]
+    tools += [] if request.linearisation in ("linear", "srgb") else [Path(request.linearisation)]
     jobs, failed = [], {}
     for path in request.images:
         try:
@@ -144,7 +143,7 @@ def plan_restoration(request: RestoreRequest) -> RestorePlan:
             chosen = _only(filter_, request.bands, source.bands)
             reader = restored(source, chosen, light, out)
             target = request.folder / f"{stems[path.name]}_restored.tif"
-            jobs.append(_job(request, reader, target, text, tuple(inputs)))
+            jobs.append(_job(request, reader, target, text, tuple(tools)))
         except InputError as error:
             failed[path.name] = str(error)
     for job in jobs:
@@ -168,7 +167,7 @@ def _only(filter_: RestorationFilter, bands: tuple[int, ...], count: int) -> Res
     return RestorationFilter(tuple(kernels), filter_.image_size, filter_.description, filter_.facts)
 
 
-def _job(request: RestoreRequest, reader: SteppedReader, target: Path, text: str, inputs: tuple[Path, ...]) -> Job:
+def _job(request: RestoreRequest, reader: SteppedReader, target: Path, text: str, tools: tuple[Path, ...]) -> Job:
     info = reader.info
     digest = fingerprint(info.path).digest
     facts = [__version__, digest, text, request.settings["bands"], str(reader.dtype), request.linearisation]
@@ -187,7 +186,7 @@ def _job(request: RestoreRequest, reader: SteppedReader, target: Path, text: str
             f"{info.path}: {reader.bands} bands of {reader.dtype}; compression jpeg takes one or three of uint8"
         )
     form: ImageForm = form_of(info)
-    return Job(reader, target, form, key, nodata, digest, inputs)
+    return Job(reader, target, form, key, nodata, digest, tools, (*request.images, *tools))
 
 
 def _check_outputs(job: Job, request: RestoreRequest) -> None:
