@@ -15,7 +15,7 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.heights import crs_with_heights
 from photoplan.io.product import check_output
 from photoplan.io.terrain.export import TIN_SUFFIXES, replacing, write_points, write_tin
-from photoplan.products.dtm.raster import GridOptions, settings_of, write_grid
+from photoplan.products.dtm.raster import GridOptions, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.targets.map import MapTarget
@@ -122,15 +122,7 @@ def _grid(request: ExportRequest, terrain: OpenTerrain) -> MapGrid:
 def _export_raster(request: ExportRequest, terrain: OpenTerrain, events: Events) -> ExportReport:
     grid, surface = _grid(request, terrain), terrain.surface
     target = MapTarget(grid)
-    options = GridOptions(
-        kind="heights",
-        settings=settings_of(request),
-        inputs=[request.model],
-        tile=_TILE,
-        workers=request.workers,
-        overwrite=request.overwrite,
-        events=events,
-    )
+    options = GridOptions.of(request, "heights", [request.model], events, tile=_TILE)
 
     def heights(window: Window) -> NDArray[np.float32]:
         return surface.relief(target, window)[None]

@@ -20,7 +20,7 @@ from photoplan.io.polygons import label_polygons, read_features, write_features
 from photoplan.io.product import check_output
 from photoplan.io.tables import read_table
 from photoplan.plain import pick
-from photoplan.products.dtm.raster import GridOptions, settings_of, write_grid
+from photoplan.products.dtm.raster import GridOptions, write_grid
 from photoplan.products.dtm.visible import COLUMNS, own_grid, read_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.terrain.flow import CELL_BYTES, Flow, FlowMethod, flow_of, snapped
@@ -219,14 +219,12 @@ def _write(
         ]
         return np.stack(bands).astype(np.float32)
 
-    options = GridOptions(
-        kind="flow",
-        settings=settings_of(request),
-        inputs=inputs,
+    options = GridOptions.of(
+        request,
+        "flow",
+        inputs,
+        events,
         tile=TILE,
-        workers=request.workers,
-        overwrite=request.overwrite,
-        events=events,
         resampling="nearest",
         tags={"BANDS": "; ".join(BANDS)},
     )

@@ -59,6 +59,14 @@ class GridOptions:
     tags: Mapping[str, str] | None = None
     """Tags of the file."""
 
+    @classmethod
+    def of(cls, request: Any, kind: str, inputs: Sequence[Path], events: Events, **more: Any) -> GridOptions:
+        """Those of a request: its fields that may decide values are the settings; its files are inputs or outputs."""
+        stated = {each.name: getattr(request, each.name) for each in fields(request)}
+        settings = {k: v for k, v in stated.items() if k not in _IDLE and not isinstance(v, Path)}
+        given = {"settings": settings, "workers": request.workers, "overwrite": request.overwrite, "events": events}
+        return cls(kind=kind, inputs=inputs, **(given | more))
+
     @property
     def key(self) -> str:
         """The digest of all that decides its values beside the place."""
@@ -67,12 +75,6 @@ class GridOptions:
 
 #: Fields of requests that decide no value.
 _IDLE = {"memory", "workers", "overwrite", "tolerance"}
-
-
-def settings_of(request: Any) -> dict[str, Any]:
-    """Fields of a request that may decide values of a grid; its files are inputs or outputs."""
-    found = {each.name: getattr(request, each.name) for each in fields(request)}
-    return {name: value for name, value in found.items() if name not in _IDLE and not isinstance(value, Path)}
 
 
 def write_grid(

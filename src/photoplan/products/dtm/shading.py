@@ -116,13 +116,12 @@ def make_picture(
     terrain = open_terrain(request.model, request.crs)
     grid = _grid(request, terrain)
     made = picture(terrain, grid)
-    options = GridOptions(
-        kind=made.kind,
+    options = GridOptions.of(
+        request,
+        made.kind,
+        inputs,
+        events,
         settings=made.settings,
-        workers=request.workers,
-        overwrite=request.overwrite,
-        inputs=inputs,
-        events=events,
         resampling=made.resampling,
         colours=made.colours,
         tags={"PHOTOPLAN_VERSION": __version__, "PHOTOPLAN_KIND": made.kind}

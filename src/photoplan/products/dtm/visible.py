@@ -23,7 +23,7 @@ from photoplan.io.product import check_output
 from photoplan.io.result_log import ResultLog
 from photoplan.io.tables import Columns, read_table
 from photoplan.plain import pick
-from photoplan.products.dtm.raster import GridOptions, settings_of, write_grid
+from photoplan.products.dtm.raster import GridOptions, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.visibility import Observer, SightSettings, horizon, needed_heights, parts
@@ -134,14 +134,12 @@ def dtm_visible(request: VisibleRequest, events: Events = SILENT) -> VisibleRepo
     grid = _grid(request, terrain, places)
     _check_memory(grid, len(places), request)
     heights = read_grid(terrain, grid)
-    options = GridOptions(
-        kind="visibility",
-        settings=settings_of(request),
-        inputs=inputs,
+    options = GridOptions.of(
+        request,
+        "visibility",
+        inputs,
+        events,
         tile=TILE,
-        workers=request.workers,
-        overwrite=request.overwrite,
-        events=events,
         resampling="average" if request.minimum_height else "nearest",
     )
     events.begin("lines of sight", len(places) * parts(heights), "parts")

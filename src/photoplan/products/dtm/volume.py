@@ -18,7 +18,7 @@ from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.polygons import Feature, read_features
 from photoplan.io.product import check_output
 from photoplan.plain import pick
-from photoplan.products.dtm.raster import GridOptions, settings_of, write_grid
+from photoplan.products.dtm.raster import GridOptions, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.targets.map import MapTarget
@@ -217,13 +217,5 @@ def _write_difference(
         return np.asarray(b.surface.relief(target, window) - a.surface.relief(target, window))[None]
 
     assert request.difference is not None
-    options = GridOptions(
-        kind="difference",
-        settings=settings_of(request),
-        inputs=inputs,
-        tile=TILE,
-        workers=request.workers,
-        overwrite=request.overwrite,
-        events=events,
-    )
+    options = GridOptions.of(request, "difference", inputs, events, tile=TILE)
     write_grid(request.difference, grid.placement, np.float32, 1, "auto", tile, options)
