@@ -15,9 +15,9 @@ import numpy as np
 from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
-from photoplan.geometry.triangulation import constrained_faces
 from photoplan.io.terrain.files import read_measured
 from photoplan.surfaces.measured import MeasuredTerrain
+from photoplan.surfaces.mesh.faces import constrained_faces
 from photoplan.terrain.clean.run import clean
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from tools.build_terrain import built, directly, line, scattered, surface_of, terrain
 
 from photoplan.errors import GeometryError, InputError
+from photoplan.products.dtm.build import describe_plan
 from photoplan.surfaces.measured import MeasuredTerrain
 from photoplan.terrain.build import Built, plan_build
 from photoplan.terrain.settings import BuildSettings
@@ -300,3 +303,51 @@ class TestPlans:
 
         with pytest.raises(UsageError, match=r"needed|are "):
             BuildSettings(**bad)
+
+
+class TestFigures:
+    """What a build says of itself."""
+
+    def test_the_plan_names_the_grid_that_is_built(self) -> None:
+        """Half the width where breaklines pass, unless a width is asked for."""
+        xyz = with_heights(scattered(60.0, 900, 1), smooth, 0.02)
+        edge = line(np.column_stack([np.full(9, 10.2), np.linspace(5, 30, 9), np.full(9, 300.0)]))
+        for measured, asked, part in (
+            (terrain(xyz, edge), None, 2),
+            (terrain(xyz, edge), 1.0, 1),
+            (terrain(xyz), None, 1),
+            (terrain(xyz, replace(edge, kind="formline")), None, 1),
+        ):
+            model = built(measured, unit_meshes=16, adapt=0.0, grid_width=asked)
+            widths = {unit.width for unit in model.units.values()}
+            assert model.plan.finest == pytest.approx(model.plan.width / part)
+            assert min(widths) == pytest.approx(model.plan.finest) and max(widths) == pytest.approx(model.plan.width)
+            said = describe_plan(model.plan, measured, "EPSG:25832", None)
+            assert (f"{model.plan.finest:g} m where breaklines pass" in said) == (part == 2)
+
+    def test_sigma_of_posts_leaves_the_extrapolated_rim_out(self) -> None:
+        """As in the middle of the square; with the rim it would be half as large again. All rim: all posts count."""
+        xyz = with_heights(scattered(40.0, 700, 1), smooth, 0.05)
+        model = built(terrain(xyz), unit_meshes=16, adapt=0.0)
+        XY, sigmas = posts_of(model)
+        inside = (np.abs(XY - 20) < 16).all(axis=1)
+        middle, every = (np.sqrt((s**2).mean()) for s in (sigmas[inside], sigmas))
+        assert every > 1.3 * middle
+        assert model.sigma == pytest.approx(middle, rel=0.05)
+        known = np.array([f.sigma for f in model.figures if np.isfinite(f.sigma)])
+        assert known.min() <= model.sigma <= known.max() < every * 1.5
+        sparse = built(terrain(np.array([[0.0, 0, 5], [9, 0, 6], [0, 9, 7], [9, 9, 7.5]])), unit_meshes=4)
+        _, sigmas = posts_of(sparse)
+        assert sparse.sigma == pytest.approx(np.sqrt((sigmas**2).mean()))
+
+
+def posts_of(model: Built) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Places (n, 2) and standard deviations of all posts that have a height."""
+    places, sigmas = [], []
+    for unit in model.units.values():
+        along = np.arange(unit.meshes + 1) * unit.width
+        x, y = np.meshgrid(unit.left + along, unit.top - along)
+        known = np.isfinite(unit.sigmas)
+        places.append(np.column_stack([x[known], y[known]]))
+        sigmas.append(unit.sigmas[known].astype(float))
+    return np.concatenate(places), np.concatenate(sigmas)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from tools.effort import at_most
 
 from photoplan.errors import GeometryError, InputError
-from photoplan.geometry.triangulation import constrained_faces
 from photoplan.surfaces.measured import MeasuredLine, MeasuredTerrain, PointGroup
+from photoplan.surfaces.mesh.faces import constrained_faces
 from photoplan.terrain.clean.run import Finding, clean, domain_of
 
 EAST, NORTH = 21_530_000.0, 6_782_000.0

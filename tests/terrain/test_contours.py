@@ -11,7 +11,7 @@ import shapely
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
-from photoplan.geometry.triangulation import constrained_faces
+from photoplan.surfaces.mesh.faces import constrained_faces
 from photoplan.surfaces.units import MeshFaces
 from photoplan.terrain.contours import run as contours
 from photoplan.terrain.contours.parts import SurfacePart, grid_parts

@@ -5,20 +5,21 @@ from __future__ import annotations
 import shutil
 import subprocess
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import rasterio
+from hypothesis import given
+from hypothesis import strategies as st
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.targets.map import MapTarget
-from photoplan.terrain.shading import run as shading
-from photoplan.terrain.shading import tints as shading_tints
+from photoplan.terrain import shading
 
 GRID = MapGrid(1000.0, 2000.0, 0.5, 60, 50, "EPSG:32633")
 
@@ -164,10 +165,10 @@ def test_classes() -> None:
 def test_ramps_interpolate_or_class() -> None:
     text = "# sea\n0, 0 0 100\n100;100 200 0  # green\n\n50\t50 50 50\nnv 0 0 0\n"
     heights = np.array([[-5, 0, 25, 50, 99, 100, 500, np.nan]], np.float32)
-    smooth = shading_tints.parse_ramp(text, "a.txt")(heights)
+    smooth = shading.parse_ramp(text, "a.txt")(heights)
     np.testing.assert_allclose(smooth[0, 0, :7], [0, 0, 25, 50, 99, 100, 100], atol=1e-4)
     assert np.isnan(smooth[:, 0, 7]).all()
-    classed = shading_tints.parse_ramp(text, "a.txt", classed=True)(heights)
+    classed = shading.parse_ramp(text, "a.txt", classed=True)(heights)
     np.testing.assert_allclose(classed[1, 0, :7], [0, 0, 0, 50, 50, 200, 200])
 
 
@@ -178,24 +179,24 @@ def test_ramps_interpolate_or_class() -> None:
 )  # fmt: skip
 def test_fault_18_a_bad_ramp_names_its_line(text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        shading_tints.parse_ramp(text, "a.txt")
+        shading.parse_ramp(text, "a.txt")
 
 
 def test_built_in_ramps_span_their_range() -> None:
-    ramp = shading_tints.built_in_ramp("hypsometric", 100, 900)
+    ramp = shading.built_in_ramp("hypsometric", 100, 900)
     ends = np.array([[100, 900]], np.float32)
-    np.testing.assert_allclose(ramp(ends)[:, 0, 0], shading_tints.RAMPS["hypsometric"][0], atol=1e-3)
-    np.testing.assert_allclose(ramp(ends)[:, 0, 1], shading_tints.RAMPS["hypsometric"][-1], atol=1e-3)
-    steps = shading_tints.built_in_ramp("grey", 0, 10, 5)(np.array([[0, 1.9, 2, 9.9, 10]], np.float32))[0, 0]
+    np.testing.assert_allclose(ramp(ends)[:, 0, 0], shading.RAMPS["hypsometric"][0], atol=1e-3)
+    np.testing.assert_allclose(ramp(ends)[:, 0, 1], shading.RAMPS["hypsometric"][-1], atol=1e-3)
+    steps = shading.built_in_ramp("grey", 0, 10, 5)(np.array([[0, 1.9, 2, 9.9, 10]], np.float32))[0, 0]
     np.testing.assert_allclose(steps, [40, 40, 40 + 205 / 4, 245, 245], atol=1e-3)
     with pytest.raises(UsageError, match="hypsometric"):
-        shading_tints.built_in_ramp("nice", 0, 1)
+        shading.built_in_ramp("nice", 0, 1)
 
 
 def test_shading_keeps_the_colour_of_flat_ground() -> None:
     colours = np.full((3, 1, 4), 120, np.float32)
     shade = np.array([[0.5, 0.0, 1.0, np.nan]], np.float32)
-    found = shading_tints.shaded(colours, shade, 0.5, 1.0)[0, 0]
+    found = shading.shaded(colours, shade, 0.5, 1.0)[0, 0]
     np.testing.assert_allclose(found, [120, 0, 120 + 135 / 2, 120])
 
 
@@ -231,14 +232,7 @@ def test_gdaldem_agrees(
     with rasterio.open(tmp_path / "a.tif") as file:
         theirs = file.read(1).astype(float)
 
-    @dataclass(frozen=True)
-    class Posts:
-        size: tuple[int, int] = (150, 120)
-
-        def read(self, window: Window) -> np.ndarray:
-            return heights[window.row : window.stop[1], window.col : window.stop[0]]
-
-    surface = RasterSurface(Posts(), (500_000.5, 5_199_999.5), (1.0, 1.0))
+    surface = RasterSurface(Posts(heights), (500_000.5, 5_199_999.5), (1.0, 1.0))
     grid = MapGrid(500_000, 5_200_000, 1.0, 150, 120, "EPSG:32633")
     assert surface.relief(MapTarget(grid), grid.window)[7, 9] == heights[7, 9]
     slopes = shading.surface_slopes(surface, grid, grid.window)
@@ -256,6 +250,51 @@ def test_gdaldem_agrees(
         off, inner = (off + 180) % 360 - 180, inner & steep
     assert np.abs(off[inner]).max() < tolerance
     assert np.abs(off[inner]).mean() < tolerance / 6
+
+
+@dataclass(frozen=True)
+class Posts:
+    heights: np.ndarray
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.heights.shape[1], self.heights.shape[0]
+
+    def read(self, window: Window) -> np.ndarray:
+        assert min(window.col, window.row, window.size - 1) >= 0
+        assert window.stop[0] <= self.size[0] and window.stop[1] <= self.size[1]
+        return self.heights[window.row : window.stop[1], window.col : window.stop[0]]
+
+
+@given(
+    st.floats(0.4, 7.0), st.floats(-3, 3), st.floats(-3, 3), st.integers(2, 9), st.integers(2, 9), st.booleans(),
+    st.sampled_from([(1.0, 1.0), (2.0, 0.7)]), st.booleans(),
+)  # fmt: skip
+def test_rasters_of_planes_have_their_slope_up_to_the_border(
+    resolution: float, gx: float, gy: float, columns: int, rows: int, void: bool, mesh: tuple[float, float], other: bool
+) -> None:
+    """The outer half cell, where heights go on level, and tiles of any size; also through another CRS."""
+    y, x = np.mgrid[:rows, :columns]
+    heights = (100 + gx * mesh[0] * x - gy * mesh[1] * y).astype(np.float32)
+    if void and rows > 4 and columns > 4:
+        heights[1, 2] = np.nan
+    width, height = columns * mesh[0], rows * mesh[1]
+    surface = RasterSurface(Posts(heights), (1000 + mesh[0] / 2, 2000 - mesh[1] / 2), mesh)
+    if other:
+        surface = replace(surface, to_grid_crs=lambda XY: XY + 0.0)
+    grid = MapGrid.covering((1000, 2000 - height, 1000 + width, 2000), resolution, "EPSG:32633")
+    slopes = shading.surface_slopes(surface, grid, grid.window)
+    valid = np.isfinite(slopes.heights)
+    found = slopes.gradient[:, valid]
+    known = np.isfinite(found).all(axis=0)
+    # A pixel that reaches beyond the terrain on both sides has nothing beside its middle.
+    assert known.all() or void or resolution > 2 * min(width, height) / 3
+    off = np.abs(found[:, known] - np.array([[gx], [gy]], np.float32))
+    assert not known.any() or off.max() < 2e-4 / min(resolution, *mesh) + 1e-4
+    for part in grid.window.tiles(13):
+        again = shading.surface_slopes(surface, grid, part).gradient
+        inside = np.s_[:, part.row : part.stop[1], part.col : part.stop[0]]
+        np.testing.assert_allclose(again, slopes.gradient[inside], atol=2e-4 / resolution)
 
 
 @pytest.mark.parametrize("wrong", [{"altitude": 0}, {"altitude": 91}, {"azimuth": np.nan}, {"exaggeration": -1}])

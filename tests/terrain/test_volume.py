@@ -16,8 +16,7 @@ from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid
 from photoplan.surfaces.level import LevelSurface
 from photoplan.surfaces.measured import Tin
-from photoplan.terrain.volume.region import cover
-from photoplan.terrain.volume.run import VolumeSettings, volume_between
+from photoplan.terrain.volume import VolumeSettings, cover, volume_between
 
 X0, Y0 = 456_000.0, 5_340_000.0
 """Map coordinates have seven digits before the point."""

@@ -11,7 +11,7 @@ from tools.function_surface import FunctionSurface
 
 from photoplan.errors import UsageError
 from photoplan.surfaces.level import LevelSurface
-from photoplan.terrain.volume.sigma import ErrorModel, volume_sigma
+from photoplan.terrain.volume import ErrorModel, volume_sigma
 
 FLAT = LevelSurface(0.0)
 

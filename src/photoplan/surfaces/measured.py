@@ -104,6 +104,10 @@ class MeasuredTerrain:
     files: tuple[Path, ...] = ()
     notes: tuple[str, ...] = field(default=())
     """What was noticed while reading and repaired or left out, one line each."""
+    codes: frozenset[str] = frozenset()
+    """All codes and names of layers that the files hold."""
+    fields: tuple[str, ...] = ()
+    """What the columns, attributes or layers of the files are called, file by file, for messages."""
 
     @property
     def count(self) -> int:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 from photoplan.errors import InputError
 from photoplan.events import SILENT, Events, Map
@@ -20,6 +21,7 @@ from photoplan.surfaces.mesh.thin import thin
 from photoplan.surfaces.units import LineElement, MeshFaces, Unit, UnitFigures, UnitLayout
 from photoplan.terrain.clean.borders import domain_of
 from photoplan.terrain.fit import TerrainFit, fit
+from photoplan.terrain.held_out import calibrated
 from photoplan.terrain.observations import Observations, observe
 from photoplan.terrain.predict import Domain, predict_lines, predict_unit
 from photoplan.terrain.settings import BuildSettings
@@ -33,6 +35,8 @@ _ROUND = (1.0, 1.25, 1.6, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
 _ADAPT = 0.25
 #: Units of a model at most: a wider spread of points needs a wider grid.
 _MOST_UNITS = 1_000_000
+#: Cells from the edge of the domain to the posts that data surround: it is 1.5 beyond the outermost data.
+_RIM = 2.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +54,12 @@ class BuildPlan:
     """Polygon of the border lines, in the CRS; None: there are none."""
     settings: BuildSettings
 
+    @property
+    def finest(self) -> float:
+        """Grid width where breaklines pass, metres; `width` where there are none."""
+        halved = self.settings.grid_width is None and any(x.kind == "breakline" for x in self.seen.lines.lines)
+        return self.width / 2 if halved else self.width
+
 
 @dataclass(frozen=True, eq=False)
 class Built:
@@ -63,6 +73,8 @@ class Built:
     """With their intersections with the grid."""
     figures: tuple[UnitFigures, ...] = field(default=())
     """Of all units, row by row."""
+    sigma: float = np.nan
+    """Root mean square of the standard deviations of posts that data surround, metres; of all posts if none is."""
 
 
 def plan_build(measured: MeasuredTerrain, settings: BuildSettings) -> BuildPlan:
@@ -133,9 +145,11 @@ def build_terrain(plan: BuildPlan, run: Map = map, events: Events = SILENT) -> B
     local = replace(layout, left=layout.left - seen.origin[0], top=layout.top - seen.origin[1])
     count = layout.columns * layout.rows
     found = fit(seen, local, settings, run, events)
+    domain = _domain(plan)
+    events.begin("held-out blocks", unit="units")
+    found = calibrated(found, domain.places(), settings.unit_meshes, run)
     events.begin("lines", unit="units")
     lines = predict_lines(found, run)
-    domain = _domain(plan)
     events.begin("heights", count, "units")
     meshes_of = settings.unit_meshes * _finer(plan, lines).ravel()
     posts = run(lambda u: _thinned(plan, predict_unit(found, u, domain, int(meshes_of[u]), plan.reach)), range(count))
@@ -145,7 +159,33 @@ def build_terrain(plan: BuildPlan, run: Map = map, events: Events = SILENT) -> B
         meshes[row, column] = unit.meshes
     lines = [on_grid(line, layout, meshes) for line in lines]
     units = _with_faces(plan, units, lines, run, events)
-    return Built(plan, found, units, tuple(lines), tuple(_figures(plan, found, units, lines)))
+    sigmas = _surrounded(plan, domain, units)
+    every = np.concatenate([np.empty(0), *sigmas.values()])
+    sigma = float(np.sqrt((every**2).mean())) if len(every) else np.nan
+    return Built(plan, found, units, tuple(lines), tuple(_figures(plan, found, units, lines, sigmas)), sigma)
+
+
+def _surrounded(
+    plan: BuildPlan, domain: Domain, units: dict[tuple[int, int], Unit]
+) -> dict[tuple[int, int], NDArray[np.float64]]:
+    """Standard deviations of the posts of each unit that lie inside the outline of the data by a spacing.
+
+    The domain reaches a spacing beyond the data: heights there are extrapolated, and their standard deviations, many
+    times larger, would say nothing of the model that is used. All posts count where no post of the model lies inside.
+    """
+    inner = distance_transform_edt(domain.near) > _RIM
+    origin = plan.seen.origin
+    inside, everywhere = {}, {}
+    for key, unit in units.items():
+        along = np.arange(unit.meshes + 1) * unit.width
+        row = ((domain.top - (unit.top - along - origin[1])) / domain.cell).astype(int)
+        column = ((unit.left + along - origin[0] - domain.left) / domain.cell).astype(int)
+        # Posts outside the raster have no height.
+        rows, columns = (np.clip(k, 0, n - 1) for k, n in zip((row, column), inner.shape))
+        known = np.isfinite(unit.sigmas)
+        everywhere[key] = unit.sigmas[known].astype(float)
+        inside[key] = unit.sigmas[known & inner[np.ix_(rows, columns)]].astype(float)
+    return inside if any(len(s) for s in inside.values()) else everywhere
 
 
 def _domain(plan: BuildPlan) -> Domain:
@@ -211,7 +251,11 @@ def _with_faces(
 
 
 def _figures(
-    plan: BuildPlan, found: TerrainFit, units: dict[tuple[int, int], Unit], lines: list[LineElement]
+    plan: BuildPlan,
+    found: TerrainFit,
+    units: dict[tuple[int, int], Unit],
+    lines: list[LineElement],
+    sigmas: dict[tuple[int, int], NDArray[np.float64]],
 ) -> list[UnitFigures]:
     layout = plan.layout
     passing = _passing(layout, lines)
@@ -229,7 +273,8 @@ def _figures(
             heights += [] if unit.faces is None else [unit.faces.vertices[:, 2]]
             everything = np.concatenate(heights)
             low, high = float(np.nanmin(everything)), float(np.nanmax(everything))
-            sigma = float(np.sqrt(np.nanmean(unit.sigmas.astype(float) ** 2)))
+            some = sigmas[column, row]
+            sigma = float(np.sqrt((some**2).mean())) if len(some) else np.nan
         figures.append(
             UnitFigures(
                 column=column,

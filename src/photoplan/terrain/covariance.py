@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,6 +130,8 @@ class Covariance:
     """Distance at which the correlation is one half, metres."""
     noise: float
     """Standard deviation of mass points, metres: their filter value."""
+    ground: float = 0.0
+    """Part of the noise's variance that may be ground: what other families, weighed by their scores, do not need."""
 
     @property
     def name(self) -> str:
@@ -168,17 +170,26 @@ def estimate_all(
     first, bounds = _start(seen, blocks, settings)
     families = range(len(FAMILIES)) if settings.family == "auto" else [FAMILIES.index(settings.family)]
     prior = np.stack([first, np.zeros(3), *bounds])
-    best: tuple[NDArray[np.float64], Covariance] | None = None
+    found: list[tuple[NDArray[np.float64], Covariance]] = []
+    best = 0
     for family in families:
         scaled = blocks.sides * GAPS[family] ** 2 / 4
         logs, _ = minimise(blocks.d2, scaled, blocks.b, blocks.noise, prior, first, family)
         logs, _ = minimise(blocks.d2, scaled, blocks.b, blocks.noise, prior, logs, family)
         each = zip(blocks.d2, scaled, blocks.b, blocks.noise)
         scores = np.array([block_score(*block, np.exp(logs), family) for block in each])
-        if best is None or _clearly_better(best[0] - scores):
-            best = scores, _covariance(family, logs)
-    assert best is not None
-    return best[1]
+        found.append((scores, _covariance(family, logs)))
+        if _clearly_better(found[best][0] - scores):
+            best = len(found) - 1
+    return replace(found[best][1], ground=_ground(found, found[best][1].noise))
+
+
+def _ground(found: list[tuple[NDArray[np.float64], Covariance]], noise: float) -> float:
+    """Share of the noise's variance that may be ground, where points decide little between families."""
+    scores = np.array([scores.mean() for scores, _ in found])
+    weight = np.exp(scores.min() - scores)
+    less = [max(0.0, 1 - (covariance.noise / noise) ** 2) for _, covariance in found]
+    return float(np.average(less, weights=weight))
 
 
 def _clearly_better(gain: NDArray[np.float64]) -> bool:

@@ -5,28 +5,33 @@ The area is cut into squares that hold few points each: every one is the core of
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.events import SILENT, Events, Map
+from photoplan.kernels.local_planes import local_scales
+from photoplan.kernels.patch import MOST_MISFIT
 from photoplan.kernels.patch_test import score_models, test_points
 from photoplan.surfaces.units import UnitLayout
+from photoplan.terrain.calibration import NONE, Calibration
 from photoplan.terrain.covariance import LADDER, Covariance, Neighbours, estimate_all, estimate_unit, ladder, near_lines
-from photoplan.terrain.observations import Observations
+from photoplan.terrain.observations import Observations, told_by
+from photoplan.terrain.screen import PART, Neighbourhoods, Screened, screen, supported
 from photoplan.terrain.settings import BuildSettings
 
 #: A patch reaches this many half sides from the middle of its leaf (see the weights in `photoplan.kernels.patch`).
 REACH = 1.5
 #: Rounds of looking for gross errors; each finds at most one in a patch.
 _ROUNDS = 12
-#: Residuals whose spread a unit's own ones must outweigh: its standard deviations follow their neighbours' till then.
-_EXPECTED_RESIDUALS = 50
-#: Points within so many spacings support each other if both deviate by more than so many standard deviations.
-_CLOSE, _CLEAR = 1.5, 2.0
-#: A point tells nothing of its error if less than this share of it shows in the residual.
-_LEAST_REDUNDANCY = 0.02
+#: Spacings at which data count a quarter for the roughness; points of a leaf from which it is judged whether roughness
+#: differs; the usual roughness counts as so many data.
+_ROUGH, _LEAST_OF_LEAF, _WEIGHTS = 3.0, 6, (1.0, 100.0)
+#: With fewer points no one is a gross error.
+_FEWEST = 8
+#: While the stochastic model is estimated, the standard deviation of what looks like a gross error is so many times it.
+_WEIGHTLESS = 30.0
 #: Points that a leaf holds at most.
 CAPACITY = 24
 #: A leaf is not smaller than this many meshes.
@@ -131,11 +136,28 @@ class TerrainFit:
     shares: NDArray[np.float64]
     """Weight of each function of the ladder in every patch, shape (leaves, len(LADDER))."""
     residuals: NDArray[np.float64]
-    """Residual (metres), redundancy and normalised residual of every point, shape (points, 3); NaN: not tested."""
-    spread: NDArray[np.float64]
-    """Spread of the normalised residuals in each unit, by which standard deviations are multiplied."""
+    """Height less its prediction from all others (metres), redundancy (share of this difference that the filtered
+    surface leaves) and the difference in its standard deviations, of every point, shape (points, 3); NaN: not tested.
+    Of gross errors: without any of them."""
+    ground: NDArray[np.float64]
+    """Variance in each unit that is taken for noise and may be ground, m²."""
     members: tuple[NDArray[np.int64], ...]
     """Points of each unit."""
+    suspects: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 5)))
+    """Points that are used, but look like part of a gross error: number, group, and residuals as above, as if the
+    group were not used; shape (n, 5)."""
+    usual: NDArray[np.float64] = field(default_factory=lambda: np.ones(3))
+    """Mean of the squared normalised residuals, how many data it counts as beside those around a place, and the
+    distance at which these count a quarter, metres."""
+    calibration: Calibration = NONE
+
+    @property
+    def squares(self) -> NDArray[np.float64]:
+        """Squared normalised residuals of all data; NaN: not tested, or not used."""
+        squares = np.full(len(self.noise), np.nan)
+        squares[: self.seen.points] = self.residuals[:, 2] ** 2
+        squares[self.noise < 0] = np.nan
+        return squares
 
     @property
     def gross(self) -> NDArray[np.int64]:
@@ -166,10 +188,20 @@ def fit(
     neighbours = Neighbours.of(seen.xyz[:, :2], seen.points, order)
     count = layout.columns * layout.rows
     events.begin("covariance functions and gross errors", 3 * count + 1, "units")
-    unit_of_point = _unit_of(seen.xyz[:, :2], layout)
+    unit_of_point = unit_of(seen.xyz[:, :2], layout)
     members = _members(unit_of_point[: seen.points], count)
-    (whole,) = run(lambda members: estimate_all(seen, neighbours, members, settings), [members])
-    units = list(run(lambda u: estimate_unit(seen, neighbours, members[u], whole, settings), range(count)))
+    around = screened = None
+    trusted = seen
+    if settings.gross > 0 and seen.points >= _FEWEST:
+        around = Neighbourhoods.of(seen)
+        screened = screen(seen, around, settings.gross)
+        trusted = _weightless(seen, screened)
+    told, near, subjects = told_by(trusted), neighbours, members
+    if told is not trusted:
+        near = Neighbours.of(told.xyz[:, :2], told.points, np.arange(told.points))
+        subjects = _members(unit_of(told.xyz[:, :2], layout), count)
+    (whole,) = run(lambda subjects: estimate_all(told, near, subjects, settings), [subjects])
+    units = list(run(lambda u: estimate_unit(told, near, subjects[u], whole, settings), range(count)))
     mass = np.array([unit.noise for unit in units])
     found = TerrainFit(
         seen=seen,
@@ -178,22 +210,52 @@ def fit(
         neighbours=neighbours,
         whole=whole,
         units=tuple(units),
-        noise=seen.noise(mass[unit_of_point]),
+        noise=trusted.noise(mass[unit_of_point]),
         shares=np.empty((len(leaves.half), len(LADDER))),
         residuals=np.full((seen.points, 3), np.nan),
-        spread=np.ones(count),
+        ground=whole.ground * mass**2,
         members=tuple(members),
     )
-    for u, shares in enumerate(run(lambda u: _choose(found, u), range(count))):
+    for u, shares in enumerate(run(lambda u: choose(found, leaves.of_unit(u)), range(count))):
         found.shares[leaves.of_unit(u)] = shares
     _test_all(found, [leaves.of_unit(u) for u in range(count)], run)
-    if settings.gross > 0:
+    if around is not None and screened is not None:
         events.begin("gross errors", unit="units")
-        _flag(found, settings.gross, run)
-    return replace(found, spread=_spread(found))
+        suspects = _judge(found, around, screened, seen.noise(mass[unit_of_point]), settings.gross, run)
+        _flag(found, around, screened, settings.gross, run)
+        found = replace(found, suspects=suspects[~np.isin(suspects[:, 0], found.gross)])
+    return replace(found, usual=_usual(found))
 
 
-def _unit_of(xy: NDArray[np.float64], layout: UnitLayout) -> NDArray[np.int64]:
+def _weightless(seen: Observations, screened: Screened) -> Observations:
+    """Observations among which those that look like gross errors have next to no weight."""
+    parts = seen.parts.copy()
+    parts[: seen.points, 0] += (_WEIGHTLESS * screened.size) ** 2
+    return replace(seen, parts=parts)
+
+
+def _usual(found: TerrainFit) -> NDArray[np.float64]:
+    """How rough ground is on average, and how much that counts: the less, the more leaves differ beyond chance."""
+    points, leaf = found.seen.points, _leaf_of(found)
+    square = np.minimum(found.squares[:points], MOST_MISFIT)
+    known = np.isfinite(square)
+    reach = _ROUGH * found.seen.spacing
+    if not known.any():
+        return np.array([1.0, 1.0, reach])
+    square, leaf = square[known], leaf[:points][known]
+    mean = float(square.mean())
+    count = np.bincount(leaf)
+    full = count >= _LEAST_OF_LEAF
+    count, total, squared = (np.bincount(leaf, w)[full] for w in (None, square, square**2))
+    of_leaf = total / count
+    chance = (squared / count - of_leaf**2) / (count - 1)
+    differ = float(((of_leaf - mean) ** 2 - chance).mean()) / max(mean, 1e-9) ** 2 if len(count) else 0.0
+    # Two thirds: data further off count too, less each, so that the sum of their weights is a third of their number.
+    return np.array([max(mean, 1e-9), np.clip(2 / 3 / max(differ, 1e-9), *_WEIGHTS), reach])
+
+
+def unit_of(xy: NDArray[np.float64], layout: UnitLayout) -> NDArray[np.int64]:
+    """Number of the unit, row · columns + column, of places (n, 2); outside, the nearest."""
     column = np.clip(((xy[:, 0] - layout.left) / layout.side).astype(np.int64), 0, layout.columns - 1)
     row = np.clip(((layout.top - xy[:, 1]) / layout.side).astype(np.int64), 0, layout.rows - 1)
     unit: NDArray[np.int64] = row * layout.columns + column
@@ -216,14 +278,14 @@ def lines_of(
     return near_lines(found.seen, low, high)
 
 
-def _choose(found: TerrainFit, unit: int) -> NDArray[np.float64]:
-    """Weights of the ladder's functions in the patches of a unit, shape (patches, len(LADDER))."""
-    some = found.leaves.of_unit(unit)
+def choose(found: TerrainFit, some: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Weights of the ladder's functions in the patches of some leaves, shape (patches, len(LADDER))."""
     ids = found.neighbours.query(found.leaves.middle[some])
     scores = np.zeros((len(some), len(LADDER)))
     patches = patches_at(found.leaves, some)
     lines = lines_of(found, patches, ids)
     score_models(found.seen.xyz, found.noise, ids, patches, found.seen.points, *lines, found.models(some), scores)
+    scores[:, 1:][(scores == 0).all(axis=1)] = np.inf  # without points, the unit's own function
     scores -= np.where(np.isfinite(scores), scores, np.inf).min(axis=1, keepdims=True)
     weight = np.exp(-scores / 2)
     weight = np.where(np.isfinite(weight), weight, 0.0)
@@ -263,45 +325,70 @@ def _test(found: TerrainFit, some: NDArray[np.int64]) -> tuple[NDArray[np.int64]
     return numbers, found.residuals[numbers]
 
 
-def _flag(found: TerrainFit, limit: float, run: Map) -> None:
+def _judge(
+    found: TerrainFit, around: Neighbourhoods, screened: Screened, noise: NDArray[np.float64], limit: float, run: Map
+) -> NDArray[np.float64]:
+    """Compare what looks like gross errors with the model that was estimated without it, and use the rest again.
+
+    Returns the suspects. `noise` are the variances of all data, with their weight.
+    """
+    some = screened.all
+    inflated, result = found.noise[some], found.residuals
+    # A datum of variance s² adds it to the variance of the difference from its prediction; the rest is the latter's.
+    variance = np.maximum(inflated / result[some, 1] - inflated, 0.0) + noise[some]
+    result[some, 1] = noise[some] / variance
+    result[some, 2] = result[some, 0] / np.sqrt(variance)
+    found.noise[some] = noise[some]
+    trusted = np.ones(found.seen.points, bool)
+    trusted[some] = False
+    scale = np.full(found.seen.points, np.nan)
+    local_scales(result[:, 2], around.wide, trusted, some, scale)
+    ratio = np.abs(result[:, 2]) / np.fmax(scale, 1.0)
+    gross = [screened.single[ratio[screened.single] > PART * limit]]
+    gross += [group for group in screened.clusters if np.median(ratio[group]) > limit]
+    wrong = np.unique(np.concatenate(gross))
+    kept = [group[~np.isin(group, wrong)] for group in (*screened.clusters, *screened.suspects)]
+    kept = [group for group in kept if len(group) and np.median(ratio[group]) > PART * limit]
+    rows = [np.column_stack([group, np.full(len(group), k), result[group]]) for k, group in enumerate(kept, 1)]
+    found.noise[wrong] = -1.0
+    _test_near(found, some, run)
+    return np.vstack([np.empty((0, 5)), *rows])
+
+
+def _test_near(found: TerrainFit, changed: NDArray[np.int64], run: Map) -> NDArray[np.int64]:
+    """Test the neighbourhoods of points again whose use has changed; returns the points of them."""
+    if not len(changed):
+        return changed
+    near = np.unique(found.neighbours.near[0].query(found.seen.xyz[changed, :2]))
+    leaves = np.unique(_leaf_of(found)[near])
+    unit = found.leaves.unit[leaves]
+    _test_all(found, [leaves[unit == u] for u in np.unique(unit)], run)
+    return near
+
+
+def _flag(found: TerrainFit, around: Neighbourhoods, screened: Screened, limit: float, run: Map) -> None:
     """Flag the worst point of each neighbourhood, test the neighbourhood again, until none is left (data snooping).
 
     A point that fits no smooth surface may still show what the terrain is like: a ditch or a stone that no line
-    describes. It is an error only if no neighbour deviates as it does.
+    describes. It is an error only if it contradicts the model by more than its neighbours do, and their planes as well.
     """
     points = found.seen.points
     cleared = np.zeros(points, bool)
+    scale, changed = np.full(points, np.nan), np.arange(points)
     for _ in range(_ROUNDS):
-        used = (found.noise[:points] >= 0) & ~cleared
-        wild = (np.abs(found.residuals[:, 2]) > limit) & (found.residuals[:, 1] > _LEAST_REDUNDANCY)
-        suspect = np.flatnonzero(used & wild)
-        if not len(suspect):
-            return
-        supported = _supported(found, suspect)
-        cleared[suspect[supported]] = True
-        suspect = suspect[~supported]
-        if not len(suspect):
-            return
-        near = found.neighbours.near[0].query(found.seen.xyz[suspect, :2])
-        size = np.where(found.noise[:points] >= 0, np.abs(found.residuals[:, 2]), 0.0)
-        flagged = suspect[size[suspect] >= np.nan_to_num(size[near]).max(axis=1)]
+        used = found.noise[:points] >= 0
+        local_scales(found.residuals[:, 2], around.wide, used, changed, scale)
+        ratio = np.where(used & ~cleared, np.abs(found.residuals[:, 2]) / np.fmax(scale, 1.0), 0.0)
+        wild = np.flatnonzero(ratio > limit)
+        meets = supported(found.seen, around, screened.slopes, wild, found.residuals[wild, 0])
+        cleared[wild[meets]] = True
+        wild = wild[~meets]
+        near = found.neighbours.near[0].query(found.seen.xyz[wild, :2])
+        flagged = wild[ratio[wild] >= np.where(cleared[near], 0.0, np.nan_to_num(ratio[near])).max(axis=1, initial=0.0)]
         if not len(flagged):
             return
         found.noise[flagged] = -1.0
-        touched = np.unique(found.neighbours.near[0].query(found.seen.xyz[flagged, :2]))
-        leaves = np.unique(_leaf_of(found)[touched])
-        unit = found.leaves.unit[leaves]
-        _test_all(found, [leaves[unit == u] for u in np.unique(unit)], run)
-
-
-def _supported(found: TerrainFit, suspect: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether another point close by deviates clearly and to the same side."""
-    near = found.neighbours.near[0].query(found.seen.xyz[suspect, :2])
-    apart = np.linalg.norm(found.seen.xyz[near, :2] - found.seen.xyz[suspect, None, :2], axis=2)
-    close = (apart <= _CLOSE * found.seen.spacing) & (near != suspect[:, None])
-    same = found.residuals[near, 2] * np.sign(found.residuals[suspect, 2])[:, None] > _CLEAR
-    supported: NDArray[np.bool_] = (close & same).any(axis=1)
-    return supported
+        changed = _test_near(found, flagged, run)
 
 
 def _leaf_of(found: TerrainFit) -> NDArray[np.int64]:
@@ -309,16 +396,3 @@ def _leaf_of(found: TerrainFit) -> NDArray[np.int64]:
     leaf = np.empty(len(found.leaves.order), np.int64)
     leaf[found.leaves.order] = np.repeat(np.arange(len(found.leaves.half)), found.leaves.count)
     return leaf
-
-
-def _spread(found: TerrainFit) -> NDArray[np.float64]:
-    """Spread of the normalised residuals of each unit's points, drawn to that of all where there are few."""
-    points = found.seen.points
-    good = (found.noise[:points] >= 0) & np.isfinite(found.residuals[:, 2])
-    z2 = found.residuals[:, 2] ** 2
-    if not good.any():
-        return np.ones(len(found.members))
-    whole = float(z2[good].mean())
-    sums = np.array([z2[m][good[m]].sum() for m in found.members])
-    counts = np.array([good[m].sum() for m in found.members])
-    return np.sqrt((sums + _EXPECTED_RESIDUALS * whole) / (counts + _EXPECTED_RESIDUALS))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from photoplan.terrain.settings import SHARE, BuildSettings
 
 #: Points at which the spacing is measured.
 _SAMPLE = 20_000
+#: Neighbours among which another line is looked for.
+_NEAR = 48
 #: Copies of a breakline's points lie this part of the spacing beside it, one on each side.
 _BESIDE = 1e-6
 
@@ -59,6 +61,8 @@ class Observations:
     """Group of each point, shape (points,)."""
     record: NDArray[np.int64]
     """Place of each point in its group, shape (points,)."""
+    line: NDArray[np.int64]
+    """Number of the form line that each datum is of, −1: of none, shape (n,)."""
     lines: Lines
     barriers: tuple[NDArray[np.float64], NDArray[np.int64]]
     """Vertices (v, 2) and beginnings of breaklines, cut so that no piece turns far."""
@@ -70,6 +74,32 @@ class Observations:
     def noise(self, mass: NDArray[np.float64]) -> NDArray[np.float64]:
         """Variances of all data, shape (n,), m², from the standard deviation of mass points at each of them."""
         return np.maximum(self.parts[:, 0] + self.parts[:, 1] * mass**2, 0.0)
+
+
+def told_by(seen: Observations) -> Observations:
+    """The data from which covariance functions are estimated: the points, or form lines where these are most of all.
+
+    Points along a form line say nothing of the ground between lines: they are taken as far apart as lines are.
+    """
+    some = np.flatnonzero(seen.line >= 0)
+    if len(some) <= seen.points:
+        return seen
+    _, first = np.unique(np.floor(seen.xyz[some, :2] / lines_apart(seen)), axis=0, return_index=True)
+    kept = np.concatenate([np.arange(seen.points), some[np.sort(first)]])
+    if len(kept) - seen.points <= seen.points:
+        return seen
+    return replace(seen, xyz=seen.xyz[kept], points=len(kept), parts=seen.parts[kept], line=seen.line[kept])
+
+
+def lines_apart(seen: Observations) -> float:
+    """Distance from a point of a form line to the nearest one of another, the median, metres."""
+    every = np.flatnonzero(seen.line >= 0)
+    xy, line = seen.xyz[every, :2], seen.line[every]
+    some = np.arange(0, len(xy), max(1, len(xy) // _SAMPLE))
+    distance, near = cKDTree(xy).query(xy[some], k=min(_NEAR, len(xy)))
+    other = line[near] != line[some, None]
+    other[:, -1] = True
+    return max(float(np.median(distance[np.arange(len(some)), other.argmax(axis=1)])), 1e-6)
 
 
 def _variances(
@@ -120,7 +150,7 @@ def observe(measured: MeasuredTerrain, settings: BuildSettings) -> Observations:
     known = np.unique(heights[:, :2] - origin[:2], axis=0)
     spacing = spacing_of(known)
     table = _line_table(lines, others, origin, spacing)
-    data, given, share = _line_data(table, spacing, settings)
+    data, given, share, number = _line_data(table, spacing, settings)
     group_given = [_sigma(g.sigma, settings.filters.get(g.kind)) for g in measured.points]
     sizes = [len(g.xyz) for g in measured.points]
     barriers = _straight_pieces(table.xyz[: table.start[table.separating], :2], table.start[: table.separating + 1])
@@ -135,6 +165,7 @@ def observe(measured: MeasuredTerrain, settings: BuildSettings) -> Observations:
         known_noise=known_noise,
         group=np.repeat(np.arange(len(sizes), dtype=np.int32), sizes),
         record=np.concatenate([np.arange(n) for n in sizes]) if sizes else np.empty(0, np.int64),
+        line=np.concatenate([np.full(len(points), -1), number]),
         lines=table,
         barriers=barriers,
         barrier_boxes=_boxes(*barriers),
@@ -194,9 +225,9 @@ def _left_of(xy: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _line_data(
     table: Lines, spacing: float, settings: BuildSettings
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Points along lines at most a spacing apart with their known standard deviations and shares."""
-    xyz, given, share = [np.empty((0, 3))], [np.empty(0)], [np.empty(0)]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Points along lines at most a spacing apart with their known standard deviations, shares and form lines."""
+    xyz, given, share, number = [np.empty((0, 3))], [np.empty(0)], [np.empty(0)], [np.empty(0, np.int64)]
     for k, line in enumerate(table.lines):
         part = slice(table.start[k], table.start[k + 1])
         if not np.isfinite(table.xyz[part, 2]).all():
@@ -213,7 +244,8 @@ def _line_data(
             xyz.append(side)
             given.append(np.full(len(side), _sigma(line.sigma, settings.filters.get(line.kind))))
             share.append(np.full(len(side), SHARE[line.kind]))
-    return np.vstack(xyz), np.concatenate(given), np.concatenate(share)
+            number.append(np.full(len(side), k if line.kind == "formline" else -1))
+    return np.vstack(xyz), np.concatenate(given), np.concatenate(share), np.concatenate(number)
 
 
 def _densify(rows: NDArray[np.float64], spacing: float) -> NDArray[np.float64]:

@@ -14,13 +14,18 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 from photoplan.events import Map
 from photoplan.kernels.patch import predict
 from photoplan.surfaces.units import LineElement, Unit
-from photoplan.terrain.fit import REACH, TerrainFit, lines_of, patches_at
+from photoplan.terrain.calibration import Surroundings, signal_share
+from photoplan.terrain.fit import REACH, TerrainFit, choose, lines_of, patches_at
 
 #: A prepared polygon builds its index when it is first asked, and GEOS does not guard that against other threads.
 _ONE_AT_A_TIME = threading.Lock()
 
 #: Cells of the raster that says what is near data, at most; more area means larger cells.
 _MOST_CELLS = 30_000_000
+
+
+#: Cells that are looked at for the widest gaps.
+_PLACES = 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +61,13 @@ class Domain:
             shapely.prepare(polygon)
         return cls(float(left), float(top), cell, near, polygon)
 
+    def places(self) -> NDArray[np.float64]:
+        """Middles of some cells that have a surface, shape (n, 2), evenly taken."""
+        row, column = np.nonzero(self.near)
+        step = max(1, len(row) // _PLACES)
+        xy = np.column_stack([self.left + (column + 0.5) * self.cell, self.top - (row + 0.5) * self.cell])[::step]
+        return np.asarray(xy[self.contains(xy)])
+
     def contains(self, xy: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether places (n, 2) have a surface."""
         rows, columns = self.near.shape
@@ -80,7 +92,30 @@ def heights_at(
         Relative to the observations' origin; standard deviation; distance to the nearest datum; metres. NaN where
         nothing can be predicted.
     """
-    sums = np.zeros((len(xy), 4))
+    raw = raw_at(fit, unit, xy)
+    return raw.height, raw.sigma * fit.calibration.factor(raw.around), raw.around.distance * fit.seen.spacing
+
+
+@dataclass(frozen=True, eq=False)
+class Raw:
+    """Prediction before its standard deviations are calibrated."""
+
+    height: NDArray[np.float64]
+    """Relative to the origin of the observations, shape (n,), metres; NaN: none."""
+    sigma: NDArray[np.float64]
+    """Standard deviation by the covariance functions, metres."""
+    around: Surroundings
+
+
+def raw_at(fit: TerrainFit, unit: int, xy: NDArray[np.float64], chosen: bool = True) -> Raw:
+    """What the covariance functions say at places (n, 2) in or near a unit.
+
+    Parameters
+    ----------
+    chosen : bool
+        Whether patches have chosen their functions; else those that are needed do now.
+    """
+    sums = np.zeros((len(xy), 5))
     sums[:, 3] = np.inf
     low, high = xy.min(axis=0), xy.max(axis=0)
     some = _leaves_near(fit, unit, low, high)
@@ -93,22 +128,35 @@ def heights_at(
         ids = fit.neighbours.query(middle)
         patches = patches_at(fit.leaves, some)
         lines = lines_of(fit, patches, ids)
+        shares = fit.shares[some] if chosen else choose(fit, some)
+        about = fit.squares, fit.usual
         predict(
-            fit.seen.xyz, fit.noise, ids, patches, xy, wanted, start, *lines, fit.models(some), fit.shares[some], sums
+            fit.seen.xyz, fit.noise, ids, patches, xy, wanted, start, *lines, fit.models(some), shares, *about, sums
         )
     with np.errstate(invalid="ignore", divide="ignore"):
-        heights, sigmas = sums[:, 0] / sums[:, 1], sums[:, 2] / sums[:, 1]
-    return heights, sigmas * _spread_at(fit, xy), sums[:, 3]
+        height, sigma, rough = sums[:, 0] / sums[:, 1], sums[:, 2] / sums[:, 1], sums[:, 4] / sums[:, 1]
+    sigma = np.sqrt(sigma**2 + _ground_at(fit, xy))
+    around = Surroundings(signal_share(sigma, fit.whole.noise), sums[:, 3] / fit.seen.spacing, _beside(fit, xy), rough)
+    return Raw(height, sigma, around)
 
 
-def _spread_at(fit: TerrainFit, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Factor of standard deviations at places, linear between the middles of units: else they would step at borders."""
+def _beside(fit: TerrainFit, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How near lines are, 1 to 0; 0 where there are only points, or only lines."""
+    seen = fit.seen
+    if not len(seen.xyz) > seen.points > 0:
+        return np.zeros(len(xy))
+    away = fit.neighbours.near[-1].tree.query(xy)[0] / seen.spacing
+    return np.asarray(1 / (1 + away**2))
+
+
+def _ground_at(fit: TerrainFit, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What may be ground, m², linear between the middles of units: else it would step at borders."""
     layout = fit.layout
-    spread = fit.spread.reshape(layout.rows, layout.columns)
+    ground = fit.ground.reshape(layout.rows, layout.columns)
     column = (xy[:, 0] - layout.left) / layout.side - 0.5
     row = (layout.top - xy[:, 1]) / layout.side - 0.5
-    factor: NDArray[np.float64] = map_coordinates(spread, [row, column], order=1, mode="nearest")
-    return factor
+    found: NDArray[np.float64] = map_coordinates(ground, [row, column], order=1, mode="nearest")
+    return found
 
 
 def _leaves_near(fit: TerrainFit, unit: int, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.int64]:

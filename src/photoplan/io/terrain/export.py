@@ -10,6 +10,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 from photoplan import __version__
 from photoplan.errors import PhotoplanError
 from photoplan.events import SILENT, Events
+from photoplan.geometry.crs import parse_crs
+from photoplan.geometry.heights import height_label
 from photoplan.io.disk import disk_error, sync_file, sync_folder
 from photoplan.io.lock import FileLock
 from photoplan.io.product import check_output
@@ -70,7 +73,16 @@ def replacing(path: Path, inputs: Sequence[Path | str] = (), overwrite: bool = F
             raise disk_error(path, error) from error
 
 
-def write_tin(part: Path, kind: str, source: UnitSource, name: str, events: Events = SILENT) -> ExportFigures:
+def write_tin(
+    part: Path,
+    kind: str,
+    source: UnitSource,
+    name: str,
+    events: Events = SILENT,
+    *,
+    crs: str | None = None,
+    height_system: str | None = None,
+) -> ExportFigures:
     """Write the triangulation of a model.
 
     Parameters
@@ -86,6 +98,8 @@ def write_tin(part: Path, kind: str, source: UnitSource, name: str, events: Even
         Name of the surface in the file.
     events
         Told of each unit.
+    crs, height_system
+        Stated in LandXML, the only one of the three that can; None: not.
     """
     counts = [0, 0, 0]
 
@@ -97,7 +111,10 @@ def write_tin(part: Path, kind: str, source: UnitSource, name: str, events: Even
             events.done()
             yield item
 
-    {".obj": _write_obj, ".ply": _write_ply, ".xml": _write_landxml}[kind](part, parts(), name)
+    if kind == ".xml":
+        _write_landxml(part, parts(), name, _coordinate_system(crs, height_system))
+    else:
+        {".obj": _write_obj, ".ply": _write_ply}[kind](part, parts(), name)
     return ExportFigures(counts[0], counts[1], 0 if kind == ".xml" else counts[2])
 
 
@@ -145,17 +162,27 @@ def _ply_header(vertices: int, faces: int, name: str) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def _write_landxml(path: Path, parts: Iterator[MeshPart], name: str) -> None:
-    safe = _word(name).replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
+def _coordinate_system(crs: str | None, height_system: str | None) -> str:
+    """The CoordinateSystem of LandXML 1.2; empty if nothing is known."""
+    facts: dict[str, str] = {}
+    if crs is not None:
+        code = crs.upper().removeprefix("EPSG:")
+        facts |= {"name": parse_crs(crs).name} | ({"epsgCode": code} if code.isdigit() else {"ogcWktCode": crs})
+    if height_system is not None:
+        facts |= {"verticalDatum": height_label(height_system), "verticalCoordinateSystemName": height_system}
+    return f"<CoordinateSystem{''.join(f' {k}={quoteattr(v)}' for k, v in facts.items())}/>\n" if facts else ""
+
+
+def _write_landxml(path: Path, parts: Iterator[MeshPart], name: str, system: str) -> None:
     with ExitStack() as open_files:
         file, faces = _two_files(open_files, path)
         file.write(
             (
                 '<?xml version="1.0" encoding="UTF-8"?>\n<LandXML xmlns="http://www.landxml.org/schema/LandXML-1.2" '
                 'version="1.2">\n<Units><Metric linearUnit="meter" areaUnit="squareMeter" volumeUnit="cubicMeter" '
-                'temperatureUnit="celsius" pressureUnit="milliBars"/></Units>\n'
+                f'temperatureUnit="celsius" pressureUnit="milliBars"/></Units>\n{system}'
                 f'<Application name="photoplan" version="{__version__}"/>\n'
-                f'<Surfaces><Surface name="{safe}"><Definition surfType="TIN">\n<Pnts>\n'
+                f'<Surfaces><Surface name={quoteattr(_word(name))}><Definition surfType="TIN">\n<Pnts>\n'
             ).encode()
         )
         count = 0

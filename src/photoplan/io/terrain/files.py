@@ -19,6 +19,7 @@ from photoplan.io.terrain import landxml as terrain_landxml
 from photoplan.io.terrain import las as terrain_las
 from photoplan.io.terrain import text as terrain_text
 from photoplan.io.terrain import vector as terrain_vector
+from photoplan.io.terrain.groups import check_matched
 from photoplan.io.terrain.options import ReadOptions
 from photoplan.io.terrain.reader import HIGHEST, LOWEST
 from photoplan.io.validity import USUAL_NODATA
@@ -49,7 +50,7 @@ def read_measured(paths: Sequence[Path], options: ReadOptions | None = None) -> 
         No file, or one file twice; LAS without laspy.
     InputError
         A file cannot be read, is not in metres, or states another CRS than the others; the message names file and
-        line, point or feature.
+        line, point or feature. A table of codes was given, and none of its codes is in the files.
     HeightSystemError
         Two files state different height systems.
     """
@@ -72,7 +73,9 @@ def read_measured(paths: Sequence[Path], options: ReadOptions | None = None) -> 
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
         parts.append(_with_crs(_plausible(part, options), options))
-    return _merged(parts)
+    measured = _merged(parts)
+    check_matched(measured, options)
+    return measured
 
 
 def _reader(path: Path) -> _Reader:
@@ -193,6 +196,8 @@ def _merged(parts: Sequence[MeasuredTerrain]) -> MeasuredTerrain:
         tin,
         tuple(f for p in parts for f in p.files),
         tuple(notes),
+        frozenset().union(*(p.codes for p in parts)),
+        tuple(f for p in parts for f in p.fields),
     )
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.io.terrain.options import CodeClass, ReadOptions
-from photoplan.surfaces.measured import LINE_KINDS, POINT_KINDS, PointGroup
+from photoplan.io.terrain.options import OTHER, CodeClass, ReadOptions
+from photoplan.surfaces.measured import LINE_KINDS, POINT_KINDS, MeasuredTerrain, PointGroup
 
 MAX_CODES = 1000
 """More codes than this in one file are names rather than classes: their points become one group for each class."""
@@ -80,6 +80,29 @@ def class_of(code: str, options: ReadOptions, default: str, where: str) -> CodeC
             + '; add it (`ignore` leaves it out), or give a class for all other codes with the code "*"'
         )
     return CodeClass(default)
+
+
+def check_matched(measured: MeasuredTerrain, options: ReadOptions) -> None:
+    """Refuse a table of codes of which the files hold none: what it says would be lost without a word.
+
+    Raises
+    ------
+    InputError
+        No code of the table (``*`` does not count) is in the files; the message names their columns.
+    """
+    named = [code for code in options.codes.classes if code != OTHER]
+    if not named or any(code in measured.codes for code in named):
+        return
+    held = sorted(code for code in measured.codes if code)
+    raise InputError(
+        f"{options.codes.file or 'table of codes'}: none of its codes ({_some(named)}) is in the files; they hold "
+        f"{f'the codes {_some(held)}' if held else 'no codes'} ({'; '.join(measured.fields)}); say which column holds "
+        "them (`columns` x=…,y=…,z=…,code=… of text, `attribute` of vector files), or leave `codes` out"
+    )
+
+
+def _some(texts: Sequence[str]) -> str:
+    return ", ".join(texts[:10]) + (f" and {len(texts) - 10} more" if len(texts) > 10 else "")
 
 
 def make_groups(

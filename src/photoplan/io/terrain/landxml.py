@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import canonical_crs, parse_crs
-from photoplan.io.terrain.options import CodeClass, ReadOptions
+from photoplan.io.terrain.options import OTHER, CodeClass, ReadOptions
 from photoplan.surfaces.measured import LINE_KINDS, LineKind, MeasuredLine, MeasuredTerrain, PointGroup, Tin
 
 MAX_BYTES = 4 << 30
@@ -83,6 +83,7 @@ class _Reader:
         self.system: dict[str, str] = {}
         self.notes: list[str] = []
         self.walls = 0
+        self.codes: set[str] = set()
 
     def start(self, element: Element) -> None:
         tag = _tag(element)
@@ -220,10 +221,7 @@ class _Reader:
         if len(xyz) < 2:
             raise InputError(f"{where}: has {len(xyz)} point; at least two are needed")
         code = _code(element)
-        own = self.options.codes.classes.get(code) or (
-            self.options.codes.classes.get("*") if kind == "breakline" else None
-        )
-        cls = own or CodeClass(kind)
+        cls = self._class(code, kind)
         if cls.kind == "ignore":
             surface.ignored += 1
         elif cls.kind in LINE_KINDS:
@@ -232,6 +230,13 @@ class _Reader:
             surface.lines.append(MeasuredLine(name, line_kind, xyz, None, cls.sigma, code))
         else:
             surface.points.append((code, xyz))
+
+    def _class(self, code: str, kind: str) -> CodeClass:
+        """Class of a line's or a point's code; what the element is says it where the table does not."""
+        self.codes.add(code)
+        classes = self.options.codes.classes
+        other = classes.get(OTHER) if kind in ("mass", "breakline") else None
+        return classes.get(code) or other or CodeClass(kind)
 
     def terrain(self) -> MeasuredTerrain:
         """All that was read."""
@@ -252,7 +257,16 @@ class _Reader:
             )
         crs, heights = _reference(self.path, self.system)
         lines = tuple(line for s in surfaces for line in s.lines)
-        return MeasuredTerrain(tuple(groups), lines, crs, heights, _tin(surfaces), (self.path,), tuple(self.notes))
+        held = sorted(code for code in self.codes if code)
+        unknown = [code for code in held if code not in self.options.codes.classes]
+        if unknown and self.options.codes.classes and OTHER not in self.options.codes.classes:
+            some = ", ".join(unknown[:5]) + (f" and {len(unknown) - 5} more" if len(unknown) > 5 else "")
+            self.notes.append(
+                f"{self.path.name}: codes that the table does not have, read as their elements say: {some}"
+            )
+        fields = (f"{self.path.name}: surface {', '.join(s.name for s in surfaces)}",)
+        tin, notes = _tin(surfaces), tuple(self.notes)
+        return MeasuredTerrain(tuple(groups), lines, crs, heights, tin, (self.path,), notes, frozenset(held), fields)
 
     def _chosen(self) -> list[_LandXmlSurface]:
         names = [s.name for s in self.surfaces]
@@ -261,7 +275,7 @@ class _Reader:
         if not chosen:
             raise InputError(f"{self.path}: holds no surface" + (f" called {wanted}; it has {names}" if names else ""))
         if wanted is None and len(chosen) > 1:
-            raise InputError(f"{self.path}: holds {len(chosen)} surfaces: {names}; choose with the option for layers")
+            raise InputError(f"{self.path}: holds {len(chosen)} surfaces: {names}; choose with `layers`")
         return chosen
 
     def _groups(self, surface: _LandXmlSurface) -> list[PointGroup]:
@@ -270,7 +284,7 @@ class _Reader:
         for code, xyz in surface.points:
             by_code.setdefault(code, []).append(xyz)
         for code, parts in by_code.items():
-            cls = self.options.codes.classes.get(code) or self.options.codes.classes.get("*") or CodeClass("mass")
+            cls = self._class(code, "mass")
             xyz = np.concatenate(parts)
             records = np.arange(count + 1, count + len(xyz) + 1)
             count += len(xyz)

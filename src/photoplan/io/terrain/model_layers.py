@@ -90,15 +90,15 @@ def _of(function: Callable[[Any], Any], values: NDArray[np.float64]) -> float:
     return float(function(values)) if np.isfinite(values).any() else np.nan
 
 
-def write_gross(path: Path, gross: Sequence[GrossError], crs: str) -> None:
-    """Layer `gross_errors`: a point for each flagged measurement."""
+def write_gross(path: Path, layer: str, gross: Sequence[GrossError], crs: str) -> None:
+    """Layer `gross_errors` or `suspects`: a point for each measurement."""
     xyz = np.array([g.xyz for g in gross], float).reshape(-1, 3)
     columns: dict[str, NDArray[Any]] = {
         name: np.array([getattr(g, name) for g in gross], object if name in ("name", "kind") else float)
         for name in ("name", "kind", "residual", "redundancy", "normalised")
     }
     columns |= {axis: xyz[:, i] for i, axis in enumerate("xyz")}
-    _write(path, "gross_errors", shapely.points(xyz), columns, crs, "Point Z")
+    _write(path, layer, shapely.points(xyz), columns, crs, "Point Z")
 
 
 def write_border(path: Path, domain: Any, crs: str) -> None:

@@ -188,13 +188,20 @@ class ModelReader:
 
     def gross(self) -> list[GrossError]:
         """Measurements that were flagged as gross errors."""
-        if "gross_errors" not in self._tables():
+        return self._flagged("gross_errors")
+
+    def suspects(self) -> list[GrossError]:
+        """Measurements that are used, but look like parts of gross errors."""
+        return self._flagged("suspects")
+
+    def _flagged(self, layer: str) -> list[GrossError]:
+        if layer not in self._tables():
             return []
-        query = "SELECT name, kind, x, y, z, residual, redundancy, normalised FROM gross_errors ORDER BY fid"
+        query = f"SELECT name, kind, x, y, z, residual, redundancy, normalised FROM {layer} ORDER BY fid"
         found = []
         for name, kind, *values in self._rows(query):
             x, y, z, residual, redundancy, normalised = (
-                _number(value, False, f"{self.path}: gross_errors") for value in values
+                _number(value, False, f"{self.path}: {layer}") for value in values
             )
             found.append(GrossError(str(name), str(kind), (x, y, z), residual, redundancy, normalised))
         return found

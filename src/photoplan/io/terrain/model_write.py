@@ -65,6 +65,8 @@ class ModelParts:
     """Measurements flagged as gross errors."""
     domain: Any | None = None
     """Where there is a surface: a polygon or multipolygon of Shapely in the model's CRS; None: not bounded."""
+    suspects: Sequence[GrossError] = ()
+    """Measurements that are used, but look like parts of gross errors."""
 
 
 @dataclass(eq=False)
@@ -211,7 +213,9 @@ class ModelWriter:
         crs = parts.header.crs
         write_units(part, self.layout, self.figures(), crs)
         write_lines(part, parts.lines, crs)
-        write_gross(part, parts.gross, crs)
+        write_gross(part, "gross_errors", parts.gross, crs)
+        if parts.suspects:
+            write_gross(part, "suspects", parts.suspects, crs)
         if parts.domain is not None:
             write_border(part, parts.domain, crs)
         meshes = self._base_meshes()

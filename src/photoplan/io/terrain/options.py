@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from photoplan.errors import InputError, UsageError
+from photoplan.io.plain_files import read_toml
 from photoplan.io.table_lines import decimal
 from photoplan.io.tables import Columns, Dialect, read_table
-from photoplan.io.toml_file import read_toml
 from photoplan.surfaces.measured import LINE_KINDS, POINT_KINDS
 
 KINDS: tuple[str, ...] = (*POINT_KINDS, *LINE_KINDS, "ignore")
@@ -45,7 +45,7 @@ class CodeClass:
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise InputError(f"class {self.kind!r}; allowed are {', '.join(KINDS)}")
-        if self.sigma is not None and not (np.isfinite(self.sigma) and self.sigma >= 0):
+        if self.sigma is not None and not (np.isfinite(float(self.sigma)) and self.sigma >= 0):
             raise InputError(f"sigma {self.sigma}; a standard deviation in metres, zero or more, is needed")
 
 

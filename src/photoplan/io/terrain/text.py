@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.plain_files import crs_beside
-from photoplan.io.table_lines import line_blocks
+from photoplan.io.table_lines import line_blocks, split_line
 from photoplan.io.tables import TableLayout
 from photoplan.io.terrain.columns import PointBlock, parse_block, points_layout
 from photoplan.io.terrain.groups import CodeIndex, PointColumns, class_of, is_line, make_groups
-from photoplan.io.terrain.options import CodeClass, ReadOptions
+from photoplan.io.terrain.options import OTHER, CodeClass, ReadOptions
 from photoplan.surfaces.measured import LineKind, MeasuredLine, MeasuredTerrain
 
 
@@ -51,6 +51,7 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
     """
     layout: TableLayout | None = None
     codes, ids, out = CodeIndex(), CodeIndex(), _Columns()
+    notes: list[str] = []
     classes: list[CodeClass] = []
 
     def look_up(code: str, line: int) -> CodeClass:
@@ -59,6 +60,7 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
     for first, lines in line_blocks(path):
         if layout is None:
             layout = points_layout(path, lines, options.dialect)
+            notes = [] if layout is None else _unused(path, layout, lines, options)
         block = None
         if layout is not None:
             block = parse_block(path, layout, first, lines, look_up, options.dialect.decimal_comma)
@@ -67,7 +69,24 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
             _learn(classes, codes, block, look_up)
     if layout is None or not out.xyz:
         raise InputError(f"{path}: holds no line with data" + ("" if layout is None else ", only a header"))
-    return _terrain(path, layout, out, codes, ids, classes)
+    return _terrain(path, layout, out, codes, ids, classes, notes)
+
+
+def _unused(path: Path, layout: TableLayout, lines: list[str], options: ReadOptions) -> list[str]:
+    """What to note of columns that are not used; refused where they hold codes of the table and no column has codes."""
+    if not layout.header:
+        return []
+    unused = {at: name for at, name in enumerate(layout.names) if at not in layout.roles.values()}
+    head = [item for item in enumerate(lines[:1000], 1) if item[1].strip() and not item[1].lstrip().startswith("#")]
+    rows = [split_line(path, item, layout.delimiter) for item in head if item[0] > layout.header]
+    for at, name in unused.items() if "code" not in layout.roles else ():
+        found = sorted({row[at] for row in rows if len(row) > at} & (options.codes.classes.keys() - {OTHER}))
+        if found:
+            raise InputError(
+                f"{path}: column {name!r} holds codes of the table ({', '.join(found[:5])}), but is not read as codes; "
+                f"the columns are {', '.join(layout.names)}: declare `columns` x=…,y=…,z=…,code={name}, or call it code"
+            )
+    return [f"{path.name}: columns not used: {', '.join(unused.values())}"] if unused else []
 
 
 def _append(out: _Columns, block: PointBlock, codes: CodeIndex, ids: CodeIndex) -> None:
@@ -96,7 +115,13 @@ def _learn(
 
 
 def _terrain(
-    path: Path, layout: TableLayout, out: _Columns, codes: CodeIndex, ids: CodeIndex, classes: list[CodeClass]
+    path: Path,
+    layout: TableLayout,
+    out: _Columns,
+    codes: CodeIndex,
+    ids: CodeIndex,
+    classes: list[CodeClass],
+    notes: list[str],
 ) -> MeasuredTerrain:
     def whole(parts: list[Any]) -> Any:
         joined = np.concatenate(parts) if parts else None
@@ -114,7 +139,6 @@ def _terrain(
         on_line = by_class[number] if number is not None else line > 0
         if number is not None and line is not None:
             on_line |= (line > 0) & (number == 0)
-    notes = []
     if layout.by_order and layout.width > 3:
         notes.append(f"{path.name}: no header; columns taken as {', '.join(layout.roles)}")
     lines: list[MeasuredLine] = []
@@ -141,7 +165,16 @@ def _terrain(
         notes.append(f"{path.name}: {left_out} points left out, their codes say `ignore`")
     stated = crs_beside(path)
     crs, heights = (None, None) if stated is None else (stated.crs, stated.height_system)
-    return MeasuredTerrain(tuple(groups), tuple(lines), crs, heights, files=(path,), notes=tuple(notes))
+    return MeasuredTerrain(
+        tuple(groups),
+        tuple(lines),
+        crs,
+        heights,
+        files=(path,),
+        notes=tuple(notes),
+        codes=frozenset(codes.texts),
+        fields=(f"{path.name}: {', '.join(layout.names if layout.header else layout.roles)}",),
+    )
 
 
 def _make_lines(

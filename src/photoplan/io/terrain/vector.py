@@ -48,6 +48,8 @@ class _Layer:
     codes: list[str]
     sigma: NDArray[np.float64] | None
     names: NDArray[Any] | None
+    fields: tuple[str, ...]
+    """What the attributes are called."""
     right: NDArray[Any] | None
 
 
@@ -67,6 +69,8 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
     lines: list[MeasuredLine] = []
     crs: str | None = None
     heights: str | None = None
+    codes: set[str] = set()
+    fields: list[str] = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for name in _layers(path, options, drawing):
@@ -80,7 +84,11 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
             more = _features(path, layer, options, notes)
             points += more[0]
             lines += more[1]
-    return MeasuredTerrain(tuple(points), tuple(lines), crs, heights, files=(path,), notes=tuple(notes))
+            codes |= {layer.name, *layer.codes}
+            fields.append(f"{path.name}: layer {layer.name} with {', '.join(layer.fields) or 'no attributes'}")
+    return MeasuredTerrain(
+        tuple(points), tuple(lines), crs, heights, None, (path,), tuple(notes), frozenset(codes), tuple(fields)
+    )
 
 
 def _is_drawing(path: Path) -> bool:
@@ -181,6 +189,7 @@ def _layer(
             codes,
             None if "sigma" not in fields else _sigma(path, fields["sigma"][row]),
             None if names is None else np.array([_text(v) for v in names[row]]),
+            tuple(str(f) for f in meta["fields"]),
             fields["z_right"][row] if "z_right" in fields else None,
         ),
         meta["crs"],

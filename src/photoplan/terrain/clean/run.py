@@ -18,6 +18,7 @@ from photoplan.terrain.clean.borders import Finding, closed, domain_of, outside,
 from photoplan.terrain.clean.heights import Joined, Meeting, cut_at_walls, one_height
 from photoplan.terrain.clean.nodes import Network, make_network, noded, without_repeats
 from photoplan.terrain.clean.points import Points, join_to_lines, points_near, without_coincident
+from photoplan.terrain.clean.segments import joined_segments
 
 CLASS_SIGMAS: Mapping[str, float] = {
     "mass": 0.10,
@@ -46,6 +47,7 @@ def clean(
 ) -> tuple[MeasuredTerrain, tuple[Finding, ...]]:
     """The terrain without contradictions, and what was found.
 
+    - Lines that came as single segments are joined (`joined_segments`); what stays single is reported.
     - Points and vertices closer than `TOLERANCE` become one; a point keeps the weighted mean of the heights, and the
       class of the one measured best.
     - Lines that meet, cross, touch or run along each other get common vertices there. All heights that meet at one
@@ -82,7 +84,9 @@ def clean(
     """
     _check_range(measured)
     sigmas = {**CLASS_SIGMAS, **(sigmas or {})}
-    lines, found = closed(measured.lines)
+    lines, found = joined_segments(measured.lines, TOLERANCE, HEIGHT_TOLERANCE)
+    lines, more = closed(lines)
+    found += more
     points, more = without_coincident(Points.of(measured.points, sigmas), TOLERANCE, HEIGHT_TOLERANCE)
     found += more
     net, more = _network(lines)

@@ -29,8 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import UsageError
-from photoplan.kernels.contour import count_segments, cross_edges, fill_segments, link_segments
-from photoplan.kernels.contour_smooth import smooth_line, thin_line
+from photoplan.kernels.contour import count_segments, cross_edges, fill_segments, link_segments, smooth_line, thin_line
 from photoplan.terrain.contours.mesh import Front, PartMesh, build_mesh
 from photoplan.terrain.contours.parts import SurfacePart
 

@@ -1,0 +1,298 @@
+"""Hillshade, slope, aspect and height tints of any surface, at the pixels of a map grid.
+
+Slopes come from the surface itself: differences of its heights half a pixel to the left and right and above and below
+each pixel's centre. Inside a face they are the face's own; a breakline shows in the pixels that it passes and in no
+others. Where the surface ends inside a pixel, the half that is left is used.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.kernels.gradient import gradients, illumination
+from photoplan.surfaces.base import Surface
+from photoplan.surfaces.raster import RasterSurface
+from photoplan.targets.map import MapTarget
+
+#: Aspect of a flat place.
+FLAT = -1.0
+#: Suns of a multidirectional hillshade, from the azimuth that was given.
+FAN = (-90.0, -45.0, 0.0, 45.0)
+
+
+@dataclass(frozen=True)
+class Light:
+    """Where light comes from, and how much relief is made of the terrain."""
+
+    azimuth: float = 315.0
+    """Direction of the sun, degrees clockwise from north."""
+    altitude: float = 45.0
+    """Its height above the horizon, degrees."""
+    exaggeration: float = 1.0
+    """Factor of all heights."""
+    multidirectional: bool = False
+    """Four suns, at the azimuth, 45 degrees to its right, and 45 and 90 to its left, weighted by the squared cosine of
+    the angle between their azimuth and the slope's, as `gdaldem hillshade -multidirectional` has it."""
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.azimuth):
+            raise UsageError(f"azimuth {self.azimuth}; degrees clockwise from north are needed")
+        if not 0 < self.altitude <= 90:
+            raise UsageError(f"altitude {self.altitude} of the sun; more than 0 and up to 90 degrees are needed")
+        if not (math.isfinite(self.exaggeration) and self.exaggeration > 0):
+            raise UsageError(f"exaggeration {self.exaggeration}; a positive factor is needed")
+
+    @property
+    def directions(self) -> NDArray[np.float64]:
+        """Unit vectors towards the suns (east, north, up), shape (n, 3)."""
+        azimuths = np.radians([self.azimuth + turn for turn in (FAN if self.multidirectional else (0.0,))])
+        altitude = math.radians(self.altitude)
+        level = math.cos(altitude)
+        up = np.full(len(azimuths), math.sin(altitude))
+        return np.column_stack([level * np.sin(azimuths), level * np.cos(azimuths), up])
+
+    @property
+    def level(self) -> float:
+        """Light on flat ground, 0 to 1."""
+        return math.sin(math.radians(self.altitude))
+
+
+@dataclass(frozen=True, eq=False)
+class Slopes:
+    """Heights and slopes at the pixels of a window."""
+
+    heights: NDArray[np.float32]
+    """At the centres, shape (h, w), metres; NaN = no surface."""
+    gradient: NDArray[np.float32]
+    """dz/dX and dz/dY, shape (2, h, w); NaN where there is no surface on either side of the centre."""
+    resolution: float
+    """Side of a pixel, metres."""
+
+
+def surface_slopes(surface: Surface, grid: MapGrid, window: Window) -> Slopes:
+    """Heights and slopes of a surface at the pixel centres of a window.
+
+    In the outer half cell of a raster, where its heights go on level, the slope is that between the outer two posts.
+    """
+    half = grid.resolution / 2
+    columns = MapGrid(grid.left - half, grid.top, grid.resolution, grid.width + 1, grid.height, grid.crs)
+    rows = MapGrid(grid.left, grid.top + half, grid.resolution, grid.width, grid.height + 1, grid.crs)
+    middle = surface.relief(MapTarget(grid), window)
+    gradient = np.full((2, *middle.shape), np.nan, np.float32)
+    if np.isfinite(middle).any():
+        centre = middle
+        if isinstance(surface, RasterSurface):
+            surface = surface.continued()
+            centre = np.where(np.isnan(middle), np.float32(np.nan), surface.relief(MapTarget(grid), window))
+        across = surface.relief(MapTarget(columns), Window(window.col, window.row, window.width + 1, window.height))
+        along = surface.relief(MapTarget(rows), Window(window.col, window.row, window.width, window.height + 1))
+        gradients(across, along, centre, grid.resolution, gradient)
+    return Slopes(middle, gradient, grid.resolution)
+
+
+def hillshade(slopes: Slopes, light: Light) -> NDArray[np.float32]:
+    """Light on a matt surface (Lambert), shape (h, w), 0 to 1; NaN = no surface."""
+    result = np.empty(slopes.heights.shape, np.float32)
+    illumination(slopes.gradient, light.exaggeration, light.directions, light.multidirectional, result)
+    return result
+
+
+def grey(shade: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """A hillshade as grey values 1 to 255; 0 where there is no surface."""
+    empty = np.isnan(shade)
+    return np.where(empty, 0, np.rint(1 + 254 * np.where(empty, 0, shade))).astype(np.uint8)
+
+
+def slope_degrees(slopes: Slopes) -> NDArray[np.float32]:
+    """Inclination, degrees, shape (h, w); NaN = no surface."""
+    return np.degrees(np.arctan(_steepness(slopes)))
+
+
+def slope_percent(slopes: Slopes) -> NDArray[np.float32]:
+    """Rise over horizontal distance, percent, shape (h, w); NaN = no surface."""
+    return 100 * _steepness(slopes)
+
+
+def _steepness(slopes: Slopes) -> NDArray[np.float32]:
+    return np.hypot(slopes.gradient[0], slopes.gradient[1])
+
+
+def slope_classes(values: NDArray[np.float32], limits: tuple[float, ...]) -> NDArray[np.uint8]:
+    """Number of each value's class: 1 below the first limit, 2 from there to the second …; 0 for NaN.
+
+    Raises
+    ------
+    UsageError
+        The limits do not rise, or there are more than 254.
+    """
+    if not limits or len(limits) > 254 or not (np.diff(limits) > 0).all() or not np.isfinite(limits).all():
+        raise UsageError(f"class limits {limits}; one to 254 rising numbers are needed")
+    classes = 1 + np.searchsorted(np.array(limits), values, side="right")
+    return np.where(np.isnan(values), 0, classes).astype(np.uint8)
+
+
+def aspect(slopes: Slopes) -> NDArray[np.float32]:
+    """Direction in which the surface falls, degrees clockwise from north, 0 to below 360, shape (h, w).
+
+    -1 where it is flat, which is where heights differ by no more than the rounding of the float32 numbers that they
+    come in; NaN where there is no surface.
+    """
+    gx, gy = slopes.gradient
+    direction = np.degrees(np.arctan2(-gx, -gy)) % 360
+    direction = np.where(direction >= 360, 0, direction)
+    with np.errstate(invalid="ignore"):
+        rounding = 2 * np.spacing(np.abs(slopes.heights)) / slopes.resolution
+        flat = np.hypot(gx, gy) <= rounding
+    return np.where(flat, FLAT, direction).astype(np.float32)
+
+
+#: Colours from the lowest to the highest place, red, green, blue.
+RAMPS: dict[str, tuple[tuple[int, int, int], ...]] = {
+    "hypsometric": (
+        (86, 135, 92),
+        (139, 169, 110),
+        (200, 202, 142),
+        (231, 219, 168),
+        (214, 181, 128),
+        (180, 139, 99),
+        (146, 112, 96),
+        (190, 182, 182),
+        (250, 250, 250),
+    ),
+    "grey": ((40, 40, 40), (245, 245, 245)),
+    "spectral": ((50, 60, 150), (60, 150, 190), (120, 200, 140), (240, 235, 140), (235, 150, 70), (170, 40, 50)),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Ramp:
+    """Colours at rising heights."""
+
+    heights: NDArray[np.float64]
+    """Metres, rising, shape (n,)."""
+    colours: NDArray[np.float64]
+    """Red, green, blue, 0 to 255, shape (n, 3)."""
+    classed: bool = False
+    """A height has the colour of the entry at or below it; else colours are interpolated. Beyond the ends the first
+    and the last colour hold."""
+
+    def __post_init__(self) -> None:
+        if len(self.heights) < 1 or self.colours.shape != (len(self.heights), 3):
+            raise InputError(f"colour ramp of {len(self.heights)} heights and colours of shape {self.colours.shape}")
+        if not (np.diff(self.heights) > 0).all() or not np.isfinite(self.heights).all():
+            raise InputError("colour ramp: heights must be finite and rise from entry to entry")
+        if not ((self.colours >= 0) & (self.colours <= 255)).all():
+            raise InputError("colour ramp: red, green and blue must be from 0 to 255")
+
+    def __call__(self, heights: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Colours of heights (h, w), shape (3, h, w), 0 to 255; NaN where the height is NaN."""
+        empty = np.isnan(heights)
+        if self.classed:
+            at = np.clip(np.searchsorted(self.heights, heights, side="right") - 1, 0, len(self.heights) - 1)
+            bands = [self.colours[at, k] for k in range(3)]
+        else:
+            bands = [np.interp(heights, self.heights, self.colours[:, k]) for k in range(3)]
+        return np.where(empty, np.nan, np.stack(bands)).astype(np.float32)
+
+
+def built_in_ramp(name: str, low: float, high: float, steps: int | None = None) -> Ramp:
+    """A ramp of `RAMPS` between two heights.
+
+    Parameters
+    ----------
+    name
+        One of `RAMPS`.
+    low, high
+        Metres.
+    steps
+        Number of classes of equal height; None: interpolated.
+
+    Raises
+    ------
+    UsageError
+        The name is unknown, or the range is empty.
+    """
+    if name not in RAMPS:
+        raise UsageError(f"colour ramp {name!r}; built in are {', '.join(RAMPS)}, anything else is the name of a file")
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise UsageError(f"heights of the ramp from {low} to {high}; two rising numbers are needed")
+    colours = np.array(RAMPS[name], float)
+    smooth = Ramp(np.linspace(low, high, len(colours)), colours)
+    if steps is None:
+        return smooth
+    if not 1 <= steps <= 1000:
+        raise UsageError(f"{steps} height classes; 1 to 1000 are allowed")
+    lower = low + (high - low) * np.arange(steps) / steps
+    middle = low + (high - low) * (np.arange(steps) / max(steps - 1, 1))
+    picked = [np.interp(middle, smooth.heights, colours[:, k]) for k in range(3)]
+    return Ramp(lower, np.column_stack(picked), classed=True)
+
+
+def parse_ramp(text: str, name: str, classed: bool = False) -> Ramp:
+    """A ramp of a text: lines `height red green blue`, separated by blanks, commas or tabs; `#` begins a remark.
+
+    Parameters
+    ----------
+    text
+        The lines, in any order.
+    name
+        Of the file, for messages.
+    classed
+        See `Ramp`.
+
+    Raises
+    ------
+    InputError
+        A line is no entry (its number is named), there are none, or a height comes twice.
+    """
+    rows: list[list[float]] = []
+    for number, line in enumerate(text.lstrip("\ufeff").splitlines(), 1):
+        words = line.split("#")[0].replace(",", " ").replace(";", " ").split()
+        if not words or words[0].lower() == "nv":
+            continue
+        try:
+            row = [float(word) for word in words[:4]]
+        except ValueError:
+            row = []
+        if len(row) < 4 or not all(map(math.isfinite, row)) or not all(0 <= c <= 255 for c in row[1:]):
+            raise InputError(
+                f"{name}, line {number}: {line.strip()!r}; needed are a height in metres and red, green and blue from "
+                "0 to 255"
+            )
+        rows.append(row)
+    if not rows:
+        raise InputError(f"{name}: no line with a height and a colour; write for example `500 200 180 120`")
+    table = np.array(sorted(rows))
+    twice = table[:-1, 0][np.diff(table[:, 0]) == 0]
+    if len(twice):
+        raise InputError(f"{name}: height {twice[0]:g} has two colours; keep one of them")
+    return Ramp(table[:, 0], table[:, 1:], classed)
+
+
+def shaded(
+    colours: NDArray[np.float32], shade: NDArray[np.float32], level: float, strength: float = 0.6
+) -> NDArray[np.float32]:
+    """Colours darkened and lightened by a hillshade; flat ground keeps its colour.
+
+    Parameters
+    ----------
+    colours
+        Shape (3, h, w), 0 to 255.
+    shade
+        Light, 0 to 1, shape (h, w); NaN leaves the colour as it is.
+    level
+        Light on flat ground.
+    strength
+        How much of the hillshade is taken, 0 to 1.
+    """
+    shade = np.where(np.isnan(shade), np.float32(level), shade)
+    dark = np.minimum(shade / level, 1)
+    bright = np.maximum(shade - level, 0) / max(1 - level, 1e-6)
+    # Light slopes go half way to white at most: their colour must still be read.
+    return (colours * (1 - strength * (1 - dark)) + (255 - colours) * (0.5 * strength * bright)).astype(np.float32)

@@ -1,1 +1,0 @@
-"""Shading, slope and tints."""
