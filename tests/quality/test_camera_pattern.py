@@ -10,9 +10,17 @@ from tools.camera_model import Sensor
 from photoplan.errors import InputError
 from photoplan.quality.camera.blooming import find_blooming
 from photoplan.quality.camera.defects import find_blinking, find_defects, find_lines, log_histogram
-from photoplan.quality.camera.fixed_pattern import pattern_variance, prnu_percent, signed_root, spectrogram
+from photoplan.quality.camera.fixed_pattern import (
+    LINE_SHARE,
+    WHITE_SHARE,
+    background,
+    high_pass,
+    pattern_variance,
+    prnu_percent,
+    signed_root,
+    spectrogram,
+)
 from photoplan.quality.camera.frame_statistics import StackSums
-from photoplan.quality.camera.high_pass import LINE_SHARE, WHITE_SHARE, background, high_pass
 
 RUNS = 150
 

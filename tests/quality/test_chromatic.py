@@ -6,9 +6,8 @@ from scipy import ndimage
 
 from photoplan.errors import GeometryError, InputError
 from photoplan.quality.colour.discs import disc_displacements, find_discs
-from photoplan.quality.colour.edge_displacements import edge_displacements
+from photoplan.quality.colour.displacements import edge_displacements, patch_displacements
 from photoplan.quality.colour.model import BandModel, ChromaticModel, Displacements, fit_band
-from photoplan.quality.colour.patch_displacements import patch_displacements
 from photoplan.quality.edges.find import EdgePicture, find_edges
 from photoplan.quality.formation.model import ImageModel, form_image
 from photoplan.quality.formation.parts import Falloff, Gain, Lateral, Quantisation, Spread

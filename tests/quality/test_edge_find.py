@@ -25,6 +25,13 @@ def reasons(grey: np.ndarray, **masks: np.ndarray) -> dict[str, int]:
 
 
 class TestFound:
+    @pytest.mark.parametrize("angle", [43.0, 44.0, 45.0, 46.0, 136.0, -44.5])
+    def test_diagonal_edges_do_not_break(self, angle: float) -> None:
+        """Noise decides there whether rows or columns hold the ridge: SNR 20, one line from border to border."""
+        scene = 0.25 + 0.5 * half_plane((160, 150), (80.3, 75.2), angle, 0.8)
+        lines, _ = find_lines(noisy(scene, 20, 3, "float32"), None, 20.0)
+        assert len(lines) == 1 and lines[0].length > 190.0
+
     @pytest.mark.parametrize("angle", [0.0, 3.0, -17.0, 45.0, 78.0, 90.0, 131.0, -160.0])
     def test_where_it_is(self, angle: float) -> None:
         """Through (44.3, 40.2), whatever its direction: within 0.1 pixel and 0.5 degrees; bright on its right."""

@@ -14,7 +14,9 @@ from photoplan.quality.spread import gaussian_modulation
 
 
 class TestCombine:
-    @pytest.mark.parametrize(("between", "edges"), [(0.0, 12), (0.0, 4), (0.02, 12), (0.02, 5), (0.05, 30)])
+    @pytest.mark.parametrize(
+        ("between", "edges"), [(0.0, 12), (0.0, 4), (0.0, 3), (0.0, 2), (0.02, 12), (0.02, 5), (0.05, 30)]
+    )
     def test_intervals_cover_the_truth(self, between: float, edges: int) -> None:
         """Edges that differ by more than their own errors say: 95 % intervals hold the mean in 90 to 98 %."""
         rng = np.random.default_rng(edges + round(1000 * between))
@@ -26,6 +28,14 @@ class TestCombine:
             inside += low <= 0.3 <= high
         print(f"scatter {between}, {edges} edges: {inside / 4:.1f} % covered")
         assert 0.90 <= inside / 400 <= 0.985
+
+    def test_two_edges_lean_on_their_own_errors(self) -> None:
+        """A little farther apart than these let expect: not 12.7 standard deviations, as Student says of two values."""
+        alone = combine([0.30], [0.010])
+        apart, near = combine([0.30, 0.316], [0.010, 0.010]), combine([0.30, 0.31], [0.010, 0.010])
+        assert apart.scatter > 0.0 and near.scatter == 0.0
+        assert np.ptp(apart.interval) < 6.0 * apart.sigma
+        assert np.ptp(near.interval) < 0.75 * np.ptp(alone.interval)
 
     def test_a_gross_error_counts_little(self) -> None:
         rng = np.random.default_rng(1)

@@ -71,6 +71,29 @@ def test_a_second_edge_is_refused():
     _refused(_clean() + step, "a second edge 1[23].* pixels beside")
 
 
+@pytest.mark.parametrize("height", [3.0, 10.0])
+def test_a_line_beside_a_step_is_refused(height):
+    """Its overshoot would be hundreds of percent."""
+    end = edge_image(SHAPE, 6.0, (31.3, 50.2), gaussian(0.7))
+    _refused((1.0 + height) * _clean(noise=0.002) - height * end, "no edge but a line: .* % of the step beyond")
+
+
+def test_figures_that_are_not_determined_are_not_known():
+    """Edges of 20 rows along the pixels, SNR 5.6: widths have intervals above 0, or no value."""
+    random = np.random.default_rng(3)
+    widths = []
+    for _ in range(60):
+        image = edge_image((20, 40), 0.0, (19.3, 10.0), gaussian(0.4)) + random.normal(0.0, 0.18, (20, 40))
+        try:
+            edge = measure_edge(image)
+        except InputError:
+            continue
+        widths.append((edge.fwhm, *edge.fwhm_interval))
+    known = np.array([np.isfinite(each) for each in widths])
+    assert (known.all(axis=1) == known.any(axis=1)).all() and 0 < known.all(axis=1).sum() < len(widths)
+    assert all(low > 0.0 for _, low, _ in np.array(widths)[known.all(axis=1)])
+
+
 def test_a_corner_is_refused():
     corner = np.minimum(
         edge_image(SHAPE, 6.0, (29.3, 50.0), gaussian(0.7)), edge_image(SHAPE, 96.0, (29.0, 45.0), gaussian(0.7))

@@ -13,7 +13,7 @@ from photoplan.quality.camera.line_jitter import line_jitter
 from photoplan.quality.camera.line_period import Harmonic, Waves, spectrum
 from photoplan.quality.camera.parallel_edges import above_control, compare_edges
 from photoplan.quality.camera.plumb_edge import correlate_edge, fit_edge
-from photoplan.quality.sensor.figures import jitter_grey, jitter_pixels
+from photoplan.quality.sensor import jitter_grey, jitter_pixels
 
 LINES = np.arange(400.0)
 

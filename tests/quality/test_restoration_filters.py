@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.quality.restoration.aperture import aperture_filter
 from photoplan.quality.restoration.design import point_spread, radial_filter, separable_filter
 from photoplan.quality.restoration.filters import FilterKernel
-from photoplan.quality.restoration.inverse import band_matrix, condition_of, exact_inverse, spread_of_inverse
+from photoplan.quality.restoration.inverse import BAND_ROWS, band_matrix, condition_of, exact_inverse
 from photoplan.quality.spread import SpreadFunction, gaussian_modulation
 
 # Kölbl 2006, figures 4 and 6: the octant's rows from the centre outwards, [distance down][distance right].
@@ -212,3 +213,24 @@ def test_point_spread_functions_have_the_sums_that_were_measured():
     assert both.sum(axis=0)[1:-1] == pytest.approx(x.values)
     assert both.sum(axis=1) == pytest.approx(y.values)
     assert both.sum() == pytest.approx(1.0)
+
+
+def spread_of_inverse(inverse: NDArray[np.float64], half: int = 20) -> SpreadFunction:
+    """The spread function whose exact inverse is a given one-dimensional filter.
+
+    Parameters
+    ----------
+    inverse : ndarray, shape (2 n + 1,)
+        Such as the row sums of a two-dimensional restoration filter; divided by its sum first.
+    half : int
+        How many pixels of the spread function are kept to each side.
+
+    Raises
+    ------
+    InputError
+        The filter suppresses a frequency wholly: it is no inverse.
+    """
+    filter_ = SpreadFunction.normalised(inverse)
+    if condition_of(filter_).least_transfer < 1e-6:
+        raise InputError("the filter suppresses a frequency wholly: it is not the inverse of a spread function")
+    return SpreadFunction.normalised(exact_inverse(filter_, half, max(BAND_ROWS, 8 * half + 1)))

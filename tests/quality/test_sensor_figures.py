@@ -8,11 +8,8 @@ import numpy as np
 import pytest
 
 from photoplan.errors import InputError
-from photoplan.quality.sensor import figures as sensor
-from photoplan.quality.sensor import noise as sensor_noise
-from photoplan.quality.sensor import video_norm
-from photoplan.quality.sensor.noise import NoiseBudget
-from photoplan.quality.sensor.video_norm import VideoNorm
+from photoplan.quality import sensor
+from photoplan.quality.sensor import NoiseBudget, VideoNorm
 
 CCIR = VideoNorm(625, 64e-6, 12e-6, 25 * 64e-6 + 12e-6, 4 / 3, 0.67)
 
@@ -24,13 +21,13 @@ def printed(name: str, value: float, figure: float, digits: int) -> None:
 
 
 def test_behr_equations_3_1_to_3_5_lines_from_the_viewing_angle():
-    lines = video_norm.lines_from_viewing(radians(14.0), radians(1.5 / 60))
+    lines = sensor.lines_from_viewing(radians(14.0), radians(1.5 / 60))
     printed("Z, eq. 3.3", lines, 560, 6)
-    height = video_norm.viewed_length(3.0, radians(14.0))
-    spacing = video_norm.viewed_length(3.0, radians(1.5 / 60))
+    height = sensor.viewed_length(3.0, radians(14.0))
+    spacing = sensor.viewed_length(3.0, radians(1.5 / 60))
     assert height / spacing == pytest.approx(lines, rel=1e-12)
-    assert video_norm.columns_of(lines, 4 / 3) == pytest.approx(746.667, abs=1e-3)
-    assert video_norm.points_of(lines, 4 / 3) == pytest.approx(560 * 560 * 4 / 3)
+    assert sensor.columns_of(lines, 4 / 3) == pytest.approx(746.667, abs=1e-3)
+    assert sensor.points_of(lines, 4 / 3) == pytest.approx(560 * 560 * 4 / 3)
 
 
 def test_behr_table_3_1_the_norm():
@@ -56,7 +53,7 @@ def test_behr_equation_3_12_kell_factor():
 
 
 def test_behr_equation_3_13_sampling_theorem():
-    printed("f_s MHz for a signal of 5 MHz", video_norm.sampling_hz(5e6) / 1e6, 10, 9)
+    printed("f_s MHz for a signal of 5 MHz", sensor.sampling_hz(5e6) / 1e6, 10, 9)
 
 
 def test_behr_equation_3_14_quantisation():
@@ -117,23 +114,21 @@ def test_behr_equation_3_23_and_table_3_4_nyquist_frequency(size, limit):
 
 
 def test_behr_table_3_3_noise_budget():
-    budget = NoiseBudget(
-        1e6, 0.01 * 1e6, sensor_noise.transfer_noise(1e6, 1e-5, 2000), sensor_noise.amplifier_noise(0.25)
-    )
+    budget = NoiseBudget(1e6, 0.01 * 1e6, sensor.transfer_noise(1e6, 1e-5, 2000), sensor.amplifier_noise(0.25))
     printed("shot", budget.shot, 1000, 6)
     printed("dark", budget.dark, 100, 6)
     printed("amplifier", budget.amplifier, 200, 6)
     # The table prints ε = 1e-4 beside 200 electrons: its formula gives 632 with it, and 200 with 1e-5.
     printed("transfer, ε = 1e-5", budget.transfer, 200, 6)
-    printed("transfer, ε = 1e-4", sensor_noise.transfer_noise(1e6, 1e-4, 2000), 632, 0)
+    printed("transfer, ε = 1e-4", sensor.transfer_noise(1e6, 1e-4, 2000), 632, 0)
     # Its total is the plain sum; independent sources add by their squares.
     printed("plain sum", budget.plain_sum, 1500, 6)
     printed("root of the sum of squares (table: 1500)", budget.total, 1044, 0)
 
 
 def test_behr_section_3_6_4_dark_current_doubles_in_ten_degrees():
-    assert sensor_noise.dark_at(3.0, 35.0, 25.0) == pytest.approx(6.0)
-    assert sensor_noise.dark_at(3.0, 5.0, 25.0) == pytest.approx(0.75)
+    assert sensor.dark_at(3.0, 35.0, 25.0) == pytest.approx(6.0)
+    assert sensor.dark_at(3.0, 5.0, 25.0) == pytest.approx(0.75)
 
 
 def test_behr_equations_4_5_to_4_7_jitter():

@@ -2,16 +2,16 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy import ndimage, signal, special
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.quality.formation import optics
 from photoplan.quality.formation.kernels import pixel_kernel
-from photoplan.quality.formation.model import ImageModel, form_image
+from photoplan.quality.formation.model import ImageModel, form_image, model_modulation, model_mtf50, model_transfer
 from photoplan.quality.formation.parts import Aperture, Falloff, Lateral, LineJitterPart, Spread
 from photoplan.quality.formation.scenes import ArrayScene, PatternScene, parse_pattern
-from photoplan.quality.formation.truth import line_spread, model_modulation, model_mtf50
 from photoplan.quality.spread import GAUSSIAN_WIDTH
 
 
@@ -268,3 +268,32 @@ def test_patterns_by_name():
 def test_what_cannot_be_is_refused(make, words):
     with pytest.raises(InputError, match=words):
         make()
+
+
+#: Cycles per pixel up to which a transfer function is summed; what is left there is refused.
+_MOST_FREQUENCY = 40.0
+
+
+def line_spread(
+    model: ImageModel, offsets: NDArray[np.float64], angle_deg: float = 0.0, radius: float = 0.0
+) -> NDArray[np.float64]:
+    """Line spread function at offsets in pixels, its integral 1, by Fourier's integral.
+
+    Direction and place are those of `model_transfer`.
+
+    Raises
+    ------
+    InputError
+        The line spread function has steps (an aperture or a motion without other spread): the integral does not
+        converge.
+    """
+    f = np.linspace(0.0, _MOST_FREQUENCY, 16001)
+    transfer = model_transfer(model, f, angle_deg, radius)
+    if np.abs(transfer[-2000:]).max() > 2e-3:
+        raise InputError(
+            "the line spread function of this model has steps; give it some Gaussian spread, or ask for its MTF"
+        )
+    waves = np.exp(2j * np.pi * np.multiply.outer(np.asarray(offsets, float), f))
+    weights = np.full(f.size, f[1])
+    weights[[0, -1]] /= 2.0
+    return np.asarray(2.0 * (waves * transfer).real @ weights)

@@ -14,7 +14,7 @@ __getattr__, __dir__, __all__ = public(
         "quality.patterns.bars": "measure_bars",
         "quality.patterns.usaf": "measure_usaf",
         "quality.restoration.inverse": "exact_inverse",
-        "quality.restoration.regularised": "regularised_filter",
+        "quality.restoration.design": "design_filter",
         "quality.camera.photon_transfer": "photon_transfer",
     },
 )

@@ -58,6 +58,16 @@ class MtfCurve:
         """Frequency at modulation 0.5, cycles per pixel; NaN if it is not reached."""
         return self.falls_to(0.5)
 
+    def mtf50_interval(self, sigmas: float = 1.96) -> tuple[float, float]:
+        """Frequencies at which the curve less and plus so many standard deviations falls to 0.5.
+
+        The last frequency of the curve where that is not reached; equal where the standard deviations are unknown.
+        """
+        margin = 0.0 if self.sigma is None else sigmas * np.asarray(self.sigma, float)
+        ends = [MtfCurve(self.frequency, self.modulation + sign * margin).mtf50 for sign in (-1.0, 1.0)]
+        low, high = (float(np.nan_to_num(end, nan=self.frequency[-1])) for end in ends)
+        return low, high
+
     @property
     def mtf10(self) -> float:
         """Frequency at modulation 0.1, cycles per pixel; NaN if it is not reached."""

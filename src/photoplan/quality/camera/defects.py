@@ -17,7 +17,7 @@ from scipy import ndimage, special
 
 from photoplan.adjustment.robust import spread
 from photoplan.errors import InputError
-from photoplan.quality.camera.high_pass import background
+from photoplan.quality.camera.fixed_pattern import background
 
 Kind = Literal["hot", "dark", "blinking", "row", "column"]
 #: False alarms that are expected in a whole image.

@@ -15,6 +15,7 @@ from photoplan.errors import GeometryError, InputError
 from photoplan.quality.camera.fall_off_adjust import (
     CONSTANT,
     POINT,
+    Blocks,
     FallOffFit,
     FallOffSettings,
     adjust,
@@ -22,9 +23,9 @@ from photoplan.quality.camera.fall_off_adjust import (
     moved,
     separability,
     significant,
+    to_blocks,
     weakest,
 )
-from photoplan.quality.camera.fall_off_blocks import Blocks, to_blocks
 from photoplan.quality.camera.fall_off_model import FallOffModel
 
 Array = NDArray[np.float64]

@@ -29,9 +29,9 @@ class EdgeSettings:
     curve: int = 1
     """1: a straight line; 2: a parabola, for edges that a lens bends."""
     reach: float = 16.0
-    """Distance in pixels up to which light counts as spread by the camera (8 standard deviations of wider edges). What
-    lies farther counts to the levels, since no image tells it from uneven light. Infinite: the whole region, for evenly
-    lit targets."""
+    """Distance in pixels up to which pixels are used (8 standard deviations of wider edges); light that is spread
+    farther is estimated. Infinite: the whole region, for evenly lit targets: uneven light across the edge looks like
+    stray light."""
     shading: Literal["none", "along", "plane"] = "along"
     """Whether both levels may change linearly: not at all, along the edge, or along and across it. Across, a slope can
     hardly be told from stray light, so that figures become less certain."""
@@ -166,6 +166,16 @@ def check_one_peak(positions: NDArray[np.float64], line: NDArray[np.float64], si
                 f"the sides of the edge are not even: a second edge {away[i]:.1f} pixels beside the first one, "
                 f"{100 * height[i] / line[top]:.0f} % as steep; choose a narrower region"
             )
+
+
+def check_overshoot(overshoot: float, undershoot: float) -> None:
+    """Refuse a profile that goes farther beyond a level than from one to the other: a line."""
+    most = max(overshoot, undershoot)
+    if most > 1.0:
+        raise InputError(
+            f"no edge but a line: beside it light goes {100 * most:.0f} % of the step beyond both sides; choose "
+            "a region with one edge"
+        )
 
 
 def check_certainty(mtf50: float, reach: float, most: float) -> None:

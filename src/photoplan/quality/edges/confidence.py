@@ -17,20 +17,29 @@ from photoplan.quality.spread import GAUSSIAN_WIDTH
 DENSITY = 25
 #: Reach, in standard deviations of the trend, within which width, over- and undershoot are looked for.
 REACH = 8.0
+#: Standard deviation of the light beyond the window, relative to what is estimated by the square of the distance: 95 %
+#: reach from none of it, as where a bell ends, to twice as much.
+BEYOND = 0.5
 #: Frequencies for each cycle per pixel at which the transfer function is computed.
 FREQUENCIES = 128
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeShape:
-    """Linear maps from the coefficients of a profile to what is read from it."""
+    """Linear maps from the coefficients of a profile, and from light beyond the window, to what is read from it.
+
+    That light is half of it on each side, so far away that only the levels and the modulation at frequency 0 have it;
+    it is never less than none.
+    """
 
     at: NDArray[np.float64]
     edge: NDArray[np.float64]
+    ends: NDArray[np.float64]
     line: NDArray[np.float64]
     frequency: NDArray[np.float64]
     transfer: NDArray[np.complex128]
     steps: NDArray[np.float64]
+    tails: NDArray[np.float64]
 
     @classmethod
     def of(cls, fit: EdgeFit, highest: float) -> EdgeShape:
@@ -41,20 +50,30 @@ class EdgeShape:
         high = min(basis.high, REACH * basis.model.total)
         at = np.linspace(low, high, int((high - low) / spacing) + 2)
         frequency = np.linspace(0.0, highest, max(2, round(highest * FREQUENCIES) + 1))
-        return cls(at, basis.edge(at), basis.line(at), frequency, basis.transfer(frequency), basis.steps())
+        far = (np.full(at.size, 0.5), np.zeros(at.size), (frequency == 0.0) + 0.0j, 1.0)
+        near = (basis.edge(at), basis.line(at), basis.transfer(frequency), basis.steps())
+        edge, line, transfer, steps = (np.append(a, np.expand_dims(b, -1), axis=-1) for a, b in zip(near, far))
+        ends = np.append(basis.edge(np.array([basis.low, basis.high])), [[0.5], [0.5]], axis=-1)
+        return cls(at, edge, ends, line, frequency, transfer, steps, np.append(basis.tails(), 1.0))
+
+    def allowed(self, shapes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Coefficients (k, size + 1) with what makes negative tails none."""
+        filled = shapes.copy()
+        filled[:, -1] += np.maximum(0.0, -(shapes @ self.tails))
+        return filled
 
     def modulation(self, shapes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Modulation (k, frequencies) of coefficients (k, size): 1 at frequency 0."""
+        """Modulation (k, frequencies) of coefficients (k, size + 1): 1 at frequency 0."""
         return np.asarray(np.abs(shapes @ self.transfer.T) / (shapes @ self.steps)[:, None])
 
     def figures(self, shapes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """MTF50, MTF10, FWHM, overshoot, undershoot, modulation at 0.5: shape (k, 6) for coefficients (k, size)."""
+        """MTF50, MTF10, FWHM, overshoot, undershoot, modulation at 0.5: shape (k, 6) for coefficients (k, size + 1)."""
         step = (shapes @ self.steps)[:, None]
-        edges, lines, modulation = shapes @ self.edge.T / step, shapes @ self.line.T / step, self.modulation(shapes)
+        edges, ends, lines = (shapes @ each.T / step for each in (self.edge, self.ends, self.line))
         rows = []
-        for edge, line, curve in zip(edges, lines, modulation):
+        for edge, end, line, curve in zip(edges, ends, lines, self.modulation(shapes)):
             mtf = MtfCurve(self.frequency, curve)
-            over, under = _beyond(self.at, edge)
+            over, under = _beyond(self.at, edge, end)
             rows.append([mtf.mtf50, mtf.mtf10, _width(self.at, line), over, under, mtf.at(0.5)])
         return np.array(rows)
 
@@ -77,12 +96,15 @@ def edge_figures(fit: EdgeFit, shape: EdgeShape, confidence: float) -> EdgeFigur
     The edge is split along its length into blocks, each of which is a profile of its own. The spread between the
     figures with one block left out (jackknife; Efron and Tibshirani 1993, eq. 11.5) holds noise of any distribution
     and correlation within a block. It cannot hold what the prior hides in all blocks alike, which is added: the change
-    of a figure in each direction in which the shape may differ unseen. Intervals use Student's distribution with one
-    degree of freedom less than blocks.
+    of a figure in each direction in which the shape may differ unseen, and by the light beyond the window (`BEYOND`).
+    Intervals use Student's distribution with one degree of freedom less than blocks.
     """
     blocks = fit.left_out.shape[0]
-    middle = fit.shape[None, :]
-    all_shapes = np.concatenate([middle, fit.left_out, middle + fit.hidden, middle - fit.hidden])
+    unseen = np.zeros((fit.hidden.shape[0] + 1, fit.shape.size + 1))
+    unseen[:-1, :-1] = fit.hidden
+    unseen[-1, -1] = BEYOND * fit.beyond[0] * fit.step
+    known = np.pad(np.vstack([fit.shape, fit.left_out]), ((0, 0), (0, 1)))
+    all_shapes = shape.allowed(np.concatenate([known, known[:1] + unseen, known[:1] - unseen]))
     figures, curves = shape.figures(all_shapes), shape.modulation(all_shapes)
     sigma = _spread(figures, blocks)
     return EdgeFigures(
@@ -125,9 +147,9 @@ def _peak(line: NDArray[np.float64], top: int) -> float:
     return float(middle + (right - left) ** 2 / (8.0 * curvature)) if curvature > 0.0 else float(middle)
 
 
-def _beyond(at: NDArray[np.float64], edge: NDArray[np.float64]) -> tuple[float, float]:
-    """How far the profile rises above 1 on the bright side, and falls below 0 on the dark side; not below 0."""
+def _beyond(at: NDArray[np.float64], edge: NDArray[np.float64], ends: NDArray[np.float64]) -> tuple[float, float]:
+    """How far the profile rises above what it is at the bright end, and falls below the dark one; not below 0."""
     bright, dark = edge[at > 0.0], edge[at < 0.0]
-    over = float(bright.max() - 1.0) if bright.size else 0.0
-    under = float(-dark.min()) if dark.size else 0.0
+    over = float(bright.max() - ends[1]) if bright.size else 0.0
+    under = float(ends[0] - dark.min()) if dark.size else 0.0
     return max(over, 0.0), max(under, 0.0)

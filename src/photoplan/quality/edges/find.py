@@ -27,6 +27,8 @@ REASONS = {
 }
 #: Widths of half a window that are tried, pixels.
 _HALVES = (20, 16, 13, 11, 9, 7)
+#: Wider ones, where they are asked for.
+_WIDE = (26, 33, 42, 52)
 #: Good blocks that must lie before and behind a gap.
 _RUN = 5
 
@@ -49,7 +51,8 @@ class EdgeRules:
     @classmethod
     def within(cls, half: int, least_length: float, least_snr: float) -> EdgeRules:
         """Rules with windows that reach no farther than half a width, pixels."""
-        return cls(halves=(*(h for h in _HALVES if h < half), half), least_length=least_length, least_snr=least_snr)
+        halves = (*(h for h in _WIDE + _HALVES if h < half), half)
+        return cls(halves=halves, least_length=least_length, least_snr=least_snr)
 
     def __post_init__(self) -> None:
         if not 8.0 <= self.least_length <= 10_000.0:
@@ -189,7 +192,7 @@ def examine(picture: EdgePicture, line: StraightEdge, rules: EdgeRules) -> tuple
             reasons[reason] += 1
             continue
         # A narrower window must make the edge much longer: tails of the spread function need width.
-        score = region.line.length * min(half, 16) ** 0.5
+        score = region.line.length * half**0.5
         if best is None or score > 1.25 * best[0]:
             best = score, region
         if region.line.length > 0.8 * line.length:

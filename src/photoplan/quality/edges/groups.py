@@ -49,8 +49,9 @@ def combine(
     Weights are 1 / (σ² + τ²): τ, what edges differ by beyond their noise, follows from their spread (the estimate of
     Paule and Mandel 1982), so that neither the sharpest measured edge decides alone nor a noisy one counts in full.
     Edges far from the others get less weight (Huber, 2.5 standard deviations). The standard deviation of the mean is
-    that of the weighted residuals (Hartung and Knapp 2001), the interval that of Student's distribution; where the
-    edges' own errors explain their spread (τ = 0), that of the normal distribution with these errors.
+    that of the weighted residuals (Hartung and Knapp 2001), but not less than the edges' own errors make it. These are
+    known beforehand, only the rest follows from the few edges: the interval is that of Student's distribution with
+    (n − 1) σ² / rest² degrees of freedom (after Satterthwaite 1946), of the normal one where the rest is 0.
 
     Parameters
     ----------
@@ -101,9 +102,12 @@ def combine(
     share = weight / weight.sum()
     sigma = sqrt(float(share @ (v - mean) ** 2) / (n - 1))
     # Less than the edges' own errors allow is luck, not accuracy.
-    sigma = max(sigma, sqrt(float((share**2) @ (s**2))))
+    own = sqrt(float((share**2) @ (s**2)))
+    sigma = max(sigma, own)
+    rest = sigma**2 - own**2
     part = 0.5 + confidence / 2
-    reach = float(stdtrit(n - 1, part) if tau2 > 0.0 else ndtri(part)) * sigma
+    certain = rest <= 1e-9 * sigma**2
+    reach = float(ndtri(part) if certain else stdtrit((n - 1) * sigma**2 / rest, part)) * sigma
     return CombinedValue(mean, (max(mean - reach, least), mean + reach), sigma, sqrt(tau2), n)
 
 

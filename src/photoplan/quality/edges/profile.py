@@ -4,8 +4,13 @@ Every pixel is one observation of the edge profile at its own distance from the 
 profile many times per pixel). The observations are adjusted together by linear prediction, as heights are in a terrain
 model: the *trend* is the profile of Gaussian optics and a square pixel with free levels, place and width; the *signal*
 is what the true line spread function has beyond that (asymmetry, tails of stray light, edge enhancement), a random
-function that is smooth at the scale of the edge's width, and wide and faint far from it; restricted likelihood says
-how smooth and how large, so the data decide how much of it there is; the rest is *noise*.
+function that is smooth at the scale of the edge's width, and wide and faint far from it, where both sides may have the
+wings of an aperture in common; restricted likelihood says how smooth and how large, so the data decide how much of it
+there is; the rest is *noise*.
+
+Pixels end where the window does, light does not: beyond it the signal fades with the square of the distance from what
+it is at the ends, as behind an aperture, so that levels, step and modulation are those of the whole line spread
+function.
 
 ISO 12233 and its relatives average pixels into bins of a quarter pixel, difference the bins and multiply with a
 Hamming window; bins and differences filter the result (corrected there approximately), bins hold unequal numbers of
@@ -13,7 +18,8 @@ phases unless the slope suits them, and the window cuts tails away. Here no bin,
 is nothing to correct: the profile is a sum of functions whose derivatives and Fourier transforms are known.
 
 Sources: linear prediction: Kraus, Photogrammetrie 3, 2000, sect. 1; restricted likelihood: Patterson and Thompson,
-Biometrika 58, 1971.
+Biometrika 58, 1971; wings of the line spread function of a circular aperture, 2 λN / (π³ x²): the transform of the
+cusp of its transfer function at frequency 0, 1 − 4 λN |f| / π (Goodman, Introduction to Fourier Optics, eq. 6-32).
 """
 
 from __future__ import annotations
@@ -27,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve, eigh
+from scipy.special import exp1
 
 from photoplan.quality.edges.model import LEAST_BLUR, PixelEdge
 
@@ -43,6 +50,8 @@ SCALES = 10.0 ** np.linspace(-3.0, 3.5, 53)
 UNLIKELY = 1.92
 #: How many unknowns of the shape belong to the trend: step, shift, width.
 TREND = 3
+#: Variance of the wings that both sides have in common, relative to that of the signal elsewhere.
+WINGS = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +94,12 @@ class ProfileBasis:
             (variance + change - least) / self.model.total**2,
         )
 
+    @property
+    def _tails(self) -> NDArray[np.float64]:
+        """Light of the functions of the signal beyond both ends, where they fade with the square, shape (2, k)."""
+        ends = np.array([self.low, self.high])
+        return np.asarray(np.abs(ends)[:, None] * self._signal(1)(ends))
+
     def _signal(self, derivative: int) -> BSpline:
         spline = BSpline(self.knots, np.eye(self.knots.size - 4), 3, extrapolate=False)
         return spline if derivative == 1 else spline.antiderivative()
@@ -94,8 +109,8 @@ class ProfileBasis:
         wide, narrow, difference = self._wider
         rise, spread, _ = self.model.profile(distance)
         width = (wide.profile(distance)[0] - narrow.profile(distance)[0]) / difference
-        clipped = np.clip(distance, self.knots[3], self.knots[-4])
-        signal = self._signal(0)(clipped) - self._signal(0)(self.knots[3:4])
+        inside = self._signal(0)(np.clip(distance, self.low, self.high))
+        signal = inside - self._signal(0)(np.array([self.low])) + self._tails[0]
         return np.concatenate([rise[:, None], spread[:, None] * self.model.total, width[:, None], signal], axis=1)
 
     def line(self, distance: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -109,33 +124,42 @@ class ProfileBasis:
     def transfer(self, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Fourier transforms of the line spread functions at cycles per pixel (m,), shape (m, size).
 
-        Those of the trend in closed form, those of the signal by Gauss' quadrature between the nodes, to 1e-9.
+        Those of the trend in closed form, those of the signal by Gauss' quadrature between the nodes, to 1e-9, and
+        beyond the window in closed form again.
         """
         wide, narrow, difference = self._wider
         own = self.model.transfer(frequency)
         width = (wide.transfer(frequency) - narrow.transfer(frequency)) / difference
-        at, weight = _quadrature(self.knots[3:-3], float(frequency.max()))
+        inner = self.knots[(self.knots > self.low) & (self.knots < self.high)]
+        at, weight = _quadrature(np.concatenate([[self.low], inner, [self.high]]), float(frequency.max()))
         waves = np.exp(-2j * pi * np.multiply.outer(frequency, at)) * weight
         signal = waves @ self._signal(1)(at)
+        for end, tail in zip((self.low, self.high), self._tails):
+            signal += np.multiply.outer(_faded(2.0 * pi * frequency * end), tail)
         shift = 2j * pi * frequency * own * self.model.total
         return np.concatenate([own[:, None], shift[:, None], width[:, None], signal], axis=1)
 
     def steps(self) -> NDArray[np.float64]:
         """What each function adds to the step from dark to bright, shape (size,)."""
-        signal = self._signal(0)(self.knots[-4:-3]) - self._signal(0)(self.knots[3:4])
-        return np.concatenate([[1.0, 0.0, 0.0], signal[0]])
+        inside = np.diff(self._signal(0)(np.array([self.low, self.high])), axis=0)[0]
+        return np.concatenate([[1.0, 0.0, 0.0], inside + self._tails.sum(axis=0)])
+
+    def tails(self) -> NDArray[np.float64]:
+        """What each function adds to the step beyond the window, shape (size,)."""
+        return np.asarray(self.steps() - np.diff(self.edge(np.array([self.low, self.high])), axis=0)[0])
 
     def root(self, correlation: float) -> NDArray[np.float64]:
         """Matrix R with R Rᵀ the covariance of the signal's coefficients, for unit variance in the middle.
 
         Twice differentiable (Matérn 5/2) in a coordinate that grows like the logarithm of the distance in the tails,
-        where it fades as 1 / distance², as the lines of diffraction and of veiling light do.
+        where it fades as 1 / distance², as the lines of diffraction and of veiling light do; a part that is alike
+        everywhere but for that are the wings of both sides.
         """
         unit = self.model.total * CORE
         place = np.arcsinh(self.centres / unit) * CORE
         fading = 1.0 / (1.0 + (self.centres / unit) ** 2) / self.model.total
         apart = np.abs(np.subtract.outer(place, place)) * (sqrt(5.0) / correlation)
-        matern = (1.0 + apart + apart**2 / 3.0) * np.exp(-apart)
+        matern = (1.0 + apart + apart**2 / 3.0) * np.exp(-apart) + WINGS
         value, vector = eigh(matern)
         return np.asarray(fading[:, None] * (vector * np.sqrt(np.maximum(value, 0.0))))
 
@@ -146,7 +170,7 @@ class EdgeFit:
 
     basis: ProfileBasis
     levels: NDArray[np.float64]
-    """Unknowns beside the shape: the dark level, then slopes of the levels."""
+    """Unknowns beside the shape: the dark level (far away, without `missing`), then slopes of the levels."""
     shape: NDArray[np.float64]
     """Coefficients of the basis, shape (size,)."""
     covariance: NDArray[np.float64]
@@ -161,6 +185,24 @@ class EdgeFit:
     """Effective number of unknowns."""
     signal: float
     """Standard deviation of the signal relative to the noise."""
+
+    @property
+    def missing(self) -> float:
+        """Light that lies beyond the window beside that of the shape: where its tails are negative, they are none."""
+        return max(0.0, -float(self.basis.tails() @ self.shape))
+
+    @property
+    def step(self) -> float:
+        """Difference of both levels, far away."""
+        return float(self.basis.steps() @ self.shape) + self.missing
+
+    @property
+    def beyond(self) -> tuple[float, float]:
+        """Share of the light beyond the window, and its standard deviation by the covariance."""
+        tails, step = self.basis.tails(), self.step
+        share = (float(tails @ self.shape) + self.missing) / step
+        change = (tails - share * self.basis.steps()) / step
+        return share, sqrt(max(float(change @ self.covariance @ change), 0.0))
 
 
 def fit_profile(
@@ -274,6 +316,12 @@ def _quadrature(knots: NDArray[np.float64], most: float) -> tuple[NDArray[np.flo
         places.append(0.5 * (a + b) + 0.5 * (b - a) * x)
         weights.append(0.5 * (b - a) * w)
     return np.concatenate(places), np.concatenate(weights)
+
+
+def _faded(angle: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Transform of 1 / t² from 1 on, at angles for each unit of t: the exponential integral E₂ (DLMF 8.19.12)."""
+    wave = 1j * np.where(angle == 0.0, 1.0, angle)
+    return np.where(angle == 0.0, 1.0, np.exp(-wave) - wave * exp1(wave))
 
 
 @lru_cache(maxsize=64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import nan
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +17,13 @@ from photoplan.quality.edges.checks import (
     check_clipping,
     check_line,
     check_one_peak,
+    check_overshoot,
     check_region,
     check_sides,
     check_step,
     grain,
 )
-from photoplan.quality.edges.confidence import EdgeFigures, EdgeShape, edge_figures, gaussian_width
+from photoplan.quality.edges.confidence import BEYOND, EdgeFigures, EdgeShape, edge_figures, gaussian_width
 from photoplan.quality.edges.line import EdgeLine, EdgePixels, determines, find_line, fit_line
 from photoplan.quality.edges.model import PixelEdge
 from photoplan.quality.edges.profile import EdgeFit, ProfileBasis, fit_profile
@@ -108,8 +110,12 @@ class EdgeMeasurement:
     phase_gap: float
     """Largest distance between neighbouring samples of the profile in the edge: 1 if it is aligned with the pixels."""
     window: tuple[float, float]
-    """Distances between which the profile is determined; light spread farther than this is not seen: it counts to the
-    levels."""
+    """Distances between which the profile is determined."""
+    beyond: float
+    """Share of the light that is spread farther than that, estimated from what the line spread function is at the ends;
+    it is in levels, profiles and modulation. Not below 0."""
+    beyond_sigma: float
+    """It holds the noise, and half of the estimate for the form of the tails."""
     confidence: float
     """Probability of the intervals."""
 
@@ -289,19 +295,23 @@ def _fit(
 
 def _measured(found: _Context) -> EdgeMeasurement:
     fit, line, settings = found.fit, found.line, found.settings
-    step = float(fit.basis.steps() @ fit.shape)
-    noise = fit.noise
+    step, noise = fit.step, fit.noise
+    beyond, spoilt = fit.beyond
     check_step(step, noise, grain(found.pixels.light, found.pixels.along, found.pixels.across), settings)
     straightness, structure = _residual_checks(found, step)
     gap = _phase_gap(found.distance, fit.basis.model)
     profiles = _profiles(found, step, gap)
-    check_one_peak(profiles["lsf"].positions, profiles["lsf"].values, profiles["lsf"].sigma)
+    lsf = profiles["lsf"]
+    # How much lies beyond the window makes both peaks of two edges higher or lower, but not one of them.
+    own = np.sqrt(np.maximum(lsf.sigma**2 - (BEYOND * beyond * lsf.values) ** 2, 0.0))
+    check_one_peak(lsf.positions, lsf.values, own)
     shape = EdgeShape.of(fit, min(1.0, 0.5 / gap))
     figures = edge_figures(fit, shape, settings.confidence)
     mtf50, mtf10, fwhm, over, under, nyquist = (float(v) for v in figures.values)
+    check_overshoot(over, under)
     check_certainty(mtf50, figures.factor * float(figures.sigma[0]), settings.most_uncertain)
     middle = line.place(0.5 * (found.span[0] + found.span[1]))
-    dark = float(fit.levels[0])
+    dark = float(fit.levels[0]) - fit.missing / 2.0
     return EdgeMeasurement(
         col=found.origin[0] + middle[0],
         row=found.origin[1] + middle[1],
@@ -315,9 +325,9 @@ def _measured(found: _Context) -> EdgeMeasurement:
         mtf=MtfCurve(shape.frequency, figures.modulation, figures.modulation_sigma),
         mtf50=mtf50,
         mtf50_interval=_interval(figures, 0),
-        mtf10=mtf10,
+        mtf10=mtf10 if np.isfinite(_interval(figures, 1)).all() else nan,
         mtf10_interval=_interval(figures, 1),
-        fwhm=fwhm,
+        fwhm=fwhm if np.isfinite(_interval(figures, 2)).all() else nan,
         fwhm_interval=_interval(figures, 2),
         gaussian_fwhm=gaussian_width(mtf50),
         overshoot=over,
@@ -329,13 +339,16 @@ def _measured(found: _Context) -> EdgeMeasurement:
         structure=structure,
         phase_gap=gap,
         window=(fit.basis.low, fit.basis.high),
+        beyond=beyond,
+        beyond_sigma=float(np.hypot(BEYOND * beyond, spoilt)),
         confidence=settings.confidence,
     )
 
 
 def _interval(figures: EdgeFigures, which: int) -> tuple[float, float]:
+    """Interval of a figure; NaN where it would reach 0 or below, so that the pixels do not determine the figure."""
     value, reach = float(figures.values[which]), figures.factor * float(figures.sigma[which])
-    return value - reach, value + reach
+    return (value - reach, value + reach) if reach < value else (nan, nan)
 
 
 def _phase_gap(distance: NDArray[np.float64], model: PixelEdge) -> float:
@@ -365,10 +378,12 @@ def _profiles(found: _Context, step: float, gap: float) -> dict[str, EdgeProfile
     edge, line = fit.basis.edge(at) / step, fit.basis.line(at) / step
     area = fit.basis.steps() / step
     profiles = {}
-    for name, rows, share in (("esf", edge, edge @ fit.shape), ("lsf", line, line @ fit.shape)):
+    far = BEYOND * fit.beyond[0]
+    for name, rows, base in (("esf", edge, 0.5), ("lsf", line, 0.0)):
+        share = rows @ fit.shape + base * fit.missing / step
         relative = rows - np.multiply.outer(share, area)
-        sigma = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", relative, fit.covariance, relative), 0.0))
-        profiles[name] = EdgeProfile(at, share, sigma)
+        variance = np.maximum(np.einsum("ij,jk,ik->i", relative, fit.covariance, relative), 0.0)
+        profiles[name] = EdgeProfile(at, share, np.sqrt(variance + (far * (share - base)) ** 2))
     aligned = 1.0 / found.line.length_of_normal if abs(found.line.slope) < 0.05 else min(gap, 1.0)
     width = 0.25 if gap <= DENSE else aligned
     # Bins are centred on the phase that occurs most, so that no column of an aligned edge is split.
@@ -377,6 +392,9 @@ def _profiles(found: _Context, step: float, gap: float) -> dict[str, EdgeProfile
     place -= place.min()
     count = np.bincount(place)
     mean = np.bincount(place, found.distance)[count > 0] / count[count > 0]
-    value = np.bincount(place, (found.pixels.light - fit.levels[0]) / step)[count > 0] / count[count > 0]
+    value = (
+        np.bincount(place, (found.pixels.light - fit.levels[0] + fit.missing / 2.0) / step)[count > 0]
+        / count[count > 0]
+    )
     sigma = fit.noise / step / np.sqrt(count[count > 0])
     return profiles | {"samples": EdgeProfile(mean, value, sigma)}

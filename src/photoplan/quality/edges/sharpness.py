@@ -23,6 +23,8 @@ _HALF = 5
 _KNOWN = 0.5
 #: Share by which the MTF50 of edges may differ from the upper quartile.
 _AGREE = 0.08
+#: Standard deviation by which the modulation of edges differs besides what they state.
+_ALIKE = 0.01
 #: Where mean spread and transfer functions are tabulated: pixels, cycles per pixel.
 _POSITIONS = np.linspace(-10.0, 10.0, 401)
 _FREQUENCIES = np.linspace(0.0, 1.0, 201)
@@ -105,7 +107,7 @@ def _together(edges: Sequence[EdgeMeasurement], weights: NDArray[np.float64]) ->
     responses = [
         np.interp(_POSITIONS, edge.esf.positions, edge.esf.values, left=np.nan, right=np.nan) for edge in edges
     ]
-    response = _mean(np.array(responses), weights)
+    response = _mean(np.array(responses), weights[:, None])
     known = np.isfinite(response)
     reach = float(np.abs(_POSITIONS[known]).max()) if known.any() else 0.0
     reach = min(reach, -float(_POSITIONS[known].min()), float(_POSITIONS[known].max())) if known.any() else 0.0
@@ -114,17 +116,41 @@ def _together(edges: Sequence[EdgeMeasurement], weights: NDArray[np.float64]) ->
         raise InputError("the edges are not seen far enough to both sides for a spread function")
     spread, _ = spread_from_response(_POSITIONS[known], response[known], half)
     curves = [np.interp(_FREQUENCIES, edge.mtf.frequency, edge.mtf.modulation, right=np.nan) for edge in edges]
-    curve = _mean(np.array(curves), weights)
+    own = np.array([_own_sigma(edge.mtf) for edge in edges])
+    # What an edge knows of light that is spread far differs more from edge to edge than what it knows of the rest.
+    each = weights[:, None] / (own**2 + _ALIKE**2)
+    curve = _mean(np.array(curves), each)
+    sigma = _sigma_of_mean(np.array(curves) - curve, own, each)
     known = np.isfinite(curve)
     end = int(np.argmin(known)) if not known.all() else known.size
-    return Sharpness(spread, MtfCurve(_FREQUENCIES[:end], curve[:end]))
+    return Sharpness(spread, MtfCurve(_FREQUENCIES[:end], curve[:end], sigma[:end]))
+
+
+def _own_sigma(curve: MtfCurve) -> NDArray[np.float64]:
+    """Standard deviations that an edge states; 0 if it states none."""
+    if curve.sigma is None:
+        return np.zeros(_FREQUENCIES.size)
+    return np.interp(_FREQUENCIES, curve.frequency, np.nan_to_num(curve.sigma))
+
+
+def _sigma_of_mean(
+    apart: NDArray[np.float64], own: NDArray[np.float64], weights: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Standard deviation of a mean curve: the larger of what edges state and what they differ by; all (edges, n)."""
+    known = np.isfinite(apart)
+    share = np.where(known, weights, 0.0)
+    share /= np.maximum(share.sum(axis=0), 1e-300)
+    count = np.maximum(known.sum(axis=0), 2)
+    stated = (share**2 * own**2).sum(axis=0)
+    scatter = (share**2 * np.where(known, apart, 0.0) ** 2).sum(axis=0) * count / (count - 1)
+    return np.asarray(np.sqrt(np.maximum(stated, scatter)))
 
 
 def _mean(values: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weighted mean over the edges that know a place; NaN where too few do. Shape (edges, n) to (n,)."""
+    """Weighted mean over the edges that know a place; NaN where too few do. Shapes (edges, n) to (n,)."""
     known = np.isfinite(values)
-    each = np.where(known, weights[:, None], 0.0)
+    each = np.where(known, weights, 0.0)
     total = each.sum(axis=0)
-    enough = total >= _KNOWN * weights.sum()
+    enough = total >= _KNOWN * weights.sum(axis=0)
     mean = np.where(known, values, 0.0) * each
     return np.where(enough, mean.sum(axis=0) / np.where(enough, total, 1.0), np.nan)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import exp
+from math import cos, exp, radians, sin
 from typing import Annotated, Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from photoplan.errors import InputError
+from photoplan.quality.formation.kernels import aperture_transfer, spread_transfer
 from photoplan.quality.formation.optics import Light, Optics, line_displacements
 from photoplan.quality.formation.parts import (
     Aperture,
@@ -40,6 +41,7 @@ from photoplan.quality.formation.parts import (
 )
 from photoplan.quality.formation.scenes import ArrayScene, LightScene
 from photoplan.quality.formation.sensor import Pattern, add_shot_noise, fixed_pattern, moved_charge, overflow
+from photoplan.quality.mtf_curve import MtfCurve
 
 _Array = NDArray[np.float64]
 #: Pixels × bands of an image that is formed: it is held in memory several times as float64.
@@ -284,3 +286,38 @@ def _grey(model: ImageModel, grey: _Array, frame: Frame) -> NDArray[Any]:
     if model.tone is not None:
         grey = toned(grey, model.tone)
     return grey if model.quantisation is None else quantised(grey, model.quantisation)
+
+
+def model_transfer(
+    model: ImageModel, frequency: _Array, angle_deg: float = 0.0, radius: float = 0.0
+) -> NDArray[np.complex128]:
+    """Optical transfer function of spread and aperture together, of a continuous scene.
+
+    Parameters
+    ----------
+    model : ImageModel
+    frequency : array
+        Cycles per pixel along the direction.
+    angle_deg : float
+        Direction: 0 along x, 90 along y. An edge of `PatternScene` at an angle shows it across itself.
+    radius : float
+        Place in the field: 0 in the middle, 1 in the corners.
+    """
+    f = np.asarray(frequency, float)
+    fx, fy = f * cos(radians(angle_deg)), f * sin(radians(angle_deg))
+    scale = model.spread.scale_at(radius)
+    return np.asarray(spread_transfer(model.spread, fx, fy, scale) * aperture_transfer(model.aperture, fx, fy))
+
+
+def model_modulation(model: ImageModel, frequency: _Array, angle_deg: float = 0.0, radius: float = 0.0) -> _Array:
+    """Modulus of `model_transfer`, which says what the arguments are: the MTF."""
+    return np.abs(model_transfer(model, frequency, angle_deg, radius))
+
+
+def model_mtf50(model: ImageModel, angle_deg: float = 0.0, radius: float = 0.0) -> float:
+    """First frequency at which the MTF falls to one half, cycles per pixel; NaN if it does not below 20.
+
+    Direction and place are those of `model_transfer`.
+    """
+    f = np.linspace(0.0, 20.0, 40001)
+    return MtfCurve(f, model_modulation(model, f, angle_deg, radius)).falls_to(0.5)

@@ -1,8 +1,9 @@
-"""Which filter restores an image: the exact inverse where there is one and noise allows, else least squares."""
+"""Which filter restores an image: the one of least expected error, or the exact inverse for whoever asks for it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from math import pi, sqrt
 from typing import Literal
 
@@ -13,7 +14,8 @@ from photoplan.errors import InputError
 from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.restoration.filters import FilterKernel
 from photoplan.quality.restoration.inverse import Condition, condition_of, exact_inverse
-from photoplan.quality.restoration.regularised import SceneStatistics, curve_transfer, regularised_filter
+from photoplan.quality.restoration.regularised import Expectation, curve_transfer, sharpest
+from photoplan.quality.restoration.scene import SceneStatistics
 from photoplan.quality.spread import GAUSSIAN_WIDTH, SpreadFunction
 
 
@@ -120,6 +122,12 @@ def _axis_weights(half: int, digits: int | None) -> NDArray[np.float64]:
 _HALVES = (5, 7, 10, 14, 20, 28)
 #: Share of an inverse that may be cut off.
 _CUT_OFF = 0.002
+#: Width of the 95 % interval of MTF50, by its value, beyond which a spread function is practically unknown.
+_UNKNOWN = 0.5
+#: Smoothing of noise that is worth a word, pixels.
+_SMOOTHED = 0.1
+#: How messages call the methods.
+_NAMES = {"none": "as it is", "regularised": "regularised", "exact": "exact"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +148,14 @@ class Sharpness:
         optics = np.exp(-2.0 * (pi * frequency) ** 2 * max(variance, 0.0))
         return MtfCurve(frequency, optics * np.abs(np.sinc(frequency)))
 
+    @property
+    def doubt(self) -> str:
+        """Why the spread function is practically unknown, with figures; empty if it is known."""
+        curve = self.modulation()
+        low, high = curve.mtf50_interval()
+        value = float(np.nan_to_num(curve.mtf50, nan=curve.frequency[-1]))
+        return f"MTF50 {value:.2f}, interval {low:.2f} to {high:.2f}" if high - low > _UNKNOWN * value else ""
+
 
 @dataclass(frozen=True)
 class DesignOptions:
@@ -150,8 +166,6 @@ class DesignOptions:
     """How an exact inverse becomes two-dimensional."""
     half: int | None = None
     """Pixels to each side; None: 5, or as many as an exact inverse needs."""
-    most_noise_gain: float = 6.0
-    """Exact inverses that amplify noise more than this are not used by 'auto' (Kölbl 2006, §1: factors 2 to 5)."""
     aperture: float = 1.0
     """Side of the ideal aperture that 'regularised' aims at, pixels."""
 
@@ -161,17 +175,24 @@ class Design:
     """A designed kernel and why it is as it is."""
 
     kernel: NDArray[np.float64]
-    """Shape (2 half + 1, 2 half + 1), sum 1."""
-    method: Literal["exact", "regularised"]
+    """Shape (2 m + 1, 2 n + 1), sum 1; one row or one column where the other direction stays as it is."""
+    method: Literal["none", "exact", "regularised"]
     reason: str
     """The rule that chose the method, with its figures."""
     condition_x: Condition
     condition_y: Condition
+    expected: Mapping[str, float] = field(default_factory=dict)
+    """Expected root mean square error in light by method, ``none`` for the image as it is; empty if unknown."""
 
     @property
     def noise_gain(self) -> float:
         """By what factor noise grows."""
         return FilterKernel(self.kernel).noise_gain
+
+    @property
+    def expectation(self) -> str:
+        """The expected errors, for people; empty if they are unknown."""
+        return ", ".join(f"{error:.3g} {_NAMES[method]}" for method, error in self.expected.items())
 
 
 def design_filter(
@@ -179,54 +200,82 @@ def design_filter(
 ) -> Design:
     """Restoration filter of an image whose sharpness is known along rows and along columns.
 
+    Along a direction whose MTF50 has an interval wider than half its value the image stays as it is.
+
     Parameters
     ----------
     x, y : Sharpness
         Along a row (across columns) and along a column.
     scene : SceneStatistics, optional
-        Noise and contrast; needed where the result is regularised.
+        Noise and spectrum; only an exact inverse that is asked for can do without.
     options : DesignOptions, optional
 
     Raises
     ------
     InputError
-        The exact inverse is asked for and its condition does not hold, or the scene is needed and missing.
+        The exact inverse is asked for and its condition does not hold or the spread function is practically unknown,
+        the latter in both directions whatever is asked for, or the scene is needed and missing.
     """
     asked = options or DesignOptions()
+    both = dict(zip(("along rows", "along columns"), (x, y), strict=True))
     conditions = (condition_of(x.spread), condition_of(y.spread))
-    broken = [
-        f"{name}: {c}" for name, c in zip(("along rows", "along columns"), conditions, strict=True) if not c.holds
-    ]
-    exact: NDArray[np.float64] | None = None
-    if asked.method != "regularised" and not broken:
-        exact = _exact(x.spread, y.spread, asked)
-    if asked.method == "exact":
-        if exact is None:
-            raise InputError(
-                "the image cannot be restored exactly: " + "; ".join(broken) + ". Objects that have fused cannot be "
-                "told apart; use `method` regularised"
-            )
-        return Design(exact, "exact", "exact, as asked for; the condition holds", *conditions)
-    if exact is not None and asked.method == "auto":
-        gain = FilterKernel(exact).noise_gain
-        if gain <= asked.most_noise_gain:
-            reason = (
-                f"exact: the condition holds and noise grows {gain:.1f} times, not more than {asked.most_noise_gain:g}"
-            )
-            return Design(exact, "exact", reason, *conditions)
-        why = f"the exact inverse would amplify noise {gain:.1f} times, allowed are {asked.most_noise_gain:g}"
-    else:
-        why = "as asked for" if asked.method == "regularised" else "; ".join(broken)
-    if scene is None:
-        raise InputError(f"a regularised filter ({why}) needs the noise and the contrast of the scene; state both")
-    kernel = regularised_filter(
-        curve_transfer(x.modulation(), y.modulation()), scene, asked.half or _HALVES[0], asked.aperture
-    )
-    reason = (
-        f"regularised ({why}): least square error for edges of any place and direction, noise {scene.noise:.3g}, "
-        f"neighbouring pixels that differ by {scene.contrast:.3g} (rms), ideal aperture {asked.aperture:g} px"
-    )
-    return Design(kernel, "regularised", reason, *conditions)
+    doubts = [f"{name}: {one.doubt}" for name, one in both.items() if one.doubt]
+    broken = [f"{name}: {c}" for name, c in zip(both, conditions, strict=True) if not c.holds]
+    if len(doubts) == 2 or (doubts and asked.method == "exact"):
+        raise InputError(
+            "the spread function is practically unknown "
+            + "; ".join(doubts)
+            + ". It is not inverted; give images with "
+            "more or clearer edges, or a filter"
+        )
+    if asked.method == "exact" and broken:
+        raise InputError(
+            "the image cannot be restored exactly: " + "; ".join(broken) + ". Objects that have fused cannot be told "
+            "apart; use `method` regularised"
+        )
+    kernels: dict[Literal["none", "exact", "regularised"], NDArray[np.float64]] = {"none": np.ones((1, 1))}
+    expected: dict[str, float] = {}
+    if scene is not None:
+        curves = [one.modulation() if not one.doubt else _ideal_curve(asked.aperture) for one in (x, y)]
+        transfer = curve_transfer(*curves)
+        model = Expectation.of(transfer, scene, asked.aperture)
+        half = asked.half or _HALVES[0]
+        kernels["regularised"] = model.best((0 if y.doubt else half, 0 if x.doubt else half))
+    elif asked.method != "exact":
+        raise InputError("a filter of least error needs the noise and the contrast of the scene; state both")
+    if asked.method != "regularised" and not broken and not doubts:
+        kernels["exact"] = _exact(x.spread, y.spread, asked)
+    if scene is not None:
+        expected = {method: model.error(kernel) for method, kernel in kernels.items()}
+    method = asked.method if asked.method != "auto" else min(kernels, key=lambda each: expected[each])
+    why = ["as asked for" if asked.method != "auto" else "least expected error"]
+    if asked.method == "auto" and scene is not None:
+        # The error that is expected is a mean over what the MTF may be; an image that is sharp already must not suffer.
+        worst = Expectation.of(sharpest(transfer), scene, asked.aperture)
+        before, after = worst.error(kernels["none"]), worst.error(kernels[method])
+        if after > before:
+            why = [
+                f"were the MTF at the upper end of its interval, {method} would leave {after:.3g} and not {before:.3g}"
+            ]
+            method = "none"
+    why += [f"not inverted, practically unknown {doubt}" for doubt in doubts]
+    if asked.method == "auto" and broken:
+        why.append("no exact inverse " + "; ".join(broken))
+    if scene is not None:
+        smoothed = f", smoothed by {scene.smoothed:.2f} px" if scene.smoothed > _SMOOTHED else ""
+        why.append(
+            f"noise {scene.noise:.3g}{smoothed}, neighbouring pixels of an ideal image differ by {scene.contrast:.3g} "
+            f"(rms), spectrum of the scene ν^-{scene.exponent:.2f}, ideal aperture {asked.aperture:g} px"
+        )
+        if expected[method] > expected["none"]:
+            why.append("more error is expected than the image has as it is")
+    return Design(kernels[method], method, f"{method}: " + "; ".join(why), *conditions, expected)
+
+
+def _ideal_curve(aperture: float) -> MtfCurve:
+    """MTF of an ideal aperture: nothing is left to be restored."""
+    frequency = np.linspace(0.0, 4.0, 401)
+    return MtfCurve(frequency, np.abs(np.sinc(aperture * frequency)))
 
 
 def _exact(x: SpreadFunction, y: SpreadFunction, asked: DesignOptions) -> NDArray[np.float64]:

@@ -107,24 +107,3 @@ def exact_inverse(spread: SpreadFunction, half: int = 5, rows: int = BAND_ROWS) 
     middle = rows // 2
     # A row of the inverse is read along the objects that give to it; as a filter it is turned round.
     return np.asarray(inverse[middle, middle - half : middle + half + 1][::-1].copy())
-
-
-def spread_of_inverse(inverse: NDArray[np.float64], half: int = 20) -> SpreadFunction:
-    """The spread function whose exact inverse is a given one-dimensional filter.
-
-    Parameters
-    ----------
-    inverse : ndarray, shape (2 n + 1,)
-        Such as the row sums of a two-dimensional restoration filter; divided by its sum first.
-    half : int
-        How many pixels of the spread function are kept to each side.
-
-    Raises
-    ------
-    InputError
-        The filter suppresses a frequency wholly: it is no inverse.
-    """
-    filter_ = SpreadFunction.normalised(inverse)
-    if condition_of(filter_).least_transfer < 1e-6:
-        raise InputError("the filter suppresses a frequency wholly: it is not the inverse of a spread function")
-    return SpreadFunction.normalised(exact_inverse(filter_, half, max(BAND_ROWS, 8 * half + 1)))

@@ -1,130 +1,136 @@
-"""Restoration filters where the exact inverse would amplify noise too much: least squares over all scenes with edges.
+"""What error a restoration filter is expected to leave, and the filter of its size that leaves the least.
 
-The restored pixel shall be what an ideal aperture of one pixel would have seen. Among all kernels of a given size the
-one is taken whose expected square error is least, for scenes of edges in any place and direction (power spectrum
-proportional to frequency to the power of -3) and white noise. Unlike the exact inverse of the band matrix it
-regards that edges do not lie on the borders of pixels, so that frequencies above 0.5 cycles/pixel fold back.
+The restored pixel shall be what an ideal aperture of one pixel would have seen. For a scene of a known power spectrum
+and white noise the expected square error is a square form of the filter's values, so that the best filter of a size
+follows from linear equations: a Wiener filter, but of few values, and regarding the frequencies above 0.5 cycles/pixel
+that fold back. What is not known of the modulation transfer acts like more noise (E|H|² is the square of the mean and
+the variance), so that an uncertain spread function is inverted less.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from math import pi
+from math import pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.errors import InputError
 from photoplan.quality.mtf_curve import MtfCurve
+from photoplan.quality.restoration.scene import FOLDS, SceneStatistics, Transfer, frequency_grid
 
-Transfer = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
-"""Modulation at frequencies u along rows and v along columns, cycles per pixel; arrays that broadcast."""
-
-#: Frequencies per axis and pixel at which spectra are summed.
-_GRID = 64
-#: How many times the frequency square is repeated to each side, for what folds back.
-_FOLDS = 2
-#: Power spectrum of edges of any place and direction against frequency.
-_EXPONENT = 3.0
-
-
-@dataclass(frozen=True)
-class SceneStatistics:
-    """What a filter is designed for, in grey values of linear light."""
-
-    noise: float
-    """Standard deviation of the noise."""
-    contrast: float
-    """Root mean square difference of neighbouring pixels of the image, without the share of the noise."""
-
-    def __post_init__(self) -> None:
-        if not self.noise >= 0.0 or not self.contrast > 0.0:
-            raise InputError(
-                f"noise {self.noise:g}, contrast {self.contrast:g}; needed are noise of 0 or more and contrast above 0"
-            )
+Array = NDArray[np.float64]
 
 
 def curve_transfer(x: MtfCurve, y: MtfCurve) -> Transfer:
     """Transfer function of two MTF curves; between the axes it goes over with the squared cosine of the direction.
 
-    Beyond the last frequency of a curve it is 0.
+    Beyond the last frequency of a curve it is 0. Curves without standard deviations count as known.
     """
 
-    def transfer(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+    def transfer(u: Array, v: Array) -> tuple[Array, Array]:
         square = u**2 + v**2
         frequency = np.sqrt(square)
         share = np.where(square > 0.0, u**2 / np.where(square > 0.0, square, 1.0), 0.5)
-        along_x = np.interp(frequency, x.frequency, x.modulation, right=0.0)
-        along_y = np.interp(frequency, y.frequency, y.modulation, right=0.0)
-        return np.asarray(share * along_x + (1.0 - share) * along_y)
+        along = [
+            [
+                np.zeros_like(frequency) if values is None else np.interp(frequency, curve.frequency, values, right=0.0)
+                for values in (curve.modulation, curve.sigma)
+            ]
+            for curve in (x, y)
+        ]
+        modulation, sigma = (share * one + (1.0 - share) * other for one, other in zip(*along, strict=True))
+        return modulation, sigma
 
     return transfer
 
 
-def regularised_filter(
-    transfer: Transfer, scene: SceneStatistics, half: int = 5, aperture: float = 1.0
-) -> NDArray[np.float64]:
-    """Kernel of least expected square error, symmetric in x and in y.
+def sharpest(transfer: Transfer, sigmas: float = 1.96) -> Transfer:
+    """The sharpest that a transfer function may be, by so many standard deviations; it counts as known."""
 
-    Parameters
-    ----------
-    transfer : Transfer
-        Of the image, real and symmetric.
-    scene : SceneStatistics
-    half : int
-        How many pixels the kernel reaches to each side.
-    aperture : float
-        Side of the ideal aperture, pixels; below 1 the result is sharper and noisier.
+    def known(u: Array, v: Array) -> tuple[Array, Array]:
+        modulation, sigma = transfer(u, v)
+        return np.minimum(modulation + sigmas * sigma, 1.0), np.zeros_like(sigma)
 
-    Returns
-    -------
-    ndarray, shape (2 half + 1, 2 half + 1)
-        Sum 1.
-    """
-    seen, wanted, power = _spectra(transfer, aperture)
-    scale = (scene.contrast / power) ** 2
-    total = scale * seen + scene.noise**2
-    frequency = _frequencies()
+    return known
+
+
+@dataclass(frozen=True, eq=False)
+class Expectation:
+    """Expected square errors of the filters of an image; all over one frequency square, what folds back included."""
+
+    seen: Array
+    """Power of the image, noise included."""
+    cross: Array
+    """Cross power of the image with the ideal one."""
+    ideal: Array
+    """Power of the ideal image."""
+
+    @classmethod
+    def of(cls, transfer: Transfer, scene: SceneStatistics, aperture: float = 1.0) -> Expectation:
+        """What is expected of an image.
+
+        Parameters
+        ----------
+        transfer : Transfer
+            Of the image, real and symmetric.
+        scene : SceneStatistics
+        aperture : float
+            Side of the ideal aperture, pixels; below 1 the best filter is sharper and noisier.
+        """
+        u, v = frequency_grid()
+        power, (modulation, sigma) = scene.power(u, v), transfer(u, v)
+        ideal = np.sinc(aperture * u) * np.sinc(aperture * v)
+        seen = ((modulation**2 + sigma**2) * power).sum(axis=0)
+        seen += scene.noise_power(u[0] + FOLDS, v[0] + FOLDS)
+        return cls(seen, (modulation * ideal * power).sum(axis=0), (ideal**2 * power).sum(axis=0))
+
+    def error(self, kernel: Array) -> float:
+        """Expected root mean square difference to the ideal image after a filter, in the light of the scene.
+
+        Parameters
+        ----------
+        kernel : ndarray, shape (2 m + 1, 2 n + 1)
+        """
+        base = frequency_grid()[0][0, 0]
+        left, right = (
+            np.exp(-2j * pi * np.outer(base, np.arange(side) - side // 2)) for side in np.asarray(kernel).shape
+        )
+        response = left @ kernel @ right.T
+        square = (np.abs(response) ** 2 * self.seen - 2.0 * response.real * self.cross + self.ideal).mean()
+        return sqrt(max(float(square), 0.0))
+
+    def best(self, half: tuple[int, int]) -> Array:
+        """Kernel of least expected error, symmetric in x and in y, sum 1.
+
+        Parameters
+        ----------
+        half : (int, int)
+            How many rows and columns the kernel reaches to each side.
+
+        Returns
+        -------
+        ndarray, shape (2 half[0] + 1, 2 half[1] + 1)
+        """
+        # A quadrant of the kernel is unknown; its waves are products of one per axis.
+        down, right = (_waves(frequency_grid()[0][0, 0], reach) for reach in half)
+        count = self.seen.size
+        basis = (down[:, None, :, None] * right[None, :, None, :]).reshape(count, -1)
+        normal = basis.T @ (basis * self.seen.reshape(-1, 1)) / count
+        at_zero = np.multiply.outer(*(np.where(np.arange(reach + 1) > 0, 2.0, 1.0) for reach in half)).ravel()
+        quadrant = _with_sum_one(normal, basis.T @ self.cross.ravel() / count, at_zero)
+        quadrant = quadrant.reshape(half[0] + 1, half[1] + 1)
+        rows = np.concatenate([quadrant[:0:-1], quadrant])
+        return np.concatenate([rows[:, :0:-1], rows], axis=1)
+
+
+def _waves(frequency: Array, half: int) -> Array:
+    """Real waves of the values 0 to half to both sides of a symmetric kernel, shape (frequencies, half + 1)."""
     waves = np.cos(2.0 * pi * np.outer(frequency, np.arange(half + 1)))
     waves[:, 1:] *= 2.0
-    # A quadrant of the kernel is unknown; its waves are products of one per axis.
-    basis = (waves[:, None, :, None] * waves[None, :, None, :]).reshape(_GRID**2, -1)
-    normal = basis.T @ (basis * total.reshape(-1, 1)) / _GRID**2
-    right = basis.T @ (scale * wanted).ravel() / _GRID**2
-    at_zero = np.multiply.outer(*2 * (np.where(np.arange(half + 1) > 0, 2.0, 1.0),)).ravel()
-    quadrant = _with_sum_one(normal, right, at_zero).reshape(half + 1, half + 1)
-    rows = np.concatenate([quadrant[:0:-1], quadrant])
-    return np.concatenate([rows[:, :0:-1], rows], axis=1)
+    return np.asarray(waves)
 
 
-def _frequencies() -> NDArray[np.float64]:
-    return (np.arange(_GRID) + 0.5) / _GRID - 0.5
-
-
-def _spectra(transfer: Transfer, aperture: float) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Folded power of the image, folded cross power with the ideal image, rms difference of neighbours.
-
-    All for a scene whose spectrum has the factor 1.
-    """
-    frequency = _frequencies()
-    seen, wanted = np.zeros((_GRID, _GRID)), np.zeros((_GRID, _GRID))
-    difference = 0.0
-    for down in range(-_FOLDS, _FOLDS + 1):
-        for right in range(-_FOLDS, _FOLDS + 1):
-            v, u = frequency[:, None] + down, frequency[None, :] + right
-            scene = np.hypot(u, v) ** -_EXPONENT
-            image = transfer(u, v)
-            power = image**2 * scene
-            seen += power
-            wanted += image * scene * np.sinc(aperture * u) * np.sinc(aperture * v)
-            difference += float((power * 2.0 * (np.sin(pi * u) ** 2 + np.sin(pi * v) ** 2)).mean())
-    return seen, wanted, float(np.sqrt(difference))
-
-
-def _with_sum_one(
-    normal: NDArray[np.float64], right: NDArray[np.float64], at_zero: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _with_sum_one(normal: Array, right: Array, at_zero: Array) -> Array:
     """Least squares under the condition that the kernel's sum is 1, so that brightness stays."""
     count = right.size
     # Without noise some kernels cost nothing; a trace of noise keeps the equations solvable and changes no figure.

@@ -1,0 +1,155 @@
+"""Spectrum of the scene and noise of an image, found in the image itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from math import log, pi, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from photoplan.errors import InputError
+
+Array = NDArray[np.float64]
+Transfer = Callable[[Array, Array], tuple[Array, Array]]
+"""Modulation and its standard deviation at frequencies u along rows and v along columns, cycles per pixel; arrays that
+broadcast."""
+
+#: Side of the blocks whose spectra are averaged, pixels.
+BLOCK = 64
+#: Lowest frequency that is fitted, in steps of a block's spectrum: the window spreads the mean over those below.
+_FIRST = 2.5
+#: How many times the frequency square is repeated to each side, for what folds back.
+FOLDS = 2
+#: Range of the exponent of the power spectrum: 2 to 3 in photographs (Field 1987; Ruderman and Bialek 1994), 3 for
+#: edges of any place and direction.
+_EXPONENTS = (1.0, 3.9)
+#: Where its search begins: the likelihood may have several maxima.
+_STARTS = (2.0, 3.0)
+#: Share of noise in a spectrum that counts as none.
+_NO_NOISE = 1e-12
+#: Largest smoothing of noise that is sought, pixels.
+_SMOOTHED = 0.8
+
+
+@dataclass(frozen=True)
+class SceneStatistics:
+    """What a filter is designed for, in linear light; the scene's power spectrum is a power of the frequency."""
+
+    noise: float
+    """Standard deviation of the noise, before it was smoothed."""
+    contrast: float
+    """Root mean square difference of neighbouring pixels as ideal apertures of one pixel without noise would see it."""
+    exponent: float = 3.0
+    """p of the power spectrum ν⁻ᵖ; 3: edges of any place and direction."""
+    smoothed: float = 0.0
+    """Sigma of a Gaussian, pixels, that took what is missing of white noise at high frequencies: compression (JPEG),
+    interpolation of colours and denoising do."""
+
+    def __post_init__(self) -> None:
+        if not self.noise >= 0.0 or not self.contrast > 0.0 or not _EXPONENTS[0] <= self.exponent <= _EXPONENTS[1]:
+            raise InputError(
+                f"noise {self.noise:g}, contrast {self.contrast:g}, exponent {self.exponent:g}; needed are noise of 0 "
+                f"or more, contrast above 0 and an exponent from {_EXPONENTS[0]:g} to {_EXPONENTS[1]:g}"
+            )
+
+    def power(self, u: Array, v: Array) -> Array:
+        """Power of the scene at frequencies other than 0, cycles per pixel; arrays that broadcast."""
+        return np.asarray(self.contrast**2 / _unit_contrast(self.exponent) * np.hypot(u, v) ** -self.exponent)
+
+    def noise_power(self, u: Array, v: Array) -> Array:
+        """Power of the noise at frequencies up to 0.5 cycles per pixel; arrays that broadcast."""
+        return np.asarray(self.noise**2 * np.exp(-((2.0 * pi * self.smoothed) ** 2) * (u**2 + v**2)))
+
+
+def frequency_grid(count: int = 64) -> tuple[Array, Array]:
+    """Frequencies of all folds, u and v of shapes (folds, 1, count) and (folds, count, 1), none of them 0."""
+    base = (np.arange(count) + 0.5) / count - 0.5
+    down, right = (part.ravel() for part in np.mgrid[-FOLDS : FOLDS + 1, -FOLDS : FOLDS + 1])
+    return base[None, None, :] + right[:, None, None], base[None, :, None] + down[:, None, None]
+
+
+@lru_cache(maxsize=256)
+def _unit_contrast(exponent: float) -> float:
+    """Mean square difference of neighbours for the power spectrum ν⁻ᵖ."""
+    u, v = frequency_grid()
+    power = np.hypot(u, v) ** -exponent * (np.sinc(u) * np.sinc(v)) ** 2
+    # Of both directions the mean.
+    return float((power * 2.0 * (np.sin(pi * u) ** 2 + np.sin(pi * v) ** 2)).sum(axis=0).mean())
+
+
+def block_spectra(grey: Array, usable: NDArray[np.bool_] | None = None) -> Array:
+    """Power spectra of overlapping blocks under a Hann window, mean taken off.
+
+    Parameters
+    ----------
+    grey : ndarray, shape (rows, columns)
+        Linear light; blocks with a value that is not finite are left out.
+    usable : ndarray of bool, same shape, optional
+        Blocks with a pixel that is not usable are left out.
+
+    Returns
+    -------
+    ndarray, shape (blocks, side, side)
+        White noise of variance 1 has the mean 1. Frequencies in the order of `numpy.fft.fftfreq`; side is `BLOCK`, or
+        the lesser of rows and columns.
+    """
+    side = min(BLOCK, *grey.shape)
+    keep = np.isfinite(grey) if usable is None else np.isfinite(grey) & usable
+    views = [
+        np.lib.stride_tricks.sliding_window_view(a, (side, side))[:: side // 2, :: side // 2].reshape(-1, side, side)
+        for a in (grey, keep)
+    ]
+    blocks = views[0][views[1].all(axis=(1, 2))]
+    across = np.hanning(side + 2)[1:-1]
+    window = np.outer(across, across)
+    level = (blocks * window).sum(axis=(1, 2), keepdims=True) / window.sum()
+    return np.asarray(np.abs(np.fft.fft2((blocks - level) * window)) ** 2 / (window**2).sum())
+
+
+def fit_scene(spectrum: Array, transfer: Transfer, noise: tuple[float, float]) -> SceneStatistics:
+    """Noise, contrast and exponent of the scene by which a mean spectrum is likeliest (Whittle 1953).
+
+    Parameters
+    ----------
+    spectrum : ndarray, shape (side, side)
+        Mean of `block_spectra`.
+    transfer : Transfer
+        Of the image.
+    noise : (float, float)
+        Least and largest standard deviation of the noise.
+    """
+    side = spectrum.shape[0]
+    base = np.fft.fftfreq(side)
+    down, right = (part.ravel()[:, None] for part in np.mgrid[-FOLDS : FOLDS + 1, -FOLDS : FOLDS + 1])
+    rows, columns = np.meshgrid(base, base, indexing="ij")
+    used = np.hypot(rows, columns) >= min(_FIRST / side, 0.3)
+    u, v = columns[used][None] + right, rows[used][None] + down
+    passed, logarithm = transfer(u, v)[0] ** 2, np.log(np.hypot(u, v))
+    square = (2.0 * pi) ** 2 * (rows**2 + columns**2)[used]
+    scale = float(spectrum[used].mean())
+    seen = spectrum[used] / scale
+
+    def loss(at: Array) -> tuple[float, Array]:
+        scene = passed * np.exp(at[0] - at[1] * logarithm)
+        signal, noisy = scene.sum(axis=0), np.exp(at[2] - at[3] * square)
+        model = signal + noisy
+        slope = (1.0 - seen / model) / model
+        each = signal, -(scene * logarithm).sum(axis=0), noisy, -noisy * square
+        return float((np.log(model) + seen / model).mean()), np.array([(slope * d).mean() for d in each])
+
+    low, high = (log(max(n**2 / scale, _NO_NOISE)) for n in noise)
+    bounds = ((-40.0, 20.0), _EXPONENTS, (low, high), (0.0, _SMOOTHED**2))
+    tried = []
+    for exponent in _STARTS:
+        power = (passed * np.exp(-exponent * logarithm)).sum(axis=0)
+        for share, smoothed in ((0.2, 0.0), (0.8, 0.0), (0.8, 0.2)):
+            start = (-log(float(power.mean())), exponent, low + share * (high - low), smoothed)
+            tried.append(minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds))
+    factor, exponent, white, smoothed = min(tried, key=lambda one: float(one.fun)).x
+    contrast = sqrt(scale * np.exp(factor) * _unit_contrast(float(exponent)))
+    found = sqrt(scale * np.exp(white)) if noise[1] > 0.0 else 0.0
+    return SceneStatistics(found, contrast, float(exponent), sqrt(smoothed))
