@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from camera_examples import LENSES, numeric_derivative
 from pyproj import Proj, Transformer
+from tools.resolution import curvature_displacement
 
 from photoplan.cameras.base import Camera, project
 from photoplan.cameras.build import oriented_camera
@@ -20,7 +21,6 @@ from photoplan.errors import InputError, UsageError
 from photoplan.geometry.local import LocalFrame, earth_radius
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_opk
-from photoplan.plan.resolution import curvature_displacement
 
 UTM = "EPSG:25832"
 #: Transverse Mercator with scale 1 on its meridian: nothing but curvature differs from Cartesian space near it.

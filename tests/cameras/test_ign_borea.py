@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 import rasterio
 from pyproj import Transformer
+from tools.ign_block import unaltered_height
 
 from photoplan.cameras.base import project
 from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.none import NoLens
-from photoplan.geometry.local import LocalFrame, unaltered_height
+from photoplan.geometry.local import LocalFrame
 from photoplan.geometry.pose import Pose
 
 CRS = "EPSG:2154"

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy import sparse
 from tools.sim_block import simulate
 
 from photoplan.cameras.lenses.radial_table import RadialTable
 from photoplan.errors import GeometryError, UsageError
 from photoplan.orientation.bundle.adjust import adjust_block
+from photoplan.orientation.bundle.normal import check_rank
 
 
 def test_fault_16_a_block_without_control_has_no_datum() -> None:
@@ -71,3 +75,14 @@ def test_a_lens_without_such_coefficients_is_refused() -> None:
         adjust_block(replace(block, cameras={"cam": camera}))
     with pytest.raises(UsageError, match="'k9'; allowed are c, x0"):
         adjust_block(replace(block, cameras={"cam": replace(block.cameras["cam"], free=("k9",))}))
+
+
+def test_equations_that_are_no_numbers_are_named_and_not_decomposed() -> None:
+    """A single gross value may drive iterations so far that nothing is finite any more."""
+    kind = SimpleNamespace(owners=("a", "b"), width=3, part=slice(0, 6))
+    model: Any = SimpleNamespace(columns=SimpleNamespace(kinds=(kind,)))
+    S = np.eye(6)
+    S[4, 4] = np.nan
+    reduced: Any = SimpleNamespace(S=sparse.csr_matrix(S))
+    with pytest.raises(GeometryError, match="equations of 'b' are no numbers"):
+        check_rank(model, model, reduced)

@@ -54,6 +54,15 @@ def test_wrong_control_takes_no_right_control_with_it(count: int, gnss: float | 
     assert missed <= 0.05 * wrongs
 
 
+@pytest.mark.parametrize(("seed", "gnss"), [(79, None), (75, 0.05)])
+def test_control_far_from_where_its_rays_meet_begins_there(seed: int, gnss: float | None) -> None:
+    """Begun at its given place, it tore the block apart (two exchanged points), or an image loose."""
+    wrong, result = disturbed(seed, gnss)
+    out = set(np.flatnonzero(result.ground_rejected.any(axis=1)).tolist())
+    assert out == wrong
+    assert 0.9 < result.sigma0 < 1.1
+
+
 def test_the_alternative_is_named() -> None:
     truth = plain_block(Make(seed=3))
     seen = truth.block.observations

@@ -16,7 +16,7 @@ from photoplan.cameras.lenses.none import NoLens
 from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import ROTATION_ORDERS, angles_from_rotation, rotation_from_angles
+from photoplan.geometry.rotation import ANGLE_UNITS, ROTATION_ORDERS, angles_from_rotation, rotation_from_angles
 from photoplan.io.ground_points import read_ground_points
 from photoplan.io.image_points import read_image_points
 from photoplan.io.orientation.file import read_orientation
@@ -25,7 +25,6 @@ from photoplan.orientation.readings import (
     CAMERA_AXES,
     DIRECTIONS,
     TURNS,
-    UNITS,
     Reading,
     StatedPoses,
     fitting,
@@ -66,7 +65,9 @@ def stated(names, centers, R, reading):
     F = turn_matrix(reading.camera_axes, reading.turned)
     M = R @ F  # from the axes that the file means to ours and on to the ground
     M = M if reading.direction == "camera-to-ground" else np.swapaxes(M, 1, 2)
-    angles = np.array([angles_from_rotation(m, reading.rotation) for m in M]) / UNITS[reading.angle_unit]
+    angles = np.array([angles_from_rotation(m, reading.rotation) for m in M]) * (
+        ANGLE_UNITS[reading.angle_unit] / (2 * np.pi)
+    )
     at = [reading.rotation.index(letter) for letter in "opk"]
     return StatedPoses(names, centers[:, [1, 0, 2]] if reading.swapped else centers, angles=angles[:, at])
 
@@ -74,7 +75,7 @@ def stated(names, centers, R, reading):
 SOME = [
     Reading(unit, order, direction, axes, turned, mirrored, swapped)
     for k, (unit, order, direction, axes, turned, mirrored, swapped) in enumerate(
-        product(UNITS, ROTATION_ORDERS, DIRECTIONS, CAMERA_AXES, TURNS, (False, True), (False, True))
+        product(ANGLE_UNITS, ROTATION_ORDERS, DIRECTIONS, CAMERA_AXES, TURNS, (False, True), (False, True))
     )
     if k % 67 == 0
 ]

@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from pyproj import Transformer
 
 from photoplan.geometry.crs import crs_label, parse_crs
+from photoplan.geometry.rotation import ANGLE_UNITS
 
-#: Full circle in each unit of angles.
-CIRCLE = {"deg": 360.0, "gon": 400.0, "rad": 2 * np.pi}
 #: Map coordinates beyond this lie on no map of the earth, metres.
 _FAR = 1e8
 #: Heights of anything that is photographed, and of cameras, metres: from ocean trenches to low orbits.
@@ -27,12 +26,12 @@ _BESIDE = 12.0
 
 def odd_angles(angles: Sequence[float], unit: str, names: Sequence[str] = ()) -> str | None:
     """Why angles cannot be meant; None if they can. One full circle either way is allowed."""
-    circle = CIRCLE[unit]
+    circle = ANGLE_UNITS[unit]
     worst = max(angles, key=abs, default=0.0)
     name = f"{names[list(angles).index(worst)]} = " if names else ""
     if abs(worst) <= circle * (1 + 1e-9):
         return None
-    others = [name for name, full in CIRCLE.items() if name != unit and abs(worst) <= full]
+    others = [name for name, full in ANGLE_UNITS.items() if name != unit and abs(worst) <= full]
     fits = f"; is it in {' or '.join(others)}?" if others else ""
     return f"angle {name}{worst:g} is more than a full circle in {unit}{fits}"
 

@@ -292,6 +292,8 @@ def topocentric_poses(
 
     enu = np.asarray(centers, float).reshape(-1, 3)
     J = np.stack([to_ground(enu + d) - to_ground(enu - d) for d in np.eye(3) * _REACH], axis=-1) / (2 * _REACH)
+    if not np.isfinite(J).all():
+        raise InputError("positions in east, north and up that lie nowhere on earth; are they metres?")
     # The nearest rotation: the map's scale stretches rows of J and does not turn it.
     U, _, Vt = np.linalg.svd(J)
     return to_ground(enu), U @ Vt

@@ -58,8 +58,12 @@ class Window:
                 yield Window(col, row, min(side, right - col), min(side, bottom - row))
 
 
-#: Tiles of one raster at most.
-MOST_TILES = 1_000_000
+#: Tiles of one raster at most, and their usual side, pixels.
+MOST_TILES, USUAL_TILE = 1_000_000, 512
+#: Pixels of any map, metres.
+_FINEST, _COARSEST = 1e-6, 1e6
+#: Map coordinates of anything on the earth, metres.
+_EARTH = 1e8
 
 
 def refuse_absurd(size: tuple[float, float], tile: int, where: str) -> None:
@@ -75,8 +79,22 @@ def refuse_absurd(size: tuple[float, float], tile: int, where: str) -> None:
     if tiles > MOST_TILES:
         raise UsageError(
             f"{where} gives {width:.3g} × {height:.3g} pixels in {tiles:.3g} tiles, more than {MOST_TILES}; choose a "
-            "larger `resolution` or `tile`, or smaller `bounds`"
+            "larger `resolution`, or a smaller area"
         )
+
+
+def check_resolution(resolution: float) -> None:
+    """Refuse pixels that no map has.
+
+    Raises
+    ------
+    UsageError
+        They are not between a thousandth of a millimetre and a thousand kilometres.
+    """
+    if not (math.isfinite(resolution) and resolution > 0):
+        raise UsageError(f"resolution {resolution}; a positive number of metres is needed")
+    if not _FINEST <= resolution <= _COARSEST:
+        raise UsageError(f"resolution {resolution:g} m; pixels of maps have {_FINEST:g} to {_COARSEST:g} m")
 
 
 @dataclass(frozen=True)
@@ -187,8 +205,8 @@ class MapGrid:
     """Coordinate reference system as a string that pyproj reads (usually `EPSG:…` or WKT)."""
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.resolution) and self.resolution > 0):
-            raise UsageError(f"resolution {self.resolution}; a positive number of metres is needed")
+        check_resolution(self.resolution)
+        refuse_absurd((self.width, self.height), USUAL_TILE, f"resolution {self.resolution:g} m")
         if self.width < 1 or self.height < 1:
             raise UsageError(f"grid of {self.width} × {self.height} pixels; it must hold at least one")
 
@@ -202,8 +220,9 @@ class MapGrid:
         xmin, ymin, xmax, ymax = bounds
         if not all(math.isfinite(b) for b in bounds) or xmin >= xmax or ymin >= ymax:
             raise UsageError(f"bounds {bounds}; needed are xmin ymin xmax ymax with xmin < xmax and ymin < ymax")
-        if not (math.isfinite(resolution) and resolution > 0):
-            raise UsageError(f"resolution {resolution}; a positive number of metres is needed")
+        if max(map(abs, bounds)) > _EARTH:
+            raise UsageError(f"bounds {bounds}; beyond {_EARTH:g} m there is no map")
+        check_resolution(resolution)
         # A bound on a multiple stays there although the quotient carries rounding errors.
         col0 = math.floor(xmin / resolution + 1e-6)
         col1 = math.ceil(xmax / resolution - 1e-6)

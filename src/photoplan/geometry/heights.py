@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import threading
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +19,7 @@ from pyproj import CRS, Transformer
 from pyproj.crs import CompoundCRS
 from pyproj.transformer import TransformerGroup
 
-from photoplan.errors import HeightSystemError, InputError
+from photoplan.errors import HeightSystemError, InputError, UsageError
 from photoplan.geometry.crs import area_of, canonical_crs, crs_label, missing_grids, parse_crs
 
 OPTIONS = (
@@ -76,6 +78,37 @@ def declared_pair(terrain: str | None, orientation: str | None) -> tuple[str, st
     if len(named) == 1:
         pair = named * 2
     return pair[0], pair[1]
+
+
+def common_system(stated: Mapping[Path, str | None], declared: str | None) -> str | None:
+    """The one height system of several terrain files; None: none names it, and it is declared to be one.
+
+    Parameters
+    ----------
+    stated : mapping
+        Height system by file; None: the file does not state it.
+    declared : str, optional
+        `same`: those that state none have that of the others.
+
+    Raises
+    ------
+    HeightSystemError
+        They differ, or one states none and nothing is declared.
+    UsageError
+        Something else is declared.
+    """
+    if declared not in (None, "same"):
+        raise UsageError(f"height system {declared!r}; `same` declares that all models have one")
+    named = {path: check_height_system(system) for path, system in stated.items() if system is not None}
+    if len(set(named.values())) > 1:
+        told = ", ".join(f"{path}: heights {height_label(system)}" for path, system in named.items())
+        raise HeightSystemError(f"{told}; convert one of them first")
+    if len(named) < len(stated) and declared is None:
+        without = " and ".join(str(path) for path in stated if path not in named)
+        raise HeightSystemError(
+            f"{without}: no height system stated; if the models have the same, say `height_system` same"
+        )
+    return next(iter(named.values()), None)
 
 
 @dataclass(frozen=True)

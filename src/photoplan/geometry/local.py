@@ -190,18 +190,6 @@ class LocalFrame:
         north /= np.linalg.norm(north, axis=-1, keepdims=True)
         return np.stack([np.cross(north, up), north, up], axis=-1)
 
-    def convergence(self, XY: ArrayLike) -> NDArray[np.float64]:
-        """Meridian convergence at map points (..., 2), radians: positive where grid north is east of true north."""
-        XY = np.asarray(XY, float)
-        lon, lat = self._projection.radians(XY)
-        at = np.concatenate([XY, np.zeros((*XY.shape[:-1], 1))], axis=-1)
-        grid_north = self.jacobian(at)[..., 1] @ self._R_local_earth
-        sin, cos = np.sin(lon), np.cos(lon)
-        east = grid_north[..., 1] * cos - grid_north[..., 0] * sin
-        away = grid_north[..., 0] * cos + grid_north[..., 1] * sin
-        north = grid_north[..., 2] * np.cos(lat) - away * np.sin(lat)
-        return np.arctan2(east, north)
-
     def scale(self, XY: ArrayLike) -> NDArray[np.float64]:
         """Scale of the map at points (..., 2): length in the map over length on the ellipsoid, along grid north."""
         XY = np.asarray(XY, float)
@@ -214,26 +202,3 @@ def earth_radius(crs: str, XY: ArrayLike) -> float:
     projection = _projection(crs)
     _, lat = projection.radians(np.asarray(XY, float))
     return float(projection.a * math.sqrt(1.0 - projection.e2) / (1.0 - projection.e2 * np.sin(lat) ** 2))
-
-
-def altered_height(Z_station: ArrayLike, Z_ground: ArrayLike, map_scale: ArrayLike) -> NDArray[np.float64]:
-    """Height of a projection centre with the *linear alteration* of a block that was computed in map coordinates.
-
-    Such a block treats the map as Cartesian. As horizontal distances carry the scale k of the map, its flying heights
-    above ground carry it too: Zs' = Zg + k (Zs − Zg). Blocks of the French mapping agency are delivered so.
-
-    Parameters
-    ----------
-    Z_station, Z_ground : array_like
-        True height of the projection centre and mean height of the ground below, same height system, metres.
-    map_scale : array_like
-        Scale k of the map at the station (`LocalFrame.scale`).
-    """
-    Zs, Zg = np.asarray(Z_station, float), np.asarray(Z_ground, float)
-    return Zg + np.asarray(map_scale, float) * (Zs - Zg)
-
-
-def unaltered_height(Z_station: ArrayLike, Z_ground: ArrayLike, map_scale: ArrayLike) -> NDArray[np.float64]:
-    """True height of a projection centre that carries the linear alteration; inverse of `altered_height`."""
-    Zs, Zg = np.asarray(Z_station, float), np.asarray(Z_ground, float)
-    return Zg + (Zs - Zg) / np.asarray(map_scale, float)

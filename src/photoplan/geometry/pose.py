@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
-from photoplan.geometry.rotation import opk_from_rotation, rotation_from_angles
+from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles
 
 #: Unknowns of a pose, in the order of covariances: centre, and small rotations about the axes of the camera
 #: (R ← R · exp[δ]×).
@@ -48,7 +48,7 @@ class Pose:
     @property
     def opk(self) -> NDArray[np.float64]:
         """ω, φ, κ in radians."""
-        return opk_from_rotation(self.R_ground_camera)
+        return angles_from_rotation(self.R_ground_camera)
 
     @property
     def tilt(self) -> float:

@@ -7,6 +7,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import UsageError
 
+#: Parts of a full circle of each unit of angles.
+ANGLE_UNITS = {"deg": 360.0, "gon": 400.0, "rad": 2 * np.pi}
+
 #: Orders of the three angles; the first letter is the primary rotation (about the fixed axis).
 ROTATION_ORDERS = ("opk", "pok", "kpo", "kop", "okp", "pko")
 
@@ -53,22 +56,10 @@ def rotation_opk(omega: float, phi: float, kappa: float) -> NDArray[np.float64]:
     return rotation_from_angles((omega, phi, kappa), "opk")
 
 
-def opk_from_rotation(R_ground_camera: ArrayLike) -> NDArray[np.float64]:
-    """Angles ω, φ, κ in radians of a rotation matrix; φ in [−π/2, π/2].
-
-    At φ = ±π/2 only one combination of ω and κ is determined; ω is then 0.
-    """
-    R = np.asarray(R_ground_camera, float)
-    # The arc sine would lose half the digits near ±π/2.
-    cos_phi = np.hypot(R[0, 0], R[0, 1])
-    phi = np.arctan2(R[0, 2], cos_phi)
-    if cos_phi < 1e-12:
-        return np.array([0.0, phi, np.arctan2(R[1, 0], R[1, 1])])
-    return np.array([np.arctan2(-R[1, 2], R[2, 2]), phi, np.arctan2(-R[0, 1], R[0, 0])])
-
-
 def angles_from_rotation(R_ground_camera: ArrayLike, order: str = "opk") -> NDArray[np.float64]:
-    """Angles, in the sequence of `order`, of a rotation matrix; inverse of `rotation_from_angles`.
+    """Angles in radians, in the sequence of `order`, of a rotation matrix; inverse of `rotation_from_angles`.
+
+    The second one is in [−π/2, π/2]. At its ends only one combination of the others is determined; the first is then 0.
 
     Raises
     ------
@@ -80,8 +71,13 @@ def angles_from_rotation(R_ground_camera: ArrayLike, order: str = "opk") -> NDAr
     # Renaming the axes turns every order into ω φ κ; an odd renaming mirrors space, which negates the angles.
     axes = [_AXIS[k] for k in order]
     P = np.eye(3)[axes]
-    sign = np.linalg.det(P)
-    return sign * opk_from_rotation(P @ np.asarray(R_ground_camera, float) @ P.T)
+    R = P @ np.asarray(R_ground_camera, float) @ P.T
+    # The arc sine would lose half the digits near ±π/2.
+    cos_phi = np.hypot(R[0, 0], R[0, 1])
+    omega, kappa = np.arctan2(-R[1, 2], R[2, 2]), np.arctan2(-R[0, 1], R[0, 0])
+    if cos_phi < 1e-12:
+        omega, kappa = 0.0, np.arctan2(R[1, 0], R[1, 1])
+    return np.asarray(np.linalg.det(P) * np.array([omega, np.arctan2(R[0, 2], cos_phi), kappa]))
 
 
 def skew(v: NDArray[np.float64]) -> NDArray[np.float64]:

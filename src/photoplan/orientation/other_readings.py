@@ -8,10 +8,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.geometry.rotation import ROTATION_ORDERS, rotation_from_angles
+from photoplan.geometry.rotation import ANGLE_UNITS, ROTATION_ORDERS, rotation_from_angles
 
-#: Parts of a full circle of each unit, and what it is called.
-CIRCLE = {"deg": 360.0, "gon": 400.0, "rad": 2 * np.pi}
+#: What units are called.
 NAMES = {"deg": "degrees", "gon": "gon", "rad": "radians"}
 #: True and declared units that are thought of, by the project's. `photoplan init` writes tables of gon and radians in
 #: degrees, so what was declared there may have been any.
@@ -23,11 +22,11 @@ _UNITS = {
 
 
 @dataclass(frozen=True)
-class Reading:
+class OtherReading:
     """One way to read three angles and a projection centre."""
 
     unit: str | None = None
-    """Unit that the numbers are in, a key of `CIRCLE`; None: as declared."""
+    """Unit that the numbers are in, a key of `ANGLE_UNITS`; None: as declared."""
     order: str | None = None
     """Rotation order; None: as declared."""
     transposed: bool = False
@@ -81,7 +80,7 @@ class Reading:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Projection centre (3,) and R_ground_camera (3, 3) of declared numbers (radians) under this reading."""
         if self.unit is not None:
-            angles = angles * (CIRCLE[self.declared] / CIRCLE[self.unit])
+            angles = angles * (ANGLE_UNITS[self.declared] / ANGLE_UNITS[self.unit])
         if self.order is not None:
             # An angle keeps its axis; only the sequence of rotations changes.
             named = dict(zip(order, angles))
@@ -96,20 +95,21 @@ class Reading:
         return (center[[1, 0, 2]] if self.swapped else center), R
 
 
-DECLARED = Reading()
+DECLARED = OtherReading()
 
 
-def readings(order: str, unit: str = "deg") -> list[Reading]:
+def readings(order: str, unit: str = "deg") -> list[OtherReading]:
     """All readings with one change, then those with two; `order` and `unit` are those of the project."""
     others = [o for o in ROTATION_ORDERS if o != order]
-    units = [partial(Reading, unit=true, declared=stated) for true, stated in _UNITS[unit]]
+    units = [partial(OtherReading, unit=true, declared=stated) for true, stated in _UNITS[unit]]
     one = [made() for made in units]
-    one += [Reading(transposed=True), Reading(camera_flipped=True), Reading(ground_flipped=True), Reading(swapped=True)]
-    one += [Reading(order=o) for o in others]
+    one += [OtherReading(transposed=True), OtherReading(camera_flipped=True)]
+    one += [OtherReading(ground_flipped=True), OtherReading(swapped=True)]
+    one += [OtherReading(order=o) for o in others]
     two = [made(order=o) for made in units for o in others]
     two += [made(transposed=True) for made in units]
     two += [made(camera_flipped=True) for made in units] + [made(ground_flipped=True) for made in units]
-    two += [Reading(order=o, transposed=True) for o in others]
-    two += [Reading(order=o, camera_flipped=True) for o in others]
-    two += [Reading(transposed=True, camera_flipped=True), Reading(transposed=True, ground_flipped=True)]
+    two += [OtherReading(order=o, transposed=True) for o in others]
+    two += [OtherReading(order=o, camera_flipped=True) for o in others]
+    two += [OtherReading(transposed=True, camera_flipped=True), OtherReading(transposed=True, ground_flipped=True)]
     return one + two

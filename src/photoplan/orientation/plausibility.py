@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.geometry.bounds import HIGHEST_FLIGHT
-from photoplan.geometry.rotation import rotation_from_angles
-from photoplan.orientation.other_readings import CIRCLE, DECLARED, Reading, readings
+from photoplan.geometry.rotation import ANGLE_UNITS, rotation_from_angles
+from photoplan.orientation.other_readings import DECLARED, OtherReading, readings
 
 Heights = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
@@ -168,7 +168,7 @@ def other_reading(views: Sequence[View], images: Sequence[ImagePlausibility], he
     evidence = _Evidence.of(views, declared, DECLARED)
     if not evidence.doubtful:
         return None
-    ranked: list[tuple[tuple[float, ...], Reading, list[ImagePlausibility]]] = []
+    ranked: list[tuple[tuple[float, ...], OtherReading, list[ImagePlausibility]]] = []
     for reading in readings(sample[0].order, sample[0].unit):
         # What one change explains needs no second, except where only the second makes the images upright.
         if ranked and reading.changes > ranked[0][1].changes and (ranked[0][0][0] < 0 or len(sample) < ENOUGH):
@@ -207,7 +207,7 @@ class _Evidence:
     count: int
 
     @classmethod
-    def of(cls, views: list[View], images: list[ImagePlausibility], reading: Reading) -> _Evidence:
+    def of(cls, views: list[View], images: list[ImagePlausibility], reading: OtherReading) -> _Evidence:
         tilts = [i.tilt for i in images]
         alike, offset = _alignment(views, reading)
         return cls(
@@ -235,7 +235,7 @@ class _Evidence:
     def doubtful(self) -> bool:
         return bool(self.faults) or self.middles < 0.8 or self.tilted or self.astray
 
-    def better_than(self, declared: _Evidence, reading: Reading) -> bool:
+    def better_than(self, declared: _Evidence, reading: OtherReading) -> bool:
         """Whether this reading removes what is wrong with the declared one; what only looks different is not better."""
         if self.faults or self.middles < declared.middles:
             return False
@@ -254,15 +254,15 @@ class _Evidence:
         return usual and self.alike > 0.9 and abs(self.offset) < 8
 
 
-def _possible(reading: Reading, largest: float) -> bool:
+def _possible(reading: OtherReading, largest: float) -> bool:
     """Whether the largest declared angle, in parts of a full circle, can be what the reading takes it for."""
     if reading.unit == "rad":
-        return largest * CIRCLE[reading.declared] < CIRCLE["rad"]
+        return largest * ANGLE_UNITS[reading.declared] < ANGLE_UNITS["rad"]
     if reading.unit is None or reading.declared != "rad":
         return True
     # Angles divided by 57 are upright whatever they were: only more than a full circle lets one think of that, and only
     # more than 360 of gon.
-    return largest > 1.0 and (reading.unit == "gon") == (largest * CIRCLE["rad"] > CIRCLE["deg"])
+    return largest > 1.0 and (reading.unit == "gon") == (largest * ANGLE_UNITS["rad"] > ANGLE_UNITS["deg"])
 
 
 def _sample(views: list[View], images: tuple[ImagePlausibility, ...]) -> list[int]:
@@ -272,7 +272,7 @@ def _sample(views: list[View], images: tuple[ImagePlausibility, ...]) -> list[in
     return list(dict.fromkeys(faulty[: SAMPLE // 2] + spread))[:SAMPLE]
 
 
-def _alignment(views: list[View], reading: Reading) -> tuple[float, float]:
+def _alignment(views: list[View], reading: OtherReading) -> tuple[float, float]:
     """How the image axes lie to the flight lines: how alike in all images (0 to 1), and the mean difference (degrees).
 
     The line through an image and its nearest neighbour is along or across a strip, so angles count modulo 90°.

@@ -19,10 +19,8 @@ from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
 from photoplan.cameras.observed import GroundPoints, ImagePoints
 from photoplan.errors import GeometryError, InputError
-from photoplan.geometry.rotation import ROTATION_ORDERS, rotation_from_angles
+from photoplan.geometry.rotation import ANGLE_UNITS, ROTATION_ORDERS, rotation_from_angles
 
-#: Angle units: radians per unit.
-UNITS = {"deg": np.pi / 180, "gon": np.pi / 200, "rad": 1.0}
 DIRECTIONS = ("camera-to-ground", "ground-to-camera")
 CAMERA_AXES = ("up-back", "down-forward")
 TURNS = (0, 90, 180, 270)
@@ -94,7 +92,7 @@ class StatedPoses:
             return self.matrices
         assert self.angles is not None
         at = ["opk".index(letter) for letter in order]
-        return np.stack([rotation_from_angles(a[at] * UNITS[unit], order) for a in self.angles])
+        return np.stack([rotation_from_angles(a[at] * (2 * np.pi / ANGLE_UNITS[unit]), order) for a in self.angles])
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +214,7 @@ def turn_matrix(camera_axes: str, turned: int) -> NDArray[np.float64]:
 
 def _readings(poses: StatedPoses, sights: Sights) -> Iterator[tuple[Reading, NDArray[np.float64]]]:
     """Every reading with the components of the rays along the axes of the camera that the file means."""
-    conventions = [("deg", "opk")] if poses.matrices is not None else list(product(UNITS, ROTATION_ORDERS))
+    conventions = [("deg", "opk")] if poses.matrices is not None else list(product(ANGLE_UNITS, ROTATION_ORDERS))
     others = list(product(CAMERA_AXES, TURNS, (False, True)))
     for unit, order in conventions:
         R = poses.rotations(unit, order)

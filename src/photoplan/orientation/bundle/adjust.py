@@ -51,6 +51,8 @@ _SETTLED = 1e-9
 #: by less than this part of a variance each, what is left to go means nothing: an unknown that is off by its whole
 #: standard deviation makes one.
 _FLAT, _FLAT_STEPS = 1e-4, 4
+#: Part of a variance that may be left to go where the number of iterations is used up, as the last steps shrink.
+_NEARLY = 0.1
 #: Points farther from the block than this, in units of its largest extent, begin anew.
 _FAR = 10.0
 #: Times that the robust start is made, each without the control that the one before has found wrong.
@@ -172,7 +174,11 @@ def _selected(
 
 
 def _check(model: Model, state: State, active: Active) -> None:
-    rows, _ = linearise(model, state, np.sqrt(weights_of(model, active)))
+    """Refuse at once what nothing determines; start values with points behind cameras say nothing of that yet."""
+    weight = weights_of(model, active)
+    if not np.isfinite(whitened(model, residuals_of(model, state))[weight > 0]).all():
+        return
+    rows, _ = linearise(model, state, np.sqrt(weight))
     check_rank(model, state, reduce_normals(rows, len(model.point_names)))
 
 
@@ -247,7 +253,7 @@ class _Loop:
         if robust:
             base = base * softened(model, state)
         damping, cost = 0.0, np.inf
-        patience, best, least, flat = _PATIENCE, state, np.inf, 0
+        patience, best, least, gains = _PATIENCE, state, np.inf, [np.inf] * _FLAT_STEPS
         for turn in range(self._most):
             e = whitened(model, residuals_of(model, state))
             weight = base * robust_weights(model, e * np.sqrt(base), turn) if robust else base
@@ -286,22 +292,29 @@ class _Loop:
             largest = float(np.abs(step / reduced.scale).max()) if len(step) else 0.0
             settled = abs(cost - after) <= _SETTLED * after or after < 1e-18 * len(e)
             variance = after / max(1.0, float((weight > 0).sum()) - model.columns.count - 3 * len(model.point_names))
-            flat = flat + 1 if abs(before - after) < _FLAT * variance else 0
+            gains = [*gains[1:], abs(before - after) / max(variance, 1e-300)]
             # A damped step is short for that reason alone, unless rounding is all that is left.
             if not robust and ((damping == 0.0 and (largest < _CONVERGED or settled)) or largest < _ROUNDING):
                 return state
-            if flat >= _FLAT_STEPS and not robust:
+            if max(gains) < _FLAT and not robust:
                 return state
             if robust and turn >= _LEAST and largest < _ROUGHLY:
                 return state
             cost = after
-        if robust:
+        if robust or _left(gains) < _NEARLY:
             return state
         raise GeometryError(
             f"the adjustment has not converged after {self._most} iterations (largest step {largest:.2g} standard "
             "deviations). Are the start orientations about right, and all free parameters determined? Images that have "
             "no start orientation are oriented from control and tie points"
         )
+
+
+def _left(gains: list[float]) -> float:
+    """What steps to come may gain, if each is to the next as the last ones were; infinite where they do not shrink."""
+    first, last = gains[0], gains[-1]
+    ratio = (last / first) ** (1.0 / (len(gains) - 1)) if 0.0 < last < first < np.inf else 1.0 - (last == 0.0)
+    return last * ratio / (1.0 - ratio) if ratio < 1.0 else np.inf
 
 
 def _cost(e: _Floats, weight: _Floats) -> float:

@@ -188,8 +188,21 @@ def check_rank(model: Model, state: State, reduced: Reduced) -> None:
     Raises
     ------
     GeometryError
-        The message names the combinations of unknowns that nothing determines.
+        The message names the combinations of unknowns that nothing determines, or whose equations are no numbers.
     """
+    wrong = ~np.isfinite(np.asarray(reduced.S.sum(axis=1)).ravel())
+    if wrong.any():
+        owners = dict.fromkeys(
+            kind.owners[k]
+            for kind in model.columns.kinds
+            if kind.width
+            for k in np.flatnonzero(wrong[kind.part].reshape(-1, kind.width).any(axis=1))
+        )
+        shown = ", ".join(map(repr, list(owners)[:3])) + (f" and {len(owners) - 3} more" if len(owners) > 3 else "")
+        raise GeometryError(
+            f"the equations of {shown} are no numbers any more: an image point or an orientation there is so far off "
+            "that the iterations left the block; look for it among what was changed last, or leave the image out"
+        )
     values, vectors = _smallest(reduced)
     null = values < SINGULAR
     if not null.any():

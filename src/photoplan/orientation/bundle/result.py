@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.adjustment.components import ENOUGH, variance_factors
+from photoplan.adjustment.robust import ENOUGH, variance_factors
 from photoplan.errors import GeometryError
 from photoplan.geometry.rotation import rotation_vector
 from photoplan.orientation.bundle.block import (

@@ -180,6 +180,10 @@ def first_taken_out(model: Model, state: State, active: Active, critical: float)
     # Where residuals are small beside the errors this is too strict, so it takes twice as much here; data snooping does
     # the rest.
     bad = size[: len(of)] > 2.0 * critical
+    # Gross errors are few. Where most positions look wrong the robust estimate has lost them, and snooping will tell.
+    wrong = bad[model.parts.position].reshape(-1, 3).any(axis=1)
+    if 2 * np.count_nonzero(wrong) > wrong.size:
+        bad[model.parts.position] = False
     # Control is judged afterwards, as a set (`judged_control`).
     return _without(model, active, bad)
 

@@ -16,6 +16,8 @@ _Index = NDArray[np.int64]
 
 #: Angle between rays below which a point waits until orientations are better, radians; points that every image keeps.
 _NARROW, _ENOUGH = 0.02, 8
+#: Control that is so many times farther from where its rays meet than the median of all control was given wrongly.
+_ASTRAY = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,15 +137,22 @@ def start_points(block: Block, selection: Selection, wait: bool = False) -> tupl
         kept = np.bincount(image[wide[point]], minlength=len(chosen))
         if (kept >= np.minimum(_ENOUGH, np.bincount(image, minlength=len(chosen)))).all():
             determined = wide
-    for k, name in enumerate(block.ground.names):
-        if name in point_index and not block.ground.check[k]:
-            given = block.ground.XYZ[k]
-            at = point_index[name]
-            if np.isfinite(given).all():
+    control = [
+        (point_index[name], block.ground.XYZ[k])
+        for k, name in enumerate(block.ground.names)
+        if name in point_index and not block.ground.check[k]
+    ]
+    off = np.array([np.linalg.norm(XYZ[at] - given) if determined[at] else np.nan for at, given in control])
+    far = _ASTRAY * np.nanmedian(off) if np.isfinite(off).any() else np.inf
+    for (at, given), distance in zip(control, off):
+        if np.isfinite(given).all():
+            # A point that was exchanged with another one begins where its rays meet: from where it is not, the first
+            # step would tear the block apart.
+            if not distance > far:
                 XYZ[at], determined[at] = given, True
-            elif not determined[at]:
-                XYZ[at] = _on_ray(centers[point == at][0], directions[point == at][0], given)
-                determined[at] = np.isfinite(XYZ[at]).all()
+        elif not determined[at]:
+            XYZ[at] = _on_ray(centers[point == at][0], directions[point == at][0], given)
+            determined[at] = np.isfinite(XYZ[at]).all()
     for name, start in block.start_points.items():
         if name in point_index:
             XYZ[point_index[name]] = start

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from photoplan.adjustment.linear import Fit, solve
 from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
-from photoplan.kernels.template_match import sample_template
+from photoplan.kernels.correlation import sample_template
 from photoplan.orientation.marks.template import draw
 
 _PIXEL = 1 / 12

@@ -22,8 +22,14 @@ from photoplan.cameras.lenses.field import field_limited
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.pose import Pose
 from photoplan.orientation.resection.direct import DirectPose, moved, resect_direct, tangent_derivatives
-from photoplan.orientation.resection.model import CameraOf, MeasuredPoints, Resected, ResectSettings
-from photoplan.orientation.resection.rank import ResectionUnknowns, refuse_undetermined
+from photoplan.orientation.resection.model import (
+    CameraOf,
+    MeasuredPoints,
+    Resected,
+    ResectionUnknowns,
+    ResectSettings,
+    refuse_undetermined,
+)
 
 Array = NDArray[np.float64]
 

@@ -14,8 +14,7 @@ from photoplan.errors import GeometryError
 from photoplan.geometry.pose import Pose
 from photoplan.orientation.bundle.block import BlockCamera
 from photoplan.orientation.resection.direct import resect_direct
-from photoplan.orientation.start.model import StartModel, free_model, grown, looseness
-from photoplan.orientation.start.net import Net, net_of
+from photoplan.orientation.start.model import Net, StartModel, free_model, grown, looseness, net_of
 from photoplan.orientation.start.similarity import Similarity, robust_similarity
 
 Array = NDArray[np.float64]
