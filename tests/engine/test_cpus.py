@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from photoplan.engine.cpus import available_cpus
+from photoplan.engine.executors import available_cpus
 
 
 @pytest.fixture(autouse=True)

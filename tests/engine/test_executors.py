@@ -58,6 +58,27 @@ def test_no_more_in_flight_than_allowed(in_flight: int) -> None:
     assert taken == 30
 
 
+@pytest.mark.parametrize("in_flight", [1, 3, 8])
+def test_tasks_are_taken_as_they_are_needed(in_flight: int) -> None:
+    """A product of a million tiles holds some of them at a time; the order in which they begin stays."""
+    asked, begun = 0, []
+
+    def tasks() -> Iterator[int]:
+        nonlocal asked
+        for k in range(500):
+            asked += 1
+            yield k
+
+    def work(task: int) -> int:
+        begun.append(task)
+        return task
+
+    with Workers(executor_factory("threads", 1)) as workers:
+        for done, _ in enumerate(run_tiles(tasks(), work, workers, in_flight)):
+            assert asked - done <= 2 * in_flight + 1
+    assert begun == list(range(500))
+
+
 def test_the_executor_stays_for_the_next_call() -> None:
     made: list[Executor] = []
 

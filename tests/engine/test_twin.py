@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 from tools.arrays import noise, product
 from tools.function_surface import FunctionSurface
 from tools.pinhole import Pinhole
+from tools.twin import TwinSource, twin_compose
 
 from photoplan.engine.arrays import ArrayReader
 from photoplan.engine.base import Source
 from photoplan.engine.execute import render
-from photoplan.engine.twin import TwinSource, twin_compose
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
-from photoplan.plan.owner import GivenOwners
+from photoplan.plan.owner import GivenOwners, Share
 from photoplan.plan.product import ProductPlan, compile_tile
 from photoplan.plan.tiles import Tile
 from photoplan.surfaces.level import LevelSurface
@@ -195,9 +195,9 @@ def test_owners_are_chosen_among_the_sources_of_the_tile_and_nobody_else_is_open
     asked: list[tuple[Any, ...]] = []
 
     class LastCamera:
-        def owner(self, ground: Any, cameras: Any, surface: Any) -> np.ndarray:
+        def share(self, ground: Any, cameras: Any, surface: Any) -> Share:
             asked.append((ground.window, dict(cameras), surface))
-            return np.full(ground.relief.shape, max(cameras) + 1, np.uint16)
+            return Share(np.full(ground.relief.shape, max(cameras) + 1, np.uint16))
 
     grid, surface = MapGrid.covering((-25, -25, 25, 25), 0.8, "EPSG:32615"), LevelSurface(0.0)
     one, two = (Source(camera(k), ArrayReader(noise(1, SIZE[1], SIZE[0], "uint8", int(k)))) for k in (0.0, 1.0))

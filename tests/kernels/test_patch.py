@@ -34,19 +34,28 @@ def predicted(
     lines: tuple[NDArray[np.float64], ...] = (),
     models: NDArray[np.float64] | None = None,
     shares: NDArray[np.float64] | None = None,
+    squares: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """Height, sigma and nearest distance (t, 3); a patch is asked for what lies within its reach."""
+    """Height, sigma, nearest distance and roughness (t, 4); a patch is asked for what lies within its reach."""
     p, t = len(leaves), len(targets)
     if models is None:
         models = np.tile(np.array([family, VARIANCE, LENGTH, GAP]), (p, 1, 1))
     if shares is None:
         shares = np.ones(models.shape[:2]) / models.shape[1]
-    sums = np.zeros((t, 4))
+    sums = np.zeros((t, 5))
     sums[:, 3] = np.inf
     reached = [np.flatnonzero(np.abs(targets - leaf[:2]).max(axis=1) < 1.5 * leaf[2]) for leaf in leaves]
     wanted, start = np.concatenate(reached), np.concatenate([[0], np.cumsum([len(r) for r in reached])])
-    assert predict(xyz, noise, ids, leaves, targets, wanted, start, *stacked(list(lines)), models, shares, sums) == 0
-    return np.column_stack([sums[:, 0] / sums[:, 1], sums[:, 2] / sums[:, 1], sums[:, 3]])
+    about = np.full(len(xyz), np.nan) if squares is None else squares, USUAL
+    failed = predict(
+        xyz, noise, ids, leaves, targets, wanted, start, *stacked(list(lines)), models, shares, *about, sums
+    )
+    assert failed == 0
+    return np.column_stack([sums[:, 0] / sums[:, 1], sums[:, 2] / sums[:, 1], sums[:, 3], sums[:, 4] / sums[:, 1]])
+
+
+USUAL = np.array([1.1, 3.0, 2.5])
+"""Mean of squares, how many data it counts as, reach."""
 
 
 ONE = np.array([[5.0, 5.0, 6.0]])
@@ -66,6 +75,30 @@ def test_a_patch_is_textbook_collocation(family: int, lines: tuple[NDArray[np.fl
     np.testing.assert_allclose(got[:, 1], np.sqrt(variances), rtol=1e-6 if not lines else 0.05)
     nearest = np.linalg.norm(TARGETS[:, None] - xyz[None, :, :2], axis=2).min(axis=1)
     np.testing.assert_allclose(got[:, 2], nearest, rtol=1e-9)
+
+
+def test_roughness_is_the_weighted_mean_of_squares() -> None:
+    xyz, noise = data()
+    squares = np.random.default_rng(2).chisquare(1, 40) * 3
+    squares[3], squares[5] = np.nan, 400.0
+    got = predicted(xyz, noise, ONE, np.arange(40)[None], TARGETS, squares=squares)[:, 3]
+    away = np.linalg.norm(TARGETS[:, None] - xyz[None, :, :2], axis=2)
+    weight = np.where(np.isnan(squares), 0.0, (1 + (away / 2.5) ** 2) ** -2.0)
+    expected = (weight @ np.minimum(np.nan_to_num(squares), 16.0) + 3.0 * 1.1) / (weight.sum(axis=1) + 3.0)
+    np.testing.assert_allclose(got, expected, rtol=1e-9)
+
+
+def test_roughness_is_that_of_the_own_side_of_a_line() -> None:
+    """A hundredth of the squares south of the road; so near to it both sides have as many data around."""
+    xyz, noise = data(200)
+    north = xyz[:, 1] > np.interp(xyz[:, 0], *ROAD.T)
+    places = np.column_stack([np.linspace(2, 8, 7), np.interp(np.linspace(2, 8, 7), *ROAD.T)])
+    args = (xyz, noise, ONE, np.arange(200)[None])
+    above, below = (
+        predicted(*args, places + np.array([0, by]), lines=(ROAD,), squares=np.where(north, 4.0, 0.04))[:, 3]
+        for by in (0.1, -0.1)
+    )
+    assert (above > 2.5).all() and (below < 1.1).all()
 
 
 def test_data_without_noise_are_met() -> None:
@@ -169,9 +202,8 @@ class TestLeaveOneOut:
         )
         assert failed == 0 and np.isnan(result[:5]).all()
         np.testing.assert_allclose(result[5:, 2], (differences / np.sqrt(variances))[5:], atol=0.03)
-        # Residual against the filtered surface = redundancy · difference from the prediction.
         np.testing.assert_allclose(result[5:, 1], (noise / variances)[5:], rtol=0.03)
-        np.testing.assert_allclose(result[5:, 0], (noise / variances * differences)[5:], atol=2e-4)
+        np.testing.assert_allclose(result[5:, 0], differences[5:], atol=2e-4)
         assert (result[5:, 1] > 0).all() and (result[5:, 1] < 1).all()
 
     def test_residuals_are_those_of_the_filtered_surface(self) -> None:
@@ -181,7 +213,8 @@ class TestLeaveOneOut:
         args = (np.arange(40), np.array([0, 40]), *none, np.array([MODEL]), result)
         assert patch_test.test_points(xyz, noise, np.arange(40)[None], ONE, *args) == 0
         surface = predicted(xyz, noise, ONE, np.arange(40)[None], xyz[:, :2].copy())
-        np.testing.assert_allclose(result[:, 0], xyz[:, 2] - surface[:, 0], atol=1e-6)
+        # Residual against the filtered surface = redundancy · difference from the prediction.
+        np.testing.assert_allclose(result[:, 0] * result[:, 1], xyz[:, 2] - surface[:, 0], atol=1e-6)
 
     def test_score(self, truth: tuple[NDArray[np.float64], ...]) -> None:
         """The negative logarithm of the predictive density, near points counting most."""

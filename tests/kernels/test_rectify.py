@@ -11,7 +11,7 @@ from kernel_reference import Mapping, noise, rounded
 
 from photoplan.kernels.jit import COMPILED
 from photoplan.kernels.pack import pack
-from photoplan.kernels.rectify import rectify_packed, rectify_tile
+from photoplan.kernels.rectify import rectify_tile
 from photoplan.kernels.weights import KERNELS
 
 TYPES = ("uint8", "uint16", "int16", "float32")
@@ -193,7 +193,7 @@ def test_no_read_outside_the_source(name, size):
             relief = np.zeros((rows, cols), np.float32)
             out, good = np.empty((lanes, rows, cols), np.float32), np.empty((rows, cols), bool)
             anchors = mapping.anchors([[0, 0, cols, rows]], (0.0, 1.0))
-            rectify_packed(anchors, relief, packed, None, None, name, out, good)
+            rectify_tile(anchors, relief, packed, None, None, name, out, good)
             assert good.any() or scale > 1
             assert np.isfinite(out).all()
 

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tools.arrays import noise, product
+from tools.twin import TwinSource, twin_compose
 
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
@@ -21,7 +22,6 @@ from photoplan.cameras.plane import Bilinear2D
 from photoplan.engine.arrays import ArrayReader
 from photoplan.engine.base import Source
 from photoplan.engine.execute import render
-from photoplan.engine.twin import TwinSource, twin_compose
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
 from photoplan.kernels.position import positions

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from photoplan.errors import UsageError
-from photoplan.plan.resolution import (
+from tools.resolution import (
     admissible_height_error,
     admissible_shift,
     curvature_displacement,
@@ -21,6 +19,8 @@ from photoplan.plan.resolution import (
     sampling_interval,
     scan_bytes,
 )
+
+from photoplan.errors import UsageError
 
 GON = np.pi / 200
 

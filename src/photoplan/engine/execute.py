@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.engine.base import Reader, Source
-from photoplan.engine.run import Made
+from photoplan.engine.run import Made, Output
 from photoplan.geometry.grid import Window
 from photoplan.kernels.position import ALL_MINE
 from photoplan.kernels.rectify import rectify_tile
@@ -35,6 +35,8 @@ class Painted:
     owner: NDArray[np.uint16] | None
     """(height, width): row of the table of sources, plus one, that painted each pixel; 0 where invalid. None if there
     is one source, or no pixel is valid."""
+    hidden: NDArray[np.bool_] | None
+    """(height, width): pixels that no source sees, see `photoplan.plan.owner.Share`; None if nobody has asked."""
     residual: float
     """Worst residual of the anchors, pixels of the source image."""
     cells: int
@@ -65,9 +67,9 @@ def execute_tile(tile: CompiledTile, sources: Sequence[Source], kernel: str) -> 
             owned = ALL_MINE if tile.owner is None else (tile.owner, layer.source + 1, layer.part.tolist())
             rectify_tile(layer.anchors.arrays, tile.relief, pixels, usable, border, kernel, values, valid, owned=owned)
     if not valid.any():
-        return Painted(None, None, None, tile.residual, tile.cells)
+        return Painted(None, None, None, tile.hidden, tile.residual, tile.cells)
     owner = None if tile.owner is None else tile.owner * valid
-    return Painted(values, valid, owner, tile.residual, tile.cells)
+    return Painted(values, valid, owner, tile.hidden, tile.residual, tile.cells)
 
 
 def render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface: Surface, kernel: str) -> Painted:
@@ -84,8 +86,8 @@ def render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface:
     side = max(SMALLEST_PART, -(-max(window.width, window.height) // 2))
     cut = [replace(tile, window=part) for part in window.tiles(side)]
     parts = ((part.window, render(product, part, sources, surface, kernel)) for part in cut)
-    whole = joined(window, parts, sources[tile.sources[0]].reader, product.owners is not None)
-    return whole if np.any(whole.valid) else Painted(None, None, None, whole.residual, whole.cells)
+    whole = joined(window, parts, sources[tile.sources[0]].reader)
+    return whole if np.any(whole.valid) else replace(whole, values=None, valid=None, owner=None)
 
 
 def _bytes(layer: Layer, source: Source) -> int:
@@ -93,25 +95,32 @@ def _bytes(layer: Layer, source: Source) -> int:
     return layer.anchors.source_window.size * source.reader.bands * source.reader.dtype.itemsize
 
 
-def joined(window: Window, parts: Iterable[tuple[Window, Painted]], reader: Reader, owned: bool) -> Painted:
+def joined(window: Window, parts: Iterable[tuple[Window, Painted]], reader: Reader) -> Painted:
     """A window of a product from painted parts of the product; what none of them holds is 0 and not valid.
 
-    `reader` tells bands and type of the pixels, `owned` whether there are owners.
+    `reader` tells bands and type of the pixels.
     """
     shape = (window.height, window.width)
     values, valid = np.zeros((reader.bands, *shape), reader.dtype), np.zeros(shape, bool)
-    owner = np.zeros(shape, np.uint16) if owned else None
+    owner: NDArray[np.uint16] | None = None
+    hidden: NDArray[np.bool_] | None = None
     residual, cells = 0.0, 0
     for at, part in parts:
         residual, cells = max(residual, part.residual), cells + part.cells
         common = at & window
-        if part.values is None or part.valid is None or not common.size:
+        if not common.size:
             continue
         to, of = common.slices(window), common.slices(at)
+        if part.hidden is not None:
+            hidden = np.zeros(shape, bool) if hidden is None else hidden
+            hidden[to] = part.hidden[of]
+        if part.values is None or part.valid is None:
+            continue
         values[:, to[0], to[1]], valid[to] = part.values[:, of[0], of[1]], part.valid[of]
-        if owner is not None and part.owner is not None:
+        if part.owner is not None:
+            owner = np.zeros(shape, np.uint16) if owner is None else owner
             owner[to] = part.owner[of]
-    return Painted(values, valid, owner, residual, cells)
+    return Painted(values, valid, owner, hidden, residual, cells)
 
 
 def _border(layer: Layer, size: tuple[int, int]) -> tuple[float, float, float, float]:
@@ -156,10 +165,23 @@ class RenderJob:
     product: ProductPlan
     """Without its tiles."""
     kernel: str
+    marks: bool = False
+    """Whether a second output says what is hidden: 1, or 0 for what is seen; not valid beyond the image."""
 
     def __call__(self, tile: Tile) -> Made:
-        """Pixels of a tile, and the figures of its anchors."""
+        """Pixels of a tile, and its figures: of its anchors, and how many pixels are hidden if somebody has asked."""
         opened = self.address.open()
-        pixels = render(self.product, tile, opened.sources, opened.surface, self.kernel)
-        layer = None if pixels.values is None else (pixels.values, pixels.valid)
-        return Made((layer,), {"worst_residual": pixels.residual, "cells": pixels.cells})
+        painted = render(self.product, tile, opened.sources, opened.surface, self.kernel)
+        record: dict[str, float] = {"worst_residual": painted.residual, "cells": painted.cells}
+        if painted.hidden is not None:
+            record["hidden"] = int(np.count_nonzero(painted.hidden))
+        picture = None if painted.values is None else (painted.values, painted.valid)
+        return Made((picture, _mark(painted)) if self.marks else (picture,), record)
+
+
+def _mark(painted: Painted) -> Output | None:
+    """Whether pixels are hidden, where the image has them."""
+    hidden = painted.hidden
+    if hidden is None or (painted.valid is None and not hidden.any()):
+        return None
+    return hidden.astype(np.uint8)[None], hidden if painted.valid is None else hidden | painted.valid

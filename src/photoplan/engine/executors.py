@@ -1,14 +1,18 @@
 """Tiles handed to workers: threads, processes or a Dask cluster, all as `concurrent.futures.Executor`.
 
+As many at once as this process may use: the processors of the machine, less what affinity and a container leave.
+
 A worker that dies is not the end of a run: its tiles are tried again, alone, so that one tile that kills its worker
 is found and listed without harming the others.
 """
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -23,6 +27,7 @@ from concurrent.futures import (
 )
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -239,7 +244,7 @@ def run_tiles(
     Parameters
     ----------
     tasks : iterable
-        Small and hashable; for processes and clusters they and `work` must pickle.
+        Small and hashable; for processes and clusters they and `work` must pickle. Taken as they are needed.
     work : callable
         Returns a tile's result.
     workers : Workers
@@ -254,13 +259,18 @@ def run_tiles(
     PhotoplanError
         Raised by the work itself: an input or resource fault stops the run, since the other tiles share the inputs.
     """
-    waiting = deque(tasks)
+    more = iter(tasks)
+    waiting: deque[Any] = deque()
     alone: deque[Any] = deque()
     failures: dict[Any, int] = {}
     pending: dict[Future[Any], Any] = {}
     solo = False
     try:
-        while waiting or alone or pending:
+        while True:
+            # Only what may begin soon is taken: a product of a million tasks holds a few of them at a time.
+            waiting.extend(islice(more, in_flight - len(waiting)))
+            if not (waiting or alone or pending):
+                return
             try:
                 while not solo and (queue := _next(waiting, alone, pending, in_flight)) is not None:
                     future = workers.executor.submit(work, queue[0])
@@ -321,3 +331,56 @@ def _lost(lost: list[Any], alone: deque[Any], failures: dict[Any, int]) -> Itera
 def _again(task: Any, failures: dict[Any, int]) -> bool:
     failures[task] = failures.get(task, 0) + 1
     return failures[task] <= RETRIES
+
+
+def available_cpus(root: Path = Path("/")) -> int:
+    """Number of processors that work can be spread over, at least one.
+
+    The least of the machine's processors, those that the process is bound to, and the quota of its control groups, also
+    of those around them: ``cpu.max`` of version 2, ``cpu.cfs_quota_us`` and ``cpu.cfs_period_us`` of version 1. A quota
+    of two and a half processors counts as three.
+
+    Parameters
+    ----------
+    root : Path
+        Where the system's files begin; another folder in tests.
+    """
+    counts = [float(os.cpu_count() or 1)]
+    if sys.platform == "linux":
+        counts.append(len(os.sched_getaffinity(0)))
+    groups = root / "sys/fs/cgroup"
+    for line in _text(root / "proc/self/cgroup").splitlines():
+        _, controllers, path = [*line.split(":", 2), "", ""][:3]
+        if controllers == "":
+            counts += _quotas(groups, path, "cpu.max")
+        elif "cpu" in controllers.split(","):
+            # A container sees its own group at the top, under the name that it has outside.
+            counts += _quotas(groups / controllers, path, "cpu.cfs_quota_us")
+            counts += _quotas(groups / "cpu", path, "cpu.cfs_quota_us")
+    return max(1, math.ceil(min(counts)))
+
+
+def _quotas(top: Path, path: str, name: str) -> list[float]:
+    """Processors that a group and those around it may use, where they are limited."""
+    found = []
+    parts = [part for part in path.split("/") if part not in ("", "..")]
+    for depth in range(len(parts) + 1):
+        folder = top.joinpath(*parts[:depth])
+        words = _text(folder / name).split()
+        if name != "cpu.max":
+            words += _text(folder / "cpu.cfs_period_us").split()
+        try:
+            quota, period = map(float, words)
+        except ValueError:
+            # "max" of version 2: no limit; or there is no such file.
+            continue
+        if quota > 0 and period > 0:
+            found.append(quota / period)
+    return found
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text()
+    except OSError:
+        return ""

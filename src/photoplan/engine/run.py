@@ -262,10 +262,15 @@ class Runner(Generic[T]):
         if tally.resumed:
             self._events.talk(f"{work.name}: {tally.resumed} of {len(work.tiles)} tiles are finished already")
             self._events.done(tally.resumed)
-        for index in set(range(work.count)) - {tile.index for tile in work.tiles} - finished:
-            for sink in work.sinks:
-                sink.append_empty(index)
-        waiting = [tile for tile in work.tiles if tile.index not in finished]
+        if work.sinks:
+            empty = np.ones(work.count, bool)
+            for tile in work.tiles:
+                empty[tile.index] = False
+            for index in np.flatnonzero(empty).tolist():
+                if index not in finished:
+                    for sink in work.sinks:
+                        sink.append_empty(index)
+        waiting = (tile for tile in work.tiles if tile.index not in finished)
         job = self._workers.prepared(work.job, work.scratch)
         for outcome in run_tiles(waiting, job, self._workers, self._in_flight, self._pulse):
             tile = outcome.task

@@ -61,7 +61,7 @@ def grow(
     cosine: float,
     label: NDArray[np.int32],
 ) -> int:
-    """Join neighbouring edge pixels whose gradient agrees with that of the chain so far.
+    """Join edge pixels, neighbours or with one pixel between them, whose gradient agrees with that of the chain so far.
 
     Parameters
     ----------
@@ -97,8 +97,9 @@ def grow(
         while top > 0:
             top -= 1
             k = stack[top]
-            for i in range(max(place[k, 0] - 1, 0), min(place[k, 0] + 2, h)):
-                for j in range(max(place[k, 1] - 1, 0), min(place[k, 1] + 2, w)):
+            # Near 45 degrees noise decides between rows and columns, and single pixels are missing.
+            for i in range(max(place[k, 0] - 2, 0), min(place[k, 0] + 3, h)):
+                for j in range(max(place[k, 1] - 2, 0), min(place[k, 1] + 3, w)):
                     m = index[i, j]
                     if m < 0 or label[m] >= 0:
                         continue

@@ -1,4 +1,4 @@
-"""The source as the kernels want it: bands side by side, invalid pixels zero."""
+"""Pixels with their bands side by side: the source as the kernels want it, and tiles as the blocks of a file."""
 
 from __future__ import annotations
 
@@ -100,3 +100,53 @@ def solid_patches(valid: NDArray[np.uint8], taps: int) -> NDArray[np.uint8]:
             for col in range(width):
                 solid[row, col] = along[row, col] if k == 0 else solid[row, col] & along[row + k, col]
     return solid
+
+
+@kernel
+def fill_block(
+    pixels: NDArray[Any],
+    valid: NDArray[np.bool_],
+    nodata: Any,
+    neighbour: Any,
+    fill: NDArray[Any],
+    block: NDArray[Any],
+) -> int:
+    """Write a tile into the upper left of a block.
+
+    Parameters
+    ----------
+    pixels : ndarray, shape (bands, height, width)
+    valid : ndarray of bool, shape (height, width), or (0, 0): all are
+    nodata, neighbour : scalars of the pixels' type
+        Valid values that equal `nodata` become `neighbour`; with two equal scalars, or NaN, none is changed.
+    fill : ndarray, shape (bands,), type of the pixels
+        What invalid pixels hold.
+    block : ndarray, shape (side, side, bands), type of the pixels
+        The rest of it is left as it is.
+
+    Returns
+    -------
+    int
+        Number of valid values that became `neighbour`.
+    """
+    bands, height, width = pixels.shape
+    everywhere = valid.shape[0] == 0
+    apart = nodata != neighbour
+    moved = 0
+    for row in range(height):
+        for band in range(bands):
+            blank = fill[band]
+            if everywhere:
+                for col in range(width):
+                    value = pixels[band, row, col]
+                    hit = apart and value == nodata
+                    moved += hit
+                    block[row, col, band] = neighbour if hit else value
+            else:
+                for col in range(width):
+                    value = pixels[band, row, col]
+                    hit = apart and value == nodata and valid[row, col]
+                    moved += hit
+                    kept = neighbour if hit else value
+                    block[row, col, band] = kept if valid[row, col] else blank
+    return moved

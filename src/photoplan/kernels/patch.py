@@ -13,6 +13,10 @@ from photoplan.kernels.patch_system import system, trend, usable
 
 # Models of a patch with less weight than this are left out.
 _LEAST = 0.02
+MOST_MISFIT = 16.0
+"""Squared normalised residuals count up to this: one blunder does not make its surroundings rough."""
+# Sides of a line are this many reaches apart where roughness is averaged.
+_APART = 4.0
 
 
 @inner
@@ -35,6 +39,8 @@ def predict(
     start: NDArray[Any],
     models: NDArray[Any],
     shares: NDArray[Any],
+    squares: NDArray[Any],
+    usual: NDArray[Any],
     sums: NDArray[Any],
 ) -> int:
     """Add each patch's prediction of its targets to `sums`; returns the number of patches without a solution.
@@ -59,8 +65,14 @@ def predict(
         Family, variance, half-value distance, gap between the sides of a line in half-value distances.
     shares : ndarray, shape (p, m)
         Weights of a patch's models, which add up to 1.
-    sums : ndarray, shape (t, 4)
-        Sums of w·height, w, w·standard deviation; and the shortest distance to a datum.
+    squares : ndarray, shape (n,)
+        Squared normalised residuals of the data; NaN: not known.
+    usual : ndarray, shape (3,)
+        Mean of these squares everywhere, how many data it counts as, and the distance at which data count a quarter
+        for the roughness, metres.
+    sums : ndarray, shape (t, 5)
+        Sums of w·height, w, w·standard deviation; the shortest distance to a datum; sum of w·roughness, which is the
+        mean square of the normalised residuals around, on the same side of lines.
 
     Notes
     -----
@@ -81,10 +93,12 @@ def predict(
                 )
                 if u.shape[0] > 0:
                     solved = True
+                    rough = _roughness(at, at_points, squares[data], models[patch, k], usual)
                     w, near = _towards(at, at_points, models[patch, k])
                     solve_transposed(u, w)
+                    about = np.stack((near, rough))
                     _combine(
-                        w, b, at_points, near, models[patch, k], leaves[patch], shares[patch, k], targets, some, sums
+                        w, b, at_points, about, models[patch, k], leaves[patch], shares[patch, k], targets, some, sums
                     )
         failed += 0 if solved else 1
     return failed
@@ -111,11 +125,35 @@ def _towards(at: NDArray[Any], at_points: NDArray[Any], model: NDArray[Any]) -> 
 
 
 @kernel
+def _roughness(
+    at: NDArray[Any], at_points: NDArray[Any], squares: NDArray[Any], model: NDArray[Any], usual: NDArray[Any]
+) -> NDArray[Any]:
+    """Mean of squared normalised residuals around each target, shape (t,), drawn to the usual one."""
+    n, m = len(at), len(at_points)
+    total, count = np.full(m, usual[0] * usual[1]), np.full(m, usual[1])
+    plain, across = (model[2] / usual[2]) ** 2, (_APART / model[3]) ** 2
+    for i in range(n):
+        if not squares[i] >= 0.0:
+            continue
+        square = min(squares[i], MOST_MISFIT)
+        for j in range(m):
+            apart = 0.0
+            for k in range(2, at.shape[1]):
+                d = at[i, k] - at_points[j, k]
+                apart += d * d
+            dx, dy = at[i, 0] - at_points[j, 0], at[i, 1] - at_points[j, 1]
+            near = 1.0 / (1.0 + (dx * dx + dy * dy) * plain + apart * across) ** 2
+            total[j] += near * square
+            count[j] += near
+    return total / count
+
+
+@kernel
 def _combine(
     w: NDArray[Any],
     b: NDArray[Any],
     at_points: NDArray[Any],
-    near: NDArray[Any],
+    about: NDArray[Any],
     model: NDArray[Any],
     leaf: NDArray[Any],
     part: float,
@@ -123,7 +161,7 @@ def _combine(
     some: NDArray[Any],
     sums: NDArray[Any],
 ) -> None:
-    """Heights and variances of one patch's targets, added to the sums."""
+    """Heights, variances, and what is about (nearest datum, roughness; shape (2, t)) of one patch's targets, added."""
     n, m = w.shape
     beta, inverse = trend(b)
     height, explained = np.zeros(m), np.zeros(m)
@@ -151,4 +189,5 @@ def _combine(
         sums[t, 0] += weight * (height[j] + beta[0] + beta[1] * x + beta[2] * y)
         sums[t, 1] += weight
         sums[t, 2] += weight * np.sqrt(spread)
-        sums[t, 3] = min(sums[t, 3], near[j])
+        sums[t, 3] = min(sums[t, 3], about[0, j])
+        sums[t, 4] += weight * about[1, j]

@@ -74,8 +74,8 @@ def test_points(
     """Compare data with what their neighbours predict; returns the number of patches without a solution.
 
     Parameters are those of `predict`; `own` holds data numbers of each leaf. `result`, shape (n, 3), receives for each
-    of them the residual against the filtered surface (metres), its redundancy (share of an error that shows in the
-    residual) and the normalised residual, which is also that of the prediction from all other data of the patch.
+    of them the difference from the prediction from all other data of the patch (metres), the redundancy (share of it
+    that is left as a residual against the filtered surface) and the difference in its standard deviations.
     """
     failed = 0
     for patch in range(len(leaves)):
@@ -98,7 +98,7 @@ def test_points(
         for j in range(m):
             if weight[j] > 0.0:
                 t = some[j]
-                result[t, 0] = noise[t] * alpha[j]
+                result[t, 0] = alpha[j] / weight[j]
                 result[t, 1] = noise[t] * weight[j]
                 result[t, 2] = alpha[j] / np.sqrt(weight[j])
     return failed

@@ -62,7 +62,7 @@ def rectify_tile(
     offset: tuple[int, int] = (0, 0),
     owned: Owned = ALL_MINE,
 ) -> None:
-    """Resample one tile from a source window as it was read.
+    """Resample one tile from a source window.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def rectify_tile(
     relief : ndarray, shape (rows, cols), float32
         Height of every pixel, metres; NaN where there is no surface.
     source : ndarray, shape (bands, height, width)
-        uint8, uint16, int16 or float32.
+        uint8, uint16, int16 or float32. Or what `pack` made of it, (groups, height, width, lanes), for several tiles.
     valid : ndarray, shape (height, width), or None
         Bool or uint8, 0 = invalid. NaN pixels of float data must be marked here.
     border : (x_min, y_min, x_max, y_max) or None
@@ -95,25 +95,7 @@ def rectify_tile(
     Integers are rounded half away from zero and clipped. Where the target is coarser than the source the kernel is
     widened along image x and y (see `weights.stretch`), except for "nearest", which keeps grey values.
     """
-    rectify_packed(anchors, relief, pack(source, valid), valid, border, kernel, out, out_valid, offset, owned)
-
-
-def rectify_packed(
-    anchors: AnchorArrays,
-    relief: NDArray[np.float32],
-    packed: NDArray[Any],
-    valid: NDArray[Any] | None,
-    border: Border | None,
-    kernel: str,
-    out: NDArray[Any],
-    out_valid: NDArray[np.bool_],
-    offset: tuple[int, int] = (0, 0),
-    owned: Owned = ALL_MINE,
-) -> None:
-    """Resample one tile from a source window that went through `pack` (for several tiles from one window).
-
-    Parameters as in `rectify_tile`; `packed` has the shape (groups, height, width, lanes).
-    """
+    packed = source if source.ndim == 4 else pack(source, valid)
     height, width = packed.shape[1:3]
     target, target_valid = _plain(out, out.dtype), _plain(out_valid, bool)
     if owned is ALL_MINE:

@@ -1,10 +1,10 @@
 """Lines of sight over a grid of posts, each followed exactly but for what a pyramid of maxima rules out.
 
-Heights are relative to the eye and already lowered by earth curvature. Positions are (column, row) of posts. Each line
-runs from a target post to the eye; u is 0 at the target and 1 at the eye, so that a straight line of sight whose height
-at the target is S has the height S (1 − u). The terrain is compared with it wherever the line crosses a grid line,
-where bilinear terrain is linear between two posts. Inside a mesh a bilinear patch can rise above its chord by a quarter
-of the mesh's twist (sum of opposite corners minus sum of the others) at most; that is the error of the method.
+Heights are already lowered by earth curvature. Positions are (column, row) of posts. Each line runs from a target post
+to the eye; u is 0 at the target and 1 at the eye, so that a straight line of sight between the heights S and E has the
+height S (1 − u) + E u. The terrain is compared with it wherever the line crosses a grid line, where bilinear terrain is
+linear between two posts. Inside a mesh a bilinear patch can rise above its chord by a quarter of the mesh's twist (sum
+of opposite corners minus sum of the others) at most; that is the error of the method.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from photoplan.kernels.jit import inner, kernel
 from photoplan.kernels.pyramid import Pyramid, leave
 
-_NUDGE = 1e-7
-"""Part of a mesh by which a position on a grid line is moved on to find the mesh that comes next."""
+_NUDGE, _ALONG = 1e-7, 1e-5
+"""Part of a mesh by which a position on a grid line is moved on to find the mesh that comes next; and by which a line
+leaves a row or column in all, to count as leaving it."""
 
 
 @inner
@@ -49,13 +50,15 @@ def _follow(
     target: tuple[float, float],
     way: tuple[float, float],
     top: float,
+    eye: float,
     stop: bool,
 ) -> float:
-    """Smallest height at the target, not below `top`, whose line of sight to the eye is free; with `stop` infinity as
-    soon as `top` is not enough."""
+    """Smallest height at the target, not below `top`, whose line of sight to the height `eye`, `way` from it, is free;
+    with `stop` infinity as soon as `top` is not enough."""
     _, values, levels = pyramid
     x, y = target
-    dx, dy = way
+    # A line that is all but along a row or column is: else steps that round to nothing would not leave it.
+    dx, dy = way[0] if abs(way[0]) > _ALONG else 0.0, way[1] if abs(way[1]) > _ALONG else 0.0
     nudge = _NUDGE / max(abs(dx), abs(dy))
     u, level, last = 0.0, 0, levels.shape[0] - 1
     while u < 1.0:
@@ -65,7 +68,8 @@ def _follow(
         bx, by = col >> level, row >> level
         away = max(min(leave(bx, level, x, dx), leave(by, level, y, dy)), ahead)
         end = min(away, 1.0)
-        lowest = top * (1.0 - (end if top >= 0.0 else u))
+        lower = end if top >= eye else u
+        lowest = top * (1.0 - lower) + eye * lower
         if values[levels[level, 0] + by * levels[level, 2] + bx] <= lowest:
             level = min(level + 1, last)
         elif level > 0:
@@ -73,10 +77,10 @@ def _follow(
             continue
         elif away < 1.0:
             ground = _crossing(heights, x + away * dx, y + away * dy)
-            if ground > top * (1.0 - away):
+            if ground > top * (1.0 - away) + eye * away:
                 if stop:
                     return np.inf
-                top = ground / (1.0 - away)
+                top = (ground - eye * away) / (1.0 - away)
         u = away
     return top
 
@@ -119,5 +123,166 @@ def sight_rows(
                 continue
             top = h + target_height
             if dx != 0.0 or dy != 0.0:
-                top = _follow(heights, pyramid, (float(col), float(row)), (dx, dy), top, stop)
+                top = _follow(heights, pyramid, (float(col), float(row)), (dx, dy), top, 0.0, stop)
             out[row, col] = top - h
+
+
+#: What `find_hidden` says of a pixel: it is seen; something is in the way; nothing is as far as the heights reach.
+SEEN, HIDDEN, BEYOND = 0, 1, 2
+
+
+#: Side of the blocks of posts that `quiet_blocks` tells apart.
+QUIET = 8
+
+
+@kernel
+def quiet_blocks(heights: NDArray[np.float32], slope: float, top: float) -> NDArray[np.bool_]:
+    """Blocks of `QUIET` × `QUIET` posts from which every line that rises at least so much is free.
+
+    Near by the terrain is nowhere as steep as the line; further away it is lower than the line has risen to by then.
+
+    Parameters
+    ----------
+    heights : ndarray, shape (rows, cols), float32
+        NaN = no height, which blocks nothing.
+    slope : float
+        Height per distance of two posts; from lines that do not rise no block is quiet.
+    top : float
+        No height exceeds it.
+    """
+    rows, columns = heights.shape
+    down, across = -(-rows // QUIET), -(-columns // QUIET)
+    quiet = np.ones((down, across), np.bool_)
+    low = np.full((down, across), np.inf)
+    # Steepest slope and highest post, each with those of the blocks around.
+    steep, high = np.zeros((down, across)), np.full((down, across), -np.inf)
+    for row in range(rows):
+        for col in range(columns):
+            j, i = row // QUIET, col // QUIET
+            h = heights[row, col]
+            low[j, i] = h if h < low[j, i] else low[j, i]
+            high[j, i] = h if h > high[j, i] else high[j, i]
+            x = h - heights[row, min(col + 1, columns - 1)]
+            y = h - heights[min(row + 1, rows - 1), col]
+            # Of a bilinear mesh the slopes along its four sides bound all others.
+            steep[j, i] = abs(x) if abs(x) > steep[j, i] else steep[j, i]
+            steep[j, i] = abs(y) if abs(y) > steep[j, i] else steep[j, i]
+    _widen(steep)
+    least = low.min()
+    for j in range(down):
+        for i in range(across):
+            quiet[j, i] = np.sqrt(2.0) * steep[j, i] < slope
+    if not slope > 0.0:
+        return quiet
+    _widen(high)
+    for ring in range(1, max(down, across) + 1):
+        risen = slope * QUIET * ring
+        _widen(high)
+        for j in range(down):
+            for i in range(across):
+                quiet[j, i] &= high[j, i] <= low[j, i] + risen
+        if least + risen >= top:
+            break
+    return quiet
+
+
+@inner
+def _widen(values: NDArray[np.float64]) -> None:
+    """The largest of each block and the eight around it, in place."""
+    for j in range(values.shape[0]):
+        before = values[j, 0]
+        for i in range(values.shape[1]):
+            here = values[j, i]
+            values[j, i] = max(before, here, values[j, min(i + 1, values.shape[1] - 1)])
+            before = here
+    for i in range(values.shape[1]):
+        before = values[0, i]
+        for j in range(values.shape[0]):
+            here = values[j, i]
+            values[j, i] = max(before, here, values[min(j + 1, values.shape[0] - 1), i])
+            before = here
+
+
+@kernel
+def find_hidden(
+    heights: NDArray[np.float32],
+    pyramid: Pyramid,
+    corner: tuple[int, int],
+    nodes: NDArray[np.float64],
+    levels: tuple[float, float],
+    top: float,
+    limits: tuple[float, float],
+    quiet: NDArray[np.bool_],
+    out: NDArray[np.uint8],
+) -> None:
+    """Whether the lines of sight from the pixels of a tile to a source are free.
+
+    Parameters
+    ----------
+    heights : ndarray, shape (rows, cols), float32
+        Relief of the tile and of what is around it; NaN = no surface, which hides nothing.
+    pyramid : tuple
+        `pyramid_of(heights)`.
+    corner : (int, int)
+        Column and row of the tile's first pixel in `heights`.
+    nodes : ndarray, shape (2, m, n, 5)
+        Directions to the source at two levels, m rows and n columns of nodes spread over the tile from its first to its
+        last pixel: steps in column, row and height, and what is left of the depth and by how much a step lessens it.
+        Interpolated linearly; a source at a point is the case where that is exact.
+    levels : (float, float)
+        Their heights.
+    top : float
+        A height that nothing exceeds.
+    limits : (float, float)
+        By how much ground may rise above a line, in heights, and how far a line is followed, columns or rows.
+    quiet : ndarray of bool
+        `quiet_blocks` of the heights: lines from there are not followed.
+    out : ndarray, shape (height, width), uint8
+        `SEEN`, `HIDDEN` or `BEYOND`.
+    """
+    rows, columns = heights.shape
+    m, n = nodes.shape[1], nodes.shape[2]
+    step_v, step_u = (m - 1) / max(out.shape[0] - 1, 1), (n - 1) / max(out.shape[1] - 1, 1)
+    d = np.empty(5)
+    for row in range(out.shape[0]):
+        j = min(np.int64(row * step_v), m - 2)
+        fv = row * step_v - j
+        for col in range(out.shape[1]):
+            x, y = corner[0] + col, corner[1] + row
+            h = np.float64(heights[y, x])
+            out[row, col] = SEEN
+            if np.isnan(h) or quiet[y // QUIET, x // QUIET]:
+                continue
+            i = min(np.int64(col * step_u), n - 2)
+            fu = col * step_u - i
+            fh = (h - levels[0]) / (levels[1] - levels[0])
+            for k in range(5):
+                low = (1.0 - fv) * ((1.0 - fu) * nodes[0, j, i, k] + fu * nodes[0, j, i + 1, k]) + fv * (
+                    (1.0 - fu) * nodes[0, j + 1, i, k] + fu * nodes[0, j + 1, i + 1, k]
+                )
+                high = (1.0 - fv) * ((1.0 - fu) * nodes[1, j, i, k] + fu * nodes[1, j, i + 1, k]) + fv * (
+                    (1.0 - fu) * nodes[1, j + 1, i, k] + fu * nodes[1, j + 1, i + 1, k]
+                )
+                d[k] = low + fh * (high - low)
+            t = (top - h) / d[2] if d[2] > 0.0 else np.inf
+            if d[4] > 0.0:
+                t = min(t, d[3] / d[4])
+            if not d[3] > 0.0:
+                continue
+            # As far as there are heights, but whatever the tile no further than the limit.
+            cut = min(t, limits[1] / max(abs(d[0]), abs(d[1]), 1e-300))
+            for k in range(2):
+                at, last = (x, columns - 1) if k == 0 else (y, rows - 1)
+                if d[k] > 0.0:
+                    cut = min(cut, (last - at) / d[k])
+                elif d[k] < 0.0:
+                    cut = min(cut, -at / d[k])
+            dx, dy = d[0] * cut, d[1] * cut
+            if max(abs(dx), abs(dy)) >= 1e-3:
+                begin = h + limits[0]
+                end = begin + d[2] * cut
+                if _follow(heights, pyramid, (float(x), float(y)), (dx, dy), begin, end, True) == np.inf:
+                    out[row, col] = HIDDEN
+                    continue
+            if cut < t:
+                out[row, col] = BEYOND

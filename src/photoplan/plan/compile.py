@@ -13,8 +13,7 @@ from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.boxes import blocks_in_image, judge_boxes
 from photoplan.kernels.weights import KERNELS
-from photoplan.plan.anchors import Anchors
-from photoplan.plan.bends import Positions, bend_errors
+from photoplan.plan.anchors import Anchors, Positions, bend_errors
 from photoplan.plan.field import FieldGrid, FieldTable, field_grid
 from photoplan.plan.ground import CORNERS, SQUARE, Boxes, TileGround
 

@@ -12,7 +12,19 @@ from numpy.typing import NDArray
 from photoplan.cameras.base import Projection
 from photoplan.errors import UsageError
 from photoplan.plan.ground import TileGround
+from photoplan.plan.visibility import hidden_pixels
 from photoplan.surfaces.base import Surface
+
+
+@dataclass(frozen=True, eq=False)
+class Share:
+    """Who paints the pixels of a tile."""
+
+    owner: NDArray[np.uint16] | None
+    """Row of the table of sources, plus one, for every pixel, shape (height, width); 0: no source. None: there is one
+    source, and it paints whatever it shows."""
+    hidden: NDArray[np.bool_] | None = None
+    """Pixels that lie in images, but that no source sees, painted or not; None: nobody has asked."""
 
 
 class Ownership(Protocol):
@@ -21,8 +33,8 @@ class Ownership(Protocol):
     What a pixel gets depends on the pixel alone, never on the window in which it is asked for, so that tiles join.
     """
 
-    def owner(self, ground: TileGround, cameras: Mapping[int, Projection], surface: Surface) -> NDArray[np.uint16]:
-        """Row of the table of sources, plus one, for every pixel of a tile; 0: no source.
+    def share(self, ground: TileGround, cameras: Mapping[int, Projection], surface: Surface) -> Share:
+        """Who paints each pixel of a tile.
 
         Parameters
         ----------
@@ -32,10 +44,6 @@ class Ownership(Protocol):
             By row of the table of sources, of those that can paint in the tile: nobody else may be chosen.
         surface : Surface
             What the depth was taken from; what hides a pixel may lie beyond the tile.
-
-        Returns
-        -------
-        ndarray, shape (height, width), uint16
         """
         ...
 
@@ -51,10 +59,24 @@ class GivenOwners:
         if self.raster.ndim != 2 or self.raster.dtype != np.uint16:
             raise UsageError(f"owners of shape {self.raster.shape} and type {self.raster.dtype}; a raster of uint16")
 
-    def owner(self, ground: TileGround, cameras: Mapping[int, Projection], surface: Surface) -> NDArray[np.uint16]:
+    def share(self, ground: TileGround, cameras: Mapping[int, Projection], surface: Surface) -> Share:
         """The part of the raster that lies in the tile's window."""
         target, window = ground.target, ground.window
         right, bottom = window.stop
         if window & target.window != window or self.raster.shape != (target.window.height, target.window.width):
             raise UsageError(f"owners of shape {self.raster.shape} do not cover {window} of {target.window}")
-        return np.ascontiguousarray(self.raster[window.row : bottom, window.col : right])
+        return Share(np.ascontiguousarray(self.raster[window.row : bottom, window.col : right]))
+
+
+@dataclass(frozen=True)
+class InSight:
+    """One source, and a look at which pixels it sees."""
+
+    paints_hidden: bool = False
+    """Whether it paints those too that something hides, with what hides them."""
+
+    def share(self, ground: TileGround, cameras: Mapping[int, Projection], surface: Surface) -> Share:
+        """The only source paints what it sees, or all."""
+        ((row, camera),) = cameras.items()
+        hidden = hidden_pixels(camera, ground, surface)
+        return Share(None if self.paints_hidden else np.where(hidden, 0, row + 1).astype(np.uint16), hidden)

@@ -1,4 +1,4 @@
-"""A product before its pixels: target, table of sources, tiles, and how each tile is compiled."""
+"""A product before its pixels: target, table of sources, tiles, who paints which pixel, how tiles are compiled."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from photoplan.geometry.grid import Window
 from photoplan.plan.anchors import Anchors
 from photoplan.plan.compile import AnchorRule, compile_anchors
 from photoplan.plan.ground import TileGround
-from photoplan.plan.owner import Ownership
+from photoplan.plan.owner import Ownership, Share
 from photoplan.plan.tiles import Tile, Tiles
 from photoplan.surfaces.base import Surface
 from photoplan.targets.base import Target
@@ -52,8 +52,9 @@ class CompiledTile:
     layers: tuple[Layer, ...]
     """Sources that paint a part of it, each once; those that show none of it are left out."""
     owner: NDArray[np.uint16] | None
-    """Row of the table of sources, plus one, that paints each pixel, shape (height, width); 0: none. None: there is
-    one source, and it paints whatever it shows."""
+    """See `Share.owner`."""
+    hidden: NDArray[np.bool_] | None
+    """See `Share.hidden`."""
 
     @property
     def residual(self) -> float:
@@ -108,14 +109,14 @@ def compile_tile(product: ProductPlan, tile: Tile, cameras: Mapping[int, Project
     """
     relief = surface.relief(product.target, tile.window)
     ground = TileGround.of(product.target, tile.window, relief)
-    owner = None if product.owners is None else product.owners.owner(ground, cameras, surface)
+    share = Share(None) if product.owners is None else product.owners.share(ground, cameras, surface)
     wanted, parts = ground.ranges[None], np.array([[0, 0, tile.window.width, tile.window.height]])
-    if owner is not None:
-        wanted, parts = ground.owned(owner, tile.sources, len(product.sources))
+    if share.owner is not None:
+        wanted, parts = ground.owned(share.owner, tile.sources, len(product.sources))
     layers = []
     for source, mine, part in zip(tile.sources, wanted, parts):
         anchors = compile_anchors(cameras[source], ground, product.rule, mine)
         if anchors is not None:
             level = product.rule.level(anchors)
             layers.append(Layer(source, level, anchors.at_level(level, cameras[source].size), part))
-    return CompiledTile(tile.window, relief, tuple(layers), owner)
+    return CompiledTile(tile.window, relief, tuple(layers), share.owner, share.hidden)

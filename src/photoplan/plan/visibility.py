@@ -1,0 +1,200 @@
+"""Which pixels of a tile a source sees: lines of sight through the product's own coordinates.
+
+A line of sight is where (u, v, h) keeps its image position. For a source at a point over a map it is straight, and its
+direction at a pixel, times the depth, is linear in (u, v, h): a few nodes tell all directions of a tile. Relief of the
+tile and of what is around it, as far as anything there can be in the way, decides; lines that leave that part too low
+are followed to the terrain itself. A product's depth grows towards whoever looks at it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.base import Projection, project
+from photoplan.errors import UsageError
+from photoplan.geometry.grid import Window
+from photoplan.kernels.pyramid import pyramid_of
+from photoplan.kernels.visibility import BEYOND, HIDDEN, find_hidden, quiet_blocks
+from photoplan.plan.ground import TileGround
+from photoplan.surfaces.base import Surface, Terrain
+from photoplan.targets.base import Target
+from photoplan.targets.map import MapTarget
+
+#: Nodes of directions along a side of a tile.
+_NODES = 5
+#: What is looked at around a tile as a raster, pixels to each side; longer lines are followed to the terrain itself.
+MOST_AROUND = 512
+#: Points from which derivatives of the projection are taken are so far apart, pixels.
+_STEP = 8.0
+#: A source is at a point only if that is less than this many pixels away; else its lines of sight are parallel.
+_FAR = 1e8
+#: No line is followed further than this, pixels.
+_MOST_PIXELS = 1e6
+#: Ground that is met no further than this before a place is the place itself, pixels.
+_SHORT = 0.1
+#: Lines that are followed at once.
+_BATCH = 200_000
+
+
+@dataclass(frozen=True, eq=False)
+class SightLines:
+    """Directions from places of a product to a source."""
+
+    step: NDArray[np.float64]
+    """Change of (u, v, h) along the line, shape (..., 3)."""
+    depth: NDArray[np.float64]
+    """Depth of the place and by how much a step lessens it, shape (..., 2): the source is their quotient in steps away.
+    The second is zero where lines are parallel; a depth that is not positive lies behind the source."""
+
+    @property
+    def length(self) -> NDArray[np.float64]:
+        """Steps to the source, shape (...); infinite where lines are parallel."""
+        with np.errstate(divide="ignore"):
+            return np.abs(self.depth[..., 0] / self.depth[..., 1])
+
+
+def sight_lines(projection: Projection, target: Target, uvh: NDArray[np.float64]) -> SightLines:
+    """Directions in which the image position of places (..., 3) stays the same, towards the source.
+
+    With homogeneous positions (X, Y, w) and their gradients they are w ∇X×∇Y + X ∇Y×∇w + Y ∇w×∇X, which for a central
+    projection is linear in (u, v, h) and points to the centre.
+    """
+    metre = np.linalg.norm(target.to_ground(uvh + np.array([1.0, 0, 0])) - target.to_ground(uvh), axis=-1)
+    size = np.stack(np.broadcast_arrays(1.0, 1.0, metre), axis=-1) * _STEP
+    offsets = np.eye(3)[:, None] * np.array([-1.0, 1.0])[:, None] * size[..., None, None, :]
+    ends = projection.project_homogeneous(target.to_ground(uvh[..., None, None, :] + offsets))
+    # Gradients of X, Y and w by (u, v, h), which is the axis that held the offsets.
+    dX, dY, dw = np.moveaxis((ends[..., 1, :] - ends[..., 0, :]) / (2 * size[..., None]), -1, 0)
+    X, Y, w = np.moveaxis(projection.project_homogeneous(target.to_ground(uvh)), -1, 0)
+    step = w[..., None] * np.cross(dX, dY) + X[..., None] * np.cross(dY, dw) + Y[..., None] * np.cross(dw, dX)
+    step /= np.abs(step).max(initial=1e-300)
+    nearing = -(dw * step).sum(axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixels = np.abs(w / nearing) * np.linalg.norm(step * (_STEP / size), axis=-1)
+    parallel = not np.median(pixels) < _FAR
+    sign = np.where(step[..., 2] < 0 if parallel else nearing * w < 0, -1.0, 1.0)
+    depth = np.stack([w, np.zeros_like(w) if parallel else sign * nearing], axis=-1)
+    return SightLines(sign[..., None] * step, depth)
+
+
+def hidden_pixels(projection: Projection, ground: TileGround, surface: Surface) -> NDArray[np.bool_]:
+    """Pixels of a tile that lie in the image, but that something hides.
+
+    Parameters
+    ----------
+    projection : Projection
+        The source.
+    ground : TileGround
+        A tile of a map.
+    surface : Surface
+        Terrain: what the tile's relief was taken from, and what may be in the way.
+
+    Returns
+    -------
+    ndarray of bool, shape (height, width)
+        The surface counts as bilinear between the pixels' centres, so that the border of a hidden area is known to half
+        a pixel; False where there is no surface, and outside the image. What a pixel gets does not depend on the tile
+        if the projection is linear but for its field; else pixels at such borders may.
+
+    Raises
+    ------
+    UsageError
+        The product is no map: what may be in the way beyond a tile is not known.
+    """
+    window, target = ground.window, ground.target
+    none = np.zeros((window.height, window.width), bool)
+    low, high = float(ground.ranges[0].min()), float(ground.ranges[1].max())
+    if not low <= high:
+        return none
+    if not isinstance(target, MapTarget):
+        raise UsageError(f"visibility over {type(target).__name__}; it is known for maps")
+    pad = 0.01 + 1e-6 * max(abs(low), abs(high))
+    levels = low - pad, high + pad
+    lines = sight_lines(projection, target, _nodes(window, levels))
+    if not np.isfinite(lines.step).all() or not (lines.depth[..., 0] > 0).any():
+        return none
+    # Over a map every surface is terrain.
+    terrain: Any = surface
+    top, needed = _search(terrain, target, window, lines, levels)
+    m = MOST_AROUND
+    around = needed & Window(window.col - m, window.row - m, window.width + 2 * m, window.height + 2 * m)
+    relief = ground.relief if around == window else surface.relief(target, around)
+    # Where the raster ends before the lines do, no part of it is quiet.
+    quiet = quiet_blocks(relief, _flattest(lines) if around == needed else 0.0, top)
+    if quiet.all():
+        return none
+    nodes = np.concatenate([lines.step, lines.depth], axis=-1)
+    corner = window.col - around.col, window.row - around.row
+    slack = 4 * float(np.finfo(np.float32).eps) * max(abs(low), abs(high), 1.0)
+    found = np.zeros(none.shape, np.uint8)
+    find_hidden(relief, pyramid_of(relief), corner, nodes, levels, top, (slack, float(MOST_AROUND)), quiet, found)
+    far = np.argwhere(found == BEYOND)
+    for part in np.array_split(far, -(-len(far) // _BATCH)) if len(far) else ():
+        found[tuple(part.T)] = np.where(_met(projection, terrain, target, _places(ground, part), top), HIDDEN, 0)
+    hidden = found == HIDDEN
+    there = np.argwhere(hidden)
+    xy = project(projection, target.to_ground(_places(ground, there)))
+    hidden[tuple(there.T)] = ((xy >= -0.5) & (xy <= np.array(projection.size) - 0.5)).all(axis=-1)
+    return hidden
+
+
+def _nodes(window: Window, levels: tuple[float, float]) -> NDArray[np.float64]:
+    """Places (2, _NODES, _NODES, 3) over a tile at two levels, from its first to its last pixel."""
+    u = np.linspace(window.col, max(window.stop[0] - 1, window.col + 1), _NODES)
+    v = np.linspace(window.row, max(window.stop[1] - 1, window.row + 1), _NODES)
+    h, v, u = np.meshgrid(levels, v, u, indexing="ij")
+    return np.stack([u, v, h], axis=-1)
+
+
+def _search(
+    terrain: Terrain, target: MapTarget, window: Window, lines: SightLines, levels: tuple[float, float]
+) -> tuple[float, Window]:
+    """A height that nothing on the lines of sight exceeds, and the pixels below them up to that height."""
+    foot = _nodes(window, levels)[0]
+    step, length = lines.step[0], lines.length[0]
+    top = levels[1]
+    while True:
+        with np.errstate(divide="ignore"):
+            rise = np.where(step[..., 2] > 0, (top - levels[0]) / step[..., 2], np.inf)
+            longest = _MOST_PIXELS / np.abs(step[..., :2]).max(axis=-1)
+        end = foot + np.minimum(np.minimum(rise, length), longest)[..., None] * step
+        places = np.concatenate([foot, end])[..., :2].reshape(-1, 2)
+        (col, row), (right, bottom) = np.floor(places.min(axis=0)) - 1, np.ceil(places.max(axis=0)) + 2
+        needed = Window(int(col), int(row), int(right - col), int(bottom - row))
+        corners = target.grid.to_map(np.array([(col, bottom), (right, row)]))
+        highest = float(terrain.height_range(corners.ravel())[1])
+        if not highest > top:
+            return top, needed
+        top = highest
+
+
+def _flattest(lines: SightLines) -> float:
+    """Least slope of the lines of sight of a tile, height per pixel; the quotient of a linear and a convex function is
+    least at a node."""
+    with np.errstate(divide="ignore"):
+        return float((lines.step[..., 2] / np.hypot(lines.step[..., 0], lines.step[..., 1])).min())
+
+
+def _places(ground: TileGround, pixels: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(u, v, h) of pixels (n, 2) of a tile given by row and column."""
+    row, col = pixels.T
+    return np.stack([col + ground.window.col, row + ground.window.row, ground.relief[row, col].astype(float)], axis=-1)
+
+
+def _met(
+    projection: Projection, terrain: Terrain, target: MapTarget, uvh: NDArray[np.float64], top: float
+) -> NDArray[np.bool_]:
+    """Whether terrain is met on the way down from the source to places (n, 3), before they are reached."""
+    lines = sight_lines(projection, target, uvh)
+    with np.errstate(divide="ignore"):
+        rise = np.where(lines.step[:, 2] > 0, (top - uvh[:, 2]) / lines.step[:, 2], np.inf)
+        longest = _MOST_PIXELS / np.abs(lines.step[:, :2]).max(axis=-1)
+    start = uvh + np.minimum(np.minimum(rise, lines.length), longest)[:, None] * lines.step
+    paths = target.to_ground(np.stack([start, uvh], axis=1))
+    hits = terrain.first_hit(paths)
+    short = np.linalg.norm((hits.XYZ - paths[:, 1])[:, :2], axis=1) > _SHORT * target.grid.resolution
+    return np.asarray(np.isfinite(hits.along) & short)
