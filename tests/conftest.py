@@ -22,6 +22,26 @@ settings.load_profile("same")
 CHECKOUT = Path(__file__).resolve().parents[1]
 
 
+#: Files that take longest, the longest first: one that began last would keep one process busy when all others are done.
+DEAR = (
+    "products/test_every_run.py",
+    "real/test_brighton_chain.py",
+    "real/test_m3_terrain.py",
+    "cli/test_run_faults.py",
+)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Files are handed to processes in the order of the tests, not those with many tests first."""
+    config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Dear files come first."""
+    order = {CHECKOUT / "tests" / name: k for k, name in enumerate(DEAR)}
+    items.sort(key=lambda item: order.get(item.path, len(order)))
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """The folder with test data beside the checkout."""

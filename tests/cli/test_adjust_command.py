@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from tools.adjust_project import Make, write_project
 from tools.command import Here, edit, process
+from tools.recorded import recorded
 
 pytest.importorskip("matplotlib")
 
@@ -25,9 +26,13 @@ def test_a_block_is_adjusted(tmp_path: Path) -> None:
     assert any("warning: 3 check points" in line for line in lines)
     assert "8 images · " in said.err
     assert "calibrated cam: c" in said.err
-    assert "iteration" not in said.err  # progress is for terminals
+    # Progress is for terminals; elsewhere there is a line now and then.
+    iterations = json.loads((folder / "report.json").read_text())["iterations"]
+    assert iterations > 3 * said.err.count("iteration")
     assert "orientations of 8 images written into the project" in said.err
     assert "sigma_center" in made.project_text()
+    record = recorded(folder / "report.run.json", "adjust", made.path, *made.path.parent.glob("*.csv"))
+    assert record["product"]["iterations"] == iterations and record["settings"]["calibrate"] == ["cam=c"]
 
 
 def test_json_quiet_and_dry_run(photoplan: Here, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import pytest
 import rasterio
 from tools.camera_model import Sensor, write_frame
 from tools.command import Here
+from tools.recorded import recorded
 
 SENSOR = Sensor(
     shape=(64, 80),
@@ -151,6 +152,7 @@ def test_report_tables_and_json(folder, tmp_path, run):
     gain = next(r for r in rows if r["analysis"] == "photon_transfer" and r["name"] == "gain_dn_e")
     assert float(gain["value"]) == pytest.approx(0.4, rel=0.02)
     assert (tables / "defects_list.csv").exists()
+    recorded(tables / "figures.run.json", "characterise", folder / "series.toml")
     again = run("characterise", folder / "series.toml", "--report", report)
     assert again.code == 2 and "--overwrite" in again.err
     again = run("characterise", folder / "series.toml", "--csv", tables)

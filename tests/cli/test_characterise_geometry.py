@@ -189,6 +189,20 @@ def test_gain_control_after_both_steps(photoplan: Here, tmp_path: Path) -> None:
     assert found["asymmetry_dn", ""][0] == pytest.approx(17, abs=1.5)
 
 
+@pytest.mark.parametrize("full", [255.0, 200.0])
+def test_a_saturated_transition_is_refused(photoplan: Here, tmp_path: Path, full: float) -> None:
+    """Also where the camera is full below the largest grey value, which step frames alone do not state."""
+    rng = np.random.default_rng(5)
+    t = np.arange(40) * 0.2
+    course = np.where(t < 1, 60.0, full + 4 - 17 * np.exp(-(t - 1) / 1.5))
+    frames = [np.minimum(np.full((16, 16), v) + rng.normal(0, 2, (16, 16)), full) for v in course]
+    write_series(tmp_path, "a", frames, {"time_s": t})
+    text = '[[frames]]\nfiles = "a_*.tif"\nkind = "step"\ntable = "a.csv"\nname = "a"\n'
+    said = refused(photoplan, tmp_path, text, "gain_control")
+    assert "is saturated in the window" in said and "take the series with less light" in said.casefold()
+    assert (f"cut off at {full:g} DN" in said) == (full < 255)
+
+
 PLUMB = """
 [camera]
 line_frequency_hz = 15625.0

@@ -11,6 +11,7 @@ import rasterio
 from tools.command import Here
 from tools.proposed import residuals, spoilt
 from tools.real_projects import drone_project
+from tools.recorded import recorded
 
 from photoplan.io.ground_points import read_ground_points
 from photoplan.io.image_points import read_image_points
@@ -58,6 +59,8 @@ def test_control_is_proposed_that_fits_the_true_orientation(
     assert (points.sigma >= 0.1).all()
     spread = np.ptp(ground.XYZ, axis=0)
     assert min(spread[:2]) > 40
+    record = recorded(near.with_name("control.run.json"), "control", near)
+    assert record["product"]["points"] == len(ground) and record["settings"]["grid"] == 8
 
 
 def test_json_and_refusal_of_files_that_exist(photoplan: Here, block: Path, near: Path) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tools.orientation_blocks import CAMERA, GROUND, NAMES, block, our_pixels
+from tools.recorded import recorded
 
 from photoplan.geometry.rotation import angles_from_rotation
 from photoplan.io.orientation.file import FORMATS, orientation_format, read_orientation, write_orientation
@@ -23,6 +24,7 @@ def test_paths_on_stdout_and_what_is_lost_on_stderr(photoplan, toml, tmp_path):
     assert "3 images, from toml to bingo" in said.err
     assert "bingo holds no cameras ('DMC')" in said.err
     assert "bingo holds no coordinate system" in said.err
+    assert recorded(tmp_path / "itera.run.json", "convert", toml)["settings"]["target"] == "bingo"
     quiet = photoplan("convert", toml, "--to", "csv", "-o", tmp_path / "t.csv", "-q")
     assert quiet.out.split("\n")[:2] == [str(tmp_path / "t.csv"), str(tmp_path / "t.prj")]
     assert quiet.err == ""

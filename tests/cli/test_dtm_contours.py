@@ -12,6 +12,7 @@ import pyogrio
 import pytest
 import shapely
 from tools.dem_file import X0, Y0, write_dem
+from tools.recorded import recorded
 from tools.small_model import write_small
 
 from photoplan.errors import UsageError
@@ -49,6 +50,7 @@ def test_contours_and_labels_in_every_format(hill: Path, tmp_path: Path, photopl
     assert said.code == 0, said.err
     facts = json.loads(said.out)
     assert facts["lines"] > 10 and facts["labels"] > 2 and facts["depressions"] == 4
+    assert recorded(out.with_suffix(".run.json"), "contours", hill)["product"]["lines"] == facts["lines"]
     if suffix == ".dxf":
         found = rows(out)
         text = found["Layer"] == "CONTOUR_LABEL"
@@ -184,7 +186,7 @@ def test_fault_03_what_a_killed_run_left_is_cleared_away(hill: Path, tmp_path: P
     (left / "c.gpkg").write_bytes(b"torn")
     said = photoplan("dtm", "contours", hill, "--interval", 5, "-o", tmp_path / "c.gpkg", "-q")
     assert said.code == 0, said.err
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["c.gpkg", "hill.tif"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["c.gpkg", "c.run.json", "hill.tif"]
 
 
 def test_fault_26_two_runs_on_one_output(hill: Path, tmp_path: Path, photoplan: Any) -> None:

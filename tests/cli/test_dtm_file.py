@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import rasterio
 from tools.command import Here
+from tools.recorded import recorded
 from tools.small_block import write_terrain
 from tools.small_model import EMPTY, LAYOUT, hills, write_small, write_units_of
 
@@ -46,7 +47,9 @@ class TestInfo:
         assert found["points"] == sum(10 * c + r for c in range(4) for r in range(3) if (c, r) != EMPTY)
         assert found["gross_errors"][0]["name"] == "p 17" and found["gross"] == 1
         assert found["spread"] == pytest.approx(1.01)
-        assert "p 17  mass" in photoplan("dtm", "info", model, "--gross").out
+        assert found["suspect_points"][0]["name"] == "p 18" and found["suspects"] == 1
+        listed = photoplan("dtm", "info", model, "--gross").out
+        assert "\np 17  mass" in listed and "suspect: p 18  mass" in listed
 
     def test_a_raster_is_shown_as_by_info(self, photoplan: Here, tmp_path: Path) -> None:
         dem = write_terrain(tmp_path / "dem.tif")
@@ -85,6 +88,7 @@ class TestSample:
         report = json.loads(said.out)
         outside = int(np.isnan(heights).sum())
         assert report["points"] == 500 and report["outside"] == outside
+        assert recorded(tmp_path / "out.run.json", "sample", model, points)["product"]["outside"] == outside
         assert 0 < outside < 500 and report["height_system"] == "EPSG:5773"
         assert report["sigma"] == pytest.approx(np.sqrt(np.nanmean(sigmas**2)))
         beyond = (xy < [xmin, ymin]).any(axis=1) | (xy > [xmax, ymax]).any(axis=1)

@@ -12,6 +12,7 @@ import pyogrio.raw
 import pytest
 import shapely
 from tools.command import Here
+from tools.recorded import recorded
 from tools.small_block import write_terrain
 from tools.small_model import CRS, LAYOUT, LINED, WALL, write_small
 
@@ -49,6 +50,7 @@ def read(path: Path) -> dict[str, np.ndarray]:
 def test_straight_between_points_is_the_surface(photoplan: Here, model: Path, lines: Path, tmp_path: Path) -> None:
     said = photoplan("dtm", "profile", model, lines, "-o", tmp_path / "o.csv", "--tolerance", 0.002)
     assert said.code == 0 and said.out.strip() == str(tmp_path / "o.csv")
+    assert recorded(tmp_path / "o.run.json", "profile", model, lines)["settings"]["tolerance"] == 0.002
     found = read(tmp_path / "o.csv")
     surface = HybridSurface(ModelReader(model))
     for points, ends in ((found["across"], ACROSS), (found["beyond"], BEYOND)):

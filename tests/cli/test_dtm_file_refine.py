@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tools.command import Here
+from tools.recorded import recorded
 from tools.small_model import LAYOUT, grid_unit, hills, parts, write_units_of
 
 from photoplan.io.terrain.model_read import ModelReader
@@ -48,6 +49,7 @@ def test_fine_inside_coarse_outside_joined_between(
     said = photoplan("dtm", "refine", coarse, fine, "--polygons", where, "--transition", BAND, "-o", out, "--json")
     assert said.code == 0, said.err
     report = json.loads(said.out)
+    assert recorded(tmp_path / "refined.run.json", "refine", coarse, fine, where)["settings"]["transition"] == BAND
     assert report["largest_change"] == pytest.approx(BUMP, abs=0.05) and 0 < report["changed"] <= report["units"]
     reader = ModelReader(out)
     surface, before = HybridSurface(reader), HybridSurface(ModelReader(coarse))
@@ -95,14 +97,15 @@ def test_gross_errors_and_lines_of_the_model_that_counts(files: tuple[Path, Path
             meshes = np.full((layout.rows, layout.columns), figures[0].meshes)
             header = replace(before.header, layout=layout)
             cut = [on_grid(line, layout, meshes)]
-            writer.finish(replace(parts(layout), header=header, lines=cut, gross=gross, domain=None))
+            writer.finish(replace(parts(layout), header=header, lines=cut, gross=gross, suspects=gross, domain=None))
 
     coarse, fine, where = files
     with_lists(coarse, LAYOUT, "coarse")
     with_lists(fine, FINE, "fine")
     dtm_refine(RefineRequest(coarse, fine, where, tmp_path / "r.gpkg", BAND))
     reader = ModelReader(tmp_path / "r.gpkg")
-    assert sorted(g.name for g in reader.gross()) == ["coarse out", "fine in"]
+    for some in (reader.gross(), reader.suspects()):
+        assert sorted(g.name for g in some) == ["coarse out", "fine in"]
     xmin, _, xmax, _ = INNER
     for line in reader.lines():
         x = line.xyz[:, 0]

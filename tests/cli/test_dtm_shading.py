@@ -12,7 +12,7 @@ import rasterio
 from tools.dem_file import X0, Y0, write_dem
 from tools.small_model import write_small
 
-from photoplan.terrain.shading.tints import RAMPS
+from photoplan.terrain.shading import RAMPS
 
 
 @pytest.fixture

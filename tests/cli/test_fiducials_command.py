@@ -11,6 +11,7 @@ import pytest
 import rasterio
 from tools.command import Here
 from tools.mark_scans import ARM, CORNERS, FREE, LINE, RADIUS, Simulated, simulate
+from tools.recorded import recorded
 
 from photoplan.io.project.cameras import fiducial_fit
 from photoplan.io.project.file import load_project
@@ -196,6 +197,8 @@ def test_a_project_receives_the_marks_and_the_size(scans, tmp_path: Path, photop
     assert project.image("digital").fiducials is None
     text = path.read_text()
     assert "# A comment that stays." in text
+    record = recorded(path.with_name(f"{path.stem}.fiducials.run.json"), "fiducials", path)
+    assert record["inputs"][0]["size"] == len(before.encode())  # the project as it was read
     assert "# one more" in text
 
 

@@ -13,6 +13,7 @@ import pytest
 import rasterio
 from tools.command import Here
 from tools.film_scan import Film, Scan
+from tools.recorded import recorded
 
 from photoplan.io.project.file import load_project
 
@@ -113,6 +114,7 @@ def test_the_model_is_written_to_the_camera_alone(photoplan: Here, tmp_path: Pat
     added = [line for line in path.read_text().splitlines() if line not in before.splitlines()]
     assert added == ['interior = "similarity"']
     assert path.with_suffix(".previous.toml").read_text() == before
+    recorded(path.with_name(f"{path.stem}.interior.run.json"), "interior", path)
     refused = photoplan("interior", path, "--write")
     assert refused.code == 2
     assert "--model" in refused.err

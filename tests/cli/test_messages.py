@@ -39,6 +39,25 @@ def test_the_library_names_no_option() -> None:
     assert found == []
 
 
+def test_strings_of_the_command_line_name_options_of_their_verbs() -> None:
+    """Help, errors and talk of a verb's own file; what verbs share may name the options of any."""
+    every = {o for verb in VERBS.values() for o in options_of(verb)}
+    checked, wrong = 0, []
+    for path in sorted((SOURCE / "cli").glob("*.py")):
+        module = f"photoplan.cli.{path.stem}"
+        own = {
+            o for verb in VERBS.values() if getattr(verb.callback, "__module__", "") == module for o in options_of(verb)
+        }
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                named = re.findall(r"(?<![\w-])--[a-z][a-z-]*", FOREIGN.sub("", node.value))
+                checked += len(named)
+                # The demonstration shows the other verbs' command lines.
+                known = every if "photoplan " in node.value or not own or path.stem == "demo" else own
+                wrong += [f"{path.name}:{node.lineno}: {o}" for o in named if o not in known]
+    assert wrong == [] and checked > 200
+
+
 @given(st.sampled_from(sorted(VERBS)), st.lists(st.tuples(st.sampled_from(WORDS), st.booleans()), max_size=5))
 def test_parameters_become_options_that_the_verb_has(name: str, words: list[tuple[str, bool]]) -> None:
     text = ", or ".join(f"give `{word}{'=False' * off}`" for word, off in words)

@@ -12,6 +12,8 @@ import pytest
 import rasterio
 from tools.command import Here
 from tools.edge_scenes import blocks, half_plane, mtf50_of, noisy
+from tools.optics import stray
+from tools.recorded import recorded
 
 SIZE = (330, 220)
 TOPS = {"uint8": 255, "uint16": 65535, "int16": 32767}
@@ -52,6 +54,19 @@ def refused(photoplan: Here, *words: object, code: int = 3) -> str:
 
 
 class TestFigures:
+    def test_a_wide_window_is_used(self, tmp_path: Path, photoplan: Here) -> None:
+        """8 % of the light spread by exp(−r / 8 px): 40 pixels to each side hold what 13 do not."""
+        optics = stray(0.08, 8.0, 0.6)
+        light = 0.2 + 0.6 * optics.image((140, 150), 7.0, (74.3, 70.2))
+        image = write(tmp_path / "stray.tif", noisy(light, 200, 1, "uint16", 0.6))
+        words = (image, "--linearisation", "linear", "--grid", 1, "--least-length", 60, "--roi", 0, 0, 150, 140)
+        near, far = (result(photoplan, *words, "--half-width", half)["images"][0]["edges"][0] for half in (13, 40))
+        assert near["window"] == pytest.approx([-13, 13], abs=0.1) and far["window"] == pytest.approx(
+            [-40, 40], abs=0.1
+        )
+        assert far["half_width"] == 40 and far["beyond"] < 0.5 * near["beyond"]
+        assert far["mtf50"] == pytest.approx(optics.mtf50(7.0), rel=0.015)
+
     def test_a_scene_of_known_sharpness(self, image: Path, photoplan: Here) -> None:
         """Sides of random rectangles, SNR 50: MTF50 of the mean within 1.5 %, its interval around the truth."""
         made = result(photoplan, image, "--linearisation", "linear", "--most-edges", 14, "--grid", 2)["images"][0]
@@ -178,6 +193,7 @@ class TestOutputs:
         assert text.count("data:image/png") == 4 and "Linearisation: linear" in text
         rows = list(csv.DictReader(table.open()))
         assert len(rows) == 4
+        assert recorded(tmp_path / "r.run.json", "mtf", image)["settings"]["most_edges"] == 4
         assert float(rows[0]["mtf50_low"]) < float(rows[0]["mtf50"]) < float(rows[0]["mtf50_high"])
         assert "exists already" in refused(photoplan, *words, code=2)
         assert photoplan("mtf", *words, "--overwrite", "-q").code == 0

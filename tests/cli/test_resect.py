@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import rasterio
 from click.testing import CliRunner, Result
+from tools.recorded import recorded
 
 from photoplan.cameras.base import project as project_points
 from photoplan.cameras.build import oriented_camera
@@ -114,6 +115,7 @@ def test_images_with_control_are_oriented_and_written(folder: Path) -> None:
     text = (folder / "project.toml").read_text()
     assert text.startswith("# A comment that stays.")
     assert (folder / "project.previous.toml").is_file()
+    recorded(folder / "project.resect.run.json", "resect", folder / "project.toml", folder / "control.csv")
     first = result.stdout.splitlines()
     assert first[0].startswith("a  ") and "sigma0" in first[0] and "rms 0." in first[0]
     assert first[1].strip().startswith(("X0 499999.", "X0 500000.")) and "±" in first[1]

@@ -1,6 +1,7 @@
 """`photoplan restore` without a filter: measured in the images, kept, used again; and apertures of scanners."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -29,7 +30,10 @@ def test_a_measured_filter_is_printed_kept_and_gives_the_same_again(photoplan, i
     assert first.code == 0
     assert "spread function along rows 0.6" in first.err
     assert "condition: along rows: A/Z = 0.3" in first.err
-    assert "rule: exact: the condition holds and noise grows" in first.err
+    assert "rule: regularised: least expected error; noise " in first.err
+    assert re.search(
+        r"expected: error 0\.0\d+ as it is, 0\.0\d+ regularised, 0\.0\d+ exact \(rms in light, full", first.err
+    )
     assert first.err.index("noise grows") < first.err.index("Mpx in")
     kept = tmp_path / "a" / "restoration_filter.toml"
     second = photoplan("restore", image, "--output", tmp_path / "b", "--filter", kept)
@@ -66,7 +70,9 @@ def test_dry_run_writes_nothing(photoplan, image, tmp_path):
     assert said.code == 0
     plan = json.loads(said.out)
     assert plan["filter"]["noise_gain"] > 1.5
-    assert plan["filter"]["facts"]["parts"][0]["method"] == "exact"
+    assert plan["filter"]["facts"]["parts"][0]["method"] == "regularised"
+    errors = plan["filter"]["facts"]["parts"][0]["expected_error"]
+    assert errors["regularised"] < min(errors["none"], errors["exact"])
     assert not (tmp_path / "a").exists()
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from tools.command import Here
+from tools.recorded import recorded
 
 TEMPLATES = Path(__file__).resolve().parents[2] / "docs" / "templates"
 VIDEO, FRAME = TEMPLATES / "sensor-video.toml", TEMPLATES / "sensor-frame.toml"
@@ -75,6 +76,7 @@ def test_plain_text_report_and_table(photoplan: Here, tmp_path: Path):
     assert {row["name"]: float(row["value"]) for row in rows}["jitter_px"] == pytest.approx(0.2)
     page = report.read_text("utf-8")
     assert page.count("data:image/png") == 3 and "stated elsewhere" in page
+    assert recorded(tmp_path / "sensor.run.json", "sensor", VIDEO)["file"] == "sensor.csv"
     again = photoplan("sensor", VIDEO, "--report", report)
     assert again.code == 2 and "--overwrite" in again.err
     assert photoplan("sensor", VIDEO, "--report", report, "--overwrite", "-q").code == 0

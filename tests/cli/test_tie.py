@@ -11,7 +11,7 @@ from tools.real_projects import drone_project
 
 from photoplan.io.image_points import read_image_points
 from photoplan.io.project.file import load_project
-from photoplan.products.tie import work as tie_work
+from photoplan.products.tie import inputs as tie_work
 
 NEAR = ("DJI_0025", "DJI_0026", "DJI_0033")
 FAST = ("--features", 1200, "--per-image", 150, "--workers", 1)

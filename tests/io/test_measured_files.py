@@ -7,6 +7,7 @@ import sqlite3
 import struct
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -540,3 +541,29 @@ def test_fault_08_what_is_no_measured_terrain_is_named(tmp_path: Path, name: str
 def test_fault_09_virtual_paths_are_refused() -> None:
     with pytest.raises(InputError, match="virtual"):
         read_measured([Path("/vsizip/a.zip/a.gpkg")])
+
+
+def test_codes_that_no_attribute_holds_are_an_error_that_lists_the_attributes(tmp_path: Path) -> None:
+    path = vector(tmp_path / "p.gpkg", ["POINT Z (1 2 3)", "POINT Z (4 5 6)"], Description=["G", "S"], Nr=["a", "b"])
+    options = ReadOptions(codes=CodeTable({"S": CodeClass("spot"), "*": CodeClass("mass")}))
+    with pytest.raises(InputError, match=r"none of its codes \(S\).*layer survey with Description, Nr.*`attribute`"):
+        read_measured([path], options)
+    named = read_measured([path], replace(options, attribute="Description"))
+    assert sorted(g.kind for g in named.points) == ["mass", "spot"]
+    by_layer = ReadOptions(codes=CodeTable({"survey": CodeClass("spot")}))
+    assert [g.kind for g in read_measured([path], by_layer).points] == ["spot"]
+
+
+def test_codes_that_landxml_does_not_hold(tmp_path: Path) -> None:
+    source = '<DataPoints code="7"><PntList3D>2 1 1 2 1 2</PntList3D></DataPoints>' * 2
+    path = landxml(tmp_path / "a.xml", source.replace('"7"', '"8"', 1))
+    with pytest.raises(InputError, match=r"none of its codes \(9\).*the codes 7, 8"):
+        read_measured([path], ReadOptions(codes=CodeTable({"9": CodeClass("spot")})))
+    read = read_measured([path], ReadOptions(codes=CodeTable({"7": CodeClass("spot")})))
+    assert any("read as their elements say: 8" in note for note in read.notes)
+
+
+def test_a_standard_deviation_too_large_for_a_machine_number_is_a_number() -> None:
+    assert CodeClass("mass", 10**30).sigma == 10**30
+    with pytest.raises(InputError, match="zero or more"):
+        CodeClass("mass", -(10**30))

@@ -222,3 +222,28 @@ def test_options_that_cannot_be_meant_are_refused() -> None:
         ReadOptions(dialect=Dialect(delimiter=",", decimal_comma=True))
     with pytest.raises(UsageError):
         read_measured([])
+
+
+def test_codes_that_no_column_holds_are_an_error_that_lists_the_columns(write: Write) -> None:
+    codes = CodeTable({"121": CodeClass("breakline"), "G": CodeClass("spot")}, Path("codes.toml"))
+    path = write("x,y,z,Description,Remark\n1,2,3,121,a\n4,5,6,121,b\n7,8,9,G,c\n")
+    with pytest.raises(
+        InputError, match=r"'Description' holds codes of the table .121, G.*x, y, z, Description, Remark"
+    ):
+        read_measured([path], ReadOptions(codes=codes))
+    named = ReadOptions(Dialect("x=x,y=y,z=z,code=Description"), codes)
+    assert [line.kind for line in read_measured([path], named).lines] == ["breakline"]
+    assert read_measured([path]).notes == (f"{path.name}: columns not used: Description, Remark",)
+    for text in ("x,y,z,Art\n1,2,3,bb\n4,5,6,cc\n", "1 2 3\n4 5 6\n", "x,y,z,code\n1,2,3,\n4,5,6,\n"):
+        for more in ({}, {"*": CodeClass("mass")}):
+            other = CodeTable({**codes.classes, **more}, codes.file)
+            columns = "x, y, z, Art" if "Art" in text else "x, y, z"
+            with pytest.raises(InputError, match=rf"codes.toml: none of its codes \(121, G\).*no codes.*{columns}"):
+                read_measured([write(text)], ReadOptions(codes=other))
+    only_rest = ReadOptions(codes=CodeTable({"*": CodeClass("spot")}))
+    assert {g.kind for g in read_measured([write("1 2 3\n4 5 6\n")], only_rest).points} == {"spot"}
+
+
+def test_codes_of_one_of_several_files_are_enough(write: Write) -> None:
+    points, lines = write("1 2 3\n4 5 6\n", "p.xyz"), write("x,y,z,code\n1,1,1,B\n2,2,2,B\n", "l.csv")
+    assert read_measured([points, lines], ReadOptions(codes=table(B="breakline", C="spot"))).count == 2

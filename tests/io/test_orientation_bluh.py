@@ -121,7 +121,7 @@ def test_other_conventions_are_declared(tmp_path):
         ("", "holds no image"),
         ("a 1 2 3 4 5\n", r":1: 6 columns"),
         ("a 1 2 3 4 5 6\nb 1 2 nan 4 5 6\n", r":2: image 'b': X, Y, Z, phi, omega, kappa = 'nan' is not a number"),
-        ("a 1 2 3 4 5 401\n", r":1: image 'a': kappa = 401 is more than a full circle in gon"),
+        ("a 1 2 3 4 5 401\n", r":1: image 'a': angle kappa = 401 is more than a full circle in gon"),
         ("a 1 2 3 4 5 6\r\na 1 2 3 4 5 6\r\n", r"'a' is given twice \(lines 1 and 2\)"),
         ("a 1,5 2 3 4 5 6\n", "'1,5' is not a number"),
         ("a 1 2 1e999 4 5 6\n", "'1e999' is not a number"),

@@ -147,7 +147,7 @@ def test_losses() -> None:
         (CAMERAS.replace("2 PIN", "1 PIN"), IMAGES, r"cameras\.txt:5: camera 1 is given twice"),
         (CAMERAS, IMAGES.replace("0.851773", "0.1"), r"images\.txt:5: image 'P1180141.JPG': the quaternion"),
         (CAMERAS, IMAGES.replace(" 1 P1180142", " 9 P1180142"), "camera '9' of image 'P1180142.JPG' is not described"),
-        (CAMERAS, IMAGES.replace("1.02973", "x"), r"images\.txt:5: .*numbers are needed"),
+        (CAMERAS, IMAGES.replace("1.02973", "x"), r"images\.txt:5: .*'x' is not a number"),
         (
             CAMERAS,
             IMAGES.replace("\n2362.39 248.498 58396 1784.7 268.254 59027 1784.7 268.254 -1", ""),

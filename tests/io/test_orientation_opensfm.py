@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from photoplan.errors import InputError
 from photoplan.io.orientation.file import read_orientation
-from photoplan.io.orientation.opensfm import rotation_from_axis_angle
 
 LLA = {"latitude": 46.84, "longitude": -91.99, "altitude": 150.0}
 
@@ -54,12 +53,6 @@ def test_any_pose_projects_as_the_documentation_says(tmp_path: Path) -> None:
         x, y, z = R @ X + t
         ours = table.rotations[k].T @ (X - table.centers[k])
         np.testing.assert_allclose(ours, [x, -y, -z], atol=1e-9)
-
-
-def test_axis_angle() -> None:
-    rng = np.random.default_rng(1)
-    for v in [np.zeros(3), [1e-9, 0, 0], [0, 0, np.pi], *rng.normal(size=(20, 3))]:
-        np.testing.assert_allclose(rotation_from_axis_angle(v), Rotation.from_rotvec(v).as_matrix(), atol=1e-14)
 
 
 def test_several_reconstructions_and_the_origin_beside(tmp_path: Path) -> None:

@@ -60,8 +60,8 @@ def test_a_matrix_of_other_angles_is_refused_with_its_line(tmp_path: Path) -> No
     ("change", "says"),
     [
         (lambda t: t.replace("\t910.000000", ""), r"opk\.txt:4: 15 columns"),
-        (lambda t: t.replace("910.000000", "x"), r"opk\.txt:4: .*must be numbers"),
-        (lambda t: t.replace("910.000000", "nan"), r"opk\.txt:4: nan given"),
+        (lambda t: t.replace("910.000000", "x"), r"opk\.txt:4: image .*'x' is not a number"),
+        (lambda t: t.replace("910.000000", "nan"), r"opk\.txt:4: image .*'nan' is not a number"),
         (lambda t: HEADER, "holds no image"),
         (lambda t: "# CoordinateSystem: PROJCS[\n" + t, r"opk\.txt:1: .*not a coordinate reference system"),
     ],

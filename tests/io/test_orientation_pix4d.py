@@ -222,7 +222,7 @@ def test_losses() -> None:
     ("change", "says"),
     [
         (lambda t: t.replace(" 119.812500", ""), r"external_camera_parameters\.txt:2: "),
-        (lambda t: t.replace("119.812500", "inf"), r"external_camera_parameters\.txt:2: inf given"),
+        (lambda t: t.replace("119.812500", "inf"), r"external_camera_parameters\.txt:2: .*'inf' is not a number"),
         (lambda t: t.replace("imageName", "image"), "begins neither"),
         (lambda t: t.split("\n")[0], "holds no image"),
     ],

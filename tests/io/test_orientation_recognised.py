@@ -37,7 +37,7 @@ def test_every_format_is_called_as_in_the_registry() -> None:
 @pytest.mark.parametrize("via", [("metashape", "pix4d", "opensfm"), ("pix4d", "opk", "odm"), ("odm", "opk", "pix4d")])
 def test_a_chain_of_formats_keeps_the_poses(tmp_path: Path, via: tuple[str, ...]) -> None:
     """Map to map, through the formats of four programs: what remains is rounding."""
-    from photoplan.products.convert.run import ConvertRequest, convert_orientation, read_block
+    from photoplan.products.convert import ConvertRequest, convert_orientation, read_block
 
     start = block_of({"a": frame("opencv", focal_px=3100.0)}, crs="EPSG:32632", height_system="ellipsoidal")
     path = tmp_path / "start.toml"

@@ -94,7 +94,7 @@ def test_fault_18_decimal_comma_is_read_when_declared_and_hinted_at_when_not(tmp
         (HEAD + "a.jpg,0x10,2,3,4,5,6\n", ":2: x = '0x10'"),
         (HEAD + ",1,2,3,4,5,6\n", ":2: the image has no name"),
         (HEAD + ROWS + "a.jpg,1,2,3,4,5,6\n", r"'a\.jpg' is given twice \(lines 2 and 4\)"),
-        (HEAD + "a.jpg,1,2,3,4,5,361\n", ":2: kappa = 361 is more than a full circle in deg"),
+        (HEAD + "a.jpg,1,2,3,4,5,361\n", ":2: image 'a.jpg': angle kappa = 361 is more than a full circle in deg"),
         (HEAD + '"a.jpg,1,2,3,4,5,6\n', ":2: cannot be split"),
         (HEAD + '"a.jpg" x,1,2,3,4,5,6\n', ":2: cannot be split"),
         ("a.jpg,1,2,3,4,5,6\n" + ROWS, ":1: no header; declare the columns"),

@@ -11,11 +11,16 @@ from defusedxml import ElementTree
 from tools.small_model import EMPTY, LAYOUT, grid_unit, hills, lines, unit_at, wall_line
 
 from photoplan.errors import UsageError
+from photoplan.geometry.crs import canonical_crs, same_crs
 from photoplan.io.terrain.export import replacing, write_points, write_tin
 from photoplan.io.terrain.export_mesh import mesh_parts
+from photoplan.io.terrain.files import read_measured
+from photoplan.io.terrain.options import ReadOptions
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.mesh.faces import build_faces
 from photoplan.surfaces.units import MemoryUnits, Unit, UnitLayout
+
+LOCAL = canonical_crs("+proj=tmerc +lat_0=48 +lon_0=16 +k=1 +x_0=1000 +y_0=2000 +ellps=GRS80 +units=m +type=crs")
 
 
 def small() -> MemoryUnits:
@@ -122,6 +127,23 @@ def test_obj_ply_and_landxml_say_the_same(model: MemoryUnits, tmp_path: Path) ->
     assert triangles == {tuple(f) for f in faces.tolist()}
     assert next(root.iter(f"{space}Surface")).get("name") == 'a<b>&"c'
     assert list(tmp_path.glob("*.faces")) != []
+
+
+@pytest.mark.parametrize(
+    ("crs", "heights"),
+    [("EPSG:25832", "EPSG:7837"), ("EPSG:3875", "ellipsoidal"), (LOCAL, None), ("EPSG:25832", None)],
+)
+def test_landxml_states_its_systems_and_is_read_with_them(
+    model: MemoryUnits, tmp_path: Path, crs: str, heights: str | None
+) -> None:
+    """By code where there is one, else as WKT with all its quotes."""
+    path = tmp_path / "a.xml"
+    write_tin(path, ".xml", model, "m", crs=crs, height_system=heights)
+    read = read_measured([path], ReadOptions(tin_points=True))
+    assert read.crs is not None and same_crs(read.crs, crs) and read.height_system == heights
+    assert read.count == len(whole(model)[0])
+    write_tin(path, ".xml", model, "m")
+    assert read_measured([path], ReadOptions(tin_points=True)).crs is None
 
 
 def test_points_are_each_post_once_and_the_lines(model: MemoryUnits, tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from tools.small_model import (
     GROSS,
     LAYOUT,
     LINED,
+    SUSPECTS,
     figures_of,
     grid_unit,
     hills,
@@ -90,9 +91,9 @@ def test_figures_lines_gross_border_and_header_come_back(model: ModelReader) -> 
         for name in ("xyz", "sigmas", "on_grid", "right"):
             a, b = getattr(line, name), getattr(written, name)
             assert a is b is None or np.array_equal(a, b, equal_nan=name != "on_grid")
-    assert model.gross() == list(GROSS)
+    assert model.gross() == list(GROSS) and model.suspects() == list(SUSPECTS)
     assert model.domain().bounds == LAYOUT.bounds
-    assert model.header.settings == {"filter": 0.1, "nan": None}
+    assert model.header.settings == {"filter": 0.1, "reach": None}
     assert model.header.crs == CRS and model.header.height_system == "EPSG:5773"
     assert model.header.family == "gaussian" and model.header.made_by.startswith("photoplan ")
     assert model.finest == 2.5
@@ -113,6 +114,7 @@ def test_layers_open_in_a_gis(model: ModelReader) -> None:
         "lines": "LineString Z",
         "walls_right": "LineString Z",
         "gross_errors": "Point Z",
+        "suspects": "Point Z",
         "border": "Polygon",
     }
     info = pyogrio.read_info(model.path, layer="units")

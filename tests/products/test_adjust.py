@@ -13,10 +13,9 @@ import pytest
 from tools.adjust_project import CAMERA, FILM, Made, Make, misses, write_project
 
 from photoplan.errors import GeometryError, InputError, UsageError
-from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles
+from photoplan.geometry.rotation import ANGLE_UNITS, angles_from_rotation, rotation_from_angles
 from photoplan.io.image_points import read_image_points
 from photoplan.io.project.file import load_project
-from photoplan.io.project.model import ANGLE_UNITS
 from photoplan.orientation.bundle.block import AdjustSettings
 from photoplan.orientation.bundle.frame import angle_derivatives
 from photoplan.products.adjust.block import adjust_prepared, map_result, prepare
@@ -458,5 +457,20 @@ def test_control_of_another_program(tmp_path: Path) -> None:
     (tmp_path / "gcp_list.txt").write_text("\n".join(lines) + "\n")
     (tmp_path / "points.csv").write_text("\n".join(",".join(r) for r in rows if r[0] not in ground) + "\n")
     edit(made.path, '"control.csv"', '"gcp_list.txt"')
+    exactly(made)
+    np.testing.assert_allclose(found(made)[0], made.centers, atol=2e-4)
+
+
+def test_tables_whose_columns_the_project_declares(tmp_path: Path) -> None:
+    """Without headers, with columns that are not used, and with decimal commas: the true orientations."""
+    made = write_project(tmp_path)
+    for name, order in (("points.csv", (1, 0, None, 2, 3)), ("control.csv", (None, 0, 1, 2, 3))):
+        rows = [r.split(",") for r in (tmp_path / name).read_text().strip().split("\n")][1:]
+        lines = [";".join("9" if k is None else r[k].replace(".", ",") for k in order) for r in rows]
+        (tmp_path / name).write_text("\n".join(lines).replace(",jpg", ".jpg").replace(",tif", ".tif") + "\n")
+    with pytest.raises(InputError, match=r"is no header|declare"):
+        adjusted(made)
+    declared = 'control_columns = "-,name,x,y,z"\nimage_points_columns = "image,point,-,x,y"\ndecimal_comma = true\n'
+    edit(made.path, "[observations]\n", "[observations]\n" + declared)
     exactly(made)
     np.testing.assert_allclose(found(made)[0], made.centers, atol=2e-4)

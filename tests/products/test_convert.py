@@ -14,8 +14,7 @@ from photoplan.io.orientation.file import FORMATS, orientation_format, read_orie
 from photoplan.io.orientation.table import TableFormat
 from photoplan.orientation.readings import Reading
 from photoplan.plain import json_text, plain
-from photoplan.products.convert.readings import list_readings
-from photoplan.products.convert.run import ConvertRequest, convert_orientation
+from photoplan.products.convert import ConvertRequest, convert_orientation, list_readings
 
 MINE = ("csv", "toml", "patb", "bingo", "bluh", "inpho")
 FROM_CAMERA = TableFormat(declared=frozenset({"direction"}))

@@ -10,7 +10,6 @@ import os
 import shutil
 import signal
 from collections.abc import Callable
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from cli.test_dtm_build import ground, ridge
 from tools.forked import QUIET, Mishap, Ran, content, forked
 from tools.landxml import write_landxml
 from tools.real_projects import drone_project
+from tools.recorded import checked
 from tools.small_block import texture, write_block, write_image
 
 from photoplan.io.lock import FileLock, lock_of
@@ -254,11 +254,7 @@ def test_every_phase_counts_to_its_end(product: Product, quiet: Ran) -> None:
 
 
 def test_the_record_answers_for_the_product(product: Product, quiet: Ran, undisturbed: Path) -> None:
-    record = product.record(undisturbed)
-    assert {"file", "product", "settings", "key", "inputs", "run", "versions", "peak_memory_bytes"} <= record.keys()
+    record = checked(product.record(undisturbed))
     files = [each for each in record["inputs"] if not each["path"].endswith("quiet.toml")]  # `tie` adds its table
     assert files and all(each["size"] == Path(each["path"]).stat().st_size for each in files)
-    assert all(len(each["sampled_sha256"]) == 64 for each in record["inputs"]) and len(record["key"]) == 64
-    started, finished = (datetime.fromisoformat(record["run"][name]) for name in ("started", "finished"))
-    assert started <= finished and record["run"]["workers"] >= 1
-    assert {"photoplan", "GDAL", "numpy", "numba"} <= record["versions"].keys()
+    assert record["run"]["workers"] >= 1

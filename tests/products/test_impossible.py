@@ -10,7 +10,7 @@ import pytest
 from tools.plain_block import SIZE, pixels
 
 from photoplan.geometry.rotation import rotation_from_angles
-from photoplan.products.resect.run import ResectRequest, resect_project
+from photoplan.products.resect import ResectRequest, resect_project
 
 CENTER = np.array([500_200.0, 500_900.0, 1400.0])
 

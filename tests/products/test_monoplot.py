@@ -15,6 +15,7 @@ from cameras.camera_examples import BROWN
 from scipy.ndimage import gaussian_filter
 from tools.function_surface import FunctionSurface, raster_surface
 from tools.real_projects import drone_project
+from tools.recorded import recorded
 from tools.small_block import hills
 
 from photoplan.cameras.base import project
@@ -214,6 +215,7 @@ def test_lines_become_lines_in_space(small, tmp_path, capsys):
     meta, _, wkb, _ = pyogrio.raw.read(vectors, force_2d=False)
     found = shapely.from_wkb(wkb)
     assert [len(line.coords) for line in found] == [2, 2] and meta["geometry_type"] == "LineString Z"
+    assert recorded(out.with_suffix(".run.json"), "monoplot", small.project, lines)["product"]["met"] == 4
     with out.open() as file:
         rows = [*csv.DictReader(file)]
     assert rows[2]["X"] == "" and "outside" in rows[2]["reason"] and rows[0]["sigma_X"] == ""

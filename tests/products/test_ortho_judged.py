@@ -8,7 +8,7 @@ from tools.small_block import Block, make_project
 from photoplan.errors import GeometryError, UsageError
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
-from photoplan.products.check.run import check_project
+from photoplan.products.check import check_project
 from photoplan.products.orthophoto.plan import plan_orthophotos
 
 

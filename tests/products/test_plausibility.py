@@ -18,7 +18,7 @@ from photoplan.io.project.model import Image, Orientation
 from photoplan.io.terrain.reader import TerrainReader
 from photoplan.orientation.other_readings import DECLARED, readings
 from photoplan.orientation.plausibility import Heights, ImagePlausibility, View, look, other_reading
-from photoplan.products.check.view import view_of
+from photoplan.project.scene import view_of
 from photoplan.surfaces.raster import RasterSurface
 
 EAST = np.array([1100.0, 0, 0])

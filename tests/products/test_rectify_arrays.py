@@ -11,10 +11,10 @@ import rasterio
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from tools.other_geometry import Cylinder, Wall, like_a_satellite
+from tools.twin import TwinSource, twin_compose
 
 import photoplan
 from photoplan.cameras import NoLens, OpenCV
-from photoplan.engine.twin import TwinSource, twin_compose
 from photoplan.errors import InputError, UsageError
 
 SIZE = (300, 220)

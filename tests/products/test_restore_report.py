@@ -20,9 +20,8 @@ from photoplan.products.restore.design import DesignedPart, DesignRequest
 from photoplan.products.restore.filter import FilterRequest, FoundFilter, requested_filter
 from photoplan.quality.restoration.design import DesignOptions, design_filter
 from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
-from photoplan.quality.restoration.regularised import SceneStatistics
+from photoplan.quality.restoration.scene import SceneStatistics
 from photoplan.report.page import open_report
-from photoplan.report.restore.details import compare
 from photoplan.report.restore.page import (
     axis_pictures,
     distinct_kernels,
@@ -33,6 +32,7 @@ from photoplan.report.restore.page import (
     part_rows,
     plain_facts,
 )
+from photoplan.report.restore.plots import compare
 
 PNG = "data:image/png;base64,"
 

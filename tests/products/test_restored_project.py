@@ -13,7 +13,7 @@ from tools.small_block import Block, texture, write_image
 from photoplan.errors import InputError, UsageError
 from photoplan.io.project.file import load_project
 from photoplan.io.project.write import project_text
-from photoplan.products.check.run import check_project
+from photoplan.products.check import check_project
 from photoplan.products.orthophoto.execution import Run, execute
 from photoplan.products.orthophoto.plan import plan_orthophotos
 from photoplan.products.restore.run import RestoreRequest, restore_images

@@ -19,7 +19,7 @@ from photoplan.geometry.crs import crs_step
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.io.project.file import load_project
 from photoplan.io.terrain.model_read import ModelReader
-from photoplan.products.check.run import check_project
+from photoplan.products.check import check_project
 from photoplan.products.init.run import InitRequest, init_project
 from photoplan.products.orthophoto.execution import Run, execute
 from photoplan.products.orthophoto.plan import plan_orthophotos

@@ -12,6 +12,7 @@ cores; with the command's own settings the figures are 4.2, 4.7, 2.4 cm and 0.08
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +20,7 @@ import numpy as np
 import pytest
 from tools.command import edit, process
 from tools.drone_block import distance, write_control, write_images
+from tools.kept import kept
 from tools.matching import match
 from tools.pictures import gray
 
@@ -47,23 +49,39 @@ class Chain:
 
 @pytest.fixture(scope="module")
 def chain(shared: Path, block: Path, tmp_path_factory: pytest.TempPathFactory) -> Chain:
-    """Images as the drone wrote them, and the reference as a project."""
-    folder = tmp_path_factory.mktemp("chain")
-    write_images(block / "images", shared / "data" / "drone_brighton" / "exif.csv", folder / "images")
-    made = Chain(folder, block / "int.yaml", block / "dsm.tif", folder / "reference" / "project.toml")
-    made.init("reference", "--orientation", block / "ext.csv", "--terrain", made.heights)
-    return made
+    """Images as the drone wrote them, the reference as a project, and a project with tie points."""
+    exif = shared / "data" / "drone_brighton" / "exif.csv"
+
+    def make(folder: Path) -> None:
+        write_images(block / "images", exif, folder / "images")
+        for name in ("int.yaml", "dsm.tif", "ext.csv"):
+            shutil.copy(block / name, folder)
+        made = chain_in(folder)
+        made.init("reference", "--orientation", folder / "ext.csv", "--terrain", made.heights)
+        tie(made)
+
+    folder = tmp_path_factory.mktemp("chain") / "copy"
+    commands = ["photoplan.cli.init", "photoplan.cli.convert", "photoplan.cli.tie"]
+    shutil.copytree(kept("brighton-chain", make, commands, [block, exif]), folder)
+    return chain_in(folder)
+
+
+def chain_in(folder: Path) -> Chain:
+    return Chain(folder, folder / "int.yaml", folder / "dsm.tif", folder / "reference" / "project.toml")
 
 
 @pytest.fixture(scope="module")
 def tied(chain: Chain) -> Path:
+    return chain.folder / "gnss" / "project.toml"
+
+
+def tie(chain: Chain) -> None:
     """Approximate orientations and positions from the images, tie points by command."""
     table = chain.folder / "approximate.csv"
     command("convert", chain.folder / "images", "--to", "csv", "--crs", "EPSG:32615", "-o", table)
     project = chain.init("gnss", "--orientation", table, "--positions", chain.folder / "images")
     edit(project, 'positions = "../images"', 'positions = "../images"\nsigma_position = [3.0, 5.0]\n#')
     command("tie", project, "--scale", 0.5, "--features", 2500, "--per-image", 250, "--no-picture", "--workers", 2)
-    return project
 
 
 def test_what_the_drone_wrote_is_approximate(chain: Chain, tied: Path) -> None:

@@ -220,6 +220,29 @@ def test_covariance_classes_use_all_pairs_once(facts):
     assert (c.low <= c.high).all()
 
 
+def test_covariances_that_differ_from_what_is_expected_are_told(facts):
+    """Not by chance, not below the noise; in the page as in what the command prints."""
+    good = facts.covariance
+    assert 0.5 < good.ratio < 2 and good.warning == ""
+    for factor, word in ((8.0, "too large"), (0.1, "too small")):
+        bad = replace(good, empirical=good.expected / factor)
+        assert bad.ratio == pytest.approx(1 / factor)
+        assert f"{good.expected[0]:.3g} m²" in bad.warning and bad.warning.endswith(word)
+        assert replace(bad, noise=1e3).warning == ""
+    page = Page(build_page(replace(facts, covariance=bad), load_matplotlib("", "")))
+    assert bad.warning in page.words
+    nothing = replace(good, empirical=good.empirical * np.nan, pairs=0 * good.pairs)
+    assert np.isnan(nothing.ratio) and nothing.warning == ""
+
+
+def test_settings_name_the_grid_that_is_built(facts, built):
+    widths = {width for width, _ in facts.widths}
+    assert min(widths) == built.plan.finest == built.plan.width / 2
+    assert dict(facts.settings)["grid width"].startswith(
+        f"{built.plan.width:g} m, {built.plan.finest:g} m where breaklines pass"
+    )
+
+
 def test_without_matplotlib_the_message_says_how_to_get_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(UsageError, match=r"pip install 'photoplan\[report\]'"):

@@ -10,10 +10,10 @@ import pytest
 import rasterio
 from tools.command import peak_of
 from tools.real_projects import drone_project
+from tools.twin import strict_positions, strict_scales, twin_resample
 
 from photoplan.engine.base import Source
 from photoplan.engine.execute import render
-from photoplan.engine.twin import strict_positions, strict_scales, twin_resample
 from photoplan.geometry.grid import Window
 from photoplan.io.project.file import load_project
 from photoplan.plan.tiles import Tile

@@ -13,8 +13,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import MapGrid
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.level import LevelSurface
-from photoplan.surfaces.refined import RefinedSurface
-from photoplan.surfaces.refined_units import LinedUnits, clip_line, refine_units
+from photoplan.surfaces.refined_units import LinedUnits, RefinedSurface, clip_line, refine_units
 from photoplan.surfaces.units import MemoryUnits, UnitLayout
 from photoplan.targets.map import MapTarget
 

@@ -53,12 +53,41 @@ def any_edges(rng, size=SIZE):
     return scene
 
 
-def taken(scene, sigma, rng, noise=NOISE):
-    """The image: Gaussian blur, a pixel's aperture, sampled in the middle of the pixels, noise; and the object."""
-    frequency = np.fft.fftfreq(scene.shape[0], 1 / FINE)
-    blur = np.exp(-2 * (np.pi * sigma * frequency) ** 2) * np.sinc(frequency) / np.sinc(frequency / FINE)
-    blur = blur * np.exp(2j * np.pi * frequency * (0.5 - 0.5 / FINE))
-    image = np.fft.ifft2(np.fft.fft2(scene) * np.outer(blur, blur)).real[::FINE, ::FINE]
-    return image + rng.normal(0, noise, image.shape), scene.reshape(image.shape[0], FINE, image.shape[1], FINE).mean(
-        axis=(1, 3)
-    )
+def gaussian(sigma):
+    """Transfer function of a Gaussian blur."""
+    return lambda frequency: np.exp(-2 * (np.pi * sigma * frequency) ** 2)
+
+
+def diffraction(wavelength_by_aperture):
+    """Transfer function of a perfect round lens, by the product of wavelength and f-number, pixels."""
+
+    def transfer(frequency):
+        x = np.clip(frequency * wavelength_by_aperture, 0.0, 1.0)
+        return 2 / np.pi * (np.arccos(x) - x * np.sqrt(1 - x**2))
+
+    return transfer
+
+
+def fractal(rng, slope, size=SIZE):
+    """Amplitudes that fall with a power of the frequency, any phases; 20 to 230."""
+    side = size * FINE
+    frequency = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side))
+    frequency[0, 0] = np.inf
+    scene = np.fft.irfft2(np.fft.rfft2(rng.normal(size=(side, side))) * frequency**-slope, s=(side, side))
+    return np.clip(125.0 + 35.0 * scene / scene.std(), 20.0, 230.0)
+
+
+def taken(scene, optics, rng, noise=NOISE):
+    """The image: blur, a pixel's aperture, sampled in the middle of the pixels, noise; and the object.
+
+    The optics are a transfer function of the radial frequency, or the sigma of a Gaussian.
+    """
+    blur = optics if callable(optics) else gaussian(optics)
+    v, u = np.fft.fftfreq(scene.shape[0], 1 / FINE)[:, None], np.fft.rfftfreq(scene.shape[1], 1 / FINE)
+    seen = np.fft.rfft2(scene) * blur(np.hypot(u, v))
+    for frequency in (u, v):
+        aperture = np.sinc(frequency) / np.sinc(frequency / FINE)
+        seen *= aperture * np.exp(2j * np.pi * frequency * (0.5 - 0.5 / FINE))
+    image = np.fft.irfft2(seen, s=scene.shape)[::FINE, ::FINE]
+    objects = scene.reshape(image.shape[0], FINE, image.shape[1], FINE).mean(axis=(1, 3))
+    return image + rng.normal(0, noise, image.shape), objects

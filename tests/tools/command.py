@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -23,6 +24,15 @@ OPTIONS = ("--resolution", "1", "--tile", "128")
 SABOTEUR = Path(__file__).parent / "saboteur"
 
 
+def unfinished_numbers(text: str) -> list[str]:
+    """NaN and infinity as words of a text, but where it quotes what was given."""
+    return re.findall(r"(?<![\w'\"./-])[-+±]?(?:nan|inf(?:inity)?)\b(?!['\"/-]|\.\w)", text, re.IGNORECASE)
+
+
+def _no_number(word: str) -> None:
+    raise AssertionError(f"JSON holds {word}")
+
+
 @dataclass(frozen=True)
 class Said:
     """What a command left behind."""
@@ -34,6 +44,8 @@ class Said:
     def __post_init__(self) -> None:
         assert "Traceback" not in self.err, self.err
         assert "a fault of photoplan" not in self.err, self.err
+        if self.out.startswith("{"):
+            json.loads(self.out, parse_constant=_no_number)
 
 
 @dataclass(frozen=True)
@@ -125,6 +137,8 @@ class Here:
         code = run([str(word) for word in words])
         said = Said(code, *self.capture.readouterr())
         assert unknown_options([str(word) for word in words], said.err) == [], said.err
+        # A refusal may say what was given, and the help what nodata is.
+        assert code != 0 or "--help" in words or not unfinished_numbers(said.out + "\n" + said.err), said.out + said.err
         return said
 
 

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pyproj import Transformer
 
-from photoplan.geometry.local import LocalFrame, unaltered_height
+from photoplan.geometry.local import LocalFrame
 from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angles
 
 __all__ = ["CRS", "Published", "ign_project", "published"]
@@ -158,3 +158,26 @@ def _turned(angles: NDArray[np.float64], turn: NDArray[np.float64]) -> NDArray[n
     near = np.eye(3) + np.array([[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]])
     U, _, Vt = np.linalg.svd(near)
     return np.degrees(angles_from_rotation(rotation_from_angles(angles) @ U @ Vt))
+
+
+def altered_height(Z_station: ArrayLike, Z_ground: ArrayLike, map_scale: ArrayLike) -> NDArray[np.float64]:
+    """Height of a projection centre with the *linear alteration* of a block that was computed in map coordinates.
+
+    Such a block treats the map as Cartesian. As horizontal distances carry the scale k of the map, its flying heights
+    above ground carry it too: Zs' = Zg + k (Zs − Zg). Blocks of the French mapping agency are delivered so.
+
+    Parameters
+    ----------
+    Z_station, Z_ground : array_like
+        True height of the projection centre and mean height of the ground below, same height system, metres.
+    map_scale : array_like
+        Scale k of the map at the station (`LocalFrame.scale`).
+    """
+    Zs, Zg = np.asarray(Z_station, float), np.asarray(Z_ground, float)
+    return Zg + np.asarray(map_scale, float) * (Zs - Zg)
+
+
+def unaltered_height(Z_station: ArrayLike, Z_ground: ArrayLike, map_scale: ArrayLike) -> NDArray[np.float64]:
+    """True height of a projection centre that carries the linear alteration; inverse of `altered_height`."""
+    Zs, Zg = np.asarray(Z_station, float), np.asarray(Z_ground, float)
+    return Zg + (Zs - Zg) / np.asarray(map_scale, float)

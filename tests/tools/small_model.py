@@ -99,11 +99,12 @@ def lines(layout: UnitLayout = LAYOUT) -> list[LineElement]:
 
 
 GROSS = (GrossError("p 17", "mass", (500_010.0, 5_299_990.0, 171.5), 21.25, 0.83, 14.5),)
+SUSPECTS = (GrossError("p 18", "mass", (500_012.0, 5_299_990.0, 160.5), 10.25, 0.81, 7.5),)
 HEADER = ModelHeader(
     CRS,
     "EPSG:5773",
     LAYOUT,
-    settings={"filter": 0.1, "nan": math.nan},
+    settings={"filter": 0.1, "reach": math.nan},
     inputs=({"file": "points.xyz", "bytes": 12, "sha256_sampled": "ab"},),
     family="gaussian",
     totals={"points": 12},
@@ -112,7 +113,8 @@ HEADER = ModelHeader(
 
 def parts(layout: UnitLayout = LAYOUT) -> ModelParts:
     """All but the units."""
-    return ModelParts(replace(HEADER, layout=layout), lines(layout), GROSS, shapely.box(*layout.bounds))
+    domain = shapely.box(*layout.bounds)
+    return ModelParts(replace(HEADER, layout=layout), lines(layout), GROSS, domain, SUSPECTS)
 
 
 def write_small(path: Path, stop_after: int | None = None, key: str = "k", **options: Any) -> ModelReader | None:

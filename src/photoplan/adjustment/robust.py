@@ -1,4 +1,4 @@
-"""Scales that gross errors hardly move, and weights that fall with the size of a residual.
+"""Scales that gross errors hardly move, weights that fall with the size of a residual, and weights of groups.
 
 Weights are functions of the size s of a residual in units of its standard deviation, from 1 for small sizes downwards.
 They multiply squares: a row of equations is multiplied by their root.
@@ -54,3 +54,31 @@ def geman_mcclure(size: _Floats, limit: float) -> _Floats:
 def bisquare(size: _Floats, limit: float = BISQUARE) -> _Floats:
     """(1 − (s / limit)²)², 0 beyond the limit (Beaton and Tukey 1974)."""
     return np.asarray(np.clip(1.0 - (size / limit) ** 2, 0.0, None) ** 2, float)
+
+
+#: Smallest variance factor: data without noise would otherwise get weights that no arithmetic bears.
+_LEAST = 0.02
+#: Redundancy from which the variance factor of a group is worth estimating.
+ENOUGH = 10.0
+
+
+def variance_factors(e: _Floats, redundancies: _Floats, groups: NDArray[np.int64], before: _Floats) -> _Floats:
+    """Standard deviation found over the one stated, of each group (Förstner 1979): root of Σ e² / Σ r.
+
+    Groups with little redundancy keep the factor that they had: the more a group's weight grows, the less checks it, so
+    its factor may not fall for ever, nor jump back.
+
+    Parameters
+    ----------
+    e : ndarray, shape (n,)
+        Residuals divided by the standard deviations that were stated.
+    redundancies : ndarray, shape (n,)
+        Redundancy numbers with the weights of `before`.
+    groups : ndarray, shape (n,)
+        Group of each observation.
+    before : ndarray, shape (groups,)
+    """
+    total = np.bincount(groups, redundancies, len(before))
+    square = np.bincount(groups, e**2, len(before))
+    found = np.maximum(np.sqrt(square / np.maximum(total, ENOUGH)), _LEAST)
+    return np.asarray(np.where(total > ENOUGH, found, before), float)

@@ -30,19 +30,22 @@ def command(series: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     exposed. Every analysis that they allow is made; the others are listed with what is missing.
     """
     from photoplan.cli.telling import Telling
+    from photoplan.io.run_record import recording
     from photoplan.io.series.file import read_series
     from photoplan.products.characterise.run import CharacteriseRequest, characterise
-    from photoplan.report.characterise.page import characterise_page
+    from photoplan.report.characterise import characterise_page
     from photoplan.report.page import open_report
 
     place = options.pop("report")
-    inputs = () if place is None else read_series(series).inputs
+    inputs, request = read_series(series).inputs, CharacteriseRequest(series, **options)
     page = open_report(place, inputs, overwrite=options["overwrite"])
+    record = recording("characterise", request, [series, *inputs])
     with Telling(quiet) as events:
-        report = characterise(CharacteriseRequest(series, **options), events)
+        report = characterise(request, events)
     written = report.written
     if page is not None and not options["dry_run"]:
         written = (page.write(characterise_page(report, page.mpl)), *written)
+    record((*report.written, *written[: len(written) - len(report.written)]), report)
     if as_json:
         show_json(report, written=written)
     else:

@@ -22,7 +22,7 @@ def command(project: Path, images: tuple[str, ...], as_json: bool, quiet: bool) 
     """
     from photoplan.errors import GeometryError
     from photoplan.io.project.file import load_project
-    from photoplan.products.check.run import check_project
+    from photoplan.products.check import check_project
 
     found = check_project(load_project(project), images or None)
     if as_json:

@@ -52,7 +52,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     agree on one correction of an image's orientation are left out.
     """
     from photoplan.cli.telling import Telling
-    from photoplan.engine.cpus import available_cpus
+    from photoplan.engine.executors import available_cpus
     from photoplan.products.control.run import ControlRequest, propose_control
 
     options["workers"] = options["workers"] or available_cpus()

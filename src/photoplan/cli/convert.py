@@ -55,7 +55,7 @@ def command(
 
     What the other format cannot hold is said on stderr. A lens that it does not know is refused unless --drop-lens.
     """
-    from photoplan.products.convert.run import ConvertRequest
+    from photoplan.products.convert import ConvertRequest
 
     form = table_format(options)
     options["turned"] = int(options["turned"])
@@ -73,9 +73,12 @@ def command(
 
 
 def _convert(request: Any, as_json: bool, quiet: bool) -> None:
-    from photoplan.products.convert.run import convert_orientation
+    from photoplan.io.run_record import recording
+    from photoplan.products.convert import convert_orientation
 
+    record = recording("convert", request, [request.orientation, request.camera])
     done = convert_orientation(request)
+    record(done.files, done)
     if as_json:
         show_json(done)
     else:
@@ -90,7 +93,7 @@ def _convert(request: Any, as_json: bool, quiet: bool) -> None:
 
 
 def _list(request: Any, image_points: Path, control: Path, as_json: bool, quiet: bool) -> None:
-    from photoplan.products.convert.readings import list_readings
+    from photoplan.products.convert import list_readings
 
     found = list_readings(request, image_points, control)
     if as_json:

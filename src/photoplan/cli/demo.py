@@ -23,7 +23,7 @@ def command(folder: Path, resolution: float, quiet: bool) -> None:
 
     from photoplan.cli import running
     from photoplan.io.project.file import load_project
-    from photoplan.products.check.run import check_project
+    from photoplan.products.check import check_project
     from photoplan.products.init.run import InitRequest, init_project
     from photoplan.products.orthophoto.plan import plan_orthophotos
 

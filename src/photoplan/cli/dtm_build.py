@@ -22,7 +22,9 @@ _SHOWN = 10
 @click.command("build")
 @click.argument("points", type=_PATH, nargs=-1, required=True)
 @click.option("-o", "--output", type=_PATH, required=True, metavar="MODEL", help="The model, a .gpkg.")
-@click.option("--grid-width", type=_POSITIVE, metavar="M", help="Finest grid width [from the spacing of the points].")
+@click.option(
+    "--grid-width", type=_POSITIVE, metavar="M", help="Grid width [half the spacing; half of that at breaklines]."
+)
 @click.option("--adapt", type=click.FloatRange(0), metavar="M", help="Widen a unit's grid while its surface stays "
               "within this; 0: never [a quarter of its standard deviation].")  # fmt: skip
 @click.option("--unit-meshes", type=int, default=64, show_default=True, help="Meshes of a unit's side: a power of two.")
@@ -72,17 +74,19 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
         show(describe_plan(plan, measured, crs, system))
         for finding in findings:
             show(f"  {finding.kind}: {finding.text}")
+        for note in measured.notes:
+            show(f"  {note}")
         return
     page = open_build_report(request.output, wanted, request.overwrite)
     with Telling(quiet) as events:
         if page is None and wanted is None:
             events.talk("no report: it needs matplotlib (pip install 'photoplan[report]')")
         built = dtm_build(request, events)
-    report = None
+    report, warning = None, ""
     if page is not None:
         title, seconds = request.output.stem, built.figures["seconds"]
         facts = build_facts(title, built.built, built.measured, built.findings, request.inputs, seconds)
-        report = page.write(build_page(facts, page.mpl))
+        report, warning = page.write(build_page(facts, page.mpl)), facts.covariance.warning
     if as_json:
         show_json(built, report=report)
         return
@@ -91,10 +95,12 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
         show(report)
     for line in _summary(built):
         events.talk(line)
+    if warning:
+        events.talk(warning)
 
 
 def _request(options: dict[str, Any]) -> BuildRequest:
-    from photoplan.engine.cpus import available_cpus
+    from photoplan.engine.executors import available_cpus
     from photoplan.io.tables import Dialect
     from photoplan.io.terrain.options import CodeTable, ReadOptions, read_code_table
     from photoplan.products.dtm.build import BuildRequest
@@ -143,13 +149,24 @@ def _summary(built: BuildReport) -> list[str]:
         f"{f['points']} points in {f['seconds']:.1f} s · {f['units']} units, grid "
         + ", ".join(f"{width} m ({count})" for width, count in f["grid_widths"].items()),
         f"covariance {f['covariance']}: signal ±{f['variance'] ** 0.5:.3f} m, half at {f['length']:.2f} m · "
-        f"mass points ±{f['noise']:.3f} m · posts ±{f['sigma'] or 0:.3f} m · "
-        f"normalised residuals {f['spread'] or 0:.2f}",
+        f"mass points ±{f['noise']:.3f} m · "
+        + ("posts: none amid data · " if f["sigma"] is None else f"posts ±{f['sigma']:.3f} m · ")
+        + ("too few points for residuals" if f["spread"] is None else f"normalised residuals {f['spread']:.2f}"),
     ]
+    if f["calibration"]:
+        lines.append("held-out blocks, errors over stated ±: " + ", ".join(_class(c) for c in f["calibration"]))
     if built.gross:
         lines.append(f"gross errors, left out: {len(built.gross)}")
         lines += [f"  {g.name}: {g.residual:+.3f} m, {abs(g.normalised):.1f} σ" for g in built.gross[:_SHOWN]]
+    if built.suspects:
+        lines.append(f"suspects, used all the same: {len(built.suspects)}; look at them in the report or the model")
     if built.findings:
         lines.append(f"findings in the measurements: {len(built.findings)}")
         lines += [f"  {finding.kind}: {finding.text}" for finding in built.findings[:_SHOWN]]
     return lines + [f"  {note}" for note in built.measured.notes[:_SHOWN]]
+
+
+def _class(c: dict[str, Any]) -> str:
+    """Spread of held-out errors at some distances to data."""
+    where = f"over {c['from']:.3g} m" if c["to"] is None else f"up to {c['to']:.3g} m"
+    return f"{where} {c['after']:.2f}" if c["enough"] else f"{where} too few ({c['blocks']} blocks)"

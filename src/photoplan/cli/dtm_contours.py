@@ -42,8 +42,9 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     it.
     """
     from photoplan.cli.telling import Telling
+    from photoplan.io.run_record import recording
     from photoplan.products.dtm.contours import ContourRequest, make_contours
-    from photoplan.report.dtm.contours import contours_picture
+    from photoplan.report.dtm.profile import contours_picture
     from photoplan.report.page import open_picture
     from photoplan.terrain.contours.run import ContourOptions
 
@@ -54,10 +55,12 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
         raise click.UsageError(f"{preview}: the preview has the name of the output; choose another one")
     drawing = open_picture(preview, [options["model"]], overwrite=options["overwrite"])
     request = ContourRequest(options=chosen, sketch=drawing is not None, **options)
+    record = recording("contours", request, [request.model])
     with Telling(quiet) as events:
         facts = make_contours(request, events)
     if drawing is not None:
         drawing.write(contours_picture(facts, drawing.mpl))
+    record([*facts.files, preview], facts)
     if as_json:
         show_json(facts, preview=preview)
         return

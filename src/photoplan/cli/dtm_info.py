@@ -12,24 +12,25 @@ from photoplan.cli.output import show, show_json
 
 @click.command("info")
 @click.argument("model", type=click.Path(path_type=Path))
-@click.option("--gross", is_flag=True, help="List the measurements that were flagged as gross errors.")
+@click.option("--gross", is_flag=True, help="List the measurements that were flagged as gross errors, and suspects.")
 @json_option
 @quiet_option
 def command(model: Path, gross: bool, as_json: bool, quiet: bool) -> None:
     """Show the figures of MODEL: units, lines, accuracy, gross errors. A raster is shown as by `photoplan info`."""
-    from photoplan.products.dtm.info import dtm_info
+    from photoplan.products.describe import dtm_info
 
     found = dtm_info(model)
     if as_json:
-        show_json(found.figures | ({"gross_errors": found.gross} if gross else {}))
+        show_json(found.figures | ({"gross_errors": found.gross, "suspect_points": found.suspects} if gross else {}))
         return
     width = max(len(key) for key in found.facts)
     for key, value in found.facts.items():
         lines = value if isinstance(value, list) else [value]
         for i, line in enumerate(lines):
             show(f"{key if i == 0 else '':<{width}}  {line}")
-    for g in found.gross if gross else ():
+    flagged = [("", g) for g in found.gross] + [("suspect: ", g) for g in found.suspects]
+    for what, g in flagged if gross else ():
         show(
-            f"{g['name']}  {g['kind']}  X {g['x']:.3f} Y {g['y']:.3f} Z {g['z']:.3f}  residual {g['residual']:+.3f} m "
-            f"({g['normalised']:+.1f} σ, redundancy {g['redundancy']:.2f})"
+            f"{what}{g['name']}  {g['kind']}  X {g['x']:.3f} Y {g['y']:.3f} Z {g['z']:.3f}  "
+            f"residual {g['residual']:+.3f} m ({g['normalised']:+.1f} σ, redundancy {g['redundancy']:.2f})"
         )

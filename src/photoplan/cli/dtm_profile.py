@@ -39,8 +39,10 @@ def command(
 
     There is a point wherever the surface bends: at grid lines, breaklines and edges of triangles; at a wall two.
     """
+    from photoplan.io.run_record import recording
     from photoplan.io.tables import Dialect
     from photoplan.io.terrain.points import PointTableFormat
+    from photoplan.plain import pick
     from photoplan.products.dtm.profile import ProfileRequest, dtm_profile
     from photoplan.report.dtm.profile import profile_picture
     from photoplan.report.page import open_picture
@@ -50,10 +52,13 @@ def command(
     inputs, overwrite = [options["model"], options["lines"]], options["overwrite"]
     drawings = [open_picture(path, inputs, overwrite=overwrite) for path in pictures]
     form = PointTableFormat(x, y, Dialect(decimal_comma=decimal_comma))
-    found = dtm_profile(ProfileRequest(outputs=tables, form=form, **options))
+    request = ProfileRequest(outputs=tables, form=form, **options)
+    record = recording("profile", request, inputs)
+    found = dtm_profile(request)
     for drawing in drawings:
         if drawing is not None:
             drawing.write(profile_picture(found, drawing.mpl))
+    record(outputs, [pick(p, "name", "length") for p in found])
     if as_json:
         show_json({"files": outputs, "profiles": found})
         return

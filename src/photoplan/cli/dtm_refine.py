@@ -31,9 +31,13 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     Inside a band along the polygons' border the difference of the two is blended in; outside nothing changes.
     """
+    from photoplan.io.run_record import recording
     from photoplan.products.dtm.refine import RefineRequest, dtm_refine
 
-    found = dtm_refine(RefineRequest(**options))
+    request = RefineRequest(**options)
+    record = recording("refine", request, [request.coarse, request.fine, request.polygons])
+    found = dtm_refine(request)
+    record([found.path], found)
     if as_json:
         show_json(found)
         return

@@ -43,6 +43,7 @@ def command(
     """
     from photoplan.geometry.crs import crs_label
     from photoplan.geometry.heights import height_label
+    from photoplan.io.run_record import recording
     from photoplan.io.tables import Dialect
     from photoplan.io.terrain.points import PointTableFormat
     from photoplan.products.dtm.sample import SampleRequest, dtm_sample
@@ -50,7 +51,10 @@ def command(
     spelled = {"comma": ",", "semicolon": ";", "tab": "\t", "\\t": "\t", "space": " "}
     dialect = Dialect(delimiter=spelled.get(delimiter or "", delimiter), decimal_comma=decimal_comma)
     form = PointTableFormat(x, y, dialect, not no_header)
-    found = dtm_sample(SampleRequest(form=form, **options))
+    request = SampleRequest(form=form, **options)
+    record = recording("sample", request, [request.model, request.points])
+    found = dtm_sample(request)
+    record([found.path], found)
     if as_json:
         show_json(found)
         return

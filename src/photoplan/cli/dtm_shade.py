@@ -51,7 +51,7 @@ def light_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def take_light(options: dict[str, Any]) -> Any:
     """The light, taken out of the options of a verb."""
-    from photoplan.terrain.shading.run import Light
+    from photoplan.terrain.shading import Light
 
     names = ("azimuth", "altitude", "exaggeration", "multidirectional")
     return Light(**{name: options.pop(name) for name in names})

@@ -22,7 +22,7 @@ from photoplan.cli.dtm_shade import light_options, picture_options, report_pictu
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Colours by height: red, green, blue, with a mask where MODEL has no terrain."""
     from photoplan.products.dtm.shading import make_picture, tint_picture
-    from photoplan.terrain.shading.tints import RAMPS
+    from photoplan.terrain.shading import RAMPS
 
     ramp, span, steps = options.pop("ramp"), options.pop("heights"), options.pop("classes")
     classed, shade, strength = options.pop("classed"), options.pop("shade"), options.pop("strength")

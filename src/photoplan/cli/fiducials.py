@@ -41,7 +41,7 @@ def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any)
     from photoplan.cli.telling import Telling
     from photoplan.io.names import unique_stems
     from photoplan.plain import plain
-    from photoplan.products.fiducials.run import FiducialsRequest, locate_fiducials, scans_of
+    from photoplan.products.fiducials import FiducialsRequest, locate_fiducials, scans_of
     from photoplan.report.fiducials import marks_picture, unfound_picture
     from photoplan.report.page import open_picture
 

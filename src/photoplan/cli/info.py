@@ -18,7 +18,7 @@ from photoplan.cli.output import show, show_json
 @quiet_option
 def command(file: Path, plot: Path | None, overwrite: bool, as_json: bool, quiet: bool) -> None:
     """Show what FILE holds: a raster, a terrain model, a project, a plan, a run record or a restoration filter."""
-    from photoplan.products.describe.run import describe
+    from photoplan.products.describe import describe
 
     if plot is not None:
         from photoplan.report.restore.filters import draw_filter

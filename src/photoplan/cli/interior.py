@@ -32,6 +32,7 @@ def command(images: tuple[str, ...], as_json: bool, quiet: bool, **options: Any)
     An image whose marks are missing, exchanged, mirrored or wrong does not stop the others; they are listed at the end
     (exit code 4).
     """
+    from photoplan.io.run_record import recording
     from photoplan.products.interior import InteriorRequest, interior_orientations
     from photoplan.report.interior import InteriorPlots, interior_page
     from photoplan.report.page import open_picture, open_report
@@ -39,13 +40,16 @@ def command(images: tuple[str, ...], as_json: bool, quiet: bool, **options: Any)
     project, overwrite = options["project"], options.pop("overwrite")
     page = open_report(options.pop("report"), (), overwrite=overwrite, project=project)
     plot = open_picture(options.pop("plot"), (), overwrite=overwrite, project=project)
-    found = interior_orientations(InteriorRequest(images=images or None, **options))
+    request = InteriorRequest(images=images or None, **options)
+    record = recording("interior", request, [project])
+    found = interior_orientations(request)
     report = picture = None
     if page is not None and found.images:
         title = f"Interior orientation · {project.resolve().parent.name}"
         report = page.write(interior_page(found, title, page.mpl))
     if plot is not None and found.images:
         picture = plot.write(InteriorPlots(plot.mpl).residuals(found.images))
+    record([project if found.written else None, report, picture], found)
     if as_json:
         show_json(found, report=report, plot=picture)
     else:

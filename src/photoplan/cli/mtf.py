@@ -89,6 +89,7 @@ def run_patterns(images: tuple[Path, ...], as_json: bool, quiet: bool, options: 
     click.UsageError
         An option is for edges.
     """
+    from photoplan.io.run_record import recording
     from photoplan.products.mtf.patterns import PatternRequest, measure_patterns
     from photoplan.report.mtf.patterns import pattern_page
     from photoplan.report.page import open_report
@@ -99,8 +100,11 @@ def run_patterns(images: tuple[Path, ...], as_json: bool, quiet: bool, options: 
     inputs = [*images, options["linearisation"]]
     page = open_report(options.pop("report"), inputs, overwrite=options["overwrite"], table=options["csv"])
     kept = {name: value for name, value in options.items() if name not in _OF_EDGES}
-    report = measure_patterns(PatternRequest(images, **kept), talk)
+    request = PatternRequest(images, **kept)
+    record = recording("mtf", request, inputs)
+    report = measure_patterns(request, talk)
     written = page.write(pattern_page(report, page.mpl)) if page is not None and report.images else None
+    record([report.csv, written], report)
     say_images(report, written, as_json, talk)
     if not as_json:
         say_files(report, written)
@@ -152,6 +156,7 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any
         run_patterns(images, as_json, quiet, options)
         return
     from photoplan.cli.telling import Telling
+    from photoplan.io.run_record import recording
     from photoplan.products.mtf.result import group_lines
     from photoplan.products.mtf.run import MtfRequest, measure_mtf
     from photoplan.report.mtf.page import mtf_page
@@ -161,9 +166,11 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any
     inputs = [*images, options["linearisation"], options["lab"]]
     page = open_report(options.pop("report"), inputs, overwrite=options["overwrite"], table=options["csv"])
     request = MtfRequest(images, **edge_options(options))
+    record = recording("mtf", request, inputs)
     with Telling(quiet) as events:
         report = measure_mtf(request, events)
     written = page.write(mtf_page(report, page.mpl)) if page is not None and report.images else None
+    record([report.csv, written], report)
     say_images(report, written, as_json, talk)
     if len(report.images) > 1:
         if not as_json:

@@ -17,6 +17,7 @@ from photoplan.cli.options import bounds_option, dry_run_option, executing, imag
 @bounds_option
 @click.option("--kernel", help="nearest, bilinear, bicubic, bicubic-1 or lanczos3 [bicubic].")
 @click.option("--tolerance", type=float, metavar="PX", help="Largest residual of the anchors [0.02].")
+@click.option("--hidden", help="Ground that the image cannot see: show, nodata, or mark (second raster) [show].")
 @click.option("--compress", help="deflate, zstd, lzw, jpeg or none [deflate].")
 @click.option("--nodata", help="A number, mask, or auto: 0 for integers, NaN for floats [auto].")
 @click.option("--overviews/--no-overviews", default=None, help="Whether the file holds overviews [yes].")

@@ -11,8 +11,7 @@ from photoplan.cli.options import dry_run_option, images_option, json_option, ov
 from photoplan.cli.output import end_with_failures, say, show, show_json
 
 if TYPE_CHECKING:
-    from photoplan.products.resect.image import ResectedImage
-    from photoplan.products.resect.run import ResectResult
+    from photoplan.products.resect import ResectedImage, ResectResult
 
 _DIGITS = {"deg": 4, "gon": 4, "rad": 6}
 _FILE = click.Path(path_type=Path)
@@ -41,7 +40,7 @@ def command(as_json: bool, quiet: bool, free: str | None, **options: Any) -> Non
     they are listed at the end (exit code 4).
     """
     from photoplan.cli.telling import Telling
-    from photoplan.products.resect.run import ResectRequest, resect_project
+    from photoplan.products.resect import ResectRequest, resect_project
     from photoplan.report.page import open_report
     from photoplan.report.resect import resect_page
 

@@ -29,12 +29,10 @@ _OPTIONS = (
     click.option("--aperture", metavar="SHAPE[:RATIO]",
                  help="Undo a scanner's aperture: square or round, RATIO of aperture by step [1]."),
     click.option("--method", type=click.Choice(["auto", "exact", "regularised"]), default="auto", show_default=True,
-                 help="Of a measured filter; auto: exact where that is possible and noise allows."),
+                 help="Of a measured filter; auto: the one of least expected error."),
     click.option("--rotation", type=click.Choice(["radial", "separable"]), default="radial", show_default=True,
                  help="How an exact inverse becomes two-dimensional."),
     click.option("--size", type=click.IntRange(3, 101), metavar="N", help="Side of a measured filter [11 or more]."),
-    click.option("--most-noise-gain", type=click.FloatRange(1.0, 100.0), default=6.0, show_default=True, metavar="G",
-                 help="Up to which auto takes an exact inverse."),
     click.option("--cells", type=click.IntRange(1, 15), default=1, show_default=True, metavar="N",
                  help="Filters for N by N parts of the field, interpolated between them."),
     click.option("--per-band", is_flag=True, help="A measured filter for each band."),
@@ -43,7 +41,7 @@ _OPTIONS = (
                  help="Where a measured filter is kept [restoration_filter.toml by the results]."),
 )  # fmt: skip
 #: Options that a measurement alone can follow.
-_MEASURED = ("method", "rotation", "size", "most_noise_gain", "cells", "per_band", "least_length", "save_filter")
+_MEASURED = ("method", "rotation", "size", "cells", "per_band", "least_length", "save_filter")
 
 
 def filter_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -68,9 +66,7 @@ def filter_request(images: tuple[Path, ...], options: dict[str, Any]) -> FilterR
     size = asked["size"]
     if size is not None and size % 2 == 0:
         raise click.UsageError(f"--size {size}: a filter has an odd number of rows and columns")
-    design = DesignOptions(
-        asked["method"], asked["rotation"], None if size is None else size // 2, asked["most_noise_gain"]
-    )
+    design = DesignOptions(asked["method"], asked["rotation"], None if size is None else size // 2)
     return FilterRequest(
         design=DesignRequest(
             images,
@@ -128,7 +124,7 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
     image that fails does not stop the others (exit code 4). The same command continues a run that was interrupted.
     """
     from photoplan.cli.telling import Telling
-    from photoplan.engine.cpus import available_cpus
+    from photoplan.engine.executors import available_cpus
     from photoplan.products.restore.filter import FILTER_NAME, keep_filter, requested_filter
     from photoplan.products.restore.run import RestoreRequest, plan_restoration, restore_images
     from photoplan.report.page import open_report
@@ -189,7 +185,7 @@ def _before(plan: RestorePlan) -> list[str]:
             f"{figures['noise_gain']:.3g} times"
         ]
     )
-    for name in ("condition", "rule"):
+    for name in ("condition", "rule", "expected"):
         if name in figures["facts"]:
             lines.append(f"{name}: {figures['facts'][name]}")
     return lines + [line for job in plan.jobs for line in _corrections(job.reader)]

@@ -11,7 +11,7 @@ import click
 
 from photoplan.cli.output import show_json
 from photoplan.cli.telling import Telling
-from photoplan.engine.cpus import available_cpus
+from photoplan.engine.executors import available_cpus
 from photoplan.errors import TilesFailed
 from photoplan.products.orthophoto.execution import ProductResult, Run, execute
 from photoplan.products.orthophoto.plan import OrthoPlan
@@ -60,7 +60,8 @@ def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling)
     tiles = sum(len(p.plan.tiles) for p in plan.products)
     events.talk(
         f"plan: {len(plan.products)} products, {tiles} tiles · {settings.resolution:g} m · kernel {settings.kernel} · "
-        f"tolerance {settings.tolerance:g} px · nodata {settings.nodata} · {how.workers} {how.executor}"
+        f"tolerance {settings.tolerance:g} px · nodata {settings.nodata} · "
+        f"hidden {settings.hidden} · {how.workers} {how.executor}"
     )
     for line in plan.blind:
         events.talk(f"  sees no terrain and is left out: {line}")
@@ -87,5 +88,11 @@ def _summary(results: list[ProductResult], plan: OrthoPlan, seconds: float) -> s
     cells = sum(r.cells for r in results)
     return (
         f"{len(results)} orthophotos in {seconds:.1f} s · {pixels:.1f} Mpx, {pixels / seconds:.3g} Mpx/s · "
-        f"{cells} cells, worst anchor residual {worst:.3g} px"
+        f"{cells} cells, worst anchor residual {worst:.3g} px{_hidden(results)}"
     )
+
+
+def _hidden(results: list[ProductResult]) -> str:
+    """Ground that images cannot see, if somebody has asked."""
+    areas = [r.hidden for r in results if r.hidden is not None]
+    return f" · hidden {sum(areas):.4g} m²" if areas else ""

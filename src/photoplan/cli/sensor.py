@@ -21,15 +21,19 @@ from photoplan.cli.output import say, show, show_json
 @quiet_option
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Resolution, bandwidth, charge transfer and noise of the sensor that FILE (TOML) describes."""
-    from photoplan.products.sensor.run import SensorRequest, describe_sensor
+    from photoplan.io.run_record import recording
+    from photoplan.products.sensor import SensorRequest, describe_sensor
     from photoplan.report.page import open_report
     from photoplan.report.sensor import sensor_page
 
     overwrite, table = options["overwrite"], options["csv"]
     page = open_report(options.pop("report"), [options["file"]], overwrite=overwrite, table=table)
-    found = describe_sensor(SensorRequest(**options))
+    request = SensorRequest(**options)
+    record = recording("sensor", request, [request.file])
+    found = describe_sensor(request)
     report = None if page is None or options["dry_run"] else page.write(sensor_page(found, page.mpl))
     written = [path for path in (report, found.csv) if path is not None]
+    record(reversed(written), found)
     if as_json:
         show_json(found, written=written)
     else:

@@ -41,7 +41,7 @@ def command(scene: str, as_json: bool, quiet: bool, **options: Any) -> None:
     discs:PITCH,DIAMETER.
     """
     from photoplan.cli.telling import Telling
-    from photoplan.engine.cpus import available_cpus
+    from photoplan.engine.executors import available_cpus
     from photoplan.products.simulate.run import SimulateRequest, simulate
 
     options["workers"] = options["workers"] or available_cpus()

@@ -44,7 +44,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     [observations] in PROJECT. Images that hang together with no other are named.
     """
     from photoplan.cli.telling import Telling
-    from photoplan.engine.cpus import available_cpus
+    from photoplan.engine.executors import available_cpus
     from photoplan.products.tie.run import TieRequest, find_ties
     from photoplan.report.drawing import has_matplotlib
     from photoplan.report.page import open_picture

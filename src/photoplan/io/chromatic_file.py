@@ -11,8 +11,8 @@ from pydantic import Field, Strict
 
 from photoplan.io.camera.model import Entry, Number, Pair, Pixels
 from photoplan.io.disk import write_atomically
+from photoplan.io.plain_files import read_entries
 from photoplan.io.project.write import toml_value
-from photoplan.io.toml_file import read_entries
 
 _MAX_BYTES = 1_000_000
 _Band = Annotated[int, Strict(), Field(ge=1, le=1000)]

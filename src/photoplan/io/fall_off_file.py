@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, Strict
 
 from photoplan.io.camera.model import Entry, Number, Positive
+from photoplan.io.plain_files import read_entries
 from photoplan.io.project.write import toml_value
-from photoplan.io.toml_file import read_entries
 
 _MAX_BYTES = 1_000_000
 _Side = Annotated[int, Strict(), Field(gt=0, le=10_000_000)]

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.io.plain_files import finite, read_text
+from photoplan.io.plain_files import finite, read_text, read_toml
 from photoplan.io.project.write import toml_key, toml_value
-from photoplan.io.toml_file import read_toml
 
 #: Entry `kind` of a filter file, by which it is told from a project.
 FILTER_KIND = "restoration filter"
@@ -37,7 +36,7 @@ _HEADER = """\
 
 @dataclass(frozen=True, eq=False)
 class KernelEntry:
-    """One kernel of a file; see `photoplan.quality.filters.FilterKernel`."""
+    """One kernel of a file; see `photoplan.quality.restoration.filters.FilterKernel`."""
 
     values: NDArray[np.float64]
     """Rows and columns of finite numbers."""
@@ -48,7 +47,7 @@ class KernelEntry:
 
 @dataclass(frozen=True, eq=False)
 class FilterEntries:
-    """What a filter file says; see `photoplan.quality.filters.RestorationFilter`."""
+    """What a filter file says; see `photoplan.quality.restoration.filters.RestorationFilter`."""
 
     kernels: tuple[KernelEntry, ...]
     image_size: tuple[int, int] | None = None

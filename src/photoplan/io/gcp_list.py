@@ -22,7 +22,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_label, crs_step, parse_crs, same_crs, split_compound
 from photoplan.io.names import match_key
 from photoplan.io.plain_files import read_text
-from photoplan.io.table_lines import NUMBER
+from photoplan.io.table_lines import NUMBER, number
 
 MAX_BYTES = 100_000_000
 _UTM = re.compile(r"WGS\s*84\s+UTM\s+(\d{1,2})\s*([NS])", re.I)
@@ -69,7 +69,7 @@ def read_gcp_list(path: Path, crs: str | None = None) -> GcpList:
     if not lines:
         raise InputError(f"{path}: holds no line with data")
     own = _crs(f"{path}:{lines[0][0]}", lines[0][1])
-    rows = [_line(path, number, text) for number, text in lines[1:] if not text.startswith("#")]
+    rows = [_line(path, line, text) for line, text in lines[1:] if not text.startswith("#")]
     if not rows:
         raise InputError(f"{path}: holds a CRS and no measurement")
     names = _names(rows)
@@ -114,21 +114,18 @@ def _crs(where: str, text: str) -> str:
     return split_compound(text)[0]
 
 
-def _line(path: Path, number: int, text: str) -> _Line:
+def _line(path: Path, line: int, text: str) -> _Line:
     words = text.split()
     if len(words) < 6:
-        raise InputError(f"{path}:{number}: {len(words)} words; X Y Z column row image are needed")
+        raise InputError(f"{path}:{line}: {len(words)} words; X Y Z column row image are needed")
     values = []
     for what, word in zip(("X", "Y", "Z", "column", "row"), words):
         if what == "Z" and word.casefold() == "nan":
             values.append(np.nan)
             continue
-        if not NUMBER.fullmatch(word):
-            hint = "; write decimals with a point" if "," in word else ""
-            raise InputError(f"{path}:{number}: {what} = {word[:40]!r} is not a number{hint}")
-        values.append(float(word))
+        values.append(number(word, f"{path}:{line}: {what}"))
     X, Y, Z, col, row = values
-    return _Line(number, (X, Y, Z), (col, row), words[5], words[6] if len(words) > 6 else None)
+    return _Line(line, (X, Y, Z), (col, row), words[5], words[6] if len(words) > 6 else None)
 
 
 def _names(rows: list[_Line]) -> list[str]:
@@ -142,10 +139,10 @@ def _names(rows: list[_Line]) -> list[str]:
             continue
         key = tuple(repr(v) for v in row.XYZ)
         if key not in places:
-            number = len(places) + 1
-            while f"gcp_{number}" in taken:
-                number += 1
-            places[key] = f"gcp_{number}"
+            count = len(places) + 1
+            while f"gcp_{count}" in taken:
+                count += 1
+            places[key] = f"gcp_{count}"
             taken.add(places[key])
         out.append(places[key])
     return out

@@ -79,14 +79,12 @@ def read_image_points(
 
 
 def _sigma(table: Table) -> np.ndarray:
-    both = table.numbers("sigma", empty=True)
-    sigma = table.numbers("sigma_x", "sigma_y", empty=True)
-    sigma = np.where(np.isnan(sigma), both[:, None], sigma)
+    sigma = np.stack([table.first_known(role, "sigma") for role in ("sigma_x", "sigma_y")], axis=1)
     bad = np.flatnonzero((sigma <= 0).any(axis=1))
     if len(bad):
         k = int(bad[0])
         raise InputError(f"{table.where(k)}: standard deviation {sigma[k].tolist()} px; it must be positive")
-    return np.asarray(sigma, float)
+    return sigma
 
 
 def _once(

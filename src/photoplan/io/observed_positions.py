@@ -159,14 +159,10 @@ def read_observed_positions(
 
 
 def _sigma(table: Table) -> NDArray[np.float64]:
-    every, plane = (table.numbers(role, empty=True) for role in ("sigma", "sigma_xy"))
     out = []
-    for role in ("sigma_x", "sigma_y", "sigma_z"):
-        own = table.numbers(role, empty=True)
-        if role != "sigma_z":
-            own = np.where(np.isnan(own), plane, own)
-        out.append(np.where(np.isnan(own), every, own))
-        _positive(table, role, out[-1])
+    for roles in (("sigma_x", "sigma_xy", "sigma"), ("sigma_y", "sigma_xy", "sigma"), ("sigma_z", "sigma")):
+        out.append(table.first_known(*roles))
+        _positive(table, roles[0], out[-1])
     return np.stack(out, axis=1)
 
 

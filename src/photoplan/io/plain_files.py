@@ -1,24 +1,21 @@
-"""Text files read with limits: size, encoding, and depth of nesting."""
+"""Text, JSON and TOML files read whole, with limits: size, encoding."""
 
 from __future__ import annotations
 
 import json
 import math
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
-import yaml
 from pydantic import BaseModel, ValidationError
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.io.appearance import looks_like
 from photoplan.io.project.errors import explain
-
-#: Levels of nesting that any of our formats could need.
-MAX_DEPTH = 32
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -80,52 +77,6 @@ def read_head(path: Path) -> str:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
     return raw.decode("utf-8-sig", errors="replace").replace("\r\n", "\n").replace("\r", "\n")
-
-
-def read_yaml(path: Path) -> Any:
-    """Plain contents of a YAML file.
-
-    Aliases (which let a small file unfold without bound), deep nesting and repeated keys are refused before anything
-    is built.
-
-    Raises
-    ------
-    InputError
-        The file is not such YAML.
-    """
-    return parse_yaml(read_text(path, 200_000), path)
-
-
-def parse_yaml(text: str, path: Path) -> Any:
-    """Plain contents of YAML text that was read from `path`; raises InputError as `read_yaml`."""
-    try:
-        depth = 0
-        for event in yaml.parse(text, yaml.SafeLoader):
-            line = event.start_mark.line + 1 if event.start_mark else 0
-            if isinstance(event, yaml.AliasEvent):
-                raise InputError(f"{path}:{line}: YAML aliases are not read; write the values out")
-            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > MAX_DEPTH:
-                raise InputError(f"{path}:{line}: nested deeper than {MAX_DEPTH} levels")
-        _refuse_repeated_keys(yaml.compose(text, yaml.SafeLoader), path)
-        return yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f"{path}:{mark.line + 1}" if mark else str(path)
-        raise InputError(f"{where}: not valid YAML ({getattr(error, 'problem', None) or error})") from None
-
-
-def _refuse_repeated_keys(node: Any, path: Path) -> None:
-    if isinstance(node, yaml.SequenceNode):
-        for child in node.value:
-            _refuse_repeated_keys(child, path)
-    if isinstance(node, yaml.MappingNode):
-        seen: set[str] = set()
-        for key, child in node.value:
-            if str(key.value) in seen:
-                raise InputError(f"{path}:{key.start_mark.line + 1}: {key.value!r} is given twice")
-            seen.add(str(key.value))
-            _refuse_repeated_keys(child, path)
 
 
 def read_json(path: Path, max_bytes: int = 1_000_000_000) -> Any:
@@ -208,3 +159,37 @@ def crs_beside(path: Path) -> StatedCrs | None:
     text = read_text(side, _MAX_BYTES).strip()
     parse_crs(text, str(side))
     return StatedCrs(side, *split_compound(text))
+
+
+#: A project of 100,000 images stays far below; anything larger is not a project file.
+MAX_BYTES = 200_000_000
+
+
+def read_toml(path: Path, max_bytes: int = MAX_BYTES) -> tuple[dict[str, Any], str]:
+    """Contents of a TOML file and its text.
+
+    Raises
+    ------
+    InputError
+        The file is missing, too large, not UTF-8 or not TOML; the message names the line.
+    """
+    text = read_text(path, max_bytes)
+    try:
+        return tomllib.loads(text), text
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from None
+
+
+def read_entries(path: Path, model: type[M], max_bytes: int = MAX_BYTES) -> M:
+    """Contents of a TOML file as a checked value.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or an entry is missing, unknown or wrong; the message names the entry and its line.
+    """
+    contents, text = read_toml(path, max_bytes)
+    try:
+        return model.model_validate(contents)
+    except ValidationError as error:
+        raise InputError(explain(error, contents, str(path), text)) from None

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pyogrio.errors import DataSourceError, FieldError, GeometryError
 
 from photoplan.errors import InputError, UsageError
+from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.grid import MapGrid
 from photoplan.io.checks import check_plain_file
 from photoplan.io.geopackage import VectorLayer, write_geopackage
@@ -27,6 +28,7 @@ _KINDS = {
     "Point": ("Point", "MultiPoint"),
     "LineString": ("LineString", "MultiLineString"),
 }
+_PLURAL = {"Polygon": "polygons", "Point": "points", "LineString": "lines"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +51,7 @@ class VectorFeatures:
     items: tuple[Feature, ...]
 
 
-def read_features(path: Path, *kinds: str) -> VectorFeatures:
+def read_features(path: Path, *kinds: str, crs: str | None = None) -> VectorFeatures:
     """Objects of the first layer of a GeoPackage, Shapefile, GeoJSON or FlatGeobuf.
 
     Parameters
@@ -57,11 +59,14 @@ def read_features(path: Path, *kinds: str) -> VectorFeatures:
     path : Path
     kinds : str
         What the objects may be: `Polygon`, `Point`, `LineString`; several objects in one are taken as such.
+    crs : str, optional
+        That of the model for which they are wanted.
 
     Raises
     ------
     InputError
-        The file is none of these formats, holds no such objects, or polygons that cross themselves (all are named).
+        The file is none of these formats, holds no such objects, or polygons that cross themselves (all are named), or
+        states another CRS.
     """
     path = check_plain_file(path, "vector file")
     with path.open("rb") as file:
@@ -84,12 +89,17 @@ def read_features(path: Path, *kinds: str) -> VectorFeatures:
             raise InputError(
                 f"{path}: feature {i + 1} is a {shape.geom_type}; allowed are {', '.join(allowed)}. Give another file"
             )
-        own = None if names is None else names[i]
-        items.append(Feature(str(own) if own is not None and str(own).strip() else str(i + 1), shape))
+        name = None if names is None else names[i]
+        items.append(Feature(str(name) if name is not None and str(name).strip() else str(i + 1), shape))
     if not items:
         raise InputError(f"{path}: holds no {' or '.join(kinds)}; give a file that does")
     _refuse_invalid(path, items)
-    return VectorFeatures(path, meta["crs"] if _states_crs(path, head) else None, tuple(items))
+    own = meta["crs"] if _states_crs(path, head) else None
+    if own is not None and crs is not None and not same_crs(own, crs):
+        raise InputError(
+            f"{path}: {_PLURAL[kinds[0]]} in {crs_label(own)}, the model is in {crs_label(crs)}; reproject them"
+        )
+    return VectorFeatures(path, own, tuple(items))
 
 
 def _states_crs(path: Path, head: bytes) -> bool:

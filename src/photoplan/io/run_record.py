@@ -9,6 +9,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields
 from datetime import UTC, datetime
 from functools import cache
 from hashlib import sha256
@@ -42,6 +43,8 @@ _PICTURE = base64.b64decode(
 #: Decoders by the beginning of the digest of what they make of it.
 _DECODERS = {"dda6fb8a7330": "libjpeg 9 of the IJG", "0626c3e14946": "libjpeg-turbo"}
 T = TypeVar("T")
+#: Fields of requests that decide no value.
+_IDLE = {"memory", "workers", "overwrite", "dry_run"}
 _PACKAGES = ("photoplan", "numpy", "numba", "scipy", "rasterio", "pyproj", "pyogrio", "shapely")
 
 
@@ -64,14 +67,71 @@ def input_entry(path: Path | str, digest: str | None = None) -> dict[str, Any]:
     return {"path": path, "sampled_sha256": digest or fingerprint(path).digest, "size": Path(path).stat().st_size}
 
 
-def run_key(kind: str, settings: object, inputs: Iterable[Path]) -> str:
-    """The digest of all that decides a product: a run with another one starts afresh."""
-    known = {"by": __version__, "kind": kind, "settings": settings, "inputs": [fingerprint(p).digest for p in inputs]}
+def run_key(kind: str, settings: object, inputs: Iterable[Path | Mapping[str, Any]]) -> str:
+    """The digest of all that decides a product, of files or their entries: a run with another one starts afresh."""
+    digests = [_entry(each)["sampled_sha256"] for each in inputs]
+    known = {"by": __version__, "kind": kind, "settings": settings, "inputs": digests}
     return sha256(json_text(known, "settings").encode()).hexdigest()
 
 
+def settings_of(request: Any) -> dict[str, Any]:
+    """Fields of a request that may decide values: not its files, which are inputs or outputs."""
+    stated = {each.name: getattr(request, each.name) for each in fields(request)}
+    return {name: value for name, value in stated.items() if name not in _IDLE and not _of_files(value)}
+
+
+def _of_files(value: Any) -> bool:
+    return isinstance(value, Path) or (
+        isinstance(value, tuple) and bool(value) and all(isinstance(v, Path) for v in value)
+    )
+
+
+def recording(kind: str, request: Any, inputs: Iterable[Any]) -> Callable[[Iterable[Path | None], Any], None]:
+    """The record of a command that measures or converts: what it reads is looked at now, before it changes any of it.
+
+    Parameters
+    ----------
+    kind : str
+    request : dataclass
+        See `settings_of`.
+    inputs : iterable
+        Files; what is none (a word, or missing and not needed) is passed over.
+
+    Returns
+    -------
+    callable
+        Takes the files that were written, None among them passed over, and the figures. Writes the record beside the
+        first of them; `PROJECT.KIND.run.json` beside a project that was changed; nothing if there are none.
+
+    Raises
+    ------
+    InputError
+        An input cannot be read; see `write_run_record` for the callable.
+    """
+    times, settings = run_times(), settings_of(request)
+    read = {Path(each): None for each in inputs if each is not None and Path(each).is_file()}
+    entries = [input_entry(each) for each in read]
+    key = run_key(kind, settings, entries)
+
+    def record(written: Iterable[Path | None], product: Any) -> None:
+        files = [path for path in written if path is not None]
+        if files:
+            path = files[0].with_name(f"{files[0].stem}.{kind}.run.json") if files[0] in read else None
+            told = {"kind": kind, "product": product, "settings": settings, "files": files}
+            write_run_record(files[0], path=path, key=key, inputs=entries, run=times(), **told)
+
+    return record
+
+
 def write_run_record(
-    product: Path, /, *, key: str, inputs: Iterable[Path | Mapping[str, Any]], run: Mapping[str, Any], **told: Any
+    product: Path,
+    /,
+    *,
+    key: str,
+    inputs: Iterable[Path | Mapping[str, Any]],
+    run: Mapping[str, Any],
+    path: Path | None = None,
+    **told: Any,
 ) -> Path:
     """Write the record of a product as JSON; the name holds the old or the whole new record.
 
@@ -86,6 +146,8 @@ def write_run_record(
         Files, or their entries, see `input_entry`.
     run : mapping
         Workers and whatever else was chosen without an effect on the content; times, see `run_times`.
+    path : Path, optional
+        Another place for the record.
     **told
         What the kind of product has to say: `product`, `settings`, and more.
 
@@ -96,13 +158,18 @@ def write_run_record(
     ResourceError
         If the disk is full.
     """
-    entries = [each if isinstance(each, Mapping) else input_entry(each) for each in inputs]
+    entries = [_entry(each) for each in inputs]
     record = {"file": product.name, **told, "key": key, "inputs": entries, "run": run, "versions": versions()}
-    path = record_path(product)
-    if _of_another(path, product):
-        path = product.with_name(f"{product.name}.run.json")
+    if path is None:
+        path = record_path(product)
+        if _of_another(path, product):
+            path = product.with_name(f"{product.name}.run.json")
     write_atomically(path, (json_text(record | {"peak_memory_bytes": peak_memory_bytes()}, "record") + "\n").encode())
     return path
+
+
+def _entry(each: Path | Mapping[str, Any]) -> Mapping[str, Any]:
+    return each if isinstance(each, Mapping) else input_entry(each)
 
 
 def _of_another(path: Path, product: Path) -> bool:

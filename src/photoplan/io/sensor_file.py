@@ -9,7 +9,7 @@ from pydantic import Field, Strict, model_validator
 
 from photoplan.errors import InputError
 from photoplan.io.camera.model import Entry, Name, Number
-from photoplan.io.toml_file import read_entries
+from photoplan.io.plain_files import read_entries
 
 _MAX_BYTES = 1_000_000
 #: Nothing that is described is larger, or smaller than its reciprocal; it keeps every figure finite.

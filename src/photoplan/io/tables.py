@@ -152,6 +152,13 @@ class Table:
         found = [self._numbers(role, empty) for role in roles]
         return found[0] if len(found) == 1 else np.stack(found, axis=1)
 
+    def first_known(self, *roles: str) -> NDArray[np.float64]:
+        """Numbers of the first of several roles that has one, shape (n,); NaN where none has; raises as `numbers`."""
+        found = self.numbers(roles[0], empty=True)
+        for role in roles[1:]:
+            found = np.where(np.isnan(found), self.numbers(role, empty=True), found)
+        return found
+
     def _numbers(self, role: str, empty: bool) -> NDArray[np.float64]:
         if role not in self.roles:
             return np.full(len(self.rows), np.nan)

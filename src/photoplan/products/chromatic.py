@@ -17,9 +17,8 @@ from photoplan.io.chromatic_file import read_chromatic, write_chromatic
 from photoplan.io.raster import RasterReader
 from photoplan.plain import pick, plain
 from photoplan.quality.colour.discs import disc_displacements, find_discs
-from photoplan.quality.colour.edge_displacements import edge_displacements
+from photoplan.quality.colour.displacements import edge_displacements, patch_displacements
 from photoplan.quality.colour.model import BandModel, ChromaticModel, Displacements, fit_band
-from photoplan.quality.colour.patch_displacements import patch_displacements
 from photoplan.quality.edges.find import EdgePicture, find_edges
 
 #: Side of the parts in which edges are sought, pixels; it bounds memory.

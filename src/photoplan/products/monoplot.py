@@ -19,10 +19,12 @@ from photoplan.io.polygons import read_features, write_features
 from photoplan.io.product import check_output
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
+from photoplan.io.run_record import recording
 from photoplan.io.tables import Columns, read_table, write_table
 from photoplan.plain import pick
+from photoplan.plan.footprint import footprint
 from photoplan.project.open_terrain import open_terrain
-from photoplan.project.scene import Scene, input_files, open_scene, pose_of
+from photoplan.project.scene import Ground, camera_without_pixels, ground_of, input_files, pose_of
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.terrain.monoplot import REASONS, MonoplotErrors, MonoplotPoints, monoplot
 
@@ -108,16 +110,18 @@ def monoplot_file(request: MonoplotRequest) -> MonoplotReport:
             check_output(path, inputs, overwrite=request.overwrite)
     if request.vectors is not None and request.vectors.suffix.lower() != ".gpkg":
         raise UsageError(f"{request.vectors}: vectors are written as GeoPackage; give a name that ends with .gpkg")
+    terrain = project.terrain and project.terrain.file
+    record = recording("monoplot", request, [*inputs[:2], terrain and project.resolve(terrain)])
     name = _image_name(project, request.image)
     given = _read(request)
-    scene = open_scene(project, name)
-    mesh, sigma = _mesh_and_sigma(project, scene)
+    camera, ground = camera_without_pixels(project, name), ground_of(project)
+    mesh, sigma = _mesh_and_sigma(project, ground)
     if request.sigma_terrain is not None:
         sigma = request.sigma_terrain
     notes = []
     if sigma is None:
         notes.append("no standard deviations: the terrain has none of its own; give `sigma_terrain` METRES")
-    pose = pose_of(project, project.image(name), scene.ground)
+    pose = pose_of(project, project.image(name), ground)
     unit = project.orientation.angle_unit
     errors = MonoplotErrors(
         request.sigma_image,
@@ -126,16 +130,18 @@ def monoplot_file(request: MonoplotRequest) -> MonoplotReport:
         tuple(float(a) for a in angle_in_radians(np.array(request.sigma_angles), unit)),  # type: ignore[arg-type]
         _axes(pose.R_ground_camera, project.orientation.rotation),
     )
-    seen = scene.footprint
-    found = monoplot(scene.camera, given.xy, scene.surface, seen.height_range, errors, mesh)
+    seen = footprint(camera, ground.surface, ground.bounds)
+    found = monoplot(camera, given.xy, ground.surface, seen.height_range, errors, mesh)
     if (found.reasons != "").all():
         bounds = "nowhere" if seen.bounds is None else " ".join(f"{v:.8g}" for v in seen.bounds)
-        center = " ".join(f"{v:.8g}" for v in scene.camera.center)
+        center = " ".join(f"{v:.8g}" for v in camera.center)
         notes.append(f"no point is on the ground; camera at {center}, terrain in its reach {bounds}")
     _write_table(request.output, given, found)
     if request.vectors is not None:
         _write_vectors(request.vectors, given, found, project.crs)
-    return _report(request, found, scene.ground.working_system, notes)
+    report = _report(request, found, ground.working_system, notes)
+    record([request.output, request.vectors], report)
+    return report
 
 
 def _image_name(project: Project, name: str) -> str:
@@ -146,12 +152,12 @@ def _image_name(project: Project, name: str) -> str:
 
 
 def _mesh_and_sigma(
-    project: Project, scene: Scene
+    project: Project, ground: Ground
 ) -> tuple[float, Callable[[NDArray[np.float64]], NDArray[np.float64]] | float | None]:
     """Mesh width of the project's terrain and its standard deviation, if it knows one."""
-    if scene.ground.file is None:
+    if ground.file is None:
         return 1.0, None
-    terrain, _ = open_terrain(scene.ground.file, project.ground.crs).in_crs(project.crs)
+    terrain, _ = open_terrain(ground.file, project.ground.crs).in_crs(project.crs)
     surface = terrain.surface
     return terrain.resolution, surface.sigmas if isinstance(surface, HybridSurface) else None
 

@@ -202,9 +202,10 @@ def rectify(
 def _collected(plan: ProductPlan, reader: Reader, work: Any, workers: int) -> Raster:
     with Workers(executor_factory("threads", workers), workers) as pool:
         parts = ((each.task.window, _painted(each)) for each in run_tiles(plan.tiles, work, pool, pool.in_flight))
-        whole = joined(plan.target.window, parts, reader, plan.owners is not None)
+        whole = joined(plan.target.window, parts, reader)
     assert whole.values is not None and whole.valid is not None
-    return Raster(whole.values, whole.valid, plan.target.placement, whole.owner, whole.residual)
+    owner = np.zeros_like(whole.valid, np.uint16) if plan.owners is not None and whole.owner is None else whole.owner
+    return Raster(whole.values, whole.valid, plan.target.placement, owner, whole.residual)
 
 
 def _painted(outcome: Outcome) -> Painted:

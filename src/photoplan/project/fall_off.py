@@ -21,7 +21,7 @@ from photoplan.quality.restoration.restorer import light_of
 
 
 def read_fall_off(path: Path) -> FallOffModel:
-    """The model of a correction file; `photoplan.quality.fall_off_model.correct_fall_off` applies it.
+    """The model of a correction file; `photoplan.quality.camera.fall_off_model.correct_fall_off` applies it.
 
     Raises
     ------

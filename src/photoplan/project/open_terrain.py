@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from photoplan.errors import InputError
+from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.crs import CrsStep, crs_step, require_projected_metres, same_crs
 from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
 from photoplan.io.terrain.reader import TerrainReader
@@ -30,6 +30,19 @@ class OpenTerrain:
     """Mesh width, of a hybrid model the finest, metres."""
     model: ModelReader | None = None
     """The file of a hybrid model, with its units, lines and figures; None: a raster of heights."""
+
+    def refuse_apart(self, bounds: tuple[float, float, float, float]) -> None:
+        """Refuse bounds xmin, ymin, xmax, ymax that do not meet the terrain.
+
+        Raises
+        ------
+        GeometryError
+            They do not; the message states both.
+        """
+        a, b = self.bounds, bounds
+        if not (a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]):
+            asked, covered = (" ".join(f"{v:.10g}" for v in each) for each in (b, a))
+            raise GeometryError(f"bounds {asked} do not meet {self.path}, which covers {covered}")
 
     def in_crs(self, crs: str) -> tuple[OpenTerrain, tuple[CrsStep, ...]]:
         """The same terrain with its surface in another CRS, and the coordinate operation that leads to the file's.

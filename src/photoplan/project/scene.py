@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import CentralCamera
 from photoplan.cameras.build import oriented_camera
@@ -20,14 +20,17 @@ from photoplan.geometry.crs import CrsStep
 from photoplan.geometry.heights import HeightStep, declared_pair, height_step
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_from_angles
+from photoplan.io.camera.model import CameraEntry
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.names import resolve_input
 from photoplan.io.orientation.table import angle_in_radians
-from photoplan.io.project.cameras import interior_of, lens_of
+from photoplan.io.project.cameras import image_size, interior_of, lens_of
 from photoplan.io.project.file import parse_project
-from photoplan.io.project.model import Image, Project
+from photoplan.io.project.model import Image, Orientation, Project
 from photoplan.io.project.model import Terrain as StatedTerrain
 from photoplan.io.raster import RasterReader
+from photoplan.io.raster_info import read_info
+from photoplan.orientation.plausibility import View
 from photoplan.plan.footprint import Footprint, footprint
 from photoplan.project.filter_files import load_filter
 from photoplan.project.linearisation import linearisation_of
@@ -155,6 +158,29 @@ def open_scene(project: Project, name: str) -> Scene:
         declared or cannot be joined exactly.
     """
     return _open(scene_address(project, name))
+
+
+def is_there(file: Path) -> bool:
+    """Whether anything is found under a name, be it one that no file can have."""
+    try:
+        file.stat()
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def camera_without_pixels(project: Project, name: str) -> CentralCamera:
+    """Camera of one image by numbers alone: the image file need not be there; where it is, its size is compared.
+
+    Raises
+    ------
+    InputError
+        No size is known, that of the file is another one, or the image is not oriented.
+    """
+    image = project.image(name)
+    file = project.resolve(image.file)
+    size = read_info(file).size if is_there(file) else image_size(project.cameras[image.camera], image)
+    return _camera(project, image, ground_of(project), size)
 
 
 def map_order(project: Project, names: Sequence[str]) -> list[int]:
@@ -334,4 +360,36 @@ def _camera(project: Project, image: Image, ground: Ground, size: tuple[int, int
         earth_curvature=project.orientation.earth_curvature,
         refraction=project.orientation.refraction,
         mean_ground=nadir if np.isfinite(nadir) else 0.0,
+    )
+
+
+#: Points on a side of the grid over an image.
+_POINTS = 5
+
+
+def view_of(image: Image, camera: CameraEntry, orientation: Orientation, center: ArrayLike) -> View:
+    """View of a project's image.
+
+    Parameters
+    ----------
+    image : Image
+    camera : CameraEntry
+        Description of its camera.
+    orientation : Orientation
+        What its angles mean.
+    center : array_like, shape (3,)
+        Projection centre in the terrain's height system.
+    """
+    interior, lens = interior_of(camera, image), lens_of(camera)
+    w, h = interior.size
+    part = np.linspace(0.0, 1.0, _POINTS)
+    x, y = (g.ravel() for g in np.meshgrid(part * (w - 1), part * (h - 1)))
+    middle, half = np.array([(w - 1) / 2, (h - 1) / 2]), np.array([0.5, 0.0])
+    xy = np.concatenate([[middle, middle + half, middle - half], np.column_stack([x, y])])
+    t = lens.undistort(interior.tangent_to_pixel.inverse(xy))
+    pixel = float(np.linalg.norm(t[1] - t[2]))
+    angles = angle_in_radians(np.array(image.pose_numbers[1]), orientation.angle_unit)
+    points = np.delete(t, [1, 2], axis=0)
+    return View(
+        image.name, np.asarray(center, float), angles, orientation.rotation, points, pixel, orientation.angle_unit
     )

@@ -13,7 +13,7 @@ from photoplan.orientation.marks.layout import MarkLayout
 from photoplan.orientation.marks.measure import mark_window
 from photoplan.orientation.marks.search import Scan
 from photoplan.orientation.marks.template import Template, draw
-from photoplan.products.fiducials.run import ImageFiducials, UnfoundFiducials
+from photoplan.products.fiducials import ImageFiducials, UnfoundFiducials
 from photoplan.project.camera_marks import ScanImage
 from photoplan.report.drawing import png
 

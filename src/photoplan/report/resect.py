@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from photoplan.products.resect.image import ResectedImage
-from photoplan.products.resect.run import ResectResult
+from photoplan.products.resect import ResectedImage, ResectResult
 from photoplan.report.drawing import BLUE, INK, RED, SOFT, STYLE, axes_of, png, round_down, shortened
 from photoplan.report.page import Cell, cells, figure, headline, number, page, section, table, text
 

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.io.sensor_file import Chip, SensorDescription
-from photoplan.products.sensor.figures import noise_budget
-from photoplan.products.sensor.run import SensorReport, short_number
-from photoplan.quality.sensor import figures as sensor
-from photoplan.quality.sensor.noise import NoiseBudget
+from photoplan.products.sensor import SensorReport, noise_budget, short_number
+from photoplan.quality import sensor
+from photoplan.quality.sensor import NoiseBudget
 from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, PURPLE, RED, SOFT, STYLE, axes_of, png
 from photoplan.report.page import Cell, figure, page, section, table
 

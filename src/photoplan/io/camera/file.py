@@ -21,9 +21,8 @@ from photoplan.io.orientation import colmap as orientation_colmap
 from photoplan.io.orientation import metashape as orientation_metashape
 from photoplan.io.orientation import pix4d as orientation_pix4d
 from photoplan.io.orientation.table import TableFormat
-from photoplan.io.plain_files import read_head
+from photoplan.io.plain_files import read_head, read_toml
 from photoplan.io.project.errors import explain
-from photoplan.io.toml_file import read_toml
 
 _CAMERAS = TypeAdapter(dict[str, Camera])
 

@@ -12,7 +12,7 @@ import re
 from pathlib import Path
 
 from photoplan.errors import InputError
-from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, common_losses, require_map
+from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, common_losses, name_losses, require_map
 from photoplan.io.orientation.table import Direction, TableFormat
 from photoplan.io.orientation.text import angle_block, angle_lines, word_lines
 
@@ -47,21 +47,13 @@ def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     return {path: "".join(f"{KEYWORD} {line}\n" for line in angle_lines(block, path, NAME))}
 
 
-def _losses(block: OrientationBlock) -> list[Loss]:
-    lost = common_losses(block, cameras=False)
-    long = [image.name for image in block.table.images if len(image.name) > NAME]
-    if long:
-        lost.append(Loss("other", f"names of more than {NAME} characters may not be taken ({long[0]!r}): shorten them"))
-    return lost
-
-
 FORMAT = OrientationFormat(
     name="bingo",
     title="orientation lines of BINGO",
     sniff=lambda path, head: re.search(rf"^\s*{KEYWORD}\s+\S+(\s+[-+.\deEdD]+){{6}}", head, re.M) is not None,
     read=read,
     render=render,
-    losses=_losses,
+    losses=lambda block: [*common_losses(block, cameras=False), *name_losses(block, NAME)],
     suffix=".dat",
     angles=True,
 )

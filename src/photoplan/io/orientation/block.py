@@ -1,6 +1,6 @@
 """Oriented images together with their cameras, and what a file format for them is.
 
-How a format is added: a module ``orientation_NAME.py`` defines `FORMAT`, an `OrientationFormat` of four functions, and
+How a format is added: a module in this folder defines `FORMAT`, an `OrientationFormat` of four functions, and
 `photoplan.io.orientation.file.FORMATS` gets a line. Nothing else changes.
 """
 
@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.geometry.rotation import angles_from_rotation
+from photoplan.geometry.rotation import ANGLE_UNITS, angles_from_rotation
 from photoplan.io.camera.model import CameraEntry, IdealLens
 from photoplan.io.orientation.table import Direction, OrientationTable, OrientedImage, TableFormat
-from photoplan.io.project.model import ANGLE_UNITS
 
 LossKind = Literal["lens", "camera", "film", "crs", "height_system", "other"]
 
@@ -191,6 +190,13 @@ def common_losses(
     if block.table.height_system is not None:
         lost.append(Loss("height_system", f"no height system ({block.table.height_system})"))
     return lost
+
+
+def name_losses(block: OrientationBlock, most: int) -> Iterable[Loss]:
+    """The loss of a format whose names have so many characters at the most."""
+    long = [image.name for image in block.table.images if len(image.name) > most]
+    if long:
+        yield Loss("other", f"names of more than {most} characters may not be taken ({long[0]!r}): shorten them")
 
 
 def height_losses(table: OrientationTable) -> Iterable[Loss]:

@@ -19,8 +19,9 @@ from photoplan.errors import InputError
 from photoplan.io.camera.model import CameraEntry
 from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, require_cameras
-from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
-from photoplan.io.plain_files import finite, read_text
+from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, posed
+from photoplan.io.orientation.text import numbers
+from photoplan.io.plain_files import read_text
 
 MAX_BYTES = 2 << 30
 #: Parameters of every model: one or two focal lengths f, principal point c, coefficients of the lens.
@@ -91,7 +92,7 @@ def read_cameras(path: Path) -> dict[str, CameraEntry]:
 
 
 def _camera(model: str, words: list[str], where: str) -> CameraEntry:
-    width, height, *values = _floats(words, where, 2 + len(_MODELS[model]))
+    width, height, *values = numbers(words, where, f"camera model {model}", 2 + len(_MODELS[model]))
     v = dict(zip(_MODELS[model], values))
     focal = (v.get("fx", v.get("f", 0.0)), v.get("fy", v.get("f", 0.0)))
     fisheye = model.endswith("FISHEYE")
@@ -107,15 +108,6 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
             yield number, line
 
 
-def _floats(words: list[str], where: str, count: int) -> tuple[float, ...]:
-    try:
-        values = [float(w) for w in words]
-    except ValueError:
-        raise InputError(f"{where}: {' '.join(words)[:80]!r}: numbers are needed") from None
-    checked: tuple[float, ...] = finite(values, where, count)
-    return checked
-
-
 def _images(path: Path) -> Iterator[OrientedImage]:
     """Every image; the line of its points, which may be empty, is passed over."""
     lines = enumerate(read_text(path, MAX_BYTES).split("\n"), 1)
@@ -129,16 +121,14 @@ def _images(path: Path) -> Iterator[OrientedImage]:
                 f"{where}: {len(words)} columns; IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID and NAME are needed "
                 "(a line with points follows every image, even if it is empty)"
             )
-        values = _floats(words[1:8], where, 7)
+        values = numbers(words[1:8], where, f"image {words[9]!r}: pose", 7)
         q, t = np.array(values[:4]), np.array(values[4:])
         if not 0.99 < np.linalg.norm(q) < 1.01:
             raise InputError(
                 f"{where}: image {words[9]!r}: the quaternion has the length {np.linalg.norm(q):.3g}, not 1"
             )
         R_camera_world = Rotation.from_quat(np.roll(q, -1)).as_matrix()
-        x, y, z = (-R_camera_world.T @ t).tolist()
-        a = degrees_of((R_camera_world.T @ FLIP)[None])[0].tolist()
-        yield OrientedImage(words[9].strip(), (x, y, z), (a[0], a[1], a[2]), words[8], number)
+        yield posed(words[9].strip(), -R_camera_world.T @ t, R_camera_world.T @ FLIP, words[8], number)
         next(lines, None)
 
 

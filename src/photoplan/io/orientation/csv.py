@@ -10,9 +10,8 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, common_losses, require_map
-from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
+from photoplan.io.orientation.table import ANGLE_NAMES, OrientationTable, OrientedImage, TableFormat
 from photoplan.io.plain_files import crs_beside
-from photoplan.io.project.model import ANGLE_UNITS
 from photoplan.io.table_lines import NUMBER
 from photoplan.io.tables import Columns, Dialect, Table, read_table
 
@@ -29,8 +28,6 @@ HEADERS = {
 }
 NEEDED = ("name", "x", "y", "z", "omega", "phi", "kappa")
 MAX_BYTES = 100_000_000
-
-_ANGLE_OF = {"o": "omega", "p": "phi", "k": "kappa"}
 
 
 def _explain(first: tuple[str, ...], why: str) -> str | None:
@@ -88,13 +85,7 @@ def _image(table: Table, k: int, values: list[float], form: TableFormat) -> Orie
     if not name:
         raise InputError(f"{where}: the image has no name")
     value = dict(zip(NEEDED[1:], values))
-    for role in ("omega", "phi", "kappa"):
-        if abs(value[role]) > ANGLE_UNITS[form.angle_unit] * (1 + 1e-9):
-            raise InputError(
-                f"{where}: {role} = {value[role]:g} is more than a full circle in {form.angle_unit}; "
-                "declare the angle unit that the table is in (deg, gon or rad)"
-            )
-    a, b, c = (value[_ANGLE_OF[letter]] for letter in form.rotation)
+    a, b, c = (value[ANGLE_NAMES[letter]] for letter in form.rotation)
     camera = row[roles["camera"]] if "camera" in roles else None
     return OrientedImage(name, (value["x"], value["y"], value["z"]), (a, b, c), camera or None, table.lines[k])
 

@@ -23,7 +23,7 @@ from photoplan.geometry.earth_poses import enu_poses
 from photoplan.geometry.rotation import rotation_from_angles
 from photoplan.io.image_metadata import ImageMetadata, read_image_metadata
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
-from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat, degrees_of
+from photoplan.io.orientation.table import OrientationTable, TableFormat, posed
 
 SUFFIXES = (".jpg", ".jpeg", ".tif", ".tiff")
 #: From north, east, down to east, north, up.
@@ -104,11 +104,9 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     origin, enu, axes = enu_poses(np.array([m.position for m in oriented], float))
     # One camera needs no name: that of the camera file may be any.
     several = len({m.camera for m in oriented}) > 1
-    R = np.stack([rotation_from_gimbal(m.yaw_pitch_roll or (0, 0, 0)) for m in oriented])
-    angles = degrees_of(axes @ R).tolist()
     images = tuple(
-        OrientedImage(m.file.name, (x, y, z), (a[0], a[1], a[2]), m.camera if several else None)
-        for m, (x, y, z), a in zip(oriented, enu.tolist(), angles)
+        posed(m.file.name, at, R @ rotation_from_gimbal(m.yaw_pitch_roll or (0, 0, 0)), m.camera if several else None)
+        for m, at, R in zip(oriented, enu, axes)
     )
     lost = len(files) - len(oriented)
     notes = [f"{path.name}: {lost} images state no position or attitude; left out"] if lost else []

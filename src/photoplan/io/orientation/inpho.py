@@ -37,9 +37,10 @@ from photoplan.io.camera.frame import FrameEntry
 from photoplan.io.camera.model import CameraEntry
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation.inpho_write import losses, render
-from photoplan.io.orientation.table import Direction, OrientationTable, TableFormat
-from photoplan.io.orientation.text import DIRECTIONS, checked_rotation, number, numbers, pose_image
+from photoplan.io.orientation.table import Direction, OrientationTable, TableFormat, posed
+from photoplan.io.orientation.text import DIRECTIONS, checked_rotation, numbers
 from photoplan.io.plain_files import build, read_text
+from photoplan.io.table_lines import number
 
 MAX_BYTES = 200_000_000
 #: Largest median difference of matrices and angles that settles what the matrices do: boresight angles and errors of
@@ -163,7 +164,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         turn = turns.get(pose.camera or "", np.eye(3))
         turned |= not np.array_equal(turn, np.eye(3))
         R = (pose.M if direction == "camera-to-ground" else pose.M.T) @ turn.T
-        images.append(pose_image(pose.name, pose.center, R, pose.line, pose.camera))
+        images.append(posed(pose.name, pose.center, R, pose.camera, pose.line))
     if turned:
         notes.append(f"{path.name}: image axes of $CCD_INTERIOR_ORIENTATION are turned; the rotations are adapted")
     if any(image.camera not in cameras for image in images):
@@ -206,7 +207,7 @@ def _direction(poses: list[_Pose], file: _InphoFile, form: TableFormat, path: Pa
         name, ins = section.text("$PHOTO_NUM"), section.get("$INS")
         if name is not None and ins is not None:
             words = ins.value.split()[:3]
-            angles[name] = [number(w, f"{path}:{ins.line}", f"$INS of image {name!r}") * unit for w in words]
+            angles[name] = [number(w, f"{path}:{ins.line}: $INS of image {name!r}") * unit for w in words]
     known = [(pose.M, rotation_opk(*angles[pose.name])) for pose in poses if len(angles.get(pose.name, [])) == 3]
     usual = ", as MATCH-AT writes them (another program's project: `rotation_direction` camera-to-ground)"
     if not known:
@@ -267,7 +268,7 @@ def _coefficients(section: _Section, key: str, path: Path) -> list[float]:
     if key not in section:
         return []
     entry = section[key]
-    return [number(w, f"{path}:{entry.line}", key) for row in (entry.value, *entry.rows) for w in row.split()]
+    return [number(w, f"{path}:{entry.line}: {key}") for row in (entry.value, *entry.rows) for w in row.split()]
 
 
 def _affine(section: _Section, path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -295,7 +296,7 @@ def _frame(
     width, height = (float(v) for v in pixel * 1000)
     values = {
         "size": tuple(size),
-        "camera_constant_mm": number(section["$FOCAL_LENGTH"].value, where, "$FOCAL_LENGTH"),
+        "camera_constant_mm": number(section["$FOCAL_LENGTH"].value, f"{where}: $FOCAL_LENGTH"),
         "pixel_size_um": width if abs(width - height) < 1e-9 * width else (width, height),
         "principal_point_px": (col, row),
     }

@@ -1,4 +1,4 @@
-"""Agisoft Metashape's ``cameras.xml``: cameras and poses (File, Export, Export Cameras).
+"""Agisoft Metashape's ``cameras.xml``: cameras and poses (File, Export, Export Cameras), read and written.
 
 As its manual (Metashape User Manual, Professional Edition 2.1, appendix "Camera models") and the API reference define
 it: a camera's ``transform`` is a row-major 4 × 4 matrix from the camera's axes (x right, y down, z forwards) to the
@@ -6,40 +6,48 @@ chunk's own system; the ``transform`` of a component (of the chunk, in files bef
 rotation and translation to the world: geocentric coordinates of the datum of the ``reference`` CRS if that is
 geographic or projected, else the local system. Pixels: u = w/2 + cx + x′ f + x′ B1 + y′ B2, v = h/2 + cy + y′ f with
 (0.5, 0.5) as the centre of the upper-left pixel; x′, y′ from Brown's polynomial with k1–k4, p1, p2, y down.
+
+Written (version 2.0.0) are transforms in a local system (east, north, up about the middle of the block), which the
+component's transform places on the earth; a block without CRS is written in its own coordinates, as a local system.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree.ElementTree import Element
+from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
-from photoplan.geometry.crs import parse_crs, split_compound
+from photoplan.geometry.crs import crs_step, parse_crs, split_compound
 from photoplan.geometry.earth_poses import (
     enu_axes,
     geocentric_of_geodetic,
+    geocentric_poses,
     geodetic_of_geocentric,
     is_local_crs,
     is_wgs84_geographic,
+    legacy_wkt,
     map_poses,
 )
 from photoplan.io.camera.model import CameraEntry
-from photoplan.io.lens_forms import AgisoftForm, frame_camera
-from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
-from photoplan.io.orientation.metashape_write import losses, render
-from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
+from photoplan.io.lens_forms import AgisoftForm, agisoft_form, frame_camera
+from photoplan.io.markup_files import numbers, read_xml
+from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, height_losses, require_cameras
+from photoplan.io.orientation.table import FLIP, OrientationTable, TableFormat, posed
+from photoplan.io.orientation.text import checked_rotation
 from photoplan.io.plain_files import finite
-from photoplan.io.xml_file import numbers, read_xml
 
 MAX_BYTES = 256 << 20
 _COEFFICIENTS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 
 _Floats = NDArray[np.float64]
+#: How far a printed matrix times itself may be from the unit matrix.
+_ROUNDED = 2e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +80,7 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     rolling = sum(c.find("rolling_shutter") is not None for c in oriented)
     if rolling:
         notes.append(f"{path.name}: {rolling} cameras state a rolling shutter; its motion is not applied")
-    names, centers, rotations = [], [], []
+    names, centers, rotations, references = [], [], [], []
     placed = [by_component.get(c.get("component_id", ""), shared) for c in oriented]
     georeferenced = any(p is not None for p in placed)
     kept = [c for c, p in zip(oriented, placed) if p is not None or not georeferenced]
@@ -85,16 +93,21 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         names.append((camera.get("label") or f"camera {camera.get('id')}", camera.get("sensor_id", "")))
         centers.append(world.scale * world.R @ t + world.t)
         rotations.append(world.R @ R @ FLIP)
+        references.append(_reference(camera))
     cameras = {s: _sensor(sensors.get(s), s, path) for s in dict.fromkeys(s for _, s in names)}
     placing = _place(chunk, np.array(centers), np.array(rotations), georeferenced, path)
-    angles = degrees_of(placing.rotations).tolist()
     images = tuple(
-        OrientedImage(name, (x, y, z), (a[0], a[1], a[2]), cameras[s][0])
-        for (name, s), (x, y, z), a in zip(names, placing.centers.tolist(), angles)
+        posed(name, at, R, cameras[s][0]) for (name, s), at, R in zip(names, placing.centers, placing.rotations)
     )
     heights = "ellipsoidal" if placing.crs is not None else None
     table = OrientationTable(
-        path, images, crs=placing.crs, height_system=heights, origin=placing.origin, notes=(*notes, *placing.notes)
+        path,
+        images,
+        crs=placing.crs,
+        height_system=heights,
+        origin=placing.origin,
+        positions=_geodetic(np.array(references), chunk, path),
+        notes=(*notes, *placing.notes),
     )
     return OrientationBlock(table, _unique(cameras, path))
 
@@ -144,23 +157,42 @@ def _similarity(element: Element | None, where: str) -> _Similarity | None:
     scale = numbers(element.find("scale"), f"{where}: scale", 1)[0] if element.find("scale") is not None else 1.0
     if scale <= 0:
         raise InputError(f"{where}: scale {scale}; a positive number is needed")
-    return _Similarity(_rotation(R, where), t, scale)
-
-
-def _rotation(R: _Floats, where: str) -> _Floats:
-    """The rotation next to a printed one."""
-    U, _, Vt = np.linalg.svd(R)
-    nearest = U @ Vt
-    if np.linalg.det(nearest) < 0 or np.abs(nearest - R).max() > 1e-5:
-        raise InputError(f"{where}: its matrix is not a right-handed rotation; the file is damaged or of another kind")
-    return nearest
+    return _Similarity(checked_rotation(R, where, _ROUNDED), t, scale)
 
 
 def _camera_pose(camera: Element, where: str) -> tuple[_Floats, _Floats]:
     M = np.array(numbers(camera.find("transform"), f"{where}: transform", 16)).reshape(4, 4)
     if not np.allclose(M[3], [0.0, 0.0, 0.0, 1.0], rtol=0, atol=1e-9):
         raise InputError(f"{where}: transform: the last row is {M[3].tolist()}; 0 0 0 1 is needed")
-    return _rotation(M[:3, :3], where), M[:3, 3]
+    return checked_rotation(M[:3, :3], where, _ROUNDED), M[:3, 3]
+
+
+def _reference(camera: Element) -> list[float]:
+    """What a receiver measured, in the CRS of the chunk; NaN where the camera states nothing, or does not use it."""
+    stated = camera.find("reference")
+    if stated is None or stated.get("enabled", "true") in ("0", "false"):
+        return [np.nan] * 3
+    try:
+        return [float(stated.get(axis, "nan")) for axis in "xyz"]
+    except ValueError:
+        return [np.nan] * 3
+
+
+def _geodetic(references: _Floats, chunk: Element, path: Path) -> _Floats | None:
+    """Latitude, longitude and height (n, 3) of receivers' positions; None: none, or in no CRS that leads there."""
+    crs = (chunk.findtext("./reference") or "").strip()
+    there = np.isfinite(references[:, :2]).all(axis=1)
+    if not there.any() or not crs or is_local_crs(crs):
+        return None
+    try:
+        horizontal = split_compound(crs)[0]
+        if parse_crs(horizontal, f"{path}: reference").is_geocentric:
+            return None
+        out = np.full(references.shape, np.nan)
+        out[there] = np.column_stack([crs_step(horizontal, "EPSG:4326")(references[there, :2]), references[there, 2]])
+    except InputError:  # they only check the poses
+        return None
+    return out[:, [1, 0, 2]]
 
 
 def _sensor(sensor: Element | None, key: str, path: Path) -> tuple[str, CameraEntry]:
@@ -248,6 +280,97 @@ def _place(chunk: Element, centers: _Floats, rotations: _Floats, georeferenced: 
 
 def _sniff(path: Path, head: str) -> bool:
     return "<document" in head and "<chunk" in head and path.suffix.lower() == ".xml"
+
+
+_LOCAL = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
+
+
+def losses(block: OrientationBlock) -> Iterable[Loss]:
+    """What of a block the format cannot hold."""
+    for name, camera in block.cameras.items():
+        if camera.pixels is None:
+            yield Loss("camera", f"no camera {name!r}: film has no pixels of its own")
+        elif agisoft_form(camera) is None:
+            yield Loss("lens", f"no lens of type {camera.lens.type} as camera {name!r} has it")
+    yield from height_losses(block.table)
+
+
+def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
+    """Text of a ``cameras.xml``.
+
+    Raises
+    ------
+    InputError
+        The block has no cameras, a lens has no form there, or the CRS cannot be used.
+    """
+    require_cameras(block, path, "cameras.xml")
+    R_world_chunk, t, wkt, centers, rotations = _placed(block)
+    sensors = {name: str(k) for k, name in enumerate(block.cameras)}
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', '<document version="2.0.0">']
+    lines += ['  <chunk label="Chunk 1" enabled="true">', f'    <sensors next_id="{len(sensors)}">']
+    for name, camera in block.cameras.items():
+        lines += _sensor_lines(name, sensors[name], camera, path)
+    lines += ["    </sensors>", '    <components next_id="1" active_id="0">']
+    lines += ['      <component id="0" label="Component 1">', "        <transform>"]
+    lines += [
+        f"          <rotation>{_text(R_world_chunk)}</rotation>",
+        f"          <translation>{_text(t)}</translation>",
+        "          <scale>1</scale>",
+    ]
+    lines += ["        </transform>", "      </component>", "    </components>"]
+    lines += [f'    <cameras next_id="{len(block.table.images)}" next_group_id="0">']
+    for k, image in enumerate(block.table.images):
+        M = np.eye(4)
+        M[:3, :3], M[:3, 3] = rotations[k] @ FLIP, centers[k]
+        sensor = sensors[block.camera_name(image)]
+        lines += [
+            f'      <camera id="{k}" sensor_id="{sensor}" component_id="0" label={quoteattr(image.name)}>',
+            f"        <transform>{_text(M)}</transform>",
+            "      </camera>",
+        ]
+    lines += ["    </cameras>", f"    <reference>{escape(wkt)}</reference>", "  </chunk>", "</document>", ""]
+    return {path: "\n".join(lines)}
+
+
+def _placed(block: OrientationBlock) -> tuple[_Floats, _Floats, str, _Floats, _Floats]:
+    """Rotation and translation of the chunk, WKT of the CRS, and poses in the chunk's system."""
+    table = block.table
+    if table.crs is not None:
+        earth, axes = geocentric_poses(table.crs, table.centers)
+        t = earth.mean(axis=0)
+        lat, lon, _ = geodetic_of_geocentric(t)
+        R = enu_axes(lat, lon)
+        return R.T, t, legacy_wkt(table.crs), (earth - t) @ R.T, R @ axes @ table.rotations
+    if table.origin is not None:
+        R, t = enu_axes(*table.origin[:2]), geocentric_of_geodetic(table.origin)
+        return R.T, t, legacy_wkt("EPSG:4326"), table.centers, table.rotations
+    return np.eye(3), np.zeros(3), _LOCAL, table.centers, table.rotations
+
+
+def _sensor_lines(name: str, key: str, camera: CameraEntry, path: Path) -> list[str]:
+    form = agisoft_form(camera)
+    if form is None:
+        raise InputError(
+            f"{path}: camera {name!r} has no form in cameras.xml; write without its lens, or another format"
+        )
+    kind = "fisheye" if form.fisheye else "frame"
+    size = f'<resolution width="{form.size[0]}" height="{form.size[1]}"/>'
+    numbers = {"f": form.f, "cx": form.offset[0], "cy": form.offset[1], "b1": form.b[0], "b2": form.b[1]}
+    numbers |= {f"k{i + 1}": v for i, v in enumerate(form.k)} | {"p1": form.p[0], "p2": form.p[1]}
+    return [
+        f'      <sensor id="{key}" label={quoteattr(name)} type="{kind}">',
+        f"        {size}",
+        f'        <calibration type="{kind}" class="adjusted">',
+        f"          {size}",
+        *(f"          <{n}>{v!r}</{n}>" for n, v in numbers.items() if n == "f" or v != 0),
+        "        </calibration>",
+        "      </sensor>",
+    ]
+
+
+def _text(values: ArrayLike) -> str:
+    # Seventeen digits: numbers come back as they were.
+    return " ".join(repr(v) for v in np.asarray(values, float).ravel().tolist())
 
 
 FORMAT = OrientationFormat("metashape", "Metashape cameras.xml", _sniff, read, render, losses, suffix=".xml")

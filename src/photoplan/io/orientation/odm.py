@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import canonical_crs, crs_label, crs_step, utm_codes
@@ -25,8 +26,7 @@ from photoplan.io.camera import opensfm as camera_opensfm
 from photoplan.io.camera.model import CameraEntry
 from photoplan.io.lens_forms import opencv_form
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, common_losses
-from photoplan.io.orientation.opensfm import axis_angle, rotation_from_axis_angle
-from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
+from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, posed
 from photoplan.io.plain_files import finite, read_json
 
 #: Longest distance of the two positions of an image, metres; the same numbers differ by rounding only.
@@ -64,15 +64,12 @@ def _shot(feature: Any, k: int, path: Path) -> tuple[tuple[int, int], OrientedIm
     name = properties["filename"]
     where = f"{path}: shot {name!r}"
     center = finite(properties.get("translation"), f"{where}: translation", 3)
-    R_camera_ground = rotation_from_axis_angle(finite(properties.get("rotation"), f"{where}: rotation", 3))
-    angles = degrees_of((R_camera_ground.T @ FLIP)[None])[0].tolist()
+    R_camera_ground = Rotation.from_rotvec(finite(properties.get("rotation"), f"{where}: rotation", 3)).as_matrix()
     width, height = finite([properties.get("width"), properties.get("height")], f"{where}: width and height", 2)
     geometry = feature.get("geometry")
     place = geometry.get("coordinates") if isinstance(geometry, dict) else None
     camera = properties.get("camera")
-    image = OrientedImage(
-        name, center, (angles[0], angles[1], angles[2]), str(camera) if isinstance(camera, str) else None
-    )
+    image = posed(name, center, R_camera_ground.T @ FLIP, camera if isinstance(camera, str) else None)
     return (int(width), int(height)), image, finite(place, f"{where}: coordinates", 3)
 
 
@@ -117,7 +114,7 @@ def _render(block: OrientationBlock, path: Path) -> dict[Path, str]:
         if size is None:
             raise InputError(f"{path}: the size of image {image.name!r} is not known; name the file with the cameras")
         properties |= {"width": size[0], "height": size[1], "translation": list(image.center)}
-        properties["rotation"] = axis_angle(FLIP @ R.T)
+        properties["rotation"] = Rotation.from_matrix(FLIP @ R.T).as_rotvec().tolist()
         point = {"type": "Point", "coordinates": [lon, lat, image.center[2]]}
         features.append({"type": "Feature", "properties": properties, "geometry": point})
     return {path: json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n"}

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from photoplan.errors import InputError
@@ -27,14 +27,8 @@ from photoplan.io.camera.opensfm import cameras_of
 from photoplan.io.lens_forms import opencv_form, opencv_losses
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, height_losses, require_cameras
 from photoplan.io.orientation.opensfm_world import Shots, world_of
-from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
+from photoplan.io.orientation.table import FLIP, OrientationTable, TableFormat, posed
 from photoplan.io.plain_files import finite, read_json
-
-
-def axis_angle(R_camera_world: NDArray[np.float64]) -> list[float]:
-    """Rotation vector of a matrix (3, 3), radians."""
-    vector: list[float] = Rotation.from_matrix(R_camera_world).as_rotvec().tolist()
-    return vector
 
 
 def losses(block: OrientationBlock) -> Iterable[Loss]:
@@ -57,7 +51,7 @@ def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
     for image, center, R in zip(block.table.images, centers, rotations):
         R_camera_world = FLIP @ R.T
         shots[image.name] = {
-            "rotation": axis_angle(R_camera_world),
+            "rotation": Rotation.from_matrix(R_camera_world).as_rotvec().tolist(),
             "translation": (-R_camera_world @ center).tolist(),
             "camera": block.camera_name(image),
             "orientation": 1,
@@ -113,24 +107,16 @@ def normalised_camera(name: str, camera: CameraEntry, path: Path) -> dict[str, A
     return {"projection_type": "brown", **common, **radial, "p1": form.p[0], "p2": form.p[1]}
 
 
-def rotation_from_axis_angle(vector: ArrayLike) -> NDArray[np.float64]:
-    """Matrix of the rotation about `vector` (3,) by its length in radians (Rodrigues' formula)."""
-    v = np.asarray(vector, float)
-    angle = float(np.linalg.norm(v))
-    if angle == 0:
-        return np.eye(3)
-    x, y, z = v / angle
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
+def read(path: Path, form: TableFormat) -> OrientationBlock:
+    """Oriented images of a ``reconstruction.json``, in its local system or UTM zone; `form` is not used.
 
-
-def read(path: Path, form: TableFormat) -> OrientationTable:
-    """Orientation table of a ``reconstruction.json``, in its local system or UTM zone; `form` is not used.
+    With the cameras of the file, where it describes them.
 
     Raises
     ------
     InputError
-        The file is no such JSON, it is not georeferenced, or its poses are in no known world.
+        The file is no such JSON, it is not georeferenced, its poses are in no known world, or a camera's model is not
+        supported.
     """
     contents = read_json(path)
     if not isinstance(contents, list) or not all(isinstance(r, dict) and "shots" in r for r in contents):
@@ -146,19 +132,17 @@ def read(path: Path, form: TableFormat) -> OrientationTable:
         raise InputError(f"{path}: a reconstruction.json without shots; reconstruct again")
     shots = _shots(stated, path)
     world = world_of(path, origin, shots)
-    rotations = np.stack([rotation_from_axis_angle(v).T @ FLIP for v in shots.vectors])
+    rotations = np.swapaxes(Rotation.from_rotvec(shots.vectors).as_matrix(), 1, 2) @ FLIP
     images = tuple(
-        OrientedImage(name, (x, y, z), (a[0], a[1], a[2]), str(shot["camera"]) if shot.get("camera") else None)
-        for (name, shot), (x, y, z), a in zip(
-            stated, (shots.centers + world.offset).tolist(), degrees_of(rotations).tolist()
-        )
+        posed(name, center, R, str(shot["camera"]) if shot.get("camera") else None)
+        for (name, shot), center, R in zip(stated, shots.centers + world.offset, rotations)
     )
     notes = [world.note]
     if len(contents) > 1:
         sizes = ", ".join(str(len(r["shots"])) for r in contents)
         notes.insert(0, f"{path.name}: {len(contents)} separate reconstructions ({sizes} images), tied by GPS only")
     known = np.isfinite(shots.gps).any()
-    return OrientationTable(
+    table = OrientationTable(
         path,
         images,
         crs=world.crs,
@@ -166,6 +150,8 @@ def read(path: Path, form: TableFormat) -> OrientationTable:
         positions=geodetic_of_enu(origin, shots.gps) if known else None,
         notes=tuple(notes),
     )
+    described = all(isinstance(r.get("cameras"), dict) for r in contents)
+    return OrientationBlock(table, cameras_of(contents, path) if described else {})
 
 
 def _origin(reconstruction: dict[str, Any], path: Path) -> tuple[float, float, float]:
@@ -190,7 +176,7 @@ def _shots(stated: list[tuple[str, Any]], path: Path) -> Shots:
             raise InputError(f"{where}: rotation or translation is missing")
         vectors.append(finite(shot["rotation"], f"{where}: rotation", 3))
         t = np.array(finite(shot["translation"], f"{where}: translation", 3))
-        centers.append(-rotation_from_axis_angle(vectors[-1]).T @ t)
+        centers.append(-Rotation.from_rotvec(vectors[-1]).inv().apply(t))
         position = shot.get("gps_position")
         gps.append([np.nan] * 3 if position is None else finite(position, f"{where}: gps_position", 3))
         dops.append(shot["gps_dop"] if isinstance(shot.get("gps_dop"), int | float) else np.nan)
@@ -204,27 +190,11 @@ def _shots(stated: list[tuple[str, Any]], path: Path) -> Shots:
     )
 
 
-def read_block(path: Path, form: TableFormat) -> OrientationBlock:
-    """The same table with the cameras of the file, where it describes them.
-
-    Raises
-    ------
-    InputError
-        See `read`, or a camera's model is not supported.
-    """
-    table = read(path, form)
-    contents = read_json(path)
-    cameras = {}
-    if all(isinstance(r.get("cameras"), dict) for r in contents):
-        cameras = cameras_of(contents, path)
-    return OrientationBlock(table, cameras)
-
-
 FORMAT = OrientationFormat(
     name="opensfm",
     title="reconstruction.json of OpenSfM",
     sniff=lambda path, head: path.suffix.lower() == ".json" and '"shots"' in head,
-    read=read_block,
+    read=read,
     render=render,
     losses=losses,
     suffix=".json",

@@ -22,8 +22,9 @@ from photoplan.geometry.crs import parse_crs, split_compound
 from photoplan.geometry.earth_poses import enu_poses, is_local_crs, is_wgs84_geographic, legacy_wkt
 from photoplan.geometry.rotation import rotation_opk
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, common_losses
-from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
-from photoplan.io.plain_files import finite, read_text
+from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, posed
+from photoplan.io.orientation.text import numbers
+from photoplan.io.plain_files import read_text
 
 MAX_BYTES = 256 << 20
 _HEADER = re.compile(r"#\s*PhotoID\W+X\W+Y\W+Z\W+Omega\W+Phi\W+Kappa", re.I)
@@ -66,10 +67,8 @@ def _in_tangential_system(table: OrientationTable) -> OrientationTable:
     if (np.abs(lat) > 90).any():
         raise InputError(f"{table.file}: latitude {lat[np.abs(lat) > 90][0]}; X is longitude and Y latitude, degrees")
     origin, enu, axes = enu_poses(np.column_stack([lat, lon, height]))
-    angles = degrees_of(axes @ table.rotations).tolist()
     images = tuple(
-        replace(image, center=(x, y, z), angles=(a[0], a[1], a[2]))
-        for image, (x, y, z), a in zip(table.images, enu.tolist(), angles)
+        posed(image.name, at, R, line=image.line) for image, at, R in zip(table.images, enu, axes @ table.rotations)
     )
     return replace(table, images=images, origin=origin)
 
@@ -91,11 +90,7 @@ def _image(line: str, number: int, path: Path) -> OrientedImage:
     fields = [f.strip() for f in fields if f.strip()]
     if len(fields) not in (7, 16):
         raise InputError(f"{where}: {len(fields)} columns; 7 (PhotoID, X, Y, Z, Omega, Phi, Kappa) or 16 are needed")
-    try:
-        values = [float(f) for f in fields[1:]]
-    except ValueError:
-        raise InputError(f"{where}: {line[:80]!r}: columns after the name must be numbers") from None
-    X, Y, Z, omega, phi, kappa, *matrix = finite(values, where, len(values))
+    X, Y, Z, omega, phi, kappa, *matrix = numbers(fields[1:], where, f"image {fields[0]!r}: column", len(fields) - 1)
     if matrix:
         _check_matrix(np.array(matrix).reshape(3, 3), rotation_opk(*np.radians([omega, phi, kappa])), fields[0], where)
     return OrientedImage(fields[0], (X, Y, Z), (omega, phi, kappa), None, number)

@@ -14,18 +14,24 @@ from pathlib import Path
 import numpy as np
 
 from photoplan.errors import InputError
-from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat, common_losses, require_map
-from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
+from photoplan.io.orientation.block import (
+    Loss,
+    OrientationBlock,
+    OrientationFormat,
+    common_losses,
+    name_losses,
+    require_map,
+)
+from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat, posed
 from photoplan.io.orientation.text import (
     DIRECTIONS,
     Words,
     checked_rotation,
-    number,
     numbers,
     one_word,
-    pose_image,
     word_lines,
 )
+from photoplan.io.table_lines import number
 
 #: Characters of an image name that PATB takes at most (Catalyst's guide on export to PATB).
 NAME = 15
@@ -65,14 +71,14 @@ def _image(first: Words, second: Words, third: Words, form: TableFormat) -> Orie
         )
     name = first.words[0]
     if len(first.words) == 5:
-        number(first.words[1], first.where, f"image {name!r}: camera constant")
+        number(first.words[1], f"{first.where}: image {name!r}: camera constant")
     center = numbers(first.words[-3:], first.where, f"image {name!r}: X, Y, Z", 3)
     rows = (
         *numbers(second.words, second.where, f"image {name!r}: a11 a12 a13 a21 a22", 5),
         *numbers(third.words, third.where, f"image {name!r}: a23 a31 a32 a33", 4),
     )
     M = checked_rotation(rows, f"{second.where}: image {name!r}")
-    return pose_image(name, center, M if form.direction == "camera-to-ground" else M.T, first.line)
+    return posed(name, center, M if form.direction == "camera-to-ground" else M.T, line=first.line)
 
 
 def render(block: OrientationBlock, path: Path) -> dict[Path, str]:
@@ -94,10 +100,7 @@ def _losses(block: OrientationBlock) -> list[Loss]:
     lost = common_losses(block, cameras=False)
     direction = DIRECTIONS[block.matrix or "camera-to-ground"]
     lost.append(Loss("other", f"no word on what the rotation matrix does; it is written {direction}"))
-    long = [image.name for image in block.table.images if len(image.name) > NAME]
-    if long:
-        lost.append(Loss("other", f"names of more than {NAME} characters may not be taken ({long[0]!r}): shorten them"))
-    return lost
+    return [*lost, *name_losses(block, NAME)]
 
 
 def _sniff(path: Path, head: str) -> bool:
@@ -106,7 +109,7 @@ def _sniff(path: Path, head: str) -> bool:
     if [len(words) for words in lines] not in ([4, 5, 4], [5, 5, 4]):
         return False
     try:
-        checked_rotation([number(w, "", "") for w in lines[1] + lines[2]], "")
+        checked_rotation([number(w, "") for w in lines[1] + lines[2]], "")
     except InputError:
         return False
     return True

@@ -24,8 +24,9 @@ from photoplan.io.camera import pix4d as camera_pix4d
 from photoplan.io.camera.model import CameraEntry
 from photoplan.io.lens_forms import OpenCVForm, frame_camera, opencv_form, opencv_losses
 from photoplan.io.orientation.block import Loss, OrientationBlock, OrientationFormat
-from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, degrees_of
-from photoplan.io.plain_files import finite, read_text
+from photoplan.io.orientation.table import FLIP, OrientationTable, OrientedImage, TableFormat, posed
+from photoplan.io.orientation.text import checked_rotation, numbers
+from photoplan.io.plain_files import read_text
 
 MAX_BYTES = 1 << 30
 _EXTERNAL = re.compile(r"\s*#?\s*imageName\s+X\s+Y\s+Z\s+Omega\s+Phi\s+Kappa\b", re.I)
@@ -89,11 +90,8 @@ def _external(line: str, number: int, path: Path) -> OrientedImage:
     where = f"{path}:{number}"
     # A name may hold spaces: the numbers are counted from the end.
     words = line.rsplit(maxsplit=6)
-    try:
-        values = finite([float(w) for w in words[1:]], where, 6)
-    except ValueError:
-        raise InputError(f"{where}: {line[:80]!r}: a name, X, Y, Z, omega, phi and kappa are needed") from None
-    return OrientedImage(words[0].strip(), values[:3], values[3:], None, number)
+    X, Y, Z, *angles = numbers(words[1:], where, f"image {words[0]!r}: X, Y, Z, omega, phi, kappa", 6)
+    return OrientedImage(words[0].strip(), (X, Y, Z), (angles[0], angles[1], angles[2]), None, number)
 
 
 def _cameras_beside(path: Path, names: list[str]) -> tuple[dict[str, CameraEntry], dict[str, str | None], list[str]]:
@@ -128,9 +126,7 @@ def _read_full(lines: list[str], path: Path) -> OrientationBlock:
     for k in range(0, len(rows), 10):
         name, camera, t, R_camera_world = _ten_lines(rows[k : k + 10], path)
         label = cameras.setdefault(camera, f"camera {len(cameras)}")
-        x, y, z = (t + offset).tolist()
-        a = degrees_of((R_camera_world.T @ FLIP)[None])[0].tolist()
-        images.append(OrientedImage(name, (x, y, z), (a[0], a[1], a[2]), label, rows[k][0]))
+        images.append(posed(name, t + offset, R_camera_world.T @ FLIP, label, rows[k][0]))
     return _block(path, images, {label: c for c, label in cameras.items()}, notes)
 
 
@@ -138,11 +134,7 @@ def _offset(path: Path) -> tuple[NDArray[np.float64], list[str]]:
     file = path.with_name(f"{_stem(path).name}_offset.xyz")
     if not file.is_file():
         return np.zeros(3), [f"{path.name}: positions are relative to {file.name}, which is not there"]
-    words = read_text(file, 10_000).split()
-    try:
-        return np.array(finite([float(w) for w in words], str(file), 3)), []
-    except ValueError:
-        raise InputError(f"{file}: {' '.join(words)[:80]!r}: three numbers are needed") from None
+    return np.array(numbers(read_text(file, 10_000).split(), str(file), "offset", 3)), []
 
 
 def _ten_lines(
@@ -153,12 +145,10 @@ def _ten_lines(
     words = rows[0][1].rsplit(maxsplit=2)
     if len(words) != 3 or not (words[1].isdigit() and words[2].isdigit()):
         raise InputError(f"{where}: {rows[0][1][:80]!r}: file name, width and height are needed")
-    K = np.array([_row(row, 3, path) for row in rows[1:4]])
-    radial, tangential = _row(rows[4], 3, path), _row(rows[5], 2, path)
-    t = np.array(_row(rows[6], 3, path))
-    R = np.array([_row(row, 3, path) for row in rows[7:10]])
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-5 or np.linalg.det(R) < 0:
-        raise InputError(f"{path}:{rows[7][0]}: image {words[0]!r}: its matrix is not a right-handed rotation")
+    lengths = (3, 3, 3, 3, 2, 3, 3, 3, 3)
+    values = [numbers(row.split(), f"{path}:{n}", "line", count) for (n, row), count in zip(rows[1:], lengths)]
+    K, radial, tangential, t = np.array(values[:3]), values[3], values[4], np.array(values[5])
+    R = checked_rotation(values[6:], f"{path}:{rows[7][0]}: image {words[0]!r}", 1e-5)
     if K[0, 1] != 0 or K[1, 0] != 0:
         raise InputError(f"{path}:{rows[1][0]}: image {words[0]!r}: a sheared camera matrix is not supported")
     form = OpenCVForm(
@@ -169,17 +159,7 @@ def _ten_lines(
         (*radial, 0.0, 0.0, 0.0),
         (tangential[0], tangential[1]),
     )
-    U, _, Vt = np.linalg.svd(R)
-    return words[0], frame_camera(form, f"{where}: image {words[0]!r}"), t, U @ Vt
-
-
-def _row(row: tuple[int, str], count: int, path: Path) -> tuple[float, ...]:
-    where = f"{path}:{row[0]}"
-    try:
-        values: tuple[float, ...] = finite([float(w) for w in row[1].split()], where, count)
-    except ValueError:
-        raise InputError(f"{where}: {row[1][:80]!r}: {count} numbers are needed") from None
-    return values
+    return words[0], frame_camera(form, f"{where}: image {words[0]!r}"), t, R
 
 
 def _render(block: OrientationBlock, path: Path) -> dict[Path, str]:

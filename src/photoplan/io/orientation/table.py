@@ -8,14 +8,15 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.bounds import odd_angles, odd_place
-from photoplan.geometry.rotation import ROTATION_ORDERS, opk_from_rotation, rotation_from_angles
-from photoplan.io.project.model import ANGLE_UNITS
+from photoplan.geometry.rotation import ANGLE_UNITS, ROTATION_ORDERS, angles_from_rotation, rotation_from_angles
 
 Direction = Literal["camera-to-ground", "ground-to-camera"]
+#: By the letters that spell an order of rotations.
+ANGLE_NAMES = {"o": "omega", "p": "phi", "k": "kappa"}
 #: From camera axes x right, y down, z forwards to x right, y up, z backwards, and back.
 FLIP = np.diag([1.0, -1.0, -1.0])
 
@@ -131,7 +132,7 @@ class OrientationTable:
                 where = f" (lines {' and '.join(lines)})" if lines else ""
                 raise InputError(f"{self.file}: image {image.name!r} is given twice{where}; keep one of them")
             first[image.name] = image
-            odd = odd_angles(image.angles, self.angle_unit)
+            odd = odd_angles(image.angles, self.angle_unit, [ANGLE_NAMES[letter] for letter in self.rotation])
             if odd is None and self.crs is not None:
                 odd = odd_place(image.center, camera=True)
             if odd is not None:
@@ -160,5 +161,18 @@ class OrientationTable:
 def degrees_of(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     """ω, φ, κ in degrees of matrices (n, 3, 3); rounded to 1e-12°, below the noise of the conversion."""
     # Adding zero turns −0.0 into 0.0.
-    angles = np.array([opk_from_rotation(R) for R in rotations], np.float64)
+    angles = np.array([angles_from_rotation(R) for R in rotations], np.float64)
     return np.asarray(np.round(np.degrees(angles), 12) + 0.0, np.float64)
+
+
+def posed(
+    name: str,
+    center: ArrayLike,
+    R_ground_camera: NDArray[np.float64],
+    camera: str | None = None,
+    line: int | None = None,
+) -> OrientedImage:
+    """An image whose rotation is given by a matrix (3, 3), with ω, φ, κ in degrees; `center` is X, Y, Z, metres."""
+    X, Y, Z = np.asarray(center, float).tolist()
+    omega, phi, kappa = degrees_of(R_ground_camera[None])[0].tolist()
+    return OrientedImage(name, (X, Y, Z), (omega, phi, kappa), camera, line)

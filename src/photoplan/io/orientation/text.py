@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.orientation.block import OrientationBlock
-from photoplan.io.orientation.table import Direction, OrientationTable, OrientedImage, TableFormat, degrees_of
+from photoplan.io.orientation.table import Direction, OrientationTable, OrientedImage, TableFormat
 from photoplan.io.plain_files import read_text
-from photoplan.io.project.model import ANGLE_UNITS
+from photoplan.io.table_lines import number
 
 MAX_BYTES = 200_000_000
 #: Rotation matrices of files are rounded; what differs more from a rotation is none.
 ORTHOGONAL = 2e-4
 DIRECTIONS = {"camera-to-ground": "camera to ground", "ground-to-camera": "ground to camera"}
-
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eEdD][-+]?\d+)?", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -39,21 +35,6 @@ def word_lines(path: Path) -> list[Words]:
     """Lines of a text file that are not empty; raises InputError as `read_text`."""
     lines = read_text(path, MAX_BYTES).split("\n")
     return [Words(f"{path}:{n}", n, tuple(text.split())) for n, text in enumerate(lines, 1) if text.strip()]
-
-
-def number(word: str, where: str, what: str) -> float:
-    """A finite number; ``1.5D+03`` of old programs is read too.
-
-    Raises
-    ------
-    InputError
-        It is something else; the message begins with `where` and names `what`.
-    """
-    if _NUMBER.fullmatch(word):
-        value = float(word.translate({ord("d"): "e", ord("D"): "e"}))
-        if math.isfinite(value):
-            return value
-    raise InputError(f"{where}: {what} = {word[:40]!r} is not a number")
 
 
 def numbers(words: Sequence[str], where: str, what: str, count: int) -> tuple[float, ...]:
@@ -73,7 +54,7 @@ def numbers(words: Sequence[str], where: str, what: str, count: int) -> tuple[fl
     """
     if len(words) != count:
         raise InputError(f"{where}: {what}: {len(words)} values; {count} numbers are needed")
-    return tuple(number(word, where, what) for word in words)
+    return tuple(number(word, f"{where}: {what}") for word in words)
 
 
 def one_word(name: str, path: Path) -> str:
@@ -89,8 +70,8 @@ def one_word(name: str, path: Path) -> str:
     return name
 
 
-def checked_rotation(values: Sequence[float], where: str) -> NDArray[np.float64]:
-    """The rotation (3, 3) nearest to nine rounded numbers, row by row.
+def checked_rotation(values: ArrayLike, where: str, tolerance: float = ORTHOGONAL) -> NDArray[np.float64]:
+    """The rotation (3, 3) nearest to nine rounded numbers, row by row; `tolerance` is that of the matrix times itself.
 
     Raises
     ------
@@ -98,33 +79,12 @@ def checked_rotation(values: Sequence[float], where: str) -> NDArray[np.float64]
         They are no rotation.
     """
     M = np.array(values, float).reshape(3, 3)
-    if not np.allclose(M @ M.T, np.eye(3), atol=ORTHOGONAL) or np.linalg.det(M) < 0:
+    if not np.allclose(M @ M.T, np.eye(3), rtol=0, atol=tolerance) or np.linalg.det(M) < 0:
         raise InputError(
             f"{where}: the nine numbers are not a rotation matrix (rows of length 1, at right angles, right-handed)"
         )
     U, _, Vt = np.linalg.svd(M)
     return np.asarray(U @ Vt, np.float64)
-
-
-def pose_image(
-    name: str, center: Sequence[float], R_ground_camera: NDArray[np.float64], line: int, camera: str | None = None
-) -> OrientedImage:
-    """An image whose rotation is given by a matrix, with ω, φ, κ in degrees.
-
-    Parameters
-    ----------
-    name : str
-    center : sequence of float
-        X, Y, Z, metres.
-    R_ground_camera : ndarray, shape (3, 3)
-    line : int
-        Of the file, for messages.
-    camera : str, optional
-        Name of its camera, where the file states it.
-    """
-    X, Y, Z = center
-    omega, phi, kappa = degrees_of(R_ground_camera[None])[0].tolist()
-    return OrientedImage(name, (X, Y, Z), (omega, phi, kappa), camera, line)
 
 
 def angle_block(
@@ -152,12 +112,6 @@ def angle_block(
     for line, name, words in rows:
         X, Y, Z, phi, omega, kappa = numbers(words, line.where, f"image {name!r}: X, Y, Z, phi, omega, kappa", 6)
         named = {"p": phi, "o": omega, "k": kappa}
-        for what, value in zip(("phi", "omega", "kappa"), named.values()):
-            if abs(value) > ANGLE_UNITS[unit] * (1 + 1e-9):
-                raise InputError(
-                    f"{line.where}: image {name!r}: {what} = {value:g} is more than a full circle in {unit}; declare "
-                    "the angle unit of the file with `angle_unit`"
-                )
         a, b, c = (named[letter] for letter in rotation)
         images.append(OrientedImage(name, (X, Y, Z), (a, b, c), None, line.line))
     note = f"{path.name}: angles read as {unit}, rotation {rotation}, {DIRECTIONS[direction]}"

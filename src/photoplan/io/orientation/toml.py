@@ -18,10 +18,10 @@ from photoplan.io.camera.kinds import Camera
 from photoplan.io.camera.model import Fiducials, Name, Pixels, Triple
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat, require_map
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
+from photoplan.io.plain_files import read_toml
 from photoplan.io.project.errors import explain
 from photoplan.io.project.model import Orientation
 from photoplan.io.project.write import camera_lines, toml_value
-from photoplan.io.toml_file import read_toml
 
 
 class _TomlLine(BaseModel):
@@ -46,19 +46,14 @@ class _File(BaseModel):
     images: Annotated[tuple[_TomlLine, ...], Field(min_length=1)]
 
 
-def read(path: Path, form: TableFormat) -> OrientationTable:
-    """Orientation table of a TOML file; it states its own angle unit and rotation, so `form` is not used.
+def read(path: Path, form: TableFormat) -> OrientationBlock:
+    """Oriented images of a TOML file with their cameras; it states its own angle unit and rotation: `form` is not used.
 
     Raises
     ------
     InputError
         An entry is wrong; the message names its line.
     """
-    return read_block(path, form).table
-
-
-def read_block(path: Path, form: TableFormat) -> OrientationBlock:
-    """Oriented images of a TOML file with their cameras; raises as `read`."""
     contents, text = read_toml(path)
     try:
         file = _File.model_validate(contents)
@@ -142,7 +137,7 @@ FORMAT = OrientationFormat(
     name="toml",
     title="photoplan's own TOML",
     sniff=lambda path, head: path.suffix.lower() == ".toml",
-    read=read_block,
+    read=read,
     render=render,
     suffix=".toml",
     angles=True,

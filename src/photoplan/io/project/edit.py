@@ -13,10 +13,9 @@ from tomlkit.items import AoT, Table
 
 from photoplan.errors import InputError
 from photoplan.io.disk import write_atomically
-from photoplan.io.plain_files import read_text
+from photoplan.io.plain_files import MAX_BYTES, read_text
 from photoplan.io.project.file import parse_project
 from photoplan.io.project.model import Project
-from photoplan.io.toml_file import MAX_BYTES
 
 
 @dataclass(frozen=True)

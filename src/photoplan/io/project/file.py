@@ -12,10 +12,10 @@ from photoplan.errors import InputError
 from photoplan.geometry.crs import require_projected_metres
 from photoplan.geometry.heights import check_height_system
 from photoplan.io.disk import write_atomically
+from photoplan.io.plain_files import read_toml
 from photoplan.io.project.errors import explain
 from photoplan.io.project.model import Project
 from photoplan.io.project.write import project_text
-from photoplan.io.toml_file import read_toml
 
 
 def load_project(path: str | Path) -> Project:

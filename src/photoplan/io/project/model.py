@@ -26,9 +26,6 @@ from photoplan.io.camera.model import (
 )
 from photoplan.io.names import check_input_name, resolve_input, unique_stems
 
-#: Angle units and the size of one unit in radians' common measure, a full circle.
-ANGLE_UNITS = {"deg": 360.0, "gon": 400.0, "rad": 6.283185307179586}
-
 InputName = Annotated[str, Field(max_length=4000)]
 NotNegative = Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)]
 
@@ -121,6 +118,12 @@ class ObservationsEntry(Entry):
     """Measured image points: point, image, column, row."""
     control: tuple[InputName, ...] = ()
     """Ground points, control and check."""
+    image_points_columns: InputName | None = None
+    """Columns of tables of image points in their order, as ``point,image,-,x,y``; None: as their headers say."""
+    control_columns: InputName | None = None
+    """Columns of tables of ground points, as ``name,-,x,y,z`` in their order or ``name=Nr,x=East,y=North,z=H``."""
+    decimal_comma: Annotated[bool, Strict()] | None = None
+    """Whether tables of image and ground points write numbers as 1,5."""
     positions: InputName | None = None
     """Table of observed projection centres, with or without attitudes."""
     sigma_image: Positive = 0.5
@@ -170,6 +173,7 @@ class OrthoDefaults(Entry):
     bounds: tuple[Number, Number, Number, Number] | None = None
     kernel: Name | None = None
     tolerance: Positive | None = None
+    hidden: Literal["show", "nodata", "mark"] | None = None
     nodata: Number | Literal["auto", "mask"] | None = None
     compress: Name | None = None
     overviews: Annotated[bool, Strict()] | None = None

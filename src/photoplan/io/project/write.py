@@ -123,6 +123,9 @@ def _observations(observations: ObservationsEntry) -> list[str]:
     comments = {
         "image_points": "measured image points: point, image, column, row",
         "control": "ground points, control and check",
+        "image_points_columns": "their columns, where no header names them",
+        "control_columns": "their columns, where no header names them",
+        "decimal_comma": "whether both write numbers as 1,5",
         "positions": "table of observed projection centres, with or without attitudes",
         "sigma_image": "standard deviation of an image coordinate, pixels",
         "sigma_control": "[horizontal, height], metres, where the file does not state it",
@@ -166,6 +169,7 @@ def _ortho(ortho: OrthoDefaults) -> list[str]:
                 ("bounds", ortho.bounds, "[xmin, ymin, xmax, ymax]; default: all that the images see"),
                 ("kernel", ortho.kernel, "interpolation of grey values"),
                 ("tolerance", ortho.tolerance, "largest error of a source position, pixels"),
+                ("hidden", ortho.hidden, 'ground behind other ground: "show", "nodata" or "mark"'),
                 ("nodata", ortho.nodata, 'a number, "mask" or "auto"'),
                 ("compress", ortho.compress, "compression of the products"),
                 ("overviews", ortho.overviews, "whether products hold overviews"),

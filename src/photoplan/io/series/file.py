@@ -15,12 +15,11 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.camera.model import Entry
 from photoplan.io.names import resolve_input
+from photoplan.io.plain_files import read_entries
 from photoplan.io.raster import RasterReader
 from photoplan.io.series.model import CONDITIONS, CameraFacts, FramesEntry, SeriesEntry
 from photoplan.io.series.names import Values, find_files, number_of_time, read_conditions
-from photoplan.io.series.positions import MeasuredPositions, read_positions
-from photoplan.io.series.statistics import ReducedPoint, read_statistics
-from photoplan.io.toml_file import read_entries
+from photoplan.io.series.statistics import MeasuredPositions, ReducedPoint, read_positions, read_statistics
 
 #: A series of a hundred thousand frames is far below this.
 _MAX_BYTES = 20_000_000

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from photoplan.cameras.observed import GroundPoints
 from photoplan.errors import InputError
 from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import angles_from_rotation
+from photoplan.geometry.rotation import ANGLE_UNITS, angles_from_rotation
 from photoplan.io.project.cameras import interior_of
-from photoplan.io.project.model import ANGLE_UNITS, Project
+from photoplan.io.project.model import Project
 from photoplan.orientation.bundle.adjust import adjust_block
 from photoplan.orientation.bundle.block import Adjusted, AdjustSettings, Block, BlockCamera, BlockImage
 from photoplan.orientation.bundle.frame import BlockFrame, angle_derivatives

@@ -72,7 +72,8 @@ def read_inputs(project: Project, names: Sequence[str]) -> AdjustInputs:
         path = project.resolve(file)
         if path not in files:
             files.append(path)
-            parts.append((path, read_image_points(path, doubtful=notes)))
+            columns, comma = observations.image_points_columns, bool(observations.decimal_comma)
+            parts.append((path, read_image_points(path, columns=columns, decimal_comma=comma, doubtful=notes)))
     points = _image_points(project, parts, names, notes)
     ground = _ground(project, ground_parts)
     measured = set(points.points)
@@ -121,7 +122,8 @@ def _control(project: Project) -> tuple[list[GroundPoints], list[tuple[Path, Ima
             grounds.append(gcps.ground)
             points.append((path, gcps.points))
         else:
-            grounds.append(read_ground_points(path, crs=project.crs))
+            columns, comma = project.observations.control_columns, bool(project.observations.decimal_comma)
+            grounds.append(read_ground_points(path, crs=project.crs, columns=columns, decimal_comma=comma))
     return grounds, points, files
 
 

@@ -13,7 +13,7 @@ from photoplan.orientation.judgement import Evidence, fitting, impossible
 from photoplan.orientation.resection.model import ResectSettings
 from photoplan.products.adjust.block import MapResult
 from photoplan.products.adjust.frame import nadir_heights
-from photoplan.products.resect.image import control_rows, measured_control, resected
+from photoplan.products.resect import control_rows, measured_control, resected
 
 #: Change of a camera constant, and part of the squared residuals that it explains, from which the block is refused.
 _FAR, _ALL = 0.1, 0.9

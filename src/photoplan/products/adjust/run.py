@@ -22,7 +22,7 @@ from photoplan.io.product import check_output
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
-from photoplan.io.run_record import versions
+from photoplan.io.run_record import recording, versions
 from photoplan.orientation.bundle.adjust import adjust_block
 from photoplan.orientation.bundle.block import Adjusted, AdjustSettings
 from photoplan.orientation.bundle.causes import weighed_causes
@@ -306,6 +306,7 @@ def _used(prepared: Prepared) -> str:
 
 def _write(request: AdjustRequest, result: MapResult, figures: AdjustFigures, data: dict[str, Any]) -> AdjustReport:
     folder, adjusted = request.folder, result.adjusted
+    record = recording("adjust", request, [request.project, *result.prepared.inputs.files])
     changes = _changes(result)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -322,7 +323,19 @@ def _write(request: AdjustRequest, result: MapResult, figures: AdjustFigures, da
     )
     write_atomically(folder / "report.json", json_text(data, indent=1).encode())
     edit_project(request.project, changes)
-    return AdjustReport(tuple(folder / name for name in OUTPUTS), figures, len(adjusted.images), data)
+    written = tuple(folder / name for name in OUTPUTS)
+    figures_of_block = (
+        "sigma0",
+        "redundancy",
+        "unknowns",
+        "iterations",
+        "seconds",
+        "measurements",
+        "points",
+        "rejected",
+    )
+    record((*written, request.project), pick(figures, *figures_of_block))
+    return AdjustReport(written, figures, len(adjusted.images), data)
 
 
 def _changes(result: MapResult) -> ProjectChanges:

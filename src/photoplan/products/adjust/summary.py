@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import height_label
+from photoplan.geometry.rotation import ANGLE_UNITS
 from photoplan.io.geopackage import PointLayer
-from photoplan.io.project.model import ANGLE_UNITS
 from photoplan.orientation.bundle.block import AdjustSettings
 from photoplan.orientation.check_points import CheckAccuracy, check_accuracy
 from photoplan.products.adjust.block import MapResult
-from photoplan.products.adjust.field import residual_fields
 from photoplan.products.adjust.figures import (
     AdjustFigures,
     GroundFigures,
     ImageFigures,
     NamedMeasurement,
     StripFigures,
+    residual_fields,
 )
 from photoplan.products.init.match import some
 

@@ -17,6 +17,10 @@ from photoplan.geometry.grid import Window
 from photoplan.io.series.file import Frame, SeriesGroup
 from photoplan.io.series.pixels import frame_pixels, plane_mask, split
 from photoplan.products.characterise.data import SeriesData
+from photoplan.quality.clipping import piled_ends
+
+#: Share of a window that may be saturated, and samples of it that are looked at for the value where frames are cut off.
+_MOST, _SAMPLE = 0.01, 4096
 
 
 @dataclass(frozen=True)
@@ -119,20 +123,31 @@ def window_means(data: SeriesData, group: FrameGroup, window: Window, advice: st
     Raises
     ------
     InputError
-        Over 1 % of the window is saturated in a frame; the message ends with the advice.
+        Over 1 % of the window is saturated in a frame: at the largest grey value, or at a smaller one where the frames
+        of the entry are cut off; the message ends with the advice.
     """
     means: dict[str, list[float]] = {p.name: [] for p in data.planes}
     variances: dict[str, list[float]] = {p.name: [] for p in data.planes}
     last: dict[str, NDArray[np.float64]] = {}
+    samples: dict[str, list[NDArray[np.float64]]] = {p.name: [] for p in data.planes}
     for frame, planes in zip(group.frames, group.pixels(data, window)):
         for name, pixels in planes.items():
             values = pixels.astype(float)
-            if float((values >= data.saturation_dn(name)).mean()) > 0.01:
+            if float((values >= data.saturation_dn(name)).mean()) > _MOST:
                 raise InputError(f"{group.group.label}: {frame.file.name} is saturated in the window; {advice}")
             means[name].append(float(values.mean()))
             if name in last:
                 variances[name].append(float((values - last[name]).var(ddof=1)) / 2.0 if values.size > 1 else nan)
             last[name] = values
+            samples[name].append(values.ravel()[:: max(1, values.size // _SAMPLE)])
+    for parts in samples.values():
+        top = piled_ends(np.concatenate(parts))[1]
+        for frame, part in zip(group.frames, parts):
+            if float((part >= top).mean()) > _MOST:
+                raise InputError(
+                    f"{group.group.label}: {frame.file.name} is saturated in the window: the frames are cut off at "
+                    f"{top:g} DN; {advice}"
+                )
     return {n: WindowMeans(np.array(m), np.array(variances[n]), last[n].size) for n, m in means.items()}
 
 

@@ -19,7 +19,7 @@ from photoplan.products.characterise.result import Chart, Figure, Findings, List
 from photoplan.quality.camera.line_jitter import LineJitter, line_jitter
 from photoplan.quality.camera.parallel_edges import EdgePair, above_control, compare_edges
 from photoplan.quality.camera.plumb_edge import EdgeLines, correlate_edge, fit_edge
-from photoplan.quality.sensor.figures import jitter_grey
+from photoplan.quality.sensor import jitter_grey
 
 #: Frames that are drawn.
 _CHARTS = 4

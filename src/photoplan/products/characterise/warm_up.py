@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.io.series.positions import MeasuredPositions
+from photoplan.io.series.statistics import MeasuredPositions
 from photoplan.products.characterise.data import SeriesData
 from photoplan.products.characterise.groups import FrameGroup, frame_groups
 from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Subject, Trace, joined, known

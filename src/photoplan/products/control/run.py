@@ -24,6 +24,7 @@ from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project, Terrain
 from photoplan.io.raster import RasterReader
+from photoplan.io.run_record import recording
 from photoplan.matching.grey import GreyImage
 from photoplan.matching.ortho import ImageControl, OrthoPatch, Photo, Settings, control_of_image
 from photoplan.plain import pick
@@ -122,6 +123,7 @@ def propose_control(request: ControlRequest, events: Events = SILENT) -> Control
     def work(k: int) -> ImageControl:
         return control_of_image(names[k], photos[k], patches, covariances, settings)
 
+    record = recording("control", request, [request.project, *request.ortho, *input_files(project), request.heights])
     events.begin("matching", len(names), "images")
     with steps(output.name, request.workers, events) as run:
         images = list(run(work, range(len(names))))
@@ -141,7 +143,9 @@ def propose_control(request: ControlRequest, events: Events = SILENT) -> Control
     write_image_points(image_output, points)
     _enter(request.project, output, image_output)
     sigma = (*_medians(ground.sigma[:, [0, 2]]), float(np.median(points.sigma)))
-    return ControlReport(output, image_output, len(patches), settings.resolution, len(ground), tuple(images), sigma)
+    report = ControlReport(output, image_output, len(patches), settings.resolution, len(ground), tuple(images), sigma)
+    record([output, image_output, request.project], report)
+    return report
 
 
 def _medians(values: NDArray[np.float64]) -> tuple[float, float]:

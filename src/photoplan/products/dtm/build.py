@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import psutil
+from numpy.typing import NDArray
 
 from photoplan import __version__
 from photoplan.engine.steps import steps
@@ -29,6 +30,7 @@ from photoplan.io.terrain.options import ReadOptions
 from photoplan.plain import pick
 from photoplan.surfaces.measured import MeasuredTerrain
 from photoplan.terrain.build import BuildPlan, Built, build_terrain, plan_build
+from photoplan.terrain.calibration import ClassFigures
 from photoplan.terrain.clean.run import Finding, clean
 from photoplan.terrain.settings import BuildSettings
 
@@ -59,6 +61,8 @@ class BuildReport:
     figures: dict[str, Any]
     """Figures of the whole model."""
     gross: tuple[GrossError, ...]
+    suspects: tuple[GrossError, ...]
+    """Used, but they look like parts of gross errors; group by group."""
     findings: tuple[Finding, ...]
     built: Built
     measured: MeasuredTerrain
@@ -70,6 +74,7 @@ class BuildReport:
             "model": self.path,
             **self.figures,
             "gross_errors": [pick(g, "name", "xyz", "residual", "normalised") for g in self.gross],
+            "suspects": [pick(g, "name", "xyz", "residual", "normalised") for g in self.suspects],
             "findings": self.findings,
             "notes": self.measured.notes,
         }
@@ -124,6 +129,8 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
         with steps(request.output.name, request.workers, events, kept) as run:
             built = build_terrain(plan, run, events)
         gross = tuple(_gross(built, measured))
+        rows = built.fit.suspects
+        suspects = tuple(_named(built, measured, rows[:, 0].astype(np.int64), rows[:, 2:]))
         events.begin("writing the model", len(built.figures), "units")
         done = writer.done()
         for of_unit in built.figures:
@@ -136,11 +143,11 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
         header = ModelHeader(
             crs, system, plan.layout, asdict(request.settings), tuple(facts), built.fit.whole.name, totals
         )
-        writer.finish(ModelParts(header, built.lines, gross, plan.polygon))
+        writer.finish(ModelParts(header, built.lines, gross, plan.polygon, suspects))
         kept.remove()
     ran = times()
     figures = {**totals, "crs": crs_label(crs), "height_system": system, "seconds": ran["seconds"]}
-    report = BuildReport(request.output, figures, gross, findings, built, measured)
+    report = BuildReport(request.output, figures, gross, suspects, findings, built, measured)
     told = report.json_fields() | {"findings": dict(Counter(f.kind for f in findings))}
     write_run_record(
         request.output,
@@ -161,7 +168,8 @@ def describe_plan(plan: BuildPlan, measured: MeasuredTerrain, crs: str, system: 
     lines = ", ".join(_many(count, kind) for kind, count in kinds.items()) or "no lines"
     return (
         f"{measured.count} points, {lines} · spacing {plan.seen.spacing:.3g} m · grid {plan.width:g} m, "
-        f"{layout.columns} × {layout.rows} units of {layout.side:g} m · gaps over {2 * plan.reach:.3g} m stay open · "
+        + (f"{plan.finest:g} m where breaklines pass, " if plan.finest < plan.width else "")
+        + f"{layout.columns} × {layout.rows} units of {layout.side:g} m · gaps over {2 * plan.reach:.3g} m stay open · "
         f"{crs_label(crs)}, heights {height_label(system)}"
     )
 
@@ -175,6 +183,7 @@ def plan_facts(
         "lines": dict(Counter(line.kind for line in measured.lines)),
         "spacing": round(plan.seen.spacing, 4),
         "grid_width": plan.width,
+        "grid_width_at_breaklines": plan.finest,
         "units": [plan.layout.columns, plan.layout.rows],
         "unit_side": plan.layout.side,
         "bounds": list(plan.layout.bounds),
@@ -182,6 +191,7 @@ def plan_facts(
         "crs": crs_label(crs),
         "height_system": system,
         "findings": findings,
+        "notes": measured.notes,
     }
 
 
@@ -224,17 +234,23 @@ def _key(request: BuildRequest, facts: Sequence[dict[str, Any]], plan: BuildPlan
 
 def _gross(built: Built, measured: MeasuredTerrain) -> list[GrossError]:
     """The flagged points with their names, the worst first."""
-    seen, residuals = built.fit.seen, built.fit.residuals
+    some = built.fit.gross
+    found = _named(built, measured, some, built.fit.residuals[some])
+    return sorted(found, key=lambda g: -abs(g.normalised))
+
+
+def _named(
+    built: Built, measured: MeasuredTerrain, some: NDArray[np.int64], residuals: NDArray[np.float64]
+) -> list[GrossError]:
+    """Points with their names and residuals."""
+    seen = built.fit.seen
     found = []
-    for k in built.fit.gross:
+    for k, row in zip(some.tolist(), residuals.tolist()):
         group = measured.points[seen.group[k]]
         place = int(seen.record[k])
         X, Y, Z = group.xyz[place].tolist()
-        residual, redundancy, normalised = residuals[k].tolist()
-        # The filtered surface still leans towards the point: without it, it would lie this far away.
-        away = residual / redundancy
-        found.append(GrossError(group.label(place), group.kind, (X, Y, Z), away, redundancy, normalised))
-    return sorted(found, key=lambda g: -abs(g.normalised))
+        found.append(GrossError(group.label(place), group.kind, (X, Y, Z), *row))
+    return found
 
 
 def _totals(built: Built, measured: MeasuredTerrain, findings: Sequence[Finding], gross: int) -> dict[str, Any]:
@@ -253,8 +269,23 @@ def _totals(built: Built, measured: MeasuredTerrain, findings: Sequence[Finding]
         "variance": whole.variance,
         "length": whole.length,
         "noise": whole.noise,
-        "sigma": float(np.sqrt(np.nanmean([f.sigma**2 for f in there]))) if there else None,
+        "sigma": built.sigma if np.isfinite(built.sigma) else None,
         "spread": float(z.std()) if len(z) else None,
+        "calibration": [_class(c, fit.seen.spacing) for c in fit.calibration.classes if c.count],
         "gross": gross,
         "findings": len(findings),
+    }
+
+
+def _class(found: ClassFigures, spacing: float) -> dict[str, Any]:
+    """What was held out at some distances to data (metres), as plain values; `to` None: and further."""
+    to = found.furthest * spacing
+    return {
+        "from": round(found.nearest * spacing, 4),
+        "to": round(to, 4) if np.isfinite(to) else None,
+        "heights": found.count,
+        "blocks": found.blocks,
+        "before": round(found.before, 3),
+        "after": round(found.after, 3),
+        "enough": found.enough,
     }

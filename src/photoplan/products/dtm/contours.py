@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.errors import GeometryError, UsageError
+from photoplan.errors import UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.contour_file import ContourRow, LabelRow, contour_files, write_contours
 from photoplan.io.product import check_output
@@ -182,11 +182,7 @@ def _bounds(request: ContourRequest, terrain: OpenTerrain) -> tuple[float, float
     a, b = terrain.bounds, request.bounds
     if not (b[0] < b[2] and b[1] < b[3]):
         raise UsageError(f"bounds {b}; needed are xmin ymin xmax ymax with xmin < xmax and ymin < ymax")
-    if not (a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]):
-        raise GeometryError(
-            f"bounds {' '.join(f'{v:.10g}' for v in b)} do not meet {terrain.path}, which covers "
-            f"{' '.join(f'{v:.10g}' for v in a)}"
-        )
+    terrain.refuse_apart(b)
     return max(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), min(a[3], b[3])
 
 

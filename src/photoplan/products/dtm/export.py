@@ -88,7 +88,8 @@ def dtm_export(request: ExportRequest, events: Events = SILENT) -> ExportReport:
             figures = write_points(part, kind, reader, reader.lines(), events)
             counts = {"posts": figures.vertices, "line_points": figures.line_points}
         else:
-            figures = write_tin(part, kind, reader, request.model.stem, events)
+            system = {"crs": terrain.crs, "height_system": terrain.height_system}
+            figures = write_tin(part, kind, reader, request.model.stem, events, **system)
             counts = {"vertices": figures.vertices, "triangles": figures.faces, "wall_triangles": figures.walls}
     return ExportReport((request.output,), counts)
 

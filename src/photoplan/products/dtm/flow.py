@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +13,16 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from photoplan.engine.steps import steps
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.io.polygons import label_polygons, read_features, write_features
+from photoplan.io.polygons import label_polygons, write_features
 from photoplan.io.product import check_output
-from photoplan.io.tables import read_table
+from photoplan.io.result_log import ResultLog
 from photoplan.plain import pick
 from photoplan.products.dtm.raster import GridOptions, write_grid
-from photoplan.products.dtm.visible import COLUMNS, own_grid, read_grid
+from photoplan.products.dtm.visible import Place, named_points, own_grid, read_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.terrain.flow import CELL_BYTES, Flow, FlowMethod, flow_of, snapped
 
@@ -112,20 +113,31 @@ def dtm_flow(request: FlowRequest, events: Events = SILENT) -> FlowReport:
     for path in (request.output, request.catchments):
         if path is not None:
             check_output(path, inputs, overwrite=request.overwrite)
+    if request.catchments is not None and request.catchments.resolve() == request.output.resolve():
+        raise UsageError(f"{request.output}: raster and catchments are the same file; give them two names")
     if request.catchments is not None and request.catchments.suffix.lower() != ".gpkg":
         raise UsageError(f"{request.catchments}: polygons are written as GeoPackage; give a name that ends with .gpkg")
     if not (math.isfinite(request.snap) and request.snap >= 0):
         raise UsageError(f"snap {request.snap} m; zero or a positive number of metres is needed")
     terrain = open_terrain(request.model, request.crs)
-    points = [] if request.outlets is None else _points(request.outlets, terrain)
+    points = [] if request.outlets is None else named_points(request.outlets, terrain.crs)
     grid = _grid(request, terrain)
-    events.begin("flow")
     heights = read_grid(terrain, grid)
-    cells = _cells(request, grid, heights, points)
-    flow = flow_of(heights, grid.resolution, cells, request.method)
-    rows = [_row(flow, grid, number, name, cell) for number, ((name, _, _), cell) in enumerate(zip(points, cells), 1)]
+    options = GridOptions.of(
+        request, "flow", inputs, events, tile=TILE, resampling="nearest", tags={"BANDS": "; ".join(BANDS)}
+    )
+    log = ResultLog.beside(request.output, f"{options.key} {grid}", locked=False)
+    snapping = bool(points) and request.snap > 0
+    events.begin("flow", 1 + snapping, "steps")
+    with log, steps(request.output.name, 1, events, log) as run:
+        # Upstream areas do not depend on outlets.
+        area = next(run(partial(_area, grid.resolution), [heights])) if snapping else _there(heights)
+        cells = _cells(request, grid, area, points)
+        (flow,) = run(partial(flow_of, cell=grid.resolution, outlets=cells, method=request.method), [heights])
+    rows = [_row(flow, grid, number, name, cell) for number, ((name, *_), cell) in enumerate(zip(points, cells), 1)]
     depth = flow.filled - heights
-    _write(request, grid, flow, depth, inputs, events)
+    _write(request, grid, flow, depth, options)
+    log.remove()
     if request.catchments is not None:
         _write_catchments(request.catchments, grid, flow, rows, terrain.crs)
     pixel = grid.resolution**2
@@ -139,21 +151,6 @@ def dtm_flow(request: FlowRequest, events: Events = SILENT) -> FlowReport:
         pit_volume=float(np.nansum(depth, dtype=float)) * pixel,
         rows=tuple(rows),
     )
-
-
-def _points(path: Path, terrain: OpenTerrain) -> list[tuple[str, float, float]]:
-    """Name, X and Y of the outlets."""
-    if path.suffix.lower() in (".csv", ".txt", ".tsv", ".xyz", ".dat"):
-        table = read_table(path, COLUMNS)
-        names = table.labels("name", "line {line}")
-        return [(name, float(x), float(y)) for name, (x, y) in zip(names, table.numbers("x", "y"))]
-    read = read_features(path, "Point")
-    if read.crs is not None and not same_crs(read.crs, terrain.crs):
-        raise InputError(
-            f"{path}: outlets in {crs_label(read.crs)}, the model is in {crs_label(terrain.crs)}; reproject them"
-        )
-    at = [shapely.get_coordinates(item.geometry)[0] for item in read.items]
-    return [(item.name, float(x), float(y)) for item, (x, y) in zip(read.items, at)]
 
 
 def _grid(request: FlowRequest, terrain: OpenTerrain) -> MapGrid:
@@ -170,15 +167,20 @@ def _grid(request: FlowRequest, terrain: OpenTerrain) -> MapGrid:
     return grid
 
 
+def _area(cell: float, heights: NDArray[np.float32]) -> NDArray[np.float64]:
+    return flow_of(heights, cell).area
+
+
+def _there(heights: NDArray[np.float32]) -> NDArray[np.float64]:
+    return np.where(np.isnan(heights), np.nan, 1.0)
+
+
 def _cells(
-    request: FlowRequest, grid: MapGrid, heights: NDArray[np.float32], points: Sequence[tuple[str, float, float]]
+    request: FlowRequest, grid: MapGrid, area: NDArray[np.float64], points: Sequence[Place]
 ) -> list[tuple[int, int]]:
     """Row and column of every outlet, moved to the flow where that is wanted."""
-    if not points:
-        return []
-    area = flow_of(heights, grid.resolution).area if request.snap > 0 else np.where(np.isnan(heights), np.nan, 1.0)
-    cells = []
-    for name, x, y in points:
+    cells: list[tuple[int, int]] = []
+    for name, x, y, _ in points:
         column, row = grid.to_pixel((x, y))
         try:
             cells.append(snapped(area, float(row), float(column), request.snap / grid.resolution))
@@ -202,9 +204,7 @@ def _row(flow: Flow, grid: MapGrid, number: int, name: str, cell: tuple[int, int
     return OutletRow(name, float(X), float(Y), float(flow.area[cell]), own, float(flow.longest[cell]))
 
 
-def _write(
-    request: FlowRequest, grid: MapGrid, flow: Flow, depth: NDArray[np.float32], inputs: Sequence[Path], events: Events
-) -> None:
+def _write(request: FlowRequest, grid: MapGrid, flow: Flow, depth: NDArray[np.float32], options: GridOptions) -> None:
     def tile(window: Window) -> NDArray[np.float32]:
         right, bottom = window.stop
         part = slice(window.row, bottom), slice(window.col, right)
@@ -219,15 +219,6 @@ def _write(
         ]
         return np.stack(bands).astype(np.float32)
 
-    options = GridOptions.of(
-        request,
-        "flow",
-        inputs,
-        events,
-        tile=TILE,
-        resampling="nearest",
-        tags={"BANDS": "; ".join(BANDS)},
-    )
     write_grid(request.output, grid.placement, np.float32, len(BANDS), "auto", tile, options)
 
 

@@ -13,7 +13,6 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
-from photoplan.geometry.crs import crs_label, same_crs
 from photoplan.io.polygons import read_features
 from photoplan.io.product import check_output
 from photoplan.io.terrain.export import replacing
@@ -123,14 +122,8 @@ def _lines(request: ProfileRequest, terrain: OpenTerrain) -> list[tuple[str, NDA
     """Name and vertices of each line."""
     if request.lines.suffix.lower() in (*TABLES, ".xyz"):
         return _lines_of_table(request)
-    features = read_features(request.lines, "LineString")
-    if features.crs is not None and not same_crs(features.crs, terrain.crs):
-        raise InputError(
-            f"{request.lines}: lines in {crs_label(features.crs)}, the model is in {crs_label(terrain.crs)}; reproject "
-            "the lines"
-        )
     lines = []
-    for item in features.items:
+    for item in read_features(request.lines, "LineString", crs=terrain.crs).items:
         parts = shapely.get_parts(item.geometry)
         for number, part in enumerate(parts, 1):
             name = item.name if len(parts) == 1 else f"{item.name}.{number}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, fields
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,15 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.engine.cpus import available_cpus
-from photoplan.engine.executors import threads
+from photoplan.engine.executors import available_cpus, threads
 from photoplan.engine.run import Made, Runner, Tally, Work
 from photoplan.errors import ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import Placement, Window, refuse_absurd
 from photoplan.io.disk import free_megabytes
 from photoplan.io.product import ProductFacts, ProductFile, check_output
-from photoplan.io.run_record import input_entry, run_key, run_times, write_run_record
+from photoplan.io.run_record import input_entry, run_key, run_times, settings_of, write_run_record
 from photoplan.io.storage import Nodata
 from photoplan.plan.tiles import Tile, Tiles
 
@@ -62,8 +61,8 @@ class GridOptions:
     @classmethod
     def of(cls, request: Any, kind: str, inputs: Sequence[Path], events: Events, **more: Any) -> GridOptions:
         """Those of a request: its fields that may decide values are the settings; its files are inputs or outputs."""
-        stated = {each.name: getattr(request, each.name) for each in fields(request)}
-        settings = {k: v for k, v in stated.items() if k not in _IDLE and not isinstance(v, Path)}
+        # How exactly volumes are integrated does not change the raster beside them.
+        settings = {name: value for name, value in settings_of(request).items() if name != "tolerance"}
         given = {"settings": settings, "workers": request.workers, "overwrite": request.overwrite, "events": events}
         return cls(kind=kind, inputs=inputs, **(given | more))
 
@@ -71,10 +70,6 @@ class GridOptions:
     def key(self) -> str:
         """The digest of all that decides its values beside the place."""
         return run_key(self.kind, self.settings, self.inputs)
-
-
-#: Fields of requests that decide no value.
-_IDLE = {"memory", "workers", "overwrite", "tolerance"}
 
 
 def write_grid(

@@ -12,13 +12,13 @@ import numpy as np
 import shapely
 
 from photoplan import __version__
-from photoplan.errors import HeightSystemError, InputError, UsageError
+from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import crs_label, same_crs
-from photoplan.geometry.heights import check_height_system, height_label
+from photoplan.geometry.heights import common_system
 from photoplan.io.polygons import read_features
 from photoplan.io.product import check_output
 from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
-from photoplan.io.terrain.model_tables import ModelHeader, empty_figures, input_facts
+from photoplan.io.terrain.model_tables import GrossError, ModelHeader, empty_figures, input_facts
 from photoplan.io.terrain.model_write import ModelParts, ModelWriter
 from photoplan.plain import pick
 from photoplan.surfaces.refined_units import LinedUnits, refine_units
@@ -80,7 +80,8 @@ def dtm_refine(request: RefineRequest) -> RefineReport:
             f"{coarse.path} is in {crs_label(coarse.header.crs)}, {fine.path} in {crs_label(fine.header.crs)}; build "
             "both in one CRS"
         )
-    system = _one_system(coarse, fine, request.height_system)
+    stated = {reader.path: reader.header.height_system for reader in (coarse, fine)}
+    system = common_system(stated, request.height_system)
     polygons = _polygons(request, coarse)
     width = request.width if request.width is not None else fine.finest
     with ModelWriter(request.output, coarse.layout, _key(request, coarse, fine), request.overwrite, inputs) as writer:
@@ -105,29 +106,8 @@ def _model(path: Path) -> ModelReader:
     return ModelReader(path)
 
 
-def _one_system(coarse: ModelReader, fine: ModelReader, declared: str | None) -> str | None:
-    """The height system of both models."""
-    if declared not in (None, "same"):
-        raise UsageError(f"height system {declared!r}; `same` declares that both models have one")
-    stated = [reader.header.height_system for reader in (coarse, fine)]
-    named = [check_height_system(system) for system in stated if system is not None]
-    if len(named) == 2 and named[0] != named[1]:
-        raise HeightSystemError(
-            f"{coarse.path}: heights {height_label(named[0])}, {fine.path}: {height_label(named[1])}; build both in one"
-        )
-    if len(named) < 2 and declared is None:
-        without = " and ".join(str(r.path) for r, s in zip((coarse, fine), stated) if s is None)
-        raise HeightSystemError(f"{without}: no height system stated; if both have the same, say `height_system` same")
-    return named[0] if named else None
-
-
 def _polygons(request: RefineRequest, coarse: ModelReader) -> Any:
-    read = read_features(request.polygons, "Polygon")
-    if read.crs is not None and not same_crs(read.crs, coarse.header.crs):
-        raise InputError(
-            f"{request.polygons}: polygons in {crs_label(read.crs)}, the models are in "
-            f"{crs_label(coarse.header.crs)}; reproject them"
-        )
+    read = read_features(request.polygons, "Polygon", crs=coarse.header.crs)
     return shapely.union_all([shapely.force_2d(item.geometry) for item in read.items])
 
 
@@ -199,8 +179,12 @@ def _parts(
         family=coarse.header.family,
     )
     shapely.prepare(polygons)
-    gross = [g for g in coarse.gross() if not shapely.intersects_xy(polygons, *g.xyz[:2])]
-    gross += [g for g in fine.gross() if shapely.intersects_xy(polygons, *g.xyz[:2])]
+
+    def merged(outside: list[GrossError], inside: list[GrossError]) -> list[GrossError]:
+        kept = [g for g in outside if not shapely.intersects_xy(polygons, *g.xyz[:2])]
+        return kept + [g for g in inside if shapely.intersects_xy(polygons, *g.xyz[:2])]
+
+    gross, suspects = merged(coarse.gross(), fine.gross()), merged(coarse.suspects(), fine.suspects())
     outer, inner = coarse.domain(), fine.domain()
     domain = None
     if outer is not None or inner is not None:
@@ -209,7 +193,7 @@ def _parts(
         domain = outer.difference(polygons).union(polygons if inner is None else polygons.intersection(inner))
         areas = [p for p in shapely.get_parts(domain) if p.geom_type == "Polygon" and p.area > 0]
         domain = shapely.multipolygons(areas)
-    return ModelParts(header, lines, gross, domain)
+    return ModelParts(header, lines, gross, domain, suspects)
 
 
 def _largest(coarse: ModelReader, units: dict[tuple[int, int], Unit]) -> float:

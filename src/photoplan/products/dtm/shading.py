@@ -21,9 +21,8 @@ from photoplan.io.storage import Nodata
 from photoplan.plain import pick
 from photoplan.products.dtm.raster import GridOptions, GridTile, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
-from photoplan.terrain.shading import run as shading
-from photoplan.terrain.shading import tints as shading_tints
-from photoplan.terrain.shading.run import Light, surface_slopes
+from photoplan.terrain import shading
+from photoplan.terrain.shading import Light, surface_slopes
 
 #: From flat to steep, for slope classes.
 SLOPE_COLOURS = ((255, 255, 212), (254, 217, 142), (254, 153, 41), (204, 76, 2), (120, 30, 10))
@@ -140,12 +139,7 @@ def make_picture(
 def _grid(request: PictureRequest, terrain: OpenTerrain) -> MapGrid:
     bounds = request.bounds or terrain.bounds
     grid = MapGrid.covering(bounds, request.resolution or terrain.resolution, terrain.crs)
-    a, b = terrain.bounds, grid.bounds
-    if not (a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]):
-        raise GeometryError(
-            f"bounds {' '.join(f'{v:.10g}' for v in bounds)} do not meet {terrain.path}, which covers "
-            f"{' '.join(f'{v:.10g}' for v in a)}"
-        )
+    terrain.refuse_apart(grid.bounds)
     return grid
 
 
@@ -227,7 +221,7 @@ def tint_picture(
     Parameters
     ----------
     ramp
-        A name of `shading_tints.RAMPS`, or a text file with lines `height red green blue`.
+        A name of `shading.RAMPS`, or a text file with lines `height red green blue`.
     span
         Heights of a built-in ramp's ends; None: those of the terrain inside the grid.
     steps
@@ -248,7 +242,7 @@ def tint_picture(
             slopes = surface_slopes(terrain.surface, grid, window)
             tints = colours(slopes.heights)
             if light is not None:
-                tints = shading_tints.shaded(tints, shading.hillshade(slopes, light), light.level, strength)
+                tints = shading.shaded(tints, shading.hillshade(slopes, light), light.level, strength)
             return _bytes(tints)
 
         settings = {
@@ -271,18 +265,18 @@ def _bytes(tints: NDArray[np.float32]) -> GridTile:
 
 def _ramp(
     terrain: OpenTerrain, grid: MapGrid, name: str, span: tuple[float, float] | None, steps: int | None
-) -> shading_tints.Ramp:
-    if name not in shading_tints.RAMPS:
+) -> shading.Ramp:
+    if name not in shading.RAMPS:
         return _ramp_file(Path(name), steps is not None)
     low, high = span if span is not None else terrain.surface.height_range(grid.bounds)
     if not (math.isfinite(low) and math.isfinite(high)):
         raise GeometryError(f"{terrain.path}: no heights inside the bounds; there is nothing to tint")
     if span is None and low == high:
         low, high = low - 0.5, high + 0.5
-    return shading_tints.built_in_ramp(name, low, high, steps)
+    return shading.built_in_ramp(name, low, high, steps)
 
 
-def _ramp_file(path: Path, classed: bool) -> shading_tints.Ramp:
+def _ramp_file(path: Path, classed: bool) -> shading.Ramp:
     try:
         if path.stat().st_size > 1 << 20:
             raise InputError(f"{path}: {path.stat().st_size} bytes are no colour ramp; lines `height red green blue`")
@@ -290,6 +284,6 @@ def _ramp_file(path: Path, classed: bool) -> shading_tints.Ramp:
     except UnicodeDecodeError:
         raise InputError(f"{path}: is no text; a colour ramp has lines `height red green blue`") from None
     except OSError as error:
-        built_in = ", ".join(shading_tints.RAMPS)
+        built_in = ", ".join(shading.RAMPS)
         raise InputError(f"{path}: no such colour ramp ({error.strerror}); built in are {built_in}") from None
-    return shading_tints.parse_ramp(text, str(path), classed)
+    return shading.parse_ramp(text, str(path), classed)

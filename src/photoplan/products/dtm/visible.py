@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
-from photoplan.engine.cpus import available_cpus
+from photoplan.engine.executors import available_cpus
 from photoplan.engine.steps import Steps, steps
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.geometry.crs import same_crs, split_compound
+from photoplan.geometry.crs import split_compound
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.local import earth_radius
 from photoplan.io.polygons import read_features
@@ -41,10 +42,6 @@ COLUMNS = Columns(
     needed=("x", "y"),
     row="point",
 )
-
-
-Report = Callable[[int, int], None]
-"""Called with the number of observers just finished and of the posts looked at."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +169,7 @@ Place = tuple[str, float, float, float]
 def _places(request: VisibleRequest, terrain: OpenTerrain) -> list[Place]:
     places = [(str(i + 1), x, y, request.height_observer) for i, (x, y) in enumerate(request.points)]
     if request.file is not None:
-        places += _from_file(request.file, request.height_observer, terrain)
+        places += named_points(request.file, terrain.crs, request.height_observer)
     if not places:
         raise UsageError("no observer; give `points` X Y or `observers` FILE")
     if len(places) > 254:
@@ -189,20 +186,25 @@ def _places(request: VisibleRequest, terrain: OpenTerrain) -> list[Place]:
     return places
 
 
-def _from_file(path: Path, height: float, terrain: OpenTerrain) -> list[Place]:
+def named_points(path: Path, crs: str, height: float = 0.0) -> list[Place]:
+    """Points of a table (x, y and optionally name, h) or of a vector file in a CRS; `height` where none is stated.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, states another CRS, or holds several points in one.
+    """
     if path.suffix.lower() in (".csv", ".txt", ".tsv", ".xyz", ".dat"):
         table = read_table(path, COLUMNS)
         eyes, xy = table.numbers("h", empty=True), table.numbers("x", "y")
         own = np.where(np.isnan(eyes), height, eyes)
         names = table.labels("name", "line {line}")
         return [(name, float(x), float(y), float(h)) for name, (x, y), h in zip(names, xy, own)]
-    read = read_features(path, "Point")
-    if read.crs is not None and not same_crs(read.crs, terrain.crs):
-        raise InputError(f"{path}: points in {read.crs}, the model is in {terrain.crs}; reproject them")
-    single = [item for item in read.items if item.geometry.geom_type == "Point"]
-    if len(single) < len(read.items):
+    items = read_features(path, "Point", crs=crs).items
+    at = [shapely.get_coordinates(item.geometry).tolist() for item in items]
+    if any(len(each) > 1 for each in at):
         raise InputError(f"{path}: holds multipoints; split them into points")
-    return [(item.name, item.geometry.x, item.geometry.y, height) for item in single]
+    return [(item.name, x, y, height) for item, ((x, y),) in zip(items, at)]
 
 
 def _grid(request: VisibleRequest, terrain: OpenTerrain, places: Sequence[Place]) -> MapGrid:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,22 +13,21 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from photoplan.errors import HeightSystemError, InputError, UsageError
+from photoplan.engine.steps import steps
+from photoplan.errors import InputError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.crs import crs_label, same_crs
-from photoplan.geometry.grid import MapGrid, Window
+from photoplan.geometry.grid import USUAL_TILE, MapGrid, Window, check_resolution, refuse_absurd
+from photoplan.geometry.heights import common_system
 from photoplan.io.polygons import Feature, read_features
 from photoplan.io.product import check_output
+from photoplan.io.result_log import ResultLog
 from photoplan.plain import pick
 from photoplan.products.dtm.raster import GridOptions, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.targets.map import MapTarget
-from photoplan.terrain.volume.run import TILE, Volume, VolumeSettings, volume_between
-from photoplan.terrain.volume.sigma import ErrorModel, VolumeSigma, volume_sigma
-
-Report = Callable[[int, int], None]
-"""Called with the number of windows just finished and of their cells."""
+from photoplan.terrain.volume import TILE, ErrorModel, Volume, VolumeSettings, VolumeSigma, volume_between, volume_sigma
 
 
 @dataclass(frozen=True)
@@ -108,26 +109,38 @@ def dtm_volume(request: VolumeRequest, events: Events = SILENT) -> VolumeReport:
     if request.difference is not None:
         check_output(request.difference, inputs, overwrite=request.overwrite)
     a, b = (open_terrain(path, request.crs) for path in (request.a, request.b))
-    system = _one_system(a, b, request.height_system)
+    system = common_system({t.path: t.height_system for t in (a, b)}, request.height_system) or "same, not named"
     if not same_crs(a.crs, b.crs):
         raise InputError(
             f"{a.path} is in {crs_label(a.crs)}, {b.path} in {crs_label(b.crs)}; bring both into one CRS first"
         )
     items = _polygons(request.polygons, a, b)
     cell = request.resolution or min(a.resolution, b.resolution)
+    check_resolution(cell / 2)
+    for item in items:
+        xmin, ymin, xmax, ymax = item.geometry.bounds
+        halves = 2 * (xmax - xmin) / cell, 2 * (ymax - ymin) / cell
+        refuse_absurd(halves, USUAL_TILE, f"{item.name}: resolution {cell:g} m, halved to see how exact it is,")
     settings = VolumeSettings(cell, 0.0 if request.resolution else request.tolerance)
     errors, notes = _errors(request, a, b)
-    rows = []
-    events.begin("volumes", _windows(items, cell), "windows")
-    for item in items:
-        volume = volume_between(a.surface, b.surface, item.geometry, settings, events.done)
-        sigma = None
-        if errors is not None:
-            sigma = volume_sigma(a.surface, b.surface, errors, item.geometry, cell, request.bias)
-        rows.append(VolumeRow(item.name, volume, sigma))
-    notes += [note for row in rows for note in _notes(row)]
+    options = GridOptions.of(request, "difference", inputs, events, tile=TILE)
+    log = None
     if request.difference is not None:
-        _write_difference(request, (a, b), items, cell, inputs, events)
+        log = ResultLog.beside(request.difference, f"{options.key} {settings}", locked=False)
+    events.begin("volumes", _windows(items, cell) + len(items) * (errors is not None), "windows")
+    rows = []
+    # One window at once: a prepared polygon makes its index when it is first asked, whoever else asks it meanwhile.
+    with log or nullcontext(), steps("volumes", 1, events, log) as run:
+        for item in items:
+            volume, sigma = volume_between(a.surface, b.surface, item.geometry, settings, run), None
+            if errors is not None:
+                of_errors = partial(volume_sigma, a.surface, b.surface, errors, cell=cell, bias=request.bias)
+                (sigma,) = run(of_errors, [item.geometry])
+            rows.append(VolumeRow(item.name, volume, sigma))
+    notes += [note for row in rows for note in _notes(row)]
+    if log is not None and request.difference is not None:
+        _write_difference(request.difference, (a, b), items, cell, options)
+        log.remove()
     return VolumeReport(tuple(rows), system, tuple(notes), request.difference)
 
 
@@ -148,21 +161,6 @@ def _notes(row: VolumeRow) -> list[str]:
     return notes
 
 
-def _one_system(a: OpenTerrain, b: OpenTerrain, declared: str | None) -> str:
-    """The height system of both models."""
-    if declared not in (None, "same"):
-        raise UsageError(f"height system {declared!r}; `same` declares that both models have one")
-    named = [system for system in (a.height_system, b.height_system) if system is not None]
-    if len(named) == 2 and not (named[0] == named[1] or same_crs(named[0], named[1])):
-        raise HeightSystemError(f"{a.path}: heights in {named[0]}, {b.path}: in {named[1]}; convert one of them first")
-    if len(named) < 2 and declared is None:
-        without = " and ".join(str(t.path) for t in (a, b) if t.height_system is None)
-        raise HeightSystemError(
-            f"{without}: no height system stated; if both models have the same, say `height_system` same"
-        )
-    return named[0] if named else "same, not named"
-
-
 def _polygons(path: Path | None, a: OpenTerrain, b: OpenTerrain) -> tuple[Feature, ...]:
     """The polygons, or the rectangle that both models share."""
     common = np.maximum(a.bounds[:2], b.bounds[:2]), np.minimum(a.bounds[2:], b.bounds[2:])
@@ -170,11 +168,7 @@ def _polygons(path: Path | None, a: OpenTerrain, b: OpenTerrain) -> tuple[Featur
         raise InputError(f"{a.path} covers {_text(a.bounds)}, {b.path} {_text(b.bounds)}: they have nothing in common")
     if path is None:
         return (Feature("all", shapely.box(*common[0], *common[1])),)
-    read = read_features(path, "Polygon")
-    if read.crs is not None and not same_crs(read.crs, a.crs):
-        raise InputError(
-            f"{path}: polygons in {crs_label(read.crs)}, the models are in {crs_label(a.crs)}; reproject them"
-        )
+    read = read_features(path, "Polygon", crs=a.crs)
     return tuple(Feature(item.name, shapely.force_2d(item.geometry)) for item in read.items)
 
 
@@ -200,12 +194,7 @@ def _own(terrain: OpenTerrain) -> Callable[[NDArray[np.float64]], NDArray[np.flo
 
 
 def _write_difference(
-    request: VolumeRequest,
-    both: tuple[OpenTerrain, OpenTerrain],
-    items: tuple[Feature, ...],
-    cell: float,
-    inputs: list[Path],
-    events: Events,
+    path: Path, both: tuple[OpenTerrain, OpenTerrain], items: tuple[Feature, ...], cell: float, options: GridOptions
 ) -> None:
     """B − A as a raster over all polygons."""
     a, b = both
@@ -216,6 +205,4 @@ def _write_difference(
     def tile(window: Window) -> NDArray[np.float32]:
         return np.asarray(b.surface.relief(target, window) - a.surface.relief(target, window))[None]
 
-    assert request.difference is not None
-    options = GridOptions.of(request, "difference", inputs, events, tile=TILE)
-    write_grid(request.difference, grid.placement, np.float32, 1, "auto", tile, options)
+    write_grid(path, grid.placement, np.float32, 1, "auto", tile, options)

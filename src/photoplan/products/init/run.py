@@ -38,6 +38,7 @@ from photoplan.products.init.systems import (
     project_crs,
     terrain_entry,
 )
+from photoplan.products.judged import differences, on_map, stated_positions
 
 LENS_NAMES = {
     "none": "no distortion",
@@ -160,6 +161,9 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
         centers, angles = placed(table, crs, systems[1])
         check_joined(systems, crs, centers)
         poses = {i.name: (_triple(c), _triple(a)) for i, c, a in zip(table.images, centers, angles)}
+        stated = on_map(stated_positions(table, {oriented.name: file for file, oriented in pairs}), crs)
+        for said in differences([i.name for i in table.images], centers, stated):
+            talk(f"  warning: {said}")
     images = []
     for file, oriented in pairs:
         camera, described = used[oriented.name]

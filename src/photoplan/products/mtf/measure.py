@@ -216,6 +216,7 @@ def _measured(image: LightImage, channel: int, number: int, region: EdgeRegion, 
         mask &= ~picture.saturated
     light = picture.grey.astype(float)
     settings = EdgeSettings(
+        reach=float(region.half),
         least_snr=min(how.rules.least_snr, 5.0),
         least_length=min(how.rules.least_length, 12.0),
         most_structure=how.rules.evenness,

@@ -24,7 +24,7 @@ from photoplan.quality.spread import SpreadFunction
 #: Of a measured edge, in JSON under their own names.
 _FIGURES = ("angle_deg", "length", "sampling", "dark", "bright", "snr", "mtf50", "mtf50_interval", "mtf10",
             "mtf10_interval", "fwhm", "fwhm_interval", "gaussian_fwhm", "overshoot", "overshoot_sigma", "undershoot",
-            "undershoot_sigma")  # fmt: skip
+            "undershoot_sigma", "window", "beyond", "beyond_sigma")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

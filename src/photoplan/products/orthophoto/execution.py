@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from photoplan import __version__
 from photoplan.engine.cluster import Question
@@ -20,10 +22,11 @@ from photoplan.io.disk import make_folder
 from photoplan.io.image_form import bands_of
 from photoplan.io.product import ProductFile
 from photoplan.io.quicklook import write_overview
-from photoplan.io.run_record import input_entry, run_times, versions, write_run_record
+from photoplan.io.run_record import input_entry, recorded_result, run_times, versions, write_run_record
 from photoplan.kernels.rectify import is_compiled
+from photoplan.plain import pick
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct
-from photoplan.products.orthophoto.results import ProductResult, finished_products, product_path
+from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.restored import RestoreStep
 from photoplan.project.scene import Scene, input_files, open_scene, scene_address
 
@@ -112,7 +115,8 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     folder = Path(output)
     run.check()
     picture = folder / "overview.png"
-    _refuse_inputs(plan, [*(product_path(folder, p) for p in plan.products), *([picture] if run.quicklook else [])])
+    rasters = [path for p in plan.products for path in outputs(folder, p, plan.settings)]
+    _refuse_inputs(plan, [*rasters, *([picture] if run.quicklook else [])])
     kept = finished_products(plan, folder, run.overwrite)
     make_folder(folder)
     if kept:
@@ -161,28 +165,36 @@ def _work(
         run.events.talk(f"note: {note}")
     if not is_compiled(scene.reader.dtype, scene.reader.bands, settings.kernel):
         run.events.talk("compiling the resampling kernels for this kind of image, once (up to a minute)")
-    file = ProductFile(
-        product_path(folder, product),
-        product.grid.placement,
-        scene.reader.bands,
-        scene.reader.dtype,
+    picture, *marks = outputs(folder, product, settings)
+    open_file = partial(
+        ProductFile,
+        placement=product.grid.placement,
         run_key=product.key,
-        nodata=settings.nodata_value,
-        compress=settings.compress,
         overviews=settings.overviews,
         tile=settings.tile,
         overwrite=run.overwrite,
         inputs=scene.files,
         threads=run.workers,
+    )
+    file = open_file(
+        picture,
+        bands=scene.reader.bands,
+        dtype=scene.reader.dtype,
+        nodata=settings.nodata_value,
+        compress=settings.compress,
         form=bands_of(scene.reader.info),
     )
+    mark = partial(open_file, bands=1, dtype=np.dtype(np.uint8), nodata=255, resampling="mode")
+    files = (file, *(mark(path) for path in marks))
+    told = replace(product.plan, tiles=product.plan.tiles.only(()))
+    job = RenderJob(scene.address, told, settings.kernel, marks=bool(marks))
     return Work(
         name=product.plan.name,
-        job=RenderJob(scene.address, replace(product.plan, tiles=product.plan.tiles.only(())), settings.kernel),
+        job=job,
         tiles=product.plan.tiles,
         count=product.plan.tiles.total,
-        sinks=(file,),
-        complete=partial(_complete, plan, product, scene, run, file, _clock(workers)),
+        sinks=files,
+        complete=partial(_complete, plan, product, scene, run, files, _clock(workers)),
         scratch=file.path.with_name(f".{file.path.name}.parcels"),
     )
 
@@ -204,12 +216,13 @@ def _complete(
     product: OrthoProduct,
     scene: Scene,
     run: Run,
-    file: ProductFile,
+    files: Sequence[ProductFile],
     times: Callable[[], dict[str, Any]],
     tally: Tally,
 ) -> ProductResult:
     """Give the product its name and its record; with failed tiles it gets neither."""
-    facts = None if tally.failed else file.complete(_tags(plan, product))
+    file = files[0]
+    facts, *_ = [None] if tally.failed else [each.complete(_tags(plan, product)) for each in files]
     ran = times()
     result = ProductResult(
         path=file.path,
@@ -220,6 +233,7 @@ def _complete(
         cells=tally.totals.get("cells", 0),
         tiles=product.plan.tiles.total,
         resumed=tally.resumed,
+        hidden=None if plan.settings.owners is None else tally.totals.get("hidden", 0) * product.grid.resolution**2,
         failed=tuple(sorted(tally.failed)),
         reason=next(iter(tally.reasons), ""),
     )
@@ -272,3 +286,82 @@ def _record(plan: OrthoPlan, product: OrthoProduct, scene: Scene, result: Produc
         "projection_centre": [float(c) for c in center],
         "gsd_m": product.gsd,
     }
+
+
+@dataclass(frozen=True)
+class ProductResult:
+    """What became of one product."""
+
+    path: Path
+    image: str
+    seconds: float
+    valid_share: float
+    """Valid pixels among all pixels of the product, 0 to 1."""
+    residual: float
+    """Worst residual of the anchors over all tiles, pixels of the source image."""
+    cells: int
+    """Boxes that the anchors of all tiles have."""
+    tiles: int
+    """Tiles that the product has, the empty ones included."""
+    resumed: int
+    """Tiles taken over from an earlier run."""
+    hidden: float | None
+    """Ground in the image that it cannot see, m²; None: nobody has asked."""
+    failed: tuple[int, ...]
+    """Tiles that could not be computed; the product is then not written."""
+    reason: str = ""
+    """Why the first of them failed."""
+
+    def json_fields(self) -> dict[str, Any]:
+        """Figures without the reason of a failure."""
+        own = ("path", "image", "seconds", "valid_share", "cells", "tiles")
+        more = {"worst_anchor_residual_px": "residual", "resumed_tiles": "resumed", "failed_tiles": "failed"}
+        return pick(self, *own, hidden_m2="hidden", **more)
+
+
+def outputs(folder: Path, product: OrthoProduct, settings: OrthoSettings) -> list[Path]:
+    """Rasters of a product: itself, and where ground is hidden if that is to be marked."""
+    path = folder / f"{product.plan.name}.tif"
+    return [path, path.with_name(f"{path.stem}_hidden.tif")] if settings.hidden == "mark" else [path]
+
+
+def finished_products(plan: OrthoPlan, folder: Path, overwrite: bool) -> dict[str, ProductResult]:
+    """Products that exist: those of this very run, interrupted, are kept; any other is refused before any work.
+
+    When all products of a plan exist, the run was not interrupted: doing it again needs `overwrite`.
+    """
+    existing = [p for p in plan.products if outputs(folder, p, plan.settings)[0].exists()]
+    if overwrite or not existing:
+        return {}
+    kept = {p.plan.name: _kept(plan, p, folder) for p in existing}
+    foreign = [name for name, result in kept.items() if result is None]
+    if foreign or len(existing) == len(plan.products):
+        first, *_ = outputs(folder, plan[foreign[0]] if foreign else existing[0], plan.settings)
+        more = f" and {len(existing) - 1} more" if len(existing) > 1 else ""
+        raise UsageError(f"{first}{more} exists; give `overwrite` to replace it, or another `output`")
+    return {name: result for name, result in kept.items() if result is not None}
+
+
+def _kept(plan: OrthoPlan, product: OrthoProduct, folder: Path) -> ProductResult | None:
+    """The result of an earlier run with the same key and settings; None if the product is not one."""
+    path, *others = outputs(folder, product, plan.settings)
+    if not all(other.exists() for other in others):
+        return None
+
+    def result(made: dict[str, Any], recorded: dict[str, Any]) -> ProductResult | None:
+        if OrthoSettings.from_dict(recorded) != plan.settings:
+            return None
+        return ProductResult(
+            path=path,
+            image=product.image,
+            seconds=made["seconds"],
+            valid_share=made["valid_share"],
+            residual=made["worst_anchor_residual_px"],
+            cells=made["cells"],
+            tiles=made["tiles"],
+            resumed=made["tiles"],
+            hidden=made.get("hidden_m2"),
+            failed=(),
+        )
+
+    return recorded_result(path, product.key, result)

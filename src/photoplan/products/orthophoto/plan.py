@@ -17,18 +17,17 @@ from photoplan.engine.execute import joined
 from photoplan.engine.execute import render as render_tile
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.geometry.bounds import area_fault
 from photoplan.geometry.grid import MapGrid, Window, refuse_absurd
 from photoplan.io.names import safe_stem
 from photoplan.io.project.model import Project
 from photoplan.io.storage import nodata_for
-from photoplan.orientation.plausibility import look
+from photoplan.orientation.plausibility import ImagePlausibility, View, other_reading
 from photoplan.plan.compile import AnchorRule
 from photoplan.plan.footprint import Footprint, covered_tiles, image_border, mean_gsd, some_height
 from photoplan.plan.product import ProductPlan
-from photoplan.products.check.view import view_of
+from photoplan.products.judged import judged
 from photoplan.products.orthophoto.settings import OrthoSettings
-from photoplan.project.scene import Scene, SceneAddress, ground_of, map_order, open_scene, pose_of
+from photoplan.project.scene import Scene, SceneAddress, map_order, open_scene
 from photoplan.targets.map import MapTarget
 
 #: A product is at most so many times finer than its images see the ground.
@@ -131,16 +130,15 @@ def plan_orthophotos(
     # Each image is looked at twice: where it lies, and which tiles it needs.
     events.begin("planning", 2 * len(names), "steps")
     scenes: dict[str, Scene] = {}
-    faults: dict[str, str] = {}
+    seen: dict[int, tuple[View, ImagePlausibility]] = {}
     for place in map_order(project, names):
         # All that is asked of the terrain for one image, before the next: its blocks are then at hand.
-        name = names[place]
-        scene = scenes[name] = open_scene(project, name)
-        seen = scene.footprint.bounds is not None
-        fault = _fault(project, name) if seen and not force else None
-        if fault is not None:
-            faults[name] = fault
+        scenes[names[place]] = scene = open_scene(project, names[place])
+        if scene.footprint.bounds is not None:
+            seen[place] = judged(project, project.image(names[place]), scene.ground)
         events.done()
+    if not force:
+        _refuse_faults(seen, scenes)
     for name in names:
         scene = scenes[name]
         if scene.footprint.bounds is None:
@@ -148,12 +146,6 @@ def plan_orthophotos(
         else:
             looks.append((name, scene, mean_gsd(scene.camera, scene.footprint)))
     resolution = chosen.resolution or (two_figures(float(np.mean([look[2] for look in looks]))) if looks else 1.0)
-    if faults:
-        name, fault = next(iter(faults.items()))
-        raise GeometryError(
-            f"image {name!r}: {fault} ({len(faults)} of {len(looks)} images have such faults, `photoplan check` lists "
-            "them); nothing is made of them unless you say `force`"
-        )
     if looks and not force:
         _refuse_too_fine(project, resolution, chosen, looks)
     products = []
@@ -171,12 +163,18 @@ def plan_orthophotos(
     return OrthoPlan(project, replace(chosen, resolution=resolution), tuple(products), tuple(blind))
 
 
-def _fault(project: Project, name: str) -> str | None:
-    """Why an orientation cannot be right; None: it can. Images that see no terrain are told otherwise."""
-    ground, image = ground_of(project), project.image(name)
-    center = pose_of(project, image, ground).center
-    view = view_of(image, project.cameras[image.camera], project.orientation, center)
-    return area_fault(project.crs, center) or look(view, ground.surface.heights).fault
+def _refuse_faults(seen: dict[int, tuple[View, ImagePlausibility]], scenes: dict[str, Scene]) -> None:
+    """Refuse what `check` calls a fault; images that see no terrain are told otherwise."""
+    faults = [found for _, found in seen.values() if found.fault is not None]
+    if not faults:
+        return
+    views, looks = zip(*(seen[place] for place in sorted(seen)))
+    other = other_reading(views, looks, scenes[faults[0].name].surface.heights)
+    raise GeometryError(
+        f"image {faults[0].name!r}: {faults[0].fault} ({len(faults)} of {len(seen)} images have such faults, "
+        f"`photoplan check` lists them); nothing is made of them unless you say `force`"
+        + ("" if other is None else f". {other}")
+    )
 
 
 def _refuse_too_fine(
@@ -215,7 +213,8 @@ def _plan_one(project: Project, scene: Scene, name: str, settings: OrthoSettings
     tiles = covered_tiles(scene.camera, scene.surface, grid, settings.tile)
     if not len(tiles):
         return None
-    return ProductPlan(product_name(name), (name,), target, AnchorRule.of(settings.kernel, settings.tolerance), tiles)
+    rule = AnchorRule.of(settings.kernel, settings.tolerance)
+    return ProductPlan(product_name(name), (name,), target, rule, tiles, settings.owners)
 
 
 def product_name(image: str) -> str:
@@ -247,6 +246,7 @@ def product_key(scene: SceneAddress, plan: ProductPlan, settings: OrthoSettings)
         "rule": [plan.rule.tolerance, plan.rule.radius, plan.tiles.side],
         "kernel": settings.kernel,
         "nodata": settings.nodata,
+        "hidden": settings.hidden,
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
@@ -319,7 +319,7 @@ def render(
         (tile.window, render_tile(product.plan, tile, scene.sources, scene.surface, plan.settings.kernel))
         for tile in tiles
     )
-    whole = joined(window, parts, scene.reader, owned=False)
+    whole = joined(window, parts, scene.reader)
     assert whole.values is not None and whole.valid is not None
     return whole.values, whole.valid
 

@@ -216,7 +216,7 @@ def read_plan(path: Path | str) -> tuple[OrthoPlan, Path]:
         listed: dict[str, set[int]] = {}
         for name, index in zip(tiles["product"].tolist(), tiles["tile"].tolist()):
             listed.setdefault(name, set()).add(index)
-        products = [_product(entry, listed) for entry in header["products"]]
+        products = [_product(entry, listed, settings) for entry in header["products"]]
         changed = [
             p.image
             for p, entry in zip(products, header["products"])
@@ -253,7 +253,7 @@ def _product_header(product: OrthoProduct, tiles: int) -> dict[str, Any]:
     }
 
 
-def _product(entry: dict[str, Any], listed: dict[str, set[int]]) -> OrthoProduct:
+def _product(entry: dict[str, Any], listed: dict[str, set[int]], settings: OrthoSettings) -> OrthoProduct:
     """What `_product_header` says, with the tiles that the layer lists.
 
     A person may have deleted some: it is then another product.
@@ -267,7 +267,8 @@ def _product(entry: dict[str, Any], listed: dict[str, set[int]]) -> OrthoProduct
     key = entry["key"]
     if len(tiles) != entry["tiles"]:
         key = hashlib.sha256(f"{key} {tiles.indices.tolist()}".encode()).hexdigest()
-    plan = ProductPlan(name, (entry["image"],), MapTarget(grid), AnchorRule(**entry["rule"]), tiles)
+    rule = AnchorRule(**entry["rule"])
+    plan = ProductPlan(name, (entry["image"],), MapTarget(grid), rule, tiles, settings.owners)
     outline = np.array(entry["outline"], float).reshape(-1, 3)
     bounds = None if entry["bounds"] is None else tuple(entry["bounds"])
     low, high = entry["height_range"]

@@ -6,8 +6,11 @@ from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args
 
 from photoplan.errors import UsageError
+from photoplan.geometry.grid import check_resolution
+from photoplan.plan.owner import InSight, Ownership
 
 Kernel = Literal["nearest", "bilinear", "bicubic", "bicubic-1", "lanczos3"]
+Hidden = Literal["show", "nodata", "mark"]
 Compression = Literal["deflate", "zstd", "lzw", "jpeg", "none"]
 
 
@@ -25,6 +28,9 @@ class OrthoSettings:
     """Largest residual of the anchors, pixels of the source image."""
     tile: int = 512
     """Side of a tile, pixels; a multiple of 16 from 128 on."""
+    hidden: Hidden = "show"
+    """What becomes of ground that the image cannot see, since other ground is in the way: ``show`` paints it with what
+    hides it, without asking; ``nodata`` leaves it empty; ``mark`` paints it and writes where it is."""
     nodata: str = "auto"
     """A number, ``mask`` (an internal mask band), or ``auto``: 0 for unsigned integers, −32768 for int16, NaN for
     floats."""
@@ -34,12 +40,13 @@ class OrthoSettings:
     """Whether the file holds overviews."""
 
     def __post_init__(self) -> None:
-        if self.resolution is not None and not self.resolution > 0:
-            raise UsageError(f"resolution {self.resolution}; a positive number of metres is needed")
+        if self.resolution is not None:
+            check_resolution(self.resolution)
         if self.kernel not in get_args(Kernel):
             raise UsageError(f"kernel {self.kernel!r}; allowed are {', '.join(get_args(Kernel))}")
-        if self.compress not in get_args(Compression):
-            raise UsageError(f"compression {self.compress!r}; allowed are {', '.join(get_args(Compression))}")
+        for what, value, allowed in (("compression", self.compress, Compression), ("hidden", self.hidden, Hidden)):
+            if value not in get_args(allowed):
+                raise UsageError(f"{what} {value!r}; allowed are {', '.join(get_args(allowed))}")
         if not 1e-6 <= self.tolerance <= 10:
             raise UsageError(f"tolerance {self.tolerance} px; allowed are 1e-6 to 10, usual is 0.02")
         if self.tile < 128 or self.tile > 4096 or self.tile % 16:
@@ -51,6 +58,11 @@ class OrthoSettings:
                 float(self.nodata)
             except ValueError:
                 raise UsageError(f"nodata {self.nodata!r}; allowed are auto, mask or a number") from None
+
+    @property
+    def owners(self) -> Ownership | None:
+        """Who paints a pixel of an orthophoto of one image."""
+        return None if self.hidden == "show" else InSight(paints_hidden=self.hidden == "mark")
 
     @property
     def nodata_value(self) -> float | Literal["auto", "mask"]:

@@ -22,13 +22,16 @@ from photoplan.quality.edges.sharpness import LEAST_EDGES, sharpness_of
 from photoplan.quality.restoration.design import Design, DesignOptions, Sharpness, design_filter
 from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
 from photoplan.quality.restoration.image_noise import block_noise, image_noise
-from photoplan.quality.restoration.regularised import SceneStatistics
+from photoplan.quality.restoration.regularised import curve_transfer
+from photoplan.quality.restoration.scene import SceneStatistics, Transfer, block_spectra, fit_scene
 
 #: Windows of an image in which its contrast is looked for, in each direction, and their side.
 _WINDOWS = 5
 _SIDE = 256
 #: Share of the blocks of an image that must hold no saturated pixel, for the noise to be looked for in these alone.
 _CLEAN = 0.1
+#: The noise of an image, by that of its most even blocks: they may show scene besides, and compression clears them.
+_NOISE_RANGE = (0.1, 30.0)
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,8 @@ class DesignedPart:
             "edges": self.edges,
             "noise": self.scene.noise,
             "contrast": self.scene.contrast,
+            "exponent": round(self.scene.exponent, 3),
+            "noise_smoothed": round(self.scene.smoothed, 3),
             "mtf50_x": round(self.sharpness[0].modulation().mtf50, 4),
             "mtf50_y": round(self.sharpness[1].modulation().mtf50, 4),
             "spread_x": [round(float(v), 5) for v in self.sharpness[0].spread.side()],
@@ -87,6 +92,7 @@ class DesignedPart:
             "condition_y": str(self.design.condition_y),
             "noise_gain": round(self.design.noise_gain, 3),
             "method": self.design.method,
+            "expected_error": {method: float(f"{error:.4g}") for method, error in self.design.expected.items()},
             "rule": self.design.reason,
         }
 
@@ -139,7 +145,7 @@ def design_restoration(
     parts: list[DesignedPart] = []
     notes = [f"not measured: {why}" for why in mtf.failed.values()]
     for channel in _channels(mtf.images, request.per_band):
-        scene = _scene(opened, channel)
+        scene = _spectrum(opened, channel)
         edges = [e.measured for image in mtf.images for e in image.edges if e.channel == channel]
         parts += _parts(request, (channel if request.per_band else None, size), edges, scene, notes)
     if mtf.enhancement is not None and mtf.enhancement.enhanced:
@@ -167,7 +173,7 @@ def _parts(
     request: DesignRequest,
     where: tuple[int | None, tuple[int, int]],
     edges: Sequence[EdgeMeasurement],
-    scene: SceneStatistics,
+    scene: SceneSpectrum,
     notes: list[str],
 ) -> list[DesignedPart]:
     """The filters of a band: for the whole field, or for each part of it that has edges enough."""
@@ -205,7 +211,7 @@ def _designed(
     request: DesignRequest,
     place: tuple[int | None, tuple[float, float] | None],
     edges: Sequence[EdgeMeasurement],
-    scene: SceneStatistics,
+    spectrum: SceneSpectrum,
     whole: DesignedPart | None = None,
 ) -> DesignedPart:
     """The filter of edges; what a part of the field does not show is taken from the whole."""
@@ -216,37 +222,50 @@ def _designed(
             raise
         return DesignedPart(*place, 0, whole.sharpness, whole.missing, whole.scene, whole.design)
     if whole is not None:
-        x = whole.sharpness[0] if "x" in missing else x
-        y = whole.sharpness[1] if "y" in missing else y
+        x = whole.sharpness[0] if "x" in missing or x.doubt else x
+        y = whole.sharpness[1] if "y" in missing or y.doubt else y
+    scene = whole.scene if whole is not None else spectrum.scene(curve_transfer(x.modulation(), y.modulation()))
     return DesignedPart(*place, len(edges), (x, y), missing, scene, design_filter(x, y, scene, request.options))
 
 
-def _scene(images: Sequence[LightImage], channel: int) -> SceneStatistics:
-    """Noise and contrast of images, from windows over the whole of them, in their light."""
-    blocks: list[NDArray[np.float64]] = []
-    clean: list[NDArray[np.float64]] = []
-    squares, count = 0.0, 0
+@dataclass(frozen=True, eq=False)
+class SceneSpectrum:
+    """What images show of their scenes, in their light."""
+
+    power: NDArray[np.float64]
+    """Mean spectrum of their blocks."""
+    noise: float
+    """Standard deviation in the most even blocks; 0 if there is none."""
+
+    def scene(self, transfer: Transfer) -> SceneStatistics:
+        """The scene, once the transfer function of the images is known."""
+        return fit_scene(self.power, transfer, (_NOISE_RANGE[0] * self.noise, _NOISE_RANGE[1] * self.noise))
+
+
+def _spectrum(images: Sequence[LightImage], channel: int) -> SceneSpectrum:
+    """Spectrum and noise of images, from windows over the whole of them, in their light."""
+    noises: list[list[NDArray[np.float64]]] = [[], []]
+    # All blocks, and those without a saturated pixel: number of them, sum of their spectra.
+    sums: list[list[Any]] = [[0, 0.0], [0, 0.0]]
     for image in images:
         for window in _windows(image.size):
             picture = image.picture(window, channel)
             grey = picture.grey.astype(np.float64)
             if picture.valid is not None:
                 grey[~picture.valid] = np.nan
-            blocks.append(block_noise(grey))
-            clean.append(blocks[-1] if picture.saturated is None else block_noise(grey, ~picture.saturated))
-            for difference in (np.diff(grey, axis=0), np.diff(grey, axis=1)):
-                known = difference[np.isfinite(difference)]
-                squares += float(known @ known)
-                count += known.size
-    if count == 0 or squares == 0.0:
-        raise InputError("the images have no contrast")
-    every, whole = np.concatenate(blocks), np.concatenate(clean)
+            usable = [None, None if picture.saturated is None else ~picture.saturated]
+            for mask, blocks, total in zip(usable, noises, sums, strict=True):
+                blocks.append(block_noise(grey, mask))
+                spectra = block_spectra(grey, mask)
+                total[0] += len(spectra)
+                total[1] = total[1] + spectra.sum(axis=0)
+    every, whole = (np.concatenate(blocks) for blocks in noises)
     # A full sky seems to have no noise, and its few pixels below the end seem to be all of it.
     noise = image_noise(whole if whole.size >= _CLEAN * every.size else every)
-    noise = noise if np.isfinite(noise) else 0.0
-    # Differences of neighbours hold the noise of both.
-    contrast = max(squares / count - 2.0 * noise**2, 1e-4 * squares / count)
-    return SceneStatistics(noise, float(np.sqrt(contrast)))
+    count, total = sums[1] if sums[1][0] >= _CLEAN * sums[0][0] else sums[0]
+    if count == 0 or not total.any():
+        raise InputError("the images have no contrast")
+    return SceneSpectrum(total / count, noise if np.isfinite(noise) else 0.0)
 
 
 def _windows(size: tuple[int, int]) -> list[Window]:
@@ -264,11 +283,12 @@ def _where(part: DesignedPart, parts: Sequence[DesignedPart]) -> str:
     """Which of several parts is spoken of, and how many are restored how; empty for a single one."""
     if len(parts) == 1:
         return ""
-    exact = sum(one.design.method == "exact" for one in parts)
+    methods = [one.design.method for one in parts]
+    counted = ", ".join(f"{methods.count(each)} {each}" for each in ("exact", "regularised", "none") if each in methods)
     band = [] if part.band is None else [f"band {part.band}"]
     place = [] if part.at is None else [f"at column {part.at[0]:.0f}, row {part.at[1]:.0f}"]
     which = " ".join(band + place)
-    return f"{exact} of {len(parts)} parts exact, {len(parts) - exact} regularised; the noisiest, {which}: "
+    return f"of {len(parts)} parts {counted}; the noisiest, {which}: "
 
 
 def _filter(request: DesignRequest, parts: Sequence[DesignedPart], size: tuple[int, int]) -> RestorationFilter:
@@ -277,10 +297,12 @@ def _filter(request: DesignRequest, parts: Sequence[DesignedPart], size: tuple[i
     worst = max(parts, key=lambda part: part.design.noise_gain)
     names = ", ".join(path.name for path in request.images[:3])
     more = f" and {len(request.images) - 3} more" if len(request.images) > 3 else ""
+    scale = ", full scale 1" if request.linearisation in (None, "linear", "srgb") else ""
     facts: dict[str, Any] = {
         "condition": _where(worst, parts)
         + f"along rows: {worst.design.condition_x}; along columns: {worst.design.condition_y}",
         "rule": _where(worst, parts) + worst.design.reason,
+        "expected": _where(worst, parts) + f"error {worst.design.expectation} (rms in light{scale})",
         "rotation": f"{request.options.rotation}: weights off the axes follow from those on them",
         "linearisation": request.linearisation or "linear",
         "noise_gain": round(max(part.design.noise_gain for part in parts), 3),

@@ -22,7 +22,7 @@ from photoplan.io.storage import Nodata
 from photoplan.plain import pick
 from photoplan.plan.tiles import Tile, Tiles
 from photoplan.products.chromatic import model_figures, save_chromatic
-from photoplan.products.restore.request import RestoreRequest
+from photoplan.products.restore.filter import RestoreRequest
 from photoplan.project.align import AlignStep
 from photoplan.project.fall_off import FallOffStep
 from photoplan.project.restored import read_counted, restoration_of

@@ -28,7 +28,7 @@ from photoplan.io.storage import Nodata
 from photoplan.plain import pick
 from photoplan.products.chromatic import load_chromatic, measured_once, model_figures
 from photoplan.products.restore.execute import Job, RestoredImage, earlier_result, memory_of_a_tile, restoration
-from photoplan.products.restore.request import RestoreRequest
+from photoplan.products.restore.filter import RestoreRequest
 from photoplan.project.align import AlignStep
 from photoplan.project.fall_off import FallOffFile, FallOffStep, load_fall_off
 from photoplan.project.filter_files import entries_of, load_filter

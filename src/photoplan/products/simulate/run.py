@@ -20,12 +20,10 @@ from photoplan.io.raster import RasterReader
 from photoplan.io.result_log import ResultLog
 from photoplan.io.run_record import run_key, run_times, write_run_record
 from photoplan.plain import pick
-from photoplan.products.simulate.model import read_model
-from photoplan.products.simulate.series import SimulatedImage, count_parts, form_frames, is_kept
-from photoplan.quality.formation.model import MOST_PIXELS, ImageModel
+from photoplan.products.simulate.model import SimulatedImage, count_parts, form_frames, is_kept, read_model
+from photoplan.quality.formation.model import MOST_PIXELS, ImageModel, model_mtf50
 from photoplan.quality.formation.parts import Quantisation
 from photoplan.quality.formation.scenes import PATTERNS, LightScene, PatternScene, parse_pattern
-from photoplan.quality.formation.truth import model_mtf50
 
 _MOST_FRAMES = 10_000
 _BITS = {"uint8": 8, "uint16": 16}

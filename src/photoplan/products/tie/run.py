@@ -30,8 +30,16 @@ from photoplan.matching.tracks import Tracks, TracksFound, build_tracks, connect
 from photoplan.matching.verify import PairMatches, VerifySettings
 from photoplan.plain import pick
 from photoplan.products.init.match import some
-from photoplan.products.tie.inputs import TieImage, chosen_pairs, open_images
-from photoplan.products.tie.work import FeatureStore, digest_of, find_features, find_pairs, like_pairs
+from photoplan.products.tie.inputs import (
+    FeatureStore,
+    TieImage,
+    chosen_pairs,
+    digest_of,
+    find_features,
+    find_pairs,
+    like_pairs,
+    open_images,
+)
 from photoplan.project.scene import input_files
 
 #: Changes when kept results mean something else.

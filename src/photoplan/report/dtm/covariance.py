@@ -19,6 +19,8 @@ _BLOCKS, _POINTS, _CLASSES = 160, 60, 14
 _ROUNDS = 8
 #: Squared difference of side coordinates from which points lie on two sides of a breakline; 4 across its middle.
 _PARTED = 0.4
+#: Factor between measured and expected covariances that is told. One field of known covariance scatters by 1.4.
+_DIFFER = 2.0
 #: Argument at which (1 + t) exp(−t) is one half.
 _MATERN_HALF = 1.6783469900166605
 
@@ -42,6 +44,30 @@ class CovarianceTest:
     """What the fitted functions let expect of these means, shape (k,), m²."""
     pairs: NDArray[np.int64]
     """Pairs in each class, shape (k,)."""
+
+    noise: float = 0.0
+    """Variance of the noise of mass points, m²: what is smaller cannot be told from it."""
+
+    @property
+    def ratio(self) -> float:
+        """Factor by which the means are those expected, by least squares over all classes; NaN: no pairs."""
+        known = np.isfinite(self.empirical) & np.isfinite(self.expected)
+        weight = self.pairs[known] * self.expected[known]
+        scale = float((weight * self.expected[known]).sum())
+        return float((weight * self.empirical[known]).sum()) / scale if scale > 0 else np.nan
+
+    @property
+    def warning(self) -> str:
+        """What to say where measured and expected covariances differ by more than chance and noise; or empty."""
+        first = int(np.argmax(self.pairs > 0))
+        measured, expected = float(self.empirical[first]), float(self.expected[first])
+        if not abs(measured - expected) > self.noise / 2 or 1 / _DIFFER <= self.ratio <= _DIFFER:
+            return ""
+        return (
+            f"the covariance of neighbouring points is {measured:.3g} m² where the fitted functions let expect "
+            f"{expected:.3g} m²: they are fitted to predict points from their neighbours, but in gaps and at edges "
+            f"standard deviations may be too {'large' if self.ratio < 1 else 'small'}"
+        )
 
 
 def correlation_at(family: str, t: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -89,6 +115,7 @@ def covariance_test(fit: TerrainFit) -> CovarianceTest:
         empirical=mean(product),
         expected=mean(expected),
         pairs=count,
+        noise=fit.whole.noise**2,
     )
 
 

@@ -11,8 +11,9 @@ import numpy as np
 from photoplan.errors import UsageError
 from photoplan.report.drawing import has_matplotlib, load_matplotlib
 from photoplan.report.dtm.plots import LINE_WORDS, Plots
-from photoplan.report.dtm.samples import BuildFacts
-from photoplan.report.page import Cell, ReportFile, figure, headline, page, section, table
+from photoplan.report.dtm.samples import BuildFacts, PlottedError
+from photoplan.report.page import Cell, ReportFile, figure, headline, page, section, table, text
+from photoplan.terrain.calibration import ClassFigures
 
 #: Rows of a list at most: more are counted.
 MOST_ROWS = 2000
@@ -65,7 +66,7 @@ def _headline(facts: BuildFacts) -> list[tuple[str, str, str]]:
         (_number(points), "points", "; ".join(f"{kind} {_number(n)}" for kind, n in facts.counts if n)),
         (_number(lines), "lines", "with their intersections with the grid"),
         (_number(facts.units), "computing units", f"{widths}; {_number(facts.empty)} units are empty"),
-        (_metres(facts.sigma), "standard deviation of heights", "root mean square over all posts"),
+        (_metres(facts.sigma), "standard deviation of heights", "root mean square over the posts that data surround"),
         (_metres(facts.whole.noise), "noise of mass points", "their filter value"),
         (
             f"{np.sqrt(facts.whole.variance):.3g} m",
@@ -106,7 +107,7 @@ def _fit(facts: BuildFacts, plots: Plots) -> list[str]:
             "Histogram of normalised residuals",
             "Difference of each point from what its neighbours predict, in its standard deviations, beside the normal "
             "curve. A narrower histogram means that standard deviations are too large, a wider one that they are too "
-            "small. The model's standard deviations have been multiplied by the spread of each unit.",
+            "small. The model's standard deviations follow the spread around each place, and what held-out blocks say.",
         ),
         figure(
             plots.covariance(facts.covariance),
@@ -115,6 +116,25 @@ def _fit(facts: BuildFacts, plots: Plots) -> list[str]:
             "the heights above a plane through each neighbourhood (dots), and what the fitted functions let expect of "
             "it after the same plane is taken away (line).",
         ),
+        *([f"<p><strong>{text(facts.covariance.warning)}</strong></p>"] if facts.covariance.warning else []),
+        *_held_out(facts.calibration),
+    ]
+
+
+def _held_out(classes: Sequence[ClassFigures]) -> list[str]:
+    """What blocks that were held out say of the standard deviations."""
+    rows: list[list[str | Cell]] = []
+    for c in classes:
+        where = f"{c.nearest:.3g} to {c.furthest:.3g} m" if np.isfinite(c.furthest) else f"over {c.nearest:.3g} m"
+        after = f"{c.after:.2f}" if c.enough else "too few blocks"
+        words = (_number(c.count), _number(c.blocks), f"{c.before:.2f}", after)
+        rows.append([where, *(Cell(word, number=True) for word in words)])
+    if not rows:
+        return []
+    return [
+        "<p>Blocks of heights were held out and predicted from all others. Their errors, divided by the standard "
+        "deviations, have this spread (1: standard deviations are right; more: they are too small):</p>",
+        table(["distance to data", "heights", "blocks", "as predicted", "as stated in the model"], rows),
     ]
 
 
@@ -153,9 +173,33 @@ def _effect(facts: BuildFacts, plots: Plots) -> list[str]:
 
 
 def _gross(facts: BuildFacts, plots: Plots) -> list[str]:
-    if not facts.gross:
+    if not facts.gross and not facts.suspects:
         return ["<p>None were sought.</p>" if facts.limit == 0 else "<p>None was found.</p>"]
     order = sorted(facts.gross, key=lambda g: -abs(g.normalised))
+    parts = [
+        figure(
+            plots.gross(order, facts.suspects, facts.map),
+            "Map of gross errors",
+            "Where gross errors lie; the largest have the numbers of the list. Circles: suspects.",
+        )
+    ]
+    if order:
+        parts += [
+            "<p>Points that contradict what their neighbours predict, alone or as a small group whose border breaks "
+            "off all round. They were not used.</p>",
+            *_errors(order),
+        ]
+    if facts.suspects:
+        parts += [
+            "<p>Suspects: small groups of points whose border breaks off in part, or that lie at the edge of the data. "
+            "They were used; normalised residuals are those that each group has without itself. Is there a rock, a "
+            "roof, a heap? Else take them out.</p>",
+            *_errors(facts.suspects),
+        ]
+    return parts
+
+
+def _errors(order: Sequence[PlottedError]) -> list[str]:
     rows: list[Sequence[str | Cell]] = [
         [
             Cell(str(k), number=True),
@@ -166,19 +210,9 @@ def _gross(facts: BuildFacts, plots: Plots) -> list[str]:
         ]
         for k, g in enumerate(order[:MOST_ROWS], 1)
     ]
-    head = ["no.", "point", "X m", "Y m", "height m", "above the model m", "normalised residual"]
-    parts = [
-        "<p>Points that differ from what their neighbours predict by more than the limit. They were not used. Look at "
-        "the largest first: one wrong point can make good neighbours look wrong.</p>",
-        figure(
-            plots.gross(order, facts.map),
-            "Map of gross errors",
-            "Where gross errors lie; the largest have the numbers of the list.",
-        ),
-        table(head, rows),
-    ]
+    parts = [table(["no.", "point", "X m", "Y m", "height m", "above the model m", "normalised residual"], rows)]
     if len(order) > MOST_ROWS:
-        parts.append(f"<p>and {_number(len(order) - MOST_ROWS)} more, with smaller normalised residuals.</p>")
+        parts.append(f"<p>and {_number(len(order) - MOST_ROWS)} more.</p>")
     return parts
 
 

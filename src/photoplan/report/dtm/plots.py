@@ -150,21 +150,24 @@ class Plots:
             self._bar(fig, axes, tints, norm, "measured − filtered cm", extend="both")
             return png(fig)
 
-    def gross(self, errors: Sequence[PlottedError], area: ReportMap) -> bytes:
-        """Gross errors on the relief; those above the model point up, those below it down."""
+    def gross(self, errors: Sequence[PlottedError], suspects: Sequence[PlottedError], area: ReportMap) -> bytes:
+        """Gross errors on the relief; those above the model point up, those below it down; suspects are circles."""
         with self.mpl.rc_context(STYLE):
             fig, axes = self._map(area)
             _grey_relief(axes, area)
-            xy = np.array([(error.X, error.Y) for error in errors])
-            up = np.array([error.normalised > 0 for error in errors])
+            xy = np.array([(error.X, error.Y) for error in errors]).reshape(-1, 2)
+            up = np.array([error.normalised > 0 for error in errors], bool)
             for some, marker, colour, name in ((up, "^", RED, "too high"), (~up, "v", BLUE, "too low")):
                 if some.any():
                     axes.scatter(
                         *xy[some].T, marker=marker, s=28, color=colour, edgecolor="white", linewidth=0.5, label=name
                     )
+            if suspects:
+                places = np.array([(error.X, error.Y) for error in suspects])
+                axes.scatter(*places.T, s=30, facecolor="none", edgecolor=PURPLE, linewidth=1.1, label="suspects")
             for k, (x, y) in enumerate(xy[:_NUMBERED], 1):
                 axes.annotate(str(k), (x, y), (4, 3), textcoords="offset points", fontsize=7.5, color=INK, zorder=5)
-            fig.legend(loc="outside lower center", ncols=2)
+            fig.legend(loc="outside lower center", ncols=3)
             return png(fig)
 
     def _map(self, area: ReportMap) -> tuple[Any, Any]:

@@ -1,4 +1,4 @@
-"""A picture of profiles: heights over the distance, with their standard deviation."""
+"""Small pictures to look at: profiles, heights over the distance with their standard deviation; contours."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from photoplan.errors import UsageError
+from photoplan.products.dtm.contours import ContourFacts
 from photoplan.products.dtm.profile import Profile
 from photoplan.report.drawing import png
 
@@ -67,3 +68,33 @@ def _range(item: Profile) -> tuple[float, float]:
         return 0.0, 1.0
     low, high = float(drawn.min()), float(drawn.max())
     return (low, high) if high - low > 0.1 else (low - 0.05, high + 0.05)
+
+
+def contours_picture(facts: ContourFacts, mpl: Any) -> bytes:
+    """Contours and their labels as PNG."""
+    sketch = facts.sketch
+    assert sketch is not None
+    xmin, ymin, xmax, ymax = sketch.bounds
+    inches = (xmax - xmin) / sketch.pixel / 100, (ymax - ymin) / sketch.pixel / 100
+    figure = mpl.figure.Figure(figsize=(max(inches[0], 1), max(inches[1], 1)), dpi=100)
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.set_axis_off()
+    for kind, colour, width in (("plain", "#a8763e", 0.5), ("low", "#4a78a8", 0.5), ("index", "#7a4a14", 1.1)):
+        lines = mpl.collections.LineCollection(sketch.lines[kind], colors=colour, linewidths=width)
+        axes.add_collection(lines)
+    axes.set(xlim=(xmin, xmax), ylim=(ymin, ymax), aspect="equal")
+    points = max(5.0, 72 / 100 * (facts.text_height or 1.0) / sketch.pixel)
+    for label in facts.labels:
+        box = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
+        axes.text(
+            label.X,
+            label.Y,
+            label.text,
+            rotation=label.angle,
+            ha="center",
+            va="center",
+            size=points,
+            color="#5a3208",
+            bbox=box,
+        )
+    return png(figure, dpi=100, facecolor="white")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -19,6 +19,7 @@ from photoplan.surfaces.measured import MeasuredTerrain
 from photoplan.surfaces.units import MemoryUnits
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.build import Built
+from photoplan.terrain.calibration import ClassFigures
 from photoplan.terrain.clean.run import Finding
 from photoplan.terrain.covariance import Covariance
 
@@ -87,7 +88,7 @@ class FilterEffect:
 
 @dataclass(frozen=True)
 class PlottedError:
-    """A point that was left out."""
+    """A point that was left out, or a suspect."""
 
     name: str
     X: float
@@ -128,7 +129,7 @@ class BuildFacts:
     whole: Covariance
     """Function and filter value of the whole area."""
     sigma: float
-    """Root mean square of the standard deviations of posts, metres."""
+    """Root mean square of the standard deviations of posts that data surround, metres."""
     spread: float
     """Spread of the normalised residuals; NaN: too few points."""
     seconds: float
@@ -136,8 +137,12 @@ class BuildFacts:
     normalised: NDArray[np.float64]
     """Normalised residuals of points that were used, or a sample of them."""
     covariance: CovarianceTest
+    calibration: tuple[ClassFigures, ...]
+    """What standard deviations are worth by distance to data; distances in metres."""
     effects: tuple[FilterEffect, ...]
     gross: tuple[PlottedError, ...]
+    suspects: tuple[PlottedError, ...] = ()
+    """Points that are used, but look like parts of gross errors."""
     notes: tuple[Note, ...] = ()
     """What cleaning found."""
     settings: tuple[tuple[str, str], ...] = ()
@@ -161,10 +166,6 @@ def build_facts(
     z = fit.residuals[:, 2]
     used = z[(fit.noise[: fit.seen.points] >= 0) & np.isfinite(z)]
     full = [f for f in figures if f.meshes > 0]
-    posts = np.array([(f.meshes + 1) ** 2 for f in full], float)
-    sigmas = np.array([f.sigma for f in full])
-    known = np.isfinite(sigmas)
-    sigma = float(np.sqrt(np.average(sigmas[known] ** 2, weights=posts[known]))) if known.any() else np.nan
     widths = Counter(built.plan.layout.side / f.meshes for f in full)
     return BuildFacts(
         title=title,
@@ -174,14 +175,20 @@ def build_facts(
         empty=len(figures) - len(full),
         widths=tuple(sorted(widths.items())),
         whole=fit.whole,
-        sigma=sigma,
+        sigma=built.sigma,
         spread=float(used.std()) if len(used) >= 20 else np.nan,
         seconds=seconds,
         map=_map(built, surface),
         normalised=_thin(used, _RESIDUALS),
         covariance=covariance_test(fit),
+        calibration=tuple(
+            replace(c, nearest=c.nearest * fit.seen.spacing, furthest=c.furthest * fit.seen.spacing)
+            for c in fit.calibration.classes
+            if c.count
+        ),
         effects=_effects(built, measured, surface),
-        gross=_gross(built, measured, surface),
+        gross=_errors(built, measured, surface, fit.gross, fit.residuals[fit.gross]),
+        suspects=_errors(built, measured, surface, fit.suspects[:, 0].astype(np.int64), fit.suspects[:, 2:]),
         notes=(
             *(Note("while reading", note) for note in measured.notes),
             *(Note(f.kind, f.text, f.X, f.Y) for f in findings),
@@ -311,18 +318,22 @@ def _one(sigma: NDArray[np.float64]) -> float:
     return float(sigma[0]) if len(sigma) and np.ptp(sigma) <= 1e-9 * sigma[0] else np.nan
 
 
-def _gross(built: Built, measured: MeasuredTerrain, surface: HybridSurface) -> tuple[PlottedError, ...]:
-    fit, seen = built.fit, built.fit.seen
-    some = fit.gross
+def _errors(
+    built: Built,
+    measured: MeasuredTerrain,
+    surface: HybridSurface,
+    some: NDArray[np.int64],
+    residuals: NDArray[np.float64],
+) -> tuple[PlottedError, ...]:
     if not len(some):
         return ()
+    seen = built.fit.seen
     xyz = seen.xyz[some] + seen.origin
     difference = xyz[:, 2] - surface.heights(xyz[:, :2])
     names = [measured.points[seen.group[k]].label(int(seen.record[k])) for k in some.tolist()]
-    normalised = fit.residuals[some, 2]
     return tuple(
         PlottedError(name, float(X), float(Y), float(Z), float(d), float(z))
-        for name, (X, Y, Z), d, z in zip(names, xyz, difference, normalised)
+        for name, (X, Y, Z), d, z in zip(names, xyz, difference, residuals[:, 2])
     )
 
 
@@ -338,11 +349,12 @@ def _size(path: Path) -> str:
 def _settings(built: Built) -> tuple[tuple[str, str], ...]:
     plan, settings = built.plan, built.plan.settings
     given = settings.filters
+    finer = f", {plan.finest:g} m where breaklines pass" if plan.finest < plan.width else ""
     own = "" if settings.grid_width else " (from the spacing of the points)"
     adapt = "a quarter of each unit's standard deviation" if settings.adapt is None else f"{settings.adapt:g} m"
     return (
-        ("finest grid width", f"{plan.width:g} m{own}"),
-        ("computing units", f"{settings.unit_meshes} finest meshes, {plan.layout.side:g} m along a side"),
+        ("grid width", f"{plan.width:g} m{finer}{own}"),
+        ("computing units", f"{plan.layout.side:g} m along a side: {settings.unit_meshes} grid widths"),
         ("grids widened within", "no, all have the finest width" if settings.adapt == 0 else adapt),
         ("covariance family", f"{settings.family}" + (" (the likeliest)" if settings.family == "auto" else "")),
         ("filter values", ", ".join(f"{_WORDS[k]} {v:g} m" for k, v in given.items()) or "estimated from the data"),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from photoplan.io.disk import write_atomically
 from photoplan.io.product import check_output
-from photoplan.products.describe.run import place_of
+from photoplan.products.describe import place_of
 from photoplan.project.filter_files import load_filter
 from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, SOFT, STYLE, load_matplotlib, png
 

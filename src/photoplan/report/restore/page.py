@@ -22,9 +22,8 @@ from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.restoration.design import Sharpness
 from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
 from photoplan.report.page import Cell, cells, figure, headline, page, section, table, text
-from photoplan.report.restore.details import compare
 from photoplan.report.restore.filters import MOST_DRAWN, FilterPlots, frequency_response
-from photoplan.report.restore.plots import AxisPicture, FieldMap, RestorePlots
+from photoplan.report.restore.plots import AxisPicture, FieldMap, RestorePlots, compare
 
 #: Images that get pictures, and parts of the field that are listed.
 _PICTURED = 30

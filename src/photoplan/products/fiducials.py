@@ -16,6 +16,7 @@ from photoplan.io.camera.model import FiducialSystem
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
 from photoplan.io.project.model import Project
+from photoplan.io.run_record import recording
 from photoplan.io.scan_pitch import parse_pitch
 from photoplan.orientation.marks.fiducials import FiducialSearch, find_fiducials
 from photoplan.orientation.marks.found import FiducialResult, MarksNotFound, SoughtMark
@@ -173,6 +174,7 @@ def locate_fiducials(
     project = _project(request)
     jobs = _jobs(request, project)
     pixel_mm = sum(parse_pitch(request.scan_resolution)) / 2 if request.scan_resolution else None
+    record = recording("fiducials", request, [*request.images, request.camera, *(job.file for job in jobs)])
     results: list[ImageFiducials] = []
     failed: dict[str, str] = {}
     unfound: list[UnfoundFiducials] = []
@@ -191,7 +193,9 @@ def locate_fiducials(
     if project is not None and results and not request.dry_run:
         written = request.images[0]
         edit_project(written, ProjectChanges(images={r.name: _entries(project, r) for r in results}))
-    return FiducialsReport(tuple(results), failed, tuple(unfound), written)
+    report = FiducialsReport(tuple(results), failed, tuple(unfound), written)
+    record([written], report)
+    return report
 
 
 def scans_of(request: FiducialsRequest) -> dict[str, Path]:

@@ -1,9 +1,9 @@
-"""Orientation files from one format to another, and what a format cannot hold."""
+"""Orientation files from one format to another, what a format cannot hold, and which readings fit measured points."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.cameras.interior import Interior
+from photoplan.cameras.lenses.base import Lens
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.crs import canonical_crs, require_projected_metres
+from photoplan.geometry.earth_poses import enu_of_geodetic
 from photoplan.io.camera.file import read_cameras
+from photoplan.io.ground_points import read_ground_points
+from photoplan.io.image_points import named_as, read_image_points
+from photoplan.io.names import match_key
 from photoplan.io.orientation.block import Loss, OrientationBlock, without_lenses
+from photoplan.io.orientation.exif import SUFFIXES
 from photoplan.io.orientation.file import (
     choose_format,
     orientation_format,
@@ -24,10 +31,22 @@ from photoplan.io.orientation.file import (
 )
 from photoplan.io.orientation.table import Direction, OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.product import check_output
-from photoplan.orientation.readings import turn_matrix
+from photoplan.io.project.cameras import interior_of, lens_of
+from photoplan.io.project.model import Image
+from photoplan.orientation.readings import (
+    FittedReading,
+    Reading,
+    StatedPoses,
+    fitting,
+    judge_readings,
+    sights_of,
+    turn_matrix,
+)
 from photoplan.plain import pick
 from photoplan.products.init.match import camera_name
 from photoplan.products.init.run import placed
+from photoplan.products.judged import differences, on_map, stated_positions
+from photoplan.project.scene import is_there
 
 
 @dataclass(frozen=True)
@@ -94,6 +113,7 @@ def convert_orientation(request: ConvertRequest) -> ConvertReport:
     if target.render is None:
         raise UsageError(f"orientation format {target.name} is read only; written are {', '.join(written_formats())}")
     source, block = read_block(request.orientation, request.form, request.format)
+    images = _image_files(block)
     if request.camera is not None:
         block = with_cameras(block, request.camera)
     block = replace(_in_crs(_with_axes(block, request), request.crs), matrix=request.matrix)
@@ -112,9 +132,34 @@ def convert_orientation(request: ConvertRequest) -> ConvertReport:
         images=len(table.images),
         cameras=tuple(block.cameras),
         crs=table.crs,
-        notes=table.notes,
+        notes=(*table.notes, *_against_positions(block, images)),
         lost=lost,
     )
+
+
+def _against_positions(block: OrientationBlock, files: Mapping[str, Path]) -> tuple[str, ...]:
+    """What positions of receivers, in the file or in its images, say against its poses."""
+    table = block.table
+    stated = stated_positions(table, files)
+    if table.origin is not None:
+        here = enu_of_geodetic(table.origin, stated)
+    elif table.crs is not None:
+        here = on_map(stated, table.crs)
+    else:
+        return ()
+    return differences([image.name for image in table.images], table.centers, here)
+
+
+def _image_files(block: OrientationBlock) -> dict[str, Path]:
+    """Image files that a file of orientations names, or that lie beside it under the names of its images."""
+    folder = block.table.file if block.table.file.is_dir() else block.table.file.parent
+    try:
+        beside = {match_key(path.name): path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES}
+    except OSError:  # a folder that may be entered, but not listed
+        beside = {}
+    found = {image.name: beside.get(match_key(image.name)) for image in block.table.images}
+    found |= {name: folder / file for name, file in block.files.items() if is_there(folder / file)}
+    return {name: file for name, file in found.items() if file is not None}
 
 
 def read_block(path: Path, form: TableFormat, format: str | None) -> tuple[str, OrientationBlock]:
@@ -207,3 +252,127 @@ def _without_lost_lenses(
     if not block.cameras:
         raise InputError(f"{block.table.file}: a lens would be lost, and no camera is described")
     return without_lenses(block), lost
+
+
+#: Readings that are listed besides those that fit.
+OTHERS = 5
+#: Beyond this median even the best reading does not fit, pixels.
+POOR = 20.0
+
+
+@dataclass(frozen=True)
+class ReadingsReport:
+    """Readings of a file with their errors, the best first."""
+
+    format: str
+    points: int
+    images: int
+    matrices: bool
+    """Whether the file states matrices, so that units and orders have no meaning."""
+    fitting: tuple[FittedReading, ...]
+    others: tuple[FittedReading, ...]
+    """The next ones, for comparison."""
+    notes: tuple[str, ...]
+
+    def options(self, reading: Reading) -> str:
+        """What to give to `photoplan convert` so that it reads the file so."""
+        words = [] if self.matrices else [f"`angle_unit` {reading.angle_unit}", f"`rotation` {reading.rotation}"]
+        words.append(f"`rotation_direction` {reading.direction}")
+        if reading.camera_axes != Reading.camera_axes:
+            words.append(f"`camera_axes` {reading.camera_axes}")
+        if reading.turned:
+            words.append(f"`image_turned` {reading.turned}")
+        if reading.swapped:
+            words.append("and exchange X and Y")
+        if reading.mirrored:
+            words.append("and mirror the images (film: mirrored = true)")
+        return " ".join(words)
+
+    def json_fields(self) -> dict[str, Any]:
+        """Readings with the options that declare them."""
+        return {
+            **pick(self, "format", "points", "images", "notes"),
+            "fitting": [self._fields(found) for found in self.fitting],
+            "others": [self._fields(found) for found in self.others],
+        }
+
+    def _fields(self, found: FittedReading) -> dict[str, Any]:
+        reading = found.reading
+        stated = {} if self.matrices else pick(reading, "angle_unit", "rotation")
+        axes = pick(
+            reading, "camera_axes", "mirrored", "swapped", rotation_direction="direction", image_turned="turned"
+        )
+        return {**stated, **axes, "median_px": found.median, "options": self.options(reading)}
+
+
+def list_readings(request: ConvertRequest, image_points: Path, control: Path) -> ReadingsReport:
+    """Judge all readings of an orientation file by measured points.
+
+    Raises
+    ------
+    UsageError
+        No camera is known.
+    InputError
+        A file cannot be used, or too few points are known in both.
+    """
+    name, block = _as_stated(request)
+    if request.camera is not None:
+        block = with_cameras(block, request.camera)
+    if not block.cameras:
+        raise UsageError("to compare readings the camera has to be known; give `camera` FILE")
+    table = block.table
+    names = tuple(image.name for image in table.images)
+    observed, unknown = named_as(read_image_points(image_points), names)
+    ground = read_ground_points(control, crs=table.crs)
+    cameras, notes = _cameras(block)
+    sights = sights_of(names, cameras, observed, ground)
+    if unknown:
+        notes.append(f"{len(unknown)} images of {image_points.name} have no orientation ({unknown[0]!r} …)")
+    open_angles = orientation_format(name).angles
+    if open_angles:
+        at = [table.rotation.index(letter) for letter in "opk"]
+        poses = StatedPoses(names, table.centers, angles=np.array([i.angles for i in table.images], float)[:, at])
+    else:
+        poses = StatedPoses(names, table.centers, matrices=table.rotations)
+    results = judge_readings(poses, sights)
+    fits = fitting(results)
+    if fits[0].median > POOR:
+        notes.append(
+            f"even the best reading leaves {fits[0].median:.0f} px: are orientation and control in one coordinate "
+            "system with heights of one kind, and is it the right camera?"
+        )
+    others = [r for r in results if r not in fits and np.isfinite(r.median)][:OTHERS]
+    seen = len(np.unique(sights.image))
+    return ReadingsReport(name, len(sights.image), seen, not open_angles, fits, tuple(others), tuple(notes))
+
+
+def _as_stated(request: ConvertRequest) -> tuple[str, OrientationBlock]:
+    """The file's numbers: read so that no unit or direction is refused; what they are taken for does not matter."""
+    # Of all units gon allows the largest numbers.
+    form = replace(request.form, angle_unit="gon", rotation="opk", direction="camera-to-ground")
+    form = replace(form, declared=frozenset({"rotation", "direction"}))
+    return read_block(request.orientation, form, request.format)
+
+
+def _cameras(block: OrientationBlock) -> tuple[dict[str, tuple[Interior, Lens]], list[str]]:
+    """Interior orientation and lens of every image, and notes on images without one."""
+    found: dict[str, tuple[Interior, Lens]] = {}
+    missing = []
+    for image in block.table.images:
+        camera = block.camera(image)
+        if not camera.places(image.fiducials):
+            missing.append(image.name)
+            continue
+        # Only the marks and the size of the image matter here; no file is opened.
+        described = Image(
+            name=image.name,
+            file="none",
+            camera=block.camera_name(image),
+            fiducials=image.fiducials,
+            size=block.sizes.get(image.name),
+        )
+        found[image.name] = (interior_of(camera, described), lens_of(camera))
+    if not found:
+        raise InputError(f"{block.table.file}: no image has measured fiducial marks; `photoplan fiducials` finds them")
+    notes = [f"{len(missing)} film images have no measured fiducial marks ({missing[0]!r} …)"] if missing else []
+    return found, notes

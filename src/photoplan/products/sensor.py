@@ -1,18 +1,99 @@
-"""Figures of a described sensor: which equation gives which figure from which entries."""
+"""`photoplan sensor`: figures of a sensor from its description, as values and table."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from math import degrees, radians
+from pathlib import Path
 
 from photoplan.errors import InputError
-from photoplan.io.sensor_file import Chip, Noise, OpticsEntry, PictureEntry, SensorDescription, Transfer, Video, Viewing
-from photoplan.quality.sensor import figures as sensor
-from photoplan.quality.sensor import noise as sensor_noise
-from photoplan.quality.sensor import video_norm
-from photoplan.quality.sensor.noise import NoiseBudget
-from photoplan.quality.sensor.video_norm import VideoNorm
+from photoplan.io.product import check_output
+from photoplan.io.sensor_file import (
+    Chip,
+    Noise,
+    OpticsEntry,
+    PictureEntry,
+    SensorDescription,
+    Transfer,
+    Video,
+    Viewing,
+    read_sensor,
+)
+from photoplan.io.tables import write_table
+from photoplan.plain import pick
+from photoplan.quality import sensor
+from photoplan.quality.sensor import NoiseBudget, VideoNorm
+
+
+@dataclass(frozen=True)
+class SensorRequest:
+    """What is asked."""
+
+    file: Path
+    """The description."""
+    csv: Path | None = None
+    """Table to write."""
+    overwrite: bool = False
+    dry_run: bool = False
+    """Compute, write nothing."""
+
+
+@dataclass(frozen=True)
+class SensorReport:
+    """Figures of a sensor."""
+
+    described: SensorDescription
+    figures: tuple[SensorFigure, ...]
+    csv: Path | None
+    """Table that was written."""
+
+    def json_fields(self) -> dict[str, object]:
+        """Without the description."""
+        return {"name": self.described.name, "figures": self.figures}
+
+    def __str__(self) -> str:
+        lines = [self.described.name]
+        section = ""
+        wide = max(len(figure.meaning) for figure in self.figures)
+        for figure in self.figures:
+            if figure.section != section:
+                section = figure.section
+                lines.append(f"[{section}]")
+            value = f"{short_number(figure.value)} {figure.unit}".rstrip()
+            stated = "" if figure.stated is None else f"  (stated: {short_number(figure.stated)})"
+            lines.append(f"  {figure.meaning:<{wide}}  {value:<18}  {figure.source}{stated}")
+        return "\n".join(lines)
+
+
+def short_number(value: float) -> str:
+    """A figure with four digits, without an exponent where that is short."""
+    if value == 0.0 or 1e-4 <= abs(value) < 1e4:
+        return f"{value:.4g}"
+    return f"{value:,.0f}".replace(",", " ") if 1e4 <= abs(value) < 1e9 else f"{value:.3e}"
+
+
+def describe_sensor(request: SensorRequest) -> SensorReport:
+    """Compute the figures of a description and write what is asked.
+
+    Raises
+    ------
+    UsageError
+        The table exists or is the input.
+    InputError
+        The description cannot be used.
+    """
+    if request.csv is not None:
+        check_output(request.csv, [request.file], overwrite=request.overwrite)
+    described = read_sensor(request.file)
+    figures = sensor_figures(described, str(request.file))
+    written = None if request.dry_run else request.csv
+    if written is not None:
+        head = ("section", "name", "value", "unit", "stated", "meaning", "source")
+        rows = (pick(figure, *head).values() for figure in figures)
+        write_table(written, head, [["" if value is None else value for value in row] for row in rows])
+    return SensorReport(described, figures, written)
+
 
 _AXES = ("x", "y")
 _ALONG = ("across", "down")
@@ -87,16 +168,16 @@ def sensor_figures(described: SensorDescription, file: str) -> tuple[SensorFigur
 def _viewing(table: Viewing) -> Found:
     angle, eye = radians(table.angle_deg), radians(table.eye_resolution_arcmin / 60.0)
     aspect = table.aspect[0] / table.aspect[1]
-    lines = video_norm.lines_from_viewing(angle, eye)
+    lines = sensor.lines_from_viewing(angle, eye)
     if table.distance_m is not None:
-        height = video_norm.viewed_length(table.distance_m, angle)
-        spacing = 1000.0 * video_norm.viewed_length(table.distance_m, eye)
+        height = sensor.viewed_length(table.distance_m, angle)
+        spacing = 1000.0 * sensor.viewed_length(table.distance_m, eye)
         yield "picture_height_m", "height of the picture that is viewed", height, "m", "Behr 1989, eq. 3.1"
         yield "line_spacing_mm", "spacing of its lines", spacing, "mm", "Behr 1989, eq. 3.2"
     yield "viewing_lines", "lines that the eye needs", lines, "lines", "Behr 1989, eq. 3.3"
-    columns = video_norm.columns_of(lines, aspect)
+    columns = sensor.columns_of(lines, aspect)
     yield "viewing_columns", "points in a line", columns, "points", "Behr 1989, eq. 3.4"
-    yield "viewing_points", "points of the picture", video_norm.points_of(lines, aspect), "points", "Behr 1989, eq. 3.5"
+    yield "viewing_points", "points of the picture", sensor.points_of(lines, aspect), "points", "Behr 1989, eq. 3.5"
 
 
 def _video(table: Video) -> Found:
@@ -113,7 +194,7 @@ def _video(table: Video) -> Found:
     yield "line_hz", "lines a second", norm.line_hz, "Hz", printed
     yield "frame_hz", "frames a second", norm.frame_hz, "Hz", printed
     yield "field_hz", "fields a second", norm.field_hz, "Hz", printed
-    points = video_norm.points_of(norm.lines, norm.aspect)
+    points = sensor.points_of(norm.lines, norm.aspect)
     yield "video_points", "points of the picture", points, "points", "Behr 1989, eq. 3.5"
     yield "bandwidth_mhz", "bandwidth without blanking", norm.plain_hz / 1e6, "MHz", "Behr 1989, eq. 3.6, 3.7"
     yield "columns_factor", "lines lengthened by blanking", norm.columns_factor, "", "Behr 1989, eq. 3.8, 3.9"
@@ -122,7 +203,7 @@ def _video(table: Video) -> Found:
     yield "bandwidth_blanked_mhz", "bandwidth with blanking", norm.blanked_hz / 1e6, "MHz", "Behr 1989, eq. 3.11"
     yield "resolved_lines", "lines resolved with the Kell factor", norm.resolved_lines, "lines", "Behr 1989, §3.1"
     yield "bandwidth_kell_mhz", "bandwidth with Kell factor", norm.kell_hz / 1e6, "MHz", "Behr 1989, eq. 3.12"
-    least = video_norm.sampling_hz(norm.kell_hz) / 1e6
+    least = sensor.sampling_hz(norm.kell_hz) / 1e6
     yield "least_sampling_mhz", "lowest frequency of sampling", least, "MHz", "Behr 1989, eq. 3.13"
 
 
@@ -215,7 +296,7 @@ def noise_budget(described: SensorDescription) -> NoiseBudget | None:
     shift = described.transfer
     amplifier = table.read_noise_e
     if table.output_capacitance_pf is not None:
-        amplifier = sensor_noise.amplifier_noise(table.output_capacitance_pf)
+        amplifier = sensor.amplifier_noise(table.output_capacitance_pf)
     bits = described.image.bits if described.image is not None else None
     rounding = None
     if bits is not None and table.full_well_e is not None:
@@ -223,7 +304,7 @@ def noise_budget(described: SensorDescription) -> NoiseBudget | None:
     return NoiseBudget(
         signal,
         _dark(table, signal),
-        None if shift is None else sensor_noise.transfer_noise(signal, shift.inefficiency, shift.transfers),
+        None if shift is None else sensor.transfer_noise(signal, shift.inefficiency, shift.transfers),
         amplifier,
         rounding,
     )
@@ -233,7 +314,7 @@ def _dark_current(table: Noise) -> float | None:
     """Electrons per second at the temperature of use."""
     if table.dark_current_e_per_s is None or table.temperature_c is None or table.dark_reference_c is None:
         return table.dark_current_e_per_s
-    return sensor_noise.dark_at(
+    return sensor.dark_at(
         table.dark_current_e_per_s, table.temperature_c, table.dark_reference_c, table.dark_doubling_c
     )
 

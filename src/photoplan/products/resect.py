@@ -1,9 +1,11 @@
-"""One image of a project resected: from measurements and control to entries of the project."""
+"""`photoplan resect`: images of a project oriented by control points, one by one, as entries of the project."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,11 +15,15 @@ from photoplan.cameras.base import CentralCamera
 from photoplan.cameras.build import oriented_camera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
-from photoplan.errors import GeometryError
+from photoplan.errors import GeometryError, PhotoplanError, UsageError
+from photoplan.events import SILENT, Events
 from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import angles_from_rotation
+from photoplan.geometry.rotation import ANGLE_UNITS, angles_from_rotation
 from photoplan.io.project.cameras import interior_of, lens_of
-from photoplan.io.project.model import ANGLE_UNITS, Image, Project
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
+from photoplan.io.project.model import Image, Project
+from photoplan.io.run_record import recording
 from photoplan.orientation.bundle.block import AdjustedCamera
 from photoplan.orientation.bundle.frame import angle_derivatives
 from photoplan.orientation.judgement import fitting, impossible, of_resection
@@ -27,8 +33,138 @@ from photoplan.plain import pick
 from photoplan.products.adjust.block import decimals_of
 from photoplan.products.adjust.cameras import Calibrated, block_camera, calibrated, camera_entries
 from photoplan.products.adjust.frame import block_frame, nadir_heights
-from photoplan.products.adjust.inputs import AdjustInputs
+from photoplan.products.adjust.inputs import AdjustInputs, read_inputs
 from photoplan.project.scene import stated_pose
+
+#: Control points from which an image is tried where none is named.
+_LEAST = 3
+
+
+@dataclass(frozen=True)
+class ResectRequest:
+    """What is asked."""
+
+    project: Path
+    images: tuple[str, ...] = ()
+    """Names or patterns; none: all images with three control points or more."""
+    image_points: tuple[Path, ...] = ()
+    """Instead of those that [observations] names."""
+    control: tuple[Path, ...] = ()
+    """Instead of those that [observations] names."""
+    sigma_image: float | None = None
+    """Standard deviation of image coordinates, pixels; None: that of the project."""
+    sigma_control: tuple[float, float] | None = None
+    """Standard deviation of control, horizontal and height, metres; None: that of the project."""
+    free: tuple[str, ...] = ()
+    """Parameters of the camera that are unknowns: c, x0, y0."""
+    unknown_camera_constant: bool = False
+    """The stated camera constant is no start value either."""
+    critical: float = 4.0
+    dry_run: bool = False
+    """Whether the project is left as it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class ResectResult:
+    """What came out."""
+
+    project: Path
+    images: tuple[ResectedImage, ...]
+    failed: dict[str, str]
+    """Images that could not be oriented, with the reason."""
+    left_out: tuple[str, ...]
+    """Images with fewer than three control points."""
+    written: bool
+    notes: tuple[str, ...]
+
+    def json_fields(self) -> dict[str, Any]:
+        """Failures as a list."""
+        return {
+            **pick(self, "project", "written", "images", "left_out", "notes"),
+            "failed": [{"image": name, "reason": reason} for name, reason in self.failed.items()],
+        }
+
+
+def resect_project(request: ResectRequest, events: Events = SILENT) -> ResectResult:
+    """Orient images by control and write the result into the project.
+
+    Parameters
+    ----------
+    request : ResectRequest
+    events : Events
+        Told of every image.
+
+    Raises
+    ------
+    UsageError
+        Parameters of a camera should be free for several of its images.
+    InputError
+        Project or measurements cannot be used, or no image has three control points.
+    """
+    settings = ResectSettings(request.free, not request.unknown_camera_constant, request.critical)
+    project = _overridden(load_project(request.project), request)
+    names = project.select(request.images or None)
+    inputs = read_inputs(project, names)
+    record = recording("resect", request, [request.project, *inputs.files])
+    counts = {name: len(control_rows(inputs, name)) for name in names}
+    wanted = [n for n in names if request.images or counts[n] >= _LEAST]
+    _refuse(inputs, wanted, counts, settings)
+    done: list[ResectedImage] = []
+    failed: dict[str, str] = {}
+    for name in wanted:
+        try:
+            done.append(resect_image(inputs, project.image(name), settings))
+        except PhotoplanError as error:
+            text = str(error)
+            failed[name] = text if repr(name) in text else f"image {name!r}: {text}"
+        events.done()
+    written = bool(done) and not request.dry_run
+    left = tuple(n for n in names if n not in wanted)
+    result = ResectResult(request.project, tuple(done), failed, left, written, inputs.notes)
+    if written:
+        edit_project(request.project, _changes(done))
+        record([request.project], result)
+    return result
+
+
+def _overridden(project: Project, request: ResectRequest) -> Project:
+    """The project with the measurements that options name."""
+    changes: dict[str, Any] = {
+        "image_points": tuple(str(p.absolute()) for p in request.image_points),
+        "control": tuple(str(p.absolute()) for p in request.control),
+        "sigma_image": request.sigma_image,
+        "sigma_control": request.sigma_control,
+        # Positions take no part in a resection.
+        "positions": None,
+    }
+    kept = {k: v for k, v in changes.items() if v or k == "positions"}
+    return project.model_copy(update={"observations": project.observations.model_copy(update=kept)})
+
+
+def _refuse(inputs: AdjustInputs, wanted: Sequence[str], counts: dict[str, int], settings: ResectSettings) -> None:
+    if not wanted:
+        most = max(counts.items(), key=lambda item: item[1])
+        raise UsageError(
+            f"none of the {len(counts)} images has {_LEAST} control points with three known coordinates; the most, "
+            f"{most[1]}, has image {most[0]!r}. Check that points are called the same in image points and control"
+        )
+    if settings.free:
+        project = inputs.project
+        count = Counter(project.image(n).camera for n in wanted)
+        camera, images = count.most_common(1)[0]
+        if images > 1:
+            raise UsageError(
+                f"{', '.join(settings.free)} of camera {camera!r} cannot be found for {images} images one by one, as "
+                "each gives another value; name one with `images`, or free the parameters in `photoplan adjust`"
+            )
+
+
+def _changes(done: Sequence[ResectedImage]) -> ProjectChanges:
+    return ProjectChanges(
+        images={r.image.name: r.image_entries for r in done},
+        cameras={r.image.camera: r.camera_entries for r in done if r.camera_entries},
+    )
+
 
 Array = NDArray[np.float64]
 

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from photoplan.geometry.bounds import area_fault
+from photoplan.cameras.base import CentralCamera
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.local import MEAN_RADIUS
 from photoplan.io.project.model import Project
-from photoplan.orientation.plausibility import ImagePlausibility, look, other_reading
+from photoplan.orientation.plausibility import ImagePlausibility, View, other_reading
 from photoplan.plain import pick
-from photoplan.plan.footprint import mean_gsd
-from photoplan.products.check.positions import position_fault, turned_against_positions
-from photoplan.products.check.view import view_of
+from photoplan.plan.footprint import Footprint, footprint, mean_gsd
+from photoplan.products.judged import against_files, judged
 from photoplan.products.orthophoto.plan import two_figures
-from photoplan.project.scene import Scene, ground_of, map_order, open_scene, pose_of
+from photoplan.project.scene import Ground, camera_without_pixels, ground_of, is_there, map_order, open_scene
 
 #: Terrain displacements of curvature above this deserve a strict model, pixels.
 _CURVATURE_MATTERS = 0.3
@@ -97,7 +96,7 @@ class ProjectCheck:
 
 
 def check_project(project: Project, images: Sequence[str] | None = None) -> ProjectCheck:
-    """Open every input of a project, and compute what its images promise.
+    """Open every input of a project, and compute what its images promise; their files need not be there.
 
     Parameters
     ----------
@@ -112,19 +111,12 @@ def check_project(project: Project, images: Sequence[str] | None = None) -> Proj
     """
     names = project.select(images)
     ground = ground_of(project)
-    entries = [project.image(name) for name in names]
-    views = [
-        view_of(image, project.cameras[image.camera], project.orientation, pose_of(project, image, ground).center)
-        for image in entries
-    ]
-    looked: dict[int, tuple[ImagePlausibility, ImageCheck]] = {}
+    looked: dict[int, tuple[View, ImagePlausibility, ImageCheck]] = {}
     for place in map_order(project, names):
         # All that is asked of the terrain for one image, before the next: its blocks are then at hand.
-        found = look(views[place], ground.surface.heights)
-        odd = area_fault(project.crs, views[place].center) or position_fault(project, entries[place])
-        found = found if odd is None else replace(found, fault=odd)
-        looked[place] = found, _check_image(open_scene(project, names[place]), found)
-    looks, checks = zip(*(looked[place] for place in range(len(names))))
+        view, found = judged(project, project.image(names[place]), ground)
+        looked[place] = view, found, _check_image(project, ground, found)
+    views, looks, checks = zip(*(looked[place] for place in range(len(names))))
     gsds = [c.gsd for c in checks if np.isfinite(c.gsd)]
     return ProjectCheck(
         checks,
@@ -136,9 +128,15 @@ def check_project(project: Project, images: Sequence[str] | None = None) -> Proj
     )
 
 
-def _check_image(scene: Scene, looked: ImagePlausibility) -> ImageCheck:
+def _check_image(project: Project, ground: Ground, looked: ImagePlausibility) -> ImageCheck:
     name, tilt, fault = looked.name, looked.tilt, looked.fault
-    seen = scene.footprint
+    file = project.resolve(project.image(name).file)
+    if is_there(file):
+        scene = open_scene(project, name)
+        camera, seen, notes = scene.camera, scene.footprint, scene.notes
+    else:
+        camera, notes = camera_without_pixels(project, name), (f"{file} is not there: all but its pixels is checked",)
+        seen = footprint(camera, ground.surface, ground.bounds)
     nan = float("nan")
     if seen.bounds is None:
         fault = fault or f"sees nothing of the terrain (tilt {tilt:.1f}°)"
@@ -152,38 +150,38 @@ def _check_image(scene: Scene, looked: ImagePlausibility) -> ImageCheck:
             admissible_height_error=nan,
             curvature_px=nan,
             fault=fault,
-            notes=scene.notes,
+            notes=notes,
         )
-    relief, curvature = _sensitivity(scene)
+    relief, curvature = _sensitivity(camera, seen)
     xmin, ymin, xmax, ymax = seen.bounds
     return ImageCheck(
         image=name,
         tilt_deg=tilt,
-        gsd=mean_gsd(scene.camera, seen),
+        gsd=mean_gsd(camera, seen),
         footprint=(xmax - xmin, ymax - ymin),
         on_terrain=seen.on_surface,
         relief_px=relief,
         admissible_height_error=1 / relief if relief > 0 else nan,
         curvature_px=curvature,
         fault=fault,
-        notes=scene.notes,
+        notes=notes,
     )
 
 
-def _sensitivity(scene: Scene) -> tuple[float, float]:
+def _sensitivity(camera: CentralCamera, seen: Footprint) -> tuple[float, float]:
     """Largest displacement by 1 m of height, and by the earth's curvature, over the footprint; pixels."""
-    outline = scene.footprint.outline
+    outline = seen.outline
     points = outline[np.isfinite(outline).all(axis=1)]
     if not len(points):
         return float("nan"), float("nan")
-    per_metre = np.linalg.norm(scene.camera.derivatives(points)[..., 2], axis=-1)
+    per_metre = np.linalg.norm(camera.derivatives(points)[..., 2], axis=-1)
     # Ecker 1991, eq. 4.17 with Z̄ = 0: the ground falls away from the tangential plane by d² / 2R.
-    drop = ((points[:, :2] - scene.camera.center[:2]) ** 2).sum(axis=1) / (2 * MEAN_RADIUS)
+    drop = ((points[:, :2] - camera.center[:2]) ** 2).sum(axis=1) / (2 * MEAN_RADIUS)
     return float(np.nanmax(per_metre)), float(np.nanmax(per_metre * drop))
 
 
 def _advice(project: Project, checks: Sequence[ImageCheck]) -> tuple[str, ...]:
-    lines = list(turned_against_positions(project, [check.image for check in checks]))
+    lines = list(against_files(project, [check.image for check in checks]))
     curvature = np.nanmax([c.curvature_px for c in checks] + [0.0])
     if project.orientation.earth_curvature == "none" and curvature > _CURVATURE_MATTERS:
         lines.append(

@@ -1,1 +1,0 @@
-"""What to expect of a project, and whether its parts fit together."""

@@ -1,1 +1,0 @@
-"""Orientations from one format into another."""

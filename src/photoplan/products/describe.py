@@ -1,0 +1,302 @@
+"""What a file holds, in words: rasters, terrain models, projects, plans, filters."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from photoplan.errors import InputError
+from photoplan.geometry.crs import crs_label
+from photoplan.geometry.heights import height_label
+from photoplan.io.appearance import looks_like
+from photoplan.io.filter_file import is_filter
+from photoplan.io.plan_file import read_plan_tables
+from photoplan.io.project.file import load_project
+from photoplan.io.raster_info import RasterInfo, read_info
+from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
+from photoplan.io.terrain.model_tables import GrossError
+from photoplan.plain import pick
+from photoplan.project.filter_files import load_filter
+from photoplan.quality.restoration.borders import Convolution
+from photoplan.quality.restoration.filters import FilterKernel
+from photoplan.surfaces.units import LineElement, UnitFigures
+
+
+def describe_filter(path: Path) -> dict[str, Any]:
+    """Facts of a filter file by name, as plain values; lists have a line each."""
+    used = load_filter(path)
+    columns, rows = used.margin
+    facts: dict[str, Any] = {
+        "filter": str(path),
+        "made": used.description or "not stated",
+        "reach": f"{2 * columns + 1} × {2 * rows + 1} pixels",
+        "noise": f"grows {used.noise_gain:.4g} times" + (" at most" if len(used.kernels) > 1 else ""),
+        "kernels": [_kernel(kernel) for kernel in used.kernels],
+    }
+    if used.image_size is not None:
+        facts["images"] = f"{used.image_size[0]} × {used.image_size[1]} pixels"
+    for name, value in used.facts.items():
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            facts[str(name)] = f"{len(value)}, see the file"
+        else:
+            facts[str(name)] = value if isinstance(value, str | int | float) else str(value)
+    return facts
+
+
+def _kernel(kernel: FilterKernel) -> str:
+    rows, columns = kernel.values.shape
+    even = "symmetric" if Convolution(kernel).even else "general"
+    return f"{place_of(kernel)}: {columns} × {rows}, {even}, sum {kernel.total:.4g}, noise gain {kernel.noise_gain:.4g}"
+
+
+def place_of(kernel: FilterKernel) -> str:
+    """Band and place in the field of a kernel."""
+    band = "all bands" if kernel.band is None else f"band {kernel.band}"
+    return band if kernel.at is None else f"{band} at {kernel.at[0]:g}, {kernel.at[1]:g}"
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """Facts of a file by name, as plain values; lists have a line each.
+
+    Raises
+    ------
+    InputError
+        The file is missing, damaged, or of no kind that is known.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    kind = path.suffix.lower()
+    if kind == ".csv" or (kind == ".toml" and is_filter(path)):
+        return describe_filter(path)
+    if kind == ".toml":
+        return _project(path)
+    if is_terrain_model(path):
+        return describe_model(ModelReader(path))
+    if kind == ".gpkg":
+        return _plan(path)
+    if kind == ".json":
+        return _record(path)
+    return _raster(read_info(path))
+
+
+def _project(path: Path) -> dict[str, Any]:
+    project = load_project(path)
+    return {
+        "project": str(path),
+        "crs": crs_label(project.crs),
+        "terrain": (
+            "none" if project.terrain is None else project.terrain.file or f"one height, {project.terrain.height} m"
+        ),
+        "cameras": [f"{name}: {camera.type}, lens {camera.lens.type}" for name, camera in project.cameras.items()],
+        "orientation": f"{project.orientation.rotation}, {project.orientation.angle_unit}, "
+        f"earth curvature {project.orientation.earth_curvature}",
+        "images": [f"{image.name}: {image.file}" for image in project.images],
+    }
+
+
+def _plan(path: Path) -> dict[str, Any]:
+    header, tiles = read_plan_tables(path)
+    return {
+        "plan": str(path),
+        "made by": f"photoplan {header['photoplan']}",
+        "settings": [f"{key} = {value}" for key, value in header["settings"].items()],
+        "products": [f"{p['image']}, key {p['key'][:12]}" for p in header["products"]],
+        "tiles": len(tiles["tile"]),
+        "cells": int(tiles["cells"].sum()),
+        "worst anchor residual": f"{float(tiles['residual_px'].max()):.3g} px" if len(tiles["tile"]) else "none",
+    }
+
+
+def _record(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: no readable JSON ({error}){looks_like(path)}") from None
+    if not isinstance(content, dict) or "product" not in content:
+        raise InputError(f"{path}: no run record of photoplan{looks_like(path)}")
+    return {
+        str(key): value if isinstance(value, (str, int, float)) else json.dumps(value) for key, value in content.items()
+    }
+
+
+def _raster(info: RasterInfo) -> dict[str, Any]:
+    facts: dict[str, Any] = {
+        "raster": str(info.path),
+        "format": info.driver,
+        "size": f"{info.size[0]} × {info.size[1]} pixels",
+        "bands": f"{info.bands} of {info.dtype}" + (f", {info.bits} bits used" if info.bits else ""),
+        "colours": ", ".join(info.colours),
+        "blocks": f"{info.block[0]} × {info.block[1]}",
+        "overviews": ", ".join(f"1/{f}" for f in info.overviews) or "none",
+        "nodata": "none" if info.nodata is None else f"{info.nodata:g}",
+        "mask": "yes" if info.has_mask or info.alpha_bands else "no",
+    }
+    if info.crs is not None:
+        facts["crs"] = crs_label(info.crs)
+        facts["heights"] = "not stated" if info.vertical_crs is None else crs_label(info.vertical_crs)
+    if info.to_map is not None:
+        x0, xx, _, y0, _, yy = info.to_map
+        facts["first pixel's centre"] = f"X {x0:.4f}, Y {y0:.4f}"
+        facts["pixel"] = f"{xx:g} × {abs(yy):g}"
+    if info.warnings:
+        facts["note"] = list(info.warnings)
+    return facts
+
+
+def describe_model(reader: ModelReader) -> dict[str, Any]:
+    """Facts of a terrain model by name, as texts; lists have a line each."""
+    f = model_figures(reader)
+    low, high = f["heights"]
+    xmin, ymin, xmax, ymax = f["bounds"]
+    facts: dict[str, Any] = {
+        "terrain model": f["model"],
+        "made by": f["made_by"],
+        "crs": crs_label(f["crs"]),
+        "heights": "none" if low is None else f"{low:.3f} to {high:.3f} m, {height_label(f['height_system'])}",
+        "bounds": f"{xmin:.3f} {ymin:.3f} {xmax:.3f} {ymax:.3f}",
+        "units": f"{f['units']} of {f['side']:g} m ({f['columns']} × {f['rows']} places, {f['empty']} empty)",
+        "grid widths": [f"{w['width']:g} m in {w['units']} units" for w in f["widths"]],
+        "posts": f["posts"],
+        "measured": f"{f['points']} points",
+        "lines": _lines_in_words(f["lines"]),
+    }
+    if f["family"]:
+        facts["covariance"] = f"{f['family']}, half length {_number(f['length'])} m, signal {_number(f['signal'])} m"
+    facts["accuracy"] = (
+        f"posts {_number(f['sigma'])} m, mass points as measured {_number(f['noise'])} m, spread of normalised "
+        f"residuals {_number(f['spread'])}"
+    )
+    facts["gross errors"] = f["gross"]
+    if f["suspects"]:
+        facts["suspects"] = f["suspects"]
+    if f["inputs"]:
+        facts["inputs"] = [str(item.get("file", item)) for item in f["inputs"]]
+    if f["settings"]:
+        facts["settings"] = [f"{key} = {'auto' if value is None else value}" for key, value in f["settings"].items()]
+    facts["layers"] = ", ".join(f["layers"])
+    return facts
+
+
+def model_figures(reader: ModelReader) -> dict[str, Any]:
+    """Figures of a terrain model as plain values; None where there is none.
+
+    Lengths are medians and accuracies root mean squares over the units that are not empty, each unit counted once.
+    """
+    header, layout = reader.header, reader.layout
+    units = [u for u in reader.figures() if u.meshes > 0]
+    widths = Counter(u.meshes for u in units)
+    there = np.isfinite(reader.ranges[..., 0])
+    heights = [float(reader.ranges[there][:, 0].min()), float(reader.ranges[there][:, 1].max())] if there.any() else []
+    return {
+        "model": str(reader.path),
+        "made_by": header.made_by,
+        "identity": header.identity,
+        "crs": header.crs,
+        "height_system": header.height_system,
+        "bounds": list(layout.bounds),
+        "heights": heights or [None, None],
+        "side": layout.side,
+        "columns": layout.columns,
+        "rows": layout.rows,
+        "units": int(there.sum()),
+        "empty": int((~there).sum()),
+        "widths": [{"width": layout.side / n, "units": widths[n]} for n in sorted(widths)],
+        "posts": sum(count * (n + 1) ** 2 for n, count in widths.items()),
+        "points": sum(u.points for u in units),
+        "lines": _line_counts(reader.lines()),
+        "gross": len(reader.gross()),
+        "suspects": len(reader.suspects()),
+        "family": header.family,
+        "length": _median([u.length for u in units]),
+        "signal": _rms([np.sqrt(u.variance) for u in units if u.variance >= 0]),
+        "noise": _rms([u.noise for u in units]),
+        "sigma": _rms([u.sigma for u in units]),
+        "spread": _spread(units),
+        "totals": dict(header.totals),
+        "settings": dict(header.settings),
+        "inputs": [dict(item) for item in header.inputs],
+        "layers": reader.layers(),
+    }
+
+
+def _line_counts(lines: list[LineElement]) -> dict[str, int]:
+    counts = Counter(line.kind for line in lines)
+    walls = sum(line.right is not None for line in lines)
+    vertices = sum(len(line.xyz) for line in lines)
+    return {**{str(k): counts[k] for k in sorted(counts)}, "two-sided": walls, "vertices": vertices}
+
+
+def _lines_in_words(counts: dict[str, int]) -> str:
+    kinds = [
+        f"{n} {kind}{'s' if n != 1 else ''}" for kind, n in counts.items() if kind not in ("two-sided", "vertices")
+    ]
+    if not kinds:
+        return "none"
+    walls = f", {counts['two-sided']} of them two-sided" if counts["two-sided"] else ""
+    return f"{', '.join(kinds)}{walls}; {counts['vertices']} vertices"
+
+
+def _median(values: list[float]) -> float | None:
+    good = [v for v in values if np.isfinite(v)]
+    return float(np.median(good)) if good else None
+
+
+def _rms(values: list[float]) -> float | None:
+    good = np.array([v for v in values if np.isfinite(v)])
+    return float(np.sqrt((good**2).mean())) if good.size else None
+
+
+def _spread(units: list[UnitFigures]) -> float | None:
+    """Spread over all units, each weighted with its points."""
+    good = [(u.points, u.spread) for u in units if np.isfinite(u.spread) and u.points > 0]
+    if not good:
+        return None
+    points, spread = np.array(good, float).T
+    return float(np.sqrt((points * spread**2).sum() / points.sum()))
+
+
+def _number(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.3g}"
+
+
+@dataclass(frozen=True)
+class TerrainFacts:
+    """What is known of a terrain file."""
+
+    facts: dict[str, Any]
+    """In words, by name; lists have a line each."""
+    figures: dict[str, Any]
+    """Plain values, as JSON takes them."""
+    gross: list[dict[str, Any]]
+    """Measurements flagged as gross errors, the largest normalised residual first."""
+    suspects: list[dict[str, Any]]
+    """Measurements that are used, but look like parts of gross errors."""
+
+
+def dtm_info(path: Path) -> TerrainFacts:
+    """Facts of a model or of a raster of heights.
+
+    Raises
+    ------
+    InputError
+        The file is missing, damaged or no terrain.
+    """
+    if not is_terrain_model(path):
+        if path.is_file() and path.suffix.lower() in (".gpkg", ".toml", ".json"):
+            raise InputError(f"{path}: no terrain model; `photoplan info` shows other files")
+        facts = describe(path)
+        return TerrainFacts(facts, facts, [], [])
+    reader = ModelReader(path)
+    gross = sorted(reader.gross(), key=lambda g: -abs(g.normalised))
+    lists = ([_flagged(g) for g in some] for some in (gross, reader.suspects()))
+    return TerrainFacts(describe_model(reader), model_figures(reader), *lists)
+
+
+def _flagged(g: GrossError) -> dict[str, Any]:
+    x, y, z = g.xyz
+    return {"x": x, "y": y, "z": z, **pick(g, "name", "kind", "residual", "redundancy", "normalised")}

@@ -1,1 +1,0 @@
-"""What a file is: images, terrain models, filters, cameras."""

@@ -1,1 +1,0 @@
-"""Fiducial marks of the scans of a project."""

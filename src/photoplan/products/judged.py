@@ -1,0 +1,140 @@
+"""The judgement of orientations: what `check` lists, what `init` and `convert` tell, and what nothing is made of.
+
+Positions of receivers, which image files (EXIF, XMP) or files of orientations state, are never used to place poses that
+are given; whatever reads, writes or uses orientations asks here whether the two go together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.errors import InputError
+from photoplan.geometry.agreement import agreement
+from photoplan.geometry.bounds import area_fault
+from photoplan.geometry.crs import crs_step
+from photoplan.io.image_metadata import read_image_metadata
+from photoplan.io.orientation.exif import SUFFIXES
+from photoplan.io.orientation.table import OrientationTable
+from photoplan.io.project.model import Image, Project
+from photoplan.orientation.plausibility import ImagePlausibility, View, look
+from photoplan.project.scene import Ground, is_there, pose_of, view_of
+
+_Floats = NDArray[np.float64]
+
+#: No receiver is off by so much, metres.
+_FAR = 1000.0
+#: A turn of the block against its positions that is told: degrees, and in its own standard deviations.
+_TURN, _CLEAR = 0.2, 6.0
+#: A shift that all images share and that is told: metres, and in the scatter of single positions.
+_SHIFT, _ALIKE = 50.0, 10.0
+#: Images needed before their common way is judged.
+_ENOUGH = 4
+
+
+def judged(project: Project, image: Image, ground: Ground) -> tuple[View, ImagePlausibility]:
+    """An oriented image, and what follows from its orientation: by its CRS, its file's own position, and the terrain.
+
+    Raises
+    ------
+    InputError
+        The image is not oriented.
+    """
+    center = pose_of(project, image, ground).center
+    view = view_of(image, project.cameras[image.camera], project.orientation, center)
+    found = look(view, ground.surface.heights)
+    odd = area_fault(project.crs, center) or position_fault(project, image)
+    return view, found if odd is None else replace(found, fault=odd)
+
+
+def geodetic_positions(files: Iterable[Path | None]) -> _Floats:
+    """Latitude, longitude (degrees, WGS 84) and height that image files state, (n, 3); NaN where one does not."""
+    return np.array([_position(file) for file in files], float).reshape(-1, 3)
+
+
+def _position(file: Path | None) -> tuple[float, float, float]:
+    nothing = (float("nan"),) * 3
+    if file is None or file.suffix.lower() not in SUFFIXES or not is_there(file):
+        return nothing
+    try:
+        stated = read_image_metadata(file)
+    except InputError:
+        return nothing
+    wgs84 = (stated.datum or "WGS84").upper().replace("-", "").replace(" ", "").startswith("WGS84")
+    return stated.position if stated.position is not None and wgs84 else nothing
+
+
+def stated_positions(table: OrientationTable, files: Mapping[str, Path]) -> _Floats:
+    """Latitude, longitude and height (n, 3) of a table's images: as it states them itself, else as their files do."""
+    own = table.positions if table.positions is not None else np.full((len(table.images), 3), np.nan)
+    known = np.isfinite(own[:, 0]) & np.isfinite(own[:, 1])
+    read = geodetic_positions(None if known[k] else files.get(image.name) for k, image in enumerate(table.images))
+    return np.where(known[:, None], own, read)
+
+
+def on_map(geodetic: _Floats, crs: str) -> _Floats:
+    """Map coordinates (n, 2) of latitudes and longitudes; NaN where there are none, or where the CRS has no place."""
+    out = np.full((len(geodetic), 2), np.nan)
+    for k in np.flatnonzero(np.isfinite(geodetic[:, :2]).all(axis=1)):
+        try:
+            out[k] = crs_step("EPSG:4326", crs)(geodetic[k, [1, 0]])
+        except InputError:
+            # One position outside the area of the CRS says nothing of the others.
+            continue
+    return out
+
+
+def position_fault(project: Project, image: Image) -> str | None:
+    """Why an orientation cannot be that of the image file; None if it can, or the file states no position."""
+    if image.center is None:
+        return None
+    stated = on_map(geodetic_positions([project.resolve(image.file)]), project.crs)
+    away = float(np.hypot(*(stated[0] - image.center[:2])))
+    if not away > _FAR:
+        return None
+    return f"its file states a GPS position {away / 1000:.3g} km away; is the CRS right, and the image the one meant?"
+
+
+def against_files(project: Project, names: Sequence[str]) -> tuple[str, ...]:
+    """Sentences on how the oriented images of a project lie to the positions of their files, those far off left out."""
+    images = [image for image in map(project.image, names) if image.center is not None]
+    stated = on_map(geodetic_positions(project.resolve(image.file) for image in images), project.crs)
+    return common_differences([image.center or () for image in images], stated)
+
+
+def differences(names: Sequence[str], centers: ArrayLike, stated: ArrayLike) -> tuple[str, ...]:
+    """Sentences on what of projection centres and positions, both (n, 2) or more columns, cannot be right together."""
+    away = np.hypot(*(np.asarray(stated, float)[:, :2] - np.asarray(centers, float)[:, :2]).T)
+    far = np.flatnonzero(away > _FAR)
+    if not len(far):
+        return common_differences(centers, stated)
+    worst = int(far[np.argmax(away[far])])
+    return (
+        f"{len(far)} of {int(np.isfinite(away).sum())} projection centres lie more than {_FAR / 1000:g} km from the "
+        f"GPS positions that their files state (image {names[worst]!r} {away[worst] / 1000:.3g} km); is the CRS right, "
+        "and are the images the ones meant?",
+    )
+
+
+def common_differences(centers: ArrayLike, stated: ArrayLike) -> tuple[str, ...]:
+    """A sentence where a block is turned against its positions, or shifted as a whole."""
+    found = agreement(stated, centers)
+    if found.count < _ENOUGH:
+        return ()
+    turn, sigma = np.degrees([found.turn, found.sigma_turn])
+    said = []
+    if abs(turn) > max(_TURN, _CLEAR * sigma):
+        said.append(
+            f"the projection centres are turned by {turn:.2f}° ± {sigma:.2f}° against the GPS positions of "
+            f"{found.count} image files: grid north, or the axes of another CRS?"
+        )
+    if _FAR > found.shift > max(_SHIFT, _ALIKE * found.scatter):
+        said.append(
+            f"the projection centres lie {found.shift:.0f} m from the GPS positions of {found.count} image files, all "
+            f"alike to {found.scatter:.1f} m: another datum, or another zone?"
+        )
+    return tuple(said)

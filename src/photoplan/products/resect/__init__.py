@@ -1,1 +1,0 @@
-"""Space resection of the images of a project."""

@@ -1,1 +1,0 @@
-"""What a sensor can do, from its data sheet."""

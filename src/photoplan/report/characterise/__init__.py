@@ -1,1 +1,0 @@
-"""Report of what a series of images tells of a camera."""
