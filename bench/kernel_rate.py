@@ -19,7 +19,7 @@ import numpy as np
 
 from photoplan.kernels.pack import pack
 from photoplan.kernels.position import positions
-from photoplan.kernels.rectify import rectify_packed
+from photoplan.kernels.rectify import rectify_tile
 
 SIDE = 512
 CASES = (("uint8", 3), ("uint8", 1), ("uint16", 1), ("float32", 1), ("uint16", 3), ("float32", 3))
@@ -74,7 +74,7 @@ def kernel_rates(repeats: int = 31) -> dict[str, Any]:
         out, valid = np.empty((bands, SIDE, SIDE), dtype), np.empty((SIDE, SIDE), bool)
 
         def ours(packed: Any = packed, out: Any = out, valid: Any = valid) -> None:
-            rectify_packed(anchors, relief, packed, None, None, "bicubic", out, valid)
+            rectify_tile(anchors, relief, packed, None, None, "bicubic", out, valid)
 
         def theirs(image: Any = image) -> object:
             return cv2.remap(image, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
@@ -93,8 +93,8 @@ def kernel_rates(repeats: int = 31) -> dict[str, Any]:
     anchors, relief, window = scene(2.0)
     packed = pack((np.random.default_rng(1).random((3, window, window)) * 250).astype(np.uint8))
     out, valid = np.empty((3, SIDE, SIDE), np.uint8), np.empty((SIDE, SIDE), bool)
-    rectify_packed(anchors, relief, packed, None, None, "bicubic", out, valid)
-    coarse = seconds(lambda: rectify_packed(anchors, relief, packed, None, None, "bicubic", out, valid))
+    rectify_tile(anchors, relief, packed, None, None, "bicubic", out, valid)
+    coarse = seconds(lambda: rectify_tile(anchors, relief, packed, None, None, "bicubic", out, valid))
     rates["uint8 x 3 at scale 2"] = {"ours": round(SIDE * SIDE / 1e6 / coarse, 1)}
     cv2.setNumThreads(threads)
     return rates
