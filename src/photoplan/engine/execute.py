@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,8 @@ from photoplan.kernels.rectify import rectify_tile
 from photoplan.plan.product import CompiledTile, Layer, ProductPlan, compile_tile
 from photoplan.plan.tiles import Tile
 from photoplan.surfaces.base import Surface
+
+OutputName = Literal["picture", "hidden", "sources"]
 
 #: A window of the source larger than this (bytes as read) is not read at once; its tile is executed in parts.
 MOST_SOURCE_BYTES = 48 * 2**20
@@ -37,6 +39,8 @@ class Painted:
     is one source, or no pixel is valid."""
     hidden: NDArray[np.bool_] | None
     """(height, width): pixels that no source sees, see `photoplan.plan.owner.Share`; None if nobody has asked."""
+    bare: int
+    """Pixels with a surface that lie in no source; 0 if there is one source and nobody has asked."""
     residual: float
     """Worst residual of the anchors, pixels of the source image."""
     cells: int
@@ -66,10 +70,13 @@ def execute_tile(tile: CompiledTile, sources: Sequence[Source], kernel: str) -> 
             border = _border(layer, reader.size)
             owned = ALL_MINE if tile.owner is None else (tile.owner, layer.source + 1, layer.part.tolist())
             rectify_tile(layer.anchors.arrays, tile.relief, pixels, usable, border, kernel, values, valid, owned=owned)
+    bare = 0
+    if tile.hidden is not None:
+        bare = int(np.count_nonzero(np.isfinite(tile.relief) & ~valid & ~tile.hidden))
     if not valid.any():
-        return Painted(None, None, None, tile.hidden, tile.residual, tile.cells)
+        return Painted(None, None, None, tile.hidden, bare, tile.residual, tile.cells)
     owner = None if tile.owner is None else tile.owner * valid
-    return Painted(values, valid, owner, tile.hidden, tile.residual, tile.cells)
+    return Painted(values, valid, owner, tile.hidden, bare, tile.residual, tile.cells)
 
 
 def render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface: Surface, kernel: str) -> Painted:
@@ -104,9 +111,9 @@ def joined(window: Window, parts: Iterable[tuple[Window, Painted]], reader: Read
     values, valid = np.zeros((reader.bands, *shape), reader.dtype), np.zeros(shape, bool)
     owner: NDArray[np.uint16] | None = None
     hidden: NDArray[np.bool_] | None = None
-    residual, cells = 0.0, 0
+    residual, bare, cells = 0.0, 0, 0
     for at, part in parts:
-        residual, cells = max(residual, part.residual), cells + part.cells
+        residual, bare, cells = max(residual, part.residual), bare + part.bare, cells + part.cells
         common = at & window
         if not common.size:
             continue
@@ -120,7 +127,7 @@ def joined(window: Window, parts: Iterable[tuple[Window, Painted]], reader: Read
         if part.owner is not None:
             owner = np.zeros(shape, np.uint16) if owner is None else owner
             owner[to] = part.owner[of]
-    return Painted(values, valid, owner, hidden, residual, cells)
+    return Painted(values, valid, owner, hidden, bare, residual, cells)
 
 
 def _border(layer: Layer, size: tuple[int, int]) -> tuple[float, float, float, float]:
@@ -165,18 +172,23 @@ class RenderJob:
     product: ProductPlan
     """Without its tiles."""
     kernel: str
-    marks: bool = False
-    """Whether a second output says what is hidden: 1, or 0 for what is seen; not valid beyond the image."""
+    outputs: tuple[OutputName, ...] = ("picture",)
+    """What a tile gives, in the order of the sinks: its ``picture``; what is ``hidden``, 1, or 0 for what is seen, not
+    valid beyond the images; of the ``sources``, the row in their table, plus one, that painted a pixel."""
 
     def __call__(self, tile: Tile) -> Made:
-        """Pixels of a tile, and its figures: of its anchors, and how many pixels are hidden if somebody has asked."""
+        """Outputs of a tile, and its figures: of its anchors, and how many pixels are hidden or in no image if somebody
+        has asked."""
         opened = self.address.open()
         painted = render(self.product, tile, opened.sources, opened.surface, self.kernel)
         record: dict[str, float] = {"worst_residual": painted.residual, "cells": painted.cells}
         if painted.hidden is not None:
-            record["hidden"] = int(np.count_nonzero(painted.hidden))
-        picture = None if painted.values is None else (painted.values, painted.valid)
-        return Made((picture, _mark(painted)) if self.marks else (picture,), record)
+            record |= {"hidden": int(np.count_nonzero(painted.hidden)), "bare": painted.bare}
+        return Made(tuple(_OUTPUTS[name](painted) for name in self.outputs), record)
+
+
+def _picture(painted: Painted) -> Output | None:
+    return None if painted.values is None else (painted.values, painted.valid)
 
 
 def _mark(painted: Painted) -> Output | None:
@@ -185,3 +197,15 @@ def _mark(painted: Painted) -> Output | None:
     if hidden is None or (painted.valid is None and not hidden.any()):
         return None
     return hidden.astype(np.uint8)[None], hidden if painted.valid is None else hidden | painted.valid
+
+
+def _sources(painted: Painted) -> Output | None:
+    """Who painted each pixel."""
+    return None if painted.owner is None else (painted.owner[None], painted.owner > 0)
+
+
+_OUTPUTS: dict[OutputName, Callable[[Painted], Output | None]] = {
+    "picture": _picture,
+    "hidden": _mark,
+    "sources": _sources,
+}

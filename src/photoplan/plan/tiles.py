@@ -9,6 +9,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
 
 
@@ -30,6 +31,27 @@ class Tile:
 
 
 @dataclass(frozen=True, eq=False)
+class Shares:
+    """Which sources can paint which tile."""
+
+    ends: NDArray[np.int64]
+    """Where the rows of each tile end, shape (n,)."""
+    rows: NDArray[np.uint16]
+    """Rows of the table of sources, tile by tile."""
+
+    def __getitem__(self, place: int) -> tuple[int, ...]:
+        start = self.ends[place - 1] if place else 0
+        return tuple(self.rows[start : self.ends[place]].tolist())
+
+    def only(self, places: NDArray[np.int64]) -> Shares:
+        """Those of some tiles, by their places."""
+        counts = np.diff(self.ends, prepend=0)[places]
+        ends = np.cumsum(counts)
+        at = np.arange(int(counts.sum())) + np.repeat(self.ends[places] - ends, counts)
+        return Shares(ends, self.rows[at])
+
+
+@dataclass(frozen=True, eq=False)
 class Tiles(Sequence[Tile]):
     """Tiles that can hold a part of a source; all others of the product stay empty. A `Tile` is made when one is asked
     for."""
@@ -40,14 +62,32 @@ class Tiles(Sequence[Tile]):
     """Side of a tile, pixels."""
     indices: NDArray[np.uint32]
     """`Tile.index` of each, increasing."""
-    sources: tuple[int, ...] = (0,)
-    """Rows of the table of sources that can paint them."""
+    sources: tuple[int, ...] | Shares = (0,)
+    """Rows of the table of sources that can paint them: the same for all tiles, or tile by tile."""
 
     @classmethod
     def every(cls, window: Window, side: int, sources: int = 1) -> Tiles:
         """All tiles of a product, which every one of its sources can paint."""
         none = cls(window, side, np.empty(0, np.uint32), tuple(range(sources)))
         return none.only(range(none.total))
+
+    @classmethod
+    def shared(cls, sources: Sequence[Tiles]) -> Tiles:
+        """Tiles of a product that at least one of its sources can paint, from those of each source alone.
+
+        Raises
+        ------
+        UsageError
+            There are more sources than an owner raster can count.
+        """
+        if len(sources) > np.iinfo(np.uint16).max - 1:
+            raise UsageError(f"{len(sources):,} images in one product; at most {np.iinfo(np.uint16).max - 1:,} can be")
+        index = np.concatenate([tiles.indices for tiles in sources])
+        rows = np.repeat(np.arange(len(sources), dtype=np.uint16), [len(tiles) for tiles in sources])
+        order = np.argsort(index, kind="stable")
+        indices, first = np.unique(index[order], return_index=True)
+        ends = np.append(first[1:], len(index)).astype(np.int64)[: len(indices)]
+        return replace(sources[0], indices=indices, sources=Shares(ends, rows[order]))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -60,8 +100,13 @@ class Tiles(Sequence[Tile]):
         return self.shape[0] * self.shape[1]
 
     def only(self, indices: Iterable[int]) -> Tiles:
-        """Those tiles of the product that have these indices, increasing."""
-        return replace(self, indices=np.fromiter(indices, np.uint32))
+        """Those tiles of the product that have these indices, increasing; where sources are told tile by tile, tiles
+        that are not among these are left out."""
+        wanted = np.fromiter(indices, np.uint32)
+        if not isinstance(self.sources, Shares):
+            return replace(self, indices=wanted)
+        places = np.flatnonzero(np.isin(self.indices, wanted))
+        return replace(self, indices=self.indices[places], sources=self.sources.only(places))
 
     @property
     def windows(self) -> NDArray[np.int64]:
@@ -87,8 +132,9 @@ class Tiles(Sequence[Tile]):
     def __getitem__(self, place: slice) -> Tiles: ...
     def __getitem__(self, place: int | slice) -> Tile | Tiles:
         if isinstance(place, slice):
-            return replace(self, indices=self.indices[place])
+            return self.only(self.indices[place].tolist())
         index = int(self.indices[place])
         row, col = divmod(index, self.shape[1])
         corner = Window(self.window.col + col * self.side, self.window.row + row * self.side, self.side, self.side)
-        return Tile(index, corner & self.window, self.sources)
+        mine = self.sources[place % len(self)] if isinstance(self.sources, Shares) else self.sources
+        return Tile(index, corner & self.window, mine)

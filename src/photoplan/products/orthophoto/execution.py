@@ -187,7 +187,7 @@ def _work(
     mark = partial(open_file, bands=1, dtype=np.dtype(np.uint8), nodata=255, resampling="mode")
     files = (file, *(mark(path) for path in marks))
     told = replace(product.plan, tiles=product.plan.tiles.only(()))
-    job = RenderJob(scene.address, told, settings.kernel, marks=bool(marks))
+    job = RenderJob(scene.address, told, settings.kernel, ("picture", "hidden") if marks else ("picture",))
     return Work(
         name=product.plan.name,
         job=job,
