@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.jit import inner, kernel
 from photoplan.kernels.pyramid import Pyramid, leave
+from photoplan.kernels.triangles import Cells, first_of
 
 _NUDGE, _ALONG = 1e-7, 1e-5
 """Part of a mesh by which a position on a grid line is moved on to find the mesh that comes next; and by which a line
@@ -203,11 +204,28 @@ def _widen(values: NDArray[np.float64]) -> None:
             before = here
 
 
+@inner
+def _toward(nodes: NDArray[np.float64], part: tuple[float, float, float], d: NDArray[np.float64]) -> None:
+    """Direction to a source at a place between nodes: parts of rows, of columns, and of the way between the levels."""
+    m, n = nodes.shape[1], nodes.shape[2]
+    j, i = min(np.int64(part[0]), m - 2), min(np.int64(part[1]), n - 2)
+    fv, fu = part[0] - j, part[1] - i
+    for k in range(d.shape[0]):
+        low = (1.0 - fv) * ((1.0 - fu) * nodes[0, j, i, k] + fu * nodes[0, j, i + 1, k]) + fv * (
+            (1.0 - fu) * nodes[0, j + 1, i, k] + fu * nodes[0, j + 1, i + 1, k]
+        )
+        high = (1.0 - fv) * ((1.0 - fu) * nodes[1, j, i, k] + fu * nodes[1, j, i + 1, k]) + fv * (
+            (1.0 - fu) * nodes[1, j + 1, i, k] + fu * nodes[1, j + 1, i + 1, k]
+        )
+        d[k] = low + part[2] * (high - low)
+
+
 @kernel
 def find_hidden(
     heights: NDArray[np.float32],
     pyramid: Pyramid,
     corner: tuple[int, int],
+    relief: NDArray[np.float32],
     nodes: NDArray[np.float64],
     levels: tuple[float, float],
     top: float,
@@ -220,11 +238,13 @@ def find_hidden(
     Parameters
     ----------
     heights : ndarray, shape (rows, cols), float32
-        Relief of the tile and of what is around it; NaN = no surface, which hides nothing.
+        Ground of the tile and of what is around it; NaN = no surface, which hides nothing.
     pyramid : tuple
         `pyramid_of(heights)`.
     corner : (int, int)
         Column and row of the tile's first pixel in `heights`.
+    relief : ndarray, shape (height, width), float32
+        Where lines begin: on the ground or above it; NaN = no surface.
     nodes : ndarray, shape (2, m, n, 5)
         Directions to the source at two levels, m rows and n columns of nodes spread over the tile from its first to its
         last pixel: steps in column, row and height, and what is left of the depth and by how much a step lessens it.
@@ -241,29 +261,16 @@ def find_hidden(
         `SEEN`, `HIDDEN` or `BEYOND`.
     """
     rows, columns = heights.shape
-    m, n = nodes.shape[1], nodes.shape[2]
-    step_v, step_u = (m - 1) / max(out.shape[0] - 1, 1), (n - 1) / max(out.shape[1] - 1, 1)
+    step_v, step_u = (nodes.shape[1] - 1) / max(out.shape[0] - 1, 1), (nodes.shape[2] - 1) / max(out.shape[1] - 1, 1)
     d = np.empty(5)
     for row in range(out.shape[0]):
-        j = min(np.int64(row * step_v), m - 2)
-        fv = row * step_v - j
         for col in range(out.shape[1]):
             x, y = corner[0] + col, corner[1] + row
-            h = np.float64(heights[y, x])
+            h = np.float64(relief[row, col])
             out[row, col] = SEEN
             if np.isnan(h) or quiet[y // QUIET, x // QUIET]:
                 continue
-            i = min(np.int64(col * step_u), n - 2)
-            fu = col * step_u - i
-            fh = (h - levels[0]) / (levels[1] - levels[0])
-            for k in range(5):
-                low = (1.0 - fv) * ((1.0 - fu) * nodes[0, j, i, k] + fu * nodes[0, j, i + 1, k]) + fv * (
-                    (1.0 - fu) * nodes[0, j + 1, i, k] + fu * nodes[0, j + 1, i + 1, k]
-                )
-                high = (1.0 - fv) * ((1.0 - fu) * nodes[1, j, i, k] + fu * nodes[1, j, i + 1, k]) + fv * (
-                    (1.0 - fu) * nodes[1, j + 1, i, k] + fu * nodes[1, j + 1, i + 1, k]
-                )
-                d[k] = low + fh * (high - low)
+            _toward(nodes, (row * step_v, col * step_u, (h - levels[0]) / (levels[1] - levels[0])), d)
             t = (top - h) / d[2] if d[2] > 0.0 else np.inf
             if d[4] > 0.0:
                 t = min(t, d[3] / d[4])
@@ -286,3 +293,47 @@ def find_hidden(
                     continue
             if cut < t:
                 out[row, col] = BEYOND
+
+
+@kernel
+def find_behind(
+    corners: NDArray[np.float64],
+    cells: Cells,
+    frame: tuple[float, float, float],
+    relief: NDArray[np.float32],
+    nodes: NDArray[np.float64],
+    levels: tuple[float, float],
+    short: float,
+    out: NDArray[np.uint8],
+) -> None:
+    """Enter the pixels of a tile whose lines of sight to a source meet a triangle; `HIDDEN` ones are not asked.
+
+    Parameters
+    ----------
+    corners, cells
+        As in `kernels.triangles.highest`.
+    frame : (float, float, float)
+        X, Y of the centre of the tile's first pixel, as corners have them, and side of a pixel.
+    relief, nodes, levels
+        As in `find_hidden`.
+    short : float
+        What is met no further than this from the pixel's place, metres, is the place itself.
+    out : ndarray, shape (height, width), uint8
+    """
+    step_v, step_u = (nodes.shape[1] - 1) / max(out.shape[0] - 1, 1), (nodes.shape[2] - 1) / max(out.shape[1] - 1, 1)
+    d, line = np.empty(5), np.empty(6)
+    for row in range(out.shape[0]):
+        for col in range(out.shape[1]):
+            h = np.float64(relief[row, col])
+            if np.isnan(h) or out[row, col] == HIDDEN:
+                continue
+            _toward(nodes, (row * step_v, col * step_u, (h - levels[0]) / (levels[1] - levels[0])), d)
+            if not d[3] > 0.0:
+                continue
+            line[0], line[1], line[2] = frame[0] + col * frame[2], frame[1] - row * frame[2], h
+            line[3], line[4], line[5] = d[0] * frame[2], -d[1] * frame[2], d[2]
+            begin = short / np.sqrt(line[3] * line[3] + line[4] * line[4] + line[5] * line[5])
+            end = d[3] / d[4] if d[4] > 0.0 else np.inf
+            _, face = first_of(corners, cells, line, begin, end)
+            if face >= 0:
+                out[row, col] = HIDDEN

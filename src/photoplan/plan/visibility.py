@@ -18,9 +18,10 @@ from photoplan.cameras.base import Projection, project
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.pyramid import pyramid_of
-from photoplan.kernels.visibility import BEYOND, HIDDEN, find_hidden, quiet_blocks
+from photoplan.kernels.visibility import BEYOND, HIDDEN, find_behind, find_hidden, quiet_blocks
 from photoplan.plan.ground import TileGround
 from photoplan.surfaces.base import Surface, Terrain
+from photoplan.surfaces.objects import ObjectSurface, without_objects
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
 
@@ -117,29 +118,51 @@ def hidden_pixels(projection: Projection, ground: TileGround, surface: Surface) 
     lines = sight_lines(projection, target, _nodes(window, levels))
     if not np.isfinite(lines.step).all() or not (lines.depth[..., 0] > 0).any():
         return none
-    # Over a map every surface is terrain.
-    terrain: Any = surface
-    top, needed = _search(terrain, target, window, lines, levels)
-    m = MOST_AROUND
-    around = needed & Window(window.col - m, window.row - m, window.width + 2 * m, window.height + 2 * m)
-    relief = ground.relief if around == window else surface.relief(target, around)
-    # Where the raster ends before the lines do, no part of it is quiet.
-    quiet = quiet_blocks(relief, _flattest(lines) if around == needed else 0.0, top)
-    if quiet.all():
-        return none
-    nodes = np.concatenate([lines.step, lines.depth], axis=-1)
-    corner = window.col - around.col, window.row - around.row
-    slack = 4 * float(np.finfo(np.float32).eps) * max(abs(low), abs(high), 1.0)
     found = np.zeros(none.shape, np.uint8)
-    find_hidden(relief, pyramid_of(relief), corner, nodes, levels, top, (slack, float(MOST_AROUND)), quiet, found)
-    far = np.argwhere(found == BEYOND)
-    for part in np.array_split(far, -(-len(far) // _BATCH)) if len(far) else ():
-        found[tuple(part.T)] = np.where(_met(projection, terrain, target, _places(ground, part), top), HIDDEN, 0)
+    nodes = np.concatenate([lines.step, lines.depth], axis=-1)
+    _behind_ground(projection, ground, surface, lines, levels, found)
+    if isinstance(surface, ObjectSurface):
+        local, cells, origin = surface.faces.in_cells
+        x, y = (target.grid.to_map((window.col, window.row)) - origin[:2]).tolist()
+        frame = x, y, target.grid.resolution
+        find_behind(local, cells, frame, ground.relief, nodes, levels, _SHORT * target.grid.resolution, found)
     hidden = found == HIDDEN
     there = np.argwhere(hidden)
     xy = project(projection, target.to_ground(_places(ground, there)))
     hidden[tuple(there.T)] = ((xy >= -0.5) & (xy <= np.array(projection.size) - 0.5)).all(axis=-1)
     return hidden
+
+
+def _behind_ground(
+    projection: Projection,
+    ground: TileGround,
+    surface: Surface,
+    lines: SightLines,
+    levels: tuple[float, float],
+    found: NDArray[np.uint8],
+) -> None:
+    """Enter the pixels of a tile that terrain hides."""
+    window, target = ground.window, ground.target
+    assert isinstance(target, MapTarget)
+    # Over a map every surface is terrain.
+    terrain: Any = without_objects(surface)
+    top, needed = _search(terrain, target, window, lines, levels)
+    m = MOST_AROUND
+    around = needed & Window(window.col - m, window.row - m, window.width + 2 * m, window.height + 2 * m)
+    mine = around == window and terrain is surface
+    heights = ground.relief if mine else terrain.relief(target, around)
+    # Where the raster ends before the lines do, no part of it is quiet.
+    quiet = quiet_blocks(heights, _flattest(lines) if around == needed else 0.0, top)
+    if quiet.all():
+        return
+    nodes = np.concatenate([lines.step, lines.depth], axis=-1)
+    corner = window.col - around.col, window.row - around.row
+    slack = 4 * float(np.finfo(np.float32).eps) * max(*np.abs(levels), 1.0)
+    limits = slack, float(MOST_AROUND)
+    find_hidden(heights, pyramid_of(heights), corner, ground.relief, nodes, levels, top, limits, quiet, found)
+    far = np.argwhere(found == BEYOND)
+    for part in np.array_split(far, -(-len(far) // _BATCH)) if len(far) else ():
+        found[tuple(part.T)] = np.where(_met(projection, terrain, target, _places(ground, part), top), HIDDEN, 0)
 
 
 def _nodes(window: Window, levels: tuple[float, float]) -> NDArray[np.float64]:

@@ -1,0 +1,82 @@
+"""Terrain with objects on it: houses, bridges, walls, trees (Behr 1989, §6.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.errors import UsageError
+from photoplan.geometry.grid import Window
+from photoplan.kernels.raycast import SURFACE
+from photoplan.surfaces.base import Surface, Terrain
+from photoplan.surfaces.faces import Faces
+from photoplan.surfaces.rays import Hits
+from photoplan.targets.base import Target
+from photoplan.targets.map import MapTarget
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectSurface:
+    """Terrain that is raised by the objects which a product shows, and from which rays are kept by all of them.
+
+    What overhangs has ground below it: a bridge that is painted gives its deck, one that only hides leaves the road.
+    """
+
+    ground: Terrain
+    """Without objects."""
+    faces: Faces
+
+    @property
+    def painted(self) -> Terrain:
+        """The surface without objects that only hide: what a product is an image of."""
+        faces = self.faces.painted
+        return self.ground if faces is None else ObjectSurface(self.ground, faces)
+
+    def relief(self, target: Target, window: Window) -> NDArray[np.float32]:
+        """Height of the ground or of the highest painted face above it at the pixel centres of a window of a map
+        target, shape (height, width), metres; NaN where there is neither."""
+        relief, faces = self.ground.relief(target, window), self.faces.painted
+        if faces is None:
+            return relief
+        if not isinstance(target, MapTarget):
+            raise UsageError(f"objects give relief for map targets, not for {type(target).__name__}")
+        v, u = np.mgrid[window.row : window.stop[1], window.col : window.stop[0]].astype(float)
+        raised = faces.heights(target.grid.to_map(np.stack([u, v], axis=-1)))
+        return np.where(np.isneginf(raised), relief, np.fmax(relief, raised)).astype(np.float32)
+
+    def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
+        """Height of the ground or of the highest painted face above it at map points (..., 2), shape (...)."""
+        heights, faces = self.ground.heights(XY), self.faces.painted
+        if faces is None:
+            return heights
+        raised = faces.heights(XY)
+        return np.where(np.isneginf(raised), heights, np.fmax(heights, raised))
+
+    def height_range(self, bounds: ArrayLike) -> NDArray[np.float64]:
+        """Bounds of ground and faces, painted or not, inside map bounds (..., 4), shape (..., 2)."""
+        ground, faces = self.ground.height_range(bounds), self.faces.height_range(bounds)
+        return np.stack([np.fmin(ground[..., 0], faces[..., 0]), np.fmax(ground[..., 1], faces[..., 1])], axis=-1)
+
+    def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
+        """What rays meet first: the ground, as `Terrain.first_hit` has it, or a face, from either side."""
+        ground = self.ground.first_hit(paths, bend)
+        along, XYZ, _ = self.faces.first_hit(paths, bend)
+        nearer = np.isfinite(along) & ~(ground.along < along)
+        return Hits(
+            np.where(nearer[:, None], XYZ, ground.XYZ),
+            np.where(nearer, along, ground.along),
+            np.where(nearer, SURFACE, ground.result),
+            ground.below & ~nearer,
+        )
+
+
+def without_objects(surface: Surface) -> Surface:
+    """The ground alone."""
+    return surface.ground if isinstance(surface, ObjectSurface) else surface
+
+
+def painted_surface(surface: Terrain) -> Terrain:
+    """What a product shows, without what only hides."""
+    return surface.painted if isinstance(surface, ObjectSurface) else surface

@@ -1,0 +1,158 @@
+"""Polygons in space as triangles, and heights inside polygons (Behr 1989, §6.2.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.errors import InputError
+
+Rings = Sequence[NDArray[np.float64]]
+"""A polygon in space: its outer ring and its holes, each (k, 3), X, Y, Z in metres; the first point may come again."""
+
+#: Polygons with less area than this, square metres, have no inside and are left out.
+LEAST_AREA = 1e-6
+#: A ring that comes back to itself within this is not yet one that crosses itself, metres: files round to millimetres.
+ROUNDING = 2e-3
+#: Polygons that are named in a message.
+_NAMED = 5
+
+
+def triangles_of(
+    polygons: Sequence[Rings], names: Sequence[str], where: str
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Triangles that fill polygons between their vertices, whose heights they have.
+
+    Inside a plane polygon the height is that of the plane; inside another one that of a constrained Delaunay
+    triangulation of its vertices, seen along its mean normal (Newell's), so that upright and overhanging polygons are
+    as good as level ones.
+
+    Parameters
+    ----------
+    polygons : sequence of `Rings`
+    names : sequence of str
+        Of the polygons, for messages.
+    where : str
+        What a message begins with.
+
+    Returns
+    -------
+    corners : ndarray, shape (n, 3, 3)
+    polygon : ndarray, shape (n,)
+        Place of the polygon of each triangle.
+
+    Raises
+    ------
+    InputError
+        Polygons have vertices without a height, or cross themselves; they are named.
+    """
+    flat: list[Any] = []
+    bases: list[_Base | None] = []
+    faults: dict[str, str] = {}
+    for rings, name in zip(polygons, names, strict=True):
+        base, plane, fault = _flattened(rings)
+        if fault:
+            faults[name] = fault
+        flat.append(plane)
+        bases.append(base)
+    if faults:
+        told = "; ".join(f"{name!r} {fault}" for name, fault in list(faults.items())[:_NAMED])
+        more = f"; and {len(faults) - _NAMED} more" if len(faults) > _NAMED else ""
+        raise InputError(f"{where}: {len(faults)} polygons cannot be used: {told}{more}. Repair or remove them")
+    found = shapely.constrained_delaunay_triangles(np.array(flat, object))
+    pieces, polygon = shapely.get_parts(found, return_index=True)
+    uv = shapely.get_coordinates(pieces).reshape(-1, 4, 2)[:, :3]
+    corners = np.empty((len(uv), 3, 3))
+    starts = np.searchsorted(polygon, np.arange(len(flat) + 1))
+    for base, first, last in zip(bases, starts[:-1], starts[1:]):
+        if base is not None:
+            corners[first:last] = base.in_space(uv[first:last])
+    return corners, polygon.astype(np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Base:
+    """Vertices of a polygon in space and in its mean plane."""
+
+    xyz: NDArray[np.float64]
+    uv: NDArray[np.float64]
+    middle: NDArray[np.float64]
+    axes: NDArray[np.float64]
+
+    def in_space(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (..., 2) of the plane: those of vertices are where these are, all others stay in the plane."""
+        place = {(u, v): k for k, (u, v) in enumerate(self.uv.tolist())}
+        at = np.array([place.get((u, v), -1) for u, v in uv.reshape(-1, 2).tolist()], int).reshape(uv.shape[:-1])
+        points = self.middle + uv @ self.axes
+        return np.where(at[..., None] < 0, points, self.xyz[at])
+
+
+def _flattened(rings: Rings) -> tuple[_Base | None, Any, str]:
+    """Vertices of a polygon, the polygon in its mean plane, and what is wrong with it; none of them if it has no
+    inside."""
+    clean = [_opened(np.asarray(ring, float)) for ring in rings]
+    if not all(np.isfinite(ring[:, :2]).all() for ring in clean):
+        return None, None, "has coordinates that are no numbers"
+    if not all(np.isfinite(ring[:, 2]).all() for ring in clean):
+        return None, None, "has vertices without a height"
+    if not clean or len(clean[0]) < 3:
+        return None, None, ""
+    middle = clean[0].mean(axis=0)
+    around = clean[0] - middle
+    # Newell's normal: its length is twice the area.
+    normal = np.cross(around, np.roll(around, -1, axis=0)).sum(axis=0)
+    size = float(np.linalg.norm(normal))
+    spread = np.linalg.svd(around, compute_uv=False)
+    if size < 2 * LEAST_AREA:
+        return None, None, "crosses itself" if spread[0] * spread[1] > 1e-3 * len(around) else ""
+    axes = _axes(normal / size)
+    clean = [clean[0], *(ring for ring in clean[1:] if len(ring) >= 3)]
+    planes = [(ring - middle) @ axes.T for ring in clean]
+    plane: Any = shapely.Polygon(planes[0], planes[1:])
+    if not plane.is_valid:
+        reason = shapely.is_valid_reason(plane).split("[")[0].strip()
+        # What touches itself or goes back on its own way encloses what it seems to; what crosses itself does not.
+        mended = shapely.make_valid(plane)
+        if abs(mended.area - plane.area) > ROUNDING * plane.length:
+            return None, None, f"crosses itself ({reason})"
+        plane = shapely.multipolygons([part for part in shapely.get_parts(mended) if part.geom_type == "Polygon"])
+    return _Base(np.concatenate(clean), np.concatenate(planes), middle, axes), plane, ""
+
+
+def _opened(ring: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A ring without points that repeat the one before them."""
+    same = (ring == np.roll(ring, 1, axis=0)).all(axis=1)
+    return ring[~same] if same.any() else ring
+
+
+def _axes(normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Two axes across a unit vector, (2, 3)."""
+    u = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    u /= np.linalg.norm(u)
+    return np.stack([u, np.cross(normal, u)])
+
+
+def distance_weighted(vertices: ArrayLike, XY: ArrayLike) -> NDArray[np.float64]:
+    """Heights inside a polygon from those of its vertices, each weighted by one over its distance on the map.
+
+    The way of Behr 1989, §6.2.2 (there without a formula); at a vertex its own height. Between two vertices of an edge
+    all others pull as well, so that neither a plane nor an edge is kept (design/022).
+
+    Parameters
+    ----------
+    vertices : array_like, shape (k, 3)
+    XY : array_like, shape (..., 2)
+
+    Returns
+    -------
+    ndarray, shape (...)
+    """
+    vertices, XY = np.asarray(vertices, float), np.asarray(XY, float)
+    away = np.linalg.norm(XY[..., None, :] - vertices[:, :2], axis=-1)
+    weight = 1.0 / np.maximum(away, 1e-9)
+    return np.asarray((weight * vertices[:, 2]).sum(axis=-1) / weight.sum(axis=-1))

@@ -1,0 +1,92 @@
+"""Polygons as squares, large inside and small along the border (Behr 1989, §6.2.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from photoplan.errors import UsageError
+
+#: More squares than this are not made of one polygon.
+MOST_SQUARES = 4_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Squares:
+    """Squares of a polygon in the order of Behr's linear list: depth first; NW, NE, SW, SE."""
+
+    corner: NDArray[np.float64]
+    """Upper-left corners X, Y, shape (n, 2), metres."""
+    side: NDArray[np.float64]
+    """Shape (n,), metres."""
+    level: NDArray[np.int64]
+    """How often a mesh was divided, shape (n,)."""
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Outer edges xmin, ymin, xmax, ymax, shape (n, 4)."""
+        (x, y), side = self.corner.T, self.side
+        return np.stack([x, y - side, x + side, y], axis=1)
+
+
+def decompose(polygon: Any, corner: tuple[float, float], mesh: float, levels: int) -> Squares:
+    """Squares that a polygon is made of.
+
+    Meshes that lie inside stay as they are, those outside are dropped, all others are divided by four; the smallest
+    belong to the polygon if their middles do.
+
+    Parameters
+    ----------
+    polygon : shapely Polygon or MultiPolygon
+        On the map; holes are kept free.
+    corner : (float, float)
+        X, Y of a corner of the meshes.
+    mesh : float
+        Their side, metres: what a camera took at once, here what is worth a square.
+    levels : int
+        How often they may be divided; Behr stops where they are no larger than a pixel.
+
+    Raises
+    ------
+    UsageError
+        There would be more squares than `MOST_SQUARES`.
+    """
+    xmin, ymin, xmax, ymax = polygon.bounds
+    col = np.arange(np.floor((xmin - corner[0]) / mesh), np.ceil((xmax - corner[0]) / mesh))
+    row = np.arange(np.floor((corner[1] - ymax) / mesh), np.ceil((corner[1] - ymin) / mesh))
+    finest = mesh / 2**levels
+    if polygon.length / finest + len(col) * len(row) > MOST_SQUARES / 4:
+        raise UsageError(f"a polygon of {polygon.length:.6g} m in squares of {finest:g} m; choose larger ones")
+    # Columns and rows are counted in squares of each level, from the first mesh.
+    at = np.stack(np.meshgrid(col - col[0], row - row[0]), axis=-1).reshape(-1, 2).astype(np.int64)
+    first = np.array([corner[0] + col[0] * mesh, corner[1] - row[0] * mesh])
+    shapely.prepare(polygon)
+    found = []
+    for level in range(levels + 1):
+        side = mesh / 2**level
+        x, y = (first + at * (side, -side)).T
+        boxes = shapely.box(x, y - side, x + side, y)
+        inside = shapely.contains(polygon, boxes)
+        divide = ~inside & shapely.intersects(polygon, boxes)
+        if level == levels:
+            inside |= divide & shapely.contains_xy(polygon, x + side / 2, y - side / 2)
+        found.append((at[inside], np.full(int(inside.sum()), level)))
+        at = (2 * at[divide][:, None] + np.array([[0, 0], [1, 0], [0, 1], [1, 1]])).reshape(-1, 2)
+    places, level_of = (np.concatenate(part) for part in zip(*found))
+    scale = 2 ** (levels - level_of)
+    order = np.lexsort((_along(places * scale[:, None]),))
+    places, level_of = places[order], level_of[order]
+    side_of = mesh / 2.0**level_of
+    return Squares(first + places * np.stack([side_of, -side_of], axis=1), side_of, level_of)
+
+
+def _along(places: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Place of the finest squares along a depth-first way (the curve of Morton)."""
+    code = np.zeros(len(places), np.int64)
+    for bit in range(31):
+        code |= ((places[:, 0] >> bit & 1) << (2 * bit)) | ((places[:, 1] >> bit & 1) << (2 * bit + 1))
+    return code
