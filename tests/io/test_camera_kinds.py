@@ -62,4 +62,4 @@ def test_the_names_are_those_of_the_code() -> None:
 def test_a_kind_is_complete(kind: type[CameraEntry]) -> None:
     """It has no abstract part, and a comment for every entry that is written."""
     assert not inspect.isabstract(kind)
-    assert set(kind.comments) | {"lens", "restore"} == set(kind.model_fields)
+    assert set(kind.comments) | {"lens", "restore", "sigma"} == set(kind.model_fields)

@@ -17,7 +17,6 @@ from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.brown import Brown
 from photoplan.cameras.plane import Affine2D, Bilinear2D
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import rotation_vector
 from photoplan.orientation.bundle.adjust import adjust_block
 from photoplan.orientation.bundle.block import AdjustSettings

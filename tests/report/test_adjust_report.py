@@ -111,6 +111,7 @@ def facts(name: str = "p") -> AdjustFigures:
                 np.array([153.0, 0.0]),
                 np.array([153.0123, 0.0042]),
                 np.outer((0.0021, 0.0013), (0.0021, 0.0013)) * np.array([[1.0, 0.93], [0.93, 1.0]]),
+                np.eye(2),
             ),
         ),
         strips=(

@@ -173,7 +173,7 @@ def tile_accuracy(
 
 
 def _slope(relief: NDArray[np.float64]) -> NDArray[np.float64]:
-    """∂h/∂u, ∂h/∂v of all but the outermost pixels, (height, width, 2): the gentler of both sides; 0 where none is known.
+    """∂h/∂u, ∂h/∂v of all but the outermost pixels, (height, width, 2), each the gentler of both sides; 0: not known.
 
     At a wall it is that of the roof or of the ground that the pixel shows, and not the wall's.
     """
@@ -230,8 +230,7 @@ def _miss(nodes: NDArray[np.float64], axis: int) -> float:
 def resampling_sigma(kernel: str) -> float:
     """Standard deviation of the position of what a kernel resamples, pixels of the source.
 
-    It is the phase error of a wave of four pixels, over all places between pixels; a kernel that takes the nearest pixel
-    has 1/√12.
+    It is the phase error of a wave of four pixels, over all places between pixels; the nearest pixel is off by 1/√12.
     """
     weights = KERNELS[kernel]
     if weights.taps == 1:

@@ -30,7 +30,7 @@ from photoplan.orientation.judgement import fitting, impossible, of_resection
 from photoplan.orientation.resection.adjust import resect
 from photoplan.orientation.resection.model import MeasuredPoints, Resected, ResectSettings
 from photoplan.plain import pick
-from photoplan.products.adjust.block import decimals_of
+from photoplan.products.adjust.block import decimals_of, stated_accuracy
 from photoplan.products.adjust.cameras import Calibrated, block_camera, calibrated, camera_entries
 from photoplan.products.adjust.frame import block_frame, nadir_heights
 from photoplan.products.adjust.inputs import AdjustInputs, read_inputs
@@ -185,8 +185,8 @@ class ResectedImage:
     """(3,), in the project's CRS and the orientation's height system."""
     angles: Array
     """(3,), in the unit and order of the project."""
-    sigma_center: Array
-    sigma_angles: Array
+    covariance: Array
+    """Of centre, angles and the parameters of the camera that were unknowns, (6 + k, 6 + k)."""
     angle_names: tuple[str, ...]
     """ω, φ, κ in the order of the angles."""
     angle_unit: str
@@ -195,6 +195,16 @@ class ResectedImage:
     camera_entries: dict[str, Any]
     """Entries of the camera in the project that change."""
     notes: tuple[str, ...]
+
+    @property
+    def sigma_center(self) -> Array:
+        """(3,), metres."""
+        return np.sqrt(np.diag(self.covariance)[:3])
+
+    @property
+    def sigma_angles(self) -> Array:
+        """(3,), in the project's unit."""
+        return np.sqrt(np.diag(self.covariance)[3:6])
 
     @property
     def angle_sign(self) -> str:
@@ -207,8 +217,7 @@ class ResectedImage:
         return {
             "center": _rounded(self.center, decimals_of(self.sigma_center)),
             "angles": _rounded(self.angles, _ANGLE_DECIMALS),
-            "sigma_center": [float(f"{v:.4g}") for v in self.sigma_center],
-            "sigma_angles": [float(f"{v:.4g}") for v in self.sigma_angles],
+            **stated_accuracy(self.covariance),
         }
 
     @property
@@ -310,6 +319,8 @@ def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -
     R = found.pose.R_ground_camera
     D = angle_derivatives(R, orientation.rotation)
     of_angles = D @ found.covariance[3:6, 3:6] @ D.T
+    T = np.eye(len(found.covariance))
+    T[3:6, 3:6] = D * to_unit
     camera = None
     entries: dict[str, Any] = {}
     if found.free:
@@ -317,7 +328,9 @@ def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -
         adjusted = AdjustedCamera(
             image.camera, found.interior.c, found.interior.principal_point, lens, found.free, found.covariance[6:, 6:]
         )
-        camera, entries = calibrated(described, start, adjusted), camera_entries(described, start, adjusted)
+        camera = calibrated(described, start, adjusted)
+        entries = {**camera_entries(described, start, adjusted), "sigma": camera.sigmas}
+        T[6:, 6:] = camera.of_block
     return ResectedImage(
         image=image,
         size=interior.size,
@@ -325,8 +338,7 @@ def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -
         found=found,
         center=center,
         angles=angles_from_rotation(R, orientation.rotation) * to_unit,
-        sigma_center=np.sqrt(np.diag(found.covariance)[:3]),
-        sigma_angles=np.sqrt(np.diag(of_angles)) * to_unit,
+        covariance=T @ found.covariance @ T.T,
         angle_names=tuple(_GREEK[k] for k in orientation.rotation),
         angle_unit=orientation.angle_unit,
         calibrated=camera,

@@ -64,9 +64,10 @@ class SceneAddress:
         (camera,) = project.pop("cameras").values()
         restored = image.pop("restore", None) or camera.get("restore")
         camera.pop("restore", None)
-        for name in ("name", "file", "camera", "sigma_center", "sigma_angles"):
+        for name in ("name", "file", "camera", "sigma_center", "sigma_angles", "correlation"):
             image.pop(name, None)
-        project["terrain"].pop("file", None)
+        for entries, name in ((project["terrain"], "file"), (project["terrain"], "sigma"), (camera, "sigma")):
+            entries.pop(name, None)
         table = None
         if restored is not None:
             # Of a filter and a table the content counts, which is among the digests.
@@ -180,7 +181,7 @@ def camera_without_pixels(project: Project, name: str) -> CentralCamera:
     image = project.image(name)
     file = project.resolve(image.file)
     size = read_info(file).size if is_there(file) else image_size(project.cameras[image.camera], image)
-    return _camera(project, image, ground_of(project), size)
+    return camera_of(project, image, ground_of(project), size)
 
 
 def map_order(project: Project, names: Sequence[str]) -> list[int]:
@@ -238,7 +239,7 @@ def _open(address: SceneAddress) -> Scene:
     image = project.images[0]
     ground = ground_of(project)
     reader = _reader(project, image)
-    camera = _camera(project, image, ground, reader.size)
+    camera = camera_of(project, image, ground, reader.size)
     return Scene(camera, ground.surface, reader, ground, address)
 
 
@@ -341,7 +342,8 @@ def pose_of(project: Project, image: Image, ground: Ground) -> Pose:
     return Pose(center, stated.R_ground_camera)
 
 
-def _camera(project: Project, image: Image, ground: Ground, size: tuple[int, int]) -> CentralCamera:
+def camera_of(project: Project, image: Image, ground: Ground, size: tuple[int, int]) -> CentralCamera:
+    """Camera of an image by the project's numbers; `size` is that of its file, another one stated is an InputError."""
     description = project.cameras[image.camera]
     stated = image.size or description.size
     if stated is not None and tuple(stated) != size:

@@ -36,6 +36,7 @@ from photoplan.io.names import check_input_name
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)]
 Pixels = Annotated[int, Strict(), Field(gt=0, le=10_000_000)]
 Pair = tuple[Number, Number]
 Triple = tuple[Number, Number, Number]
@@ -267,6 +268,8 @@ class CameraEntry(Entry, ABC):
     lens: AnyLens = IdealLens()
     restore: Restore | None = None
     """Filter that its images are restored with, where they state no other."""
+    sigma: dict[Name, NotNegative] | None = None
+    """Standard deviations of c, x0, y0 and coefficients of the lens, by these names and in the units stated here."""
 
     comments: ClassVar[Mapping[str, str]]
     """Entries in the order in which they are written, each with its comment; lens and filter follow."""

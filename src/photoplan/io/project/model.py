@@ -17,6 +17,7 @@ from photoplan.io.camera.model import (
     Entry,
     Fiducials,
     Name,
+    NotNegative,
     Number,
     Pixels,
     Positive,
@@ -27,7 +28,8 @@ from photoplan.io.camera.model import (
 from photoplan.io.names import check_input_name, resolve_input, unique_stems
 
 InputName = Annotated[str, Field(max_length=4000)]
-NotNegative = Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)]
+
+Correlation = tuple[Annotated[float, Strict(), Field(ge=-1, le=1)], ...]
 
 
 class Image(Entry):
@@ -46,6 +48,9 @@ class Image(Entry):
     """Standard deviations of the projection centre, metres, as `photoplan adjust` and `resect` found them."""
     sigma_angles: tuple[NotNegative, NotNegative, NotNegative] | None = None
     """Standard deviations of the angles, in their unit."""
+    correlation: Correlation | None = None
+    """The correlation matrix of centre, angles and, after a calibration, what `sigma` of the camera lists, below its
+    diagonal, row by row; None: they are not correlated."""
     fiducials: Fiducials | None = None
     """Measured fiducial marks of a film scan: name = [column, row], pixels."""
     size: tuple[Pixels, Pixels] | None = None
@@ -62,6 +67,8 @@ class Image(Entry):
     def _both(self) -> Self:
         if (self.center is None) != (self.angles is None):
             raise ValueError("center and angles go together: give both, or none for an image that is not oriented")
+        if self.correlation is not None and (self.sigma_center is None or self.sigma_angles is None):
+            raise ValueError("correlation goes with sigma_center and sigma_angles")
         return self
 
     @property
@@ -88,6 +95,8 @@ class Terrain(Entry):
     crs: Name | None = None
     """CRS of a file that does not state one, such as an ASCII grid."""
     height_system: Name | None = None
+    sigma: NotNegative | None = None
+    """Standard deviation of the heights, metres, where the file states none."""
 
     @field_validator("file")
     @classmethod

@@ -86,6 +86,7 @@ def _terrain(terrain: Terrain) -> list[str]:
             [
                 ("file", terrain.file, "heights: GeoTIFF, ASC, or a terrain model (.gpkg)"),
                 ("height", terrain.height, "or one height everywhere"),
+                ("sigma", terrain.sigma, "standard deviation of heights, where a terrain model states none"),
                 ("crs", terrain.crs, "its CRS, where the file does not state one"),
             ]
         ),
@@ -181,7 +182,7 @@ def _ortho(ortho: OrthoDefaults) -> list[str]:
 
 def camera_lines(name: str, camera: CameraEntry) -> list[str]:
     """The ``[cameras.NAME]`` table of a camera."""
-    comments = {**camera.comments, "restore": "filter that its images are restored with", "lens": ""}
+    comments = {**camera.comments, "restore": "filter that its images are restored with", "lens": "", "sigma": ""}
     rows = [(entry, _stated(entry, getattr(camera, entry)), comment) for entry, comment in comments.items()]
     return [f"[cameras.{toml_key(name)}]", *_entries(r for r in rows if r[1] is not None), ""]
 

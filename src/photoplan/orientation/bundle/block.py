@@ -190,6 +190,8 @@ class Adjusted:
     pose_covariance: NDArray[np.float64]
     """(n, 6, 6): projection centre in metres, then small rotations about the camera's x, y, z axes in radians
     (R ← R · exp[δ]×); NaN without covariance."""
+    pose_camera_covariance: tuple[NDArray[np.float64], ...]
+    """For each image that of its pose with the free parameters of its camera, (6, k)."""
     cameras: tuple[AdjustedCamera, ...]
     points: tuple[str, ...]
     """All points that were adjusted: tie, control and check points."""

@@ -187,6 +187,7 @@ def result_of(block: Block, selection: Selection, weighted: Weighted, active: Ac
         images=model.image_names,
         poses=state.poses(),
         pose_covariance=_covariances(solution, IMAGES, variance),
+        pose_camera_covariance=_with_camera(solution, variance),
         cameras=_cameras(solution, variance),
         points=model.point_names,
         XYZ=state.XYZ,
@@ -264,6 +265,22 @@ def _covariances(solution: Solution, key: str, variance: float) -> _Floats:
         assert solution.inverse is not None
         out[k] = solution.inverse.block(kind.columns(k)) * variance
     return out
+
+
+def _with_camera(solution: Solution, variance: float) -> tuple[_Floats, ...]:
+    """Covariances of each pose with the free parameters of its camera, (6, k)."""
+    model = solution.model
+    poses = model.columns.get(IMAGES)
+    assert poses is not None
+    out = []
+    for k in range(len(model.image_names)):
+        camera = model.columns.get(f"camera {model.camera_names[model.camera_of[k]]}")
+        if camera is None or solution.inverse is None:
+            out.append(np.full((6, 0 if camera is None else camera.width), np.nan))
+            continue
+        both = solution.inverse.block(np.concatenate([poses.columns(k), camera.columns(0)]))
+        out.append(both[:6, 6:] * variance)
+    return tuple(out)
 
 
 def _sigma(solution: Solution, key: str, variance: float) -> _Floats:

@@ -52,10 +52,9 @@ class MapResult:
     """Map poses, angles about the map's axes at each station, in the order of `adjusted.images`."""
     angles: _Floats
     """(n, 3), in the unit and order of the project."""
-    sigma_center: _Floats
-    """(n, 3), metres."""
-    sigma_angles: _Floats
-    """(n, 3), in the project's unit."""
+    covariances: tuple[_Floats, ...]
+    """Of each image: projection centre (metres), angles in the unit and order of the project, then the parameters of
+    its camera that were unknowns, in the project's units, (6 + k, 6 + k)."""
     XYZ: _Floats
     """All adjusted points, (m, 3)."""
     covariance: _Floats
@@ -66,6 +65,16 @@ class MapResult:
     """Computed minus observed, (p, 3), metres."""
     cameras: tuple[Calibrated, ...]
     """Those that had unknowns."""
+
+    @property
+    def sigma_center(self) -> _Floats:
+        """(n, 3), metres."""
+        return np.array([_roots(c)[:3] for c in self.covariances]).reshape(-1, 3)
+
+    @property
+    def sigma_angles(self) -> _Floats:
+        """(n, 3), in the project's unit."""
+        return np.array([_roots(c)[3:6] for c in self.covariances]).reshape(-1, 3)
 
 
 def prepare(inputs: AdjustInputs, starts: Mapping[str, Pose], free: Free) -> Prepared:
@@ -192,23 +201,35 @@ def map_result(prepared: Prepared, adjusted: Adjusted) -> MapResult:
     unit, order = project.orientation.angle_unit, project.orientation.rotation
     to_unit = ANGLE_UNITS[unit] / (2 * np.pi)
     angles = np.array([angles_from_rotation(pose.R_ground_camera, order) for pose in poses]).reshape(-1, 3) * to_unit
-    D = np.array([angle_derivatives(pose.R_ground_camera, order) for pose in poses]).reshape(-1, 3, 3)
-    of_angles = D @ adjusted.pose_covariance[:, 3:, 3:] @ np.swapaxes(D, 1, 2)
-    of_centers = frame.map_covariance(adjusted.pose_covariance[:, :3, :3], centers)
+    T = np.zeros((len(poses), 6, 6))
+    T[:, :3, :3] = np.linalg.inv(frame.jacobian(centers))
+    for k, pose in enumerate(poses):
+        T[k, 3:, 3:] = angle_derivatives(pose.R_ground_camera, order) * to_unit
     XYZ = frame.map_points(adjusted.XYZ)
+    cameras = _cameras(project, prepared.block, adjusted)
     return MapResult(
         prepared=prepared,
         adjusted=adjusted,
         poses=poses,
         angles=angles,
-        sigma_center=_roots(of_centers),
-        sigma_angles=_roots(of_angles) * to_unit,
+        covariances=tuple(_joint(prepared, adjusted, cameras, k, T[k]) for k in range(len(poses))),
         XYZ=XYZ,
         covariance=frame.map_covariance(adjusted.point_covariance, XYZ),
         ground_residuals=_ground_residuals(prepared, adjusted, XYZ),
         position_residuals=_position_residuals(prepared, adjusted),
-        cameras=_cameras(project, prepared.block, adjusted),
+        cameras=cameras,
     )
+
+
+def _joint(prepared: Prepared, adjusted: Adjusted, cameras: Sequence[Calibrated], k: int, T: _Floats) -> _Floats:
+    """Covariance of an image and its camera; T takes the block's position and small rotations to the project's."""
+    name = prepared.inputs.project.image(adjusted.images[k]).camera
+    pose = T @ adjusted.pose_covariance[k] @ T.T
+    found = next((c for c in cameras if c.name == name), None)
+    if found is None:
+        return pose
+    both = T @ adjusted.pose_camera_covariance[k] @ found.of_block.T
+    return np.block([[pose, both], [both.T, found.covariance]])
 
 
 def _roots(covariance: _Floats) -> _Floats:
@@ -238,6 +259,29 @@ def _cameras(project: Project, block: Block, adjusted: Adjusted) -> tuple[Calibr
         for found in adjusted.cameras
         if found.free
     )
+
+
+def stated_accuracy(covariance: _Floats) -> dict[str, list[float] | None]:
+    """Entries of an image in the project for its covariance (6 + k, 6 + k); None where nothing is known.
+
+    Position and angles may be correlated to one part in 100 000 and less; what then is left of their effects on the
+    ground needs the digits.
+    """
+    sigma = np.sqrt(np.diag(covariance))
+    if not (np.isfinite(sigma) & (sigma > 0)).all():
+        known = np.isfinite(sigma).all()
+        center, angles = (_figures(part) if known else None for part in (sigma[:3], sigma[3:6]))
+        return {"sigma_center": center, "sigma_angles": angles, "correlation": None}
+    correlation = (covariance / np.outer(sigma, sigma))[np.tril_indices(len(sigma), -1)]
+    return {
+        "sigma_center": _figures(sigma[:3]),
+        "sigma_angles": _figures(sigma[3:6]),
+        "correlation": [round(float(v), 8) + 0.0 for v in np.clip(correlation, -1.0, 1.0)],
+    }
+
+
+def _figures(values: _Floats) -> list[float]:
+    return [float(f"{v:.6g}") for v in values]
 
 
 def decimals_of(sigma: _Floats) -> int:

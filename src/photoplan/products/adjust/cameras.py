@@ -39,11 +39,19 @@ class Calibrated:
     after: NDArray[np.float64]
     covariance: NDArray[np.float64]
     """Shape (k, k); NaN without covariance."""
+    of_block: NDArray[np.float64]
+    """Takes the adjustment's parameters to these, shape (k, k)."""
 
     @property
     def sigma(self) -> NDArray[np.float64]:
         """Standard deviations, shape (k,)."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def sigmas(self) -> dict[str, float] | None:
+        """Standard deviations as the project states them; None where they are not known."""
+        known = np.isfinite(self.sigma).all() and (self.sigma > 0).all()
+        return dict(zip(self.parameters, (float(f"{v:.6g}") for v in self.sigma))) if known else None
 
     @property
     def correlation(self) -> NDArray[np.float64]:
@@ -167,17 +175,16 @@ def calibrated(camera: CameraEntry, start: BlockCamera, found: AdjustedCamera) -
         before.append(value[0])
         after.append(value[1])
         scales.append(scale)
-    S = np.array(scales)
-    covariance = found.covariance * np.outer(S, S)
     order = np.argsort([PARAMETERS.index(n) for n in names])
-    pick = np.ix_(order, order)
+    of_block = np.diag(scales)[order]
     return Calibrated(
         found.name,
         tuple(names[k] for k in order),
         tuple(units[k] for k in order),
         np.array(before)[order],
         np.array(after)[order],
-        covariance[pick],
+        of_block @ found.covariance @ of_block.T,
+        of_block,
     )
 
 

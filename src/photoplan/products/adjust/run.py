@@ -35,6 +35,7 @@ from photoplan.products.adjust.block import (
     decimals_of,
     map_result,
     prepare,
+    stated_accuracy,
 )
 from photoplan.products.adjust.cameras import Calibrated, Free, camera_entries, parse_calibrate
 from photoplan.products.adjust.figures import AdjustFigures, GroundFigures, NamedMeasurement
@@ -346,11 +347,14 @@ def _changes(result: MapResult) -> ProjectChanges:
         images[name] = {
             "center": _rounded(result.poses[k].center, decimals_of(result.sigma_center[k])),
             "angles": _rounded(result.angles[k], 10),
-            "sigma_center": _figures(result.sigma_center[k]),
-            "sigma_angles": _figures(result.sigma_angles[k]),
+            **stated_accuracy(result.covariances[k]),
         }
+    sigmas = {found.name: found.sigmas for found in result.cameras}
     cameras = {
-        found.name: camera_entries(project.cameras[found.name], block.cameras[found.name], found)
+        found.name: {
+            **camera_entries(project.cameras[found.name], block.cameras[found.name], found),
+            "sigma": sigmas[found.name],
+        }
         for found in result.adjusted.cameras
         if found.free
     }
@@ -359,8 +363,3 @@ def _changes(result: MapResult) -> ProjectChanges:
 
 def _rounded(values: np.ndarray, digits: int) -> list[float]:
     return [round(float(v), digits) + 0.0 for v in values]
-
-
-def _figures(values: np.ndarray) -> list[float] | None:
-    """Three figures of each; None where one is not known."""
-    return [float(f"{v:.3g}") for v in values] if np.isfinite(values).all() else None

@@ -1,0 +1,158 @@
+"""What a project knows of its own errors: orientations, cameras, terrain."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.base import Projection
+from photoplan.errors import InputError
+from photoplan.geometry.grid import Window
+from photoplan.io.camera.model import CameraEntry
+from photoplan.io.project.model import Image, Project
+from photoplan.plan.accuracy import Cause, SourceErrors
+from photoplan.project.open_terrain import open_terrain
+from photoplan.project.scene import Ground, camera_of
+from photoplan.surfaces.hybrid import HybridSurface
+from photoplan.targets.base import Target
+
+#: Cameras are moved by so many standard deviations: far above rounding, and small where an angle is badly known.
+_STEP = 1 / 16
+_ANGLES = {"o": "omega", "p": "phi", "k": "kappa"}
+
+
+def source_errors(
+    project: Project, image: Image, ground: Ground, projection: Projection, in_image: float
+) -> SourceErrors:
+    """Errors of an image as the project states them.
+
+    Parameters
+    ----------
+    project : Project
+    image : Image
+    ground : Ground
+        The project's.
+    projection : Projection
+        The image's camera.
+    in_image : float
+        Standard deviation of image coordinates, pixels.
+
+    Raises
+    ------
+    InputError
+        The project states no standard deviations of the image's orientation, or such of the camera that do not fit.
+    """
+    if image.sigma_center is None or image.sigma_angles is None:
+        raise InputError(
+            f"image {image.name!r}: nothing is known of the accuracy of its orientation; `photoplan adjust` and "
+            "`resect` write sigma_center and sigma_angles, or state them in [[images]]"
+        )
+    camera = project.cameras[image.camera]
+
+    def at(change: NDArray[np.float64]) -> Projection:
+        moved, entry = _moved(image, camera, change)
+        changed = project.model_copy(update={"cameras": {**project.cameras, image.camera: entry}})
+        return camera_of(changed, moved, ground, projection.size)
+
+    causes = (Cause(name, at(_STEP * d), at(-_STEP * d), _STEP) for name, d in _deviations(project, image, camera))
+    return SourceErrors(projection, tuple(causes), in_image)
+
+
+def _deviations(project: Project, image: Image, camera: CameraEntry) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """Independent errors of centre, angles and camera, each one standard deviation large, with their names."""
+    assert image.sigma_center is not None and image.sigma_angles is not None
+    of_camera = camera.sigma or {}
+    sigma = np.array([*image.sigma_center, *image.sigma_angles, *of_camera.values()])
+    angles = (_ANGLES[letter] for letter in project.orientation.rotation)
+    names = ["X0", "Y0", "Z0", *angles, *(f"camera {name}" for name in of_camera)]
+    given = np.array(image.correlation or (), float)
+    joined = {0: 0, 15: 6, len(sigma) * (len(sigma) - 1) // 2: len(sigma)}.get(len(given))
+    if joined is None:
+        raise InputError(
+            f"image {image.name!r}: correlation has {len(given)} numbers; 15 for centre and angles, or "
+            f"{len(sigma) * (len(sigma) - 1) // 2} for them and the {len(of_camera)} parameters of its camera"
+        )
+    R = np.eye(len(sigma))
+    R[:joined, :joined][np.tril_indices(joined, -1)] = given
+    values, axes = np.linalg.eigh(np.tril(R) + np.tril(R, -1).T)
+    if joined and values[0] < -1e-3:
+        raise InputError(f"image {image.name!r}: correlation is that of no covariance; `photoplan adjust` writes it")
+    together = "orientation" if joined <= 6 else "orientation and camera"
+    for value, axis in zip(values, axes.T):
+        k = int(np.argmax(np.abs(axis)))
+        yield (together if k < joined else names[k]), axis * np.sqrt(max(value, 0.0)) * sigma
+
+
+def _moved(image: Image, camera: CameraEntry, change: NDArray[np.float64]) -> tuple[Image, CameraEntry]:
+    """An image and its camera with other centre, angles and camera parameters."""
+    center, angles = (np.array(part) for part in image.pose_numbers)
+    update = {"center": tuple(center + change[:3]), "angles": tuple(angles + change[3:6])}
+    lens = {}
+    entries: dict[str, object] = {}
+    by_name = dict(zip(camera.sigma or {}, change[6:].tolist()))
+    for name, d in by_name.items():
+        if name == "c" and camera.camera_constant_mm is not None:
+            entries["camera_constant_mm"] = camera.camera_constant_mm + d
+        elif name == "c" and camera.pixels is not None:
+            fx, fy = camera.pixels.focal
+            entries["focal_px"] = (fx + d, fy * (fx + d) / fx)
+        elif name in type(camera.lens).model_fields and isinstance(getattr(camera.lens, name), float):
+            lens[name] = getattr(camera.lens, name) + d
+        elif name not in ("x0", "y0"):
+            raise InputError(
+                f"camera {image.camera!r}: sigma of {name!r}; allowed are c, x0, y0 and what its lens states"
+            )
+    d_point = np.array([by_name.get("x0", 0.0), by_name.get("y0", 0.0)])
+    if d_point.any() and camera.states_pixels and camera.pixels is not None:
+        entries["principal_point_px"] = tuple(camera.pixels.point + d_point)
+    elif d_point.any():
+        entries["principal_point_mm"] = tuple((camera.principal_point_mm or (0.0, 0.0)) + d_point)
+    if lens:
+        entries["lens"] = camera.lens.model_copy(update=lens)
+    return image.model_copy(update=update), camera.model_copy(update=entries)
+
+
+@dataclass(frozen=True)
+class StatedHeightErrors:
+    """One standard deviation of the heights everywhere, metres."""
+
+    sigma: float
+
+    def __call__(self, target: Target, window: Window) -> NDArray[np.floating]:
+        """See `photoplan.plan.accuracy.DepthErrors`."""
+        return np.full((window.height, window.width), self.sigma)
+
+
+@dataclass(frozen=True)
+class ModelHeightErrors:
+    """The standard deviations that a terrain model holds for its posts, interpolated as its heights are."""
+
+    surface: HybridSurface
+
+    def __call__(self, target: Target, window: Window) -> NDArray[np.floating]:
+        """See `photoplan.plan.accuracy.DepthErrors`."""
+        return self.surface.relief_with_sigma(target, window)[1]
+
+
+def height_errors(project: Project) -> StatedHeightErrors | ModelHeightErrors:
+    """Standard deviations of a project's terrain: what [terrain] states, or else what the terrain model holds.
+
+    Raises
+    ------
+    InputError
+        Neither is known.
+    """
+    terrain = project.ground
+    if terrain.sigma is not None:
+        return StatedHeightErrors(terrain.sigma)
+    if terrain.file is not None:
+        placed, _ = open_terrain(project.resolve(terrain.file), terrain.crs).in_crs(project.crs)
+        if isinstance(placed.surface, HybridSurface):
+            return ModelHeightErrors(placed.surface)
+    raise InputError(
+        "nothing is known of the accuracy of the terrain's heights: state `sigma` (metres) in [terrain], or take a "
+        "terrain model of `photoplan dtm build`, which holds it"
+    )

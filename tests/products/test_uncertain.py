@@ -1,0 +1,120 @@
+"""What a project file keeps of the accuracy of its images, and what becomes of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from photoplan.cameras.base import project
+from photoplan.cameras.frame import FrameCamera
+from photoplan.cameras.interior import Interior
+from photoplan.cameras.lenses.brown import Brown
+from photoplan.errors import InputError
+from photoplan.geometry.pose import Pose
+from photoplan.io.project.file import parse_project
+from photoplan.products.adjust.block import stated_accuracy
+from photoplan.project.scene import ground_of
+from photoplan.project.uncertain import StatedHeightErrors, height_errors, source_errors
+
+CENTER, ANGLES = np.array([400_000.0, 5_200_000.0, 1500.0]), np.array([2.0, -3.0, 100.0])
+SIZE, FOCAL, K1 = (4000, 3000), 3600.0, -0.05
+XYZ = CENTER + np.array([(300.0, 200, -1500), (-500, 400, -1450), (0, 0, -1480)])
+
+
+def project_with(tmp_path, image: dict, camera: dict | None = None, terrain: dict | None = None):
+    return parse_project(
+        {
+            "format": 1,
+            "crs": "EPSG:32633",
+            "terrain": {"height": 0.0, "height_system": "same", **(terrain or {})},
+            "orientation": {"height_system": "EPSG:5773", "angle_unit": "gon", "rotation": "opk"},
+            "cameras": {
+                "c": {
+                    "type": "frame",
+                    "size": list(SIZE),
+                    "focal_px": FOCAL,
+                    "lens": {"type": "brown", "k1": K1},
+                    **(camera or {}),
+                }
+            },
+            "images": [
+                {"name": "a", "file": "a.tif", "camera": "c", "center": [*CENTER], "angles": [*ANGLES], **image}
+            ],
+        },
+        tmp_path,
+        "project",
+    )
+
+
+def camera_at(change: np.ndarray) -> FrameCamera:
+    """The camera of the project with other X0, Y0, Z0, ω, φ, κ (gon), c, x0, y0 (pixels), k1."""
+    pose = Pose.from_angles(CENTER + change[:3], np.radians(0.9 * (ANGLES + change[3:6])))
+    interior = Interior.digital(SIZE, (FOCAL + change[6],) * 2, (change[7], change[8]))
+    return FrameCamera(interior, Brown(k1=K1 + change[9]), pose)
+
+
+def image_covariance(covariance: np.ndarray) -> np.ndarray:
+    """Covariances (n, 2, 2) of image points by central differences of the camera itself."""
+    steps = 0.01 * np.sqrt(np.diag(covariance)) + 1e-300
+    J = [
+        (project(camera_at(h * e), XYZ) - project(camera_at(-h * e), XYZ)) / (2 * h) for e, h in zip(np.eye(10), steps)
+    ]
+    D = np.stack(J, axis=-1)
+    return D @ covariance @ np.swapaxes(D, 1, 2)
+
+
+def joint_covariance() -> np.ndarray:
+    """Position and angles nearly make up for each other, as in every block."""
+    rng = np.random.default_rng(4)
+    sigma = np.array([0.3, 0.4, 0.1, 0.015, 0.012, 0.003, 2.0, 1.5, 1.0, 2e-4])
+    L = np.eye(10) + np.tril(rng.normal(0, 0.2, (10, 10)), -1)
+    L[4, 0], L[3, 1] = 30.0, -30.0
+    R = L @ L.T
+    d = np.sqrt(np.diag(R))
+    return R / np.outer(d, d) * np.outer(sigma, sigma)
+
+
+@pytest.mark.parametrize("count", [6, 10])
+def test_what_is_written_is_what_counts(tmp_path, count: int) -> None:
+    covariance = np.zeros((10, 10))
+    covariance[:count, :count] = joint_covariance()[:count, :count]
+    entries = stated_accuracy(covariance[:count, :count])
+    sigma = dict(zip(("c", "x0", "y0", "k1"), np.sqrt(np.diag(covariance))[6:].tolist()))
+    loaded = project_with(tmp_path, entries, {"sigma": sigma} if count > 6 else None)
+    errors = source_errors(loaded, loaded.images[0], ground_of(loaded), camera_at(np.zeros(10)), 0.0)
+    D = np.stack([cause.displacement(XYZ) for cause in errors.causes], axis=-1)
+    np.testing.assert_allclose(D @ np.swapaxes(D, 1, 2), image_covariance(covariance), rtol=2e-3, atol=1e-3)
+
+
+def test_uncorrelated_errors_have_names(tmp_path) -> None:
+    stated = {"sigma_center": [0.1, 0.2, 0.3], "sigma_angles": [0.01, 0.02, 0.03]}
+    loaded = project_with(tmp_path, stated, {"sigma": {"c": 2.0, "k1": 1e-4}})
+    errors = source_errors(loaded, loaded.images[0], ground_of(loaded), camera_at(np.zeros(10)), 0.0)
+    names = {cause.name for cause in errors.causes}
+    assert names == {"X0", "Y0", "Z0", "omega", "phi", "kappa", "camera c", "camera k1"}
+    D = np.stack([cause.displacement(XYZ) for cause in errors.causes], axis=-1)
+    sigma = np.array([0.1, 0.2, 0.3, 0.01, 0.02, 0.03, 2.0, 0.0, 0.0, 1e-4])
+    np.testing.assert_allclose(D @ np.swapaxes(D, 1, 2), image_covariance(np.diag(sigma**2)), rtol=1e-3, atol=1e-6)
+
+
+def test_what_is_not_known_is_said(tmp_path) -> None:
+    loaded = project_with(tmp_path, {})
+    with pytest.raises(InputError, match=r"'a'.*photoplan adjust.*sigma_center"):
+        source_errors(loaded, loaded.images[0], ground_of(loaded), camera_at(np.zeros(10)), 0.0)
+    with pytest.raises(InputError, match=r"`sigma` \(metres\) in \[terrain\]"):
+        height_errors(loaded)
+    stated = {"sigma_center": [0.1, 0.2, 0.3], "sigma_angles": [0.01, 0.02, 0.03]}
+    for image, camera, match in (
+        ({**stated, "correlation": [0.0] * 14}, None, "14 numbers; 15"),
+        ({**stated, "correlation": [1.0, 1.0, -1.0, *[0.0] * 12]}, None, "no covariance"),
+        (stated, {"sigma": {"k9": 1.0}}, "'k9'"),
+    ):
+        loaded = project_with(tmp_path, image, camera)
+        with pytest.raises(InputError, match=match):
+            source_errors(loaded, loaded.images[0], ground_of(loaded), camera_at(np.zeros(10)), 0.0)
+    with pytest.raises(InputError, match="correlation goes with"):
+        project_with(tmp_path, {"correlation": [0.0] * 15})
+
+
+def test_terrain_states_its_own(tmp_path) -> None:
+    assert height_errors(project_with(tmp_path, {}, terrain={"sigma": 0.25})) == StatedHeightErrors(0.25)
