@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tools.function_surface import FunctionSurface
-from tools.resolution import displacement_by_height, displacement_by_kappa, displacement_by_tilt
 from tools.source_errors import moved, pose_errors
 
 from photoplan.cameras.base import project
@@ -19,6 +18,7 @@ from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
 from photoplan.plan.accuracy import Cause, SourceErrors, figures_at, resampling_sigma, tile_accuracy
+from photoplan.plan.budget import displacement_by_height, displacement_by_kappa, displacement_by_tilt
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.monoplot import MonoplotErrors, monoplot
 

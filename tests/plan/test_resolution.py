@@ -5,22 +5,24 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from tools.resolution import (
-    admissible_height_error,
-    admissible_shift,
     curvature_displacement,
-    displacement_by_height,
-    displacement_by_kappa,
-    displacement_by_shift,
-    displacement_by_tilt,
     megabytes,
     on_map,
-    orientation_effect,
     resolution_on_ground,
     sampling_interval,
     scan_bytes,
 )
 
 from photoplan.errors import UsageError
+from photoplan.plan.budget import (
+    admissible_height_error,
+    admissible_shift,
+    displacement_by_height,
+    displacement_by_kappa,
+    displacement_by_shift,
+    displacement_by_tilt,
+    orientation_effect,
+)
 
 GON = np.pi / 200
 

@@ -101,7 +101,7 @@ def test_what_is_not_known_is_said(tmp_path) -> None:
     loaded = project_with(tmp_path, {})
     with pytest.raises(InputError, match=r"'a'.*photoplan adjust.*sigma_center"):
         source_errors(loaded, loaded.images[0], ground_of(loaded), camera_at(np.zeros(10)), 0.0)
-    with pytest.raises(InputError, match=r"`sigma` \(metres\) in \[terrain\]"):
+    with pytest.raises(InputError, match=r"sigma = METRES in \[terrain\]"):
         height_errors(loaded)
     stated = {"sigma_center": [0.1, 0.2, 0.3], "sigma_angles": [0.01, 0.02, 0.03]}
     for image, camera, match in (

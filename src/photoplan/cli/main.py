@@ -28,6 +28,7 @@ VERBS = {
     "resect": "Orient single images by control points.",
     "adjust": "Adjust a block of images (bundle adjustment).",
     "check": "Validate a project and print what to expect of it.",
+    "budget": "What limits the accuracy of products, cause by cause.",
     "ortho": "Make orthophotos.",
     "run": "Execute a plan written by `ortho --plan`.",
     "dtm": "Terrain models: build, sample, contours, volumes …",

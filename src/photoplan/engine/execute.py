@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
@@ -14,11 +14,12 @@ from photoplan.engine.run import Made, Output
 from photoplan.geometry.grid import Window
 from photoplan.kernels.position import ALL_MINE
 from photoplan.kernels.rectify import rectify_tile
+from photoplan.plan.accuracy import DepthErrors, SourceErrors, radial_counts, tile_accuracy
 from photoplan.plan.product import CompiledTile, Layer, ProductPlan, compile_tile
 from photoplan.plan.tiles import Tile
 from photoplan.surfaces.base import Surface
 
-OutputName = Literal["picture", "hidden", "sources"]
+OutputName = Literal["picture", "hidden", "sources", "accuracy"]
 
 #: A window of the source larger than this (bytes as read) is not read at once; its tile is executed in parts.
 MOST_SOURCE_BYTES = 48 * 2**20
@@ -164,6 +165,28 @@ class Address(Protocol):
         ...
 
 
+class KnownErrors(Protocol):
+    """What is known of the errors of sources and surface."""
+
+    @property
+    def depth(self) -> DepthErrors:
+        """Of the surface."""
+        ...
+
+    @property
+    def sources(self) -> Mapping[int, SourceErrors]:
+        """By row of the table of sources."""
+        ...
+
+
+class ErrorsAddress(Protocol):
+    """How a worker opens what is known of errors: small, and pickles."""
+
+    def open(self) -> KnownErrors:
+        """Errors of all sources; each is made when it is asked for, and kept for the next tile."""
+        ...
+
+
 @dataclass(frozen=True)
 class RenderJob:
     """What a worker is told once of a product that is resampled."""
@@ -174,17 +197,35 @@ class RenderJob:
     kernel: str
     outputs: tuple[OutputName, ...] = ("picture",)
     """What a tile gives, in the order of the sinks: its ``picture``; what is ``hidden``, 1, or 0 for what is seen, not
-    valid beyond the images; of the ``sources``, the row in their table, plus one, that painted a pixel."""
+    valid beyond the images; of the ``sources``, the row in their table, plus one, that painted a pixel; of the
+    ``accuracy``, the bands of `photoplan.plan.accuracy`."""
+    errors: ErrorsAddress | None = None
+    """Needed for the output ``accuracy``."""
 
     def __call__(self, tile: Tile) -> Made:
         """Outputs of a tile, and its figures: of its anchors, and how many pixels are hidden or in no image if somebody
         has asked."""
         opened = self.address.open()
         painted = render(self.product, tile, opened.sources, opened.surface, self.kernel)
-        record: dict[str, float] = {"worst_residual": painted.residual, "cells": painted.cells}
+        record: dict[str, Any] = {"worst_residual": painted.residual, "cells": painted.cells}
         if painted.hidden is not None:
             record |= {"hidden": int(np.count_nonzero(painted.hidden)), "bare": painted.bare}
-        return Made(tuple(_OUTPUTS[name](painted) for name in self.outputs), record)
+        made = {name: find(painted) for name, find in _OUTPUTS.items()}
+        if self.errors is not None:
+            made["accuracy"] = accuracy = self._accuracy(tile, painted, opened.surface, self.errors.open())
+            record |= {} if accuracy is None else radial_counts(accuracy[0])
+        return Made(tuple(made[name] for name in self.outputs), record)
+
+    def _accuracy(self, tile: Tile, painted: Painted, surface: Surface, errors: KnownErrors) -> Output | None:
+        """How exactly lies what is painted."""
+        if painted.valid is None:
+            return None
+        owner = painted.owner
+        if owner is None:
+            owner = painted.valid * np.uint16(tile.sources[0] + 1)
+        found = tile_accuracy(self.product.target, tile.window, surface, errors.depth, errors.sources, owner)
+        known = np.isfinite(found[0])
+        return (found, known) if known.any() else None
 
 
 def _picture(painted: Painted) -> Output | None:

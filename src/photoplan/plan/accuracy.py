@@ -12,7 +12,7 @@ tile and computed at nodes; depth, slope and error of the depth are those of eve
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,6 +39,8 @@ BANDS = (
 _TOLERANCE = 0.01
 #: Most nodes along u or v, and along the depth.
 _MOST_NODES = (33, 9)
+#: Classes of errors of position, and the powers of ten of metres between which they lie.
+_CLASSES, _COUNTED = 400, (-5.0, 3.0)
 #: Cycles per pixel at which the position of a resampled pattern is judged: half of what an image can hold.
 _FREQUENCY = 0.25
 
@@ -227,6 +229,22 @@ def _miss(nodes: NDArray[np.float64], axis: int) -> float:
     return float(np.nan_to_num(miss / scale).max(initial=0.0))
 
 
+def radial_counts(accuracy: NDArray[np.float32]) -> dict[str, list[int]]:
+    """How many pixels have which error of position √(σ_X² + σ_Y²): tiles' counts add up, medians do not."""
+    radial = np.hypot(accuracy[0], accuracy[1])
+    log = np.log10(np.clip(radial[np.isfinite(radial)], 10.0 ** _COUNTED[0], 10.0 ** _COUNTED[1]))
+    counts = np.histogram(log, _CLASSES, _COUNTED)[0]
+    return {"radial_errors": counts.tolist()}
+
+
+def radial_error(counts: Sequence[int], share: float) -> float:
+    """Error of position, metres, that a share of the counted pixels does not exceed, to 2 %; NaN where none is."""
+    if not sum(counts):
+        return float("nan")
+    below = np.concatenate([[0.0], np.cumsum(counts) / sum(counts)])
+    return float(10.0 ** np.interp(share, below, np.linspace(*_COUNTED, _CLASSES + 1)))
+
+
 def resampling_sigma(kernel: str) -> float:
     """Standard deviation of the position of what a kernel resamples, pixels of the source.
 
@@ -240,3 +258,19 @@ def resampling_sigma(kernel: str) -> float:
     wave = np.exp(2j * np.pi * _FREQUENCY * (offsets - place[:, None]))
     phase = np.angle((weights.weights(place) * wave).sum(axis=1))
     return float(np.sqrt(np.mean((phase / (2 * np.pi * _FREQUENCY)) ** 2)))
+
+
+def in_image(kernel: str, tolerance: float, scale: float = 1.0) -> float:
+    """Standard deviation of image coordinates by resampling and by anchors within a tolerance, pixels.
+
+    Parameters
+    ----------
+    kernel : str
+        Resampling kernel; empty: none.
+    tolerance : float
+        Largest residual of the anchors, pixels; all residuals up to it count as equally likely.
+    scale : float
+        Pixels of the source that the kernel is widened to.
+    """
+    own = resampling_sigma(kernel) * max(scale, 1.0) if kernel else 0.0
+    return float(np.hypot(own, tolerance / np.sqrt(3)))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +15,11 @@ from photoplan.cameras.base import Projection
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.camera.model import CameraEntry
+from photoplan.io.project.file import parse_project
 from photoplan.io.project.model import Image, Project
 from photoplan.plan.accuracy import Cause, SourceErrors
 from photoplan.project.open_terrain import open_terrain
-from photoplan.project.scene import Ground, camera_of
+from photoplan.project.scene import Ground, SceneAddress, camera_of
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.targets.base import Target
 
@@ -116,6 +120,53 @@ def _moved(image: Image, camera: CameraEntry, change: NDArray[np.float64]) -> tu
 
 
 @dataclass(frozen=True)
+class ScenesErrors(Mapping[int, SourceErrors]):
+    """What is known of the errors of some images over one ground; made from it where it is opened."""
+
+    scenes: tuple[SceneAddress, ...]
+    """One for each row of the table of sources."""
+    in_image: tuple[float, ...]
+    """Standard deviation of image coordinates of each, pixels."""
+
+    @property
+    def sources(self) -> Mapping[int, SourceErrors]:
+        """By row of the table of sources."""
+        return self
+
+    @property
+    def depth(self) -> StatedHeightErrors | ModelHeightErrors:
+        """Of the ground."""
+        return _heights_of(self.scenes[0])
+
+    def open(self) -> ScenesErrors:
+        """Itself: what it opens is kept."""
+        return self
+
+    def __getitem__(self, row: int) -> SourceErrors:
+        if not 0 <= row < len(self.scenes):
+            raise KeyError(row)
+        return _errors_of(self.scenes[row], self.in_image[row])
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(range(len(self.scenes)))
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+
+@lru_cache(maxsize=64)
+def _errors_of(address: SceneAddress, in_image: float) -> SourceErrors:
+    scene = address.open()
+    project = parse_project(json.loads(address.text), Path(address.folder), "project")
+    return source_errors(project, project.images[0], scene.ground, scene.camera, in_image)
+
+
+@lru_cache(maxsize=8)
+def _heights_of(address: SceneAddress) -> StatedHeightErrors | ModelHeightErrors:
+    return height_errors(parse_project(json.loads(address.text), Path(address.folder), "project"))
+
+
+@dataclass(frozen=True)
 class StatedHeightErrors:
     """One standard deviation of the heights everywhere, metres."""
 
@@ -153,6 +204,6 @@ def height_errors(project: Project) -> StatedHeightErrors | ModelHeightErrors:
         if isinstance(placed.surface, HybridSurface):
             return ModelHeightErrors(placed.surface)
     raise InputError(
-        "nothing is known of the accuracy of the terrain's heights: state `sigma` (metres) in [terrain], or take a "
+        "nothing is known of the accuracy of the terrain's heights: state sigma = METRES in [terrain], or take a "
         "terrain model of `photoplan dtm build`, which holds it"
     )

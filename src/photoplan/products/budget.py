@@ -1,0 +1,296 @@
+"""Error budgets: what limits the position of products, cause by cause, before the flight or for a project."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.base import CentralCamera
+from photoplan.errors import GeometryError, InputError, UsageError
+from photoplan.geometry.grid import MapGrid
+from photoplan.io.project.file import load_project, parse_project
+from photoplan.io.project.model import Project
+from photoplan.kernels.weights import KERNELS
+from photoplan.plan.accuracy import SourceErrors, figures_at, in_image, resampling_sigma
+from photoplan.project.scene import Ground, camera_without_pixels, ground_of
+from photoplan.project.uncertain import StatedHeightErrors, height_errors, source_errors
+from photoplan.targets.map import MapTarget
+
+Triple = tuple[float, float, float]
+#: Places of an image for which a budget is made.
+PLACES = ("middle", "edge", "corner")
+#: What is not an error of the project, but of making the product.
+TERRAIN, RESAMPLING, ANCHORS = "terrain", "resampling", "anchors"
+#: A vertical image that is stated by numbers lies here; the system does not matter.
+_CRS, _STATION = "EPSG:32633", (500_000.0, 5_000_000.0)
+#: Sides of the map of an image.
+_MAP = 41
+
+
+@dataclass(frozen=True)
+class BudgetRequest:
+    """What is asked: a project, or the numbers of a flight."""
+
+    project: Path | None = None
+    images: tuple[str, ...] | None = None
+    """Names of its images; None: all."""
+    camera_constant: float | None = None
+    """Millimetres; with `format`, `pixel` and `height` for a vertical image without a project."""
+    format: tuple[float, float] = (230.0, 230.0)
+    """Width and height of the image, millimetres."""
+    pixel: float = 15.0
+    """Side of its pixels, µm."""
+    height: float | None = None
+    """Flying height above ground, metres."""
+    sigma_terrain: float | None = None
+    """Metres; goes before what the project states, as the next two do."""
+    sigma_center: Triple | None = None
+    """Of X0, Y0, Z0, metres."""
+    sigma_angles: Triple | None = None
+    """Of the angles, in `angle_unit`, or in the project's."""
+    angle_unit: str = "gon"
+    kernel: str = "bicubic"
+    tolerance: float = 0.02
+    """Of the anchors, pixels."""
+
+    def __post_init__(self) -> None:
+        if self.kernel not in KERNELS:
+            raise UsageError(f"kernel {self.kernel!r}; allowed are {', '.join(KERNELS)}")
+        if (self.project is None) == (self.camera_constant is None):
+            raise UsageError(
+                "a budget is that of a project or of numbers: give PROJECT, or `camera_constant` and `height`"
+            )
+        if self.project is None and self.height is None:
+            raise UsageError("a budget of numbers needs the flying height above ground: give `height` METRES")
+        numbers = [self.camera_constant, self.height, *self.format, self.pixel, self.tolerance]
+        if not all(n is None or (np.isfinite(n) and n > 0) for n in numbers):
+            raise UsageError(f"numbers {numbers} of the flight; positive ones are needed")
+
+
+@dataclass(frozen=True, eq=False)
+class ImageBudget:
+    """Standard deviations of position √(σ_X² + σ_Y²) on level ground that an image gives, metres."""
+
+    image: str
+    gsd: float
+    """Side of an image pixel on the ground in the middle, metres."""
+    parts: dict[str, NDArray[np.float64]]
+    """Contribution of every cause at `PLACES`."""
+    total: NDArray[np.float64]
+    """Of all, at `PLACES`."""
+    map: NDArray[np.float64]
+    """The total over the image, rows downwards."""
+
+    @property
+    def limits(self) -> tuple[tuple[str, float], ...]:
+        """At each place the largest contribution and its share of the variance."""
+        names, values = list(self.parts), np.array(list(self.parts.values()))
+        largest = values.argmax(axis=0)
+        shares = (values.max(axis=0) / np.maximum(self.total, 1e-300)) ** 2
+        return tuple((names[k], float(share)) for k, share in zip(largest, shares))
+
+    def json_fields(self) -> dict[str, Any]:
+        """Figures in metres, by cause and place."""
+        return {
+            "image": self.image,
+            "gsd_m": self.gsd,
+            "contributions_m": {name: dict(zip(PLACES, values.tolist())) for name, values in self.parts.items()},
+            "total_m": dict(zip(PLACES, self.total.tolist())),
+            "limited_by": {place: {"cause": n, "share": s} for place, (n, s) in zip(PLACES, self.limits)},
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Budget:
+    """Budgets of images, and what stands for all of them."""
+
+    images: tuple[ImageBudget, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def typical(self) -> ImageBudget:
+        """The image with the median error in the corner."""
+        order = np.argsort([image.total[-1] for image in self.images])
+        return self.images[int(order[(len(order) - 1) // 2])]
+
+    @property
+    def worst(self) -> ImageBudget:
+        """The image with the largest error in the corner."""
+        return max(self.images, key=lambda image: float(image.total[-1]))
+
+    def json_fields(self) -> dict[str, Any]:
+        """All images."""
+        return {"images": self.images, "typical": self.typical.image, "worst": self.worst.image, "notes": self.notes}
+
+    def __str__(self) -> str:
+        shown = [self.typical] if len(self.images) == 1 else [self.typical, self.worst]
+        heads = [
+            f"{len(self.images)} images; the typical one, {self.typical.image}",
+            f"the worst one, {self.worst.image}",
+        ]
+        lines = []
+        for head, image in zip(heads if len(self.images) > 1 else [self.typical.image], shown):
+            lines += [f"{head} · GSD {image.gsd:.3g} m", *_table(image)]
+        return "\n".join(lines)
+
+
+def _table(image: ImageBudget) -> list[str]:
+    wide = max(22, *(len(name) for name in image.parts))
+    lines = [f"  {'standard deviation, m':<{wide}}" + "".join(f"{place:>10}" for place in PLACES)]
+    for name, values in {**image.parts, "total": image.total}.items():
+        lines.append(f"  {name:<{wide}}" + "".join(f"{v:>10.3f}" for v in values))
+    lines.append(f"  {'total in image pixels':<{wide}}" + "".join(f"{v / image.gsd:>10.2f}" for v in image.total))
+    limits = (f"{place}: {name} ({share:.0%})" for place, (name, share) in zip(PLACES, image.limits))
+    return [*lines, "  limited by  " + " · ".join(limits)]
+
+
+def make_budget(request: BudgetRequest) -> Budget:
+    """Error budget of every image of a project, or of a vertical image that numbers state.
+
+    Raises
+    ------
+    InputError
+        Nothing is known of an error that counts: the message says how to state it.
+    GeometryError
+        An image does not look down on its ground.
+    """
+    project = _of_numbers(request) if request.project is None else load_project(request.project)
+    project, notes = _stated(project, request)
+    ground = ground_of(project)
+    heights = height_errors(project)
+    names = project.select(request.images)
+    if heights == StatedHeightErrors(0.0):
+        notes.append("the terrain counts as free of error")
+    budgets = tuple(_of_image(project, name, ground, heights, request) for name in names)
+    if any(project.image(name).correlation is None for name in names):
+        notes.append("position and angles count as independent: no correlation is stated")
+    return Budget(budgets, tuple(notes))
+
+
+def _of_numbers(request: BudgetRequest) -> Project:
+    """A project of one vertical image over level ground."""
+    side = request.pixel / 1000
+    size = [max(1, round(mm / side)) for mm in request.format]
+    assert request.height is not None
+    return parse_project(
+        {
+            "format": 1,
+            "crs": _CRS,
+            "terrain": {"height": 0.0, "height_system": "same"},
+            "orientation": {"height_system": "ellipsoidal", "angle_unit": request.angle_unit},
+            "cameras": {
+                "camera": {
+                    "type": "frame",
+                    "size": size,
+                    "camera_constant_mm": float(request.camera_constant or 0.0),
+                    "pixel_size_um": request.pixel,
+                }
+            },
+            "images": [
+                {
+                    "name": "vertical image",
+                    "file": "none.tif",
+                    "camera": "camera",
+                    "center": [*_STATION, float(request.height)],
+                    "angles": [0.0, 0.0, 0.0],
+                    "sigma_center": [0.0, 0.0, 0.0],
+                    "sigma_angles": [0.0, 0.0, 0.0],
+                }
+            ],
+        },
+        Path.cwd(),
+        "numbers",
+    )
+
+
+def _stated(project: Project, request: BudgetRequest) -> tuple[Project, list[str]]:
+    """The project with what the request states of accuracies; then orientations are not correlated."""
+    given = {"sigma_center": request.sigma_center, "sigma_angles": request.sigma_angles}
+    given = {name: value for name, value in given.items() if value is not None}
+    notes = []
+    if given:
+        images = tuple(i.model_copy(update={**given, "correlation": None}) for i in project.images)
+        project = project.model_copy(update={"images": images})
+    terrain = request.sigma_terrain
+    if terrain is None and request.project is None:
+        terrain = 0.0
+    if request.project is None and len(given) < 2:
+        missing = [name for name in ("sigma_center", "sigma_angles") if name not in given]
+        notes.append("free of error, as nothing is stated: " + ", ".join(f"`{name}`" for name in missing))
+    if terrain is not None:
+        project = project.model_copy(update={"terrain": project.ground.model_copy(update={"sigma": terrain})})
+    return project, notes
+
+
+def _of_image(project: Project, name: str, ground: Ground, heights: Any, request: BudgetRequest) -> ImageBudget:
+    camera = camera_without_pixels(project, name)
+    whole = source_errors(project, project.image(name), ground, camera, in_image(request.kernel, request.tolerance))
+    w, h = camera.size
+    level = _level(camera, ground, name)
+    far = [(w - 1) / 2, (h - 1) / 2]
+    edges = [(0.0, far[1]), (w - 1.0, far[1]), (far[0], 0.0), (far[0], h - 1.0)]
+    corners = [(x, y) for x in (0.0, w - 1.0) for y in (0.0, h - 1.0)]
+    xy = np.array([tuple(far), *edges, *corners])
+    columns, rows = np.meshgrid(np.linspace(0, w - 1, _MAP), np.linspace(0, h - 1, _MAP))
+    every = np.concatenate([xy, np.stack([columns.ravel(), rows.ravel()], axis=1)])
+    XY = _on_level(camera, every, level)
+    sigma = np.full(len(XY), heights.sigma) if isinstance(heights, StatedHeightErrors) else heights.surface.sigmas(XY)
+    sigma = np.where(np.isfinite(sigma), sigma, np.nanmedian(sigma) if np.isfinite(sigma).any() else np.nan)
+    parts: dict[str, NDArray[np.float64]] = {}
+    none = replace(whole, causes=(), image=0.0)
+    by_name: dict[str, SourceErrors] = {}
+    for cause in whole.causes:
+        before = by_name.get(cause.name, none)
+        by_name[cause.name] = replace(before, causes=(*before.causes, cause))
+    by_name[RESAMPLING] = replace(none, image=resampling_sigma(request.kernel))
+    by_name[ANCHORS] = replace(none, image=in_image("", request.tolerance))
+    runs, _ = _level_figures(none, XY, level)
+    parts[TERRAIN] = np.hypot(*runs.T) * sigma
+    for cause_name, errors in by_name.items():
+        parts[cause_name] = _level_figures(errors, XY, level)[1]
+    total = np.sqrt(sum(np.square(values) for values in parts.values()))
+    total = np.asarray(total, float)
+    if not np.isfinite(total[:9]).all():
+        raise GeometryError(
+            f"image {name!r}: does not look down on the ground everywhere; a budget is for such that do"
+        )
+    # The worst edge and the worst corner by the total.
+    at = [0, 1 + int(total[1:5].argmax()), 5 + int(total[5:9].argmax())]
+    middle = _level_figures(replace(none, image=np.sqrt(0.5)), XY[:1], level)[1]
+    kept = {cause: values[at] for cause, values in parts.items() if values[at].any()}
+    return ImageBudget(name, float(middle[0]), kept, total[at], total[9:].reshape(_MAP, _MAP))
+
+
+def _level(camera: CentralCamera, ground: Ground, name: str) -> float:
+    """Height of the ground below an image."""
+    height = float(ground.surface.heights(camera.center[:2]))
+    if not np.isfinite(height) and ground.bounds is not None:
+        low, high = ground.surface.height_range(np.array(ground.bounds))
+        height = float(low + high) / 2
+    if not height < camera.center[2]:
+        raise InputError(
+            f"image {name!r}: the ground below it is at {height:.0f} m, the camera at {camera.center[2]:.0f}"
+        )
+    return height
+
+
+def _on_level(camera: CentralCamera, xy: NDArray[np.float64], level: float) -> NDArray[np.float64]:
+    """Where image points lie on a level, (n, 2); NaN where they do not."""
+    origin, direction = camera.rays(xy, level)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = np.where(direction[:, 2] < 0, (level - origin[:, 2]) / direction[:, 2], np.nan)
+    return np.asarray((origin + along[:, None] * direction)[:, :2])
+
+
+def _level_figures(
+    errors: SourceErrors, XY: NDArray[np.float64], level: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Run of the rays per metre of height (n, 2), and the errors of position on level ground (n,), metres."""
+    grid = MapGrid(float(np.nanmin(XY[:, 0])), float(np.nanmax(XY[:, 1])), 1.0, 1, 1, _CRS)
+    uv = np.stack([XY[:, 0] - grid.left - 0.5, grid.top - 0.5 - XY[:, 1]], axis=1)
+    figures = figures_at(errors, MapTarget(grid), np.column_stack([uv, np.full(len(XY), level)]))
+    return figures[:, :2], np.sqrt(figures[:, 2] + figures[:, 4])
