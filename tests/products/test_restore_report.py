@@ -84,7 +84,7 @@ def test_an_exact_inverse_is_expected_to_lift_the_curve_to_that_of_whole_pixels(
     """MTF × response = MTF / transfer of the discrete spread function: for Gaussian blur it passes 1."""
     both = (sharpness(0.4), sharpness(0.5))
     scene = SceneStatistics(0.01, 0.05)
-    design = design_filter(*both, scene, DesignOptions("exact", "separable"))
+    design = design_filter(*both, (scene,), DesignOptions("exact", "separable"))
     pictures = axis_pictures(DesignedPart(None, None, 9, both, (), scene, design))
     for one, picture in zip(both, pictures):
         curve = one.modulation()

@@ -37,6 +37,19 @@ class TestCombine:
         assert np.ptp(apart.interval) < 6.0 * apart.sigma
         assert np.ptp(near.interval) < 0.75 * np.ptp(alone.interval)
 
+    @pytest.mark.parametrize("edges", [1, 2, 5])
+    def test_errors_that_are_known_from_few_blocks_make_intervals_wider(self, edges: int) -> None:
+        """Of seven degrees of freedom each: with the normal distribution's factor 91 % and not 95 % for one edge."""
+        rng = np.random.default_rng(edges)
+        inside, count = 0, 2000 // edges
+        for _ in range(count):
+            sigma = rng.uniform(0.004, 0.02, edges)
+            stated = sigma * np.sqrt(rng.chisquare(7, edges) / 7)
+            low, high = combine((0.3 + rng.normal(0, sigma)).tolist(), stated.tolist(), freedom=7).interval
+            inside += low <= 0.3 <= high
+        print(f"{edges} edges: {100 * inside / count:.1f} % covered")
+        assert 0.935 <= inside / count <= 0.98
+
     def test_a_gross_error_counts_little(self) -> None:
         rng = np.random.default_rng(1)
         values = (0.3 + rng.normal(0, 0.01, 15)).tolist()
@@ -67,6 +80,7 @@ class TestCombine:
     def test_sigma_of_an_interval_and_quantiles(self) -> None:
         assert sigma_of_interval((0.3 - 1.959964, 0.3 + 1.959964)) == pytest.approx(1.0, abs=1e-6)
         assert math.isnan(sigma_of_interval((math.nan, 1.0)))
+        assert sigma_of_interval((0.3 - 2.3646, 0.3 + 2.3646), freedom=7) == pytest.approx(1.0, abs=1e-4)
         assert quantiles([1.0, math.nan, 3.0], (0.5,)) == [2.0]
         assert math.isnan(quantiles([math.nan], (0.5,))[0])
 

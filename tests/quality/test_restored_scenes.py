@@ -68,14 +68,14 @@ def test_least_squares_for_edges_in_any_place(sigma, bound):
     curve = sharpness(sigma).modulation()
     scene = fit_scene(block_spectra(image).mean(axis=0), curve_transfer(curve, curve), (0.1, 2.0))
     assert scene.noise == pytest.approx(NOISE, rel=0.1)
-    design = design_filter(sharpness(sigma), sharpness(sigma), scene)
+    design = design_filter(sharpness(sigma), sharpness(sigma), (scene,))
     left = rms(convolve(image, design.kernel, mode="nearest") - object_)
     before = rms(image - object_)
     print(f"sigma {sigma}: rms {before:.2f} -> {left:.2f} ({left / before:.2f}), noise {design.noise_gain:.1f} times")
     assert left < bound * before
     for factor in (0.3, 3.0):
         other = replace(scene, contrast=scene.contrast * factor)
-        kernel = design_filter(sharpness(sigma), sharpness(sigma), other, DesignOptions("regularised")).kernel
+        kernel = design_filter(sharpness(sigma), sharpness(sigma), (other,), DesignOptions("regularised")).kernel
         assert left < rms(convolve(image, kernel, mode="nearest") - object_)
     if sigma < 0.8:
         exact = design_filter(sharpness(sigma), sharpness(sigma), options=DesignOptions("exact"))
@@ -88,7 +88,7 @@ def test_where_the_condition_does_not_hold():
         design_filter(wide, wide, options=DesignOptions("exact"))
     with pytest.raises(InputError, match="noise and the contrast"):
         design_filter(wide, wide)
-    design = design_filter(wide, wide, SceneStatistics(0.5, 8.0))
+    design = design_filter(wide, wide, (SceneStatistics(0.5, 8.0),))
     print(design.reason)
     assert design.method == "regularised"
     assert "A/Z = 0.550" in design.reason
@@ -97,8 +97,8 @@ def test_where_the_condition_does_not_hold():
 def test_designed_filters_keep_brightness_and_directions():
     x, y = sharpness(0.4), sharpness(0.6)
     for options in (DesignOptions("exact"), DesignOptions("regularised"), DesignOptions("exact", "separable")):
-        kernel = design_filter(x, y, SceneStatistics(0.5, 8.0), options).kernel
-        turned = design_filter(y, x, SceneStatistics(0.5, 8.0), options).kernel
+        kernel = design_filter(x, y, (SceneStatistics(0.5, 8.0),), options).kernel
+        turned = design_filter(y, x, (SceneStatistics(0.5, 8.0),), options).kernel
         assert kernel.sum() == pytest.approx(1.0)
         assert turned == pytest.approx(kernel.T, abs=1e-9)
         # The blurred direction is sharpened more.

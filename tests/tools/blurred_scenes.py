@@ -77,6 +77,42 @@ def fractal(rng, slope, size=SIZE):
     return np.clip(125.0 + 35.0 * scene / scene.std(), 20.0, 230.0)
 
 
+def white_texture(rng, size=SIZE, highest=1.0):
+    """The same amplitude at all frequencies up to the highest, cycles per pixel; 20 to 230."""
+    side = size * FINE
+    frequency = np.hypot(np.fft.fftfreq(side, 1 / FINE)[:, None], np.fft.rfftfreq(side, 1 / FINE))
+    scene = np.fft.irfft2(np.fft.rfft2(rng.normal(size=(side, side))) * (frequency < highest), s=(side, side))
+    return np.clip(125.0 + 35.0 * scene / scene.std(), 20.0, 230.0)
+
+
+def leaves(rng, size=SIZE):
+    """Ellipses of all sizes from 0.6 to 12 pixels (by the inverse cube) that cover each other, as foliage does."""
+    side = size * FINE
+    scene = np.full((side, side), 120.0)
+    count = round(0.5 * size**2)
+    radius = (0.6**-2 + rng.uniform(size=count) * (12.0**-2 - 0.6**-2)) ** -0.5
+    for reach in radius:
+        (y, x), narrow, angle = rng.uniform(0, size, 2), rng.uniform(0.4, 1.0), rng.uniform(0, np.pi)
+        rows, cols = (slice(max(0, int((at - reach) * FINE)), int((at + reach) * FINE) + 1) for at in (y, x))
+        row, col = np.ogrid[:side, :side]
+        row, col = row[rows] / FINE - y, col[:, cols] / FINE - x
+        along = (col * np.cos(angle) + row * np.sin(angle)) / reach
+        across = (row * np.cos(angle) - col * np.sin(angle)) / (reach * narrow)
+        scene[rows, cols][along**2 + across**2 < 1.0] = np.clip(rng.normal(120.0, 45.0), 10.0, 245.0)
+    return scene
+
+
+def sharpened(image, optics, amount, sigma):
+    """The image plus so much of its difference to a Gaussian blur, and the transfer function that it has then."""
+
+    def enhanced(frequency):
+        return 1.0 + amount * (1.0 - np.exp(-2 * (np.pi * sigma * frequency) ** 2))
+
+    v, u = np.fft.fftfreq(image.shape[0])[:, None], np.fft.rfftfreq(image.shape[1])
+    result = np.fft.irfft2(np.fft.rfft2(image) * enhanced(np.hypot(u, v)), s=image.shape)
+    return result, lambda frequency: optics(frequency) * enhanced(abs((frequency + 0.5) % 1.0 - 0.5))
+
+
 def taken(scene, optics, rng, noise=NOISE):
     """The image: blur, a pixel's aperture, sampled in the middle of the pixels, noise; and the object.
 

@@ -37,11 +37,13 @@ _OPTIONS = (
                  help="Filters for N by N parts of the field, interpolated between them."),
     click.option("--per-band", is_flag=True, help="A measured filter for each band."),
     click.option("--least-length", type=click.FloatRange(8.0, 10_000.0), metavar="PX", help="Of an edge [20]."),
+    click.option("--noise", type=click.FloatRange(0.0), metavar="SIGMA",
+                 help="Standard deviation in light, full scale 1 [found in the images]."),
     click.option("--save-filter", type=click.Path(path_type=Path), metavar="FILE.toml",
                  help="Where a measured filter is kept [restoration_filter.toml by the results]."),
 )  # fmt: skip
 #: Options that a measurement alone can follow.
-_MEASURED = ("method", "rotation", "size", "cells", "per_band", "least_length", "save_filter")
+_MEASURED = ("method", "rotation", "size", "cells", "per_band", "least_length", "noise", "save_filter")
 
 
 def filter_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -74,6 +76,7 @@ def filter_request(images: tuple[Path, ...], options: dict[str, Any]) -> FilterR
             asked["per_band"],
             asked["cells"],
             least_length=asked["least_length"],
+            noise=asked["noise"],
             options=design,
         )
     )
@@ -240,7 +243,7 @@ def _after(image: RestoredImage) -> list[str]:
         if image.dtype == "uint8" and above:
             way_out += ", --dtype uint16 those above 255"
         lines.append(
-            f"warning: {image.image}: {below} pixels fell below and {above} above what the type holds "
+            f"warning: {image.image}: {below} values fell below and {above} above what the type holds "
             f"({image.clipped_share:.2%}) and were clipped; {way_out}"
         )
     if image.picture is not None:

@@ -19,8 +19,9 @@ from photoplan.quality.edges.groups import (
     sigma_of_interval,
 )
 from photoplan.quality.edges.koelbl import EdgeSpread, spread_of_edge
+from photoplan.quality.edges.response import EdgeMeasurement
 
-#: Slanted edges from which on those along rows and columns do not count in a mean.
+#: Edges that show all phases of a pixel from which on others do not count in a mean.
 ENOUGH = 3
 #: Shares of light that means are given for: Z, A, B and the next.
 SHARES = 4
@@ -85,9 +86,9 @@ def _group(
         flight=edges[0].flight if direction is not None else None,
         cell=None if where is None else where[0],
         bounds=None if where is None else where[1],
-        mtf50=combine([m.mtf50 for m in own], [sigma_of_interval(m.mtf50_interval) for m in own], least=0.0),
-        mtf10=combine([m.mtf10 for m in own], [sigma_of_interval(m.mtf10_interval) for m in own], least=0.0),
-        fwhm=combine([m.fwhm for m in own], [sigma_of_interval(m.fwhm_interval) for m in own], least=0.0),
+        mtf50=_mean([(m.mtf50, m.mtf50_interval) for m in own], own),
+        mtf10=_mean([(m.mtf10, m.mtf10_interval) for m in own], own),
+        fwhm=_mean([(m.fwhm, m.fwhm_interval) for m in own], own),
         overshoot=combine([m.overshoot for m in own], [m.overshoot_sigma for m in own], least=0.0),
         undershoot=combine([m.undershoot for m in own], [m.undershoot_sigma for m in own], least=0.0),
         mtf50_range=(low, middle, high),
@@ -96,6 +97,13 @@ def _group(
         spread=tuple(_coefficient(spreads, k) for k in range(SHARES)) if direction is not None and spreads else (),
         laboratory=beside,
     )
+
+
+def _mean(figures: Sequence[tuple[float, tuple[float, float]]], edges: Sequence[EdgeMeasurement]) -> CombinedValue:
+    """Mean of figures that are known by intervals."""
+    sigmas = [sigma_of_interval(i, m.confidence, m.freedom) for (_, i), m in zip(figures, edges, strict=True)]
+    freedom = float(np.mean([m.freedom for m in edges]))
+    return combine([value for value, _ in figures], sigmas, freedom=freedom, least=0.0)
 
 
 def _coefficient(spreads: Sequence[EdgeSpread], place: int) -> CombinedValue:

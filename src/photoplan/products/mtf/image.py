@@ -20,6 +20,8 @@ from photoplan.quality.linearise import Linearisation
 #: Channel 0.
 LUMINANCE = 0
 _WEIGHTS = np.array([0.2126, 0.7152, 0.0722])
+#: Weights of red, green and blue in the luminance of JPEG (ITU-R BT.601).
+_LUMA = (0.299, 0.587, 0.114)
 """Of red, green and blue light (ITU-R BT.709)."""
 _CLIPS = tuple(float(2**bits - 1) for bits in (8, 10, 11, 12, 13, 14, 15, 16))
 """Values with which sensors of so many bits end."""
@@ -94,6 +96,13 @@ class LightImage:
         span = self._span(channel)
         grey, valid, saturated = self._light(window, channel)
         return EdgePicture(grey, valid, saturated, span)
+
+    def stored(self, window: Window, channel: int) -> NDArray[np.float64]:
+        """Grey values of a channel in a window as stored; of colours the luminance that compression works on."""
+        pixels, _ = self.reader.read(window)
+        if self.reader.bands < 3:
+            return pixels[max(channel, 1) - 1].astype(np.float64)
+        return np.tensordot(_LUMA, pixels[:3].astype(np.float64), 1)
 
     def _light(
         self, window: Window, channel: int

@@ -97,12 +97,13 @@ def measure_image(name: tuple[str, Path], image: LightImage, how: Measuring, adv
     if not first:
         raise InputError(_nothing(image, rejected, how, refusals))
     notes = [f"{n} edge{'s were' if n > 1 else ' was'} refused: {why}" for why, n in refusals.most_common(3)]
-    aligned = sum(edge.measured.sampling != "super-sampled" for edge in first)
-    if aligned:
-        used = "they do not count in means" if len(first) - aligned >= ENOUGH else "few others are there, so they count"
+    few = [edge for edge in first if edge.measured.sampling != "super-sampled"]
+    if few:
+        aligned = sum(edge.aligned for edge in few)
         notes.append(
-            f"{aligned} of {len(first)} edges are parallel to rows or columns: their profiles hold few positions "
-            f"within a pixel; {used}"
+            f"{len(few)} of {len(first)} edges show few positions within a pixel: {aligned} parallel to rows or "
+            f"columns, {len(few) - aligned} diagonal or short. They count only in means of directions and parts of the "
+            f"field with fewer than {ENOUGH} other edges"
         )
     enhancement = enhancement_of([edge.measured for edge in first])
     if enhancement.enhanced:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,19 +19,18 @@ from photoplan.products.mtf.run import MtfRequest, measure_mtf
 from photoplan.project.linearisation import linearisation_of
 from photoplan.quality.edges.response import EdgeMeasurement
 from photoplan.quality.edges.sharpness import LEAST_EDGES, sharpness_of
+from photoplan.quality.restoration.compression import BLOCK, kept_by_compression
 from photoplan.quality.restoration.design import Design, DesignOptions, Sharpness, design_filter
 from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
 from photoplan.quality.restoration.image_noise import block_noise, image_noise
 from photoplan.quality.restoration.regularised import curve_transfer
-from photoplan.quality.restoration.scene import SceneStatistics, Transfer, block_spectra, fit_scene
+from photoplan.quality.restoration.scene import SceneStatistics, block_spectra, scenes_of
 
 #: Windows of an image in which its contrast is looked for, in each direction, and their side.
 _WINDOWS = 5
 _SIDE = 256
 #: Share of the blocks of an image that must hold no saturated pixel, for the noise to be looked for in these alone.
 _CLEAN = 0.1
-#: The noise of an image, by that of its most even blocks: they may show scene besides, and compression clears them.
-_NOISE_RANGE = (0.1, 30.0)
 
 
 @dataclass(frozen=True)
@@ -50,11 +49,15 @@ class DesignRequest:
     """Edges of an image that are measured."""
     least_length: float | None = None
     """Of an edge, pixels; None: 20."""
+    noise: float | None = None
+    """Standard deviation of the white noise in the images' light; None: found in them."""
     options: DesignOptions = field(default_factory=DesignOptions)
 
     def __post_init__(self) -> None:
         if not 1 <= self.cells <= 15:
             raise UsageError(f"a field of {self.cells} × {self.cells} parts; allowed are 1 to 15")
+        if self.noise is not None and not 0.0 <= self.noise < float("inf"):
+            raise UsageError(f"`noise` {self.noise:g}; it is a standard deviation in light, 0 or more")
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +74,14 @@ class DesignedPart:
     """Along rows and along columns."""
     missing: tuple[str, ...]
     """``x`` or ``y`` where no edges show the sharpness along rows or columns and that of the other stands for it."""
-    scene: SceneStatistics
+    scenes: tuple[SceneStatistics, ...]
+    """What the images may show: more than one where noise and texture are not told apart."""
     design: Design
+
+    @property
+    def scene(self) -> SceneStatistics:
+        """What the filter is judged by."""
+        return self.design.scene or self.scenes[0]
 
     def facts(self) -> dict[str, Any]:
         """Figures for the filter's file."""
@@ -84,6 +93,7 @@ class DesignedPart:
             "contrast": self.scene.contrast,
             "exponent": round(self.scene.exponent, 3),
             "noise_smoothed": round(self.scene.smoothed, 3),
+            "texture": self.scene.texture,
             "mtf50_x": round(self.sharpness[0].modulation().mtf50, 4),
             "mtf50_y": round(self.sharpness[1].modulation().mtf50, 4),
             "spread_x": [round(float(v), 5) for v in self.sharpness[0].spread.side()],
@@ -220,12 +230,14 @@ def _designed(
     except InputError:
         if whole is None:
             raise
-        return DesignedPart(*place, 0, whole.sharpness, whole.missing, whole.scene, whole.design)
+        return DesignedPart(*place, 0, whole.sharpness, whole.missing, whole.scenes, whole.design)
     if whole is not None:
         x = whole.sharpness[0] if "x" in missing or x.doubt else x
         y = whole.sharpness[1] if "y" in missing or y.doubt else y
-    scene = whole.scene if whole is not None else spectrum.scene(curve_transfer(x.modulation(), y.modulation()))
-    return DesignedPart(*place, len(edges), (x, y), missing, scene, design_filter(x, y, scene, request.options))
+    transfer = curve_transfer(x.modulation(), y.modulation())
+    scenes = whole.scenes if whole is not None else scenes_of(spectrum.power, transfer, spectrum.noise, request.noise)
+    design = design_filter(x, y, scenes, request.options, spectrum.kept)
+    return DesignedPart(*place, len(edges), (x, y), missing, scenes, design)
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,10 +248,8 @@ class SceneSpectrum:
     """Mean spectrum of their blocks."""
     noise: float
     """Standard deviation in the most even blocks; 0 if there is none."""
-
-    def scene(self, transfer: Transfer) -> SceneStatistics:
-        """The scene, once the transfer function of the images is known."""
-        return fit_scene(self.power, transfer, (_NOISE_RANGE[0] * self.noise, _NOISE_RANGE[1] * self.noise))
+    kept: NDArray[np.float64]
+    """What compression has left of them, shape (8, 8)."""
 
 
 def _spectrum(images: Sequence[LightImage], channel: int) -> SceneSpectrum:
@@ -265,7 +275,17 @@ def _spectrum(images: Sequence[LightImage], channel: int) -> SceneSpectrum:
     count, total = sums[1] if sums[1][0] >= _CLEAN * sums[0][0] else sums[0]
     if count == 0 or not total.any():
         raise InputError("the images have no contrast")
-    return SceneSpectrum(total / count, noise if np.isfinite(noise) else 0.0)
+    kept = np.mean([_kept(image, channel) for image in images], axis=0)
+    return SceneSpectrum(total / count, noise if np.isfinite(noise) else 0.0, kept)
+
+
+def _kept(image: LightImage, channel: int) -> NDArray[np.float64]:
+    """What compression has left of an image."""
+    size = image.size[0] // BLOCK * BLOCK, image.size[1] // BLOCK * BLOCK
+    if image.reader.dtype != np.uint8 or 0 in size:
+        return np.ones((BLOCK, BLOCK))
+    at = [replace(w, col=w.col // BLOCK * BLOCK, row=w.row // BLOCK * BLOCK) for w in _windows(size)]
+    return kept_by_compression(np.array([image.stored(window, channel) for window in at]))
 
 
 def _windows(size: tuple[int, int]) -> list[Window]:

@@ -88,6 +88,8 @@ class EdgeFigures:
     modulation_sigma: NDArray[np.float64]
     factor: float
     """How many standard deviations the interval reaches to each side."""
+    freedom: int
+    """Degrees of freedom of the intervals."""
 
 
 def edge_figures(fit: EdgeFit, shape: EdgeShape, confidence: float) -> EdgeFigures:
@@ -107,9 +109,8 @@ def edge_figures(fit: EdgeFit, shape: EdgeShape, confidence: float) -> EdgeFigur
     all_shapes = shape.allowed(np.concatenate([known, known[:1] + unseen, known[:1] - unseen]))
     figures, curves = shape.figures(all_shapes), shape.modulation(all_shapes)
     sigma = _spread(figures, blocks)
-    return EdgeFigures(
-        figures[0], sigma, curves[0], _spread(curves, blocks), float(stdtrit(blocks - 1, 0.5 + confidence / 2))
-    )
+    factor = float(stdtrit(blocks - 1, 0.5 + confidence / 2))
+    return EdgeFigures(figures[0], sigma, curves[0], _spread(curves, blocks), factor, blocks - 1)
 
 
 def gaussian_width(mtf50: float) -> float:

@@ -67,8 +67,9 @@ class Enhancement:
         few = f" (by {self.edges} edge{'s' if self.edges > 1 else ''} only)" if self.edges < _FEW else ""
         return (
             f"edges are enhanced{few}: overshoot {100 * self.overshoot.value:.1f} %, undershoot "
-            f"{100 * self.undershoot.value:.1f} % of the contrast. The image was sharpened; its MTF is not that of the "
-            "lens, and restoration is limited: it would sharpen twice. Use the unsharpened image if there is one"
+            f"{100 * self.undershoot.value:.1f} % of the contrast. The image was sharpened; its MTF is that of lens "
+            "and sharpening together, and restoration is limited: noise grew already. Use the unsharpened image "
+            "if there is one"
         )
 
     def json_fields(self) -> dict[str, Any]:

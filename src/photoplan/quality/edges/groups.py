@@ -42,7 +42,12 @@ class CombinedValue:
 
 
 def combine(
-    values: Sequence[float], sigmas: Sequence[float], confidence: float = 0.95, *, least: float = -inf
+    values: Sequence[float],
+    sigmas: Sequence[float],
+    confidence: float = 0.95,
+    *,
+    freedom: float = inf,
+    least: float = -inf,
 ) -> CombinedValue:
     """Mean of figures that have errors of their own and differ from edge to edge besides.
 
@@ -50,8 +55,9 @@ def combine(
     Paule and Mandel 1982), so that neither the sharpest measured edge decides alone nor a noisy one counts in full.
     Edges far from the others get less weight (Huber, 2.5 standard deviations). The standard deviation of the mean is
     that of the weighted residuals (Hartung and Knapp 2001), but not less than the edges' own errors make it. These are
-    known beforehand, only the rest follows from the few edges: the interval is that of Student's distribution with
-    (n − 1) σ² / rest² degrees of freedom (after Satterthwaite 1946), of the normal one where the rest is 0.
+    known by `freedom` degrees each, only the rest follows from the few edges: the interval is that of Student's
+    distribution with the degrees of freedom that both have together (after Satterthwaite 1946): σ² over the sum of
+    rest² / (n − 1) and of the edges' parts by their own.
 
     Parameters
     ----------
@@ -61,6 +67,8 @@ def combine(
         Standard deviations; where one is unknown (NaN) the median of the others stands for it.
     confidence : float
         Of the interval.
+    freedom : float
+        Degrees of freedom that each of the standard deviations was found with; infinite: they are known.
     least : float
         What the figure cannot fall below: the interval ends there.
 
@@ -82,7 +90,7 @@ def combine(
     # An error that is stated as far too small must not decide alone.
     s = np.maximum(s, 0.2 * float(np.median(s)))
     if n == 1:
-        reach = float(ndtri(0.5 + confidence / 2)) * float(s[0]) if good.any() else nan
+        reach = _quantile(confidence, freedom) * float(s[0]) if good.any() else nan
         return CombinedValue(float(v[0]), (max(float(v[0]) - reach, least), float(v[0]) + reach), float(s[0]), 0.0, 1)
     keep = np.ones(n)
     mean = float(np.median(v))
@@ -102,12 +110,13 @@ def combine(
     share = weight / weight.sum()
     sigma = sqrt(float(share @ (v - mean) ** 2) / (n - 1))
     # Less than the edges' own errors allow is luck, not accuracy.
-    own = sqrt(float((share**2) @ (s**2)))
-    sigma = max(sigma, own)
-    rest = sigma**2 - own**2
-    part = 0.5 + confidence / 2
-    certain = rest <= 1e-9 * sigma**2
-    reach = float(ndtri(part) if certain else stdtrit((n - 1) * sigma**2 / rest, part)) * sigma
+    parts = share**2 * s**2
+    own = float(parts.sum())
+    sigma = max(sigma, sqrt(own))
+    rest = max(sigma**2 - own, 0.0)
+    # Each edge's part is known by its own degrees of freedom, alike edges together by as many times more.
+    unsure = rest / (n - 1) + float(parts @ parts) / (max(own, 1e-300) * freedom)
+    reach = _quantile(confidence, sigma**2 / unsure if unsure > 1e-9 * sigma**2 else inf) * sigma
     return CombinedValue(mean, (max(mean - reach, least), mean + reach), sigma, sqrt(tau2), n)
 
 
@@ -190,12 +199,18 @@ def field_cell(col: float, row: float, size: tuple[int, int], cells: int) -> tup
     return down, across
 
 
-def sigma_of_interval(interval: tuple[float, float], confidence: float = 0.95) -> float:
-    """Standard deviation that an interval stands for; NaN if it has no ends."""
+def sigma_of_interval(interval: tuple[float, float], confidence: float = 0.95, freedom: float = inf) -> float:
+    """Standard deviation, of so many degrees of freedom, that an interval stands for; NaN if it has no ends."""
     low, high = interval
     if not (isfinite(low) and isfinite(high)):
         return nan
-    return (high - low) / 2 / float(ndtri(0.5 + confidence / 2))
+    return (high - low) / 2 / _quantile(confidence, freedom)
+
+
+def _quantile(confidence: float, freedom: float) -> float:
+    """How many standard deviations an interval reaches to each side."""
+    part = 0.5 + confidence / 2
+    return float(stdtrit(freedom, part) if isfinite(freedom) else ndtri(part))
 
 
 def quantiles(values: Sequence[float], parts: Sequence[float]) -> list[float]:

@@ -118,6 +118,8 @@ class EdgeMeasurement:
     """It holds the noise, and half of the estimate for the form of the tails."""
     confidence: float
     """Probability of the intervals."""
+    freedom: int
+    """Degrees of freedom of their standard deviations."""
 
     @property
     def sampling(self) -> str:
@@ -342,6 +344,7 @@ def _measured(found: _Context) -> EdgeMeasurement:
         beyond=beyond,
         beyond_sigma=float(np.hypot(BEYOND * beyond, spoilt)),
         confidence=settings.confidence,
+        freedom=figures.freedom,
     )
 
 

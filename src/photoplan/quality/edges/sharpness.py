@@ -90,7 +90,7 @@ def _along(edges: Sequence[EdgeMeasurement], axis: float) -> Sharpness | None:
 def _sharp(edges: Sequence[EdgeMeasurement], strength: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which edges agree with the upper quartile of all; at least the three that are nearest to it."""
     mtf50 = np.array([edge.mtf50 for edge in edges])
-    sigma = np.array([sigma_of_interval(edge.mtf50_interval, edge.confidence) for edge in edges])
+    sigma = np.array([sigma_of_interval(edge.mtf50_interval, edge.confidence, edge.freedom) for edge in edges])
     known = np.isfinite(mtf50)
     if known.sum() < LEAST_EDGES:
         return np.ones(mtf50.size, bool)

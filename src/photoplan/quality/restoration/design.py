@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import pi, sqrt
 from typing import Literal
@@ -15,7 +15,7 @@ from photoplan.quality.mtf_curve import MtfCurve
 from photoplan.quality.restoration.filters import FilterKernel
 from photoplan.quality.restoration.inverse import Condition, condition_of, exact_inverse
 from photoplan.quality.restoration.regularised import Expectation, curve_transfer, sharpest
-from photoplan.quality.restoration.scene import SceneStatistics
+from photoplan.quality.restoration.scene import SceneStatistics, Transfer
 from photoplan.quality.spread import GAUSSIAN_WIDTH, SpreadFunction
 
 
@@ -124,8 +124,12 @@ _HALVES = (5, 7, 10, 14, 20, 28)
 _CUT_OFF = 0.002
 #: Width of the 95 % interval of MTF50, by its value, beyond which a spread function is practically unknown.
 _UNKNOWN = 0.5
+#: What a filter may leave of the error at most where the scenes that an image may show speak for different ones.
+_CLEAR = 0.98
 #: Smoothing of noise that is worth a word, pixels.
 _SMOOTHED = 0.1
+Method = Literal["none", "exact", "regularised"]
+_AS_IT_IS = np.ones((1, 1))
 #: How messages call the methods.
 _NAMES = {"none": "as it is", "regularised": "regularised", "exact": "exact"}
 
@@ -176,13 +180,16 @@ class Design:
 
     kernel: NDArray[np.float64]
     """Shape (2 m + 1, 2 n + 1), sum 1; one row or one column where the other direction stays as it is."""
-    method: Literal["none", "exact", "regularised"]
+    method: Method
     reason: str
     """The rule that chose the method, with its figures."""
     condition_x: Condition
     condition_y: Condition
     expected: Mapping[str, float] = field(default_factory=dict)
     """Expected root mean square error in light by method, ``none`` for the image as it is; empty if unknown."""
+    scene: SceneStatistics | None = None
+    """What the errors are expected for: the first of the scenes, or where nothing is done that in which a filter would
+    gain least."""
 
     @property
     def noise_gain(self) -> float:
@@ -196,19 +203,28 @@ class Design:
 
 
 def design_filter(
-    x: Sharpness, y: Sharpness, scene: SceneStatistics | None = None, options: DesignOptions | None = None
+    x: Sharpness,
+    y: Sharpness,
+    scenes: Sequence[SceneStatistics] = (),
+    options: DesignOptions | None = None,
+    kept: NDArray[np.float64] | None = None,
 ) -> Design:
     """Restoration filter of an image whose sharpness is known along rows and along columns.
 
-    Along a direction whose MTF50 has an interval wider than half its value the image stays as it is.
+    Along a direction whose MTF50 has an interval wider than half its value the image stays as it is. Of filters that
+    are expected to gain in one scene and lose in another the one counts that gains most in its worst scene; `auto`
+    takes none that does not gain in all.
 
     Parameters
     ----------
     x, y : Sharpness
         Along a row (across columns) and along a column.
-    scene : SceneStatistics, optional
-        Noise and spectrum; only an exact inverse that is asked for can do without.
+    scenes : sequence of SceneStatistics
+        Noise and spectrum that the image may have, the likeliest first; only an exact inverse that is asked for can do
+        without.
     options : DesignOptions, optional
+    kept : ndarray, shape (8, 8), optional
+        What compression has left of the scene (`kept_by_compression`); None: all.
 
     Raises
     ------
@@ -221,6 +237,34 @@ def design_filter(
     conditions = (condition_of(x.spread), condition_of(y.spread))
     doubts = [f"{name}: {one.doubt}" for name, one in both.items() if one.doubt]
     broken = [f"{name}: {c}" for name, c in zip(both, conditions, strict=True) if not c.holds]
+    _refuse(asked, doubts, broken, scenes)
+    exact: dict[Method, NDArray[np.float64]] = {}
+    if asked.method != "regularised" and not broken and not doubts:
+        exact["exact"] = _exact(x.spread, y.spread, asked)
+    notes = [f"not inverted, practically unknown {doubt}" for doubt in doubts]
+    if asked.method == "auto" and broken:
+        notes.append("no exact inverse " + "; ".join(broken))
+    if not scenes:
+        return Design(exact["exact"], "exact", "; ".join(["exact: as asked for", *notes]), *conditions)
+    curves = [one.modulation() if not one.doubt else _ideal_curve(asked.aperture) for one in (x, y)]
+    choice = _Choice.of(curve_transfer(*curves), scenes, asked.aperture, kept)
+    half = asked.half or _HALVES[0]
+    regularised = choice.regularised((0 if y.doubt else half, 0 if x.doubt else half))
+    kernels: dict[Method, NDArray[np.float64]] = {"regularised": regularised, **exact}
+    method, why = (asked.method, "as asked for") if asked.method != "auto" else choice.method(kernels)
+    index = choice.worst(regularised) if method == "none" else 0
+    every: dict[str, NDArray[np.float64]] = {"none": _AS_IT_IS, **{str(name): each for name, each in kernels.items()}}
+    expected = {name: choice.models[index].error(each) for name, each in every.items()}
+    if kept is not None and kept.min() < 1.0:
+        notes.append(f"compression has left {100 * kept.mean():.0f} % of the fine detail")
+    notes.append(f"{_told(scenes[index])}, ideal aperture {asked.aperture:g} px")
+    if expected[method] > expected["none"]:
+        notes.append("more error is expected than the image has as it is")
+    kernel = kernels.get(method, _AS_IT_IS)
+    return Design(kernel, method, f"{method}: " + "; ".join([why, *notes]), *conditions, expected, scenes[index])
+
+
+def _refuse(asked: DesignOptions, doubts: list[str], broken: list[str], scenes: Sequence[SceneStatistics]) -> None:
     if len(doubts) == 2 or (doubts and asked.method == "exact"):
         raise InputError(
             "the spread function is practically unknown "
@@ -233,43 +277,78 @@ def design_filter(
             "the image cannot be restored exactly: " + "; ".join(broken) + ". Objects that have fused cannot be told "
             "apart; use `method` regularised"
         )
-    kernels: dict[Literal["none", "exact", "regularised"], NDArray[np.float64]] = {"none": np.ones((1, 1))}
-    expected: dict[str, float] = {}
-    if scene is not None:
-        curves = [one.modulation() if not one.doubt else _ideal_curve(asked.aperture) for one in (x, y)]
-        transfer = curve_transfer(*curves)
-        model = Expectation.of(transfer, scene, asked.aperture)
-        half = asked.half or _HALVES[0]
-        kernels["regularised"] = model.best((0 if y.doubt else half, 0 if x.doubt else half))
-    elif asked.method != "exact":
+    if not scenes and asked.method != "exact":
         raise InputError("a filter of least error needs the noise and the contrast of the scene; state both")
-    if asked.method != "regularised" and not broken and not doubts:
-        kernels["exact"] = _exact(x.spread, y.spread, asked)
-    if scene is not None:
-        expected = {method: model.error(kernel) for method, kernel in kernels.items()}
-    method = asked.method if asked.method != "auto" else min(kernels, key=lambda each: expected[each])
-    why = ["as asked for" if asked.method != "auto" else "least expected error"]
-    if asked.method == "auto" and scene is not None:
+
+
+def _told(scene: SceneStatistics) -> str:
+    """Noise and spectrum of a scene, for people."""
+    smoothed = f", smoothed by {scene.smoothed:.2f} px" if scene.smoothed > _SMOOTHED else ""
+    white = f" and a white part of {scene.texture:.3g}" if scene.texture > 0.1 * scene.contrast else ""
+    return (
+        f"noise {scene.noise:.3g}{smoothed}, neighbouring pixels of an ideal image differ by {scene.contrast:.3g} "
+        f"(rms), spectrum of the scene ν^-{scene.exponent:.2f}{white}"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Choice:
+    """Expectations of all that an image may show, and the filter that they speak for."""
+
+    scenes: Sequence[SceneStatistics]
+    plain: Sequence[Expectation]
+    """One for each scene, as if nothing were lost by compression: what filters are designed by."""
+    models: Sequence[Expectation]
+    """The same with what is lost: what filters are judged by."""
+    sharp: Sequence[Expectation]
+    """The judges, were the image as sharp as it may be."""
+
+    @classmethod
+    def of(
+        cls,
+        transfer: Transfer,
+        scenes: Sequence[SceneStatistics],
+        aperture: float,
+        kept: NDArray[np.float64] | None,
+    ) -> _Choice:
+        """Of an image of a modulation transfer."""
+        cases = ((transfer, None), (transfer, kept), (sharpest(transfer), kept))
+        return cls(scenes, *([Expectation.of(h, s, aperture, lost) for s in scenes] for h, lost in cases))
+
+    def worst(self, kernel: NDArray[np.float64]) -> int:
+        """The scene in which a filter gains least."""
+        return int(np.argmax([model.gain(kernel) for model in self.models]))
+
+    def gain(self, kernel: NDArray[np.float64]) -> float:
+        """What a filter leaves of the error in its worst scene."""
+        return self.models[self.worst(kernel)].gain(kernel)
+
+    def regularised(self, half: tuple[int, int]) -> NDArray[np.float64]:
+        """Of the best filters of each scene and of their mean the one that gains most in its worst scene."""
+        means = [Expectation.mean(self.plain)] if len(self.plain) > 1 else []
+        return min((model.best(half) for model in [*self.plain, *means]), key=self.gain)
+
+    def method(self, kernels: Mapping[Method, NDArray[np.float64]]) -> tuple[Method, str]:
+        """Method of least expected error in the worst scene, and why."""
+        method = min(kernels, key=lambda each: self.gain(kernels[each]))
+        kernel = kernels[method]
+        gains = [model.gain(kernel) for model in self.models]
+        if max(gains) > 1.0 > min(gains):
+            told = "; ".join(f"{100 * g:.0f} % ({_told(s)})" for s, g in zip(self.scenes, gains, strict=True))
+            return "none", (
+                f"fine texture and noise cannot be told apart here, and {method} might do harm: of the error it would "
+                f"leave {told}. State the noise if you know it"
+            )
+        if max(gains) > (_CLEAR if max(gains) - min(gains) > 1.0 - _CLEAR else 1.0):
+            return "none", f"{method} is expected to leave {100 * max(gains):.0f} % of the error"
         # The error that is expected is a mean over what the MTF may be; an image that is sharp already must not suffer.
-        worst = Expectation.of(sharpest(transfer), scene, asked.aperture)
-        before, after = worst.error(kernels["none"]), worst.error(kernels[method])
-        if after > before:
-            why = [
+        left = max(self.sharp, key=lambda model: model.gain(kernel))
+        if left.gain(kernel) > 1.0:
+            before, after = left.error(_AS_IT_IS), left.error(kernel)
+            return "none", (
                 f"were the MTF at the upper end of its interval, {method} would leave {after:.3g} and not {before:.3g}"
-            ]
-            method = "none"
-    why += [f"not inverted, practically unknown {doubt}" for doubt in doubts]
-    if asked.method == "auto" and broken:
-        why.append("no exact inverse " + "; ".join(broken))
-    if scene is not None:
-        smoothed = f", smoothed by {scene.smoothed:.2f} px" if scene.smoothed > _SMOOTHED else ""
-        why.append(
-            f"noise {scene.noise:.3g}{smoothed}, neighbouring pixels of an ideal image differ by {scene.contrast:.3g} "
-            f"(rms), spectrum of the scene ν^-{scene.exponent:.2f}, ideal aperture {asked.aperture:g} px"
-        )
-        if expected[method] > expected["none"]:
-            why.append("more error is expected than the image has as it is")
-    return Design(kernels[method], method, f"{method}: " + "; ".join(why), *conditions, expected)
+            )
+        return method, "least expected error"
 
 
 def _ideal_curve(aperture: float) -> MtfCurve:

@@ -9,6 +9,7 @@ the variance), so that an uncertain spread function is inverted less.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import pi, sqrt
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.quality.mtf_curve import MtfCurve
+from photoplan.quality.restoration.compression import at_frequencies
 from photoplan.quality.restoration.scene import FOLDS, SceneStatistics, Transfer, frequency_grid
 
 Array = NDArray[np.float64]
@@ -49,7 +51,8 @@ def sharpest(transfer: Transfer, sigmas: float = 1.96) -> Transfer:
 
     def known(u: Array, v: Array) -> tuple[Array, Array]:
         modulation, sigma = transfer(u, v)
-        return np.minimum(modulation + sigmas * sigma, 1.0), np.zeros_like(sigma)
+        # A sharpened image has modulations above 1.
+        return np.maximum(modulation, np.minimum(modulation + sigmas * sigma, 1.0)), np.zeros_like(sigma)
 
     return known
 
@@ -66,7 +69,9 @@ class Expectation:
     """Power of the ideal image."""
 
     @classmethod
-    def of(cls, transfer: Transfer, scene: SceneStatistics, aperture: float = 1.0) -> Expectation:
+    def of(
+        cls, transfer: Transfer, scene: SceneStatistics, aperture: float = 1.0, kept: Array | None = None
+    ) -> Expectation:
         """What is expected of an image.
 
         Parameters
@@ -76,13 +81,29 @@ class Expectation:
         scene : SceneStatistics
         aperture : float
             Side of the ideal aperture, pixels; below 1 the best filter is sharper and noisier.
+        kept : ndarray, shape (8, 8), optional
+            Of `kept_by_compression`: what the image shows is the scene to this part only.
         """
         u, v = frequency_grid()
         power, (modulation, sigma) = scene.power(u, v), transfer(u, v)
         ideal = np.sinc(aperture * u) * np.sinc(aperture * v)
         seen = ((modulation**2 + sigma**2) * power).sum(axis=0)
         seen += scene.noise_power(u[0] + FOLDS, v[0] + FOLDS)
-        return cls(seen, (modulation * ideal * power).sum(axis=0), (ideal**2 * power).sum(axis=0))
+        cross = (modulation * ideal * power).sum(axis=0)
+        if kept is not None:
+            cross = cross * at_frequencies(kept, u[0] + FOLDS, v[0] + FOLDS)
+        return cls(seen, cross, (ideal**2 * power).sum(axis=0))
+
+    @classmethod
+    def mean(cls, each: Sequence[Expectation]) -> Expectation:
+        """Mean of expectations, each of them in units of the error that the image has as it is."""
+        shares = [1.0 / (len(each) * max(one.error(np.ones((1, 1))), 1e-300) ** 2) for one in each]
+        names = ("seen", "cross", "ideal")
+        return cls(*(sum(s * getattr(one, name) for s, one in zip(shares, each, strict=True)) for name in names))
+
+    def gain(self, kernel: Array) -> float:
+        """Expected error after a filter by that of the image as it is."""
+        return self.error(kernel) / max(self.error(np.ones((1, 1))), 1e-300)
 
     def error(self, kernel: Array) -> float:
         """Expected root mean square difference to the ideal image after a filter, in the light of the scene.

@@ -297,6 +297,8 @@ class MtfPlots:
         known = np.array([g.mtf50.value for g in groups if np.isfinite(g.mtf50.value)])
         low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.5)
         pad = max(0.02, 0.1 * (high - low))
+        step = _cell_size(groups[0])
+        frame = (-0.5, grid * step[0] - 0.5, grid * step[1] - 0.5, -0.5)
         maps = [(way, own) for way in (None, "x", "y") if (own := [g for g in groups if g.direction == way])]
         with self.mpl.rc_context(STYLE):
             fig = self.mpl.figure.Figure(figsize=(_WIDTH, 3.2), layout="constrained")
@@ -306,7 +308,8 @@ class MtfPlots:
                 values = np.full((grid, grid), np.nan)
                 for group in own:
                     values[group.cell] = group.mtf50.value
-                shown = axes.imshow(values, cmap="viridis", vmin=low - pad, vmax=high + pad, aspect="auto")
+                limits = {"vmin": low - pad, "vmax": high + pad}
+                shown = axes.imshow(values, cmap="viridis", aspect="auto", extent=frame, **limits)
                 for group in own if grid <= 6 else ():
                     assert group.cell is not None
                     value, (first, last) = group.mtf50.value, group.mtf50.interval
@@ -314,12 +317,23 @@ class MtfPlots:
                         more = f"±{(last - first) / 2:.3f}\n" if np.isfinite(last - first) else ""
                         words = f"{value:.3f}\n{more}n = {group.mtf50.edges}"
                         colour = INK if value > (low + high) / 2 else "white"
-                        at = group.cell[::-1]
+                        at = [(place + 0.5) * side - 0.5 for place, side in zip(group.cell[::-1], step)]
                         axes.annotate(words, at, ha="center", va="center", fontsize=7, color=colour)
-                axes.set(xticks=[], yticks=[], title=way or "all")
+                axes.set(xlabel="column, pixels", title=way or "all")
+                axes.xaxis.set_major_locator(self.mpl.ticker.MaxNLocator(4, integer=True))
                 axes.grid(False)
+            row[0].set_ylabel("row, pixels")
+            for axes in row[1:]:
+                axes.set_yticklabels([])
             fig.colorbar(shown, ax=list(row), label="MTF50, cycles per pixel", shrink=0.85)
             return png(fig)
+
+
+def _cell_size(group: EdgeGroup) -> tuple[float, float]:
+    """Width and height of a cell of the field, pixels."""
+    assert group.bounds is not None
+    left, top, right, bottom = group.bounds
+    return right - left, bottom - top
 
 
 def _label(group: EdgeGroup) -> str:

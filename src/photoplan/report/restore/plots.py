@@ -71,18 +71,13 @@ class RestorePlots:
             side = picture.spread[: _SPREAD + 1]
             at = np.arange(1 - side.size, side.size) + (number - (len(pictures) - 1) / 2) * width
             axes.bar(at, np.concatenate([side[:0:-1], side]), width, color=colour, label=picture.label)
-        for place, name in enumerate(_NAMES[: pictures[0].spread.size]):
-            values = " / ".join(f"{picture.spread[place]:.3f}" for picture in pictures)
-            height = max(float(picture.spread[place]) for picture in pictures)
-            axes.annotate(
-                f"{name} {values}",
-                (place, max(height, 0.0)),
-                (0 if place == 0 else -6, 3),
-                textcoords="offset points",
-                ha="center" if place == 0 else "left",
-                fontsize=7.5,
-                color=INK,
-            )
+        shares = [
+            f"{name}  " + " / ".join(f"{picture.spread[place]:.3f}" for picture in pictures)
+            for place, name in enumerate(_NAMES[: pictures[0].spread.size])
+        ]
+        # In a corner: beside the bars they would lie over each other.
+        where = {"xycoords": "axes fraction", "ha": "right", "va": "top"}
+        axes.annotate("\n".join(shares), (0.98, 0.97), fontsize=7.5, color=INK, **where)
         axes.axhline(0.0, color=SOFT, linewidth=0.8)
         axes.set(xlabel="pixels from the middle", title="spread function: share of the light", ylim=(None, 1.3 * top))
         axes.xaxis.set_major_locator(self.mpl.ticker.MaxNLocator(integer=True))
