@@ -32,3 +32,13 @@ def test_some_are_a_part_of_all() -> None:
 def test_a_large_product_takes_a_few_bytes_for_each() -> None:
     """500 images have a million tiles; as objects they took 230 bytes each."""
     assert Tiles.every(Window(0, 0, 1_000_000, 1_000_000), 1000).indices.nbytes <= 8 * 1_000_000
+
+
+def test_tiles_know_which_sources_can_paint_them() -> None:
+    every = Tiles.every(Window(0, 0, 300, 200), 100)
+    shared = Tiles.shared([every.only([0, 1, 4]), every.only([]), every.only([1, 5])])
+    assert [(tile.index, tile.sources) for tile in shared] == [(0, (0,)), (1, (0, 2)), (4, (0,)), (5, (2,))]
+    assert [(tile.index, tile.sources) for tile in shared[1:3]] == [(1, (0, 2)), (4, (0,))]
+    assert [tile.sources for tile in shared.only([5, 1, 3])] == [(0, 2), (2,)]
+    assert shared[-1].sources == (2,) and list(shared.only(())) == []
+    assert list(Tiles.shared([every.only([])])) == []

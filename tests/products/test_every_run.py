@@ -62,6 +62,12 @@ def ortho(inputs: Path, out: Path) -> list[object]:
     return ["ortho", project, "--images", "one", "--resolution", 1, "--tile", 128, "--no-quicklook", "--output", out]
 
 
+def mosaic(inputs: Path, out: Path) -> list[object]:
+    project = inputs / "block" / "project.toml"
+    bounds = ["--bounds", 500_200, 5_300_100, 500_520, 5_300_300, "--resolution", 1, "--tile", 128]
+    return ["mosaic", project, *bounds, "--sources", "--no-quicklook", "--output", out]
+
+
 def restore(inputs: Path, out: Path) -> list[object]:
     return ["restore", inputs / "scan.tif", "--filter", inputs / "weights.csv", "--no-quicklook", "--output", out]
 
@@ -91,6 +97,7 @@ def tie(inputs: Path, out: Path) -> list[object]:
 
 CASES: dict[str, tuple[Words, str]] = {
     "ortho": (ortho, "one_ortho.tif"),
+    "mosaic": (mosaic, "mosaic.tif"),
     "restore": (restore, "scan_restored.tif"),
     "simulate": (simulate, "product_0003.tif"),
     "tie": (tie, "product.csv"),

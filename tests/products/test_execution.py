@@ -201,7 +201,7 @@ def test_the_record_answers_for_the_product(plan: OrthoPlan, pristine: Block, tm
     assert record["settings"]["kernel"] == "bicubic"
     assert record["grid"]["crs"] == CRS
     assert record["heights"] == {"terrain": "same", "orientation": "same", "working": "same"}
-    assert record["projection_centre"] == [500300.0, 5300200.0, 400.0]
+    assert record["images"][0]["projection_centre"] == [500300.0, 5300200.0, 400.0]
     run = record["run"]
     assert (run["workers"], run["executor"], run["memory"]) == (2, "threads", None)
     started, finished = (datetime.fromisoformat(run[name]) for name in ("started", "finished"))

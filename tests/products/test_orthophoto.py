@@ -160,7 +160,7 @@ class TestCrops:
 class TestPlan:
     def test_a_plan_says_what_will_be_made(self, pristine: Block) -> None:
         plan = plan_orthophotos(load_project(pristine.project), resolution=1.0, tile=128)
-        assert [p.image for p in plan.products] == sorted(NAMES)
+        assert [p.images[0] for p in plan.products] == sorted(NAMES)
         text = str(plan)
         for product in plan.products:
             assert f"{product.plan.name}: {product.grid.width} × {product.grid.height} px of 1 m" in text
@@ -213,7 +213,7 @@ class TestPlan:
             plan_orthophotos(project.model_copy(update={"images": images}))
 
     def test_unknown_settings_are_named(self, pristine: Block) -> None:
-        with pytest.raises(UsageError, match="unknown settings colour; known are bounds, compress"):
+        with pytest.raises(UsageError, match="unknown settings colour; known are bounds, choice, compress"):
             plan_orthophotos(load_project(pristine.project), colour="red")
 
     def test_fault_21_nothing_seen(self, small: Block) -> None:

@@ -65,11 +65,11 @@ def test_what_was_written_is_what_is_read(planned: tuple[Path, OrthoPlan], monke
         there = figures.cells_of_tile[figures.product == place] > 0
         assert list(read.plan.tiles) == [tile for tile, some in zip(wrote.plan.tiles, there, strict=True) if some]
         assert replace(read.plan, tiles=wrote.plan.tiles) == wrote.plan
-        assert (read.footprint.bounds, read.footprint.on_surface) == (
-            wrote.footprint.bounds,
-            wrote.footprint.on_surface,
-        )
-        np.testing.assert_array_equal(read.footprint.outline, wrote.footprint.outline)
+        for got, want in zip(
+            (look.footprint for look in read.looks), (look.footprint for look in wrote.looks), strict=True
+        ):
+            assert (got.bounds, got.on_surface) == (want.bounds, want.on_surface)
+            np.testing.assert_array_equal(got.outline, want.outline)
 
 
 def test_a_plan_moves_with_its_project(planned: tuple[Path, OrthoPlan], small: Block, tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ VERBS = {
     "check": "Validate a project and print what to expect of it.",
     "budget": "What limits the accuracy of products, cause by cause.",
     "ortho": "Make orthophotos.",
+    "mosaic": "Make one orthophoto of many images.",
     "run": "Execute a plan written by `ortho --plan`.",
     "dtm": "Terrain models: build, sample, contours, volumes …",
     "monoplot": "Image points to ground points on a terrain model.",

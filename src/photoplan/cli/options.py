@@ -100,6 +100,38 @@ def listed(values: Sequence[str]) -> tuple[str, ...]:
     return tuple(part.strip() for split in parts for part in split if part.strip())
 
 
+def product_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """What may be chosen of orthophotos and mosaics."""
+    options = [
+        images_option(),
+        click.option("--resolution", type=float, metavar="R", help="Ground pixel in metres [the images' mean GSD]."),
+        bounds_option,
+        click.option("--kernel", help="nearest, bilinear, bicubic, bicubic-1 or lanczos3 [bicubic]."),
+        click.option("--tolerance", type=float, metavar="PX", help="Largest residual of the anchors [0.02]."),
+        click.option(
+            "--hidden",
+            help="Ground that no image sees: show, nodata, or mark (second raster) [ortho: show, mosaic: nodata].",
+        ),
+        click.option("--compress", help="deflate, zstd, lzw, jpeg or none [deflate]."),
+        click.option("--nodata", help="A number, mask, or auto: 0 for integers, NaN for floats [auto]."),
+        click.option("--overviews/--no-overviews", default=None, help="Whether the file holds overviews [yes]."),
+        click.option("--tile", type=int, metavar="PX", help="Side of a tile [512]."),
+        click.option(
+            "--output", type=click.Path(path_type=Path), help="Folder of the products [PROJECT's folder/products]."
+        ),
+        click.option(
+            "--force", is_flag=True, help="Also of orientations with a FAULT, and finer than a quarter of the GSD."
+        ),
+        click.option(
+            "--plan", "plan_file", type=click.Path(path_type=Path), help="Write the plan (GeoPackage) and stop."
+        ),
+        dry_run_option("Compile the plan, print it, and stop."),
+    ]
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
 def executing(command: Callable[..., Any]) -> Callable[..., Any]:
     """The options of every verb that executes a plan."""
     options = [

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,8 @@ from photoplan.cli.output import show_json
 from photoplan.cli.telling import Telling
 from photoplan.engine.executors import available_cpus
 from photoplan.errors import TilesFailed
-from photoplan.products.orthophoto.execution import ProductResult, Run, execute
+from photoplan.io.project.model import Project
+from photoplan.products.orthophoto.execution import ProductResult, Run, execute, seams_path
 from photoplan.products.orthophoto.plan import OrthoPlan
 
 
@@ -53,6 +56,23 @@ def telling(how: How) -> Telling:
     return Telling(how.quiet, product)
 
 
+def planned(
+    project: Project, plan: Callable[..., OrthoPlan], options: dict[str, Any], how: How, events: Telling
+) -> Callable[[], None]:
+    """Plan products with the options of `product_options`; what is called next makes them, or shows what would be
+    made."""
+    folder = options.pop("output") or project.folder / "products"
+    plan_file, dry_run, images = (options.pop(name) for name in ("plan_file", "dry_run", "images"))
+    changes = {k: v for k, v in options.items() if v is not None and v != ()}
+    made = plan(project, images or None, events=events, **changes)
+    if dry_run or plan_file is not None:
+        # Here, since plans as files need a library for vector data that a product does not: 30 MB of memory.
+        from photoplan.cli.show_plan import show_plan
+
+        return partial(show_plan, made, folder, plan_file, how, events)
+    return partial(execute_and_report, made, folder, how, events)
+
+
 def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling) -> None:
     """Make the products and print their paths, or one JSON object."""
     started = time.perf_counter()
@@ -78,16 +98,36 @@ def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling)
     if failed is not None:
         raise failed
     events.talk(_summary(results, plan, seconds))
+    if settings.sources:
+        _draw_sources(results, events)
     if how.quicklook:
         events.talk(f"quick look: {folder / 'overview.png'}")
+
+
+def _draw_sources(results: list[ProductResult], events: Telling) -> None:
+    """A picture of each mosaic's regions, where pictures can be made."""
+    from photoplan.io.polygons import read_features
+    from photoplan.report.drawing import has_matplotlib
+    from photoplan.report.mosaic import draw_regions
+
+    for result in results if has_matplotlib() else ():
+        regions = seams_path(result.path)
+        painted = len(result.painted or {})
+        shapes = {item.name: item.geometry for item in read_features(regions, "Polygon").items}
+        title = f"{result.path.name}: what each of {painted} images paints, of {len(result.images)} that see the ground"
+        picture = draw_regions(regions.with_suffix(".png"), shapes, title)
+        events.talk(f"regions: {regions}, drawn in {picture}")
 
 
 def _summary(results: list[ProductResult], plan: OrthoPlan, seconds: float) -> str:
     pixels = sum(p.grid.width * p.grid.height for p in plan.products) / 1e6
     worst = max(r.residual for r in results)
     cells = sum(r.cells for r in results)
+    what = (
+        f"{len(results)} orthophotos" if plan.settings.choice is None else f"mosaic of {len(results[0].images)} images"
+    )
     return (
-        f"{len(results)} orthophotos in {seconds:.1f} s · {pixels:.1f} Mpx, {pixels / seconds:.3g} Mpx/s · "
+        f"{what} in {seconds:.1f} s · {pixels:.1f} Mpx, {pixels / seconds:.3g} Mpx/s · "
         f"{cells} cells, worst anchor residual {worst:.3g} px{_hidden(results)}"
     )
 
@@ -95,4 +135,6 @@ def _summary(results: list[ProductResult], plan: OrthoPlan, seconds: float) -> s
 def _hidden(results: list[ProductResult]) -> str:
     """Ground that images cannot see, if somebody has asked."""
     areas = [r.hidden for r in results if r.hidden is not None]
-    return f" · hidden {sum(areas):.4g} m²" if areas else ""
+    outside = [r.bare for r in results if r.bare is not None]
+    hidden = f" · hidden {sum(areas):.4g} m²" if areas else ""
+    return f"{hidden} · in no image {sum(outside):.4g} m²" if outside else hidden

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 
-FORMAT = 1
+FORMAT = 2
 _HEADER = "photoplan_plan"
 #: What is read of the tiles again.
-_READ = ["product", "tile", "cells", "residual_px"]
+_READ = ["product", "tile", "sources"]
 #: Tiles that are written at once: as polygons they take much more memory than as numbers.
 _PIECE = 100_000
 
@@ -30,7 +30,7 @@ class PlanTables:
     header: dict[str, Any]
     """Settings, products, inputs with fingerprints: all that executing needs; JSON values only."""
     tiles: dict[str, NDArray[Any]]
-    """Columns of the layer `tiles`: product, image, index, col, row, width, height, cells, residual, source_*."""
+    """Columns of the layer `tiles`: product, index, sources, cells, residual, col, row, width, height, source_*."""
     tile_bounds: NDArray[np.float64]
     """Outer edges of each tile, shape (n, 4), in the product's CRS."""
     footprints: dict[str, NDArray[Any]]
@@ -101,7 +101,7 @@ def _write_layer(
 
 
 def read_plan_tables(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Header of a plan, and some columns of its tiles: product, tile, cells, residual_px.
+    """Header of a plan, and some columns of its tiles: product, tile, sources.
 
     Raises
     ------

@@ -36,7 +36,7 @@ class Feature:
     """One object of a vector file."""
 
     name: str
-    """Its column `name`, `id` or `NAME`, else its number from 1."""
+    """Its column `image`, `name`, `NAME` or `id`, else its number from 1."""
     geometry: Any
     """Shapely geometry; Z is kept."""
 
@@ -79,7 +79,7 @@ def read_features(path: Path, *kinds: str, crs: str | None = None) -> VectorFeat
     except (DataSourceError, FieldError, GeometryError, shapely.errors.ShapelyError, ValueError, RuntimeError) as error:
         raise InputError(f"{path}: cannot be read ({' '.join(str(error).split())[:200]})") from error
     columns = dict(zip(meta["fields"], values))
-    names = next((columns[key] for key in ("name", "NAME", "Name", "id", "ID") if key in columns), None)
+    names = next((columns[key] for key in ("image", "name", "NAME", "Name", "id", "ID") if key in columns), None)
     allowed = [name for kind in kinds for name in _KINDS[kind]]
     items = []
     for i, shape in enumerate(shapes):

@@ -105,7 +105,7 @@ def _plan(path: Path) -> dict[str, Any]:
         "plan": str(path),
         "made by": f"photoplan {header['photoplan']}",
         "settings": [f"{key} = {value}" for key, value in header["settings"].items()],
-        "products": [f"{p['image']}, key {p['key'][:12]}" for p in header["products"]],
+        "products": [f"{p['name']}, key {p['key'][:12]}" for p in header["products"]],
         "tiles": len(tiles["tile"]),
         "cells": int(tiles["cells"].sum()),
         "worst anchor residual": f"{float(tiles['residual_px'].max()):.3g} px" if len(tiles["tile"]) else "none",

@@ -33,7 +33,7 @@ STYLE = {
     "text.parse_math": False,
 }
 _DPI = 150
-_PARTS = ("cm", "collections", "colors", "figure", "lines", "patches", "ticker")
+_PARTS = ("cm", "collections", "colors", "figure", "lines", "patches", "path", "ticker")
 
 
 def has_matplotlib() -> bool:

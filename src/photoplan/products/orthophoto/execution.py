@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 
 from photoplan import __version__
 from photoplan.engine.cluster import Question
-from photoplan.engine.execute import MOST_SOURCE_BYTES, RenderJob
+from photoplan.engine.execute import MOST_SOURCE_BYTES, OutputName, RenderJob
 from photoplan.engine.executors import Workers, executor_factory, open_workers
 from photoplan.engine.run import Kept, Runner, Tally, Work, tiles_in_flight
 from photoplan.errors import TilesFailed, UsageError
@@ -22,13 +22,15 @@ from photoplan.io.disk import make_folder
 from photoplan.io.image_form import bands_of
 from photoplan.io.product import ProductFile
 from photoplan.io.quicklook import write_overview
+from photoplan.io.regions import source_regions, write_regions
 from photoplan.io.run_record import input_entry, recorded_result, run_times, versions, write_run_record
 from photoplan.kernels.rectify import is_compiled
 from photoplan.plain import pick
-from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct
+from photoplan.products.orthophoto.plan import Look, OrthoPlan, OrthoProduct
 from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.restored import RestoreStep
-from photoplan.project.scene import Scene, input_files, open_scene, scene_address
+from photoplan.project.scene import Scene, input_files
+from photoplan.project.scenes import Scenes, ScenesAddress
 
 #: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
 BASE_MEMORY = 320 * 2**20
@@ -115,7 +117,7 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     folder = Path(output)
     run.check()
     picture = folder / "overview.png"
-    rasters = [path for p in plan.products for path in outputs(folder, p, plan.settings)]
+    rasters = [path for p in plan.products for path in outputs(folder, p, plan.settings).values()]
     _refuse_inputs(plan, [*rasters, *([picture] if run.quicklook else [])])
     kept = finished_products(plan, folder, run.overwrite)
     make_folder(folder)
@@ -160,12 +162,14 @@ def _work(
     """What there is to do for a product."""
     if kept is not None:
         return Kept(kept, len(product.plan.tiles))
-    settings, scene = plan.settings, open_scene(plan.project, product.image)
-    for note in scene.notes:
+    settings, address = plan.settings, ScenesAddress.of(plan.project, product.images)
+    scenes = address.open()
+    scene = scenes[0]
+    for note in dict.fromkeys(note for row in range(len(product.images)) for note in scenes[row].notes):
         run.events.talk(f"note: {note}")
     if not is_compiled(scene.reader.dtype, scene.reader.bands, settings.kernel):
         run.events.talk("compiling the resampling kernels for this kind of image, once (up to a minute)")
-    picture, *marks = outputs(folder, product, settings)
+    paths = outputs(folder, product, settings)
     open_file = partial(
         ProductFile,
         placement=product.grid.placement,
@@ -173,35 +177,37 @@ def _work(
         overviews=settings.overviews,
         tile=settings.tile,
         overwrite=run.overwrite,
-        inputs=scene.files,
+        inputs=[path for path, _ in address.digests],
         threads=run.workers,
     )
-    file = open_file(
-        picture,
-        bands=scene.reader.bands,
-        dtype=scene.reader.dtype,
-        nodata=settings.nodata_value,
-        compress=settings.compress,
-        form=bands_of(scene.reader.info),
-    )
-    mark = partial(open_file, bands=1, dtype=np.dtype(np.uint8), nodata=255, resampling="mode")
-    files = (file, *(mark(path) for path in marks))
+    forms: dict[OutputName, dict[str, Any]] = {
+        "picture": {
+            "bands": scene.reader.bands,
+            "dtype": scene.reader.dtype,
+            "nodata": settings.nodata_value,
+            "compress": settings.compress,
+            "form": bands_of(scene.reader.info),
+        },
+        "hidden": {"bands": 1, "dtype": np.dtype(np.uint8), "nodata": 255, "resampling": "mode"},
+        "sources": {"bands": 1, "dtype": np.dtype(np.uint16), "nodata": 0, "resampling": "mode"},
+    }
+    files = {name: open_file(path, **forms[name]) for name, path in paths.items()}
     told = replace(product.plan, tiles=product.plan.tiles.only(()))
-    job = RenderJob(scene.address, told, settings.kernel, ("picture", "hidden") if marks else ("picture",))
+    job = RenderJob(address, told, settings.kernel, tuple(files))
     return Work(
         name=product.plan.name,
         job=job,
         tiles=product.plan.tiles,
         count=product.plan.tiles.total,
-        sinks=files,
-        complete=partial(_complete, plan, product, scene, run, files, _clock(workers)),
-        scratch=file.path.with_name(f".{file.path.name}.parcels"),
+        sinks=tuple(files.values()),
+        complete=partial(_complete, plan, product, address, run, files, _clock(workers)),
+        scratch=paths["picture"].with_name(f".{paths['picture'].name}.parcels"),
     )
 
 
 def _pixel_files(plan: OrthoPlan) -> list[Path]:
     """Files that workers open."""
-    addresses = (scene_address(plan.project, p.image) for p in plan.products)
+    addresses = (ScenesAddress.of(plan.project, p.images) for p in plan.products)
     return [Path(path) for path in dict.fromkeys(path for a in addresses for path, _ in a.digests)]
 
 
@@ -214,26 +220,33 @@ def _clock(workers: Workers) -> Callable[[], dict[str, Any]]:
 def _complete(
     plan: OrthoPlan,
     product: OrthoProduct,
-    scene: Scene,
+    address: ScenesAddress,
     run: Run,
-    files: Sequence[ProductFile],
+    files: Mapping[OutputName, ProductFile],
     times: Callable[[], dict[str, Any]],
     tally: Tally,
 ) -> ProductResult:
     """Give the product its name and its record; with failed tiles it gets neither."""
-    file = files[0]
-    facts, *_ = [None] if tally.failed else [each.complete(_tags(plan, product)) for each in files]
+    file = files["picture"]
+    facts, *_ = [None] if tally.failed else [each.complete(_tags(plan, product)) for each in files.values()]
+    painted: dict[str, float] | None = None
+    if "sources" in files and facts is not None:
+        shapes = source_regions(files["sources"].path, product.grid)
+        painted = {product.images[row - 1]: float(shape.area) for row, shape in shapes.items()}
+        write_regions(seams_path(file.path), product.images, shapes, product.grid.crs)
     ran = times()
     result = ProductResult(
         path=file.path,
-        image=product.image,
+        images=product.images,
         seconds=ran["seconds"],
         valid_share=0.0 if facts is None else facts.valid_share,
         residual=tally.totals.get("worst_residual", 0.0),
         cells=tally.totals.get("cells", 0),
         tiles=product.plan.tiles.total,
         resumed=tally.resumed,
-        hidden=None if plan.settings.owners is None else tally.totals.get("hidden", 0) * product.grid.resolution**2,
+        hidden=_area(tally, "hidden", product) if plan.settings.asks_hidden else None,
+        bare=None if plan.settings.choice is None else _area(tally, "bare", product) + _left_out(product),
+        painted=painted,
         failed=tuple(sorted(tally.failed)),
         reason=next(iter(tally.reasons), ""),
     )
@@ -241,31 +254,42 @@ def _complete(
         write_run_record(
             result.path,
             key=product.key,
-            inputs=[input_entry(path, digest) for path, digest in scene.address.digests],
+            inputs=[input_entry(path, digest) for path, digest in address.digests],
             run={"workers": run.workers, "executor": run.executor, "memory": run.memory, **ran},
             values_moved_off_nodata=facts.moved_values,
             bytes=facts.bytes,
-            **_record(plan, product, scene, result),
+            **_record(plan, product, address.open(), result),
         )
     return result
+
+
+def _area(tally: Tally, name: str, product: OrthoProduct) -> float:
+    """Pixels that tiles have counted, m²."""
+    return float(tally.totals.get(name, 0) * product.grid.resolution**2)
+
+
+def _left_out(product: OrthoProduct) -> float:
+    """Area of tiles that no image can paint, m²."""
+    tiles = product.plan.tiles
+    return float((product.grid.window.size - tiles.windows[:, 2:].prod(axis=1).sum()) * product.grid.resolution**2)
 
 
 def _tags(plan: OrthoPlan, product: OrthoProduct) -> dict[str, str]:
     """What the file itself says of its origin."""
     return {
         "PHOTOPLAN_VERSION": __version__,
-        "PHOTOPLAN_IMAGE": product.image,
+        "PHOTOPLAN_IMAGE": ", ".join(product.images),
         "PHOTOPLAN_KERNEL": plan.settings.kernel,
         "PHOTOPLAN_KEY": product.key,
     }
 
 
-def _record(plan: OrthoPlan, product: OrthoProduct, scene: Scene, result: ProductResult) -> dict[str, Any]:
+def _record(plan: OrthoPlan, product: OrthoProduct, scenes: Scenes, result: ProductResult) -> dict[str, Any]:
     """What a person needs to answer for the product, and to make it again."""
-    center = scene.camera.center
+    scene = scenes[0]
     return {
         "product": result,
-        "project": json.loads(scene.address.text),
+        "project": plan.project.model_dump(mode="json", exclude={"images"}, exclude_none=True),
         "settings": plan.settings,
         "grid": {
             "crs": product.grid.crs,
@@ -282,9 +306,19 @@ def _record(plan: OrthoPlan, product: OrthoProduct, scene: Scene, result: Produc
         "crs_operations": [
             {"operation": step.operation, "accuracy_m": step.accuracy} for step in scene.ground.operations
         ],
-        "restored": None if (step := scene.reader.step(RestoreStep)) is None else step.describe(),
-        "projection_centre": [float(c) for c in center],
-        "gsd_m": product.gsd,
+        "images": [_image_record(scenes[row], look) for row, look in enumerate(product.looks)],
+    }
+
+
+def _image_record(scene: Scene, look: Look) -> dict[str, Any]:
+    """An image as it took part."""
+    step = scene.reader.step(RestoreStep)
+    (stated,) = json.loads(scene.address.text)["images"]
+    return {
+        **stated,
+        "projection_centre": [float(c) for c in scene.camera.center],
+        "gsd_m": look.gsd,
+        "restored": None if step is None else step.describe(),
     }
 
 
@@ -293,7 +327,7 @@ class ProductResult:
     """What became of one product."""
 
     path: Path
-    image: str
+    images: tuple[str, ...]
     seconds: float
     valid_share: float
     """Valid pixels among all pixels of the product, 0 to 1."""
@@ -306,7 +340,11 @@ class ProductResult:
     resumed: int
     """Tiles taken over from an earlier run."""
     hidden: float | None
-    """Ground in the image that it cannot see, m²; None: nobody has asked."""
+    """Ground in the images that none of them sees, m²; None: nobody has asked."""
+    bare: float | None
+    """Ground of a mosaic that lies in none of its images, m²; None: it is no mosaic."""
+    painted: dict[str, float] | None
+    """Ground that each image paints, m², where that is asked for."""
     failed: tuple[int, ...]
     """Tiles that could not be computed; the product is then not written."""
     reason: str = ""
@@ -314,15 +352,23 @@ class ProductResult:
 
     def json_fields(self) -> dict[str, Any]:
         """Figures without the reason of a failure."""
-        own = ("path", "image", "seconds", "valid_share", "cells", "tiles")
+        own = ("path", "seconds", "valid_share", "cells", "tiles")
+        images = {"image": self.images[0]} if self.bare is None else {"images": self.images, "outside_m2": self.bare}
         more = {"worst_anchor_residual_px": "residual", "resumed_tiles": "resumed", "failed_tiles": "failed"}
-        return pick(self, *own, hidden_m2="hidden", **more)
+        return {**images, **pick(self, *own, hidden_m2="hidden", painted_m2="painted", **more)}
 
 
-def outputs(folder: Path, product: OrthoProduct, settings: OrthoSettings) -> list[Path]:
-    """Rasters of a product: itself, and where ground is hidden if that is to be marked."""
+def outputs(folder: Path, product: OrthoProduct, settings: OrthoSettings) -> dict[OutputName, Path]:
+    """Rasters of a product: itself, where ground is hidden, which image painted a pixel."""
     path = folder / f"{product.plan.name}.tif"
-    return [path, path.with_name(f"{path.stem}_hidden.tif")] if settings.hidden == "mark" else [path]
+    asked: dict[OutputName, bool] = {"hidden": settings.hidden == "mark", "sources": settings.sources}
+    more = {name: path.with_name(f"{path.stem}_{name}.tif") for name, ask in asked.items() if ask}
+    return {"picture": path, **more}
+
+
+def seams_path(picture: Path) -> Path:
+    """The GeoPackage of a mosaic's regions."""
+    return picture.with_name(f"{picture.stem}_seams.gpkg")
 
 
 def finished_products(plan: OrthoPlan, folder: Path, overwrite: bool) -> dict[str, ProductResult]:
@@ -330,13 +376,13 @@ def finished_products(plan: OrthoPlan, folder: Path, overwrite: bool) -> dict[st
 
     When all products of a plan exist, the run was not interrupted: doing it again needs `overwrite`.
     """
-    existing = [p for p in plan.products if outputs(folder, p, plan.settings)[0].exists()]
+    existing = [p for p in plan.products if outputs(folder, p, plan.settings)["picture"].exists()]
     if overwrite or not existing:
         return {}
     kept = {p.plan.name: _kept(plan, p, folder) for p in existing}
     foreign = [name for name, result in kept.items() if result is None]
     if foreign or len(existing) == len(plan.products):
-        first, *_ = outputs(folder, plan[foreign[0]] if foreign else existing[0], plan.settings)
+        first = outputs(folder, plan[foreign[0]] if foreign else existing[0], plan.settings)["picture"]
         more = f" and {len(existing) - 1} more" if len(existing) > 1 else ""
         raise UsageError(f"{first}{more} exists; give `overwrite` to replace it, or another `output`")
     return {name: result for name, result in kept.items() if result is not None}
@@ -344,16 +390,16 @@ def finished_products(plan: OrthoPlan, folder: Path, overwrite: bool) -> dict[st
 
 def _kept(plan: OrthoPlan, product: OrthoProduct, folder: Path) -> ProductResult | None:
     """The result of an earlier run with the same key and settings; None if the product is not one."""
-    path, *others = outputs(folder, product, plan.settings)
-    if not all(other.exists() for other in others):
+    paths = outputs(folder, product, plan.settings)
+    if not all(path.exists() for path in paths.values()):
         return None
 
     def result(made: dict[str, Any], recorded: dict[str, Any]) -> ProductResult | None:
         if OrthoSettings.from_dict(recorded) != plan.settings:
             return None
         return ProductResult(
-            path=path,
-            image=product.image,
+            path=paths["picture"],
+            images=product.images,
             seconds=made["seconds"],
             valid_share=made["valid_share"],
             residual=made["worst_anchor_residual_px"],
@@ -361,7 +407,9 @@ def _kept(plan: OrthoPlan, product: OrthoProduct, folder: Path) -> ProductResult
             tiles=made["tiles"],
             resumed=made["tiles"],
             hidden=made.get("hidden_m2"),
+            bare=made.get("outside_m2"),
+            painted=made.get("painted_m2"),
             failed=(),
         )
 
-    return recorded_result(path, product.key, result)
+    return recorded_result(paths["picture"], product.key, result)

@@ -18,40 +18,59 @@ from photoplan.engine.execute import render as render_tile
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MapGrid, Window, refuse_absurd
+from photoplan.io.fingerprint import fingerprint
 from photoplan.io.names import safe_stem
 from photoplan.io.project.model import Project
 from photoplan.io.storage import nodata_for
 from photoplan.orientation.plausibility import ImagePlausibility, View, other_reading
+from photoplan.plan.choice import BestImage, Drawn
 from photoplan.plan.compile import AnchorRule
 from photoplan.plan.footprint import Footprint, covered_tiles, image_border, mean_gsd, some_height
+from photoplan.plan.owner import InSight, Ownership
 from photoplan.plan.product import ProductPlan
+from photoplan.plan.tiles import Tiles
 from photoplan.products.judged import judged
 from photoplan.products.orthophoto.settings import OrthoSettings
-from photoplan.project.scene import Scene, SceneAddress, map_order, open_scene
+from photoplan.project.scene import Scene, map_order, open_scene
+from photoplan.project.scenes import ScenesAddress
 from photoplan.targets.map import MapTarget
 
 #: A product is at most so many times finer than its images see the ground.
 _FINER = 4.0
+#: What it counts that a user prefers an image: more than any penalty of the score.
+PREFERRED = 1000.0
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What an image sees of the terrain."""
+
+    footprint: Footprint
+    """Where it lies."""
+    gsd: float
+    """Its mean ground sampling distance, metres."""
 
 
 @dataclass(frozen=True, eq=False)
 class OrthoProduct:
-    """One orthophoto before its pixels."""
+    """One orthophoto, or a mosaic of many images, before its pixels."""
 
     plan: ProductPlan
-    """Grid, tiles and anchors' rule."""
-    footprint: Footprint
-    """Where the image lies on the terrain."""
-    gsd: float
-    """Mean ground sampling distance of the image, metres."""
+    """Grid, table of sources, tiles and anchors' rule."""
+    looks: tuple[Look, ...]
+    """What each of its images sees, by row of the table of sources."""
     key: str
     """Hash of all that decides the pixels: inputs, orientation, settings, version."""
 
     @property
-    def image(self) -> str:
-        """Name of the image."""
-        (name,) = self.plan.sources
-        return name
+    def images(self) -> tuple[str, ...]:
+        """Names of the images."""
+        return self.plan.sources
+
+    @property
+    def gsd(self) -> float:
+        """Mean ground sampling distance of the images, metres."""
+        return float(np.mean([look.gsd for look in self.looks]))
 
     @property
     def grid(self) -> MapGrid:
@@ -72,16 +91,18 @@ class OrthoPlan:
 
     def __getitem__(self, name: str) -> OrthoProduct:
         for product in self.products:
-            if name in (product.plan.name, product.image):
+            if name == product.plan.name or product.images == (name,):
                 return product
-        raise KeyError(f"{name}; the plan has {', '.join(p.image for p in self.products)}")
+        raise KeyError(f"{name}; the plan has {', '.join(p.plan.name for p in self.products)}")
 
     def __str__(self) -> str:
         tiles = sum(len(p.plan.tiles) for p in self.products)
-        lines = [f"{len(self.products)} orthophotos, {tiles} tiles, kernel {self.settings.kernel}"]
+        what = f"{len(self.products)} orthophotos" if self.settings.choice is None else "mosaic"
+        lines = [f"{what}, {tiles} tiles, kernel {self.settings.kernel}"]
         for p in self.products:
+            images = "" if self.settings.choice is None else f"{len(p.images)} images, "
             lines.append(
-                f"  {p.plan.name}: {p.grid.width} × {p.grid.height} px of {p.grid.resolution:g} m, "
+                f"  {p.plan.name}: {images}{p.grid.width} × {p.grid.height} px of {p.grid.resolution:g} m, "
                 f"{len(p.plan.tiles)} of {p.plan.tiles.total} tiles, GSD {p.gsd:.3g} m"
             )
         return "\n".join(lines)
@@ -121,14 +142,46 @@ def plan_orthophotos(
     UsageError
         An unknown image or setting, bounds that hold nothing, or a resolution that is much too fine.
     """
-    chosen = settings or project_settings(project)
-    if changes:
-        chosen = OrthoSettings.from_dict({**asdict(chosen), **changes})
-    looks = []
-    blind: list[str] = []
+    chosen = chosen_settings(project, settings, changes)
     names = project.select(images)
     # Each image is looked at twice: where it lies, and which tiles it needs.
     events.begin("planning", 2 * len(names), "steps")
+    looked, blind = look_at(project, names, force, events)
+    chosen = with_resolution(project, chosen, looked, force)
+    products = []
+    for one in looked:
+        seen = (one.look.footprint,)
+        grid = grid_of(project, chosen, seen)
+        check_storable(one.scene, one.name, grid, chosen)
+        tiles = covered_tiles(one.scene.camera, one.scene.surface, grid, chosen.tile)
+        if len(tiles):
+            plan = product_plan(product_name(one.name), (one.name,), grid, tiles, chosen, seen)
+            products.append(OrthoProduct(plan, (one.look,), keyed(project, plan, chosen)))
+        else:
+            blind.append(f"{one.name}: sees {_extent(seen[0].bounds)}; the bounds are {_extent(chosen.bounds)}")
+        events.done()
+    refuse_blind(chosen, products, blind)
+    _refuse_equal_names(products)
+    return OrthoPlan(project, chosen, tuple(products), tuple(blind))
+
+
+@dataclass(frozen=True, eq=False)
+class Looked:
+    """An image that sees terrain."""
+
+    name: str
+    scene: Scene
+    look: Look
+
+
+def chosen_settings(project: Project, settings: OrthoSettings | None, changes: dict[str, Any]) -> OrthoSettings:
+    """The project's settings or others, with single ones changed."""
+    chosen = settings or project_settings(project)
+    return OrthoSettings.from_dict({**asdict(chosen), **changes}) if changes else chosen
+
+
+def look_at(project: Project, names: Sequence[str], force: bool, events: Events) -> tuple[list[Looked], list[str]]:
+    """Images that see terrain, and a line for each that sees none."""
     scenes: dict[str, Scene] = {}
     seen: dict[int, tuple[View, ImagePlausibility]] = {}
     for place in map_order(project, names):
@@ -139,28 +192,37 @@ def plan_orthophotos(
         events.done()
     if not force:
         _refuse_faults(seen, scenes)
-    for name in names:
-        scene = scenes[name]
+    looked, blind = [], []
+    for name, scene in ((name, scenes[name]) for name in names):
         if scene.footprint.bounds is None:
             blind.append(_sees_no_terrain(scene, name))
         else:
-            looks.append((name, scene, mean_gsd(scene.camera, scene.footprint)))
-    resolution = chosen.resolution or (two_figures(float(np.mean([look[2] for look in looks]))) if looks else 1.0)
-    if looks and not force:
-        _refuse_too_fine(project, resolution, chosen, looks)
-    products = []
-    for name, scene, gsd in looks:
-        plan = _plan_one(project, scene, name, replace(chosen, resolution=resolution))
-        if plan is None:
-            blind.append(f"{name}: sees {_extent(scene.footprint.bounds)}; the bounds are {_extent(chosen.bounds)}")
-        else:
-            products.append(OrthoProduct(plan, scene.footprint, gsd, product_key(scene.address, plan, chosen)))
-        events.done()
+            looked.append(Looked(name, scene, Look(scene.footprint, mean_gsd(scene.camera, scene.footprint))))
+    return looked, blind
+
+
+def with_resolution(project: Project, settings: OrthoSettings, looked: Sequence[Looked], force: bool) -> OrthoSettings:
+    """Settings with a resolution: the images' own if none is chosen."""
+    own = two_figures(float(np.mean([one.look.gsd for one in looked]))) if looked else 1.0
+    resolution = settings.resolution or own
+    if looked and not force:
+        _refuse_too_fine(project, resolution, settings, looked)
+    return replace(settings, resolution=resolution)
+
+
+def grid_of(project: Project, settings: OrthoSettings, seen: Sequence[Footprint]) -> MapGrid:
+    """Pixels of a product: all that its images see, or the bounds that were chosen."""
+    assert settings.resolution is not None
+    extents = np.array([one.bounds for one in seen if one.bounds is not None])
+    low, high = extents[:, :2].min(axis=0).tolist(), extents[:, 2:].max(axis=0).tolist()
+    return MapGrid.covering(settings.bounds or (*low, *high), settings.resolution, project.crs)
+
+
+def refuse_blind(settings: OrthoSettings, products: Sequence[Any], blind: Sequence[str]) -> None:
+    """Refuse a plan without a product, or without an image."""
     if not products:
-        where = "the terrain" if chosen.bounds is None else "terrain inside the bounds"
+        where = "the terrain" if settings.bounds is None else "terrain inside the bounds"
         raise GeometryError(f"no image sees {where} (xmin ymin xmax ymax in metres):\n  " + "\n  ".join(blind))
-    _refuse_equal_names(products)
-    return OrthoPlan(project, replace(chosen, resolution=resolution), tuple(products), tuple(blind))
 
 
 def _refuse_faults(seen: dict[int, tuple[View, ImagePlausibility]], scenes: dict[str, Scene]) -> None:
@@ -177,16 +239,13 @@ def _refuse_faults(seen: dict[int, tuple[View, ImagePlausibility]], scenes: dict
     )
 
 
-def _refuse_too_fine(
-    project: Project, resolution: float, settings: OrthoSettings, looks: Sequence[tuple[str, Scene, float]]
-) -> None:
+def _refuse_too_fine(project: Project, resolution: float, settings: OrthoSettings, looked: Sequence[Looked]) -> None:
     """Refuse a resolution at which most pixels would be made up."""
-    finest = min((gsd for _, _, gsd in looks if gsd > 0), default=0.0)
+    finest = min((one.look.gsd for one in looked if one.look.gsd > 0), default=0.0)
     if not resolution * _FINER < finest:
         return
     pixels = tiles = 0.0
-    for name, scene, _ in looks:
-        bounds = settings.bounds or scene.footprint.bounds
+    for name, bounds in ((one.name, settings.bounds or one.look.footprint.bounds) for one in looked):
         assert bounds is not None
         width, height = ((bounds[k + 2] - bounds[k]) / resolution for k in (0, 1))
         refuse_absurd((width, height), settings.tile, f"{name}: resolution {resolution:g} m")
@@ -204,17 +263,35 @@ def project_settings(project: Project) -> OrthoSettings:
     return OrthoSettings.from_dict({k: v for k, v in project.ortho_settings().items() if v is not None})
 
 
-def _plan_one(project: Project, scene: Scene, name: str, settings: OrthoSettings) -> ProductPlan | None:
-    bounds = settings.bounds or scene.footprint.bounds
-    assert bounds is not None and settings.resolution is not None
-    grid = MapGrid.covering(bounds, settings.resolution, project.crs)
-    _check_storable(scene, name, grid, settings)
-    target = MapTarget(grid)
-    tiles = covered_tiles(scene.camera, scene.surface, grid, settings.tile)
-    if not len(tiles):
-        return None
+def product_plan(
+    name: str,
+    images: tuple[str, ...],
+    grid: MapGrid,
+    tiles: Tiles,
+    settings: OrthoSettings,
+    seen: Sequence[Footprint],
+    regions: Drawn | None = None,
+) -> ProductPlan:
+    """A product of one image or of many, from what each of them sees of the terrain."""
     rule = AnchorRule.of(settings.kernel, settings.tolerance)
-    return ProductPlan(product_name(name), (name,), target, rule, tiles, settings.owners)
+    return ProductPlan(name, images, MapTarget(grid), rule, tiles, _owners(images, settings, seen, regions))
+
+
+def _owners(
+    images: tuple[str, ...], settings: OrthoSettings, seen: Sequence[Footprint], regions: Drawn | None
+) -> Ownership | None:
+    """Who paints a pixel."""
+    if settings.choice is None:
+        return None if settings.hidden == "show" else InSight(paints_hidden=settings.hidden == "mark")
+    ranges = np.array([one.height_range for one in seen])
+    first = settings.choice.prefer
+    return BestImage(
+        levels=(float(np.nanmin(ranges[:, 0])), float(np.nanmax(ranges[:, 1]))),
+        weights=settings.choice.weights,
+        ranks=tuple(float(first.index(name) - len(first)) * PREFERRED if name in first else 0.0 for name in images),
+        drawn=regions,
+        paints_hidden=settings.hidden != "nodata",
+    )
 
 
 def product_name(image: str) -> str:
@@ -222,7 +299,7 @@ def product_name(image: str) -> str:
     return f"{safe_stem(image)}_ortho"
 
 
-def _check_storable(scene: Scene, name: str, grid: MapGrid, settings: OrthoSettings) -> None:
+def check_storable(scene: Scene, name: str, grid: MapGrid, settings: OrthoSettings) -> None:
     """Refuse a product that cannot be written, before any is."""
     refuse_absurd((grid.width, grid.height), settings.tile, f"{name}: resolution {settings.resolution:g} m")
     nodata_for(scene.reader.dtype, settings.nodata_value, settings.compress)
@@ -232,21 +309,44 @@ def _check_storable(scene: Scene, name: str, grid: MapGrid, settings: OrthoSetti
         )
 
 
-def product_key(scene: SceneAddress, plan: ProductPlan, settings: OrthoSettings) -> str:
+def keyed(project: Project, plan: ProductPlan, settings: OrthoSettings) -> str:
+    """Key of a product of a project.
+
+    Raises
+    ------
+    InputError
+        A file is missing.
+    """
+    regions = None
+    if settings.choice is not None and settings.choice.seams is not None:
+        regions = fingerprint(project.resolve(settings.choice.seams)).digest
+    return product_key(ScenesAddress.of(project, plan.sources).facts, plan, settings, regions)
+
+
+def product_key(scenes: Any, plan: ProductPlan, settings: OrthoSettings, regions: str | None = None) -> str:
     """Hash of what decides a product's pixels, and of nothing else.
 
     Another key means that finished tiles are of no use.
+
+    Parameters
+    ----------
+    scenes : plain value
+        What moves a pixel of its images, see `SceneAddress.facts`.
+    plan, settings
+    regions : str, optional
+        Digest of the file of drawn regions.
     """
     assert isinstance(plan.target, MapTarget)
     grid = plan.target.grid
     facts = {
         "version": __version__,
-        "scene": scene.facts,
+        "scene": scenes,
         "grid": [grid.left, grid.top, grid.resolution, grid.width, grid.height, grid.crs],
         "rule": [plan.rule.tolerance, plan.rule.radius, plan.tiles.side],
         "kernel": settings.kernel,
         "nodata": settings.nodata,
         "hidden": settings.hidden,
+        "choice": None if settings.choice is None else {**asdict(settings.choice), "name": "", "seams": regions},
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
@@ -287,9 +387,10 @@ def _refuse_equal_names(products: Iterable[OrthoProduct]) -> None:
         name = product.plan.name.casefold()
         if name in seen:
             raise UsageError(
-                f"images {seen[name]} and {product.image} would both be written as {product.plan.name}.tif; rename one"
+                f"images {seen[name]} and {product.images[0]} would both be written as {product.plan.name}.tif; rename "
+                "one"
             )
-        seen[name] = product.image
+        seen[name] = product.images[0]
 
 
 def render(
@@ -313,13 +414,13 @@ def render(
     """
     product = plan[name]
     window = product.grid.window if bounds is None else window_of(product.grid, bounds)
-    scene = open_scene(plan.project, product.image)
+    scenes = ScenesAddress.of(plan.project, product.images).open()
     tiles = (tile for tile in product.plan.tiles if (tile.window & window).size)
     parts = (
-        (tile.window, render_tile(product.plan, tile, scene.sources, scene.surface, plan.settings.kernel))
+        (tile.window, render_tile(product.plan, tile, scenes.sources, scenes.surface, plan.settings.kernel))
         for tile in tiles
     )
-    whole = joined(window, parts, scene.reader)
+    whole = joined(window, parts, scenes[0].reader)
     assert whole.values is not None and whole.valid is not None
     return whole.values, whole.valid
 

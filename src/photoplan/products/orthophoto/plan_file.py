@@ -20,15 +20,16 @@ from photoplan.io.disk import disk_error, free_megabytes
 from photoplan.io.plan_file import PlanTables, read_plan_tables, write_plan_tables
 from photoplan.io.product import check_output
 from photoplan.io.project.file import parse_project
+from photoplan.io.project.model import Project
 from photoplan.plain import pick
-from photoplan.plan.compile import AnchorRule
 from photoplan.plan.footprint import Footprint
-from photoplan.plan.product import ProductPlan, compile_tile
+from photoplan.plan.product import compile_tile
 from photoplan.plan.tiles import Tiles
-from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, product_key, product_name
+from photoplan.products.orthophoto.mosaic import drawn_regions
+from photoplan.products.orthophoto.plan import Look, OrthoPlan, OrthoProduct, keyed, product_plan
 from photoplan.products.orthophoto.settings import OrthoSettings
-from photoplan.project.scene import input_files, open_scene, scene_address
-from photoplan.targets.map import MapTarget
+from photoplan.project.scene import input_files
+from photoplan.project.scenes import ScenesAddress
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +41,7 @@ class PlanFigures:
     cells_of_tile: NDArray[np.int64]
     residual_of_tile: NDArray[np.float64]
     source: NDArray[np.int32]
-    """Column, row, width, height of the source window; shape (n, 4)."""
+    """Column, row, width, height of the source window; shape (n, 4), 0 where there are several sources."""
 
     @property
     def tiles(self) -> int:
@@ -69,7 +70,7 @@ class PlanFigures:
         mine = slice(*np.searchsorted(self.product, (place, place + 1)))
         return {
             "name": product.plan.name,
-            "image": product.image,
+            "images": product.images,
             **pick(product.grid, "width", "height", "resolution", "bounds"),
             "gsd": product.gsd,
             "tiles": (self.cells_of_tile[mine] > 0).sum(),
@@ -94,12 +95,13 @@ def compile_figures(plan: OrthoPlan, events: Events = SILENT) -> PlanFigures:
     source = np.zeros((len(product), 4), np.int32)
     rows = iter(range(len(product)))
     for p in plan.products:
-        scene = open_scene(plan.project, p.image)
+        scenes = ScenesAddress.of(plan.project, p.images).open()
         for tile, row in zip(p.plan.tiles, rows):
-            compiled = compile_tile(p.plan, tile, {0: scene.camera}, scene.surface)
+            cameras = {source: scenes[source].camera for source in tile.sources}
+            compiled = compile_tile(p.plan, tile, cameras, scenes.surface)
             cells[row], residual[row] = compiled.cells, compiled.residual
-            for layer in compiled.layers:
-                read = layer.window(scene.camera.size)
+            for layer in compiled.layers if len(p.images) == 1 else ():
+                read = layer.window(cameras[layer.source].size)
                 source[row] = read.col, read.row, read.width, read.height
             events.done(1, tile.window.size)
     return PlanFigures(product, cells, residual, source)
@@ -141,24 +143,26 @@ def write_plan(path: Path, plan: OrthoPlan, figures: PlanFigures, output: Path, 
     tiles = [p.plan.tiles for p in plan.products]
     windows = np.concatenate([t.windows for t in tiles])[there]
     bounds = np.concatenate([t.bounds(p.grid) for t, p in zip(tiles, plan.products)])[there]
-    names, images = (np.array(each, object) for each in zip(*((p.plan.name, p.image) for p in plan.products)))
+    names = np.array([p.plan.name for p in plan.products], object)
     columns = {
         "product": names[figures.product[there]],
-        "image": images[figures.product[there]],
         "tile": np.concatenate([t.indices for t in tiles])[there].astype(np.int64),
+        "sources": np.array([" ".join(map(str, tile.sources)) for t in tiles for tile in t], object)[there],
         "cells": figures.cells_of_tile[there],
         "residual_px": figures.residual_of_tile[there],
         **{name: windows[:, i] for i, name in enumerate(("col", "row", "width", "height"))},
         **{f"source_{name}": figures.source[there, i] for i, name in enumerate(("col", "row", "width", "height"))},
     }
+    seen = [(p, row, image, look) for p in plan.products for row, (image, look) in enumerate(zip(p.images, p.looks))]
     footprints = {
-        "product": names,
-        "image": images,
-        "gsd": np.array([p.gsd for p in plan.products]),
-        "resolution": np.array([p.grid.resolution for p in plan.products]),
-        "on_terrain": np.array([p.footprint.on_surface for p in plan.products]),
+        "product": np.array([p.plan.name for p, _, _, _ in seen], object),
+        "image": np.array([image for _, _, image, _ in seen], object),
+        "source": np.array([row for _, row, _, _ in seen], np.int64),
+        "gsd": np.array([look.gsd for _, _, _, look in seen]),
+        "resolution": np.array([p.grid.resolution for p, _, _, _ in seen]),
+        "on_terrain": np.array([look.footprint.on_surface for _, _, _, look in seen]),
     }
-    outlines = [_outline(p) for p in plan.products]
+    outlines = [_outline(p, look.footprint) for p, _, _, look in seen]
     tables = PlanTables(header, columns, bounds, footprints, outlines, plan.project.crs)
     try:
         write_plan_tables(path, tables, overwrite)
@@ -184,9 +188,9 @@ def check_plan_path(path: Path, plan: OrthoPlan, overwrite: bool = False) -> Non
     check_output(path, input_files(plan.project), overwrite=overwrite)
 
 
-def _outline(product: OrthoProduct) -> NDArray[np.float64]:
+def _outline(product: OrthoProduct, footprint: Footprint) -> NDArray[np.float64]:
     """Footprint polygon; the product's rectangle where the image's border does not meet the terrain."""
-    seen = product.footprint.outline[np.isfinite(product.footprint.outline).all(axis=1), :2]
+    seen = footprint.outline[np.isfinite(footprint.outline).all(axis=1), :2]
     if len(seen) >= 3:
         return seen
     xmin, ymin, xmax, ymax = product.grid.bounds
@@ -213,14 +217,14 @@ def read_plan(path: Path | str) -> tuple[OrthoPlan, Path]:
         folder = (path.resolve().parent / header["folder"]).resolve()
         project = parse_project(header["project"], folder, str(path))
         settings = OrthoSettings.from_dict(header["settings"])
-        listed: dict[str, set[int]] = {}
-        for name, index in zip(tiles["product"].tolist(), tiles["tile"].tolist()):
-            listed.setdefault(name, set()).add(index)
-        products = [_product(entry, listed, settings) for entry in header["products"]]
+        listed: dict[str, dict[int, tuple[int, ...]]] = {}
+        for name, index, rows in zip(*(tiles[column].tolist() for column in ("product", "tile", "sources"))):
+            listed.setdefault(name, {})[index] = tuple(map(int, rows.split()))
+        products = [_product(entry, listed, settings, project) for entry in header["products"]]
         changed = [
-            p.image
+            p.images[0] if len(p.images) == 1 else p.plan.name
             for p, entry in zip(products, header["products"])
-            if product_key(scene_address(project, p.image), p.plan, settings) != entry["key"]
+            if keyed(project, p.plan, settings) != entry["key"]
         ]
         if changed:
             raise InputError(
@@ -237,39 +241,56 @@ def read_plan(path: Path | str) -> tuple[OrthoPlan, Path]:
 
 def _product_header(product: OrthoProduct, tiles: int) -> dict[str, Any]:
     """All of a product but its tiles, as plain values."""
-    plan, seen = product.plan, product.footprint
+    plan = product.plan
     return {
-        "image": product.image,
+        "name": plan.name,
         "key": product.key,
-        "gsd": product.gsd,
         "grid": asdict(product.grid),
         "tile_side": plan.tiles.side,
-        "rule": asdict(plan.rule),
-        "outline": seen.outline.tolist(),
-        "bounds": seen.bounds,
-        "on_surface": seen.on_surface,
-        "height_range": seen.height_range,
+        "images": [_look_header(image, look) for image, look in zip(product.images, product.looks)],
         "tiles": tiles,
     }
 
 
-def _product(entry: dict[str, Any], listed: dict[str, set[int]], settings: OrthoSettings) -> OrthoProduct:
+def _look_header(image: str, look: Look) -> dict[str, Any]:
+    seen = look.footprint
+    return {
+        "image": image,
+        "gsd": look.gsd,
+        "outline": seen.outline.tolist(),
+        **pick(seen, "bounds", "on_surface", "height_range"),
+    }
+
+
+def _look(entry: dict[str, Any]) -> Look:
+    outline = np.array(entry["outline"], float).reshape(-1, 3)
+    bounds = None if entry["bounds"] is None else tuple(entry["bounds"])
+    low, high = entry["height_range"]
+    return Look(Footprint(outline, bounds, entry["on_surface"], (low, high)), entry["gsd"])
+
+
+def _product(
+    entry: dict[str, Any], listed: dict[str, dict[int, tuple[int, ...]]], settings: OrthoSettings, project: Project
+) -> OrthoProduct:
     """What `_product_header` says, with the tiles that the layer lists.
 
     A person may have deleted some: it is then another product.
     """
-    grid, name = MapGrid(**entry["grid"]), product_name(entry["image"])
+    grid, name = MapGrid(**entry["grid"]), entry["name"]
+    images = tuple(each["image"] for each in entry["images"])
     side = int(entry["tile_side"])
     if side < 1 or -(-grid.width // side) * -(-grid.height // side) > MOST_TILES:
         raise ValueError(f"{grid.width} × {grid.height} pixels in tiles of {side}")
     every = Tiles.every(grid.window, side)
-    tiles = every.only(sorted(listed.get(name, set()) & set(range(every.total))))
+    mine = {index: rows for index, rows in listed.get(name, {}).items() if 0 <= index < every.total}
+    if any(row < 0 or row >= len(images) for rows in mine.values() for row in rows):
+        raise ValueError("a tile of an image that is not listed")
+    by_row = ([i for i, rows in mine.items() if row in rows] for row in range(len(images)))
+    tiles = every.only(sorted(mine)) if len(images) == 1 else Tiles.shared([every.only(sorted(i)) for i in by_row])
     key = entry["key"]
     if len(tiles) != entry["tiles"]:
         key = hashlib.sha256(f"{key} {tiles.indices.tolist()}".encode()).hexdigest()
-    rule = AnchorRule(**entry["rule"])
-    plan = ProductPlan(name, (entry["image"],), MapTarget(grid), rule, tiles, settings.owners)
-    outline = np.array(entry["outline"], float).reshape(-1, 3)
-    bounds = None if entry["bounds"] is None else tuple(entry["bounds"])
-    low, high = entry["height_range"]
-    return OrthoProduct(plan, Footprint(outline, bounds, entry["on_surface"], (low, high)), entry["gsd"], key)
+    looks = tuple(_look(each) for each in entry["images"])
+    regions = drawn_regions(project, settings, images, grid)
+    plan = product_plan(name, images, grid, tiles, settings, [look.footprint for look in looks], regions)
+    return OrthoProduct(plan, looks, key)

@@ -2,16 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import check_resolution
-from photoplan.plan.owner import InSight, Ownership
+from photoplan.plan.choice import Weights
 
 Kernel = Literal["nearest", "bilinear", "bicubic", "bicubic-1", "lanczos3"]
 Hidden = Literal["show", "nodata", "mark"]
 Compression = Literal["deflate", "zstd", "lzw", "jpeg", "none"]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """How a mosaic chooses among its images; checked at birth."""
+
+    name: str = "mosaic"
+    """Of the product, and of its file without the extension."""
+    weights: Weights = field(default_factory=Weights)
+    """What each penalty of the score counts."""
+    prefer: tuple[str, ...] = ()
+    """Images that come before all others wherever they see the ground, the first of them before the next."""
+    seams: str | None = None
+    """A GeoPackage of regions, each with its image, that come before the score; relative to the project's folder."""
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Choice:
+        """A choice from plain values."""
+        weights = Weights(**values.get("weights", {}))
+        return cls(**{**values, "weights": weights, "prefer": tuple(values.get("prefer", ()))})
 
 
 @dataclass(frozen=True)
@@ -38,6 +58,10 @@ class OrthoSettings:
     """Compression of the file; jpeg needs ``nodata = "mask"`` and sets it."""
     overviews: bool = True
     """Whether the file holds overviews."""
+    choice: Choice | None = None
+    """How images are chosen for one mosaic of them; None: an orthophoto of each."""
+    sources: bool = False
+    """Whether a second raster says which image painted each pixel, and a GeoPackage where its regions are."""
 
     def __post_init__(self) -> None:
         if self.resolution is not None:
@@ -60,9 +84,9 @@ class OrthoSettings:
                 raise UsageError(f"nodata {self.nodata!r}; allowed are auto, mask or a number") from None
 
     @property
-    def owners(self) -> Ownership | None:
-        """Who paints a pixel of an orthophoto of one image."""
-        return None if self.hidden == "show" else InSight(paints_hidden=self.hidden == "mark")
+    def asks_hidden(self) -> bool:
+        """Whether it is looked what images cannot see."""
+        return self.hidden != "show" or self.choice is not None
 
     @property
     def nodata_value(self) -> float | Literal["auto", "mask"]:
@@ -82,4 +106,5 @@ class OrthoSettings:
         unknown = sorted(set(values) - known)
         if unknown:
             raise UsageError(f"unknown settings {', '.join(unknown)}; known are {', '.join(sorted(known))}")
-        return cls(**values)
+        choice = values.get("choice")
+        return cls(**{**values, "choice": Choice.from_dict(choice) if isinstance(choice, dict) else choice})

@@ -1,0 +1,108 @@
+"""Regions of a mosaic by the image that paints them: from the raster of sources, to a GeoPackage, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyogrio
+import rasterio
+import rasterio.features
+import rasterio.windows
+import shapely
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.io.polygons import label_polygons, read_features, write_features
+
+#: Side of the parts in which a raster is read, pixels.
+_PART = 2048
+
+
+@dataclass(frozen=True, eq=False)
+class Regions:
+    """Polygons that somebody has given to images of a mosaic."""
+
+    grid: MapGrid
+    shapes: tuple[tuple[Any, int], ...]
+    """Polygon, and row of its image in the table of sources, plus one; the last of those over each other counts."""
+
+    def rows(self, window: Window) -> NDArray[np.uint16]:
+        """Row plus one for each pixel of a window whose centre lies in a polygon; 0 elsewhere."""
+        grid, shape = self.grid, (window.height, window.width)
+        left, top = grid.left + window.col * grid.resolution, grid.top - window.row * grid.resolution
+        box = shapely.box(left, top - shape[0] * grid.resolution, left + shape[1] * grid.resolution, top)
+        near = [(polygon, row) for polygon, row in self.shapes if polygon.intersects(box)]
+        if not near:
+            return np.zeros(shape, np.uint16)
+        to_map = rasterio.Affine(grid.resolution, 0.0, left, 0.0, -grid.resolution, top)
+        return np.asarray(rasterio.features.rasterize(near, shape, transform=to_map, dtype="uint16"))
+
+
+def source_regions(path: Path, grid: MapGrid) -> dict[int, Any]:
+    """Outline of what each image paints, along the edges of pixels: multipolygons by row plus one.
+
+    Parameters
+    ----------
+    path : Path
+        A raster of sources.
+    grid : MapGrid
+        Its grid.
+    """
+    found: dict[int, list[Any]] = {}
+    with rasterio.open(path) as file:
+        for part in grid.window.tiles(_PART):
+            at = rasterio.windows.Window(part.col, part.row, part.width, part.height)
+            left, top = grid.left + part.col * grid.resolution, grid.top - part.row * grid.resolution
+            labels = file.read(1, window=at).astype(np.int32)
+            here = MapGrid(left, top, grid.resolution, part.width, part.height, grid.crs)
+            for row, shape in label_polygons(labels, here).items():
+                found.setdefault(row, []).append(shape)
+    whole = ((row, shapely.union_all(parts)) for row, parts in sorted(found.items()))
+    return {row: shape if shape.geom_type == "MultiPolygon" else shapely.MultiPolygon([shape]) for row, shape in whole}
+
+
+def write_regions(path: Path, images: Sequence[str], shapes: Mapping[int, Any], crs: str) -> None:
+    """Write regions as a GeoPackage with the layer `regions`: columns image, source and area_m2.
+
+    Raises
+    ------
+    UsageError
+        The folder cannot be written.
+    ResourceError
+        The disk is full.
+    """
+    rows = list(shapes)
+    columns = {
+        "image": np.array([images[row - 1] for row in rows], object),
+        "source": np.array(rows, np.int64),
+        "area_m2": np.array([shapes[row].area for row in rows], float),
+    }
+    write_features(path, "MultiPolygon", [shapes[row] for row in rows], columns, crs, "regions")
+
+
+def read_regions(path: Path, images: Sequence[str], grid: MapGrid) -> Regions:
+    """Regions of a GeoPackage, as `write_regions` writes them or somebody has drawn them.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, has no column `image`, names an image that is not among `images`, or holds polygons
+        that cross themselves.
+    """
+    features = read_features(path, "Polygon", crs=grid.crs).items
+    if "image" not in pyogrio.read_info(path)["fields"]:
+        raise InputError(f"{path}: no column `image`, which says whose each region is")
+    names = [each.name for each in features]
+    unknown = [name for name in names if name not in images]
+    if unknown:
+        raise InputError(
+            f"{path}: regions of {', '.join(map(repr, dict.fromkeys(unknown)))}, which "
+            f"{'is' if len(set(unknown)) == 1 else 'are'} not in the mosaic; choose these images too, or take the "
+            "regions out"
+        )
+    return Regions(grid, tuple((each.geometry, images.index(name) + 1) for each, name in zip(features, names)))

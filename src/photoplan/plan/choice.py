@@ -1,0 +1,196 @@
+"""Which of many images paints which pixel: the best of those that see it, by a stated score.
+
+The score is a sum of penalties, each without a unit; the least wins, of equal ones the first image. All of them change
+slowly over the ground but for the last, so that one image paints a region and not single pixels:
+
+- slant: tangent of the angle between the line of sight and the vertical, by which an error of the height moves a pixel;
+- coarseness: logarithm to base 2 of the ground sampling distance in pixels of the product;
+- border: 1 at the image's border, falling with the square of the distance to 0 at a tenth of the image's shorter side;
+- occlusion: 1 beside ground that the image does not see, falling to 0 at some distance on the map. Behr (1989, section
+  6.3.2.1) takes the image whose line of sight passes furthest from what hides ground; here the distance is that of the
+  pixels on the map.
+
+What an image does not see it does not paint, whatever its score.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from photoplan.cameras.base import Projection
+from photoplan.errors import UsageError
+from photoplan.geometry.grid import Window
+from photoplan.kernels.choose import between_nodes
+from photoplan.plan.ground import TileGround
+from photoplan.plan.owner import Share
+from photoplan.plan.visibility import hidden_pixels, sight_lines
+from photoplan.surfaces.base import Surface
+from photoplan.targets.map import MapTarget
+
+#: Pixels between nodes; they lie at multiples of it in the product's own pixels, whatever the tile.
+_SPACING = 32
+#: Part of an image's shorter side in which its border counts.
+_RIM = 0.1
+#: Pixels at an image's border that it does not paint where others can: kernels need what is around a position.
+_MARGIN = 3.0
+#: Penalty of lines of sight that do not come from above.
+_LEVEL = 100.0
+#: Distance in which what hides ground counts, pixels of the product.
+_AROUND = 24
+#: What a drawn region is worth, more than all penalties; and what the margin costs, more than that.
+_DRAWN, _RIMMED = 1e6, 1e7
+
+
+@dataclass(frozen=True)
+class Weights:
+    """What each penalty counts."""
+
+    slant: float = 1.0
+    coarseness: float = 1.0
+    border: float = 1.0
+    occlusion: float = 0.5
+
+    def __post_init__(self) -> None:
+        values = (self.slant, self.coarseness, self.border, self.occlusion)
+        if not all(0 <= value <= 1000 for value in values) or not any(values):
+            raise UsageError(f"weights {values}; allowed are numbers from 0 to 1000, not all of them 0")
+
+
+class Drawn(Protocol):
+    """Regions that somebody has given to images."""
+
+    def rows(self, window: Window) -> NDArray[np.uint16]:
+        """Row of the table of sources, plus one, for each pixel of a window of the product; 0: nobody was given it."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class BestImage:
+    """Each pixel is painted by the image of the least penalty among those that see it."""
+
+    levels: tuple[float, float]
+    """Lowest and highest ground of the product, metres: between them positions are interpolated."""
+    weights: Weights = Weights()
+    ranks: tuple[float, ...] = ()
+    """A penalty of each source, by row: the user's own ranking; none if empty."""
+    drawn: Drawn | None = None
+    """Regions that come before the score, where their image sees them."""
+    paints_hidden: bool = False
+    """Whether ground that none of its images sees is painted with what hides it."""
+
+    def share(self, ground: TileGround, cameras: Mapping[int, Projection], surface: Surface) -> Share:
+        """The least penalty of those that see a pixel; visibility is asked only of images that come first somewhere."""
+        rows = sorted(cameras)
+        drawn = None if self.drawn is None else self.drawn.rows(ground.window)
+        cost = np.stack([self._penalty(row, cameras[row], ground, drawn) for row in rows])
+        inside = cost.min(axis=0)
+        blind = cost if not self.paints_hidden else cost.copy()
+        wide = _wide(ground, surface) if self.weights.occlusion else ground
+        looked: set[int] = set()
+        while True:
+            best = np.argmin(cost, axis=0)
+            ahead = np.unique(best[np.isfinite(cost.min(axis=0))])
+            asked = [int(k) for k in ahead if k not in looked]
+            for k in asked:
+                self._look(cost[k], cameras[rows[k]], ground, wide, surface)
+            looked.update(asked)
+            if not asked:
+                break
+        seen = np.isfinite(cost.min(axis=0))
+        hidden = np.isfinite(inside) & ~seen
+        if self.paints_hidden:
+            best = np.where(seen, best, np.argmin(blind, axis=0))
+        paints = np.isfinite(inside) if self.paints_hidden else seen
+        return Share(np.where(paints, np.array(rows)[best] + 1, 0).astype(np.uint16), hidden)
+
+    def _look(
+        self, cost: NDArray[np.float32], camera: Projection, ground: TileGround, wide: TileGround, surface: Surface
+    ) -> None:
+        """Add to an image's penalty what it does not see, and what is near that."""
+        hidden = hidden_pixels(camera, wide, surface)
+        if not hidden.any():
+            return
+        at = ground.window.slices(wide.window)
+        if self.weights.occlusion:
+            near = 1.0 - distance_transform_edt(~hidden)[at] / _AROUND
+            cost += np.float32(self.weights.occlusion) * np.clip(near, 0.0, 1.0).astype(np.float32)
+        cost[hidden[at]] = np.inf
+
+    def _penalty(
+        self, row: int, camera: Projection, ground: TileGround, drawn: NDArray[np.uint16] | None
+    ) -> NDArray[np.float32]:
+        """Penalty of each pixel without what hides it; infinite outside the image, and without a surface."""
+        xy = np.empty((*ground.relief.shape, 2))
+        cost = np.empty(ground.relief.shape, np.float32)
+        nodes, levels, corner = self._nodes(camera, ground)
+        between_nodes(ground.relief, nodes, levels, corner, _SPACING, xy, cost)
+        near = _to_border(camera, xy)
+        rim = np.clip(1.0 - near / (_RIM * min(camera.size)), 0.0, 1.0)
+        cost += (self.weights.border * rim**2 + (self.ranks[row] if self.ranks else 0.0)).astype(np.float32)
+        if drawn is not None:
+            cost[drawn == row + 1] -= _DRAWN
+        # Beyond the margin an image only comes after all others.
+        cost[near < _MARGIN] += _RIMMED
+        cost[~(near >= 0.0) | np.isnan(cost)] = np.inf
+        return cost
+
+    def _nodes(
+        self, camera: Projection, ground: TileGround
+    ) -> tuple[NDArray[np.float64], tuple[float, float], tuple[int, int]]:
+        """Homogeneous positions and smooth penalties at nodes of two levels (2, rows, columns, 4), the levels, and by
+        how many pixels the first node lies before the tile."""
+        target, window = ground.target, ground.window
+        assert isinstance(target, MapTarget)
+        (right, bottom), (low, high) = window.stop, self.levels
+        pad = 0.01 + 1e-6 * max(abs(low), abs(high))
+        levels = low - pad, high + pad
+        first = window.col // _SPACING, window.row // _SPACING
+        u = np.arange(first[0], max(-(-right // _SPACING), first[0] + 1) + 1) * float(_SPACING)
+        v = np.arange(first[1], max(-(-bottom // _SPACING), first[1] + 1) + 1) * float(_SPACING)
+        h, v, u = np.meshgrid(levels, v, u, indexing="ij")
+        uvh = np.stack([u, v, h], axis=-1)
+        step = np.moveaxis(sight_lines(camera, target, uvh).step, -1, 0)
+        across, up = np.hypot(step[0], step[1]) * target.grid.resolution, step[2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slant = np.where(up > 0, np.minimum(across / up, _LEVEL), _LEVEL)
+        around = uvh[..., None, :] + np.array([(-0.5, 0, 0), (0.5, 0, 0), (0, -0.5, 0), (0, 0.5, 0)])
+        position = camera.project_homogeneous(target.to_ground(around))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            xy = position[..., :2] / position[..., 2:]
+            size = np.sqrt(
+                np.abs(np.linalg.det(np.stack([xy[..., 1, :] - xy[..., 0, :], xy[..., 3, :] - xy[..., 2, :]], -1)))
+            )
+            coarse = np.clip(np.nan_to_num(-np.log2(size), nan=_LEVEL, posinf=_LEVEL), -_LEVEL, _LEVEL)
+        smooth = self.weights.slant * slant + self.weights.coarseness * coarse
+        nodes = np.concatenate([camera.project_homogeneous(target.to_ground(uvh)), smooth[..., None]], axis=-1)
+        return nodes, levels, (window.col - first[0] * _SPACING, window.row - first[1] * _SPACING)
+
+
+def _wide(ground: TileGround, surface: Surface) -> TileGround:
+    """A tile with what is around it."""
+    at, r = ground.window, _AROUND
+    window = Window(at.col - r, at.row - r, at.width + 2 * r, at.height + 2 * r)
+    return TileGround.of(ground.target, window, surface.relief(ground.target, window))
+
+
+def _to_border(camera: Projection, ideal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance to the image's border of ideal positions (..., 2), pixels; negative outside, NaN where there is none."""
+    width, height = camera.size
+
+    def distance(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        # The middle first: half the passes over the pixels.
+        x, y = np.abs(xy[..., 0] - (width - 1) / 2), np.abs(xy[..., 1] - (height - 1) / 2)
+        return np.asarray(np.minimum(width / 2 - x, height / 2 - y))
+
+    near = distance(ideal)
+    if camera.field is not None:
+        # The field moves positions a little; only where that decides, or where the border counts, it is asked.
+        there = np.abs(near) < 2 * _RIM * min(camera.size)
+        near[there] = distance(camera.field(ideal[there]))
+    return near

@@ -1,0 +1,116 @@
+"""One orthophoto of many images: each pixel from the best of those that see it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from photoplan.errors import InputError, UsageError
+from photoplan.events import SILENT, Events
+from photoplan.geometry.grid import MapGrid
+from photoplan.io.names import safe_stem
+from photoplan.io.project.model import Project
+from photoplan.io.regions import Regions, read_regions
+from photoplan.plan.footprint import covered_tiles
+from photoplan.plan.tiles import Tiles
+from photoplan.products.orthophoto.plan import (
+    Looked,
+    OrthoPlan,
+    OrthoProduct,
+    check_storable,
+    chosen_settings,
+    grid_of,
+    keyed,
+    look_at,
+    product_plan,
+    refuse_blind,
+    with_resolution,
+)
+from photoplan.products.orthophoto.settings import Choice, OrthoSettings
+
+
+def plan_mosaic(
+    project: Project,
+    images: Sequence[str] | None = None,
+    settings: OrthoSettings | None = None,
+    *,
+    events: Events = SILENT,
+    force: bool = False,
+    **changes: Any,
+) -> OrthoPlan:
+    """Plan one orthophoto of many images; no pixel is touched.
+
+    Parameters
+    ----------
+    project, images, settings, events, force, **changes
+        As of `plan_orthophotos`; `choice` says how images are chosen, and what no image sees is left empty unless
+        `hidden` is given.
+
+    Raises
+    ------
+    InputError
+        An input cannot be used, or images differ in bands or type of pixels.
+    GeometryError
+        No image sees the terrain, or an orientation cannot be right.
+    UsageError
+        An unknown image or setting, bounds that hold nothing, or a resolution that is much too fine.
+    """
+    chosen = chosen_settings(project, settings, {"choice": Choice(), "hidden": "nodata", **changes})
+    assert chosen.choice is not None
+    names = project.select(images)
+    first = project.select(chosen.choice.prefer) if chosen.choice.prefer else []
+    apart = [name for name in first if name not in names]
+    if apart:
+        raise UsageError(f"image {apart[0]!r} is preferred, but not among the images of the mosaic")
+    order = [name for pattern in chosen.choice.prefer for name in project.select([pattern])]
+    chosen = replace(chosen, choice=replace(chosen.choice, prefer=tuple(dict.fromkeys(order))))
+    events.begin("planning", 2 * len(names), "steps")
+    looked, blind = look_at(project, names, force, events)
+    _refuse_mixed(looked)
+    chosen = with_resolution(project, chosen, looked, force)
+    refuse_blind(chosen, looked, blind)
+    grid = grid_of(project, chosen, [one.look.footprint for one in looked])
+    taking, tiles = [], []
+    for one in looked:
+        mine = covered_tiles(one.scene.camera, one.scene.surface, grid, chosen.tile)
+        if len(mine):
+            taking.append(one)
+            tiles.append(mine)
+        else:
+            blind.append(f"{one.name}: sees nothing inside the bounds")
+        events.done()
+    refuse_blind(chosen, taking, blind)
+    assert chosen.choice is not None
+    name = safe_stem(chosen.choice.name)
+    check_storable(taking[0].scene, name, grid, chosen)
+    taken = tuple(one.name for one in taking)
+    seen = [one.look.footprint for one in taking]
+    plan = product_plan(
+        name, taken, grid, Tiles.shared(tiles), chosen, seen, drawn_regions(project, chosen, taken, grid)
+    )
+    product = OrthoProduct(plan, tuple(one.look for one in taking), keyed(project, plan, chosen))
+    return OrthoPlan(project, chosen, (product,), tuple(blind))
+
+
+def drawn_regions(project: Project, settings: OrthoSettings, images: tuple[str, ...], grid: MapGrid) -> Regions | None:
+    """Regions of the choice's file; None: it has none.
+
+    Raises
+    ------
+    InputError
+        The file cannot be used, see `read_regions`.
+    """
+    if settings.choice is None or settings.choice.seams is None:
+        return None
+    return read_regions(project.resolve(settings.choice.seams), images, grid)
+
+
+def _refuse_mixed(looked: Sequence[Looked]) -> None:
+    """Refuse images that cannot lie in one file."""
+    kinds: dict[tuple[int, str], str] = {}
+    for one in looked:
+        kinds.setdefault((one.scene.reader.bands, str(one.scene.reader.dtype)), one.name)
+    if len(kinds) > 1:
+        told = ", ".join(f"{name!r} has {bands} bands of {dtype}" for (bands, dtype), name in kinds.items())
+        raise InputError(f"the images of a mosaic have the same bands and type of pixels: {told}; choose among them")

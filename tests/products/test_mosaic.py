@@ -1,0 +1,141 @@
+"""Mosaics: one orthophoto of many images."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyogrio.raw
+import pytest
+import rasterio
+import shapely
+from tools.command import Here
+from tools.small_block import CRS, NAMES, Block, make_project, texture, write_image
+
+BOUNDS = (500_180, 5_300_100, 500_540, 5_300_300)
+OPTIONS = ("--bounds", *BOUNDS, "--resolution", 1, "--tile", 128, "--no-quicklook")
+
+
+def made(path: Path) -> np.ndarray:
+    with rasterio.open(path) as file:
+        return file.read()
+
+
+@pytest.fixture
+def mosaic(small: Block, capsys: pytest.CaptureFixture[str]) -> tuple[Block, Here, dict]:  # type: ignore[type-arg]
+    photoplan = Here(capsys)
+    said = photoplan("mosaic", small.project, *OPTIONS, "--sources", "--json")
+    assert said.code == 0, said.err
+    (told,) = json.loads(said.out)["products"]
+    return small, photoplan, told
+
+
+def test_every_pixel_is_that_of_the_orthophoto_of_its_image(mosaic) -> None:  # type: ignore[no-untyped-def]
+    block, photoplan, told = mosaic
+    folder = block.folder / "products"
+    assert photoplan("ortho", block.project, *OPTIONS).code == 0
+    pixels, owner = made(folder / "mosaic.tif"), made(folder / "mosaic_sources.tif")[0]
+    assert told["images"] == sorted(NAMES) and set(np.unique(owner)) == {0, 1, 2, 3}
+    want = np.zeros_like(pixels)
+    for row, name in enumerate(told["images"], 1):
+        want[:, owner == row] = made(folder / f"{name}_ortho.tif")[:, owner == row]
+    np.testing.assert_array_equal(pixels, want)
+    assert (pixels[:, owner > 0] > 0).all()
+    assert told["valid_share"] == pytest.approx((owner > 0).mean(), abs=1e-6)
+    # Everything that is no pixel of an image is told: hidden, or in no image.
+    assert told["hidden_m2"] + told["outside_m2"] == pytest.approx((owner == 0).sum(), abs=1e-6)
+    assert sum(told["painted_m2"].values()) == pytest.approx((owner > 0).sum())
+
+
+def test_one_image_paints_a_region_and_not_single_pixels(mosaic) -> None:  # type: ignore[no-untyped-def]
+    block, _, _ = mosaic
+    regions = block.folder / "products" / "mosaic_seams.gpkg"
+    meta, _, wkb, values = pyogrio.raw.read(regions)
+    columns = dict(zip(meta["fields"], values))
+    shapes = shapely.from_wkb(wkb)
+    assert meta["crs"] == CRS and set(columns["image"]) == set(NAMES)
+    np.testing.assert_allclose(columns["area_m2"], shapely.area(shapes))
+    assert sum(shapely.get_num_geometries(shapes)) <= 9
+
+
+def test_edited_regions_are_followed(mosaic, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    block, photoplan, told = mosaic
+    folder = block.folder / "products"
+    again = photoplan(
+        "mosaic", block.project, *OPTIONS, "--sources", "--seams", folder / "mosaic_seams.gpkg", "--name", "b"
+    )
+    assert again.code == 0, again.err
+    np.testing.assert_array_equal(made(folder / "b_sources.tif"), made(folder / "mosaic_sources.tif"))
+    middle = shapely.box(500_330, 5_300_180, 500_380, 5_300_220)
+    drawn = tmp_path / "drawn.gpkg"
+    write(drawn, [middle], ["three"])
+    assert photoplan("mosaic", block.project, *OPTIONS, "--sources", "--seams", drawn, "--name", "c").code == 0
+    before, after = (made(folder / f"{name}_sources.tif")[0] for name in ("mosaic", "c"))
+    inside = np.zeros(before.shape, bool)
+    inside[80:120, 150:200] = True
+    row = told["images"].index("three") + 1
+    assert (after[inside] == row).all() and (before[inside] != row).any()
+    np.testing.assert_array_equal(after[~inside], before[~inside])
+
+
+def write(path: Path, shapes: list[object], images: list[str]) -> None:
+    pyogrio.raw.write(path, shapely.to_wkb(np.array(shapes)), [np.array(images, object)], ["image"],
+                      layer="regions", driver="GPKG", geometry_type="Polygon", crs=CRS)  # fmt: skip
+
+
+def test_regions_that_cannot_be_meant(small: Block, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    photoplan = Here(capsys)
+    box = shapely.box(500_330, 5_300_180, 500_380, 5_300_220)
+    bow = shapely.Polygon([(500_330, 5_300_180), (500_380, 5_300_220), (500_380, 5_300_180), (500_330, 5_300_220)])
+    for shape, image, told in ((box, "nine", "'nine', which is not in the mosaic"), (bow, "one", "cross themselves")):
+        write(tmp_path / "drawn.gpkg", [shape], [image])
+        said = photoplan("mosaic", small.project, *OPTIONS, "--seams", tmp_path / "drawn.gpkg")
+        assert said.code == 3 and told in said.err
+        (tmp_path / "drawn.gpkg").unlink()
+    said = photoplan("mosaic", small.project, *OPTIONS, "--seams", tmp_path / "none.gpkg")
+    assert said.code == 3 and "none.gpkg" in said.err
+    assert not (small.folder / "products").exists()
+
+
+def test_a_preferred_image_and_the_weights(mosaic) -> None:  # type: ignore[no-untyped-def]
+    block, photoplan, told = mosaic
+    folder = block.folder / "products"
+    said = photoplan("mosaic", block.project, *OPTIONS, "--sources", "--prefer", "three", "--name", "p", "--json")
+    (first,) = json.loads(said.out)["products"]
+    assert first["painted_m2"]["three"] > told["painted_m2"]["three"] + 1000
+    assert (made(folder / "p_sources.tif") > 0).sum() == (made(folder / "mosaic_sources.tif") > 0).sum()
+    for words, text in (
+        (("--score", "slant=x"), "NAME=WEIGHT"),
+        (("--score", "slant=-1"), "weights"),
+        (("--prefer", "nine"), "'nine' is not in the project"),
+        (("--images", "one,two", "--prefer", "three"), "not among the images of the mosaic"),
+    ):
+        wrong = photoplan("mosaic", block.project, *OPTIONS, "--name", "x", *words)
+        assert wrong.code == 2 and text in wrong.err
+
+
+def test_a_plan_of_a_mosaic_gives_the_same_bytes(mosaic, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    block, photoplan, _ = mosaic
+    plan = tmp_path / "plan.gpkg"
+    assert photoplan("mosaic", block.project, *OPTIONS, "--sources", "--plan", plan).code == 0
+    assert pyogrio.read_info(plan, layer="footprints")["features"] == 3
+    assert photoplan("run", plan, "--output", tmp_path / "again", "--no-quicklook").code == 0
+    for name in ("mosaic.tif", "mosaic_sources.tif"):
+        assert (tmp_path / "again" / name).read_bytes() == (block.folder / "products" / name).read_bytes()
+
+
+def test_the_record_names_every_image(mosaic) -> None:  # type: ignore[no-untyped-def]
+    block, photoplan, told = mosaic
+    record = json.loads((block.folder / "products" / "mosaic.run.json").read_text())
+    assert [image["name"] for image in record["images"]] == told["images"]
+    assert all(len(image["projection_centre"]) == 3 and image["gsd_m"] > 0 for image in record["images"])
+    assert len(record["inputs"]) == 4
+    assert photoplan("mosaic", block.project, *OPTIONS).code == 2
+
+
+def test_images_of_different_kinds_are_named(small: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    write_image(small.images[1], texture(bands=1))
+    make_project(small)
+    said = Here(capsys)("mosaic", small.project, *OPTIONS)
+    assert said.code == 3 and "'two' has 1 bands of uint8" in said.err and "'one' has 3 bands" in said.err
