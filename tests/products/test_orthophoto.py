@@ -165,7 +165,7 @@ class TestPlan:
         for product in plan.products:
             assert f"{product.plan.name}: {product.grid.width} × {product.grid.height} px of 1 m" in text
         assert plan["one"] is plan["one_ortho"] is plan.products[0]
-        with pytest.raises(KeyError, match="the plan has one, three, two"):
+        with pytest.raises(KeyError, match="the plan has one_ortho, three_ortho, two_ortho"):
             plan["four"]
 
     def test_resolution_is_the_mean_gsd_to_two_figures(self, small: Block) -> None:

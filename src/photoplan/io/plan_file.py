@@ -18,7 +18,7 @@ from photoplan.errors import InputError, UsageError
 FORMAT = 2
 _HEADER = "photoplan_plan"
 #: What is read of the tiles again.
-_READ = ["product", "tile", "sources"]
+_READ = ["product", "tile", "sources", "cells", "residual_px"]
 #: Tiles that are written at once: as polygons they take much more memory than as numbers.
 _PIECE = 100_000
 
@@ -101,7 +101,7 @@ def _write_layer(
 
 
 def read_plan_tables(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Header of a plan, and some columns of its tiles: product, tile, sources.
+    """Header of a plan, and some columns of its tiles: product, tile, sources, cells, residual_px.
 
     Raises
     ------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,6 +20,7 @@ from photoplan.events import SILENT, Events
 from photoplan.io.disk import make_folder
 from photoplan.io.image_form import bands_of
 from photoplan.io.product import ProductFile
+from photoplan.io.project.model import Project
 from photoplan.io.quicklook import write_overview
 from photoplan.io.regions import source_regions, write_regions
 from photoplan.io.run_record import input_entry, recorded_result, run_times, versions, write_run_record
@@ -289,7 +289,7 @@ def _record(plan: OrthoPlan, product: OrthoProduct, scenes: Scenes, result: Prod
     scene = scenes[0]
     return {
         "product": result,
-        "project": plan.project.model_dump(mode="json", exclude={"images"}, exclude_none=True),
+        "project": _project_of(plan.project, product.images).model_dump(mode="json", exclude_none=True),
         "settings": plan.settings,
         "grid": {
             "crs": product.grid.crs,
@@ -306,16 +306,25 @@ def _record(plan: OrthoPlan, product: OrthoProduct, scenes: Scenes, result: Prod
         "crs_operations": [
             {"operation": step.operation, "accuracy_m": step.accuracy} for step in scene.ground.operations
         ],
-        "images": [_image_record(scenes[row], look) for row, look in enumerate(product.looks)],
+        "images": [
+            _image_record(name, scenes[row], look)
+            for row, (name, look) in enumerate(zip(product.images, product.looks))
+        ],
     }
 
 
-def _image_record(scene: Scene, look: Look) -> dict[str, Any]:
+def _project_of(project: Project, names: tuple[str, ...]) -> Project:
+    """The project without what the product does not use: enough to make it again."""
+    images = tuple(project.image(name) for name in names)
+    cameras = {image.camera: project.cameras[image.camera] for image in images}
+    return project.model_copy(update={"images": images, "cameras": cameras})
+
+
+def _image_record(name: str, scene: Scene, look: Look) -> dict[str, Any]:
     """An image as it took part."""
     step = scene.reader.step(RestoreStep)
-    (stated,) = json.loads(scene.address.text)["images"]
     return {
-        **stated,
+        "name": name,
         "projection_centre": [float(c) for c in scene.camera.center],
         "gsd_m": look.gsd,
         "restored": None if step is None else step.describe(),
