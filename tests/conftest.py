@@ -13,6 +13,9 @@ from hypothesis import settings
 # each other, all the more with several processes on the same cores (an edge is measured in 0.17 or 0.026 s of CPU).
 assert "numpy" not in sys.modules
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Where the surroundings forbid it, every process of tests would compile all sources of photoplan and of the tests anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # Invented cases are the same in every run; `--hypothesis-profile search` looks for new ones (`make test-slow`).
 settings.register_profile("same", derandomize=True, deadline=None)

@@ -16,8 +16,13 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from multiprocessing import forkserver
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from tools.command import Said
 from tools.events import Told
@@ -50,13 +55,13 @@ class Mishap:
 
 QUIET = Mishap()
 
+_LOADED = "tools.loaded"
+
 
 def forked(words: Sequence[object], folder: Path, mishap: Mishap = QUIET) -> Ran:
     """Run a command to its end; `folder` gets what it says."""
     folder.mkdir(parents=True, exist_ok=True)
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["tools.loaded"])
-    child = context.Process(target=_run, args=([str(word) for word in words], folder, mishap))
+    child = _server().Process(target=_run, args=([str(word) for word in words], folder, mishap))
     child.start()
     child.join()
     code = child.exitcode
@@ -66,6 +71,17 @@ def forked(words: Sequence[object], folder: Path, mishap: Mishap = QUIET) -> Ran
     phases = next((each["phases"] for each in told if "phases" in each), [])
     out, err = ((folder / name).read_text() for name in ("out", "err"))
     return Ran(code, out, err, tasks, [tuple(phase) for phase in phases])
+
+
+@cache
+def _server() -> ForkServerContext:
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([_LOADED])
+    with pytest.MonkeyPatch.context() as patch:
+        # Python 3.11 does not tell its server where modules are: it would load none, and not say so.
+        patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
+        forkserver.ensure_running()
+    return context
 
 
 def content(path: Path) -> bytes:
@@ -99,6 +115,7 @@ class _Telling(Told):
 def _run(words: list[str], folder: Path, mishap: Mishap) -> None:
     import resource
 
+    assert _LOADED in sys.modules  # or each command would cost a start
     from photoplan.cli import telling
     from photoplan.cli.main import run
     from photoplan.engine import run as engine_run
