@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from tools.command import OPTIONS, Here, Undisturbed, process
+from tools.command import OPTIONS, Here, Undisturbed, inside
 from tools.small_block import Block, write_block
 
 
@@ -18,9 +18,9 @@ def pristine(tmp_path_factory: pytest.TempPathFactory) -> Block:
 
 @pytest.fixture(scope="session")
 def undisturbed(pristine: Block, tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
-    """Products of the small block, made by a process with one worker."""
+    """Products of the small block, made by one worker."""
     folder = tmp_path_factory.mktemp("undisturbed")
-    said = process("ortho", pristine.project, *OPTIONS, "--workers", 1, "--output", folder, "--json")
+    said = inside("ortho", pristine.project, *OPTIONS, "--workers", 1, "--output", folder, "--json")
     assert said.code == 0, said.err
     return Undisturbed(folder, said)
 

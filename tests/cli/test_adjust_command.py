@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from tools.adjust_project import Make, write_project
-from tools.command import Here, edit, process
+from tools.command import Here, edit, inside
 from tools.recorded import recorded
 
 pytest.importorskip("matplotlib")
@@ -15,7 +15,7 @@ pytest.importorskip("matplotlib")
 
 def test_a_block_is_adjusted(tmp_path: Path) -> None:
     made = write_project(tmp_path / "block", Make(pixel_noise=0.3, check=3))
-    said = process("adjust", made.path, "--calibrate", "cam=c")
+    said = inside("adjust", made.path, "--calibrate", "cam=c")
     assert said.code == 0, said.err
     lines = said.out.strip().split("\n")
     folder = tmp_path / "block" / "adjustment"

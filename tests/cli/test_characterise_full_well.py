@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import rasterio
-from tools.command import process
+from tools.command import inside
 
 from photoplan.quality.formation.model import ImageModel, form_image
 from photoplan.quality.formation.parts import (
@@ -75,7 +75,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
                 with rasterio.open(folder / f"{kind}_{t}ms_{k}.tif", "w", "GTiff", *SIZE, 1, dtype="uint16") as file:
                     file.write(image.reshape(SIZE[::-1]), 1)
     (folder / "series.toml").write_text(SERIES)
-    said = process("characterise", folder / "series.toml", "--json", "-q")
+    said = inside("characterise", folder / "series.toml", "--json", "-q")
     assert said.code == 0, said.err
     found: dict[str, Any] = json.loads(said.out)
     return found

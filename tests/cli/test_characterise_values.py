@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import rasterio
 from numpy.typing import NDArray
-from tools.command import Here, process
+from tools.command import Here, inside
 
 SIZE = (64, 48)
 GAIN, READ, BLACK = 0.6, 4.0, 20.0
@@ -57,7 +57,7 @@ def write_series(folder: Path, camera: str, values: Values, current: dict[float,
 def figures(series: Path) -> tuple[dict[tuple[str, str], float], dict[str, Any]]:
     """Figures by analysis and name, and all that was said."""
     wanted = ("photon_transfer", "dark_signal", "saturation", "fixed_pattern", "defects", "emva1288", "fall_off")
-    said = process("characterise", series, "--json", "-q", *(word for name in wanted for word in ("--only", name)))
+    said = inside("characterise", series, "--json", "-q", *(word for name in wanted for word in ("--only", name)))
     assert said.code == 0, said.err
     report: dict[str, Any] = json.loads(said.out)
     found = {
@@ -97,7 +97,7 @@ def test_the_unit_of_grey_values_changes_nothing_else(
 def test_more_than_the_stated_bits_is_refused(tmp_path: Path) -> None:
     """Values in the upper bits of their type are no saturated ones."""
     series = write_series(tmp_path, "bits = 12", lambda grey: (grey * 16).astype(np.uint16))
-    said = process("characterise", series, "-q")
+    said = inside("characterise", series, "-q")
     assert said.code == 3
     assert "has the grey value" in said.err
     assert "camera.bits allow 4095" in said.err

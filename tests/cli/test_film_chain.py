@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tools.command import process
+from tools.command import inside
 from tools.film_scan import ARM, HALF_LINE, PICTURE, RING, Film, Ground, Scan, read_ground, render
 from tools.matching import Matches, match
 from tools.pictures import gray
@@ -119,7 +119,7 @@ def test_orientation_that_is_true_gives_the_true_orthophoto(case: Case, tmp_path
         f'[[images]]\nname = "true"\nfile = "{(case.folder / "1987_112.tif").as_posix()}"\ncamera = "RC"\n'
         f"center = {list(FILM.center)}\nangles = {list(FILM.opk_deg)}\nfiducials = {table(case.scan.marks)}\n"
     )
-    said = process("ortho", tmp_path / "true.toml", "--resolution", 0.25, "--no-quicklook")
+    said = inside("ortho", tmp_path / "true.toml", "--resolution", 0.25, "--no-quicklook")
     assert said.code == 0, said.err
     found = rms(offsets(case, Path(said.out.strip())), "true orientation")
     assert max(found) <= 0.06  # measured: 0.033
@@ -151,10 +151,10 @@ def test_from_scan_to_orthophoto_by_commands(case: Case) -> None:
 
     options = ["--camera", camera, "--terrain", case.terrain, "--crs", "EPSG:31256", "--height-system", "same"]
     options += ["--image-points", image_points, "--control", control]
-    said = process("init", folder, "--images", case.folder / "*.tif", *options)
+    said = inside("init", folder, "--images", case.folder / "*.tif", *options)
     assert said.code == 0, said.err
 
-    said = process("fiducials", project, "--json")
+    said = inside("fiducials", project, "--json")
     assert said.code == 0, said.err
     (found,) = json.loads(said.out)["images"]
     marks = {m["name"]: (m["x"], m["y"]) for m in found["marks"]}
@@ -162,7 +162,7 @@ def test_from_scan_to_orthophoto_by_commands(case: Case) -> None:
     print(f"\nfiducial marks: rms {np.sqrt((off**2).mean()):.4f} px, worst {np.abs(off).max():.4f} px from truth")
     assert np.abs(off).max() <= 0.1
 
-    said = process("interior", project, "--json")
+    said = inside("interior", project, "--json")
     assert said.code == 0, said.err
     (interior,) = json.loads(said.out)["images"]
     assert interior["shrinkage_permille"] == pytest.approx(1000 * np.array(FILM.shrinkage), abs=0.02)
@@ -171,13 +171,13 @@ def test_from_scan_to_orthophoto_by_commands(case: Case) -> None:
     for mark in found["marks"]:  # both verbs state them in one sense
         assert mark["residual_um"] == pytest.approx(residuals[mark["name"]], abs=0.02)
 
-    said = process("resect", project, "--sigma-image", SIGMA_IMAGE, "--sigma-control", SIGMA_CONTROL, SIGMA_CONTROL)
+    said = inside("resect", project, "--sigma-image", SIGMA_IMAGE, "--sigma-control", SIGMA_CONTROL, SIGMA_CONTROL)
     assert said.code == 0, said.err
     print(said.out)
 
-    said = process("check", project)
+    said = inside("check", project)
     assert said.code == 0, said.err
-    said = process("ortho", project, "--resolution", 0.25, "--no-quicklook")
+    said = inside("ortho", project, "--resolution", 0.25, "--no-quicklook")
     assert said.code == 0, said.err
     x, y = rms(offsets(case, Path(said.out.strip())), "from scan to orthophoto")
     assert max(x, y) <= 0.3  # measured: 0.10

@@ -15,7 +15,7 @@ import numpy as np
 import psutil
 import pytest
 import rasterio
-from tools.command import OPTIONS, Here, Undisturbed, patience, process, sabotage, start, wait_for
+from tools.command import OPTIONS, Here, Undisturbed, inside, patience, process, sabotage, start, wait_for
 from tools.small_block import NAMES, Block
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals and limits")
@@ -51,7 +51,7 @@ class TestFault03Killed:
         running.communicate()
         product = folder / "one_ortho.tif"
         assert product.read_text() == "old"
-        again = process(*words)
+        again = inside(*words)
         assert again.code == 0, again.err
         facts = json.loads(again.out)["products"][0]
         assert 2 <= facts["resumed_tiles"] < facts["tiles"]
@@ -79,7 +79,7 @@ class TestFault03Killed:
         wait_for(lambda: tiles_done(folder) >= 2, running)
         running.kill()
         running.communicate()
-        again = process(*ortho(small, "--json"))
+        again = inside(*ortho(small, "--json"))
         assert json.loads(again.out)["products"][0]["resumed_tiles"] == 0
         assert (folder / "one_ortho.tif").read_bytes() == undisturbed.bytes_of("one")
 
@@ -94,7 +94,7 @@ class TestFault03Killed:
         running.kill()
         running.communicate()
         made = (folder / "one_ortho.tif").stat().st_mtime_ns
-        again = process(*words)
+        again = inside(*words)
         assert again.code == 0, again.err
         assert "1 of 3 products are finished already" in again.err
         products = {p["image"]: p for p in json.loads(again.out)["products"]}
@@ -173,7 +173,7 @@ class TestFault05DeadWorkers:
         assert (one["failed_tiles"], two["failed_tiles"]) == ([3], [])
         assert not (folder / "one_ortho.tif").exists()
         assert (folder / "two_ortho.tif").read_bytes() == undisturbed.bytes_of("two")
-        again = process(*ortho(small, "--json"))
+        again = inside(*ortho(small, "--json"))
         facts = json.loads(again.out)["products"][0]
         assert facts["resumed_tiles"] == facts["tiles"] - 1
         assert (folder / "one_ortho.tif").read_bytes() == undisturbed.bytes_of("one")
@@ -223,7 +223,7 @@ class TestFault25Interrupts:
         assert out == ""
         assert not (folder / "one_ortho.tif").exists()
         if signals == [signal.SIGTERM]:
-            again = process(*ortho(small, "--json"))
+            again = inside(*ortho(small, "--json"))
             assert json.loads(again.out)["products"][0]["resumed_tiles"] >= 2
             assert (folder / "one_ortho.tif").read_bytes() == undisturbed.bytes_of("one")
 

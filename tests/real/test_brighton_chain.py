@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tools.command import edit, process
+from tools.command import edit, inside
 from tools.drone_block import distance, write_control, write_images
 from tools.kept import kept
 from tools.matching import match
@@ -28,7 +28,7 @@ pytest.importorskip("cv2")
 
 
 def command(*words: object) -> str:
-    said = process(*words)
+    said = inside(*words)
     assert said.code == 0, said.err
     return said.out
 
@@ -110,7 +110,7 @@ def test_positions_alone_orient_the_block(chain: Chain, tied: Path) -> None:
 
 def test_the_camera_constant_is_not_determined_by_such_a_block(chain: Chain, tied: Path) -> None:
     """It converges, and the standard deviation says what it is worth: several pixels."""
-    said = process("adjust", tied, "--calibrate", "c,k1,k2", "--dry-run", "--json")
+    said = inside("adjust", tied, "--calibrate", "c,k1,k2", "--dry-run", "--json")
     assert said.code == 0, said.err
     (camera,) = json.loads(said.out)["cameras"].values()
     print(f"\ncamera: {camera}")
