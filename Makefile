@@ -6,6 +6,9 @@ STAMP := $(VENV)/.installed
 
 OLDEST := .venv-oldest
 
+# Every process would compile all sources of photoplan and of the tests anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test test-slow test-nojit test-plain test-oldest lint docs bench clean
 
 $(STAMP): pyproject.toml
@@ -17,7 +20,11 @@ $(STAMP): pyproject.toml
 demo: $(STAMP)
 	$(BIN)/photoplan demo demo
 
-test: lint docs test-nojit
+# Static checks take as long as docs and plain kernels together: side by side, each with its output in one piece.
+SIDE_BY_SIDE := --jobs=2 $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
+
+test: $(STAMP)
+	$(MAKE) $(SIDE_BY_SIDE) lint docs test-nojit
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile -m "not slow and not bench"
 
 # What is too long for every change: large inputs, simulations at their full size, new invented cases, kernels without

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
+from tools.thinned import thinned
 
 from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
 from photoplan.errors import InputError
@@ -117,12 +118,13 @@ def test_a_free_mark_is_found_to_a_twentieth_of_a_pixel(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", silhouettes())
 @pytest.mark.parametrize(("side", "texture", "limit"), [(0.0, 0.0, 0.05), (90.0, 0.1, 0.1), (270.0, 0.0, 0.05)])
-def test_a_silhouette_is_found_by_its_edges(kind: str, side: float, texture: float, limit: float) -> None:
+@thinned("scans", 1, 3)
+def test_a_silhouette_is_found_by_its_edges(kind: str, side: float, texture: float, limit: float, scans: int) -> None:
     rng = np.random.default_rng(int(side))
     mirrored = bool(rng.integers(2)) and kind != "triangle"
     pattern = silhouettes(rotation=0.0 if kind == "triangle" else side, mirrored=mirrored)[kind]
     errors = []
-    for _ in range(3):
+    for _ in range(scans):
         degrees = rng.uniform(-0.8, 0.8)
         image, x, y = frame_scene(pattern, matrix(degrees), rng, texture)
         found = find_mark(image, pattern, matrix(0.0))
