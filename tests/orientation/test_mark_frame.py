@@ -41,11 +41,13 @@ def test_silhouettes_are_placed_by_their_edges_and_tell_how_the_scan_is_turned(
         x0, y0, x1, y1 = pattern.window
         x, y = (mm - PLACES[name])[..., 0], (mm - PLACES[name])[..., 1]
         box = (x > x0) & (x < x1) & (y > y0) & (y < y1)
+        (top, bottom), (left, right) = ((k[0], k[-1] + 1) for k in (np.flatnonzero(box.any(axis)) for axis in (1, 0)))
+        cut = np.s_[top:bottom, left:right]
         tone[box] = content[box]
         for part in pattern.parts:
-            share = coverage(part.outline @ R.T + truth[name], (n, n)) * box
-            bright = content if np.isnan(part.tone) else np.maximum(content, 0.35)
-            tone = tone * (1 - share) + (0.05 if part.tone < 0.5 else bright) * share
+            share = coverage(part.outline @ R.T + truth[name] - (left, top), tone[cut].shape) * box[cut]
+            bright = content[cut] if np.isnan(part.tone) else np.maximum(content[cut], 0.35)
+            tone[cut] = tone[cut] * (1 - share) + (0.05 if part.tone < 0.5 else bright) * share
     grey = 30 + 200 * ndimage.gaussian_filter(np.clip(tone, 0, 1), 1.0) + rng.normal(0, 5, (n, n))
     layout = MarkLayout.of(PLACES, patterns)
     found = find_fiducials(ArrayScan(255 - grey if negative else grey), layout, FiducialSearch(pixel))

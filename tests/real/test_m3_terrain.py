@@ -154,11 +154,11 @@ def test_normalised_residuals_of_held_out_points_have_spread_one(seed_0: Compare
     assert 0.9 <= seed_0.normalised[0] <= 1.1
 
 
-def rock_and_terrain(folder: Path, window: shapely.Polygon) -> list[tuple[Built, Tin]]:
+def rock_and_terrain(folder: Path) -> list[tuple[Built, Tin]]:
     found = []
     for name in ("M3_Rockbed_survey.mm.xml", "M3_Terrain.mm.xml"):
         raw, tin = read_measured([folder / name], ReadOptions()), read_landxml_tin(folder / name)
-        around = shapely.box(*tin_outline(found[0][1] if found else tin).bounds).intersection(window).buffer(40)
+        around = shapely.box(*tin_outline(found[0][1] if found else tin).bounds).buffer(40)
         measured, _ = clean(inside(raw, around))
         found.append((build_terrain(plan_build(measured, BuildSettings())), tin))
     return found
@@ -175,13 +175,10 @@ def inside(measured: MeasuredTerrain, area: shapely.Geometry) -> MeasuredTerrain
     return replace(measured, points=tuple(groups), lines=tuple(lines))
 
 
-def differences(folder: Path, window: shapely.Polygon) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Terrain above rock by the triangulations and by the models, in squares; the volume by the triangulations.
-
-    Squares are those of a window; the volume is the whole one.
-    """
-    (rock, rock_tin), (ground, ground_tin) = rock_and_terrain(folder, window)
-    (xmin, ymin, xmax, ymax), cell = shapely.box(*tin_outline(rock_tin).bounds).intersection(window).bounds, CELL
+def differences(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Terrain above rock by the triangulations and by the models, in squares; the volume by the triangulations."""
+    (rock, rock_tin), (ground, ground_tin) = rock_and_terrain(folder)
+    (xmin, ymin, xmax, ymax), cell = tin_outline(rock_tin).bounds, CELL
     x, y = np.meshgrid(np.arange(xmin, xmax, cell) + cell / 2, np.arange(ymin, ymax, cell) + cell / 2)
     XY = np.column_stack([x.ravel(), y.ravel()])
     between = tin_heights(rock_tin, XY)
@@ -192,6 +189,7 @@ def differences(folder: Path, window: shapely.Polygon) -> tuple[NDArray[np.float
     return between, found, fill - cut
 
 
+@pytest.mark.slow
 def test_volume_between_rock_and_terrain_is_that_of_the_triangulations(folder: Path) -> None:
     """Over squares that all four surfaces cover; the models' gaps and outlines are their own."""
 
