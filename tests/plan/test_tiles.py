@@ -42,3 +42,10 @@ def test_tiles_know_which_sources_can_paint_them() -> None:
     assert [tile.sources for tile in shared.only([5, 1, 3])] == [(0, 2), (2,)]
     assert shared[-1].sources == (2,) and list(shared.only(())) == []
     assert list(Tiles.shared([every.only([])])) == []
+
+
+def test_tiles_that_touch_a_window() -> None:
+    every = Tiles.every(Window(0, 0, 350, 250), 100)
+    for window in (Window(99, 100, 2, 1), Window(-50, -50, 60, 60), Window(340, 240, 900, 900), Window(400, 0, 5, 5)):
+        want = [tile.index for tile in every if (tile.window & window).size]
+        assert [tile.index for tile in every.touching(window)] == want

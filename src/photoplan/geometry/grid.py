@@ -230,6 +230,14 @@ class MapGrid:
         row1 = math.ceil(-ymin / resolution - 1e-6)
         return cls(col0 * resolution, -row0 * resolution, resolution, max(1, col1 - col0), max(1, row1 - row0), crs)
 
+    def window_of(self, bounds: tuple[float, float, float, float]) -> Window:
+        """Pixels that map bounds xmin, ymin, xmax, ymax touch; empty if there are none."""
+        part = MapGrid.covering(bounds, self.resolution, self.crs)
+        col = round((part.left - self.left) / self.resolution)
+        row = round((self.top - part.top) / self.resolution)
+        left, top = max(col, 0), max(row, 0)
+        return Window(left, top, max(0, col + part.width - left), max(0, row + part.height - top)) & self.window
+
     @property
     def window(self) -> Window:
         """All pixels."""

@@ -179,9 +179,14 @@ def mean_gsd(camera: Camera, seen: Footprint) -> float:
     return float(np.nanmean(1 / np.sqrt(area)))
 
 
-def covered_tiles(camera: CentralCamera, terrain: Terrain, grid: MapGrid, side: int) -> Tiles:
-    """Tiles that can hold a pixel of the image, judged from the range of heights under each tile."""
+def covered_tiles(
+    camera: CentralCamera, terrain: Terrain, grid: MapGrid, side: int, seen: Bounds | None = None
+) -> Tiles:
+    """Tiles that can hold a pixel of the image, judged from the range of heights under each tile; others than those
+    that meet `seen`, the bounds of its footprint, are not looked at."""
     every = Tiles.every(grid.window, side)
+    if seen is not None:
+        every = every.touching(grid.window_of(seen))
     boxes = every.bounds(grid)
     ranges = terrain.height_range(boxes)
     if not np.isfinite(ranges).any():

@@ -108,6 +108,17 @@ class Tiles(Sequence[Tile]):
         places = np.flatnonzero(np.isin(self.indices, wanted))
         return replace(self, indices=self.indices[places], sources=self.sources.only(places))
 
+    def touching(self, window: Window) -> Tiles:
+        """Those that hold pixels of a window of the product."""
+        col, row = (
+            max(0, at - first) // self.side
+            for at, first in zip((window.col, window.row), (self.window.col, self.window.row))
+        )
+        ends = (-(-(stop - first) // self.side) for stop, first in zip(window.stop, (self.window.col, self.window.row)))
+        right, bottom = (min(end, most) for end, most in zip(ends, reversed(self.shape)))
+        rows, cols = np.arange(row, max(bottom, row)), np.arange(col, max(right, col))
+        return self.only((rows[:, None] * self.shape[1] + cols).ravel().tolist())
+
     @property
     def windows(self) -> NDArray[np.int64]:
         """Column, row, width and height of each, shape (n, 4)."""

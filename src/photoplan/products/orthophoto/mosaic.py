@@ -73,7 +73,7 @@ def plan_mosaic(
     grid = grid_of(project, chosen, [one.look.footprint for one in looked])
     taking, tiles = [], []
     for one in looked:
-        mine = covered_tiles(one.scene.camera, one.scene.surface, grid, chosen.tile)
+        mine = covered_tiles(one.scene.camera, one.scene.surface, grid, chosen.tile, one.look.footprint.bounds)
         if len(mine):
             taking.append(one)
             tiles.append(mine)

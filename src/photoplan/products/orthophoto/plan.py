@@ -17,7 +17,7 @@ from photoplan.engine.execute import joined
 from photoplan.engine.execute import render as render_tile
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.geometry.grid import MapGrid, Window, refuse_absurd
+from photoplan.geometry.grid import MapGrid, refuse_absurd
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.names import safe_stem
 from photoplan.io.project.model import Project
@@ -413,7 +413,7 @@ def render(
     valid : ndarray of bool, shape (height, width)
     """
     product = plan[name]
-    window = product.grid.window if bounds is None else window_of(product.grid, bounds)
+    window = product.grid.window if bounds is None else product.grid.window_of(bounds)
     scenes = ScenesAddress.of(plan.project, product.images).open()
     tiles = (tile for tile in product.plan.tiles if (tile.window & window).size)
     parts = (
@@ -423,12 +423,3 @@ def render(
     whole = joined(window, parts, scenes[0].reader)
     assert whole.values is not None and whole.valid is not None
     return whole.values, whole.valid
-
-
-def window_of(grid: MapGrid, bounds: tuple[float, float, float, float]) -> Window:
-    """Pixels of a grid that map bounds touch; empty if there are none."""
-    part = MapGrid.covering(bounds, grid.resolution, grid.crs)
-    col = round((part.left - grid.left) / grid.resolution)
-    row = round((grid.top - part.top) / grid.resolution)
-    left, top = max(col, 0), max(row, 0)
-    return Window(left, top, max(0, col + part.width - left), max(0, row + part.height - top)) & grid.window
