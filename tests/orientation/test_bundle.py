@@ -89,6 +89,9 @@ def test_sparse_solution_equals_dense_least_squares() -> None:
     n = model.columns.count
     camera = model.columns.get("camera cam").part
     np.testing.assert_allclose(result.cameras[0].covariance, Q[camera, camera] * scale, rtol=1e-4)
+    for k, both in enumerate(result.pose_camera_covariance):
+        wanted = Q[6 * k : 6 * k + 6, camera] * scale
+        np.testing.assert_allclose(both, wanted, rtol=1e-3, atol=1e-6 * np.abs(wanted).max())
     for p in (0, 7, 20):
         at = slice(n + 3 * p, n + 3 * p + 3)
         np.testing.assert_allclose(result.point_covariance[p], Q[at, at] * scale, rtol=1e-4)

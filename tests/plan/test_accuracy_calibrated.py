@@ -69,9 +69,8 @@ def errors_of_a_block(seed: int, kind: str) -> tuple[np.ndarray, np.ndarray]:
     found = adjust_block(simulated.block, PLAIN)
     covariance = found.pose_covariance
     drawn, real, stated = [], [], []
-    for k in range(len(found.images)):
-        assert found.images[k] == f"I{k}"
-        pose, truth = found.poses[k], simulated.poses[k]
+    for k, name in enumerate(found.images):
+        pose, truth = found.poses[k], simulated.poses[int(name.removeprefix("I"))]
         camera = FrameCamera(interior, lens, pose)
         # Film and errors of the orientation go together in the test's images alone: the block is measured without film.
         change = np.r_[truth.center - pose.center, rotation_vector(pose.R_ground_camera.T @ truth.R_ground_camera)]

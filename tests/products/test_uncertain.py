@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tools.adjust_project import Make, write_project
+from tools.command import process
 
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
@@ -11,9 +13,13 @@ from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.brown import Brown
 from photoplan.errors import InputError
 from photoplan.geometry.pose import Pose
-from photoplan.io.project.file import parse_project
-from photoplan.products.adjust.block import stated_accuracy
-from photoplan.project.scene import ground_of
+from photoplan.io.project.file import load_project, parse_project
+from photoplan.io.project.model import Terrain
+from photoplan.orientation.bundle.block import AdjustSettings
+from photoplan.products.adjust.block import adjust_prepared, map_result, prepare, stated_accuracy
+from photoplan.products.adjust.inputs import read_inputs
+from photoplan.products.adjust.start import started
+from photoplan.project.scene import camera_without_pixels, ground_of
 from photoplan.project.uncertain import StatedHeightErrors, height_errors, source_errors
 
 CENTER, ANGLES = np.array([400_000.0, 5_200_000.0, 1500.0]), np.array([2.0, -3.0, 100.0])
@@ -118,3 +124,37 @@ def test_what_is_not_known_is_said(tmp_path) -> None:
 
 def test_terrain_states_its_own(tmp_path) -> None:
     assert height_errors(project_with(tmp_path, {}, terrain={"sigma": 0.25})) == StatedHeightErrors(0.25)
+
+
+def test_of_an_adjusted_project_with_a_calibrated_camera(tmp_path) -> None:
+    """What the file says is the covariance of the adjustment, at points on the ground, up to its written digits."""
+    pytest.importorskip("matplotlib")
+    made = write_project(tmp_path / "block", Make(pixel_noise=0.3))
+    adjusted = load_project(made.path)
+    inputs, starts = started(read_inputs(adjusted, adjusted.select()))
+    free = {"cam": {"c": None, "x0": None}}
+    result = map_result(*adjust_prepared(prepare(inputs, starts, free), AdjustSettings(robust=False)))
+    assert process("adjust", made.path, "--calibrate", "cam=c,x0", "--no-robust").code == 0
+    terrain = Terrain(height=0.0, height_system="same")
+    loaded = load_project(made.path).model_copy(update={"terrain": terrain})
+    assert set(loaded.cameras["cam"].sigma or ()) == {"c", "x0"}
+    points = np.array([XYZ for name, XYZ in made.points.items() if name.startswith("G")])
+    for k, name in enumerate(result.adjusted.images):
+        image = loaded.image(name)
+        sigma = np.sqrt(np.diag(result.covariances[k]))
+        np.testing.assert_allclose([*image.sigma_center, *image.sigma_angles], sigma[:6], rtol=1e-4)
+        R = result.covariances[k] / np.outer(sigma, sigma)
+        np.testing.assert_allclose(image.correlation, R[np.tril_indices(8, -1)], atol=1e-6)
+        together, alone = (
+            np.sqrt(
+                sum(
+                    np.square(cause.displacement(points)).sum(axis=1)
+                    for cause in source_errors(
+                        loaded, each, ground_of(loaded), camera_without_pixels(loaded, name), 0.0
+                    ).causes
+                )
+            )
+            for each in (image, image.model_copy(update={"correlation": None}))
+        )
+        # One by one they would be many times as large: they make up for each other.
+        assert (together < 1.0).sum() > 3 and np.nanmin(together / alone) < 0.2
