@@ -112,6 +112,7 @@ def product_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "--hidden",
             help="Ground that no image sees: show, nodata, or mark (second raster) [ortho: show, mosaic: nodata].",
         ),
+        click.option("--accuracy", is_flag=True, default=None, help="Also a raster of standard deviations, a picture."),
         click.option("--compress", help="deflate, zstd, lzw, jpeg or none [deflate]."),
         click.option("--nodata", help="A number, mask, or auto: 0 for integers, NaN for floats [auto]."),
         click.option("--overviews/--no-overviews", default=None, help="Whether the file holds overviews [yes]."),

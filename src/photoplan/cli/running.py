@@ -98,10 +98,26 @@ def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling)
     if failed is not None:
         raise failed
     events.talk(_summary(results, plan, seconds))
+    if settings.accuracy:
+        _tell_accuracy(results, how.quicklook, events)
     if settings.sources:
         _draw_sources(results, events)
     if how.quicklook:
         events.talk(f"quick look: {folder / 'overview.png'}")
+
+
+def _tell_accuracy(results: list[ProductResult], draw: bool, events: Telling) -> None:
+    """Figures of each product's accuracy, and a picture where pictures can be made."""
+    from photoplan.report.accuracy import draw_accuracy
+    from photoplan.report.drawing import has_matplotlib
+
+    for result in results:
+        found = result.accuracy
+        if found is not None:
+            raster = result.path.with_name(f"{result.path.stem}_accuracy.tif")
+            picture = f", drawn in {draw_accuracy(raster)}" if draw and has_matplotlib() else ""
+            figures = f"median {found['median']:.3g} m, 95 % of the pixels below {found['p95']:.3g} m"
+            events.talk(f"standard deviation of position: {figures}: {raster}{picture}")
 
 
 def _draw_sources(results: list[ProductResult], events: Telling) -> None:

@@ -32,6 +32,8 @@ class ImageForm:
     """Metadata, such as resolution and date of a scan, or what a camera wrote into EXIF."""
     xmp: str | None = None
     """Packet of XMP."""
+    units: tuple[str, ...] = ()
+    """Unit of every band."""
 
     @property
     def photometric(self) -> str | None:
@@ -88,6 +90,8 @@ def dress(dataset: Any, form: ImageForm) -> None:
     """Give a raster that is open for writing the form of another; what GDAL does not take is left out."""
     if form.descriptions:
         dataset.descriptions = form.descriptions
+    if form.units:
+        dataset.units = form.units
     if form.colours:
         known = {each.name: each for each in rasterio.enums.ColorInterp}
         dataset.colorinterp = [known.get(name, known["undefined"]) for name in form.colours]

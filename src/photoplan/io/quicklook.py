@@ -56,6 +56,26 @@ def write_quicklook(product: Path, picture: Path, *, max_side: int = 1600) -> Pa
     return _write_png(picture, rgba)
 
 
+def read_reduced(product: Path, *, max_side: int) -> tuple[NDArray[Any], tuple[float, float, float, float]]:
+    """All bands of a product from its nearest overview, NaN where invalid, and its outer edges xmin ymin xmax ymax.
+
+    Raises
+    ------
+    InputError
+        If the product cannot be read.
+    """
+    _check_side(max_side)
+    with _opened(product) as dataset, gdal_settings():
+        factor = max(1.0, max(dataset.width, dataset.height) / max_side)
+        shape = (_scaled(dataset.height, factor), _scaled(dataset.width, factor))
+        try:
+            pixels = dataset.read(out_shape=shape, resampling=rasterio.enums.Resampling.nearest, masked=True)
+        except (*GDAL_ERRORS, OSError) as error:
+            raise InputError(f"{product}: cannot be read ({first_cause(error)})") from error
+        edges = dataset.bounds
+    return pixels.astype(float).filled(np.nan), (edges.left, edges.bottom, edges.right, edges.top)
+
+
 def write_overview(products: Sequence[Path], picture: Path, *, max_side: int = 1600) -> Path | None:
     """Write a PNG of many products placed on the map together; the first ones lie on top.
 

@@ -260,7 +260,7 @@ def resampling_sigma(kernel: str) -> float:
     return float(np.sqrt(np.mean((phase / (2 * np.pi * _FREQUENCY)) ** 2)))
 
 
-def in_image(kernel: str, tolerance: float, scale: float = 1.0) -> float:
+def in_image(kernel: str, tolerance: float) -> float:
     """Standard deviation of image coordinates by resampling and by anchors within a tolerance, pixels.
 
     Parameters
@@ -269,8 +269,6 @@ def in_image(kernel: str, tolerance: float, scale: float = 1.0) -> float:
         Resampling kernel; empty: none.
     tolerance : float
         Largest residual of the anchors, pixels; all residuals up to it count as equally likely.
-    scale : float
-        Pixels of the source that the kernel is widened to.
     """
-    own = resampling_sigma(kernel) * max(scale, 1.0) if kernel else 0.0
+    own = resampling_sigma(kernel) if kernel else 0.0
     return float(np.hypot(own, tolerance / np.sqrt(3)))

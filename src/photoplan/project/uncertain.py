@@ -49,11 +49,6 @@ def source_errors(
     InputError
         The project states no standard deviations of the image's orientation, or such of the camera that do not fit.
     """
-    if image.sigma_center is None or image.sigma_angles is None:
-        raise InputError(
-            f"image {image.name!r}: nothing is known of the accuracy of its orientation; `photoplan adjust` and "
-            "`resect` write sigma_center and sigma_angles, or state them in [[images]]"
-        )
     camera = project.cameras[image.camera]
 
     def at(change: NDArray[np.float64]) -> Projection:
@@ -67,7 +62,11 @@ def source_errors(
 
 def _deviations(project: Project, image: Image, camera: CameraEntry) -> Iterator[tuple[str, NDArray[np.float64]]]:
     """Independent errors of centre, angles and camera, each one standard deviation large, with their names."""
-    assert image.sigma_center is not None and image.sigma_angles is not None
+    if image.sigma_center is None or image.sigma_angles is None:
+        raise InputError(
+            f"image {image.name!r}: nothing is known of the accuracy of its orientation; `photoplan adjust` and "
+            "`resect` write sigma_center and sigma_angles, or state them in [[images]]"
+        )
     of_camera = camera.sigma or {}
     sigma = np.array([*image.sigma_center, *image.sigma_angles, *of_camera.values()])
     angles = (_ANGLES[letter] for letter in project.orientation.rotation)
@@ -129,6 +128,25 @@ class ScenesErrors(Mapping[int, SourceErrors]):
     """Standard deviation of image coordinates of each, pixels."""
 
     @property
+    def facts(self) -> list[object]:
+        """What decides accuracies, beside what decides pixels.
+
+        Raises
+        ------
+        InputError
+            Nothing is known of the terrain or of an image.
+        """
+        height_errors(_project_of(self.scenes[0]))
+        out: list[object] = []
+        for scene in self.scenes:
+            project = _project_of(scene)
+            (image,) = project.images
+            camera = project.cameras[image.camera]
+            deviations = [(name, d.tolist()) for name, d in _deviations(project, image, camera)]
+            out.append([deviations, camera.sigma, project.ground.sigma])
+        return [out, list(self.in_image)]
+
+    @property
     def sources(self) -> Mapping[int, SourceErrors]:
         """By row of the table of sources."""
         return self
@@ -154,16 +172,19 @@ class ScenesErrors(Mapping[int, SourceErrors]):
         return len(self.scenes)
 
 
+def _project_of(address: SceneAddress) -> Project:
+    return parse_project(json.loads(address.text), Path(address.folder), "project")
+
+
 @lru_cache(maxsize=64)
 def _errors_of(address: SceneAddress, in_image: float) -> SourceErrors:
-    scene = address.open()
-    project = parse_project(json.loads(address.text), Path(address.folder), "project")
+    scene, project = address.open(), _project_of(address)
     return source_errors(project, project.images[0], scene.ground, scene.camera, in_image)
 
 
 @lru_cache(maxsize=8)
 def _heights_of(address: SceneAddress) -> StatedHeightErrors | ModelHeightErrors:
-    return height_errors(parse_project(json.loads(address.text), Path(address.folder), "project"))
+    return height_errors(_project_of(address))
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from photoplan.engine.run import Kept, Runner, Tally, Work, tiles_in_flight
 from photoplan.errors import TilesFailed, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.disk import make_folder
-from photoplan.io.image_form import bands_of
+from photoplan.io.image_form import ImageForm, bands_of
 from photoplan.io.product import ProductFile
 from photoplan.io.project.model import Project
 from photoplan.io.quicklook import write_overview
@@ -26,12 +26,15 @@ from photoplan.io.regions import source_regions, write_regions
 from photoplan.io.run_record import input_entry, recorded_result, run_times, versions, write_run_record
 from photoplan.kernels.rectify import is_compiled
 from photoplan.plain import pick
-from photoplan.products.orthophoto.plan import Look, OrthoPlan, OrthoProduct
+from photoplan.plan.accuracy import BANDS, radial_error
+from photoplan.products.orthophoto.plan import Look, OrthoPlan, OrthoProduct, known_errors
 from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.restored import RestoreStep
 from photoplan.project.scene import Scene, input_files
 from photoplan.project.scenes import Scenes, ScenesAddress
 
+#: Names and units of the bands of an accuracy raster.
+_BANDS = ImageForm(descriptions=tuple(name for name, _ in BANDS), units=tuple(unit for _, unit in BANDS))
 #: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
 BASE_MEMORY = 320 * 2**20
 
@@ -190,10 +193,12 @@ def _work(
         },
         "hidden": {"bands": 1, "dtype": np.dtype(np.uint8), "nodata": 255, "resampling": "mode"},
         "sources": {"bands": 1, "dtype": np.dtype(np.uint16), "nodata": 0, "resampling": "mode"},
+        "accuracy": {"bands": len(BANDS), "dtype": np.dtype(np.float32), "resampling": "nearest", "form": _BANDS},
     }
     files = {name: open_file(path, **forms[name]) for name, path in paths.items()}
     told = replace(product.plan, tiles=product.plan.tiles.only(()))
-    job = RenderJob(address, told, settings.kernel, tuple(files))
+    errors = known_errors(address, told, settings) if settings.accuracy else None
+    job = RenderJob(address, told, settings.kernel, tuple(files), errors)
     return Work(
         name=product.plan.name,
         job=job,
@@ -247,6 +252,7 @@ def _complete(
         hidden=_area(tally, "hidden", product) if plan.settings.asks_hidden else None,
         bare=None if plan.settings.choice is None else _area(tally, "bare", product) + _left_out(product),
         painted=painted,
+        accuracy=_accuracy(tally.totals["radial_errors"]) if "radial_errors" in tally.totals else None,
         failed=tuple(sorted(tally.failed)),
         reason=next(iter(tally.reasons), ""),
     )
@@ -261,6 +267,10 @@ def _complete(
             **_record(plan, product, address.open(), result),
         )
     return result
+
+
+def _accuracy(counts: list[int]) -> dict[str, float]:
+    return {"median": radial_error(counts, 0.5), "p95": radial_error(counts, 0.95)}
 
 
 def _area(tally: Tally, name: str, product: OrthoProduct) -> float:
@@ -354,6 +364,8 @@ class ProductResult:
     """Ground of a mosaic that lies in none of its images, m²; None: it is no mosaic."""
     painted: dict[str, float] | None
     """Ground that each image paints, m², where that is asked for."""
+    accuracy: dict[str, float] | None
+    """Median and 95 % of the pixels' standard deviations of position, metres, where that is asked for."""
     failed: tuple[int, ...]
     """Tiles that could not be computed; the product is then not written."""
     reason: str = ""
@@ -364,13 +376,17 @@ class ProductResult:
         own = ("path", "seconds", "valid_share", "cells", "tiles")
         images = {"image": self.images[0]} if self.bare is None else {"images": self.images, "outside_m2": self.bare}
         more = {"worst_anchor_residual_px": "residual", "resumed_tiles": "resumed", "failed_tiles": "failed"}
-        return {**images, **pick(self, *own, hidden_m2="hidden", painted_m2="painted", **more)}
+        return {**images, **pick(self, *own, hidden_m2="hidden", painted_m2="painted", accuracy_m="accuracy", **more)}
 
 
 def outputs(folder: Path, product: OrthoProduct, settings: OrthoSettings) -> dict[OutputName, Path]:
-    """Rasters of a product: itself, where ground is hidden, which image painted a pixel."""
+    """Rasters of a product: itself, where ground is hidden, which image painted a pixel, how exactly it lies."""
     path = folder / f"{product.plan.name}.tif"
-    asked: dict[OutputName, bool] = {"hidden": settings.hidden == "mark", "sources": settings.sources}
+    asked: dict[OutputName, bool] = {
+        "hidden": settings.hidden == "mark",
+        "sources": settings.sources,
+        "accuracy": settings.accuracy,
+    }
     more = {name: path.with_name(f"{path.stem}_{name}.tif") for name, ask in asked.items() if ask}
     return {"picture": path, **more}
 
@@ -418,6 +434,7 @@ def _kept(plan: OrthoPlan, product: OrthoProduct, folder: Path) -> ProductResult
             hidden=made.get("hidden_m2"),
             bare=made.get("outside_m2"),
             painted=made.get("painted_m2"),
+            accuracy=made.get("accuracy_m"),
             failed=(),
         )
 

@@ -23,6 +23,7 @@ from photoplan.io.names import safe_stem
 from photoplan.io.project.model import Project
 from photoplan.io.storage import nodata_for
 from photoplan.orientation.plausibility import ImagePlausibility, View, other_reading
+from photoplan.plan.accuracy import in_image
 from photoplan.plan.choice import BestImage, Drawn
 from photoplan.plan.compile import AnchorRule
 from photoplan.plan.footprint import Footprint, covered_tiles, image_border, mean_gsd, some_height
@@ -33,6 +34,7 @@ from photoplan.products.judged import judged
 from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.scene import Scene, map_order, open_scene
 from photoplan.project.scenes import ScenesAddress
+from photoplan.project.uncertain import ScenesErrors
 from photoplan.targets.map import MapTarget
 
 #: A product is at most so many times finer than its images see the ground.
@@ -315,12 +317,20 @@ def keyed(project: Project, plan: ProductPlan, settings: OrthoSettings) -> str:
     Raises
     ------
     InputError
-        A file is missing.
+        A file is missing, or nothing is known of errors that are asked for.
     """
+    address = ScenesAddress.of(project, plan.sources)
+    facts = address.facts if not settings.accuracy else [address.facts, known_errors(address, plan, settings).facts]
     regions = None
     if settings.choice is not None and settings.choice.seams is not None:
         regions = fingerprint(project.resolve(settings.choice.seams)).digest
-    return product_key(ScenesAddress.of(project, plan.sources).facts, plan, settings, regions)
+    return product_key(facts, plan, settings, regions)
+
+
+def known_errors(address: ScenesAddress, plan: ProductPlan, settings: OrthoSettings) -> ScenesErrors:
+    """What is known of the errors of a product's images and of its ground."""
+    sigma = in_image(settings.kernel, plan.rule.tolerance)
+    return ScenesErrors(address.scenes, (sigma,) * len(address.scenes))
 
 
 def product_key(scenes: Any, plan: ProductPlan, settings: OrthoSettings, regions: str | None = None) -> str:

@@ -60,6 +60,8 @@ class OrthoSettings:
     """Whether the file holds overviews."""
     choice: Choice | None = None
     """How images are chosen for one mosaic of them; None: an orthophoto of each."""
+    accuracy: bool = False
+    """Whether a second raster holds the standard deviations of what each pixel shows; all errors must be stated."""
     sources: bool = False
     """Whether a second raster says which image painted each pixel, and a GeoPackage where its regions are."""
 
