@@ -44,9 +44,9 @@ def draw_accuracy(raster: Path) -> Path:
                 row = int((top - y) / (top - bottom) * radial.shape[0])
                 col = int((x - left) / (right - left) * radial.shape[1])
                 a, b, azimuth = bands[3:, row, col]
-                if np.isfinite(a):
+                for colour, width in ((INK, 2.2), ("white", 0.9)) if np.isfinite(a) else ():
                     ax.add_patch(mpl.patches.Ellipse((x, y), 2 * a * scale, 2 * b * scale, angle=90 - azimuth,
-                                                     fill=False, edgecolor="white", linewidth=0.9))  # fmt: skip
+                                                     fill=False, edgecolor=colour, linewidth=width))  # fmt: skip
         fig.colorbar(shown, ax=ax, shrink=0.8, extend="both", label="standard deviation of position, m")
         ax.set(xlabel="X [m]", ylabel="Y [m]", aspect="equal")
         ax.set_title(f"{raster.name}: error ellipses {scale:.3g} times as large", color=INK)
