@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from tools.adjust_project import Make, write_project
 from tools.command import process
+from tools.small_model import CRS, write_small
 
 from photoplan.cameras.base import project
 from photoplan.cameras.frame import FrameCamera
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.brown import Brown
 from photoplan.errors import InputError
+from photoplan.geometry.grid import MapGrid
 from photoplan.geometry.pose import Pose
 from photoplan.io.project.file import load_project, parse_project
 from photoplan.io.project.model import Terrain
@@ -21,6 +23,7 @@ from photoplan.products.adjust.inputs import read_inputs
 from photoplan.products.adjust.start import started
 from photoplan.project.scene import camera_without_pixels, ground_of
 from photoplan.project.uncertain import StatedHeightErrors, height_errors, source_errors
+from photoplan.targets.map import MapTarget
 
 CENTER, ANGLES = np.array([400_000.0, 5_200_000.0, 1500.0]), np.array([2.0, -3.0, 100.0])
 SIZE, FOCAL, K1 = (4000, 3000), 3600.0, -0.05
@@ -124,6 +127,14 @@ def test_what_is_not_known_is_said(tmp_path) -> None:
 
 def test_terrain_states_its_own(tmp_path) -> None:
     assert height_errors(project_with(tmp_path, {}, terrain={"sigma": 0.25})) == StatedHeightErrors(0.25)
+    write_small(tmp_path / "model.gpkg")
+    loaded = project_with(tmp_path, {})
+    target = MapTarget(MapGrid(500_000.0, 5_300_000.0, 2.0, 20, 20, CRS))
+    of_file = Terrain(file="model.gpkg", height_system="same")
+    own = height_errors(loaded.model_copy(update={"terrain": of_file}))(target, target.window)
+    np.testing.assert_allclose(own, 0.05, rtol=1e-6)
+    stated = height_errors(loaded.model_copy(update={"terrain": of_file.model_copy(update={"sigma": 0.3})}))
+    assert (stated(target, target.window) == 0.3).all()
 
 
 def test_of_an_adjusted_project_with_a_calibrated_camera(tmp_path) -> None:
