@@ -213,7 +213,7 @@ class TestPlan:
             plan_orthophotos(project.model_copy(update={"images": images}))
 
     def test_unknown_settings_are_named(self, pristine: Block) -> None:
-        with pytest.raises(UsageError, match="unknown settings colour; known are bounds, choice, compress"):
+        with pytest.raises(UsageError, match="unknown settings colour; known are accuracy, bounds, choice, compress"):
             plan_orthophotos(load_project(pristine.project), colour="red")
 
     def test_fault_21_nothing_seen(self, small: Block) -> None:
