@@ -206,13 +206,27 @@ class TestLeaveOneOut:
         np.testing.assert_allclose(result[5:, 0], differences[5:], atol=2e-4)
         assert (result[5:, 1] > 0).all() and (result[5:, 1] < 1).all()
 
+    def test_what_is_far_off_takes_no_part_in_what_is_said_of_others(self) -> None:
+        xyz, noise = data(30)
+        none, model = stacked([]), np.array([MODEL])
+        without, spoiled = np.full((28, 3), np.nan), np.full((30, 3), np.nan)
+        kept = np.arange(28)
+        args = (kept, np.array([0, 28]), *none, model)
+        patch_test.test_points(xyz[kept], noise[kept], kept[None], ONE, *args, without)
+        xyz[28:, 2] += 50.0
+        patch_test.test_points(xyz, noise, np.arange(30)[None], ONE, *args, spoiled)
+        np.testing.assert_allclose(spoiled[:28], without, rtol=1e-4, atol=1e-6)
+
     def test_residuals_are_those_of_the_filtered_surface(self) -> None:
+        """Where nothing is so far off that it takes no part."""
         xyz, noise = data()
+        noise = 25 * noise
         result = np.full((40, 3), np.nan)
         none = stacked([])
         args = (np.arange(40), np.array([0, 40]), *none, np.array([MODEL]), result)
         assert patch_test.test_points(xyz, noise, np.arange(40)[None], ONE, *args) == 0
         surface = predicted(xyz, noise, ONE, np.arange(40)[None], xyz[:, :2].copy())
+        assert np.abs(result[:, 2]).max() < 4
         # Residual against the filtered surface = redundancy · difference from the prediction.
         np.testing.assert_allclose(result[:, 0] * result[:, 1], xyz[:, 2] - surface[:, 0], atol=1e-6)
 

@@ -14,7 +14,8 @@ from tools.random_field import random_field
 from photoplan.surfaces.measured import MeasuredLine
 from photoplan.terrain.build import Built, plan_build
 from photoplan.terrain.covariance import Covariance, Neighbours, estimate_all
-from photoplan.terrain.fit import _members, quadtree, unit_of
+from photoplan.terrain.fit import _members, unit_of
+from photoplan.terrain.leaves import quadtree
 from photoplan.terrain.settings import FAMILIES, BuildSettings
 
 STEP = 0.2

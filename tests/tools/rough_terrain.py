@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-__all__ = ["Ground", "bench_edges", "benches", "fractal", "sampled"]
+__all__ = ["Ground", "bench_edges", "benches", "dunes", "fractal", "ridged", "sampled"]
 
 Ground = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Heights of places (n, 2)."""
@@ -26,6 +26,30 @@ def fractal(slope: float, nodes: int, seed: int, step: float = 1.0) -> Ground:
     field = np.fft.irfft2(white * k ** (-slope / 2), s=(nodes, nodes))
     field *= step / np.std(field[10:] - field[:-10])
     return lambda xy: np.asarray(map_coordinates(field, [xy[:, 1] / step, xy[:, 0] / step], order=1, mode="nearest"))
+
+
+def _smooth(wave: float, seed: int) -> Ground:
+    """A random surface of standard deviation 0.6 or so with waves of about twice this length, smooth, in 400 m."""
+    field = np.random.default_rng(seed).normal(size=(int(400 / wave) + 8,) * 2)
+    return lambda xy: np.asarray(map_coordinates(field, [xy[:, 1] / wave + 3, xy[:, 0] / wave + 3], order=3))
+
+
+def ridged(seed: int) -> Ground:
+    """Sharp crests 20 m high, 1 − |noise| in three octaves, in a field of 400 m."""
+    parts = [(0.4**k, _smooth(120 / 2**k, 100 * seed + k)) for k in range(3)]
+    return lambda xy: np.asarray(20 * sum(part * (1 - np.abs(noise(xy))) for part, noise in parts))
+
+
+def dunes(seed: int) -> Ground:
+    """Waves 8 m high and 60 m long that fall three times as steeply as they rise, in a field of 400 m."""
+    bend, high, small = _smooth(80, seed + 1), _smooth(100, seed + 2), _smooth(25, seed + 3)
+
+    def heights(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        along = (xy[:, 0] + 0.3 * xy[:, 1] + 12 * bend(xy)) / 60 % 1.0
+        shape = np.where(along < 0.75, along / 0.75, (1 - along) / 0.25)
+        return np.asarray(8 * shape * (1 + 0.3 * high(xy)) + 0.3 * small(xy))
+
+    return heights
 
 
 def benches(xy: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -14,6 +14,8 @@ from photoplan.kernels.sides import clip_lines, sides_of
 # Squared normalised differences count with their logarithm beyond this: no covariance function is to bend towards a
 # blunder.
 _KNEE = 16.0
+# So many data of a patch at most take no part in what is said of the others.
+_MOST_ASIDE = 8
 _JITTER = 1e-8
 # A prior for the slope of the trend so weak that it only matters where all data lie on one line.
 _SLOPE_WEIGHT = 1e-4
@@ -141,6 +143,51 @@ def left_out(b: NDArray[Any], w: NDArray[Any]) -> tuple[NDArray[Any], NDArray[An
             for q in range(3):
                 weight[j] -= cross[p, j] * inverse[p, q] * cross[q, j]
     return weight, alpha
+
+
+@kernel
+def one_by_one(b: NDArray[Any], w: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """As `left_out`, but data far off their prediction take no part in those of the others, the worst first.
+
+    A gross error spoils what is said of its neighbours: each of them contradicts it, and together they ask for a
+    surface that is rough enough to meet it. `b` and `w` are changed.
+
+    Notes
+    -----
+    A datum takes no part if its error is a further unknown of the trend: all columns are made orthogonal to its own.
+    """
+    weight, alpha = left_out(b, w)
+    aside = np.zeros(len(weight), np.bool_)
+    for _ in range(_MOST_ASIDE):
+        worst, most = -1, _KNEE
+        for j in range(len(weight)):
+            if not aside[j] and weight[j] > 0.0 and alpha[j] * alpha[j] > most * weight[j]:
+                worst, most = j, alpha[j] * alpha[j] / weight[j]
+        if worst < 0:
+            break
+        aside[worst] = True
+        unknown = w[:, worst].copy()
+        _orthogonal(b, unknown)
+        _orthogonal(w, unknown)
+        now_weight, now_alpha = left_out(b, w)
+        for j in range(len(weight)):
+            if not aside[j]:
+                weight[j], alpha[j] = now_weight[j], now_alpha[j]
+    return weight, alpha
+
+
+@kernel
+def _orthogonal(columns: NDArray[Any], to: NDArray[Any]) -> None:
+    """Take the part along a vector away from columns (n, m)."""
+    n, m = columns.shape
+    part, size = np.zeros(m), 0.0
+    for i in range(n):
+        size += to[i] * to[i]
+        for j in range(m):
+            part[j] += to[i] * columns[i, j]
+    for i in range(n):
+        for j in range(m):
+            columns[i, j] -= to[i] * (part[j] / size)
 
 
 @inner

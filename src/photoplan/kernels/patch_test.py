@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.collocation import solve_transposed
 from photoplan.kernels.jit import kernel
-from photoplan.kernels.patch_system import left_out, misfit, system, usable
+from photoplan.kernels.patch_system import misfit, one_by_one, system, usable
 
 # Points count with a normal weight of this many half sides of the leaf: far ones are other patches' matter.
 _FOCUS = 1.5
@@ -27,7 +27,8 @@ def score_models(
     models: NDArray[Any],
     result: NDArray[Any],
 ) -> None:
-    """How badly each model predicts every point of a patch from all others, result[patch, model].
+    """How badly each model predicts every point of a patch from all others that it does not contradict,
+    result[patch, model].
 
     The score is the sum of misfits over the points (numbers below `points`), e being the difference from the
     prediction and v its variance: twice the negative logarithm of the predictive density.
@@ -48,7 +49,7 @@ def score_models(
             for j in range(m):
                 w[j, j] = 1.0
             solve_transposed(u, w)
-            weight, alpha = left_out(b, w)
+            weight, alpha = one_by_one(b, w)
             total = 0.0
             for j in range(m):
                 if weight[j] > 0.0:
@@ -73,9 +74,10 @@ def test_points(
 ) -> int:
     """Compare data with what their neighbours predict; returns the number of patches without a solution.
 
-    Parameters are those of `predict`; `own` holds data numbers of each leaf. `result`, shape (n, 3), receives for each
-    of them the difference from the prediction from all other data of the patch (metres), the redundancy (share of it
-    that is left as a residual against the filtered surface) and the difference in its standard deviations.
+    Parameters are those of `predict`; `own` holds point numbers of each leaf. `result`, shape (points, 3), receives for
+    each of them the difference from the prediction from all other data of the patch but those that are far off
+    themselves (metres), the redundancy (share of it that is left as a residual against the filtered surface) and the
+    difference in its standard deviations.
     """
     failed = 0
     for patch in range(len(leaves)):
@@ -87,17 +89,15 @@ def test_points(
         if u.shape[0] == 0:
             failed += 1
             continue
-        n, m = len(data), len(some)
+        n, m = len(data), np.searchsorted(data, len(result))
         w = np.zeros((n, m))
-        place = np.searchsorted(data, some)
         for j in range(m):
-            if place[j] < n and data[place[j]] == some[j]:
-                w[place[j], j] = 1.0
+            w[j, j] = 1.0
         solve_transposed(u, w)
-        weight, alpha = left_out(b, w)
-        for j in range(m):
-            if weight[j] > 0.0:
-                t = some[j]
+        weight, alpha = one_by_one(b, w)
+        for t in some:
+            j = np.searchsorted(data[:m], t)
+            if j < m and data[j] == t and weight[j] > 0.0:
                 result[t, 0] = alpha[j] / weight[j]
                 result[t, 1] = noise[t] * weight[j]
                 result[t, 2] = alpha[j] / np.sqrt(weight[j])

@@ -17,8 +17,9 @@ from photoplan.kernels.patch_test import score_models, test_points
 from photoplan.surfaces.units import UnitLayout
 from photoplan.terrain.calibration import NONE, Calibration
 from photoplan.terrain.covariance import LADDER, Covariance, Neighbours, estimate_all, estimate_unit, ladder, near_lines
+from photoplan.terrain.leaves import Leaves, patches_at, quadtree
 from photoplan.terrain.observations import Observations, told_by
-from photoplan.terrain.screen import PART, Neighbourhoods, Screened, screen, supported
+from photoplan.terrain.screen import MEETS_MODEL, PART, Neighbourhoods, Screened, screen, supported
 from photoplan.terrain.settings import BuildSettings
 
 #: A patch reaches this many half sides from the middle of its leaf (see the weights in `photoplan.kernels.patch`).
@@ -32,90 +33,6 @@ _ROUGH, _LEAST_OF_LEAF, _WEIGHTS = 3.0, 6, (1.0, 100.0)
 _FEWEST = 8
 #: While the stochastic model is estimated, the standard deviation of what looks like a gross error is so many times it.
 _WEIGHTLESS = 30.0
-#: Points that a leaf holds at most.
-CAPACITY = 24
-#: A leaf is not smaller than this many meshes.
-_SMALLEST = 2
-
-
-@dataclass(frozen=True, eq=False)
-class Leaves:
-    """Squares that cover all units, sorted by unit."""
-
-    middle: NDArray[np.float64]
-    """X, Y of the middles, shape (n, 2), in the coordinates that were given."""
-    half: NDArray[np.float64]
-    """Half sides, shape (n,), metres."""
-    unit: NDArray[np.int64]
-    """Number of each leaf's unit, row · columns + column, shape (n,)."""
-    count: NDArray[np.int64]
-    """Points inside, shape (n,)."""
-    order: NDArray[np.int64]
-    """Points in the order of leaves, shape (p,)."""
-    first: NDArray[np.int64]
-    """Points of leaf i are order[first[i]:first[i] + count[i]]."""
-
-    def of_unit(self, unit: int) -> NDArray[np.int64]:
-        """Leaves of a unit."""
-        return np.arange(np.searchsorted(self.unit, unit), np.searchsorted(self.unit, unit, side="right"))
-
-
-def quadtree(xy: NDArray[np.float64], layout: UnitLayout, meshes: int) -> Leaves:
-    """Quarter each unit until a leaf holds at most `CAPACITY` points or is two meshes wide.
-
-    Parameters
-    ----------
-    xy : ndarray, shape (n, 2)
-        Points inside the layout, in its coordinates.
-    layout : UnitLayout
-    meshes : int
-        Meshes along a unit's side, a power of two.
-    """
-    deepest = max(0, int(np.log2(meshes / _SMALLEST)))
-    place = np.stack([xy[:, 0] - layout.left, layout.top - xy[:, 1]], axis=1) / layout.side
-    column = np.clip(place[:, 0].astype(np.int64), 0, layout.columns - 1)
-    row = np.clip(place[:, 1].astype(np.int64), 0, layout.rows - 1)
-    inside = np.clip(((place - np.stack([column, row], axis=1)) * 2**deepest).astype(np.int64), 0, 2**deepest - 1)
-    key = (row * layout.columns + column) << (2 * deepest) | _interleave(inside)
-    order = np.argsort(key, kind="stable")
-    key = key[order]
-    cells = np.arange(layout.columns * layout.rows, dtype=np.int64)
-    found: list[tuple[NDArray[np.int64], int]] = []
-    for level in range(deepest + 1):
-        shift = 2 * (deepest - level)
-        count = np.searchsorted(key, (cells + 1) << shift) - np.searchsorted(key, cells << shift)
-        split = (count > CAPACITY) & (level < deepest)
-        found.append((cells[~split], level))
-        cells = (cells[split, None] << 2 | np.arange(4)).ravel()
-    code = np.concatenate([c << (2 * (deepest - level)) for c, level in found])
-    levels = np.concatenate([np.full(len(c), level) for c, level in found])
-    sort = np.argsort(code)
-    code, levels = code[sort], levels[sort]
-    first = np.searchsorted(key, code)
-    count = np.searchsorted(key, code + (np.int64(1) << (2 * (deepest - levels)))) - first
-    unit = code >> (2 * deepest)
-    half = layout.side / 2.0 ** (levels + 1)
-    corner = _separate(code & ((1 << (2 * deepest)) - 1)) * (layout.side / 2**deepest)
-    x = layout.left + (unit % layout.columns) * layout.side + corner[:, 0] + half
-    y = layout.top - (unit // layout.columns) * layout.side - corner[:, 1] - half
-    return Leaves(np.stack([x, y], axis=1), half, unit, count, order, first)
-
-
-def _interleave(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Column and row (n, 2) to one number whose bits alternate, so that quarters are ranges."""
-    code = np.zeros(len(cells), np.int64)
-    for bit in range(12):
-        code |= ((cells[:, 0] >> bit) & 1) << (2 * bit) | ((cells[:, 1] >> bit) & 1) << (2 * bit + 1)
-    return code
-
-
-def _separate(code: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Inverse of `_interleave`."""
-    cells = np.zeros((len(code), 2), np.int64)
-    for bit in range(12):
-        cells[:, 0] |= ((code >> (2 * bit)) & 1) << bit
-        cells[:, 1] |= ((code >> (2 * bit + 1)) & 1) << bit
-    return cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,9 +53,9 @@ class TerrainFit:
     shares: NDArray[np.float64]
     """Weight of each function of the ladder in every patch, shape (leaves, len(LADDER))."""
     residuals: NDArray[np.float64]
-    """Height less its prediction from all others (metres), redundancy (share of this difference that the filtered
-    surface leaves) and the difference in its standard deviations, of every point, shape (points, 3); NaN: not tested.
-    Of gross errors: without any of them."""
+    """Height less its prediction from all others that are not far off themselves (metres), redundancy (share of this
+    difference that the filtered surface leaves) and the difference in its standard deviations, of every point, shape
+    (points, 3); NaN: not tested. Of gross errors: without any of them."""
     ground: NDArray[np.float64]
     """Variance in each unit that is taken for noise and may be ground, m²."""
     members: tuple[NDArray[np.int64], ...]
@@ -168,11 +85,6 @@ class TerrainFit:
         """Functions of the given leaves, shape (n, len(LADDER), 4)."""
         table = {unit: ladder(self.units[unit]) for unit in np.unique(self.leaves.unit[leaves]).tolist()}
         return np.stack([table[unit] for unit in self.leaves.unit[leaves].tolist()])
-
-
-def patches_at(leaves: Leaves, some: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Middle and half side of leaves, shape (n, 3)."""
-    return np.column_stack([leaves.middle[some], leaves.half[some]])
 
 
 def fit(
@@ -223,6 +135,7 @@ def fit(
         events.begin("gross errors", unit="units")
         suspects = _judge(found, around, screened, seen.noise(mass[unit_of_point]), settings.gross, run)
         _flag(found, around, screened, settings.gross, run)
+        _whole_groups(found, screened, run)
         found = replace(found, suspects=suspects[~np.isin(suspects[:, 0], found.gross)])
     return replace(found, usual=_usual(found))
 
@@ -380,7 +293,8 @@ def _flag(found: TerrainFit, around: Neighbourhoods, screened: Screened, limit: 
         local_scales(found.residuals[:, 2], around.wide, used, changed, scale)
         ratio = np.where(used & ~cleared, np.abs(found.residuals[:, 2]) / np.fmax(scale, 1.0), 0.0)
         wild = np.flatnonzero(ratio > limit)
-        meets = supported(found.seen, around, screened.slopes, wild, found.residuals[wild, 0])
+        within = MEETS_MODEL * np.abs(found.residuals[wild, 0])
+        meets = supported(found.seen, around, screened.slopes, wild, within)
         cleared[wild[meets]] = True
         wild = wild[~meets]
         near = found.neighbours.near[0].query(found.seen.xyz[wild, :2])
@@ -389,6 +303,16 @@ def _flag(found: TerrainFit, around: Neighbourhoods, screened: Screened, limit: 
             return
         found.noise[flagged] = -1.0
         changed = _test_near(found, flagged, run)
+
+
+def _whole_groups(found: TerrainFit, screened: Screened, run: Map) -> None:
+    """Flag the rest of a group most of which is flagged: what hangs together is wrong together."""
+    wrong = np.zeros(found.seen.points, bool)
+    wrong[found.gross] = True
+    groups = [group[~wrong[group]] for group in (*screened.clusters, *screened.suspects) if wrong[group].mean() > 0.5]
+    rest = np.concatenate([np.empty(0, np.int64), *groups])
+    found.noise[rest] = -1.0
+    _test_near(found, rest, run)
 
 
 def _leaf_of(found: TerrainFit) -> NDArray[np.int64]:

@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 from photoplan.events import Map
 from photoplan.terrain.calibration import HeldOut, Surroundings, calibrate, joined
 from photoplan.terrain.covariance import Neighbours
-from photoplan.terrain.fit import TerrainFit, quadtree, unit_of
+from photoplan.terrain.fit import TerrainFit, unit_of
+from photoplan.terrain.leaves import quadtree
 from photoplan.terrain.observations import Observations, lines_apart
 from photoplan.terrain.predict import raw_at
 

@@ -15,7 +15,8 @@ from photoplan.events import Map
 from photoplan.kernels.patch import predict
 from photoplan.surfaces.units import LineElement, Unit
 from photoplan.terrain.calibration import Surroundings, signal_share
-from photoplan.terrain.fit import REACH, TerrainFit, choose, lines_of, patches_at
+from photoplan.terrain.fit import REACH, TerrainFit, choose, lines_of
+from photoplan.terrain.leaves import patches_at
 
 #: A prepared polygon builds its index when it is first asked, and GEOS does not guard that against other threads.
 _ONE_AT_A_TIME = threading.Lock()

@@ -24,8 +24,9 @@ _ROUNDS = 40
 PART = 0.9
 #: Misfits below this part of the spacing are nothing to look at.
 _FINEST = 1e-3
-#: So many neighbours whose planes meet a point, to this part of its misfit, say that the terrain has an edge there.
-_SUPPORT, _MEETS = 3, 0.4
+#: So many neighbours whose planes meet a point say that the terrain has an edge there: to this part of its misfit to its
+#: own plane, which bends with the ground, or of its difference from what the model predicts.
+_SUPPORT, _MEETS, MEETS_MODEL = 3, 0.4, 0.2
 #: Points of a cluster at most.
 MOST = 20
 #: Neighbours whose heights differ by more standard deviations than this do not hang together.
@@ -157,7 +158,7 @@ def _singles(
         local_scales(planes[:, 0], around.wide, used, changed, scale)
         ratio = np.abs(planes[:, 0]) / np.maximum(scale, floor)
         found = asked[used[asked] & (ratio[asked] > PART * limit)]
-        found = found[~supported(seen, around, slopes, found, planes[found, 0])]
+        found = found[~supported(seen, around, slopes, found, _MEETS * np.abs(planes[found, 0]))]
         worst = np.zeros(p)
         worst[found] = ratio[found]
         near = around.points[found]
@@ -179,7 +180,7 @@ def supported(
     around: Neighbourhoods,
     slopes: NDArray[np.float64],
     some: NDArray[np.int64],
-    misfit: NDArray[np.float64],
+    within: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
     """Whether the planes of several neighbours meet a point: it lies on one side of an edge that no line describes.
 
@@ -187,13 +188,13 @@ def supported(
     ----------
     slopes : ndarray, shape (points, 2)
         Of the plane at every point; NaN: not known.
-    some, misfit : ndarrays, shape (n,)
-        Points that are asked for, and by how much each is off, metres.
+    some, within : ndarrays, shape (n,)
+        Points that are asked for, and to what a plane meets each of them, metres.
     """
     near, xyz = around.points[some], seen.xyz
     step = xyz[some, None] - xyz[near]
     off = step[..., 2] - (step[..., :2] * slopes[near]).sum(axis=2)
-    meets = (near >= 0) & (np.abs(off) < _MEETS * np.abs(misfit)[:, None])
+    meets = (near >= 0) & (np.abs(off) < within[:, None])
     return np.asarray(meets.sum(axis=1) >= _SUPPORT)
 
 
