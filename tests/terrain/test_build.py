@@ -195,6 +195,14 @@ class TestWall:
         assert kept.right is not None
         np.testing.assert_allclose(kept.xyz[:, 2] - kept.right, self.HIGH, atol=4 * NOISE)
 
+    def test_the_jump_stays_to_both_ends(self, model: Built) -> None:
+        """Before, it closed from the last grid line or vertex on: half of it a millimetre beside the wall."""
+        near = np.linspace(0.05, 0.5, 20)
+        y = np.concatenate([near, 60 - near])
+        surface = surface_of(model)
+        west, east = (surface.heights(np.column_stack([np.full(40, 30 + e), y])) for e in (-1e-3, 1e-3))
+        assert np.abs(west - 100 - self.HIGH).max() < 5 * NOISE and np.abs(east - 100).max() < 5 * NOISE
+
     def test_the_ground_beside_it_is_level(self, model: Built) -> None:
         expected = 100.0 + self.HIGH * (INNER[:, 0] < 30)
         error = surface_of(model).heights(INNER) - expected

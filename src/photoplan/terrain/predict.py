@@ -21,6 +21,8 @@ from photoplan.terrain.leaves import patches_at
 #: A prepared polygon builds its index when it is first asked, and GEOS does not guard that against other threads.
 _ONE_AT_A_TIME = threading.Lock()
 
+#: A wall closes this part of the spacing before its end.
+_END = 0.005
 #: Cells of the raster that says what is near data, at most; more area means larger cells.
 _MOST_CELLS = 30_000_000
 
@@ -266,18 +268,40 @@ def _elements(fit: TerrainFit, left: NDArray[np.float64], right: NDArray[np.floa
         wall = line.right is not None
         heights = np.where(np.isfinite(left[part, 0]), left[part, 0], lines.xyz[part, 2]) if wall else both[part]
         other = np.where(np.isfinite(right[part, 0]), right[part, 0], lines.right[part]) if wall else None
+        columns = np.column_stack(
+            [
+                line.xyz[:, :2],
+                heights + origin[2],
+                np.zeros(len(heights)) if other is None else other + origin[2],
+                np.maximum(left[part, 1], right[part, 1]) if wall else sigma[part],
+            ]
+        )
+        if wall:
+            columns = _to_the_end(columns, _END * fit.seen.spacing)
         found.append(
             LineElement(
                 line.name,
                 line.kind,
                 line.code,
-                np.column_stack([line.xyz[:, :2], heights + origin[2]]),
-                None if other is None else other + origin[2],
-                np.maximum(left[part, 1], right[part, 1]) if wall else sigma[part],
-                np.zeros(len(line.xyz), bool),
+                columns[:, :3].copy(),
+                columns[:, 3].copy() if wall else None,
+                columns[:, 4].copy(),
+                np.zeros(len(columns), bool),
             )
         )
     return found
+
+
+def _to_the_end(rows: NDArray[np.float64], last: float) -> NDArray[np.float64]:
+    """Rows of a wall, shape (n, c), with one more at a distance `last` before each end, linear between.
+
+    At its end a wall has one height. It would close from its last vertex or grid line on.
+    """
+    length = np.hypot(*np.diff(rows[:, :2], axis=0).T)
+    first, final = (min(last / max(side, 1e-9), 0.25) for side in (length[0], length[-1]))
+    begin = rows[0] + (rows[1] - rows[0]) * first
+    end = rows[-1] + (rows[-2] - rows[-1]) * final
+    return np.vstack([rows[:1], begin, rows[1:-1], end, rows[-1:]])
 
 
 def _shared(
