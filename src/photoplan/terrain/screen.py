@@ -24,8 +24,8 @@ _ROUNDS = 40
 PART = 0.9
 #: Misfits below this part of the spacing are nothing to look at.
 _FINEST = 1e-3
-#: So many neighbours whose planes meet a point say that the terrain has an edge there: to this part of its misfit to the
-#: plane, which bends with the ground, or of its difference from what the model predicts.
+#: So many neighbours whose planes meet a point say that it lies at an edge: to this part of its misfit to its
+#: own plane, which bends with the ground, or of its difference from the prediction of the model.
 _SUPPORT, _MEETS, MEETS_MODEL = 3, 0.4, 0.2
 #: Points of a cluster at most.
 MOST = 20
