@@ -51,7 +51,7 @@ def left(folder: Path) -> list[str]:
 class TestBuilt:
     def test_model_record_and_report(self, photoplan: Here, survey: Path, tmp_path: Path) -> None:
         out = tmp_path / "model.gpkg"
-        said = photoplan("dtm", "build", survey, "-o", out)
+        said = photoplan("dtm", "build", survey, "-o", out, "--height-system", "EPSG:5773")
         assert said.code == 0, said.err
         assert said.out.splitlines()[0] == str(out) and "gross error" in said.err
         reader = ModelReader(out)
@@ -64,7 +64,9 @@ class TestBuilt:
         assert record["kind"] == "terrain model" and record["product"]["gross"] == 1
         assert Path(record["inputs"][0]["path"]) == survey and record["peak_memory_bytes"] > 0
         page = tmp_path / "model.report.html"
-        assert page.exists() and str(page) in said.out
+        assert str(page) in said.out
+        text = page.read_text()
+        assert "system not stated" not in text and "heights: EPSG:5773" in text
         assert left(tmp_path) == [] or left(tmp_path) == [".model.gpkg.lock"]
 
     def test_json_gives_the_figures(self, photoplan: Here, survey: Path, tmp_path: Path) -> None:
@@ -74,6 +76,10 @@ class TestBuilt:
         assert set(FIELDS) <= facts.keys()
         assert facts["gross"] == 1 and facts["lines"] == {"breakline": 1} and facts["report"] is None
         assert facts["noise"] == pytest.approx(0.05, rel=0.3)
+        told = json.loads(photoplan("dtm", "info", tmp_path / "m.gpkg", "--json").out)
+        for name in ("length", "noise", "sigma", "spread"):
+            assert told[name] == facts[name], name
+        assert told["signal"] == pytest.approx(np.sqrt(facts["variance"]))
         (wrong,) = facts["gross_errors"]
         assert f"(record {len(ground()) // 3 + 1})" in wrong["name"] and wrong["residual"] == pytest.approx(2, abs=0.3)
 

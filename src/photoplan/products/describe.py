@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -185,7 +186,8 @@ def describe_model(reader: ModelReader) -> dict[str, Any]:
 def model_figures(reader: ModelReader) -> dict[str, Any]:
     """Figures of a terrain model as plain values; None where there is none.
 
-    Lengths are medians and accuracies root mean squares over the units that are not empty, each unit counted once.
+    Length, signal, noise, sigma and spread are the whole model's, as the build told them. A model without these has
+    medians (of lengths) and root mean squares over its units that are not empty, each unit counted once.
     """
     header, layout = reader.header, reader.layout
     units = [u for u in reader.figures() if u.meshes > 0]
@@ -212,15 +214,24 @@ def model_figures(reader: ModelReader) -> dict[str, Any]:
         "gross": len(reader.gross()),
         "suspects": len(reader.suspects()),
         "family": header.family,
+        **_accuracy(header.totals, units),
+        "totals": dict(header.totals),
+        "settings": dict(header.settings),
+        "inputs": [dict(item) for item in header.inputs],
+        "layers": reader.layers(),
+    }
+
+
+def _accuracy(totals: Mapping[str, Any], units: list[UnitFigures]) -> dict[str, float | None]:
+    if "spread" in totals:
+        told = {name: totals[name] for name in ("length", "noise", "sigma", "spread")}
+        return {"signal": float(np.sqrt(totals["variance"])), **told}
+    return {
         "length": _median([u.length for u in units]),
         "signal": _rms([np.sqrt(u.variance) for u in units if u.variance >= 0]),
         "noise": _rms([u.noise for u in units]),
         "sigma": _rms([u.sigma for u in units]),
         "spread": _spread(units),
-        "totals": dict(header.totals),
-        "settings": dict(header.settings),
-        "inputs": [dict(item) for item in header.inputs],
-        "layers": reader.layers(),
     }
 
 

@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +96,7 @@ def load(request: BuildRequest) -> tuple[MeasuredTerrain, tuple[Finding, ...], s
         raise InputError(f"{names}: no CRS; state it with `crs` EPSG:nnnn, it is not guessed")
     system = _height_system(raw, request.height_system)
     _check_memory(raw)
-    measured, findings = clean(raw, sigmas=request.settings.filters or None)
+    measured, findings = clean(replace(raw, height_system=system), sigmas=request.settings.filters or None)
     return measured, findings, raw.crs, system
 
 
