@@ -135,8 +135,7 @@ def fit(
         events.begin("gross errors", unit="units")
         suspects = _judge(found, around, screened, seen.noise(mass[unit_of_point]), settings.gross, run)
         _flag(found, around, screened, settings.gross, run)
-        _whole_groups(found, screened, run)
-        found = replace(found, suspects=suspects[~np.isin(suspects[:, 0], found.gross)])
+        found = replace(found, suspects=_whole_groups(found, screened, suspects, settings.gross, run))
     return replace(found, usual=_usual(found))
 
 
@@ -305,14 +304,18 @@ def _flag(found: TerrainFit, around: Neighbourhoods, screened: Screened, limit: 
         changed = _test_near(found, flagged, run)
 
 
-def _whole_groups(found: TerrainFit, screened: Screened, run: Map) -> None:
-    """Flag the rest of a group most of which is flagged: what hangs together is wrong together."""
+def _whole_groups(
+    found: TerrainFit, screened: Screened, suspects: NDArray[np.float64], limit: float, run: Map
+) -> NDArray[np.float64]:
+    """Suspects that stay: where half of a group or more is flagged, those of it that are as far off are flagged too."""
     wrong = np.zeros(found.seen.points, bool)
     wrong[found.gross] = True
-    groups = [group[~wrong[group]] for group in (*screened.clusters, *screened.suspects) if wrong[group].mean() > 0.5]
-    rest = np.concatenate([np.empty(0, np.int64), *groups])
+    groups = [group for group in (*screened.clusters, *screened.suspects) if wrong[group].mean() >= 0.5]
+    off = suspects[np.abs(suspects[:, 4]) > PART * limit, 0].astype(np.int64)
+    rest = off[np.isin(off, np.concatenate([np.empty(0, np.int64), *groups])) & ~wrong[off]]
     found.noise[rest] = -1.0
     _test_near(found, rest, run)
+    return suspects[~np.isin(suspects[:, 0], found.gross)]
 
 
 def _leaf_of(found: TerrainFit) -> NDArray[np.int64]:
