@@ -30,6 +30,9 @@ print(len(plan.products), file=sys.stderr)
 """
 
 
+MOSAIC = PLAN.replace("plan_orthophotos", "plan_mosaic")
+
+
 def report_planning(quick: bool) -> list[dict]:
     """All rows, printed and as values."""
     write_block = importlib.import_module("tools.large_block").write_block
@@ -38,9 +41,11 @@ def report_planning(quick: bool) -> list[dict]:
     folder.mkdir(parents=True, exist_ok=True)
     print(f"\nPlanning over {side:,} × {side:,} posts (asked: {SECONDS_TARGET:g} s, {MEMORY_TARGET:g} MiB)")
     rows = []
-    for name, images in (("check", 25 if quick else 400), ("plan", 30 if quick else 500)):
+    many = 30 if quick else 500
+    for name, images in (("check", 25 if quick else 400), ("plan", many), ("mosaic", many)):
         project = write_block(folder, images, side)
-        command = photoplan("check", project) if name == "check" else [sys.executable, "-c", PLAN, str(project)]
+        script = MOSAIC if name == "mosaic" else PLAN
+        command = photoplan("check", project) if name == "check" else [sys.executable, "-c", script, str(project)]
         rows.append({"what": name, "images": images, **measure(*command)})
         cost = rows[-1]
         print(

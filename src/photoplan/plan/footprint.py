@@ -184,9 +184,8 @@ def covered_tiles(
 ) -> Tiles:
     """Tiles that can hold a pixel of the image, judged from the range of heights under each tile; others than those
     that meet `seen`, the bounds of its footprint, are not looked at."""
-    every = Tiles.every(grid.window, side)
-    if seen is not None:
-        every = every.touching(grid.window_of(seen))
+    near = grid.window if seen is None else grid.window_of(seen)
+    every = Tiles(grid.window, side, np.empty(0, np.uint32)).touching(near)
     boxes = every.bounds(grid)
     ranges = terrain.height_range(boxes)
     if not np.isfinite(ranges).any():

@@ -109,7 +109,7 @@ class Tiles(Sequence[Tile]):
         return replace(self, indices=self.indices[places], sources=self.sources.only(places))
 
     def touching(self, window: Window) -> Tiles:
-        """Those that hold pixels of a window of the product."""
+        """Tiles of the product that hold pixels of a window, whichever are listed."""
         col, row = (
             max(0, at - first) // self.side
             for at, first in zip((window.col, window.row), (self.window.col, self.window.row))
