@@ -13,9 +13,9 @@ from photoplan.kernels.triangles import Cells, count_in_cells, fill_cells, first
 from photoplan.surfaces.rays import chords
 
 #: Triangles are entered into no more cells than so many times their number, and a number more.
-_ENTRIES, _MORE = 12, 4096
+_ENTRIES, _MORE = 32, 65536
 #: Sides of cells, in median extents of the triangles.
-_SIDES = 2.0
+_SIDES = 0.5
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -104,13 +105,14 @@ def _flattened(rings: Rings) -> tuple[_Base | None, Any, str]:
         return None, None, ""
     middle = clean[0].mean(axis=0)
     around = clean[0] - middle
+    (x, y, z), (xn, yn, zn) = around.T, np.concatenate([around[1:], around[:1]]).T
     # Newell's normal: its length is twice the area.
-    normal = np.cross(around, np.roll(around, -1, axis=0)).sum(axis=0)
-    size = float(np.linalg.norm(normal))
-    spread = np.linalg.svd(around, compute_uv=False)
+    normal = float(y @ zn - z @ yn), float(z @ xn - x @ zn), float(x @ yn - y @ xn)
+    size = math.hypot(*normal)
     if size < 2 * LEAST_AREA:
+        spread = np.linalg.svd(around, compute_uv=False)
         return None, None, "crosses itself" if spread[0] * spread[1] > 1e-3 * len(around) else ""
-    axes = _axes(normal / size)
+    axes = _axes(normal[0] / size, normal[1] / size, normal[2] / size)
     clean = [clean[0], *(ring for ring in clean[1:] if len(ring) >= 3)]
     planes = [(ring - middle) @ axes.T for ring in clean]
     plane: Any = shapely.Polygon(planes[0], planes[1:])
@@ -130,11 +132,15 @@ def _opened(ring: NDArray[np.float64]) -> NDArray[np.float64]:
     return ring[~same] if same.any() else ring
 
 
-def _axes(normal: NDArray[np.float64]) -> NDArray[np.float64]:
+def _axes(x: float, y: float, z: float) -> NDArray[np.float64]:
     """Two axes across a unit vector, (2, 3)."""
-    u = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    u /= np.linalg.norm(u)
-    return np.stack([u, np.cross(normal, u)])
+    if abs(z) > 0.5:
+        length = math.hypot(x, z)
+        u = z / length, 0.0, -x / length
+    else:
+        length = math.hypot(x, y)
+        u = -y / length, x / length, 0.0
+    return np.array([u, (y * u[2] - z * u[1], z * u[0] - x * u[2], x * u[1] - y * u[0])])
 
 
 def distance_weighted(vertices: ArrayLike, XY: ArrayLike) -> NDArray[np.float64]:
