@@ -110,7 +110,7 @@ def product_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--tolerance", type=float, metavar="PX", help="Largest residual of the anchors [0.02]."),
         click.option(
             "--hidden",
-            help="Ground that no image sees: show, nodata, or mark (second raster) [ortho: show, mosaic: nodata].",
+            help="What no image sees: show, nodata, or mark (second raster) [ortho: show; mosaic, --true: nodata].",
         ),
         click.option("--accuracy", is_flag=True, default=None, help="Also a raster of standard deviations, a picture."),
         click.option("--compress", help="deflate, zstd, lzw, jpeg or none [deflate]."),

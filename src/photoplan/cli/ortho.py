@@ -13,6 +13,7 @@ from photoplan.cli.options import executing, product_options
 @click.command("ortho")
 @click.argument("project", type=click.Path(path_type=Path))
 @product_options
+@click.option("--true/--ground", "true", default=None, help="Show objects where they stand, or the ground [ground].")
 @executing
 def command(project: Path, **options: Any) -> None:
     """Make an orthophoto of each image: NAME_ortho.tif (a cloud-optimised GeoTIFF) and its run record.

@@ -145,11 +145,12 @@ def _behind_ground(
     window, target = ground.window, ground.target
     assert isinstance(target, MapTarget)
     # Over a map every surface is terrain.
-    terrain: Any = without_objects(surface)
+    whole: Any = surface
+    terrain = without_objects(whole)
     top, needed = _search(terrain, target, window, lines, levels)
     m = MOST_AROUND
     around = needed & Window(window.col - m, window.row - m, window.width + 2 * m, window.height + 2 * m)
-    mine = around == window and terrain is surface
+    mine = around == window and terrain is whole
     heights = ground.relief if mine else terrain.relief(target, around)
     # Where the raster ends before the lines do, no part of it is quiet.
     quiet = quiet_blocks(heights, _flattest(lines) if around == needed else 0.0, top)

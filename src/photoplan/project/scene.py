@@ -26,7 +26,7 @@ from photoplan.io.names import resolve_input
 from photoplan.io.orientation.table import angle_in_radians
 from photoplan.io.project.cameras import image_size, interior_of, lens_of
 from photoplan.io.project.file import parse_project
-from photoplan.io.project.model import Image, Orientation, Project
+from photoplan.io.project.model import Image, Objects, Orientation, Project
 from photoplan.io.project.model import Terrain as StatedTerrain
 from photoplan.io.raster import RasterReader
 from photoplan.io.raster_info import read_info
@@ -34,11 +34,13 @@ from photoplan.orientation.plausibility import View
 from photoplan.plan.footprint import Footprint, footprint
 from photoplan.project.filter_files import load_filter
 from photoplan.project.linearisation import linearisation_of
+from photoplan.project.objects import Place, with_objects
 from photoplan.project.open_terrain import open_terrain
 from photoplan.project.restored import RestoreStep, restored
 from photoplan.project.stepped import SteppedReader
 from photoplan.surfaces.base import Terrain
 from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.objects import painted_surface, without_objects
 from photoplan.surfaces.shifted import ShiftedSurface
 
 
@@ -66,7 +68,8 @@ class SceneAddress:
         camera.pop("restore", None)
         for name in ("name", "file", "camera", "sigma_center", "sigma_angles", "correlation"):
             image.pop(name, None)
-        for entries, name in ((project["terrain"], "file"), (project["terrain"], "sigma"), (camera, "sigma")):
+        files = [(part, "file") for part in (project["terrain"], *project.get("objects", ()))]
+        for entries, name in (*files, (project["terrain"], "sigma"), (camera, "sigma")):
             entries.pop(name, None)
         table = None
         if restored is not None:
@@ -88,9 +91,10 @@ class SceneAddress:
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """The terrain of a project, in the project's CRS and the orientation's height system."""
+    """The terrain of a project with its objects, in the project's CRS and the orientation's height system."""
 
     surface: Terrain
+    """With objects: an `ObjectSurface` if there are some."""
     bounds: tuple[float, float, float, float] | None
     """Outer edges xmin, ymin, xmax, ymax; None: everywhere."""
     file: Path | None
@@ -101,6 +105,11 @@ class Ground:
     """Those of the terrain file and of the orientation, as declared or read."""
     working_system: str
     """The one that surface and cameras are in."""
+
+    @property
+    def bare(self) -> Terrain:
+        """The surface without objects."""
+        return without_objects(self.surface)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +125,7 @@ class Scene:
     @cached_property
     def footprint(self) -> Footprint:
         """What the image sees of the ground."""
-        return footprint(self.camera, self.surface, self.ground.bounds)
+        return footprint(self.camera, painted_surface(self.surface), self.ground.bounds)
 
     @property
     def sources(self) -> tuple[Source]:
@@ -144,6 +153,7 @@ def input_files(project: Project) -> list[Path]:
     restored = [project.restoration(image) for image in project.images]
     files += [file for each in restored if each is not None for file in each.files]
     files += [] if project.terrain is None or project.terrain.file is None else [project.terrain.file]
+    files += [objects.file for objects in project.objects]
     observed = project.observations
     files += [*observed.image_points, *observed.control, *([observed.positions] if observed.positions else [])]
     return [project.resolve(file) for file in files]
@@ -208,6 +218,7 @@ def scene_address(project: Project, name: str) -> SceneAddress:
     files = [project.resolve(image.file)]
     if project.ground.file is not None:
         files.append(project.resolve(project.ground.file))
+    files += [project.resolve(objects.file) for objects in project.objects]
     restoration = project.restoration(image)
     if restoration is not None:
         files += [project.resolve(file) for file in restoration.files]
@@ -263,31 +274,40 @@ class _GroundAddress:
     to_ellipsoid: bool
     crs: str
     folder: str
-    stamp: tuple[int, int]
-    """Size and time of the file: a file that changes is opened again."""
+    stamps: tuple[tuple[int, int], ...]
+    """Size and time of each file: files that change are opened again."""
+    objects: tuple[Objects, ...] = ()
 
 
 def ground_of(project: Project) -> Ground:
-    """The terrain of a project as a surface, in the project's CRS and the height system that the cameras work in.
+    """The terrain of a project with its objects, in the project's CRS and the height system that the cameras work in.
 
     Raises
     ------
     InputError
-        The terrain file cannot be used, or its CRS is not known or not joined exactly to the project's.
+        A file of terrain or objects cannot be used, or its CRS is not known or not joined exactly to the project's;
+        objects lie below the ground.
     HeightSystemError
         Height systems are not declared, or the grid that joins them is missing.
     """
     orientation = project.orientation
     strict = orientation.earth_curvature == "strict"
-    file = project.ground.file
-    stamp = (0, 0) if file is None else _stamp(project.resolve(file))
+    files = [*([] if project.ground.file is None else [project.ground.file]), *(o.file for o in project.objects)]
+    stamps = tuple(_stamp(project.resolve(file)) for file in files)
+    folder = str(project.folder)
     return _ground(
-        _GroundAddress(project.ground, orientation.height_system, strict, project.crs, str(project.folder), stamp)
+        _GroundAddress(project.ground, orientation.height_system, strict, project.crs, folder, stamps, project.objects)
     )
 
 
 @lru_cache(maxsize=8)
 def _ground(address: _GroundAddress) -> Ground:
+    if address.objects:
+        bare = _ground(replace(address, objects=(), stamps=address.stamps[: -len(address.objects)]))
+        place = Place(address.crs, bare.working_system, bare.height_systems[0], bare.bounds)
+        files = [(resolve_input(Path(address.folder), stated.file), stated) for stated in address.objects]
+        surface, steps = with_objects(bare.surface, files, place)
+        return replace(bare, surface=surface, operations=(*bare.operations, *steps))
     terrain = address.terrain
     if terrain.height is not None:
         systems = declared_pair(terrain.height_system, address.orientation_system)
@@ -353,7 +373,7 @@ def camera_of(project: Project, image: Image, ground: Ground, size: tuple[int, i
         )
     interior = interior_of(description, image, size)
     pose = pose_of(project, image, ground)
-    nadir = float(ground.surface.heights(pose.center[:2]))
+    nadir = float(ground.bare.heights(pose.center[:2]))
     return oriented_camera(
         interior,
         lens_of(description),

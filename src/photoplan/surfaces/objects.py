@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.raycast import SURFACE
-from photoplan.surfaces.base import Surface, Terrain
+from photoplan.surfaces.base import Terrain
 from photoplan.surfaces.faces import Faces
 from photoplan.surfaces.rays import Hits
 from photoplan.targets.base import Target
@@ -72,7 +72,7 @@ class ObjectSurface:
         )
 
 
-def without_objects(surface: Surface) -> Surface:
+def without_objects(surface: Terrain) -> Terrain:
     """The ground alone."""
     return surface.ground if isinstance(surface, ObjectSurface) else surface
 

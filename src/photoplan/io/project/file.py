@@ -52,6 +52,9 @@ def parse_project(data: dict[str, Any], folder: Path, source: str, text: str = "
     for table, name in (("terrain", terrain), ("orientation", project.orientation.height_system)):
         if name is not None:
             check_height_system(name, f"{source}: [{table}] height_system")
+    for objects in project.objects:
+        if objects.height_system is not None:
+            check_height_system(objects.height_system, f"{source}: [[objects]] {objects.file} height_system")
     return project
 
 

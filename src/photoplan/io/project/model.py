@@ -110,6 +110,29 @@ class Terrain(Entry):
         return self
 
 
+class Objects(Entry):
+    """A file of objects on the terrain: houses, bridges, walls, trees."""
+
+    file: InputName
+    """CityJSON; polygons in space as GeoPackage, GeoJSON, Shapefile or DXF; meshes as OBJ or PLY."""
+    role: Literal["paint", "occluder"] | None = None
+    """Whether a true orthophoto shows them, or they only hide what is behind them; None: what the file says, else
+    meshes hide and all others are shown."""
+    layer: Name | None = None
+    """Type of CityJSON's objects, if not buildings and bridges; layer of a vector file or drawing, if not the only one."""
+    crs: Name | None = None
+    """Horizontal CRS, where the file does not state it."""
+    height_system: Name | None = None
+    """Where the file does not state it; "same": that of the terrain."""
+    offset: Triple | None = None
+    """What is added to X, Y, Z of the file, metres: of meshes with an origin of their own."""
+
+    @field_validator("file")
+    @classmethod
+    def _file(cls, text: str) -> str:
+        return _plain_file(text)
+
+
 class Orientation(Entry):
     """What the numbers of all [[images]] mean."""
 
@@ -182,6 +205,7 @@ class OrthoDefaults(Entry):
     bounds: tuple[Number, Number, Number, Number] | None = None
     kernel: Name | None = None
     tolerance: Positive | None = None
+    true: Annotated[bool, Strict()] | None = None
     hidden: Literal["show", "nodata", "mark"] | None = None
     nodata: Number | Literal["auto", "mask"] | None = None
     compress: Name | None = None
@@ -201,6 +225,7 @@ class Project(Entry):
     format: Literal[1] = 1
     crs: Annotated[str, Field(min_length=1, max_length=20_000)]
     terrain: Terrain | None = None
+    objects: tuple[Objects, ...] = ()
     orientation: Orientation = Orientation()
     observations: ObservationsEntry = ObservationsEntry()
     adjustment: Adjustment = Adjustment()

@@ -13,6 +13,7 @@ from photoplan.io.camera.model import CameraEntry
 from photoplan.io.project.model import (
     Adjustment,
     Image,
+    Objects,
     ObservationsEntry,
     Orientation,
     OrthoDefaults,
@@ -54,6 +55,7 @@ def project_text(project: Project) -> str:
         f"crs = {toml_value(project.crs)}",
         "",
         *(_terrain(project.terrain) if project.terrain is not None else ["# [terrain] is needed for products.", ""]),
+        *(line for objects in project.objects for line in _objects(objects)),
         *_orientation(project.orientation),
         *_observations(project.observations),
         *_adjustment(project.adjustment),
@@ -94,6 +96,18 @@ def _terrain(terrain: Terrain) -> list[str]:
         *_entries([("height_system", terrain.height_system, "")]),
         "",
     ]
+
+
+def _objects(objects: Objects) -> list[str]:
+    comments = {
+        "file": "CityJSON, polygons in space (.gpkg, .geojson, .shp, .dxf), or a mesh (.obj, .ply)",
+        "role": '"paint": true orthophotos show them; "occluder": they only hide',
+        "layer": "type of CityJSON's objects, or layer",
+        "crs": "where the file does not state it",
+        "height_system": "where the file does not state it",
+        "offset": "added to X, Y, Z of the file",
+    }
+    return ["[[objects]]", *_given(objects, comments), ""]
 
 
 def _orientation(orientation: Orientation) -> list[str]:
@@ -170,6 +184,7 @@ def _ortho(ortho: OrthoDefaults) -> list[str]:
                 ("bounds", ortho.bounds, "[xmin, ymin, xmax, ymax]; default: all that the images see"),
                 ("kernel", ortho.kernel, "interpolation of grey values"),
                 ("tolerance", ortho.tolerance, "largest error of a source position, pixels"),
+                ("true", ortho.true, "whether objects are where they stand, and hidden ground is left empty"),
                 ("hidden", ortho.hidden, 'ground behind other ground: "show", "nodata" or "mark"'),
                 ("nodata", ortho.nodata, 'a number, "mask" or "auto"'),
                 ("compress", ortho.compress, "compression of the products"),

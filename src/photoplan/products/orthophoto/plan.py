@@ -35,6 +35,7 @@ from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.scene import Scene, map_order, open_scene
 from photoplan.project.scenes import ScenesAddress
 from photoplan.project.uncertain import ScenesErrors
+from photoplan.surfaces.objects import painted_surface
 from photoplan.targets.map import MapTarget
 
 #: A product is at most so many times finer than its images see the ground.
@@ -145,6 +146,7 @@ def plan_orthophotos(
         An unknown image or setting, bounds that hold nothing, or a resolution that is much too fine.
     """
     chosen = chosen_settings(project, settings, changes)
+    project = _painted(project, chosen)
     names = project.select(images)
     # Each image is looked at twice: where it lies, and which tiles it needs.
     events.begin("planning", 2 * len(names), "steps")
@@ -155,7 +157,7 @@ def plan_orthophotos(
         seen = (one.look.footprint,)
         grid = grid_of(project, chosen, seen)
         check_storable(one.scene, one.name, grid, chosen)
-        tiles = covered_tiles(one.scene.camera, one.scene.surface, grid, chosen.tile)
+        tiles = covered_tiles(one.scene.camera, painted_surface(one.scene.surface), grid, chosen.tile)
         if len(tiles):
             plan = product_plan(product_name(one.name), (one.name,), grid, tiles, chosen, seen)
             products.append(OrthoProduct(plan, (one.look,), keyed(project, plan, chosen)))
@@ -178,8 +180,16 @@ class Looked:
 
 def chosen_settings(project: Project, settings: OrthoSettings | None, changes: dict[str, Any]) -> OrthoSettings:
     """The project's settings or others, with single ones changed."""
-    chosen = settings or project_settings(project)
-    return OrthoSettings.from_dict({**asdict(chosen), **changes}) if changes else chosen
+    return OrthoSettings.from_dict({**(asdict(settings) if settings else project.ortho_settings()), **changes})
+
+
+def _painted(project: Project, settings: OrthoSettings) -> Project:
+    """The project with the objects that an orthophoto needs, as it needs them."""
+    if settings.true or not project.objects:
+        return project
+    # An ordinary orthophoto shows the ground; objects only matter to it if somebody asks what they hide.
+    hiding = tuple(each.model_copy(update={"role": "occluder"}) for each in project.objects)
+    return project.model_copy(update={"objects": () if settings.hidden == "show" else hiding})
 
 
 def look_at(project: Project, names: Sequence[str], force: bool, events: Events) -> tuple[list[Looked], list[str]]:

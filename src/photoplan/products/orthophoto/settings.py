@@ -48,9 +48,12 @@ class OrthoSettings:
     """Largest residual of the anchors, pixels of the source image."""
     tile: int = 512
     """Side of a tile, pixels; a multiple of 16 from 128 on."""
-    hidden: Hidden = "show"
-    """What becomes of ground that the image cannot see, since other ground is in the way: ``show`` paints it with what
-    hides it, without asking; ``nodata`` leaves it empty; ``mark`` paints it and writes where it is."""
+    true: bool = False
+    """Whether orthophotos show the project's objects where they stand; else the ground alone is what is painted."""
+    hidden: Hidden | None = None
+    """What becomes of places that the image cannot see, since ground or objects are in the way: ``show`` paints them
+    with what hides them, without asking; ``nodata`` leaves them empty; ``mark`` paints them and writes where they are.
+    None becomes ``nodata`` in true orthophotos and ``show`` in others."""
     nodata: str = "auto"
     """A number, ``mask`` (an internal mask band), or ``auto``: 0 for unsigned integers, −32768 for int16, NaN for
     floats."""
@@ -68,6 +71,8 @@ class OrthoSettings:
     def __post_init__(self) -> None:
         if self.resolution is not None:
             check_resolution(self.resolution)
+        if self.hidden is None:
+            object.__setattr__(self, "hidden", "nodata" if self.true else "show")
         if self.kernel not in get_args(Kernel):
             raise UsageError(f"kernel {self.kernel!r}; allowed are {', '.join(get_args(Kernel))}")
         for what, value, allowed in (("compression", self.compress, Compression), ("hidden", self.hidden, Hidden)):

@@ -1,0 +1,1 @@
+"""Objects on the terrain: houses, bridges, trees; one format per file."""

@@ -1,0 +1,116 @@
+"""CityJSON 1.0 to 2.0: of each object its finest level of detail that has faces (cityjson.org/specs)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.io.objects.model import ObjectFile, from_polygons
+from photoplan.io.plain_files import finite, read_json
+
+#: Types that are read if nobody says which: what stands on the ground, not what is the ground.
+STANDING = ("Building", "Bridge")
+#: How deep lists of surfaces are in lists, by the type of a geometry.
+_DEPTH = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2, "CompositeSolid": 2}
+#: Surfaces of an object that the ground is, or that are none.
+_NO_FACES = ("GroundSurface", "ClosureSurface")
+_MOST_BYTES = 1 << 29
+
+
+def read(path: Path, layer: str | None) -> ObjectFile:
+    """Faces of the objects of a CityJSON file; `layer`: of one type, with its parts (``Bridge``, ``BridgePart`` …).
+
+    Where surfaces have a meaning, ground and closure surfaces are left out. Templates are not read.
+
+    Raises
+    ------
+    InputError
+        The file is damaged, of another version, or holds no such objects with faces; the object is named.
+    """
+    data = read_json(path, _MOST_BYTES)
+    version = str(data.get("version", "")) if isinstance(data, dict) else ""
+    if not version or data.get("type") != "CityJSON" or not re.fullmatch(r"(1\.[01]|2\.0)(\.\d+)?", version):
+        raise InputError(f"{path}: not CityJSON 1.0 to 2.0 (version {version[:20]!r}); convert it with cjio")
+    vertices = _vertices(path, data)
+    city = data.get("CityObjects")
+    if not isinstance(city, dict):
+        raise InputError(f"{path}: no CityObjects; get a fresh copy")
+    types = STANDING if layer is None else (layer,)
+    polygons: list[list[NDArray[np.float64]]] = []
+    objects: list[int] = []
+    names: list[str] = []
+    for name, item in city.items():
+        if not isinstance(item, dict) or not str(item.get("type", "")).lstrip("+").startswith(types):
+            continue
+        try:
+            found = [[_ring(ring, vertices) for ring in face] for face in _faces(item.get("geometry") or [])]
+        except (TypeError, KeyError, IndexError, ValueError, AttributeError, RecursionError) as error:
+            raise InputError(f"{path}: object {name[:100]!r}: damaged geometry ({error}); get a fresh copy") from None
+        if found:
+            polygons += found
+            objects += [len(names)] * len(found)
+            names.append(name)
+    if not polygons:
+        there = sorted({str(item.get("type")) for item in city.values() if isinstance(item, dict)})
+        raise InputError(
+            f"{path}: no {' or '.join(types)} with faces; its types are {', '.join(there)[:300] or 'none'}, state one "
+            "as `layer`"
+        )
+    return from_polygons(str(path), polygons, objects, names, _crs(data))  # type: ignore[arg-type]
+
+
+def _vertices(path: Path, data: dict[str, Any]) -> NDArray[np.float64]:
+    try:
+        vertices = np.array(data["vertices"], float).reshape(-1, 3)
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"{path}: `vertices` are not a list of X, Y, Z; get a fresh copy") from None
+    transform = data.get("transform")
+    if transform is not None:
+        scale, translate = (
+            finite((transform or {}).get(k), f"{path}: transform {k}", 3) for k in ("scale", "translate")
+        )
+        vertices = vertices * scale + translate
+    if not np.isfinite(vertices).all():
+        raise InputError(f"{path}: vertices that are no numbers; get a fresh copy")
+    return vertices
+
+
+def _faces(geometries: list[Any]) -> Iterator[list[list[int]]]:
+    """Surfaces, each a list of rings, of the finest geometry that has some."""
+    usable = [g for g in geometries if g["type"] in _DEPTH]
+    if not usable:
+        return
+    finest = max(usable, key=lambda g: float(g.get("lod", 0)))
+    semantics = finest.get("semantics") or {}
+    none = {k for k, s in enumerate(semantics.get("surfaces", ())) if s["type"] in _NO_FACES}
+    yield from _of_depth(finest["boundaries"], semantics.get("values"), _DEPTH[finest["type"]], none)
+
+
+def _of_depth(items: list[Any], values: Any, depth: int, none: set[int]) -> Iterator[list[list[int]]]:
+    for k, item in enumerate(items):
+        value = None if values is None else values[k]
+        if depth:
+            yield from _of_depth(item, value, depth - 1, none)
+        elif value is None or value not in none:
+            yield item
+
+
+def _ring(places: list[int], vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+    at = np.array(places)
+    if at.ndim != 1 or (len(at) and at.dtype.kind != "i"):
+        raise ValueError(f"a ring {str(places)[:60]} that is no list of vertices")
+    if len(at) and not 0 <= at.min() <= at.max() < len(vertices):
+        raise ValueError(f"vertex {at.max() if at.min() >= 0 else at.min()} of {len(vertices)}")
+    return np.asarray(vertices[at.astype(int)])
+
+
+def _crs(data: dict[str, Any]) -> str | None:
+    stated = (data.get("metadata") or {}).get("referenceSystem")
+    found = re.search(r"EPSG(?:::|/\d+/|/[\d.]+/|:)(\d+)$", str(stated))
+    return f"EPSG:{found[1]}" if found else None

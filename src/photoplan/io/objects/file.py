@@ -1,0 +1,44 @@
+"""A file of objects, whatever its format."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from photoplan.errors import InputError
+from photoplan.io.checks import check_plain_file
+from photoplan.io.objects import cityjson, mesh, vector
+from photoplan.io.objects.model import ObjectFile
+from photoplan.io.plain_files import read_head
+
+
+def read_objects(path: Path, layer: str | None = None) -> ObjectFile:
+    """Faces of the objects of a file, which its content names, not its suffix.
+
+    Parameters
+    ----------
+    path : Path
+        CityJSON; GeoPackage, GeoJSON, Shapefile or DXF with polygons in space; OBJ or PLY.
+    layer : str, optional
+        Which part: a type of CityJSON's objects, a layer of a vector file or drawing.
+
+    Raises
+    ------
+    InputError
+        It cannot be used.
+    """
+    path = check_plain_file(path, "object file")
+    head = read_head(path).lstrip()
+    if head.startswith("ply"):
+        return mesh.read_ply(path)
+    if re.search(r'"type"\s*:\s*"CityJSON"', head) or ("CityObjects" in head) or path.name.endswith(".city.json"):
+        return cityjson.read(path, layer)
+    if re.search(r"^(v|f|o|g|vn|vt|mtllib|usemtl) ", head, re.MULTILINE) and path.suffix.casefold() == ".obj":
+        return mesh.read_obj(path)
+    vectors = ("SQLite", "{", "AutoCAD Binary DXF")
+    if head.startswith(vectors) or path.suffix.casefold() in (".dxf", ".shp", ".fgb"):
+        return vector.read(path, layer)
+    raise InputError(
+        f"{path}: not a file of objects that is read here; allowed are CityJSON, GeoPackage, GeoJSON, Shapefile, DXF, "
+        "OBJ and PLY"
+    )

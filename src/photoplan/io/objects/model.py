@@ -1,0 +1,66 @@
+"""Objects as files have them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.geometry.crs import split_compound
+from photoplan.surfaces.polygon_faces import Rings, triangles_of
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectFile:
+    """Triangles of a file's objects, in its own coordinates."""
+
+    corners: NDArray[np.float64]
+    """X, Y, Z, shape (n, 3, 3), finite."""
+    owner: NDArray[np.int32]
+    """Object of each triangle, its place in `names`, shape (n,)."""
+    names: tuple[str, ...]
+    roles: tuple[str | None, ...]
+    """``paint``, ``occluder``, or None where the file does not say, of each object."""
+    crs: str | None
+    """Horizontal CRS as stated; None: it is not."""
+    height_system: str | None
+    mesh: bool = False
+    """Whether it is a mesh, which by itself only hides."""
+
+
+def from_polygons(
+    where: str,
+    polygons: list[Rings],
+    objects: list[int],
+    names: list[str],
+    crs: str | None = None,
+    roles: list[str | None] | None = None,
+) -> ObjectFile:
+    """Objects of polygons.
+
+    Parameters
+    ----------
+    where : str
+        The file, for messages.
+    polygons : list of `Rings`
+    objects : list of int
+        Place of the object of each polygon in `names`.
+    names : list of str
+    crs : str, optional
+        As stated, with its height system if it has one.
+    roles : list, optional
+        Of each object.
+
+    Raises
+    ------
+    InputError
+        Polygons cross themselves or have no heights, or there is none with an inside.
+    """
+    corners, polygon = triangles_of(polygons, [names[k] for k in objects], where)
+    if not len(corners):
+        raise InputError(f"{where}: holds no face of an object; give a file or a layer that does")
+    horizontal, heights = (None, None) if crs is None else split_compound(crs)
+    owner = np.array(objects, np.int32)[polygon]
+    return ObjectFile(corners, owner, tuple(names), tuple(roles or [None] * len(names)), horizontal, heights)
