@@ -14,6 +14,7 @@ from draw_idea import draw_idea
 from draw_marks import draw_marks
 from draw_prediction import draw_prediction
 from draw_road import draw_road
+from draw_true import draw_true
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -155,6 +156,7 @@ FIGURES = {
     "anchor-residual": draw_residual,
     "road-edge": draw_road,
     "marks": draw_marks,
+    "true-orthophoto": draw_true,
 }
 
 

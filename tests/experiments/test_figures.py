@@ -16,6 +16,7 @@ mpl = pytest.importorskip("matplotlib")
         ("anchor-residual", {"samples": 3, "steps": 3}),
         ("road-edge", {}),
         ("marks", {}),
+        ("true-orthophoto", {"resolution": 2.0}),
     ],
 )
 def test_figure(name, sizes, tmp_path):

@@ -108,7 +108,7 @@ def test_every_entry_of_the_project_file_is_explained():
     page = "".join((DOCS / "reference" / f"{name}.md").read_text("utf-8") for name in ("project-file", "marks"))
     tables = [schema, *schema["$defs"].values()]
     entries = {name for table in tables for name in table.get("properties", {})}
-    headings = {"terrain", "orientation", "observations", "adjustment", "ortho", "cameras", "images"}
+    headings = {"terrain", "objects", "orientation", "observations", "adjustment", "ortho", "cameras", "images"}
     missing = {e for e in entries if f"`{e}`" not in page and not (e in headings and f"[{e}" in page)}
     assert not missing - {"type"}
 

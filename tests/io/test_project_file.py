@@ -214,7 +214,7 @@ def test_values_are_frozen_and_the_schema_is_json(tmp_path: Path) -> None:
         project(tmp_path).crs = "EPSG:1"  # type: ignore[misc]
     schema = json.loads(project_schema())
     assert "folder" not in schema["properties"]
-    tables = {"terrain", "orientation", "observations", "adjustment", "cameras", "images", "ortho"}
+    tables = {"terrain", "objects", "orientation", "observations", "adjustment", "cameras", "images", "ortho"}
     assert tables | {"crs", "format"} == set(schema["properties"])
 
 

@@ -191,5 +191,5 @@ def test_fault_34_coincident_objects_and_a_line_along_a_wall_flicker_nowhere() -
 
 def test_what_lies_behind_the_source_hides_nothing() -> None:
     place = target(1.0)
-    surface = ObjectSurface(LevelSurface(0.0), faces_of([[DECK[0] + (0, 0, 100)]], paints=False))
+    surface = ObjectSurface(LevelSurface(0.0), faces_of([[DECK[0] + np.array([0, 0, 100])]], paints=False))
     assert not hidden_pixels(camera((70.0, 70.0, 90.0)), tile(surface, place), surface).any()

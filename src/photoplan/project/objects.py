@@ -91,7 +91,7 @@ def _placed(path: Path, own: ObjectFile, stated: Objects, place: Place) -> tuple
     system = own.height_system or stated.height_system
     if system is None:
         raise HeightSystemError(
-            f"{path}: no height system stated → declare `height_system` in [[objects]]; allowed are {OPTIONS}"
+            f"{path}: no height system stated → height_system = … in [[objects]]; allowed are {OPTIONS}"
         )
     system = check_height_system(system, str(path))
     steps: list[CrsStep | HeightStep] = []

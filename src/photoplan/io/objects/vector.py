@@ -82,7 +82,7 @@ def _layer(path: Path, layer: str | None) -> str:
     if layer is None and len(names) == 1:
         layer = names[0]
     if layer not in names:
-        told = "state one as `layer`" if layer is None else f"there is no {layer!r}"
+        told = "state one as layer" if layer is None else f"there is no {layer!r}"
         raise InputError(f"{path}: its layers are {', '.join(names)[:300] or 'none'}; {told}")
     if layer.casefold() in _views(path):
         raise InputError(f"{path}: layer {layer!r} is a view (a query, which may have no end); store it as a table")
@@ -105,7 +105,7 @@ def _rings(part: Any, drawing: bool) -> list[NDArray[np.float64]] | None:
     """Rings of a polygon or, in a drawing, of a closed line; None: it is neither."""
     if part.geom_type == "Polygon":
         lines = [part.exterior, *part.interiors]
-    elif drawing and part.geom_type == "LineString" and part.is_ring:
+    elif drawing and part.geom_type == "LineString" and part.is_closed:
         lines = [part]
     else:
         return None

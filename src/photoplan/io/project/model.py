@@ -119,7 +119,7 @@ class Objects(Entry):
     """Whether a true orthophoto shows them, or they only hide what is behind them; None: what the file says, else
     meshes hide and all others are shown."""
     layer: Name | None = None
-    """Type of CityJSON's objects, if not buildings and bridges; layer of a vector file or drawing, if not the only one."""
+    """Type of CityJSON's objects, if not buildings and bridges; layer of a vector file or a drawing."""
     crs: Name | None = None
     """Horizontal CRS, where the file does not state it."""
     height_system: Name | None = None
