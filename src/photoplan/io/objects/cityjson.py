@@ -59,8 +59,8 @@ def read(path: Path, layer: str | None) -> ObjectFile:
     if not polygons:
         there = sorted({str(item.get("type")) for item in city.values() if isinstance(item, dict)})
         raise InputError(
-            f"{path}: no {' or '.join(types)} with faces; its types are {', '.join(there)[:300] or 'none'}; layer = … in "
-            "[[objects]] chooses one"
+            f"{path}: no {' or '.join(types)} with faces; its types are {', '.join(there)[:300] or 'none'}; layer = … "
+            "in [[objects]] chooses one"
         )
     return from_polygons(str(path), polygons, objects, names, _crs(data))  # type: ignore[arg-type]
 
