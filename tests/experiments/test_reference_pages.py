@@ -90,14 +90,14 @@ def test_example_is_understood(verb, arguments):
 
 
 def test_figures_of_linear_prediction_on_the_pages_are_those_of_the_code():
-    from photoplan.terrain import build, covariance, fit
+    from photoplan.terrain import build, covariance, leaves
     from photoplan.terrain.settings import SHARE, BuildSettings
 
     page = " ".join((DOCS / "explanation" / "linear-prediction.md").read_text("utf-8").split())
     table = (DOCS / "reference" / "dtm.md").read_text("utf-8")
     (share,) = set(SHARE.values()) - {1.0}
     assert f"get {share:g} of it" in page and f"other classes: {share:g} of it" in table
-    assert f"at most {fit.CAPACITY} points" in page
+    assert f"at most {leaves.CAPACITY} points" in page
     assert f"{covariance.POINTS} nearest points and {covariance.LINES} nearest line points" in page
     assert f"g = {min(covariance.GAPS):g} to {max(covariance.GAPS):g} half-value distances" in page
     assert f"`--gross` ({BuildSettings().gross:g})" in page

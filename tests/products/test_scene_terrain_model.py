@@ -23,7 +23,8 @@ from photoplan.products.check import check_project
 from photoplan.products.init.run import InitRequest, init_project
 from photoplan.products.orthophoto.execution import Run, execute
 from photoplan.products.orthophoto.plan import plan_orthophotos
-from photoplan.project.scene import ground_of, open_scene
+from photoplan.project.ground import ground_of
+from photoplan.project.scene import open_scene
 from photoplan.surfaces.units import Unit, UnitLayout
 from photoplan.targets.map import MapTarget
 

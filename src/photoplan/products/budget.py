@@ -16,7 +16,8 @@ from photoplan.io.project.file import load_project, parse_project
 from photoplan.io.project.model import Project
 from photoplan.kernels.weights import KERNELS
 from photoplan.plan.accuracy import SourceErrors, figures_at, in_image, resampling_sigma
-from photoplan.project.scene import Ground, camera_without_pixels, ground_of
+from photoplan.project.ground import Ground, ground_of
+from photoplan.project.scene import camera_without_pixels
 from photoplan.project.uncertain import StatedHeightErrors, height_errors, source_errors
 from photoplan.targets.map import MapTarget
 

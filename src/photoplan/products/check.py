@@ -17,7 +17,8 @@ from photoplan.plain import pick
 from photoplan.plan.footprint import Footprint, footprint, mean_gsd
 from photoplan.products.judged import against_files, judged
 from photoplan.products.orthophoto.plan import two_figures
-from photoplan.project.scene import Ground, camera_without_pixels, ground_of, is_there, map_order, open_scene
+from photoplan.project.ground import Ground, ground_of
+from photoplan.project.scene import camera_without_pixels, is_there, map_order, open_scene
 
 #: Terrain displacements of curvature above this deserve a strict model, pixels.
 _CURVATURE_MATTERS = 0.3

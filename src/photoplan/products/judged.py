@@ -22,7 +22,8 @@ from photoplan.io.orientation.exif import SUFFIXES
 from photoplan.io.orientation.table import OrientationTable
 from photoplan.io.project.model import Image, Project
 from photoplan.orientation.plausibility import ImagePlausibility, View, look
-from photoplan.project.scene import Ground, is_there, pose_of, view_of
+from photoplan.project.ground import Ground
+from photoplan.project.scene import is_there, pose_of, view_of
 
 _Floats = NDArray[np.float64]
 

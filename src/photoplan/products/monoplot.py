@@ -23,8 +23,9 @@ from photoplan.io.run_record import recording
 from photoplan.io.tables import Columns, read_table, write_table
 from photoplan.plain import pick
 from photoplan.plan.footprint import footprint
+from photoplan.project.ground import Ground, ground_of
 from photoplan.project.open_terrain import open_terrain
-from photoplan.project.scene import Ground, camera_without_pixels, ground_of, input_files, pose_of
+from photoplan.project.scene import camera_without_pixels, input_files, pose_of
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.terrain.monoplot import REASONS, MonoplotErrors, MonoplotPoints, monoplot
 

@@ -18,8 +18,9 @@ from photoplan.io.camera.model import CameraEntry
 from photoplan.io.project.file import parse_project
 from photoplan.io.project.model import Image, Project
 from photoplan.plan.accuracy import Cause, SourceErrors
+from photoplan.project.ground import Ground
 from photoplan.project.open_terrain import open_terrain
-from photoplan.project.scene import Ground, SceneAddress, camera_of
+from photoplan.project.scene import SceneAddress, camera_of
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.targets.base import Target
 

@@ -16,7 +16,7 @@ from photoplan.geometry.pose import Pose
 from photoplan.io.project.model import Project
 from photoplan.orientation.bundle.block import Bend, BlockCamera, BlockImage
 from photoplan.orientation.bundle.frame import BlockFrame
-from photoplan.project.scene import ground_of
+from photoplan.project.ground import ground_of
 
 _Floats = NDArray[np.float64]
 

@@ -38,7 +38,8 @@ from photoplan.matching.pairs import (
 )
 from photoplan.matching.tracks import Tracks
 from photoplan.matching.verify import Calibration, PairMatches, VerifySettings, verify_pair
-from photoplan.project.scene import ground_of, pose_of
+from photoplan.project.ground import ground_of
+from photoplan.project.scene import pose_of
 
 #: Up to so many images all pairs are tried where nothing is known of their places.
 FEW_IMAGES = 30

@@ -1,0 +1,136 @@
+"""The ground of a project: terrain and objects, in the system that its cameras work in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.geometry.crs import CrsStep
+from photoplan.geometry.heights import HeightStep, declared_pair, height_step
+from photoplan.io.names import resolve_input
+from photoplan.io.project.model import Objects, Project
+from photoplan.io.project.model import Terrain as StatedTerrain
+from photoplan.project.objects import Place, with_objects
+from photoplan.project.open_terrain import open_terrain
+from photoplan.surfaces.base import Terrain
+from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.objects import without_objects
+from photoplan.surfaces.shifted import ShiftedSurface
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """The terrain of a project with its objects, in the project's CRS and the orientation's height system."""
+
+    surface: Terrain
+    """With objects: an `ObjectSurface` if there are some."""
+    bounds: tuple[float, float, float, float] | None
+    """Outer edges xmin, ymin, xmax, ymax; None: everywhere."""
+    file: Path | None
+    """The height raster or terrain model."""
+    operations: tuple[CrsStep | HeightStep, ...]
+    """Coordinate operations on the way from the file, for the run record."""
+    height_systems: tuple[str, str]
+    """Those of the terrain file and of the orientation, as declared or read."""
+    working_system: str
+    """The one that surface and cameras are in."""
+
+    @property
+    def bare(self) -> Terrain:
+        """The surface without objects."""
+        return without_objects(self.surface)
+
+
+@dataclass(frozen=True)
+class _GroundAddress:
+    """What decides the ground of a project; hashable."""
+
+    terrain: StatedTerrain
+    orientation_system: str | None
+    to_ellipsoid: bool
+    crs: str
+    folder: str
+    stamps: tuple[tuple[int, int], ...]
+    """Size and time of each file: files that change are opened again."""
+    objects: tuple[Objects, ...] = ()
+
+
+def ground_of(project: Project) -> Ground:
+    """The terrain of a project with its objects, in the project's CRS and the height system that the cameras work in.
+
+    Raises
+    ------
+    InputError
+        A file of terrain or objects cannot be used, or its CRS is not known or not joined exactly to the project's;
+        objects lie below the ground.
+    HeightSystemError
+        Height systems are not declared, or the grid that joins them is missing.
+    """
+    orientation = project.orientation
+    strict = orientation.earth_curvature == "strict"
+    files = [*([] if project.ground.file is None else [project.ground.file]), *(o.file for o in project.objects)]
+    stamps = tuple(stamp_of(project.resolve(file)) for file in files)
+    folder = str(project.folder)
+    return _ground(
+        _GroundAddress(project.ground, orientation.height_system, strict, project.crs, folder, stamps, project.objects)
+    )
+
+
+@lru_cache(maxsize=8)
+def _ground(address: _GroundAddress) -> Ground:
+    if address.objects:
+        bare = _ground(replace(address, objects=(), stamps=address.stamps[: -len(address.objects)]))
+        place = Place(address.crs, bare.working_system, bare.height_systems[0], bare.bounds)
+        files = [(resolve_input(Path(address.folder), stated.file), stated) for stated in address.objects]
+        surface, steps = with_objects(bare.surface, files, place)
+        return replace(bare, surface=surface, operations=(*bare.operations, *steps))
+    terrain = address.terrain
+    if terrain.height is not None:
+        systems = declared_pair(terrain.height_system, address.orientation_system)
+        return _in_system(Ground(LevelSurface(terrain.height), None, None, (), systems, systems[1]), address)
+    assert terrain.file is not None
+    path = resolve_input(Path(address.folder), terrain.file)
+    own = open_terrain(path, terrain.crs, 'as crs = "EPSG:nnnn" in [terrain]')
+    systems = declared_pair(terrain.height_system or own.height_system, address.orientation_system)
+    placed, steps = own.in_crs(address.crs)
+    return _in_system(Ground(placed.surface, placed.bounds, placed.path, steps, systems, systems[1]), address)
+
+
+def _in_system(ground: Ground, address: _GroundAddress) -> Ground:
+    """The ground with heights in the system that the cameras work in."""
+    terrain, orientation = ground.height_systems
+    wanted = "ellipsoidal" if address.to_ellipsoid and orientation != "same" else orientation
+    step = height_step(terrain, wanted, address.crs, ground.bounds)
+    surface = ground.surface if step.definition is None else ShiftedSurface(ground.surface, _Undulation(step))
+    operations = ground.operations if step.definition is None else (*ground.operations, step)
+    return replace(ground, surface=surface, operations=operations, working_system=wanted)
+
+
+@dataclass(frozen=True)
+class _Undulation:
+    """What a height step adds at map points."""
+
+    step: HeightStep
+
+    def __call__(self, XY: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self.step(np.concatenate([XY, np.zeros((*XY.shape[:-1], 1))], axis=-1))
+
+
+def stamp_of(path: Path) -> tuple[int, int]:
+    """Size and time of a file.
+
+    Raises
+    ------
+    InputError
+        It cannot be read.
+    """
+    try:
+        state = path.stat()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check that it is there and readable") from error
+    return state.st_size, state.st_mtime_ns
