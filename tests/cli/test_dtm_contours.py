@@ -164,7 +164,7 @@ def test_fault_04_a_full_disk_leaves_the_old_file(
 ) -> None:
     import errno
 
-    from photoplan.io import contour_file
+    from photoplan.io import naming
 
     out = tmp_path / "c.gpkg"
     out.write_bytes(b"old")
@@ -172,7 +172,7 @@ def test_fault_04_a_full_disk_leaves_the_old_file(
     def full(path: Path) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(contour_file, "sync_file", full)
+    monkeypatch.setattr(naming, "sync_file", full)
     said = photoplan("dtm", "contours", hill, "--interval", 1, "-o", out, "--overwrite")
     assert said.code == 5 and "No space left" in said.err
     assert out.read_bytes() == b"old"

@@ -26,6 +26,15 @@ WORDS = sorted(
 )
 
 
+def test_an_empty_name_is_no_path_in_any_command() -> None:
+    """As `-o "$FORGOTTEN"` gives it."""
+    paths = [p for verb in VERBS.values() for p in verb.params if isinstance(p.type, click.Path)]
+    assert len(paths) > 50
+    for parameter in paths:
+        with pytest.raises(click.BadParameter, match="the name is empty"):
+            parameter.type.convert(" ", parameter, None)
+
+
 def test_the_library_names_no_option() -> None:
     """Strings, docstrings among them, outside the command line."""
     found = []

@@ -44,6 +44,27 @@ def test_fault_20_unfit_crs_is_refused_with_what_is_needed(crs: str, says: str) 
     assert str(error.value).startswith("project.toml: crs")
 
 
+@pytest.mark.parametrize(
+    ("number", "absurd"),
+    [
+        ("0.9996", "-1e300"),
+        ("0.9996", "1e300"),
+        ("0.9996", "0"),
+        ("6378137.0", "1e300"),
+        ("500000.0", "1e300"),
+        ('"Meter",1.0', '"Meter",1e300'),
+        ('"Meter",1.0', '"Meter",-1'),
+        ("298.257223563", "0.5"),
+    ],
+)
+def test_fault_30_well_formed_nonsense_is_no_reference_system(number: str, absurd: str) -> None:
+    """Numbers of any size are good WKT; what PROJ cannot compute with, or what maps no metre to a metre, is refused."""
+    usual = parse_crs("EPSG:32615").to_wkt("WKT1_ESRI")
+    assert parse_crs(usual, "a.prj").is_projected and number in usual
+    with pytest.raises(InputError, match=r"a\.prj: .* is not a coordinate reference system"):
+        parse_crs(usual.replace(number, absurd), "a.prj")
+
+
 @pytest.mark.parametrize("crs", ["EPSG:32615", "EPSG:2154", "EPSG:31287", NGI])
 def test_projected_metres_are_taken(crs: str) -> None:
     assert require_projected_metres(crs).is_projected

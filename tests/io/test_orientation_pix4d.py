@@ -69,6 +69,14 @@ def project(folder: Path, *, full: bool = True, offset: bool = True) -> Path:
     return path
 
 
+def test_fault_30_a_reference_system_of_absurd_scale_is_named_by_its_file(tmp_path: Path) -> None:
+    path = project(tmp_path)
+    side = tmp_path / "p_wkt.prj"
+    side.write_text(side.read_text().replace('"scale_factor",0.9996', '"scale_factor",-1e300'))
+    with pytest.raises(InputError, match=r"p_wkt\.prj"):
+        read_orientation_block(path)
+
+
 def test_both_files_of_pix4d_state_one_orientation(tmp_path: Path) -> None:
     external = read_orientation_block(project(tmp_path))
     full = read_orientation_block(tmp_path / f"{STEM}_camera_parameters.txt")

@@ -101,7 +101,7 @@ from pathlib import Path
 import numpy as np
 sys.path.insert(0, sys.argv[2])
 import test_product_faults as here
-from photoplan.io import product
+from photoplan.io import naming, product
 
 moment = sys.argv[3]
 def die(*args, **kwargs):
@@ -115,14 +115,14 @@ elif moment == "cog":
 elif moment == "check":
     product.check_product = die
 else:
-    product.sync_folder = die
+    naming.sync_file = die
 here.run(Path(sys.argv[1]), overwrite=sys.argv[4] == "old")
 """
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 @pytest.mark.parametrize("before", ["absent", "old"])
-@pytest.mark.parametrize("moment", ["append", "cog", "check"])
+@pytest.mark.parametrize("moment", ["append", "cog", "check", "sync"])
 def test_fault_03_killed_while_writing(tmp_path: Path, moment: str, before: str) -> None:
     """The name stays absent or old; the next run continues and its product equals an undisturbed one."""
     whole = tmp_path / "whole" / "a.tif"

@@ -32,6 +32,7 @@ import os, signal, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from tools import small_model
+from photoplan.io import naming
 from photoplan.io.terrain import model_write as module
 
 moment = sys.argv[3]
@@ -53,7 +54,7 @@ elif moment == "raster":
 elif moment == "tables":
     module.ModelWriter._check = die
 else:
-    module.sync_file = die
+    naming.sync_file = die
 small_model.write_small(Path(sys.argv[1]), overwrite=sys.argv[4] == "old")
 """
 

@@ -49,6 +49,8 @@ class Mishap:
     """This task fails when it is tried first."""
     most_bytes: int = 0
     """No file can become larger: it stands for the end of the disk."""
+    names: int = -1
+    """It is killed when so many files have got their names."""
     shuffled: bool = False
     """Tasks are handed to the workers in another order."""
 
@@ -155,6 +157,20 @@ def _run(words: list[str], folder: Path, mishap: Mishap) -> None:
         random.Random(1).shuffle(tasks)
         return run_tiles(tasks, *rest)
 
+    named = 0
+    replace_file = Path.replace
+
+    def naming(self: Path, target: Path) -> Path:
+        nonlocal named
+        there = replace_file(self, target)
+        if not Path(target).name.startswith("."):
+            named += 1
+            if named == mishap.names:
+                os.kill(os.getpid(), signal.SIGKILL)
+        return there
+
+    if mishap.names > 0:
+        Path.replace = naming  # type: ignore[method-assign, assignment]
     kept: list[_Telling] = []
     engine_run.Runner._compute = computing  # type: ignore[method-assign]
     if mishap.shuffled:

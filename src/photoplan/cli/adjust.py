@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import dry_run_option, images_option, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, dry_run_option, images_option, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import show, show_json
 
 if TYPE_CHECKING:
@@ -19,7 +18,7 @@ _SHOWN = 20
 
 
 @click.command("adjust")
-@click.argument("project", type=click.Path(path_type=Path))
+@click.argument("project", type=PATH)
 @click.option(
     "--calibrate", multiple=True, metavar="CAMERA=c:SIGMA,x0,…", help="Unknowns, with what is known [as stated]."
 )
@@ -29,7 +28,7 @@ _SHOWN = 20
 @click.option("--no-variance-components", is_flag=True, help="Weight groups as stated, not as their residuals show.")
 @click.option("--no-correlation", is_flag=True, help="Take errors of neighbouring image points as independent.")
 @click.option("--iterations", type=click.IntRange(1), default=40, show_default=True, help="Most of each solution.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Report [PROJECT/adjustment].")
+@click.option("-o", "--output", type=PATH, metavar="FOLDER", help="Report [PROJECT/adjustment].")
 @dry_run_option("Adjust and print the figures; write nothing.")
 @overwrite_option
 @json_option
@@ -41,6 +40,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     project file (the one before is kept as *.previous.toml), a report and the points into the output folder.
     """
     from photoplan.cli.telling import Telling
+    from photoplan.io.naming import together
     from photoplan.products.adjust.run import AdjustRequest, adjust_project
     from photoplan.report.adjust.page import adjust_page
     from photoplan.report.page import open_report
@@ -51,11 +51,12 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     if not request.dry_run:
         place = request.folder / "report.html"
         page = open_report(place, (), overwrite=request.overwrite, project=request.project)
-    with Telling(quiet) as events:
-        report = adjust_project(request, events)
-    written = report.written
-    if page is not None:
-        written = (page.write(adjust_page(report.figures, page.mpl)), *written)
+    with together():
+        with Telling(quiet) as events:
+            report = adjust_project(request, events)
+        written = report.written
+        if page is not None:
+            written = (page.write(adjust_page(report.figures, page.mpl)), *written)
     if as_json:
         show_json(report, files=written)
     else:

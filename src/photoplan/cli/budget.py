@@ -7,12 +7,12 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import images_option, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, images_option, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import say, show, show_json
 
 
 @click.command("budget")
-@click.argument("project", required=False, type=click.Path(path_type=Path))
+@click.argument("project", required=False, type=PATH)
 @images_option()
 @click.option("--camera-constant", type=float, metavar="MM", help="Camera constant of a vertical image, no project.")
 @click.option("--height", type=float, metavar="M", help="Its flying height above ground.")
@@ -25,9 +25,7 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--kernel", default="bicubic", help="Resampling kernel [bicubic].")
 @click.option("--tolerance", type=float, default=0.02, metavar="PX", help="Largest residual of the anchors [0.02].")
 @click.option("--tables", is_flag=True, help="Print the tables and examples of Ecker 1991 instead.")
-@click.option(
-    "--picture", type=click.Path(path_type=Path), metavar="PNG", help="Contributions, and a map of the total."
-)
+@click.option("--picture", type=PATH, metavar="PNG", help="Contributions, and a map of the total.")
 @overwrite_option
 @json_option
 @quiet_option
@@ -54,7 +52,7 @@ def command(tables: bool, picture: Path | None, overwrite: bool, as_json: bool, 
         write = BudgetPlots.ready()
     found = make_budget(request)
     if write is not None and picture is not None:
-        from photoplan.io.disk import write_atomically
+        from photoplan.io.naming import write_atomically
 
         write_atomically(picture, write.picture(found.typical))
     tell(found)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import dry_run_option, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, dry_run_option, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import end_with_failures, say, show, show_json
 
 if TYPE_CHECKING:
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 
 @click.command("characterise")
-@click.argument("series", type=click.Path(path_type=Path), metavar="SERIES")
+@click.argument("series", type=PATH, metavar="SERIES")
 @click.option("--only", multiple=True, metavar="NAME", help="Run this analysis; may be repeated [all possible].")
-@click.option("--report", type=click.Path(path_type=Path), metavar="FILE", help="Write an HTML report with plots.")
-@click.option("--csv", type=click.Path(path_type=Path), metavar="FOLDER", help="Write the figures as tables.")
+@click.option("--report", type=PATH, metavar="FILE", help="Write an HTML report with plots.")
+@click.option("--csv", type=PATH, metavar="FOLDER", help="Write the figures as tables.")
 @overwrite_option
 @dry_run_option("Say which analyses would run and what is missing for the others.")
 @json_option
@@ -39,13 +39,13 @@ def command(series: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     place = options.pop("report")
     inputs, request = read_series(series).inputs, CharacteriseRequest(series, **options)
     page = open_report(place, inputs, overwrite=options["overwrite"])
-    record = recording("characterise", request, [series, *inputs])
-    with Telling(quiet) as events:
-        report = characterise(request, events)
-    written = report.written
-    if page is not None and not options["dry_run"]:
-        written = (page.write(characterise_page(report, page.mpl)), *written)
-    record((*report.written, *written[: len(written) - len(report.written)]), report)
+    with recording("characterise", request, [series, *inputs]) as record:
+        with Telling(quiet) as events:
+            report = characterise(request, events)
+        written = report.written
+        if page is not None and not options["dry_run"]:
+            written = (page.write(characterise_page(report, page.mpl)), *written)
+        record((*report.written, *written[: len(written) - len(report.written)]), report)
     if as_json:
         show_json(report, written=written)
     else:

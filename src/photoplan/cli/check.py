@@ -6,12 +6,12 @@ from pathlib import Path
 
 import click
 
-from photoplan.cli.options import images_option, json_option, quiet_option
+from photoplan.cli.options import PATH, images_option, json_option, quiet_option
 from photoplan.cli.output import show, show_json
 
 
 @click.command("check")
-@click.argument("project", type=click.Path(path_type=Path))
+@click.argument("project", type=PATH)
 @images_option()
 @json_option
 @quiet_option

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import click
 
 from photoplan.cli.options import (
+    PATH,
     dry_run_option,
     images_option,
     json_option,
@@ -20,10 +20,10 @@ from photoplan.cli.output import say, show, show_json
 
 
 @click.command("control")
-@click.argument("project", type=click.Path(path_type=Path))
+@click.argument("project", type=PATH)
 @click.option(
     "--ortho",
-    type=click.Path(path_type=Path),
+    type=PATH,
     multiple=True,
     required=True,
     metavar="FILE",
@@ -31,14 +31,14 @@ from photoplan.cli.output import say, show, show_json
 )
 @click.option("--height-sigma", type=float, required=True, metavar="M", help="Standard deviation of the heights.")
 @click.option("--ortho-sigma", type=float, metavar="M", help="Standard deviation of X and of Y in it [one pixel].")
-@click.option("--heights", type=click.Path(path_type=Path), metavar="FILE", help="[the project's terrain]")
+@click.option("--heights", type=PATH, metavar="FILE", help="[the project's terrain]")
 @click.option("--height-system", metavar="NAME", help="Of --heights, where the file states none.")
 @images_option()
 @click.option("--grid", type=int, default=8, show_default=True, help="Patches along each side of an image.")
 @click.option("--search", type=float, default=30.0, show_default=True, metavar="M", help="How far points may be off.")
 @click.option("--radius", type=int, default=15, show_default=True, help="Of a patch, pixels of the coarser picture.")
 @click.option("--correlation", type=float, default=0.7, show_default=True, help="Least correlation of a patch.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), metavar="CSV", help="[control.csv by the project]")
+@click.option("-o", "--output", type=PATH, metavar="CSV", help="[control.csv by the project]")
 @workers_option
 @dry_run_option("Choose the patches and stop.")
 @overwrite_option

@@ -7,14 +7,22 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import DIRECTIONS, json_option, overwrite_option, quiet_option, reading_options, table_format
+from photoplan.cli.options import (
+    DIRECTIONS,
+    PATH,
+    json_option,
+    overwrite_option,
+    quiet_option,
+    reading_options,
+    table_format,
+)
 from photoplan.cli.output import say, show, show_json
 
 
 @click.command("convert")
-@click.argument("orientation", type=click.Path(path_type=Path))
+@click.argument("orientation", type=PATH)
 @click.option("--to", "target", metavar="FORMAT", help="Format to write: csv, toml, patb, bingo, bluh, inpho, …")
-@click.option("--camera", type=click.Path(path_type=Path), help="Cameras (TOML, YAML, JSON) [the orientation's].")
+@click.option("--camera", type=PATH, help="Cameras (TOML, YAML, JSON) [the orientation's].")
 @reading_options
 @click.option(
     "--camera-axes",
@@ -34,10 +42,10 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--crs", metavar="CRS", help="CRS to write; declares that of a file that states none.")
 @click.option("--matrix", type=click.Choice(DIRECTIONS), help="What written rotation matrices do (patb, inpho).")
 @click.option("--drop-lens", is_flag=True, help="Write cameras without a lens that the format does not know.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="File, or folder of several [beside the input].")
+@click.option("-o", "--output", type=PATH, help="File, or folder of several [beside the input].")
 @click.option("--list-readings", is_flag=True, help="Only list the readings of the file that fit measured points.")
-@click.option("--image-points", type=click.Path(path_type=Path), help="Measured image points, for --list-readings.")
-@click.option("--control", type=click.Path(path_type=Path), help="Their ground points, for --list-readings.")
+@click.option("--image-points", type=PATH, help="Measured image points, for --list-readings.")
+@click.option("--control", type=PATH, help="Their ground points, for --list-readings.")
 @overwrite_option
 @json_option
 @quiet_option
@@ -76,9 +84,9 @@ def _convert(request: Any, as_json: bool, quiet: bool) -> None:
     from photoplan.io.run_record import recording
     from photoplan.products.convert import convert_orientation
 
-    record = recording("convert", request, [request.orientation, request.camera])
-    done = convert_orientation(request)
-    record(done.files, done)
+    with recording("convert", request, [request.orientation, request.camera]) as record:
+        done = convert_orientation(request)
+        record(done.files, done)
     if as_json:
         show_json(done)
     else:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import click
 
-from photoplan.cli.options import quiet_option
+from photoplan.cli.options import FOLDER, quiet_option
 
 
 @click.command("demo")
-@click.argument("folder", type=click.Path(path_type=Path, file_okay=False), default=Path("photoplan-demo"))
+@click.argument("folder", type=FOLDER, default=Path("photoplan-demo"))
 @click.option("--resolution", type=float, default=0.1, show_default=True, help="Ground pixel in metres.")
 @quiet_option
 def command(folder: Path, resolution: float, quiet: bool) -> None:

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import dry_run_option, json_option, overwrite_option, quiet_option, workers_option
+from photoplan.cli.options import PATH, dry_run_option, json_option, overwrite_option, quiet_option, workers_option
 from photoplan.cli.output import show, show_json
 
 if TYPE_CHECKING:
     from photoplan.products.dtm.build import BuildReport, BuildRequest
 
-_PATH = click.Path(path_type=Path)
 _POSITIVE = click.FloatRange(0, min_open=True)
 #: Findings and gross errors that are shown; all are in the report, in the model and in --json.
 _SHOWN = 10
 
 
 @click.command("build")
-@click.argument("points", type=_PATH, nargs=-1, required=True)
-@click.option("-o", "--output", type=_PATH, required=True, metavar="MODEL", help="The model, a .gpkg.")
+@click.argument("points", type=PATH, nargs=-1, required=True)
+@click.option("-o", "--output", type=PATH, required=True, metavar="MODEL", help="The model, a .gpkg.")
 @click.option(
     "--grid-width", type=_POSITIVE, metavar="M", help="Grid width [half the spacing; half of that at breaklines]."
 )
@@ -34,7 +32,7 @@ _SHOWN = 10
 @click.option("--gross", type=click.FloatRange(0), default=5.0, show_default=True, help="Normalised residual of gross "
               "errors; 0: none is sought.")  # fmt: skip
 @click.option("--reach", type=_POSITIVE, metavar="M", help="Gaps over twice this stay open [10 spacings].")
-@click.option("--codes", type=_PATH, metavar="FILE", help="Codes and layers: TOML, or CSV with code, class, sigma.")
+@click.option("--codes", type=PATH, metavar="FILE", help="Codes and layers: TOML, or CSV with code, class, sigma.")
 @click.option("--columns", help="Columns of text files, such as x=East,y=North,z=Height,code=Art or x,y,z,-,code.")
 @click.option("--delimiter", help="Comma, semicolon, tab or space [what fits].")
 @click.option("--decimal-comma", is_flag=True, help="Numbers are written 1,5.")
@@ -58,6 +56,7 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     interrupted while it wrote.
     """
     from photoplan.cli.telling import Telling
+    from photoplan.io.naming import together
     from photoplan.products.dtm.build import describe_plan, dtm_build, load, plan_facts
     from photoplan.report.dtm.page import build_page, open_build_report
     from photoplan.report.dtm.samples import build_facts
@@ -78,15 +77,16 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
             show(f"  {note}")
         return
     page = open_build_report(request.output, wanted, request.overwrite)
-    with Telling(quiet) as events:
-        if page is None and wanted is None:
-            events.talk("no report: it needs matplotlib (pip install 'photoplan[report]')")
-        built = dtm_build(request, events)
-    report, warning = None, ""
-    if page is not None:
-        title, seconds = request.output.stem, built.figures["seconds"]
-        facts = build_facts(title, built.built, built.measured, built.findings, request.inputs, seconds)
-        report, warning = page.write(build_page(facts, page.mpl)), facts.covariance.warning
+    with together():
+        with Telling(quiet) as events:
+            if page is None and wanted is None:
+                events.talk("no report: it needs matplotlib (pip install 'photoplan[report]')")
+            built = dtm_build(request, events)
+        report, warning = None, ""
+        if page is not None:
+            title, seconds = request.output.stem, built.figures["seconds"]
+            facts = build_facts(title, built.built, built.measured, built.findings, request.inputs, seconds)
+            report, warning = page.write(build_page(facts, page.mpl)), facts.covariance.warning
     if as_json:
         show_json(built, report=report)
         return

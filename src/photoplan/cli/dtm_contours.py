@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import click
 
-from photoplan.cli.options import bounds_option, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, bounds_option, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import say, show, show_json
 
-_PATH = click.Path(path_type=Path)
 _POSITIVE = click.FloatRange(0, min_open=True)
 
 
 @click.command("contours")
-@click.argument("model", type=_PATH)
+@click.argument("model", type=PATH)
 @click.option("--interval", type=_POSITIVE, required=True, metavar="M", help="Height between contours, metres.")
 @click.option("--base", type=float, default=0.0, show_default=True, help="Height that contours are counted from.")
 @click.option("--index", type=click.IntRange(0), default=5, show_default=True, help="Every N-th is an index contour.")
@@ -30,8 +28,8 @@ _POSITIVE = click.FloatRange(0, min_open=True)
 @click.option("--text-height", type=_POSITIVE, help="Height of labels, metres on the ground [1/200 of the extent].")
 @click.option("--label-spacing", type=_POSITIVE, help="Metres between labels of a line [60 text heights].")
 @click.option("--crs", help="CRS of a model that does not state it.")
-@click.option("-o", "--output", type=_PATH, required=True, metavar="FILE", help=".gpkg, .shp, .geojson or .dxf")
-@click.option("--preview", type=_PATH, metavar="PNG", help="A small picture to look at, too.")
+@click.option("-o", "--output", type=PATH, required=True, metavar="FILE", help=".gpkg, .shp, .geojson or .dxf")
+@click.option("--preview", type=PATH, metavar="PNG", help="A small picture to look at, too.")
 @overwrite_option
 @json_option
 @quiet_option
@@ -55,12 +53,12 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
         raise click.UsageError(f"{preview}: the preview has the name of the output; choose another one")
     drawing = open_picture(preview, [options["model"]], overwrite=options["overwrite"])
     request = ContourRequest(options=chosen, sketch=drawing is not None, **options)
-    record = recording("contours", request, [request.model])
-    with Telling(quiet) as events:
-        facts = make_contours(request, events)
-    if drawing is not None:
-        drawing.write(contours_picture(facts, drawing.mpl))
-    record([*facts.files, preview], facts)
+    with recording("contours", request, [request.model]) as record:
+        with Telling(quiet) as events:
+            facts = make_contours(request, events)
+        if drawing is not None:
+            drawing.write(contours_picture(facts, drawing.mpl))
+        record([*facts.files, preview], facts)
     if as_json:
         show_json(facts, preview=preview)
         return

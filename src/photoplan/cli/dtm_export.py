@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import click
 
-from photoplan.cli.options import bounds_option, json_option, overwrite_option, quiet_option, workers_option
+from photoplan.cli.options import PATH, bounds_option, json_option, overwrite_option, quiet_option, workers_option
 from photoplan.cli.output import say, show, show_json
 
 
 @click.command("export")
-@click.argument("model", type=click.Path(path_type=Path))
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="What to write, by its suffix.")
+@click.argument("model", type=PATH)
+@click.option("-o", "--output", type=PATH, required=True, help="What to write, by its suffix.")
 @click.option("--resolution", type=click.FloatRange(0, min_open=True), metavar="R", help="Of a raster [finest width].")
 @bounds_option
-@click.option("--sigma", type=click.Path(path_type=Path), metavar="TIF", help="Write the standard deviations too.")
+@click.option("--sigma", type=PATH, metavar="TIF", help="Write the standard deviations too.")
 @click.option("--crs", help="CRS of a terrain file that does not state it.")
 @workers_option
 @overwrite_option

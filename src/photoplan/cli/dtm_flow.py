@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import click
 
-from photoplan.cli.options import BYTES, json_option, overwrite_option, quiet_option, workers_option
+from photoplan.cli.options import BYTES, PATH, json_option, overwrite_option, quiet_option, workers_option
 from photoplan.cli.output import say, show, show_json
 
 
 @click.command("flow")
-@click.argument("model", type=click.Path(path_type=Path))
+@click.argument("model", type=PATH)
 @click.option("--resolution", type=click.FloatRange(0, min_open=True), help="Side of a cell, metres [mesh width].")
-@click.option("--outlets", type=click.Path(path_type=Path), help="Points (table x, y, name, or vector file).")
+@click.option("--outlets", type=PATH, help="Points (table x, y, name, or vector file).")
 @click.option("--snap", type=float, default=0.0, help="Move outlets to the largest flow within this, metres [0].")
-@click.option("--catchments", type=click.Path(path_type=Path), metavar="GPKG", help="Write the catchments as polygons.")
+@click.option("--catchments", type=PATH, metavar="GPKG", help="Write the catchments as polygons.")
 @click.option("--method", type=click.Choice(["d8", "dinf"]), default="d8", help="How upstream areas are summed [d8].")
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, metavar="TIF", help="The raster.")
+@click.option("-o", "--output", type=PATH, required=True, metavar="TIF", help="The raster.")
 @click.option("--memory", type=BYTES, default="2GB", show_default=True, metavar="SIZE", help="Stay under this.")
 @workers_option
 @click.option("--crs", help="CRS of a model that does not state it.")

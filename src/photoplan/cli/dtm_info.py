@@ -6,12 +6,12 @@ from pathlib import Path
 
 import click
 
-from photoplan.cli.options import json_option, quiet_option
+from photoplan.cli.options import PATH, json_option, quiet_option
 from photoplan.cli.output import show, show_json
 
 
 @click.command("info")
-@click.argument("model", type=click.Path(path_type=Path))
+@click.argument("model", type=PATH)
 @click.option("--gross", is_flag=True, help="List the measurements that were flagged as gross errors, and suspects.")
 @json_option
 @quiet_option

@@ -7,14 +7,14 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import say, show, show_json
 
 
 @click.command("profile")
-@click.argument("model", type=click.Path(path_type=Path))
-@click.argument("lines", type=click.Path(path_type=Path))
-@click.option("-o", "--output", "outputs", type=click.Path(path_type=Path), required=True, multiple=True,
+@click.argument("model", type=PATH)
+@click.argument("lines", type=PATH)
+@click.option("-o", "--output", "outputs", type=PATH, required=True, multiple=True,
               metavar="FILE", help=".csv, or .png for a picture; may be repeated.")  # fmt: skip
 @click.option("--tolerance", type=click.FloatRange(0, min_open=True), default=0.001, show_default=True,
               metavar="M", help="Largest distance in height from the surface.")  # fmt: skip
@@ -53,12 +53,12 @@ def command(
     drawings = [open_picture(path, inputs, overwrite=overwrite) for path in pictures]
     form = PointTableFormat(x, y, Dialect(decimal_comma=decimal_comma))
     request = ProfileRequest(outputs=tables, form=form, **options)
-    record = recording("profile", request, inputs)
-    found = dtm_profile(request)
-    for drawing in drawings:
-        if drawing is not None:
-            drawing.write(profile_picture(found, drawing.mpl))
-    record(outputs, [pick(p, "name", "length") for p in found])
+    with recording("profile", request, inputs) as record:
+        found = dtm_profile(request)
+        for drawing in drawings:
+            if drawing is not None:
+                drawing.write(profile_picture(found, drawing.mpl))
+        record(outputs, [pick(p, "name", "length") for p in found])
     if as_json:
         show_json({"files": outputs, "profiles": found})
         return

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import say, show, show_json
-
-_PATH = click.Path(path_type=Path)
 
 
 @click.command("refine")
-@click.argument("coarse", type=_PATH)
-@click.argument("fine", type=_PATH)
-@click.option("--polygons", type=_PATH, required=True, metavar="FILE", help="Where the fine model counts.")
+@click.argument("coarse", type=PATH)
+@click.argument("fine", type=PATH)
+@click.option("--polygons", type=PATH, required=True, metavar="FILE", help="Where the fine model counts.")
 @click.option("--transition", type=click.FloatRange(0), required=True, metavar="M",
               help="Width of the band inside the polygons in which the two are joined.")  # fmt: skip
 @click.option("--width", type=click.FloatRange(0, min_open=True), metavar="M",
               help="Largest grid width inside the polygons [the fine model's finest].")  # fmt: skip
 @click.option("--height-system", metavar="same", help="Declare that both models have the same height system.")
-@click.option("-o", "--output", type=_PATH, required=True, metavar="MODEL", help="The new model, a .gpkg.")
+@click.option("-o", "--output", type=PATH, required=True, metavar="MODEL", help="The new model, a .gpkg.")
 @overwrite_option
 @json_option
 @quiet_option
@@ -35,9 +32,9 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     from photoplan.products.dtm.refine import RefineRequest, dtm_refine
 
     request = RefineRequest(**options)
-    record = recording("refine", request, [request.coarse, request.fine, request.polygons])
-    found = dtm_refine(request)
-    record([found.path], found)
+    with recording("refine", request, [request.coarse, request.fine, request.polygons]) as record:
+        found = dtm_refine(request)
+        record([found.path], found)
     if as_json:
         show_json(found)
         return

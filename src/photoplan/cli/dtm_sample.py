@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import say, show, show_json
 
 
 @click.command("sample")
-@click.argument("model", type=click.Path(path_type=Path))
-@click.argument("points", type=click.Path(path_type=Path))
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, metavar="CSV", help="What to write.")
+@click.argument("model", type=PATH)
+@click.argument("points", type=PATH)
+@click.option("-o", "--output", type=PATH, required=True, metavar="CSV", help="What to write.")
 @click.option("--x", metavar="NAME", help="Column of X, by name or number [x, east, easting].")
 @click.option("--y", metavar="NAME", help="Column of Y [y, north, northing].")
 @click.option("--delimiter", help="Comma, semicolon, tab or space [the one that splits the first line].")
@@ -52,9 +51,9 @@ def command(
     dialect = Dialect(delimiter=spelled.get(delimiter or "", delimiter), decimal_comma=decimal_comma)
     form = PointTableFormat(x, y, dialect, not no_header)
     request = SampleRequest(form=form, **options)
-    record = recording("sample", request, [request.model, request.points])
-    found = dtm_sample(request)
-    record([found.path], found)
+    with recording("sample", request, [request.model, request.points]) as record:
+        found = dtm_sample(request)
+        record([found.path], found)
     if as_json:
         show_json(found)
         return

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import bounds_option, json_option, overwrite_option, quiet_option, workers_option
+from photoplan.cli.options import PATH, bounds_option, json_option, overwrite_option, quiet_option, workers_option
 from photoplan.cli.output import say, show, show_json
 
 if TYPE_CHECKING:
@@ -17,15 +16,14 @@ if TYPE_CHECKING:
 
 def picture_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Model, grid, output and run of every picture of a terrain."""
-    path = click.Path(path_type=Path)
     positive = click.FloatRange(0, min_open=True)
     options = [
-        click.argument("model", type=path),
+        click.argument("model", type=PATH),
         click.option("--resolution", type=positive, metavar="R", help="Pixel in metres [the model's mesh width]."),
         bounds_option,
         click.option("--crs", help="CRS of a model that does not state it."),
-        click.option("-o", "--output", type=path, required=True, metavar="TIF", help="The GeoTIFF."),
-        click.option("--preview", type=path, metavar="PNG", help="A small picture to look at, too."),
+        click.option("-o", "--output", type=PATH, required=True, metavar="TIF", help="The GeoTIFF."),
+        click.option("--preview", type=PATH, metavar="PNG", help="A small picture to look at, too."),
         workers_option,
         overwrite_option,
         json_option,

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import click
 
-from photoplan.cli.options import BYTES, json_option, overwrite_option, quiet_option, workers_option
+from photoplan.cli.options import BYTES, PATH, json_option, overwrite_option, quiet_option, workers_option
 from photoplan.cli.output import say, show, show_json
 
 
 @click.command("visible")
-@click.argument("model", type=click.Path(path_type=Path))
+@click.argument("model", type=PATH)
 @click.option("--from", "points", type=float, nargs=2, multiple=True, metavar="X Y", help="Observer; may be repeated.")
-@click.option("--observers", "file", type=click.Path(path_type=Path), help="Table (x, y, h, name) or point file.")
+@click.option("--observers", "file", type=PATH, help="Table (x, y, h, name) or point file.")
 @click.option("--height-observer", type=float, default=1.7, show_default=True, help="Eye above ground, metres.")
 @click.option("--height-target", type=float, default=0.0, show_default=True, help="Target above ground, metres.")
 @click.option("--radius", type=float, default=math.inf, help="Look no further than this, metres [all].")
@@ -23,7 +22,7 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--curvature/--no-curvature", default=True, help="Whether the earth is round [yes].")
 @click.option("--minimum-height", is_flag=True, help="Write the height above ground from which a place is seen.")
 @click.option("--resolution", type=click.FloatRange(0, min_open=True), help="Pixel of the map, metres [mesh width].")
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, metavar="TIF", help="The map.")
+@click.option("-o", "--output", type=PATH, required=True, metavar="TIF", help="The map.")
 @click.option("--memory", type=BYTES, default="2GB", show_default=True, metavar="SIZE", help="Stay under this.")
 @workers_option
 @click.option("--crs", help="CRS of a model that does not state it.")

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option, overwrite_option, quiet_option, workers_option
+from photoplan.cli.options import PATH, json_option, overwrite_option, quiet_option, workers_option
 from photoplan.cli.output import say, show, show_json
 
 
 @click.command("volume")
-@click.argument("a", metavar="A", type=click.Path(path_type=Path))
-@click.argument("b", metavar="B", type=click.Path(path_type=Path))
-@click.option("--polygon", "polygons", type=click.Path(path_type=Path), help="Polygons: one line of figures for each.")
+@click.argument("a", metavar="A", type=PATH)
+@click.argument("b", metavar="B", type=PATH)
+@click.option("--polygon", "polygons", type=PATH, help="Polygons: one line of figures for each.")
 @click.option("--resolution", type=click.FloatRange(0, min_open=True), help="Cells of the integration, metres [auto].")
 @click.option("--tolerance", type=float, default=1e-3, show_default=True, help="Where cells are halved: part of it.")
-@click.option("--difference", type=click.Path(path_type=Path), metavar="TIF", help="Write B − A as a raster.")
+@click.option("--difference", type=PATH, metavar="TIF", help="Write B − A as a raster.")
 @click.option("--sigma-a", type=float, help="Standard deviation of A's heights, metres [the model's own].")
 @click.option("--sigma-b", type=float, help="The same of B.")
 @click.option("--correlation", type=float, help="Correlation length of height errors, metres [the mesh width].")

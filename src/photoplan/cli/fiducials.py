@@ -7,15 +7,15 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import dry_run_option, images_option, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, dry_run_option, images_option, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import end_with_failures, say, show, show_json
 
 _ANSWER = {"auto": None, "yes": True, "no": False}
 
 
 @click.command("fiducials")
-@click.argument("scans", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="IMAGE…")
-@click.option("--camera", type=click.Path(path_type=Path), metavar="FILE", help="Describes the camera and its marks.")
+@click.argument("scans", nargs=-1, required=True, type=PATH, metavar="IMAGE…")
+@click.option("--camera", type=PATH, metavar="FILE", help="Describes the camera and its marks.")
 @click.option("--camera-name", metavar="NAME", help="Which camera of the file, where it describes several.")
 @images_option("all film", "select")
 @click.option("--scan-resolution", metavar="DPI|UM", help="Such as 1200dpi or 21um [what the files state, else found].")
@@ -27,7 +27,7 @@ _ANSWER = {"auto": None, "yes": True, "no": False}
               help="Whether dark and bright are exchanged against the description.")  # fmt: skip
 @click.option("--band", type=click.IntRange(1), metavar="N", help="Band to use [luminance of the first three].")
 @click.option("--least-correlation", type=click.FloatRange(0.3, 0.99), metavar="R", help="Less is no mark [0.6].")
-@click.option("--pictures", type=click.Path(path_type=Path), metavar="FOLDER", help="Receives a picture of the marks.")
+@click.option("--pictures", type=PATH, metavar="FOLDER", help="Receives a picture of the marks.")
 @overwrite_option
 @dry_run_option("Of a project: do not write the marks into it.")
 @json_option
@@ -40,6 +40,7 @@ def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any)
     """
     from photoplan.cli.telling import Telling
     from photoplan.io.names import unique_stems
+    from photoplan.io.naming import together
     from photoplan.plain import plain
     from photoplan.products.fiducials import FiducialsRequest, locate_fiducials, scans_of
     from photoplan.report.fiducials import marks_picture, unfound_picture
@@ -53,16 +54,17 @@ def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any)
         for name, stem in unique_stems(files).items():
             place = folder / f"{stem}.fiducials.png"
             pictures[name] = open_picture(place, [*scans, *files.values()], overwrite=overwrite)
-    with Telling(quiet) as events:
-        report = locate_fiducials(request, events)
-    drawn = {}
-    for image in report.images:
-        picture = pictures.get(image.name)
-        drawn[image.name] = None if picture is None else picture.write(marks_picture(image, picture.mpl))
-    for lost in report.unfound:
-        picture = pictures.get(lost.name)
-        if picture is not None:
-            say(f"{lost.name}: where its marks were sought: {picture.write(unfound_picture(lost, picture.mpl))}")
+    with together():
+        with Telling(quiet) as events:
+            report = locate_fiducials(request, events)
+        drawn = {}
+        for image in report.images:
+            picture = pictures.get(image.name)
+            drawn[image.name] = None if picture is None else picture.write(marks_picture(image, picture.mpl))
+        for lost in report.unfound:
+            picture = pictures.get(lost.name)
+            if picture is not None:
+                say(f"{lost.name}: where its marks were sought: {picture.write(unfound_picture(lost, picture.mpl))}")
     if as_json:
         images = [{**plain(image), "picture": drawn[image.name]} for image in report.images]
         show_json(report, images=images)

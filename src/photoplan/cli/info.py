@@ -6,13 +6,13 @@ from pathlib import Path
 
 import click
 
-from photoplan.cli.options import json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import show, show_json
 
 
 @click.command("info")
-@click.argument("file", type=click.Path(path_type=Path))
-@click.option("--plot", type=click.Path(path_type=Path), metavar="PICTURE", help="Draw a restoration filter as PNG.")
+@click.argument("file", type=PATH)
+@click.option("--plot", type=PATH, metavar="PICTURE", help="Draw a restoration filter as PNG.")
 @overwrite_option
 @json_option
 @quiet_option

@@ -7,17 +7,26 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option, listed, overwrite_option, quiet_option, reading_options, table_format
+from photoplan.cli.options import (
+    FOLDER,
+    PATH,
+    json_option,
+    listed,
+    overwrite_option,
+    quiet_option,
+    reading_options,
+    table_format,
+)
 from photoplan.cli.output import show, show_json, talking
 
-_FILE = click.Path(path_type=Path)
+_FILE = PATH
 
 
 @click.command("init")
-@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
+@click.argument("folder", metavar="DIR", type=FOLDER)
 @click.option("--images", multiple=True, required=True, metavar="PATTERN,…", help="Files; may be repeated.",
               callback=lambda context, parameter, values: listed(values))  # fmt: skip
-@click.option("--camera", required=True, type=click.Path(path_type=Path), help="Cameras: TOML, YAML or JSON.")
+@click.option("--camera", required=True, type=PATH, help="Cameras: TOML, YAML or JSON.")
 @click.option("--orientation", type=_FILE, help="Orientation: TOML, JSON, table … [images are to be oriented].")
 @click.option(
     "--terrain", metavar="FILE|HEIGHT", help="Raster of heights, or one height in metres; needed for products."

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import click
 
-from photoplan.cli.options import images_option, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, images_option, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import end_with_failures, say, show, show_json
 
 
 @click.command("interior")
-@click.argument("project", type=click.Path(path_type=Path))
+@click.argument("project", type=PATH)
 @images_option("all film")
 @click.option(
     "--model",
@@ -20,8 +19,8 @@ from photoplan.cli.output import end_with_failures, say, show, show_json
     help="From marks to scan [what the camera states].",
 )
 @click.option("--scan-resolution", metavar="DPI|UM", help="Such as 1200dpi or 21um [what the files state].")
-@click.option("--report", type=click.Path(path_type=Path), metavar="HTML", help="Figures and plots as a page.")
-@click.option("--plot", type=click.Path(path_type=Path), metavar="PNG", help="Residual vectors.")
+@click.option("--report", type=PATH, metavar="HTML", help="Figures and plots as a page.")
+@click.option("--plot", type=PATH, metavar="PNG", help="Residual vectors.")
 @click.option("--write", is_flag=True, help="Make --model that of the cameras in the project file.")
 @overwrite_option
 @json_option
@@ -41,15 +40,15 @@ def command(images: tuple[str, ...], as_json: bool, quiet: bool, **options: Any)
     page = open_report(options.pop("report"), (), overwrite=overwrite, project=project)
     plot = open_picture(options.pop("plot"), (), overwrite=overwrite, project=project)
     request = InteriorRequest(images=images or None, **options)
-    record = recording("interior", request, [project])
-    found = interior_orientations(request)
-    report = picture = None
-    if page is not None and found.images:
-        title = f"Interior orientation · {project.resolve().parent.name}"
-        report = page.write(interior_page(found, title, page.mpl))
-    if plot is not None and found.images:
-        picture = plot.write(InteriorPlots(plot.mpl).residuals(found.images))
-    record([project if found.written else None, report, picture], found)
+    with recording("interior", request, [project]) as record:
+        found = interior_orientations(request)
+        report = picture = None
+        if page is not None and found.images:
+            title = f"Interior orientation · {project.resolve().parent.name}"
+            report = page.write(interior_page(found, title, page.mpl))
+        if plot is not None and found.images:
+            picture = plot.write(InteriorPlots(plot.mpl).residuals(found.images))
+        record([project if found.written else None, report, picture], found)
     if as_json:
         show_json(found, report=report, plot=picture)
     else:

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import click
 
-from photoplan.cli.options import json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import say, show, show_json
 
 
 @click.command("monoplot")
-@click.argument("project", type=click.Path(path_type=Path))
+@click.argument("project", type=PATH)
 @click.argument("image")
-@click.argument("points", type=click.Path(path_type=Path))
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, metavar="CSV", help="Ground points.")
-@click.option("--vectors", type=click.Path(path_type=Path), metavar="GPKG", help="Points or lines in space as well.")
+@click.argument("points", type=PATH)
+@click.option("-o", "--output", type=PATH, required=True, metavar="CSV", help="Ground points.")
+@click.option("--vectors", type=PATH, metavar="GPKG", help="Points or lines in space as well.")
 @click.option("--gis-axes", is_flag=True, help="Vectors drawn in a GIS: (0, 0) is the image's corner, y points up.")
 @click.option("--sigma-image", type=float, default=0.5, show_default=True, help="Of image coordinates, pixels.")
 @click.option("--sigma-terrain", type=float, help="Of terrain heights, metres [the model's own].")

@@ -7,13 +7,13 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import executing, listed, product_options
+from photoplan.cli.options import PATH, executing, listed, product_options
 
 _PENALTIES = ("slant", "coarseness", "border", "occlusion")
 
 
 @click.command("mosaic")
-@click.argument("project", type=click.Path(path_type=Path))
+@click.argument("project", type=PATH)
 @product_options
 @click.option("--name", default="mosaic", show_default=True, help="Of the product's files.")
 @click.option("--score", metavar="NAME=WEIGHT,…", multiple=True, callback=lambda c, p, values: listed(values),
@@ -21,7 +21,7 @@ _PENALTIES = ("slant", "coarseness", "border", "occlusion")
 @click.option("--prefer", metavar="NAME,…", multiple=True, callback=lambda c, p, values: listed(values),
               help="Images that come first wherever they see the ground.")  # fmt: skip
 @click.option("--sources", is_flag=True, help="Also which image painted each pixel: NAME_sources.tif, NAME_seams.gpkg.")
-@click.option("--seams", type=click.Path(path_type=Path), metavar="FILE",
+@click.option("--seams", type=PATH, metavar="FILE",
               help="Regions with their images, that come before the score: an edited NAME_seams.gpkg.")  # fmt: skip
 @executing
 def command(project: Path, name: str, score: tuple[str, ...], prefer: tuple[str, ...], seams: Path | None,

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import click
 
-from photoplan.cli.options import json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import end_with_failures, show, show_json, talking
 
 
@@ -101,10 +101,10 @@ def run_patterns(images: tuple[Path, ...], as_json: bool, quiet: bool, options: 
     page = open_report(options.pop("report"), inputs, overwrite=options["overwrite"], table=options["csv"])
     kept = {name: value for name, value in options.items() if name not in _OF_EDGES}
     request = PatternRequest(images, **kept)
-    record = recording("mtf", request, inputs)
-    report = measure_patterns(request, talk)
-    written = page.write(pattern_page(report, page.mpl)) if page is not None and report.images else None
-    record([report.csv, written], report)
+    with recording("mtf", request, inputs) as record:
+        report = measure_patterns(request, talk)
+        written = page.write(pattern_page(report, page.mpl)) if page is not None and report.images else None
+        record([report.csv, written], report)
     say_images(report, written, as_json, talk)
     if not as_json:
         say_files(report, written)
@@ -121,14 +121,14 @@ def _refuse(names: set[str], why: str) -> None:
 
 
 @click.command("mtf")
-@click.argument("images", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="IMAGE…")
+@click.argument("images", nargs=-1, required=True, type=PATH, metavar="IMAGE…")
 @click.option("--roi", "rois", type=int, nargs=4, multiple=True, metavar="COL ROW WIDTH HEIGHT",
               help="Window with one edge; may be repeated [edges are sought in the whole image].")  # fmt: skip
 @pattern_options
 @click.option("--linearisation", metavar="linear|srgb|TABLE", help="How grey values become light [linear].")
 @click.option("--band", metavar="N|all", help="Band, or luminance and every band [luminance, or the only band].")
 @click.option("--pixel-size", "pixel_um", type=float, metavar="UM", help="On the sensor, for cycles/mm.")
-@click.option("--lab", type=click.Path(path_type=Path), metavar="FILE", help="MTF values of a laboratory to compare.")
+@click.option("--lab", type=PATH, metavar="FILE", help="MTF values of a laboratory to compare.")
 @click.option("--flight", type=click.Choice(["x", "y"]), help="Flight direction along rows (x) or columns (y).")
 @click.option("--grid", type=int, default=3, show_default=True, metavar="N", help="Cells of the field, each way.")
 @click.option("--most-edges", type=int, default=60, show_default=True, metavar="N", help="Measured in an image.")
@@ -138,8 +138,8 @@ def _refuse(names: set[str], why: str) -> None:
               help="Largest distance from the edge that is used.")  # fmt: skip
 @click.option("--least-snr", type=click.FloatRange(3.0, 1e6), default=8.0, show_default=True, metavar="R",
               help="Contrast of an edge over its noise.")  # fmt: skip
-@click.option("--report", type=click.Path(path_type=Path), metavar="FILE.html", help="Report with plots.")
-@click.option("--csv", type=click.Path(path_type=Path), metavar="FILE", help="A row for each edge.")
+@click.option("--report", type=PATH, metavar="FILE.html", help="Report with plots.")
+@click.option("--csv", type=PATH, metavar="FILE", help="A row for each edge.")
 @overwrite_option
 @json_option
 @quiet_option
@@ -166,11 +166,11 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any
     inputs = [*images, options["linearisation"], options["lab"]]
     page = open_report(options.pop("report"), inputs, overwrite=options["overwrite"], table=options["csv"])
     request = MtfRequest(images, **edge_options(options))
-    record = recording("mtf", request, inputs)
-    with Telling(quiet) as events:
-        report = measure_mtf(request, events)
-    written = page.write(mtf_page(report, page.mpl)) if page is not None and report.images else None
-    record([report.csv, written], report)
+    with recording("mtf", request, inputs) as record:
+        with Telling(quiet) as events:
+            report = measure_mtf(request, events)
+        written = page.write(mtf_page(report, page.mpl)) if page is not None and report.images else None
+        record([report.csv, written], report)
     say_images(report, written, as_json, talk)
     if len(report.images) > 1:
         if not as_json:

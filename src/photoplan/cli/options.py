@@ -13,6 +13,19 @@ _DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 DIRECTIONS = ["camera-to-ground", "ground-to-camera"]
 
 
+class _Path(click.Path):
+    """A path that is not empty: an empty one would be the folder where the command runs."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if not str(value).strip():
+            self.fail("the name is empty; give the name of a file or folder", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+PATH = _Path(path_type=Path)
+FOLDER = _Path(path_type=Path, file_okay=False)
+
+
 def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Options that say what an orientation file does not say of itself."""
     options = [
@@ -117,15 +130,11 @@ def product_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--nodata", help="A number, mask, or auto: 0 for integers, NaN for floats [auto]."),
         click.option("--overviews/--no-overviews", default=None, help="Whether the file holds overviews [yes]."),
         click.option("--tile", type=int, metavar="PX", help="Side of a tile [512]."),
-        click.option(
-            "--output", type=click.Path(path_type=Path), help="Folder of the products [PROJECT's folder/products]."
-        ),
+        click.option("--output", type=PATH, help="Folder of the products [PROJECT's folder/products]."),
         click.option(
             "--force", is_flag=True, help="Also of orientations with a FAULT, and finer than a quarter of the GSD."
         ),
-        click.option(
-            "--plan", "plan_file", type=click.Path(path_type=Path), help="Write the plan (GeoPackage) and stop."
-        ),
+        click.option("--plan", "plan_file", type=PATH, help="Write the plan (GeoPackage) and stop."),
         dry_run_option("Compile the plan, print it, and stop."),
     ]
     for option in reversed(options):

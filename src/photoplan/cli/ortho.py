@@ -7,11 +7,11 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import executing, product_options
+from photoplan.cli.options import PATH, executing, product_options
 
 
 @click.command("ortho")
-@click.argument("project", type=click.Path(path_type=Path))
+@click.argument("project", type=PATH)
 @product_options
 @click.option("--true/--ground", "true", default=None, help="Show objects where they stand, or the ground [ground].")
 @executing

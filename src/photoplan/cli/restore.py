@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from photoplan.cli.options import (
+    PATH,
     dry_run_option,
     json_option,
     memory_option,
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from photoplan.project.stepped import SteppedReader
 
 _OPTIONS = (
-    click.option("--filter", "filter_file", type=click.Path(path_type=Path), metavar="FILE|none",
+    click.option("--filter", "filter_file", type=PATH, metavar="FILE|none",
                  help="TOML, or one kernel as rows of numbers; none: no filter [measured at edges of the images]."),
     click.option("--aperture", metavar="SHAPE[:RATIO]",
                  help="Undo a scanner's aperture: square or round, RATIO of aperture by step [1]."),
@@ -39,7 +40,7 @@ _OPTIONS = (
     click.option("--least-length", type=click.FloatRange(8.0, 10_000.0), metavar="PX", help="Of an edge [20]."),
     click.option("--noise", type=click.FloatRange(0.0), metavar="SIGMA",
                  help="Standard deviation in light, full scale 1 [found in the images]."),
-    click.option("--save-filter", type=click.Path(path_type=Path), metavar="FILE.toml",
+    click.option("--save-filter", type=PATH, metavar="FILE.toml",
                  help="Where a measured filter is kept [restoration_filter.toml by the results]."),
 )  # fmt: skip
 #: Options that a measurement alone can follow.
@@ -97,13 +98,13 @@ def _refuse_measuring(given: str) -> None:
 
 
 @click.command("restore")
-@click.argument("images", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="IMAGE…")
+@click.argument("images", nargs=-1, required=True, type=PATH, metavar="IMAGE…")
 @filter_options
-@click.option("--output", type=click.Path(path_type=Path), metavar="FOLDER",
+@click.option("--output", type=PATH, metavar="FOLDER",
               help="Folder of the results [restored, beside the first image].")  # fmt: skip
 @click.option("--band", "bands", multiple=True, type=click.IntRange(1), metavar="N",
               help="Restore this band; may be repeated [all]. Others stay as they are.")  # fmt: skip
-@click.option("--fall-off", type=click.Path(path_type=Path), metavar="MODEL.toml",
+@click.option("--fall-off", type=PATH, metavar="MODEL.toml",
               help="Before all else correct the light fall-off, by a model of 'photoplan characterise'.")  # fmt: skip
 @click.option("--chromatic", metavar="FILE|measure",
               help="First bring the bands together: by a model, or as measured in each image.")  # fmt: skip
@@ -113,7 +114,7 @@ def _refuse_measuring(given: str) -> None:
 @click.option("--compress", default="deflate", show_default=True, help="deflate, zstd, lzw, jpeg or none.")
 @workers_option
 @memory_option
-@click.option("--report", type=click.Path(path_type=Path), metavar="FILE.html", help="Report with plots.")
+@click.option("--report", type=PATH, metavar="FILE.html", help="Report with plots.")
 @overwrite_option
 @click.option("--no-quicklook", is_flag=True, help="Write no pictures.")
 @dry_run_option("Say what would be done, and stop.")

@@ -51,7 +51,8 @@ def telling(how: How) -> Telling:
 
     def product(value: object) -> None:
         if isinstance(value, ProductResult) and not value.failed and not how.as_json:
-            click.echo(str(value.path))
+            for path in (value.path, *value.others):
+                click.echo(str(path))
 
     return Telling(how.quiet, product)
 

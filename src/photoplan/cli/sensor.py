@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import click
 
-from photoplan.cli.options import dry_run_option, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, dry_run_option, json_option, overwrite_option, quiet_option
 from photoplan.cli.output import say, show, show_json
 
 
 @click.command("sensor")
-@click.argument("file", type=click.Path(path_type=Path), metavar="FILE")
-@click.option("--report", type=click.Path(path_type=Path), metavar="HTML", help="Figures and plots as a page.")
-@click.option("--csv", type=click.Path(path_type=Path), metavar="CSV", help="Figures as a table.")
+@click.argument("file", type=PATH, metavar="FILE")
+@click.option("--report", type=PATH, metavar="HTML", help="Figures and plots as a page.")
+@click.option("--csv", type=PATH, metavar="CSV", help="Figures as a table.")
 @overwrite_option
 @dry_run_option("Print the figures, write nothing.")
 @json_option
@@ -29,11 +28,11 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     overwrite, table = options["overwrite"], options["csv"]
     page = open_report(options.pop("report"), [options["file"]], overwrite=overwrite, table=table)
     request = SensorRequest(**options)
-    record = recording("sensor", request, [request.file])
-    found = describe_sensor(request)
-    report = None if page is None or options["dry_run"] else page.write(sensor_page(found, page.mpl))
-    written = [path for path in (report, found.csv) if path is not None]
-    record(reversed(written), found)
+    with recording("sensor", request, [request.file]) as record:
+        found = describe_sensor(request)
+        report = None if page is None or options["dry_run"] else page.write(sensor_page(found, page.mpl))
+        written = [path for path in (report, found.csv) if path is not None]
+        record(reversed(written), found)
     if as_json:
         show_json(found, written=written)
     else:

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import click
 
-from photoplan.cli.options import dry_run_option, json_option, overwrite_option, quiet_option, workers_option
+from photoplan.cli.options import PATH, dry_run_option, json_option, overwrite_option, quiet_option, workers_option
 from photoplan.cli.output import say, show, show_json
 
 
 @click.command("simulate")
 @click.argument("scene", metavar="SCENE")
-@click.option(
-    "--model", type=click.Path(path_type=Path), metavar="FILE", help="Describes the camera [changes nothing]."
-)
-@click.option("--output", type=click.Path(path_type=Path), metavar="FILE", help="TIFF to write [SCENE_simulated.tif].")
+@click.option("--model", type=PATH, metavar="FILE", help="Describes the camera [changes nothing].")
+@click.option("--output", type=PATH, metavar="FILE", help="TIFF to write [SCENE_simulated.tif].")
 @click.option("--frames", type=int, default=1, show_default=True, metavar="N", help="Images to form; numbered files.")
 @click.option("--seed", type=int, metavar="N", help="Of all that is random [the model's, else 0].")
 @click.option("--exposure", type=float, multiple=True, metavar="FACTOR",

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from photoplan.cli.options import (
+    PATH,
     dry_run_option,
     images_option,
     json_option,
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @click.command("tie")
-@click.argument("project", type=click.Path(path_type=Path))
+@click.argument("project", type=PATH)
 @images_option()
 @click.option("--pairs", default="auto", show_default=True, metavar="auto|all|FILE", help="Which images are compared.")
 @click.option("--scale", type=float, help="Look for features in images reduced to this, e.g. 0.5 [by their size].")
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 @click.option("--per-image", type=int, default=500, show_default=True, help="Tie points that an image is to have.")
 @click.option("--no-refine", is_flag=True, help="Features as they are, without least-squares matching.")
 @click.option("--ignore-orientation", is_flag=True, help="Work as if no image had a position.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), metavar="CSV", help="[tie_points.csv by the project]")
+@click.option("-o", "--output", type=PATH, metavar="CSV", help="[tie_points.csv by the project]")
 @click.option("--no-picture", is_flag=True, help="Do not write a picture beside the output.")
 @workers_option
 @dry_run_option("Open the images, choose pairs and stop.")
@@ -45,6 +45,7 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """
     from photoplan.cli.telling import Telling
     from photoplan.engine.executors import available_cpus
+    from photoplan.io.naming import together
     from photoplan.products.tie.run import TieRequest, find_ties
     from photoplan.report.drawing import has_matplotlib
     from photoplan.report.page import open_picture
@@ -57,11 +58,12 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     request = TieRequest(**options)
     place = request.table.with_suffix(".png") if wanted else None
     drawing = open_picture(place, [request.project], overwrite=request.overwrite)
-    with Telling(quiet) as events:
-        found = find_ties(request, events)
-    picture = None
-    if drawing is not None and found.found is not None:
-        picture = drawing.write(TiePlots(drawing.mpl).ties(found.sources, found.found))
+    with together():
+        with Telling(quiet) as events:
+            found = find_ties(request, events)
+        picture = None
+        if drawing is not None and found.found is not None:
+            picture = drawing.write(TiePlots(drawing.mpl).ties(found.sources, found.found))
     if as_json:
         show_json(found, picture=picture)
     elif found.output is None:

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
+from contextvars import copy_context
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -248,7 +249,9 @@ class Runner(Generic[T]):
                         continue
                     # Files of one product are assembled at a time; that of the next one is already computed.
                     self._settle(0)
-                    self._completing.append((work, self._pool.submit(_complete, work, tally, stack.pop_all())))
+                    self._completing.append(
+                        (work, self._pool.submit(copy_context().run, _complete, work, tally, stack.pop_all()))
+                    )
         return self.results
 
     def _compute(self, work: Work[T]) -> Tally:

@@ -22,6 +22,9 @@ from pyproj.transformer import TransformerGroup
 
 from photoplan.errors import InputError
 
+#: A hundredth of a degree on the earth, metres.
+_HUNDREDTH = 6.371e6 * np.pi / 180.0 / 100.0
+
 
 @lru_cache(maxsize=256)
 def parse_crs(text: str, where: str = "CRS") -> CRS:
@@ -33,13 +36,41 @@ def parse_crs(text: str, where: str = "CRS") -> CRS:
         The text is not a CRS.
     """
     try:
-        return CRS.from_user_input(text.strip())
+        crs = CRS.from_user_input(text.strip())
+        why = "" if text.strip()[:5].upper() == "EPSG:" else _unusable(crs)
     except CRSError as error:
-        reason = str(error).split(":")[-1].strip(" )")
+        why = str(error).split(":")[-1].strip(" )")
+    if why:
         raise InputError(
-            f"{where}: {text[:120]!r} is not a coordinate reference system ({reason}); "
+            f"{where}: {text[:120]!r} is not a coordinate reference system ({why}); "
             "give EPSG:nnnn, WKT or a PROJ string"
-        ) from None
+        )
+    return crs
+
+
+#: A map's metre on the ground: units are converted, projections stretch, the moon is small.
+_SCALES = 0.1, 10.0
+
+
+def _unusable(crs: CRS) -> str:
+    """Why a projected CRS describes no map, though it is well formed: numbers may have any size in WKT; else empty."""
+    if not crs.is_projected:
+        return ""
+    # Some of these places are near the middle of any map.
+    lon, lat = (v.ravel() for v in np.meshgrid(np.arange(-180.0, 180.0, 15.0), np.arange(-75.0, 80.0, 25.0)))
+    try:
+        transformer = Transformer.from_crs(crs.geodetic_crs, crs, always_xy=True)
+        x, y = transformer.transform(lon, lat)
+        north = transformer.transform(lon, lat + 0.01)
+        back = transformer.transform(x, y, direction="INVERSE")
+    except ProjError:
+        return "PROJ cannot compute with its numbers"
+    with np.errstate(all="ignore"):
+        turned = (back[0] - lon + 180.0) % 360.0 - 180.0
+        scale = np.hypot(north[0] - x, north[1] - y) * crs.axis_info[0].unit_conversion_factor / _HUNDREDTH
+        close = np.hypot(turned, back[1] - lat) < 1e-6
+        usable = close & (scale > _SCALES[0]) & (scale < _SCALES[1])
+    return "" if usable.any() else "nowhere on earth is one of its metres near a metre: a number of it is wrong"
 
 
 def require_projected_metres(text: str, where: str = "CRS") -> CRS:

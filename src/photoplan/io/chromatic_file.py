@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, Strict
 
 from photoplan.io.camera.model import Entry, Number, Pair, Pixels
-from photoplan.io.disk import write_atomically
+from photoplan.io.naming import write_atomically
 from photoplan.io.plain_files import read_entries
 from photoplan.io.project.write import toml_value
 

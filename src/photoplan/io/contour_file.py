@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from pyogrio.errors import DataLayerError, DataSourceError
 
 from photoplan.errors import UsageError
-from photoplan.io.disk import disk_error, sync_file, sync_folder
+from photoplan.io.disk import disk_error
 from photoplan.io.lock import FileLock
+from photoplan.io.naming import give_name, together
 from photoplan.io.product import check_output
 
 #: Ending of the name and the driver that writes it.
@@ -129,10 +130,9 @@ def write_contours(
             else:
                 _write_layers([folder / file.name for file in files], lines, labels, crs)
             # The main file comes last: where it is, its companions are.
-            for part in sorted(folder.iterdir(), key=lambda p: (p.name == path.name, p.name)):
-                sync_file(part)
-                part.replace(path.with_name(part.name))
-            sync_folder(path.parent)
+            with together():
+                for part in sorted(folder.iterdir(), key=lambda p: (p.name == path.name, p.name)):
+                    give_name(part, path.with_name(part.name))
         finally:
             shutil.rmtree(folder, ignore_errors=True)
             lock.release()

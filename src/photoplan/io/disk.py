@@ -77,24 +77,3 @@ def sync_folder(path: Path) -> None:
         pass
     finally:
         os.close(descriptor)
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a small file so that its name holds either the old or the whole new content.
-
-    Raises
-    ------
-    ResourceError, UsageError
-        See `disk_error`.
-    """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        try:
-            partial.write_bytes(content)
-            sync_file(partial)
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
-        sync_folder(path.parent)
-    except OSError as error:
-        raise disk_error(path, error) from error

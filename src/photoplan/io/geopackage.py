@@ -16,7 +16,8 @@ from pyogrio.errors import DataSourceError
 
 from photoplan.cameras.observed import ImagePoints
 from photoplan.errors import UsageError
-from photoplan.io.disk import disk_error, sync_file, sync_folder
+from photoplan.io.disk import disk_error
+from photoplan.io.naming import give_name
 from photoplan.io.tables import write_table
 
 
@@ -60,11 +61,9 @@ def write_geopackage(path: Path, layers: Sequence[VectorLayer], crs: str) -> Non
                     crs=crs,
                     append=partial.exists(),
                 )
-            sync_file(partial)
-            partial.replace(path)
+            give_name(partial, path)
         finally:
             partial.unlink(missing_ok=True)
-        sync_folder(path.parent)
     except DataSourceError as error:
         raise UsageError(f"{path}: cannot be written ({error}); choose a folder that can be written") from error
     except OSError as error:

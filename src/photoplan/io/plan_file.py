@@ -14,6 +14,7 @@ import shapely
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
+from photoplan.io.naming import give_name
 
 FORMAT = 2
 _HEADER = "photoplan_plan"
@@ -73,7 +74,7 @@ def write_plan_tables(path: Path, plan: PlanTables, overwrite: bool = False) -> 
                 (_HEADER, _HEADER),
             )
         db.close()
-        partial.replace(path)
+        give_name(partial, path)
     finally:
         partial.unlink(missing_ok=True)
 

@@ -14,14 +14,16 @@ import rasterio.crs
 import rasterio.transform
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.errors import PhotoplanError, ResourceError, UsageError
+from photoplan.errors import InputError, PhotoplanError, ResourceError, UsageError
 from photoplan.geometry.grid import Placement, Window
-from photoplan.io.disk import disk_error, free_megabytes, sync_file, sync_folder
-from photoplan.io.gdal import GDAL_ERRORS, first_cause
+from photoplan.io.disk import disk_error, free_megabytes
+from photoplan.io.gdal import GDAL_ERRORS, first_cause, open_raster
 from photoplan.io.image_form import ImageForm, dress
 from photoplan.io.lock import FileLock, lock_of
+from photoplan.io.naming import give_name, is_unfinished, standing, when_named
 from photoplan.io.plain_tiff import write_plain_tiff
 from photoplan.io.product_check import check_product
+from photoplan.io.run_record import record_path, refuse_foreign_record
 from photoplan.io.storage import PRODUCT_TYPES, BlockCoder, CogOptions, Nodata, nodata_for, write_cog
 from photoplan.io.tile_log import TileLog
 
@@ -61,8 +63,22 @@ def check_output(path: Path, inputs: Sequence[Path | str] = (), *, overwrite: bo
             raise UsageError(f"{path}: the output is the input {source}; choose another output")
     if path.is_dir():
         raise UsageError(f"{path}: is a folder; give the name of a file")
-    if not overwrite and (path.exists() or path.is_symlink()):
+    if overwrite:
+        return
+    if (path.exists() or path.is_symlink()) and not is_unfinished(path):
         raise UsageError(f"{path}: exists already; choose another output or say `overwrite`")
+    refuse_foreign_record(record_path(path))
+
+
+def is_product(path: Path) -> bool:
+    """Whether a file is a raster that `ProductFile` wrote for a product with a key among its tags."""
+    if not path.is_file():
+        return False
+    try:
+        with open_raster(path, "GTiff") as dataset:
+            return "PHOTOPLAN_KEY" in dataset.tags()
+    except InputError:
+        return False
 
 
 @dataclass(eq=False)
@@ -243,11 +259,9 @@ class ProductFile:
             try:
                 part = self._assemble(log, tags or {})
                 self._check(log, part)
-                sync_file(part)
                 # The last look before the name is taken: another program may have made the file meanwhile.
                 check_output(self.path, self.inputs, overwrite=self.overwrite)
-                part.replace(self.path)
-                sync_folder(self.path.parent)
+                give_name(part, self.path)
             finally:
                 self._remove_parts()
         except OSError as error:
@@ -259,8 +273,7 @@ class ProductFile:
         except PhotoplanError as error:
             raise self._unwritten(str(error)) from error
         facts = self._facts(log)
-        log.remove()
-        self._log = None
+        when_named(log.remove)
         return facts
 
     def _open_log(self) -> TileLog:
@@ -350,7 +363,7 @@ class ProductFile:
         notes = [log.notes(i) for i in log.finished]
         return ProductFacts(
             self.path,
-            self.path.stat().st_size,
+            standing(self.path).stat().st_size,
             len(self._windows),
             sum(log.place(i)[1] == 0 for i in log.finished),
             sum(count for _, count in notes) / self.placement.window.size,

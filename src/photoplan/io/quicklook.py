@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.io.checks import check_plain_file, raster_driver
-from photoplan.io.disk import write_atomically
 from photoplan.io.gdal import GDAL_ERRORS, first_cause, gdal_settings, not_georeferenced, open_raster
+from photoplan.io.naming import write_atomically
 
 _PERCENT = 2.0, 98.0
+_SOFTWARE = "photoplan"
 
 
 def write_quicklook(product: Path, picture: Path, *, max_side: int = 1600) -> Path:
@@ -111,6 +112,25 @@ def write_overview(products: Sequence[Path], picture: Path, *, max_side: int = 1
     return _write_png(picture, canvas)
 
 
+def refuse_foreign_overview(picture: Path) -> None:
+    """Refuse to replace a picture that is none of `write_overview`.
+
+    Raises
+    ------
+    UsageError
+        Naming it.
+    """
+    if not picture.exists():
+        return
+    try:
+        with not_georeferenced(), open_raster(picture, "PNG") as dataset:
+            own = dataset.tags().get("Software") == _SOFTWARE
+    except InputError:
+        own = False
+    if not own:
+        raise UsageError(f"{picture}: stands where the quick look goes; move it away, or say `overwrite`")
+
+
 @dataclass(frozen=True)
 class _Sheet:
     """Where a product lies on the map."""
@@ -171,8 +191,10 @@ def _write_png(picture: Path, rgba: NDArray[np.uint8]) -> Path:
     """Encode in memory and put the file in place at once."""
     with not_georeferenced(), gdal_settings(GDAL_PAM_ENABLED=False), rasterio.MemoryFile() as memory:
         profile = {"driver": "PNG", "width": rgba.shape[2], "height": rgba.shape[1], "count": 4, "dtype": "uint8"}
+        profile["WRITE_METADATA_AS_TEXT"] = "YES"
         with memory.open(**profile) as dataset:
             dataset.write(rgba)
+            dataset.update_tags(Software=_SOFTWARE)
         content = memory.read()
     write_atomically(Path(picture), content)
     return Path(picture)

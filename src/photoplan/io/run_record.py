@@ -5,10 +5,12 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields
 from datetime import UTC, datetime
 from functools import cache
@@ -21,9 +23,9 @@ import rasterio
 
 from photoplan import __version__
 from photoplan.errors import UsageError
-from photoplan.io.disk import write_atomically
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.gdal import gdal_settings, not_georeferenced
+from photoplan.io.naming import together, write_atomically
 from photoplan.plain import json_text
 
 try:
@@ -62,6 +64,26 @@ def record_path(product: Path) -> Path:
     return product.with_name(f"{product.stem}.run.json")
 
 
+def refuse_foreign_record(path: Path) -> None:
+    """Refuse to replace a file that has the name of a run record and is none.
+
+    Raises
+    ------
+    UsageError
+        Naming it.
+    """
+    if os.path.exists(path) and _read_record(path) is None:  # noqa: PTH110 - a name may be too long for `Path.exists`
+        raise UsageError(f"{path}: is no run record and stands where one goes; move it away, or say `overwrite`")
+
+
+def _read_record(path: Path) -> dict[str, Any] | None:
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return record if isinstance(record, dict) and {"file", "key", "inputs", "versions"} <= record.keys() else None
+
+
 def input_entry(path: Path | str, digest: str | None = None) -> dict[str, Any]:
     """How a record names an input; its digest is sampled if it is not known."""
     return {"path": path, "sampled_sha256": digest or fingerprint(path).digest, "size": Path(path).stat().st_size}
@@ -86,8 +108,11 @@ def _of_files(value: Any) -> bool:
     )
 
 
-def recording(kind: str, request: Any, inputs: Iterable[Any]) -> Callable[[Iterable[Path | None], Any], None]:
+@contextmanager
+def recording(kind: str, request: Any, inputs: Iterable[Any]) -> Iterator[Callable[[Iterable[Path | None], Any], None]]:
     """The record of a command that measures or converts: what it reads is looked at now, before it changes any of it.
+
+    What is written inside gets its names together with the record, see `photoplan.io.naming.together`.
 
     Parameters
     ----------
@@ -97,8 +122,8 @@ def recording(kind: str, request: Any, inputs: Iterable[Any]) -> Callable[[Itera
     inputs : iterable
         Files; what is none (a word, or missing and not needed) is passed over.
 
-    Returns
-    -------
+    Yields
+    ------
     callable
         Takes the files that were written, None among them passed over, and the figures. Writes the record beside the
         first of them; `PROJECT.KIND.run.json` beside a project that was changed; nothing if there are none.
@@ -120,7 +145,8 @@ def recording(kind: str, request: Any, inputs: Iterable[Any]) -> Callable[[Itera
             told = {"kind": kind, "product": product, "settings": settings, "files": files}
             write_run_record(files[0], path=path, key=key, inputs=entries, run=times(), **told)
 
-    return record
+    with together():
+        yield record
 
 
 def write_run_record(
@@ -174,10 +200,8 @@ def _entry(each: Path | Mapping[str, Any]) -> Mapping[str, Any]:
 
 def _of_another(path: Path, product: Path) -> bool:
     """Whether a record belongs to another file of the same name but for its extension, such as a model and a raster."""
-    try:
-        other = json.loads(path.read_text(encoding="utf-8"))["file"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
+    record = _read_record(path)
+    other = product.name if record is None else record["file"]
     return other != product.name and product.with_name(str(other)).exists()
 
 

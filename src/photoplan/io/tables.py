@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError, UsageError
 from photoplan.io.appearance import looks_like
-from photoplan.io.disk import disk_error, write_atomically
+from photoplan.io.disk import disk_error
+from photoplan.io.naming import write_atomically
 from photoplan.io.table_lines import DELIMITERS, NOTHING, Line, decimal, line_blocks, number, split_line
 
 MAX_BYTES = 1_000_000_000

@@ -13,8 +13,9 @@ import rasterio
 from numpy.typing import NDArray
 
 from photoplan.errors import PhotoplanError, UsageError
-from photoplan.io.disk import disk_error, sync_file, sync_folder
+from photoplan.io.disk import disk_error
 from photoplan.io.gdal import GDAL_ERRORS, gdal_settings
+from photoplan.io.naming import give_name
 
 _TYPES = ("uint8", "uint16", "int16", "float32")
 
@@ -59,12 +60,10 @@ def write_whole_image(path: Path, values: NDArray[Any], tags: Mapping[str, str] 
             with gdal_settings(GDAL_PAM_ENABLED=False), rasterio.open(part, "w", **profile) as dataset:
                 dataset.write(bands)
                 dataset.update_tags(**dict(tags or {}))
-            sync_file(part)
             _check(part, bands, path)
-            part.replace(path)
+            give_name(part, path)
         finally:
             part.unlink(missing_ok=True)
-        sync_folder(path.parent)
     except OSError as error:
         raise disk_error(path, error) from error
     except GDAL_ERRORS as error:

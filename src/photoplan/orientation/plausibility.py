@@ -185,7 +185,8 @@ def other_reading(views: Sequence[View], images: Sequence[ImagePlausibility], he
     if not ranked:
         return None
     equal = [r.sentence for rank, r, _ in ranked if rank == ranked[0][0]]
-    return _sentence(" — or: ".join(equal[:3]), declared, ranked[0][2])
+    lines = _alignment(views, DECLARED), _alignment(views, ranked[0][1])
+    return _sentence(" — or: ".join(equal[:3]), (declared, ranked[0][2]), lines)
 
 
 @dataclass(frozen=True)
@@ -281,26 +282,32 @@ def _alignment(views: list[View], reading: OtherReading) -> tuple[float, float]:
     XY = np.array([center[:2] for center, _ in posed])
     if len(XY) < 2:
         return 1.0, 0.0
-    from scipy.spatial import cKDTree  # noqa: PLC0415 - a quarter second of each start, and only for readings in doubt
-
-    nearest = np.asarray(cKDTree(XY).query(XY, k=2)[1])[:, 1]
-    to = XY[nearest] - XY
+    apart = np.linalg.norm(XY[:, None] - XY, axis=2)
+    np.fill_diagonal(apart, np.inf)
+    to = XY[apart.argmin(axis=1)] - XY
     line = np.arctan2(to[:, 1], to[:, 0])
     kappa = np.array([np.arctan2(R[1, 0], R[0, 0]) for _, R in posed])
     mean = np.mean(np.exp(4j * (kappa - line)))
     return float(np.abs(mean)), float(np.degrees(np.angle(mean)) / 4)
 
 
-def _sentence(what: str, before: list[ImagePlausibility], after: list[ImagePlausibility]) -> str:
+def _sentence(
+    what: str, seen: tuple[list[ImagePlausibility], list[ImagePlausibility]], lines: tuple[tuple[float, float], ...]
+) -> str:
+    """What would have to be declared, and what is better then: tilts, middles on the terrain, axes and flight lines."""
+
     def tilts(images: list[ImagePlausibility]) -> str:
         low, high = min(i.tilt for i in images), max(i.tilt for i in images)
         return f"{low:.0f}–{high:.0f}°" if round(low) != round(high) else f"{low:.0f}°"
 
-    def middles(images: list[ImagePlausibility]) -> int:
-        return sum(i.middle_on_terrain for i in images)
+    def middles(images: list[ImagePlausibility]) -> str:
+        return f"{sum(i.middle_on_terrain for i in images)} of {len(images)} images look at the terrain"
 
+    def axes(alike: float, offset: float) -> str:
+        return f"{abs(offset):.0f}° off the flight lines" if alike > 0.85 else "in no relation to the flight lines"
+
+    pairs = [[tell(images) for images in seen] for tell in (tilts, middles)] + [[axes(*each) for each in lines]]
+    forms = "tilts are then {1} instead of {0}", "{1} instead of {0}", "image axes are {1} instead of {0}"
+    told = [form.format(*pair) for form, pair in zip(forms, pairs) if pair[0] != pair[1]]
     where = "; it is declared to `photoplan init`, or under [orientation] in the project file" if "`" in what else ""
-    return (
-        f"{what}: tilts are then {tilts(after)} instead of {tilts(before)}, and of {len(after)} images "
-        f"{middles(after)} look at the terrain instead of {middles(before)}{where}"
-    )
+    return f"{what}: {', '.join(told)}{where}"

@@ -12,10 +12,10 @@ from photoplan.cameras.base import CentralCamera
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.local import MEAN_RADIUS
 from photoplan.io.project.model import Project
-from photoplan.orientation.plausibility import ImagePlausibility, View, other_reading
+from photoplan.orientation.plausibility import ImagePlausibility, View
 from photoplan.plain import pick
 from photoplan.plan.footprint import Footprint, footprint, mean_gsd
-from photoplan.products.judged import against_files, judged
+from photoplan.products.judged import against_files, judged, reading_of_block
 from photoplan.products.orthophoto.plan import two_figures
 from photoplan.project.ground import Ground, ground_of
 from photoplan.project.scene import camera_without_pixels, is_there, map_order, open_scene
@@ -92,8 +92,7 @@ class ProjectCheck:
         closing = [f"sensible resolution {self.sensible_resolution:g} m"]
         if not self.implausible and self.alternative is None:
             closing.append("all plausible")
-        alternative = [] if self.alternative is None else [self.alternative]
-        return "\n".join([*lines, " · ".join(closing), *alternative, *self.advice])
+        return "\n".join([*lines, " · ".join(closing), *self.advice])
 
 
 def check_project(project: Project, images: Sequence[str] | None = None) -> ProjectCheck:
@@ -124,7 +123,7 @@ def check_project(project: Project, images: Sequence[str] | None = None) -> Proj
         two_figures(float(np.mean(gsds))) if gsds else float("nan"),
         (*ground.height_systems, ground.working_system),
         project.crs,
-        other_reading(views, looks, ground.surface.heights),
+        reading_of_block(project, dict(zip(names, zip(views, looks))), ground),
         _advice(project, checks),
     )
 

@@ -174,27 +174,27 @@ def locate_fiducials(
     project = _project(request)
     jobs = _jobs(request, project)
     pixel_mm = sum(parse_pitch(request.scan_resolution)) / 2 if request.scan_resolution else None
-    record = recording("fiducials", request, [*request.images, request.camera, *(job.file for job in jobs)])
-    results: list[ImageFiducials] = []
-    failed: dict[str, str] = {}
-    unfound: list[UnfoundFiducials] = []
-    events.begin("fiducial marks", len(jobs), "images")
-    for job in jobs:
-        try:
-            results.append(_locate(request, job, pixel_mm, project is not None))
-        except ResourceError:
-            raise
-        except PhotoplanError as error:
-            failed[job.name] = f"{job.file}: {error}" if isinstance(error, MarksNotFound) else str(error)
-            if isinstance(error, MarksNotFound):
-                unfound.append(UnfoundFiducials(job.name, job.file, request.band, job.layout, error.sought))
-        events.done()
-    written = None
-    if project is not None and results and not request.dry_run:
-        written = request.images[0]
-        edit_project(written, ProjectChanges(images={r.name: _entries(project, r) for r in results}))
-    report = FiducialsReport(tuple(results), failed, tuple(unfound), written)
-    record([written], report)
+    with recording("fiducials", request, [*request.images, request.camera, *(job.file for job in jobs)]) as record:
+        results: list[ImageFiducials] = []
+        failed: dict[str, str] = {}
+        unfound: list[UnfoundFiducials] = []
+        events.begin("fiducial marks", len(jobs), "images")
+        for job in jobs:
+            try:
+                results.append(_locate(request, job, pixel_mm, project is not None))
+            except ResourceError:
+                raise
+            except PhotoplanError as error:
+                failed[job.name] = f"{job.file}: {error}" if isinstance(error, MarksNotFound) else str(error)
+                if isinstance(error, MarksNotFound):
+                    unfound.append(UnfoundFiducials(job.name, job.file, request.band, job.layout, error.sought))
+            events.done()
+        written = None
+        if project is not None and results and not request.dry_run:
+            written = request.images[0]
+            edit_project(written, ProjectChanges(images={r.name: _entries(project, r) for r in results}))
+        report = FiducialsReport(tuple(results), failed, tuple(unfound), written)
+        record([written], report)
     return report
 
 

@@ -21,7 +21,7 @@ from photoplan.io.image_metadata import read_image_metadata
 from photoplan.io.orientation.exif import SUFFIXES
 from photoplan.io.orientation.table import OrientationTable
 from photoplan.io.project.model import Image, Project
-from photoplan.orientation.plausibility import ImagePlausibility, View, look
+from photoplan.orientation.plausibility import ImagePlausibility, View, look, other_reading
 from photoplan.project.ground import Ground
 from photoplan.project.scene import is_there, pose_of, view_of
 
@@ -35,6 +35,8 @@ _TURN, _CLEAR = 0.2, 6.0
 _SHIFT, _ALIKE = 50.0, 10.0
 #: Images needed before their common way is judged.
 _ENOUGH = 4
+#: Images that are looked at for the reading of a block, if fewer are asked for.
+_NEIGHBOURS = 40
 
 
 def judged(project: Project, image: Image, ground: Ground) -> tuple[View, ImagePlausibility]:
@@ -50,6 +52,27 @@ def judged(project: Project, image: Image, ground: Ground) -> tuple[View, ImageP
     found = look(view, ground.surface.heights)
     odd = area_fault(project.crs, center) or position_fault(project, image)
     return view, found if odd is None else replace(found, fault=odd)
+
+
+def reading_of_block(
+    project: Project, seen: Mapping[str, tuple[View, ImagePlausibility]], ground: Ground
+) -> str | None:
+    """The reading of the orientation that would fit better than the declared one, see `other_reading`.
+
+    Few images say little of tilts and flight lines: the other images of the block beside them are looked at, too.
+    """
+    looked = dict(seen)
+    first = next((view.center for view, _ in looked.values()), None)
+    others = [image for image in project.images if image.center is not None and image.name not in looked]
+    if first is not None and len(looked) < _NEIGHBOURS:
+        others.sort(key=lambda image: float(np.hypot(*(np.array(image.center)[:2] - first[:2]))))
+        for image in others[: _NEIGHBOURS - len(looked)]:
+            view = view_of(
+                image, project.cameras[image.camera], project.orientation, pose_of(project, image, ground).center
+            )
+            looked[image.name] = view, look(view, ground.surface.heights)
+    views, looks = [view for view, _ in looked.values()], [found for _, found in looked.values()]
+    return other_reading(views, looks, ground.surface.heights)
 
 
 def geodetic_positions(files: Iterable[Path | None]) -> _Floats:

@@ -112,36 +112,36 @@ def monoplot_file(request: MonoplotRequest) -> MonoplotReport:
     if request.vectors is not None and request.vectors.suffix.lower() != ".gpkg":
         raise UsageError(f"{request.vectors}: vectors are written as GeoPackage; give a name that ends with .gpkg")
     terrain = project.terrain and project.terrain.file
-    record = recording("monoplot", request, [*inputs[:2], terrain and project.resolve(terrain)])
-    name = _image_name(project, request.image)
-    given = _read(request)
-    camera, ground = camera_without_pixels(project, name), ground_of(project)
-    mesh, sigma = _mesh_and_sigma(project, ground)
-    if request.sigma_terrain is not None:
-        sigma = request.sigma_terrain
-    notes = []
-    if sigma is None:
-        notes.append("no standard deviations: the terrain has none of its own; give `sigma_terrain` METRES")
-    pose = pose_of(project, project.image(name), ground)
-    unit = project.orientation.angle_unit
-    errors = MonoplotErrors(
-        request.sigma_image,
-        sigma,
-        request.sigma_position,
-        tuple(float(a) for a in angle_in_radians(np.array(request.sigma_angles), unit)),  # type: ignore[arg-type]
-        _axes(pose.R_ground_camera, project.orientation.rotation),
-    )
-    seen = footprint(camera, ground.surface, ground.bounds)
-    found = monoplot(camera, given.xy, ground.surface, seen.height_range, errors, mesh)
-    if (found.reasons != "").all():
-        bounds = "nowhere" if seen.bounds is None else " ".join(f"{v:.8g}" for v in seen.bounds)
-        center = " ".join(f"{v:.8g}" for v in camera.center)
-        notes.append(f"no point is on the ground; camera at {center}, terrain in its reach {bounds}")
-    _write_table(request.output, given, found)
-    if request.vectors is not None:
-        _write_vectors(request.vectors, given, found, project.crs)
-    report = _report(request, found, ground.working_system, notes)
-    record([request.output, request.vectors], report)
+    with recording("monoplot", request, [*inputs[:2], terrain and project.resolve(terrain)]) as record:
+        name = _image_name(project, request.image)
+        given = _read(request)
+        camera, ground = camera_without_pixels(project, name), ground_of(project)
+        mesh, sigma = _mesh_and_sigma(project, ground)
+        if request.sigma_terrain is not None:
+            sigma = request.sigma_terrain
+        notes = []
+        if sigma is None:
+            notes.append("no standard deviations: the terrain has none of its own; give `sigma_terrain` METRES")
+        pose = pose_of(project, project.image(name), ground)
+        unit = project.orientation.angle_unit
+        errors = MonoplotErrors(
+            request.sigma_image,
+            sigma,
+            request.sigma_position,
+            tuple(float(a) for a in angle_in_radians(np.array(request.sigma_angles), unit)),  # type: ignore[arg-type]
+            _axes(pose.R_ground_camera, project.orientation.rotation),
+        )
+        seen = footprint(camera, ground.surface, ground.bounds)
+        found = monoplot(camera, given.xy, ground.surface, seen.height_range, errors, mesh)
+        if (found.reasons != "").all():
+            bounds = "nowhere" if seen.bounds is None else " ".join(f"{v:.8g}" for v in seen.bounds)
+            center = " ".join(f"{v:.8g}" for v in camera.center)
+            notes.append(f"no point is on the ground; camera at {center}, terrain in its reach {bounds}")
+        _write_table(request.output, given, found)
+        if request.vectors is not None:
+            _write_vectors(request.vectors, given, found, project.crs)
+        report = _report(request, found, ground.working_system, notes)
+        record([request.output, request.vectors], report)
     return report
 
 

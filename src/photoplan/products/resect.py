@@ -105,25 +105,25 @@ def resect_project(request: ResectRequest, events: Events = SILENT) -> ResectRes
     project = _overridden(load_project(request.project), request)
     names = project.select(request.images or None)
     inputs = read_inputs(project, names)
-    record = recording("resect", request, [request.project, *inputs.files])
-    counts = {name: len(control_rows(inputs, name)) for name in names}
-    wanted = [n for n in names if request.images or counts[n] >= _LEAST]
-    _refuse(inputs, wanted, counts, settings)
-    done: list[ResectedImage] = []
-    failed: dict[str, str] = {}
-    for name in wanted:
-        try:
-            done.append(resect_image(inputs, project.image(name), settings))
-        except PhotoplanError as error:
-            text = str(error)
-            failed[name] = text if repr(name) in text else f"image {name!r}: {text}"
-        events.done()
-    written = bool(done) and not request.dry_run
-    left = tuple(n for n in names if n not in wanted)
-    result = ResectResult(request.project, tuple(done), failed, left, written, inputs.notes)
-    if written:
-        edit_project(request.project, _changes(done))
-        record([request.project], result)
+    with recording("resect", request, [request.project, *inputs.files]) as record:
+        counts = {name: len(control_rows(inputs, name)) for name in names}
+        wanted = [n for n in names if request.images or counts[n] >= _LEAST]
+        _refuse(inputs, wanted, counts, settings)
+        done: list[ResectedImage] = []
+        failed: dict[str, str] = {}
+        for name in wanted:
+            try:
+                done.append(resect_image(inputs, project.image(name), settings))
+            except PhotoplanError as error:
+                text = str(error)
+                failed[name] = text if repr(name) in text else f"image {name!r}: {text}"
+            events.done()
+        written = bool(done) and not request.dry_run
+        left = tuple(n for n in names if n not in wanted)
+        result = ResectResult(request.project, tuple(done), failed, left, written, inputs.notes)
+        if written:
+            edit_project(request.project, _changes(done))
+            record([request.project], result)
     return result
 
 

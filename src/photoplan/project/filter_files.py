@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io.disk import write_atomically
 from photoplan.io.filter_file import FilterEntries, KernelEntry, filter_text, plain_fact, read_filter_file
+from photoplan.io.naming import write_atomically
 from photoplan.io.product import check_output
 from photoplan.quality.restoration.filters import FilterKernel, RestorationFilter
 

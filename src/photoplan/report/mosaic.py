@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from photoplan.io.disk import write_atomically
+from photoplan.io.naming import write_atomically
 from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, PURPLE, RED, SKY, load_matplotlib, png, shortened
 
 #: Images of smaller regions get no name in the picture, part of the whole.

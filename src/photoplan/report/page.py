@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from photoplan.errors import UsageError
-from photoplan.io.disk import disk_error, write_atomically
+from photoplan.io.disk import disk_error
+from photoplan.io.naming import write_atomically
 from photoplan.io.product import check_output
 from photoplan.io.project.file import load_project
 from photoplan.project.scene import input_files

@@ -6,7 +6,8 @@ from importlib import import_module
 from pathlib import Path
 
 from photoplan.errors import InputError, UsageError
-from photoplan.io.disk import disk_error, write_atomically
+from photoplan.io.disk import disk_error
+from photoplan.io.naming import write_atomically
 from photoplan.io.orientation.block import OrientationBlock, OrientationFormat
 from photoplan.io.orientation.table import OrientationTable, TableFormat
 from photoplan.io.plain_files import read_head

@@ -12,7 +12,7 @@ from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT, Table
 
 from photoplan.errors import InputError
-from photoplan.io.disk import write_atomically
+from photoplan.io.naming import write_atomically
 from photoplan.io.plain_files import MAX_BYTES, read_text
 from photoplan.io.project.file import parse_project
 from photoplan.io.project.model import Project

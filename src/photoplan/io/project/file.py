@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from photoplan.errors import InputError
 from photoplan.geometry.crs import require_projected_metres
 from photoplan.geometry.heights import check_height_system
-from photoplan.io.disk import write_atomically
+from photoplan.io.naming import write_atomically
 from photoplan.io.plain_files import read_toml
 from photoplan.io.project.errors import explain
 from photoplan.io.project.model import Project

@@ -20,8 +20,9 @@ from photoplan.errors import PhotoplanError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.crs import parse_crs
 from photoplan.geometry.heights import height_label
-from photoplan.io.disk import disk_error, sync_file, sync_folder
+from photoplan.io.disk import disk_error
 from photoplan.io.lock import FileLock
+from photoplan.io.naming import give_name
 from photoplan.io.product import check_output
 from photoplan.io.terrain.export_mesh import MeshPart, mesh_parts
 from photoplan.surfaces.units import LineElement, Unit, UnitSource
@@ -60,10 +61,8 @@ def replacing(path: Path, inputs: Sequence[Path | str] = (), overwrite: bool = F
         try:
             try:
                 yield part
-                sync_file(part)
                 check_output(path, inputs, overwrite=overwrite)
-                part.replace(path)
-                sync_folder(path.parent)
+                give_name(part, path)
             finally:
                 for left in (part, part.with_name(part.name + ".faces")):
                     left.unlink(missing_ok=True)

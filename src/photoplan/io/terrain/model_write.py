@@ -20,9 +20,10 @@ import shapely
 
 from photoplan import __version__
 from photoplan.errors import PhotoplanError, ResourceError, UsageError
-from photoplan.io.disk import disk_error, free_megabytes, sync_file, sync_folder
+from photoplan.io.disk import disk_error, free_megabytes
 from photoplan.io.gdal import GDAL_ERRORS, first_cause
 from photoplan.io.lock import FileLock, lock_of
+from photoplan.io.naming import give_name, standing, when_named
 from photoplan.io.product import check_output
 from photoplan.io.terrain.model_blob import check_unit, inflate, pack_line, pack_unit, unit_of
 from photoplan.io.terrain.model_layers import write_border, write_gross, write_heights, write_lines, write_units
@@ -193,20 +194,17 @@ class ModelWriter:
             try:
                 identity = self._assemble(part, parts)
                 self._check(part, identity)
-                sync_file(part)
                 # The last look before the name is taken: another program may have made the file meanwhile.
                 check_output(self.path, self.inputs, overwrite=self.overwrite)
-                part.replace(self.path)
-                sync_folder(self.path.parent)
+                give_name(part, self.path)
             finally:
                 self._remove_parts()
         except OSError as error:
             raise disk_error(self.path, error) from error
         except _GPKG_ERRORS as error:
             raise self._unwritten(first_cause(error)) from error
-        log.remove()
-        self._log = None
-        return ModelReader(self.path)
+        when_named(log.remove)
+        return ModelReader(standing(self.path))
 
     def _assemble(self, part: Path, parts: ModelParts) -> str:
         """Make the file under a temporary name; returns its identity."""

@@ -15,9 +15,10 @@ import numpy as np
 
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.io.disk import disk_error, write_atomically
+from photoplan.io.disk import disk_error
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.geopackage import write_point_layers, write_residuals
+from photoplan.io.naming import write_atomically
 from photoplan.io.product import check_output
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
@@ -307,35 +308,35 @@ def _used(prepared: Prepared) -> str:
 
 def _write(request: AdjustRequest, result: MapResult, figures: AdjustFigures, data: dict[str, Any]) -> AdjustReport:
     folder, adjusted = request.folder, result.adjusted
-    record = recording("adjust", request, [request.project, *result.prepared.inputs.files])
-    changes = _changes(result)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise disk_error(folder, error) from error
-    write_point_layers(folder / "points.gpkg", point_layers(result, figures), result.prepared.frame.crs)
-    write_residuals(
-        folder / "image_points.csv",
-        result.prepared.inputs.points,
-        adjusted.residuals,
-        adjusted.normalised,
-        adjusted.redundancies,
-        adjusted.rejected,
-    )
-    write_atomically(folder / "report.json", json_text(data, indent=1).encode())
-    edit_project(request.project, changes)
-    written = tuple(folder / name for name in OUTPUTS)
-    figures_of_block = (
-        "sigma0",
-        "redundancy",
-        "unknowns",
-        "iterations",
-        "seconds",
-        "measurements",
-        "points",
-        "rejected",
-    )
-    record((*written, request.project), pick(figures, *figures_of_block))
+    with recording("adjust", request, [request.project, *result.prepared.inputs.files]) as record:
+        changes = _changes(result)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise disk_error(folder, error) from error
+        write_point_layers(folder / "points.gpkg", point_layers(result, figures), result.prepared.frame.crs)
+        write_residuals(
+            folder / "image_points.csv",
+            result.prepared.inputs.points,
+            adjusted.residuals,
+            adjusted.normalised,
+            adjusted.redundancies,
+            adjusted.rejected,
+        )
+        write_atomically(folder / "report.json", json_text(data, indent=1).encode())
+        edit_project(request.project, changes)
+        written = tuple(folder / name for name in OUTPUTS)
+        figures_of_block = (
+            "sigma0",
+            "redundancy",
+            "unknowns",
+            "iterations",
+            "seconds",
+            "measurements",
+            "points",
+            "rejected",
+        )
+        record((*written, request.project), pick(figures, *figures_of_block))
     return AdjustReport(written, figures, len(adjusted.images), data)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
-from photoplan.io.disk import write_atomically
+from photoplan.io.naming import write_atomically
 from photoplan.io.product import check_output
 from photoplan.io.series.file import Series, read_series
 from photoplan.io.series.pixels import Plane, grey_step, largest_of_steps

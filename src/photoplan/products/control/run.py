@@ -123,28 +123,34 @@ def propose_control(request: ControlRequest, events: Events = SILENT) -> Control
     def work(k: int) -> ImageControl:
         return control_of_image(names[k], photos[k], patches, covariances, settings)
 
-    record = recording("control", request, [request.project, *request.ortho, *input_files(project), request.heights])
-    events.begin("matching", len(names), "images")
-    with steps(output.name, request.workers, events) as run:
-        images = list(run(work, range(len(names))))
-    ground, points = _tables(patches, covariances, images)
-    if not len(points):
-        found = sum(i.matched for i in images)
-        advice = "give a larger `search`, another `correlation`, or an orthophoto of a similar date"
-        if not found:
-            reasons = sum((Counter(i.reasons) for i in images), Counter[str]())
-            listed = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common()) or "none is in an image"
-            raise GeometryError(f"no patch of the orthophoto was found in an image: {listed}; {advice}")
-        raise GeometryError(
-            f"{found} of {sum(i.tried for i in images)} patches were found, but they do not agree on an orientation of "
-            f"any image; {advice}"
+    with recording(
+        "control", request, [request.project, *request.ortho, *input_files(project), request.heights]
+    ) as record:
+        events.begin("matching", len(names), "images")
+        with steps(output.name, request.workers, events) as run:
+            images = list(run(work, range(len(names))))
+        ground, points = _tables(patches, covariances, images)
+        if not len(points):
+            found = sum(i.matched for i in images)
+            advice = "give a larger `search`, another `correlation`, or an orthophoto of a similar date"
+            if not found:
+                reasons = sum((Counter(i.reasons) for i in images), Counter[str]())
+                listed = (
+                    ", ".join(f"{count} {reason}" for reason, count in reasons.most_common()) or "none is in an image"
+                )
+                raise GeometryError(f"no patch of the orthophoto was found in an image: {listed}; {advice}")
+            raise GeometryError(
+                f"{found} of {sum(i.tried for i in images)} patches were found, but they do not agree on an "
+                f"orientation of any image; {advice}"
+            )
+        write_ground_points(output, ground)
+        write_image_points(image_output, points)
+        _enter(request.project, output, image_output)
+        sigma = (*_medians(ground.sigma[:, [0, 2]]), float(np.median(points.sigma)))
+        report = ControlReport(
+            output, image_output, len(patches), settings.resolution, len(ground), tuple(images), sigma
         )
-    write_ground_points(output, ground)
-    write_image_points(image_output, points)
-    _enter(request.project, output, image_output)
-    sigma = (*_medians(ground.sigma[:, [0, 2]]), float(np.median(points.sigma)))
-    report = ControlReport(output, image_output, len(patches), settings.resolution, len(ground), tuple(images), sigma)
-    record([output, image_output, request.project], report)
+        record([output, image_output, request.project], report)
     return report
 
 

@@ -20,6 +20,7 @@ from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import check_height_system, height_label
+from photoplan.io.naming import together, when_named
 from photoplan.io.product import check_output
 from photoplan.io.result_log import ResultLog
 from photoplan.io.run_record import run_times, write_run_record
@@ -143,21 +144,21 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
         header = ModelHeader(
             crs, system, plan.layout, asdict(request.settings), tuple(facts), built.fit.whole.name, totals
         )
-        writer.finish(ModelParts(header, built.lines, gross, plan.polygon, suspects))
-        kept.remove()
-    ran = times()
-    figures = {**totals, "crs": crs_label(crs), "height_system": system, "seconds": ran["seconds"]}
-    report = BuildReport(request.output, figures, gross, suspects, findings, built, measured)
-    told = report.json_fields() | {"findings": dict(Counter(f.kind for f in findings))}
-    write_run_record(
-        request.output,
-        key=key,
-        inputs=request.inputs,
-        run={"workers": request.workers, **ran},
-        kind="terrain model",
-        product=told,
-        settings=request.settings,
-    )
+        with together():
+            writer.finish(ModelParts(header, built.lines, gross, plan.polygon, suspects))
+            when_named(kept.remove)
+            ran = times()
+            figures = {**totals, "crs": crs_label(crs), "height_system": system, "seconds": ran["seconds"]}
+            report = BuildReport(request.output, figures, gross, suspects, findings, built, measured)
+            write_run_record(
+                request.output,
+                key=key,
+                inputs=request.inputs,
+                run={"workers": request.workers, **ran},
+                kind="terrain model",
+                product=report.json_fields() | {"findings": dict(Counter(f.kind for f in findings))},
+                settings=request.settings,
+            )
     return report
 
 

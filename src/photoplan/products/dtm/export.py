@@ -13,6 +13,7 @@ from photoplan.errors import InputError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.heights import crs_with_heights
+from photoplan.io.naming import together
 from photoplan.io.product import check_output
 from photoplan.io.terrain.export import TIN_SUFFIXES, replacing, write_points, write_tin
 from photoplan.products.dtm.raster import GridOptions, write_grid
@@ -134,13 +135,13 @@ def _export_raster(request: ExportRequest, terrain: OpenTerrain, events: Events)
 
     if request.sigma is not None and not isinstance(surface, HybridSurface):
         raise UsageError(f"{request.model}: a raster of heights has no standard deviations; leave `sigma` out")
-    facts = write_grid(request.output, grid.placement, np.float32, 1, "auto", heights, options)
     paths = [request.output]
-    if request.sigma is not None:
-        write_grid(
-            request.sigma, grid.placement, np.float32, 1, "auto", sigmas, replace(options, kind="standard deviations")
-        )
-        paths.append(request.sigma)
+    with together():
+        facts = write_grid(request.output, grid.placement, np.float32, 1, "auto", heights, options)
+        if request.sigma is not None:
+            of_sigmas = replace(options, kind="standard deviations")
+            write_grid(request.sigma, grid.placement, np.float32, 1, "auto", sigmas, of_sigmas)
+            paths.append(request.sigma)
     size = {"columns": grid.width, "rows": grid.height, "resolution": grid.resolution}
     return ExportReport(tuple(paths), {**size, "share_with_height": facts.valid_share})
 

@@ -17,6 +17,7 @@ from photoplan.engine.steps import steps
 from photoplan.errors import InputError, ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MapGrid, Window
+from photoplan.io.naming import together, when_named
 from photoplan.io.polygons import label_polygons, write_features
 from photoplan.io.product import check_output
 from photoplan.io.result_log import ResultLog
@@ -136,10 +137,11 @@ def dtm_flow(request: FlowRequest, events: Events = SILENT) -> FlowReport:
         (flow,) = run(partial(flow_of, cell=grid.resolution, outlets=cells, method=request.method), [heights])
     rows = [_row(flow, grid, number, name, cell) for number, ((name, *_), cell) in enumerate(zip(points, cells), 1)]
     depth = flow.filled - heights
-    _write(request, grid, flow, depth, options)
-    log.remove()
-    if request.catchments is not None:
-        _write_catchments(request.catchments, grid, flow, rows, terrain.crs)
+    with together():
+        if request.catchments is not None:
+            _write_catchments(request.catchments, grid, flow, rows, terrain.crs)
+        _write(request, grid, flow, depth, options)
+        when_named(log.remove)
     pixel = grid.resolution**2
     return FlowReport(
         path=request.output,

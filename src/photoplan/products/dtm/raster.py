@@ -17,6 +17,7 @@ from photoplan.errors import ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import Placement, Window, refuse_absurd
 from photoplan.io.disk import free_megabytes
+from photoplan.io.naming import together
 from photoplan.io.product import ProductFacts, ProductFile, check_output
 from photoplan.io.run_record import input_entry, run_key, run_times, settings_of, write_run_record
 from photoplan.io.storage import Nodata
@@ -149,18 +150,18 @@ def write_grid(
         complete=partial(_complete, file, dict(options.tags or {})),
     )
     options.events.begin(path.name, len(windows))
-    with pool:
+    with pool, together():
         (facts,) = Runner[ProductFacts](pool, None, options.events).run([work])
-    write_run_record(
-        path,
-        key=key,
-        inputs=inputs,
-        run={"workers": workers, **times()},
-        kind=options.kind,
-        product=facts,
-        settings=options.settings,
-        grid=placement,
-    )
+        write_run_record(
+            path,
+            key=key,
+            inputs=inputs,
+            run={"workers": workers, **times()},
+            kind=options.kind,
+            product=facts,
+            settings=options.settings,
+            grid=placement,
+        )
     return facts
 
 

@@ -15,7 +15,8 @@ from photoplan import __version__
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MapGrid, Window
-from photoplan.io.product import ProductFacts, check_output
+from photoplan.io.naming import standing, together
+from photoplan.io.product import check_output
 from photoplan.io.quicklook import write_quicklook
 from photoplan.io.storage import Nodata
 from photoplan.plain import pick
@@ -130,9 +131,10 @@ def make_picture(
     def tile(window: Window) -> GridTile:
         return made.tile(terrain, grid, window)
 
-    facts: ProductFacts = write_grid(request.output, grid.placement, made.dtype, made.bands, made.nodata, tile, options)
-    if request.preview is not None:
-        write_quicklook(request.output, request.preview, max_side=1200)
+    with together():
+        facts = write_grid(request.output, grid.placement, made.dtype, made.bands, made.nodata, tile, options)
+        if request.preview is not None:
+            write_quicklook(standing(request.output), request.preview, max_side=1200)
     return ShadingFacts(request.output, request.preview, made.kind, grid, made.settings, facts.valid_share, facts.bytes)
 
 

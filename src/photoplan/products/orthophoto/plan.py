@@ -22,7 +22,7 @@ from photoplan.io.fingerprint import fingerprint
 from photoplan.io.names import safe_stem
 from photoplan.io.project.model import Project
 from photoplan.io.storage import nodata_for
-from photoplan.orientation.plausibility import ImagePlausibility, View, other_reading
+from photoplan.orientation.plausibility import ImagePlausibility, View
 from photoplan.plan.accuracy import in_image
 from photoplan.plan.choice import BestImage, Drawn
 from photoplan.plan.compile import AnchorRule
@@ -30,7 +30,7 @@ from photoplan.plan.footprint import Footprint, covered_tiles, image_border, mea
 from photoplan.plan.owner import InSight, Ownership
 from photoplan.plan.product import ProductPlan
 from photoplan.plan.tiles import Tiles
-from photoplan.products.judged import judged
+from photoplan.products.judged import judged, reading_of_block
 from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.scene import Scene, map_order, open_scene
 from photoplan.project.scenes import ScenesAddress
@@ -195,15 +195,15 @@ def _painted(project: Project, settings: OrthoSettings) -> Project:
 def look_at(project: Project, names: Sequence[str], force: bool, events: Events) -> tuple[list[Looked], list[str]]:
     """Images that see terrain, and a line for each that sees none."""
     scenes: dict[str, Scene] = {}
-    seen: dict[int, tuple[View, ImagePlausibility]] = {}
+    seen: dict[str, tuple[View, ImagePlausibility]] = {}
     for place in map_order(project, names):
         # All that is asked of the terrain for one image, before the next: its blocks are then at hand.
         scenes[names[place]] = scene = open_scene(project, names[place])
         if scene.footprint.bounds is not None:
-            seen[place] = judged(project, project.image(names[place]), scene.ground)
+            seen[names[place]] = judged(project, project.image(names[place]), scene.ground)
         events.done()
     if not force:
-        _refuse_faults(seen, scenes)
+        _refuse_faults(project, seen, scenes)
     looked, blind = [], []
     for name, scene in ((name, scenes[name]) for name in names):
         if scene.footprint.bounds is None:
@@ -237,18 +237,20 @@ def refuse_blind(settings: OrthoSettings, products: Sequence[Any], blind: Sequen
         raise GeometryError(f"no image sees {where} (xmin ymin xmax ymax in metres):\n  " + "\n  ".join(blind))
 
 
-def _refuse_faults(seen: dict[int, tuple[View, ImagePlausibility]], scenes: dict[str, Scene]) -> None:
-    """Refuse what `check` calls a fault; images that see no terrain are told otherwise."""
-    faults = [found for _, found in seen.values() if found.fault is not None]
-    if not faults:
+def _refuse_faults(project: Project, seen: dict[str, tuple[View, ImagePlausibility]], scenes: dict[str, Scene]) -> None:
+    """Refuse what `check` calls a fault or read wrongly; images that see no terrain are told otherwise."""
+    if not seen:
         return
-    views, looks = zip(*(seen[place] for place in sorted(seen)))
-    other = other_reading(views, looks, scenes[faults[0].name].surface.heights)
-    raise GeometryError(
-        f"image {faults[0].name!r}: {faults[0].fault} ({len(faults)} of {len(seen)} images have such faults, "
-        f"`photoplan check` lists them); nothing is made of them unless you say `force`"
-        + ("" if other is None else f". {other}")
-    )
+    faults = [found for _, found in seen.values() if found.fault is not None]
+    other = reading_of_block(project, seen, scenes[next(iter(seen))].ground)
+    forced = "nothing is made of them unless you say `force`"
+    if faults:
+        raise GeometryError(
+            f"image {faults[0].name!r}: {faults[0].fault} ({len(faults)} of {len(seen)} images have such faults, "
+            f"`photoplan check` lists them); {forced}" + ("" if other is None else f". {other}")
+        )
+    if other is not None:
+        raise GeometryError(f"another reading of the orientations fits better; {forced}. {other}")
 
 
 def _refuse_too_fine(project: Project, resolution: float, settings: OrthoSettings, looked: Sequence[Looked]) -> None:

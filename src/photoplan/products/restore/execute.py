@@ -15,6 +15,7 @@ from photoplan.engine.run import Made, Tally, Work
 from photoplan.errors import PhotoplanError
 from photoplan.events import Events
 from photoplan.io.image_form import ImageForm, placement_of
+from photoplan.io.naming import standing, together
 from photoplan.io.product import ProductFacts, ProductFile
 from photoplan.io.quicklook import write_quicklook
 from photoplan.io.run_record import input_entry, recorded_result, run_times, write_run_record
@@ -192,37 +193,37 @@ def _complete(
     """Give the product its name, its record and its quick look."""
     if tally.failed:
         raise PhotoplanError(f"{job.target}: {tally.reasons[0]}; finished tiles are kept")
-    facts = file.complete(_tags(job))
-    reader = job.reader
-    aligned = reader.step(AlignStep)
-    if how.chromatic == "measure" and aligned is not None:
-        save_chromatic(job.chromatic_file, aligned.model)
-    ran = times()
-    nothing = [0] * reader.bands
-    result = RestoredImage(
-        image=reader.info.path.name,
-        path=job.target,
-        dtype=str(reader.dtype),
-        noise_gain=restoration_of(reader).restorer.filter.noise_gain,
-        below=tuple(tally.totals.get("below", nothing)),
-        above=tuple(tally.totals.get("above", nothing)),
-        valid_share=facts.valid_share,
-        pixels=reader.size[0] * reader.size[1],
-        tiles=job.tiles,
-        resumed=tally.resumed,
-        seconds=ran["seconds"],
-        picture=job.picture if how.quicklook else None,
-    )
-    # The record first: a disk that is full for the picture does not leave a result without it.
-    write_run_record(
-        job.target,
-        key=job.key,
-        inputs=[input_entry(reader.info.path, job.digest), *job.tools],
-        run={"workers": how.workers, "memory": how.memory, **ran},
-        **_record(job, how, result, facts),
-    )
-    if how.quicklook:
-        write_quicklook(job.target, job.picture)
+    with together():
+        facts = file.complete(_tags(job))
+        reader = job.reader
+        aligned = reader.step(AlignStep)
+        if how.chromatic == "measure" and aligned is not None:
+            save_chromatic(job.chromatic_file, aligned.model)
+        ran = times()
+        nothing = [0] * reader.bands
+        result = RestoredImage(
+            image=reader.info.path.name,
+            path=job.target,
+            dtype=str(reader.dtype),
+            noise_gain=restoration_of(reader).restorer.filter.noise_gain,
+            below=tuple(tally.totals.get("below", nothing)),
+            above=tuple(tally.totals.get("above", nothing)),
+            valid_share=facts.valid_share,
+            pixels=reader.size[0] * reader.size[1],
+            tiles=job.tiles,
+            resumed=tally.resumed,
+            seconds=ran["seconds"],
+            picture=job.picture if how.quicklook else None,
+        )
+        if how.quicklook:
+            write_quicklook(standing(job.target), job.picture)
+        write_run_record(
+            job.target,
+            key=job.key,
+            inputs=[input_entry(reader.info.path, job.digest), *job.tools],
+            run={"workers": how.workers, "memory": how.memory, **ran},
+            **_record(job, how, result, facts),
+        )
     return result
 
 

@@ -23,7 +23,6 @@ from photoplan.io.image_form import ImageForm, form_of
 from photoplan.io.names import unique_stems
 from photoplan.io.product import check_output
 from photoplan.io.raster import RasterReader
-from photoplan.io.run_record import record_path
 from photoplan.io.storage import Nodata
 from photoplan.plain import pick
 from photoplan.products.chromatic import load_chromatic, measured_once, model_figures
@@ -192,7 +191,7 @@ def _job(request: RestoreRequest, reader: SteppedReader, target: Path, text: str
 def _check_outputs(job: Job, request: RestoreRequest) -> None:
     """Refuse results that exist, but for those of this very run when it was interrupted."""
     mine = earlier_result(job, request.settings) is not None
-    outputs = [job.target, record_path(job.target), *([job.picture] if request.quicklook else [])]
+    outputs = [job.target, *([job.picture] if request.quicklook else [])]
     outputs += [job.chromatic_file] if request.chromatic == "measure" else []
     for path in outputs:
         check_output(path, job.inputs, overwrite=request.overwrite or mine)

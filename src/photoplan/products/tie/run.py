@@ -16,6 +16,7 @@ from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.image_points import write_image_points
 from photoplan.io.lock import lock_of
+from photoplan.io.naming import together
 from photoplan.io.product import check_output
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
@@ -182,19 +183,20 @@ def find_ties(request: TieRequest, events: Events = SILENT) -> TieReport:
     if not len(tracks):
         raise GeometryError("no tie point is left after refinement; look at the images, or give `refine=False`")
     points = _points(tracks, names)
-    write_image_points(output, points)
-    _enter(request.project, project, output)
-    report = _report(names, chosen, factor, (len(pairs), verified), found, tracks, notes)
-    report = replace(report, output=output, refined=refined, loops=loops, sources=tuple(images), found=tracks)
-    write_run_record(
-        output,
-        key=key,
-        inputs=[entry, *(input_entry(i.path, name[1]) for i, name in zip(images, store.names))],
-        run={"workers": request.workers, **times()},
-        kind="tie points",
-        product=report,
-        settings=pick(request, "pairs", "features", "per_image", "refine", "use_orientation"),
-    )
+    with together():
+        write_image_points(output, points)
+        _enter(request.project, project, output)
+        report = _report(names, chosen, factor, (len(pairs), verified), found, tracks, notes)
+        report = replace(report, output=output, refined=refined, loops=loops, sources=tuple(images), found=tracks)
+        write_run_record(
+            output,
+            key=key,
+            inputs=[entry, *(input_entry(i.path, name[1]) for i, name in zip(images, store.names))],
+            run={"workers": request.workers, **times()},
+            kind="tie points",
+            product=report,
+            settings=pick(request, "pairs", "features", "per_image", "refine", "use_orientation"),
+        )
     return report
 
 

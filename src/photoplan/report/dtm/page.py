@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from photoplan.errors import UsageError
+from photoplan.io.product import check_output
 from photoplan.report.drawing import has_matplotlib, load_matplotlib
 from photoplan.report.dtm.plots import LINE_WORDS, Plots
 from photoplan.report.dtm.samples import BuildFacts, PlottedError
@@ -32,8 +32,7 @@ def open_build_report(output: Path, wanted: bool | None, overwrite: bool) -> Rep
     if wanted is False:
         return None
     path = output.with_name(f"{output.stem}.report.html")
-    if path.exists() and not overwrite:
-        raise UsageError(f"{path} exists; give `overwrite` to replace it, or `report=False`")
+    check_output(path, overwrite=overwrite)
     if wanted is None and not has_matplotlib():
         return None
     return ReportFile(path, load_matplotlib("the report", "give `report=False`"))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.io.disk import write_atomically
+from photoplan.io.naming import write_atomically
 from photoplan.io.product import check_output
 from photoplan.products.describe import place_of
 from photoplan.project.filter_files import load_filter

@@ -1,0 +1,162 @@
+"""What became of the products of a plan, and which of them an earlier run has made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from photoplan.engine.execute import OutputName
+from photoplan.errors import UsageError
+from photoplan.io.naming import is_unfinished
+from photoplan.io.run_record import record_path, recorded_result, refuse_foreign_record
+from photoplan.plain import pick
+from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct
+from photoplan.products.orthophoto.settings import OrthoSettings
+
+
+@dataclass(frozen=True)
+class ProductResult:
+    """What became of one product."""
+
+    path: Path
+    others: tuple[Path, ...]
+    """More files of it: where ground is hidden, which image painted what."""
+    images: tuple[str, ...]
+    seconds: float
+    valid_share: float
+    """Valid pixels among all pixels of the product, 0 to 1."""
+    residual: float
+    """Worst residual of the anchors over all tiles, pixels of the source image."""
+    cells: int
+    """Boxes that the anchors of all tiles have."""
+    tiles: int
+    """Tiles that the product has, the empty ones included."""
+    resumed: int
+    """Tiles taken over from an earlier run."""
+    hidden: float | None
+    """Ground in the images that none of them sees, m²; None: nobody has asked."""
+    bare: float | None
+    """Ground of a mosaic that lies in none of its images, m²; None: it is no mosaic."""
+    painted: dict[str, float] | None
+    """Ground that each image paints, m², where that is asked for."""
+    accuracy: dict[str, float] | None
+    """Median and 95 % of the pixels' standard deviations of position, metres, where that is asked for."""
+    failed: tuple[int, ...]
+    """Tiles that could not be computed; the product is then not written."""
+    reason: str = ""
+    """Why the first of them failed."""
+
+    def json_fields(self) -> dict[str, Any]:
+        """Figures without the reason of a failure."""
+        own = ("path", "seconds", "valid_share", "cells", "tiles")
+        images = {"image": self.images[0]} if self.bare is None else {"images": self.images, "outside_m2": self.bare}
+        more = {"worst_anchor_residual_px": "residual", "resumed_tiles": "resumed", "failed_tiles": "failed"}
+        return {
+            **images,
+            **pick(
+                self,
+                *own,
+                hidden_m2="hidden",
+                painted_m2="painted",
+                accuracy_m="accuracy",
+                other_files="others",
+                **more,
+            ),
+        }
+
+
+def outputs(folder: Path, product: OrthoProduct, settings: OrthoSettings) -> dict[OutputName, Path]:
+    """Rasters of a product: itself, where ground is hidden, which image painted a pixel, how exactly it lies."""
+    path = folder / f"{product.plan.name}.tif"
+    asked: dict[OutputName, bool] = {
+        "hidden": settings.hidden == "mark",
+        "sources": settings.sources,
+        "accuracy": settings.accuracy,
+    }
+    more = {name: path.with_name(f"{path.stem}_{name}.tif") for name, ask in asked.items() if ask}
+    return {"picture": path, **more}
+
+
+def seams_path(picture: Path) -> Path:
+    """The GeoPackage of a mosaic's regions."""
+    return picture.with_name(f"{picture.stem}_seams.gpkg")
+
+
+def stale_files(folder: Path, product: OrthoProduct, settings: OrthoSettings) -> list[Path]:
+    """Where another kind of run would have put files beside a product, which would belong to another orthophoto."""
+    path = outputs(folder, product, settings)["picture"]
+    every = [
+        *(path.with_name(f"{path.stem}_{name}.tif") for name in ("hidden", "sources", "accuracy")),
+        seams_path(path),
+    ]
+    return [each for each in every if each not in all_files(folder, product, settings)]
+
+
+def all_files(folder: Path, product: OrthoProduct, settings: OrthoSettings) -> list[Path]:
+    """Files of a product: its rasters, and regions where sources are asked for."""
+    paths = outputs(folder, product, settings)
+    return [*paths.values(), *([seams_path(paths["picture"])] if "sources" in paths else [])]
+
+
+def finished_products(plan: OrthoPlan, folder: Path, overwrite: bool, picture: Path | None) -> dict[str, ProductResult]:
+    """Products that exist: those of this very run, interrupted, are kept; any other is refused before any work.
+
+    When all products of a plan and their overview `picture` exist, the run was not interrupted: doing it again needs
+    `overwrite`.
+    """
+    if overwrite:
+        return {}
+    kept, existing = {}, []
+    for product in plan.products:
+        files = all_files(folder, product, plan.settings)
+        there = [path for path in (*files, *stale_files(folder, product, plan.settings)) if _is_there(path)]
+        found = _kept(plan, product, folder) if files[0] in there else None
+        if found is not None:
+            kept[product.plan.name] = found
+            continue
+        existing += there
+        if not there:
+            refuse_foreign_record(record_path(files[0]))
+    if existing or (len(kept) == len(plan.products) and (picture is None or picture.exists())):
+        first, *more = existing or [result.path for result in kept.values()]
+        they = (
+            f"and {len(more)} more exist; give `overwrite` to replace them"
+            if more
+            else ("exists; give `overwrite` to replace it")
+        )
+        raise UsageError(f"{first} {they}, or another `output`")
+    return kept
+
+
+def _is_there(path: Path) -> bool:
+    return (path.exists() or path.is_symlink()) and not is_unfinished(path)
+
+
+def _kept(plan: OrthoPlan, product: OrthoProduct, folder: Path) -> ProductResult | None:
+    """The result of an earlier run with the same key and settings; None if the product is not one."""
+    path, *others = all_files(folder, product, plan.settings)
+    if not all(other.exists() for other in others):
+        return None
+
+    def result(made: dict[str, Any], recorded: dict[str, Any]) -> ProductResult | None:
+        if OrthoSettings.from_dict(recorded) != plan.settings:
+            return None
+        return ProductResult(
+            path=path,
+            others=tuple(others),
+            images=product.images,
+            seconds=made["seconds"],
+            valid_share=made["valid_share"],
+            residual=made["worst_anchor_residual_px"],
+            cells=made["cells"],
+            tiles=made["tiles"],
+            resumed=made["tiles"],
+            hidden=made.get("hidden_m2"),
+            bare=made.get("outside_m2"),
+            painted=made.get("painted_m2"),
+            accuracy=made.get("accuracy_m"),
+            failed=(),
+        )
+
+    return recorded_result(path, product.key, result)

@@ -1,0 +1,168 @@
+"""Products of several files: they get their names together, and a run that died among the names goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tools.adjust_project import Make, write_project
+from tools.dem_file import write_dem
+from tools.forked import QUIET, Mishap, Ran, content, forked
+from tools.small_block import texture, write_block, write_image
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs fork and signals")
+
+Words = Callable[[Path], list[object]]
+"""Words of a command that works in a folder, which holds its inputs and gets its outputs."""
+
+
+def ortho(at: Path) -> list[object]:
+    words = ["--images", "one", "--resolution", 2, "--tile", 128, "--hidden", "mark"]
+    return ["ortho", at / "block" / "project.toml", *words, "--workers", 1]
+
+
+def restore(at: Path) -> list[object]:
+    return ["restore", at / "scan.tif", "--filter", at / "weights.csv", "--workers", 1]
+
+
+def flow(at: Path) -> list[object]:
+    words = ["--catchments", at / "catchments.gpkg", "-o", at / "flow.tif", "--workers", 1]
+    return ["dtm", "flow", at / "dem.tif", *words]
+
+
+def volume(at: Path) -> list[object]:
+    words = ["--height-system", "same", "--difference", at / "difference.tif", "--workers", 1]
+    return ["dtm", "volume", at / "dem.tif", at / "dem.tif", *words]
+
+
+def shade(at: Path) -> list[object]:
+    words = ["--preview", at / "preview.png", "-o", at / "shade.tif", "--workers", 1]
+    return ["dtm", "shade", at / "dem.tif", *words]
+
+
+def contours(at: Path) -> list[object]:
+    words = ["--interval", 1, "--labels", "--preview", at / "preview.png", "-o", at / "lines.shp"]
+    return ["dtm", "contours", at / "dem.tif", *words]
+
+
+def adjust(at: Path) -> list[object]:
+    return ["adjust", at / "made" / "project.toml"]
+
+
+CASES: dict[str, Words] = {each.__name__: each for each in (ortho, restore, flow, volume, shade, contours, adjust)}
+
+
+_FAST = ("flow", "contours", "adjust")
+
+
+def inputs(case: Words, folder: Path) -> Path:
+    folder.mkdir()
+    if case is ortho:
+        write_block(folder / "block")
+    elif case is adjust:
+        write_project(folder / "made", Make(pixel_noise=0.3))
+    elif case is restore:
+        write_image(folder / "scan.tif", np.ascontiguousarray(texture(bands=1)[:, :300, :300]), tiled=True)
+        (folder / "weights.csv").write_text("0,-0.8,0\n-0.8,4.2,-0.8\n0,-0.8,0\n")
+    else:
+        write_dem(folder / "dem.tif", lambda x, y: 200 + 5 * np.abs(y - 20) + 0.1 * x, (60, 41))
+    return folder
+
+
+def files(folder: Path) -> dict[str, Path]:
+    return {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
+
+
+def run(case: Words, folder: Path, said: Path, mishap: Mishap = QUIET, *more: object) -> Ran:
+    return forked([*case(folder), *more], said, mishap)
+
+
+@pytest.fixture(
+    scope="module", params=[pytest.param(name, marks=[] if name in _FAST else pytest.mark.slow) for name in CASES]
+)
+def quiet(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Words, Path, set[str]]:
+    """A case, its folder after a run that nothing happened to, and what that run made."""
+    top, case = tmp_path_factory.mktemp(request.param), CASES[request.param]
+    folder = inputs(case, top / "quiet")
+    before = set(files(folder))
+    said = run(case, folder, top / "said")
+    assert said.code == 0, said.err
+    return case, folder, set(files(folder)) - before
+
+
+@pytest.mark.parametrize("end", ["first", pytest.param("last but one", marks=pytest.mark.slow)])
+def test_fault_03_killed_between_two_names(quiet: tuple[Words, Path, set[str]], tmp_path: Path, end: str) -> None:
+    """What has its name already does not stand in the way of the same command; everything is there in the end."""
+    case, undisturbed, made = quiet
+    folder = inputs(case, tmp_path / "again")
+    names = 1 if end == "first" else len(made) - 1
+    killed = run(case, folder, tmp_path / "killed", Mishap(names=names))
+    assert killed.code == -9
+    assert len(made & set(files(folder))) < len(made)
+    again = run(case, folder, tmp_path / "said")
+    assert again.code == 0, again.err
+    assert not [name for name in files(folder) if Path(name).name.startswith(".")]
+    assert made <= set(files(folder))
+    for name in made:
+        if name.endswith((".tif", ".shp", ".png")):
+            assert content(folder / name) == content(undisturbed / name), name
+    done = run(case, folder, tmp_path / "twice")
+    assert done.code == 2 and "exist" in done.err
+
+
+def test_fault_13_a_file_of_other_origin_under_a_name_that_a_dead_run_gave(tmp_path: Path) -> None:
+    folder = inputs(flow, tmp_path / "in")
+    assert run(flow, folder, tmp_path / "killed", Mishap(names=1)).code == -9
+    given = folder / "catchments.gpkg"
+    given.unlink()
+    given.write_text("my own")
+    said = run(flow, folder, tmp_path / "said")
+    assert said.code == 2 and str(given) in said.err and given.read_text() == "my own"
+
+
+def test_fault_13_records_and_overviews_of_other_origin_are_refused(tmp_path: Path) -> None:
+    folder = inputs(ortho, tmp_path / "in")
+    products = folder / "block" / "products"
+    products.mkdir()
+    for name in ("one_ortho.run.json", "overview.png"):
+        other = products / name
+        other.write_text('{"a": "paper of mine"}')
+        said = run(ortho, folder, tmp_path / "said")
+        assert said.code == 2 and str(other) in said.err, said.err
+        assert list(products.iterdir()) == [other]
+        other.unlink()
+    (folder / "shade.run.json").write_text("[]")
+    said = run(shade, folder, tmp_path / "said")
+    assert said.code == 2 and "shade.run.json" in said.err
+    assert run(shade, folder, tmp_path / "said", QUIET, "--overwrite").code == 0
+    assert json.loads((folder / "shade.run.json").read_text())["file"] == "shade.tif"
+
+
+def test_fault_13_marks_of_hidden_ground_do_not_outlive_their_orthophoto(tmp_path: Path) -> None:
+    folder = inputs(ortho, tmp_path / "in")
+    products = folder / "block" / "products"
+    first = run(ortho, folder, tmp_path / "said")
+    marks = products / "one_ortho_hidden.tif"
+    assert first.code == 0 and str(marks) in first.out.splitlines()
+    refused = run(ortho, folder, tmp_path / "said", QUIET, "--hidden", "show")
+    assert refused.code == 2 and "and 1 more exist;" in refused.err
+    assert run(ortho, folder, tmp_path / "said", QUIET, "--hidden", "show", "--overwrite").code == 0
+    assert not marks.exists() and (products / "one_ortho.tif").exists()
+    shutil.copy(products / "one_ortho.tif", tmp_path / "one.tif")
+    marks.write_text("my own")
+    assert run(ortho, folder, tmp_path / "said", QUIET, "--hidden", "show", "--overwrite").code == 0
+    assert marks.read_text() == "my own"
+
+
+def test_an_overview_that_is_missing_is_made(tmp_path: Path) -> None:
+    folder = inputs(ortho, tmp_path / "in")
+    overview = folder / "block" / "products" / "overview.png"
+    assert run(ortho, folder, tmp_path / "said").code == 0
+    overview.unlink()
+    again = run(ortho, folder, tmp_path / "said")
+    assert again.code == 0 and again.tasks == [] and overview.exists(), again.err
