@@ -127,10 +127,16 @@ def test_times_with_decimals_in_names_and_values_up_to_1(
         grey = np.rint(level + rng.normal(0.0, 6.0, (40, 40)))
         with rasterio.open(tmp_path / f"up_{0.5 * k:g}.tif", "w", "GTiff", 40, 40, 1, dtype="float32") as file:
             file.write((grey * largest / 4095).astype(np.float32), 1)
-    (tmp_path / "series.toml").write_text('[[frames]]\nkind = "step"\nname = "up"\nfiles = "up_{time_s}.tif"\n')
+        with rasterio.open(tmp_path / f"none_{0.5 * k:g}.tif", "w", "GTiff", 40, 40, 1, dtype="float32") as file:
+            level = np.rint(np.random.default_rng(k).normal(2000.0, 6.0, (40, 40)))
+            file.write((level * largest / 4095).astype(np.float32), 1)
+    entry = '[[frames]]\nkind = "step"\nname = "{0}"\nfiles = "{0}_{{time_s}}.tif"\n'
+    (tmp_path / "series.toml").write_text(entry.format("none") + entry.format("up"))
     said = Here(capsys)("characterise", tmp_path / "series.toml", "--json", "-q")
     assert said.code == 0, said.err
     part = next(part for part in json.loads(said.out)["analyses"] if part["name"] == "gain_control")
+    # A transition that cannot be used is named, and the other one is.
+    assert part["refused"]["transition none"].startswith("none: no step")
     found = {figure["name"]: figure for figure in part["figures"]}
     for name, truth in (("change_dn", 200 * largest / 4095), ("time_constant_s", 3.0)):
         assert abs(found[name]["value"] - truth) < 3.5 * found[name]["sigma"], name

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import click
@@ -24,6 +26,16 @@ VERBS = verbs()
 WORDS = sorted(
     {o.removeprefix("--").removeprefix("no-").replace("-", "_") for c in VERBS.values() for o in options_of(c)}
 )
+
+
+def test_no_word_of_numpy_reaches_a_user() -> None:
+    """An overflow of absurd numbers, in a process of its own."""
+    code = (
+        "from photoplan.cli.main import start; start(); import numpy as np; from photoplan.io.orientation import text\n"
+        "text.checked_rotation(np.full(9, 1e300), 'a.txt:1')"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "not a rotation matrix" in ran.stderr and "Warning" not in ran.stderr
 
 
 def test_an_empty_name_is_no_path_in_any_command() -> None:

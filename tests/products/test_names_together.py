@@ -57,7 +57,7 @@ def adjust(at: Path) -> list[object]:
 CASES: dict[str, Words] = {each.__name__: each for each in (ortho, restore, flow, volume, shade, contours, adjust)}
 
 
-_FAST = ("flow", "contours", "adjust")
+_FAST = ("flow", "contours")
 
 
 def inputs(case: Words, folder: Path) -> Path:

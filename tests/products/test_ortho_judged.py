@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import math
+import re
+from pathlib import Path
+
 import pytest
+from tools.real_projects import drone_project
 from tools.small_block import Block, make_project
 
 from photoplan.errors import GeometryError, UsageError
@@ -34,3 +39,22 @@ def test_a_resolution_much_finer_than_the_images_is_refused(small: Block) -> Non
         plan_orthophotos(project, [project.images[0].name], resolution=fine)
     assert plan_orthophotos(project, [project.images[0].name], resolution=fine, force=True).products
     assert plan_orthophotos(project, [project.images[0].name], resolution=gsd / 3.9).products
+
+
+def test_a_block_in_another_unit_is_noticed_by_one_image_of_it(block: Path, tmp_path: Path) -> None:
+    """Radians declared as degrees: every image is upright then and sees the terrain, and only the flight lines tell."""
+    path = drone_project(block, tmp_path / "block")
+
+    def radians(found: re.Match[str]) -> str:
+        return f"angles = {[math.radians(float(a)) for a in found[1].split(',')]}"
+
+    path.write_text(re.sub(r"angles = \[(.*)\]", radians, path.read_text()))
+    project = load_project(path)
+    for images in (None, ["DJI_0018"]):
+        told = check_project(project, images)
+        assert told.implausible == () and told.alternative is not None
+        assert "radians that were declared as degrees" in told.alternative
+        assert "image axes are" in told.alternative and "instead of 8" not in told.alternative
+        assert told.alternative not in str(told)
+    with pytest.raises(GeometryError, match=r"another reading of the orientations fits better; .*radians"):
+        plan_orthophotos(project, ["DJI_0018"], resolution=1.0)

@@ -77,6 +77,8 @@ def start() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Photos have no georeference. Here and not only where files are opened, since a filter there holds for one thread.
     warnings.filterwarnings("ignore", "Dataset has no geotransform")
+    # A user can do nothing with a word of NumPy on an overflow: what comes of it is judged by its meaning.
+    warnings.filterwarnings("ignore", category=RuntimeWarning, module=r"photoplan\.")
     warnings.formatwarning = _warning
 
 

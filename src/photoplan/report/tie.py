@@ -60,25 +60,28 @@ class TiePlots:
         if len(images) <= _NAMES:
             for image, at in zip(images, place):
                 axes.annotate(image.name, at, (4, 4), textcoords="offset points", fontsize=7, color=INK)
-        where = "by position on the map, metres" if on_map else "by what they have in common"
+        where = "by position on the map" if on_map else "by what they have in common"
         axes.set_title(f"Images, {where}; lines: common points, the widest {most}")
         axes.set_aspect("equal", adjustable="datalim")
         axes.ticklabel_format(useOffset=False, style="plain")
-        if not on_map:
+        if on_map:
+            axes.set(xlabel="X, m", ylabel="Y, m")
+        else:
             axes.set(xticks=[], yticks=[])
 
 
 def _view(axes: Any, image: TieImage, tracks: Tracks, number: int) -> None:
     grey, factor = _small(image)
     here = tracks.image == number
-    xy, rays = (tracks.xy[here] + 0.5) / factor - 0.5, tracks.rays[tracks.track[here]]
-    axes.imshow(grey, cmap="gray", vmin=-40, vmax=295, interpolation="nearest")
+    xy, rays = tracks.xy[here], tracks.rays[tracks.track[here]]
+    edges = -0.5, grey.shape[1] * factor - 0.5, grey.shape[0] * factor - 0.5, -0.5
+    axes.imshow(grey, cmap="gray", vmin=-40, vmax=295, interpolation="nearest", extent=edges)
     for many, colour in RAY_COLOURS.items():
         some = rays == many if many < 5 else rays >= 5
         label = f"{many} images" if many < 5 else "5 or more"
         if some.any():
             axes.scatter(*xy[some].T, s=7, color=colour, label=label, linewidths=0)
-    axes.set(xticks=[], yticks=[])
+    axes.set(xlabel="column, px", ylabel="row, px")
     axes.grid(False)
     axes.set_title(f"{image.name}: {len(xy)} points", color=SOFT)
     if len(xy):

@@ -24,14 +24,29 @@ def missing(data: SeriesData) -> str | None:
 
 
 def analyse(data: SeriesData) -> Findings:
-    """Every transition, and bright-dark against dark-bright."""
+    """Every transition, and bright-dark against dark-bright; one that cannot be used is named, and left out.
+
+    Raises
+    ------
+    InputError
+        None can be used.
+    """
     parts: list[Findings] = []
     found: dict[str, list[GainControl]] = {}
+    unfit: dict[str, InputError] = {}
     for group in frame_groups(data, "step"):
-        for plane, (control, noise) in _transitions(data, group).items():
+        try:
+            transitions = _transitions(data, group)
+        except InputError as error:
+            unfit[spaced("transition", group.label)] = error
+            continue
+        for plane, (control, noise) in transitions.items():
             parts.append(_outcome(control, noise, Subject(plane, group.label), data.step))
             found.setdefault(plane, []).append(control)
-    return joined([*parts, *(_asymmetry(controls, plane) for plane, controls in found.items())])
+    if not parts:
+        raise next(iter(unfit.values()))
+    left_out = Findings(refused={name: str(error) for name, error in unfit.items()})
+    return joined([left_out, *parts, *(_asymmetry(controls, plane) for plane, controls in found.items())])
 
 
 def _transitions(data: SeriesData, group: FrameGroup) -> dict[str, tuple[GainControl, tuple[float, float]]]:

@@ -119,13 +119,14 @@ def propose_control(request: ControlRequest, events: Events = SILENT) -> Control
             raise GeometryError("the orthophoto has no textured place with heights that one of the images could see")
         return ControlReport(None, None, len(patches), settings.resolution, 0, (), (np.nan,) * 3)
     covariances = _ground_covariances(patches, request, ortho)
+    # Images that take no part are no inputs.
+    files = [project.resolve(project.image(name).file) for name in names]
+    files += input_files(project.model_copy(update={"images": ()}))
 
     def work(k: int) -> ImageControl:
         return control_of_image(names[k], photos[k], patches, covariances, settings)
 
-    with recording(
-        "control", request, [request.project, *request.ortho, *input_files(project), request.heights]
-    ) as record:
+    with recording("control", request, [request.project, *request.ortho, *files, request.heights]) as record:
         events.begin("matching", len(names), "images")
         with steps(output.name, request.workers, events) as run:
             images = list(run(work, range(len(names))))
