@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,9 +23,13 @@ class _Group:
 
     waiting: dict[Path, _Identity | None] = field(default_factory=dict)
     """By the name to come: what has this name now."""
+    unfinished: set[Path] = field(default_factory=set)
+    """Those whose names an earlier run gave before it died."""
     then: list[Callable[[], object]] = field(default_factory=list)
 
     def take(self, part: Path, path: Path) -> None:
+        if path not in self.waiting and is_unfinished(path):
+            self.unfinished.add(path)
         self.waiting.setdefault(path, _identity(path))
         part.replace(_pending(path))
 
@@ -38,9 +42,8 @@ class _Group:
         earlier = {Path(other) for path in self.waiting for other in _noted(path)["files"]}
         for path in earlier - self.waiting.keys():
             _note(path).unlink(missing_ok=True)
-        files = [str(path.absolute()) for path in self.waiting]
         for path in self.waiting:
-            _note(path).write_text(json.dumps({"files": files, "identity": _identity(_pending(path))}))
+            self._write_note(path, _identity(_pending(path)))
         for path in self.waiting:
             _pending(path).replace(path)
         for folder in {path.parent for path in self.waiting}:
@@ -53,9 +56,16 @@ class _Group:
         """Remove what hidden files are left; notes stay where a name was given and another one was not."""
         unnamed = [path for path in self.waiting if _pending(path).exists()]
         for path in self.waiting:
-            if path in unnamed or not unnamed:
-                _note(path).unlink(missing_ok=True)
             _pending(path).unlink(missing_ok=True)
+            if path in unnamed and path in self.unfinished:
+                with suppress(OSError):
+                    self._write_note(path, self.waiting[path])
+            elif path in unnamed or not unnamed:
+                _note(path).unlink(missing_ok=True)
+
+    def _write_note(self, path: Path, identity: _Identity | None) -> None:
+        files = [str(each.absolute()) for each in self.waiting]
+        _note(path).write_text(json.dumps({"files": files, "identity": identity}))
 
 
 _GROUP: ContextVar[_Group | None] = ContextVar("files that get their names together", default=None)
