@@ -73,7 +73,7 @@ def refuse_foreign_record(path: Path) -> None:
         Naming it.
     """
     if os.path.exists(path) and _read_record(path) is None:  # noqa: PTH110 - a name may be too long for `Path.exists`
-        raise UsageError(f"{path}: is no run record and stands where one goes; move it away, or say `overwrite`")
+        raise UsageError(f"{path}: exists already and is no run record; move it away, or say `overwrite`")
 
 
 def _read_record(path: Path) -> dict[str, Any] | None:
