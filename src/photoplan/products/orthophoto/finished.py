@@ -111,7 +111,7 @@ def finished_products(plan: OrthoPlan, folder: Path, overwrite: bool, picture: P
     for product in plan.products:
         files = all_files(folder, product, plan.settings)
         there = [path for path in (*files, *stale_files(folder, product, plan.settings)) if _is_there(path)]
-        found = _kept(plan, product, folder) if files[0] in there else None
+        found = _kept(plan, product, folder) if files[0].exists() else None
         if found is not None:
             kept[product.plan.name] = found
             continue
