@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from photoplan.io.disk import write_atomically
+from photoplan.io.naming import write_atomically
 from photoplan.io.quicklook import read_reduced
 from photoplan.report.drawing import INK, STYLE, load_matplotlib, png, round_down
 

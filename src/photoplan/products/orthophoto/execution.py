@@ -19,16 +19,23 @@ from photoplan.errors import TilesFailed, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.disk import make_folder
 from photoplan.io.image_form import ImageForm, bands_of
-from photoplan.io.product import ProductFile
+from photoplan.io.naming import standing, together, when_named
+from photoplan.io.product import ProductFile, is_product
 from photoplan.io.project.model import Project
-from photoplan.io.quicklook import write_overview
+from photoplan.io.quicklook import refuse_foreign_overview, write_overview
 from photoplan.io.regions import source_regions, write_regions
-from photoplan.io.run_record import input_entry, recorded_result, run_times, versions, write_run_record
+from photoplan.io.run_record import input_entry, run_times, versions, write_run_record
 from photoplan.kernels.rectify import is_compiled
-from photoplan.plain import pick
 from photoplan.plan.accuracy import BANDS, radial_error
+from photoplan.products.orthophoto.finished import (
+    ProductResult,
+    all_files,
+    finished_products,
+    outputs,
+    seams_path,
+    stale_files,
+)
 from photoplan.products.orthophoto.plan import Look, OrthoPlan, OrthoProduct, known_errors
-from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.restored import RestoreStep
 from photoplan.project.scene import Scene, input_files
 from photoplan.project.scenes import Scenes, ScenesAddress
@@ -119,10 +126,12 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     run = run or Run()
     folder = Path(output)
     run.check()
-    picture = folder / "overview.png"
-    rasters = [path for p in plan.products for path in outputs(folder, p, plan.settings).values()]
-    _refuse_inputs(plan, [*rasters, *([picture] if run.quicklook else [])])
-    kept = finished_products(plan, folder, run.overwrite)
+    picture = folder / "overview.png" if run.quicklook else None
+    rasters = [path for p in plan.products for path in all_files(folder, p, plan.settings)]
+    _refuse_inputs(plan, [*rasters, *([] if picture is None else [picture])])
+    kept = finished_products(plan, folder, run.overwrite, picture)
+    if picture is not None and not run.overwrite:
+        refuse_foreign_overview(picture)
     make_folder(folder)
     if kept:
         run.events.talk(f"{len(kept)} of {len(plan.products)} products are finished already")
@@ -131,7 +140,7 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     with open_workers(run.executor, run.workers, question, run.events) as workers:
         works = (_work(plan, p, folder, run, kept.get(p.plan.name), workers) for p in plan.products)
         results = Runner[ProductResult](workers, run.in_flight(workers.threads), run.events).run(works)
-    if run.quicklook:
+    if picture is not None:
         write_overview([r.path for r in results if not r.failed], picture)
     failed = [f"{r.path.name}: tiles {', '.join(map(str, r.failed))} ({r.reason})" for r in results if r.failed]
     if failed:
@@ -231,41 +240,47 @@ def _complete(
     times: Callable[[], dict[str, Any]],
     tally: Tally,
 ) -> ProductResult:
-    """Give the product its name and its record; with failed tiles it gets neither."""
+    """Give the files of a product their names, and its record; with failed tiles they get none."""
     file = files["picture"]
-    facts, *_ = [None] if tally.failed else [each.complete(_tags(plan, product)) for each in files.values()]
-    painted: dict[str, float] | None = None
-    if "sources" in files and facts is not None:
-        shapes = source_regions(files["sources"].path, product.grid)
-        painted = {product.images[row - 1]: float(shape.area) for row, shape in shapes.items()}
-        write_regions(seams_path(file.path), product.images, shapes, product.grid.crs)
-    ran = times()
-    result = ProductResult(
-        path=file.path,
-        images=product.images,
-        seconds=ran["seconds"],
-        valid_share=0.0 if facts is None else facts.valid_share,
-        residual=tally.totals.get("worst_residual", 0.0),
-        cells=tally.totals.get("cells", 0),
-        tiles=product.plan.tiles.total,
-        resumed=tally.resumed,
-        hidden=_area(tally, "hidden", product) if plan.settings.asks_hidden else None,
-        bare=None if plan.settings.choice is None else _area(tally, "bare", product) + _left_out(product),
-        painted=painted,
-        accuracy=_accuracy(tally.totals["radial_errors"]) if "radial_errors" in tally.totals else None,
-        failed=tuple(sorted(tally.failed)),
-        reason=next(iter(tally.reasons), ""),
-    )
-    if facts is not None:
-        write_run_record(
-            result.path,
-            key=product.key,
-            inputs=[input_entry(path, digest) for path, digest in address.digests],
-            run={"workers": run.workers, "executor": run.executor, "memory": run.memory, **ran},
-            values_moved_off_nodata=facts.moved_values,
-            bytes=facts.bytes,
-            **_record(plan, product, address.open(), result),
+    with together():
+        facts, *_ = [None] if tally.failed else [each.complete(_tags(plan, product)) for each in files.values()]
+        painted: dict[str, float] | None = None
+        if "sources" in files and facts is not None:
+            shapes = source_regions(standing(files["sources"].path), product.grid)
+            painted = {product.images[row - 1]: float(shape.area) for row, shape in shapes.items()}
+            write_regions(seams_path(file.path), product.images, shapes, product.grid.crs)
+        ran = times()
+        result = ProductResult(
+            path=file.path,
+            others=tuple(all_files(file.path.parent, product, plan.settings)[1:]),
+            images=product.images,
+            seconds=ran["seconds"],
+            valid_share=0.0 if facts is None else facts.valid_share,
+            residual=tally.totals.get("worst_residual", 0.0),
+            cells=tally.totals.get("cells", 0),
+            tiles=product.plan.tiles.total,
+            resumed=tally.resumed,
+            hidden=_area(tally, "hidden", product) if plan.settings.asks_hidden else None,
+            bare=None if plan.settings.choice is None else _area(tally, "bare", product) + _left_out(product),
+            painted=painted,
+            accuracy=_accuracy(tally.totals["radial_errors"]) if "radial_errors" in tally.totals else None,
+            failed=tuple(sorted(tally.failed)),
+            reason=next(iter(tally.reasons), ""),
         )
+        if facts is not None:
+            write_run_record(
+                result.path,
+                key=product.key,
+                inputs=[input_entry(path, digest) for path, digest in address.digests],
+                run={"workers": run.workers, "executor": run.executor, "memory": run.memory, **ran},
+                values_moved_off_nodata=facts.moved_values,
+                bytes=facts.bytes,
+                **_record(plan, product, address.open(), result),
+            )
+        if facts is not None:
+            # Of the orthophoto that this one replaces.
+            for path in filter(is_product, stale_files(file.path.parent, product, plan.settings)):
+                when_named(path.unlink)
     return result
 
 
@@ -339,103 +354,3 @@ def _image_record(name: str, scene: Scene, look: Look) -> dict[str, Any]:
         "gsd_m": look.gsd,
         "restored": None if step is None else step.describe(),
     }
-
-
-@dataclass(frozen=True)
-class ProductResult:
-    """What became of one product."""
-
-    path: Path
-    images: tuple[str, ...]
-    seconds: float
-    valid_share: float
-    """Valid pixels among all pixels of the product, 0 to 1."""
-    residual: float
-    """Worst residual of the anchors over all tiles, pixels of the source image."""
-    cells: int
-    """Boxes that the anchors of all tiles have."""
-    tiles: int
-    """Tiles that the product has, the empty ones included."""
-    resumed: int
-    """Tiles taken over from an earlier run."""
-    hidden: float | None
-    """Ground in the images that none of them sees, m²; None: nobody has asked."""
-    bare: float | None
-    """Ground of a mosaic that lies in none of its images, m²; None: it is no mosaic."""
-    painted: dict[str, float] | None
-    """Ground that each image paints, m², where that is asked for."""
-    accuracy: dict[str, float] | None
-    """Median and 95 % of the pixels' standard deviations of position, metres, where that is asked for."""
-    failed: tuple[int, ...]
-    """Tiles that could not be computed; the product is then not written."""
-    reason: str = ""
-    """Why the first of them failed."""
-
-    def json_fields(self) -> dict[str, Any]:
-        """Figures without the reason of a failure."""
-        own = ("path", "seconds", "valid_share", "cells", "tiles")
-        images = {"image": self.images[0]} if self.bare is None else {"images": self.images, "outside_m2": self.bare}
-        more = {"worst_anchor_residual_px": "residual", "resumed_tiles": "resumed", "failed_tiles": "failed"}
-        return {**images, **pick(self, *own, hidden_m2="hidden", painted_m2="painted", accuracy_m="accuracy", **more)}
-
-
-def outputs(folder: Path, product: OrthoProduct, settings: OrthoSettings) -> dict[OutputName, Path]:
-    """Rasters of a product: itself, where ground is hidden, which image painted a pixel, how exactly it lies."""
-    path = folder / f"{product.plan.name}.tif"
-    asked: dict[OutputName, bool] = {
-        "hidden": settings.hidden == "mark",
-        "sources": settings.sources,
-        "accuracy": settings.accuracy,
-    }
-    more = {name: path.with_name(f"{path.stem}_{name}.tif") for name, ask in asked.items() if ask}
-    return {"picture": path, **more}
-
-
-def seams_path(picture: Path) -> Path:
-    """The GeoPackage of a mosaic's regions."""
-    return picture.with_name(f"{picture.stem}_seams.gpkg")
-
-
-def finished_products(plan: OrthoPlan, folder: Path, overwrite: bool) -> dict[str, ProductResult]:
-    """Products that exist: those of this very run, interrupted, are kept; any other is refused before any work.
-
-    When all products of a plan exist, the run was not interrupted: doing it again needs `overwrite`.
-    """
-    existing = [p for p in plan.products if outputs(folder, p, plan.settings)["picture"].exists()]
-    if overwrite or not existing:
-        return {}
-    kept = {p.plan.name: _kept(plan, p, folder) for p in existing}
-    foreign = [name for name, result in kept.items() if result is None]
-    if foreign or len(existing) == len(plan.products):
-        first = outputs(folder, plan[foreign[0]] if foreign else existing[0], plan.settings)["picture"]
-        more = f" and {len(existing) - 1} more" if len(existing) > 1 else ""
-        raise UsageError(f"{first}{more} exists; give `overwrite` to replace it, or another `output`")
-    return {name: result for name, result in kept.items() if result is not None}
-
-
-def _kept(plan: OrthoPlan, product: OrthoProduct, folder: Path) -> ProductResult | None:
-    """The result of an earlier run with the same key and settings; None if the product is not one."""
-    paths = outputs(folder, product, plan.settings)
-    if not all(path.exists() for path in paths.values()):
-        return None
-
-    def result(made: dict[str, Any], recorded: dict[str, Any]) -> ProductResult | None:
-        if OrthoSettings.from_dict(recorded) != plan.settings:
-            return None
-        return ProductResult(
-            path=paths["picture"],
-            images=product.images,
-            seconds=made["seconds"],
-            valid_share=made["valid_share"],
-            residual=made["worst_anchor_residual_px"],
-            cells=made["cells"],
-            tiles=made["tiles"],
-            resumed=made["tiles"],
-            hidden=made.get("hidden_m2"),
-            bare=made.get("outside_m2"),
-            painted=made.get("painted_m2"),
-            accuracy=made.get("accuracy_m"),
-            failed=(),
-        )
-
-    return recorded_result(paths["picture"], product.key, result)
