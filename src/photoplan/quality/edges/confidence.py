@@ -91,6 +91,11 @@ class EdgeFigures:
     freedom: int
     """Degrees of freedom of the intervals."""
 
+    def interval(self, which: int) -> tuple[float, float]:
+        """Interval of a figure; NaN where it would reach 0 or below, so that the pixels do not determine the figure."""
+        value, reach = float(self.values[which]), self.factor * float(self.sigma[which])
+        return (value - reach, value + reach) if reach < value else (np.nan, np.nan)
+
 
 def edge_figures(fit: EdgeFit, shape: EdgeShape, confidence: float) -> EdgeFigures:
     """Figures of a profile and their standard deviations.

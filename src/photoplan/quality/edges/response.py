@@ -23,7 +23,7 @@ from photoplan.quality.edges.checks import (
     check_step,
     grain,
 )
-from photoplan.quality.edges.confidence import BEYOND, EdgeFigures, EdgeShape, edge_figures, gaussian_width
+from photoplan.quality.edges.confidence import BEYOND, EdgeShape, edge_figures, gaussian_width
 from photoplan.quality.edges.line import EdgeLine, EdgePixels, determines, find_line, fit_line
 from photoplan.quality.edges.model import PixelEdge
 from photoplan.quality.edges.profile import EdgeFit, ProfileBasis, fit_profile
@@ -326,11 +326,11 @@ def _measured(found: _Context) -> EdgeMeasurement:
         **profiles,
         mtf=MtfCurve(shape.frequency, figures.modulation, figures.modulation_sigma),
         mtf50=mtf50,
-        mtf50_interval=_interval(figures, 0),
-        mtf10=mtf10 if np.isfinite(_interval(figures, 1)).all() else nan,
-        mtf10_interval=_interval(figures, 1),
-        fwhm=fwhm if np.isfinite(_interval(figures, 2)).all() else nan,
-        fwhm_interval=_interval(figures, 2),
+        mtf50_interval=figures.interval(0),
+        mtf10=mtf10 if np.isfinite(figures.interval(1)).all() else nan,
+        mtf10_interval=figures.interval(1),
+        fwhm=fwhm if np.isfinite(figures.interval(2)).all() else nan,
+        fwhm_interval=figures.interval(2),
         gaussian_fwhm=gaussian_width(mtf50),
         overshoot=over,
         overshoot_sigma=float(figures.sigma[3]),
@@ -346,12 +346,6 @@ def _measured(found: _Context) -> EdgeMeasurement:
         confidence=settings.confidence,
         freedom=figures.freedom,
     )
-
-
-def _interval(figures: EdgeFigures, which: int) -> tuple[float, float]:
-    """Interval of a figure; NaN where it would reach 0 or below, so that the pixels do not determine the figure."""
-    value, reach = float(figures.values[which]), figures.factor * float(figures.sigma[which])
-    return (value - reach, value + reach) if reach < value else (nan, nan)
 
 
 def _phase_gap(distance: NDArray[np.float64], model: PixelEdge) -> float:
