@@ -16,7 +16,7 @@ from photoplan.orientation.plausibility import ImagePlausibility, View
 from photoplan.plain import pick
 from photoplan.plan.footprint import Footprint, footprint, mean_gsd
 from photoplan.products.judged import against_files, judged, reading_of_block
-from photoplan.products.orthophoto.plan import two_figures
+from photoplan.products.orthophoto.look import two_figures
 from photoplan.project.ground import Ground, ground_of
 from photoplan.project.scene import camera_without_pixels, is_there, map_order, open_scene
 

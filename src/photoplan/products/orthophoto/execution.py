@@ -35,7 +35,8 @@ from photoplan.products.orthophoto.finished import (
     seams_path,
     stale_files,
 )
-from photoplan.products.orthophoto.plan import Look, OrthoPlan, OrthoProduct, known_errors
+from photoplan.products.orthophoto.look import Look
+from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, known_errors
 from photoplan.project.restored import RestoreStep
 from photoplan.project.scene import Scene, input_files
 from photoplan.project.scenes import Scenes, ScenesAddress

@@ -14,18 +14,16 @@ from photoplan.io.project.model import Project
 from photoplan.io.regions import Regions, read_regions
 from photoplan.plan.footprint import covered_tiles
 from photoplan.plan.tiles import Tiles
+from photoplan.products.orthophoto.look import Looked, look_at, with_resolution
 from photoplan.products.orthophoto.plan import (
-    Looked,
     OrthoPlan,
     OrthoProduct,
     check_storable,
     chosen_settings,
     grid_of,
     keyed,
-    look_at,
     product_plan,
     refuse_blind,
-    with_resolution,
 )
 from photoplan.products.orthophoto.settings import Choice, OrthoSettings
 

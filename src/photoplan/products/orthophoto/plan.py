@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -22,36 +21,23 @@ from photoplan.io.fingerprint import fingerprint
 from photoplan.io.names import safe_stem
 from photoplan.io.project.model import Project
 from photoplan.io.storage import nodata_for
-from photoplan.orientation.plausibility import ImagePlausibility, View
 from photoplan.plan.accuracy import in_image
 from photoplan.plan.choice import BestImage, Drawn
 from photoplan.plan.compile import AnchorRule
-from photoplan.plan.footprint import Footprint, covered_tiles, image_border, mean_gsd, some_height
+from photoplan.plan.footprint import Footprint, covered_tiles
 from photoplan.plan.owner import InSight, Ownership
 from photoplan.plan.product import ProductPlan
 from photoplan.plan.tiles import Tiles
-from photoplan.products.judged import judged, reading_of_block
+from photoplan.products.orthophoto.look import Look, extent_text, look_at, with_resolution
 from photoplan.products.orthophoto.settings import OrthoSettings
-from photoplan.project.scene import Scene, map_order, open_scene
+from photoplan.project.scene import Scene
 from photoplan.project.scenes import ScenesAddress
 from photoplan.project.uncertain import ScenesErrors
 from photoplan.surfaces.objects import painted_surface
 from photoplan.targets.map import MapTarget
 
-#: A product is at most so many times finer than its images see the ground.
-_FINER = 4.0
 #: What it counts that a user prefers an image: more than any penalty of the score.
 PREFERRED = 1000.0
-
-
-@dataclass(frozen=True, eq=False)
-class Look:
-    """What an image sees of the terrain."""
-
-    footprint: Footprint
-    """Where it lies."""
-    gsd: float
-    """Its mean ground sampling distance, metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,20 +148,11 @@ def plan_orthophotos(
             plan = product_plan(product_name(one.name), (one.name,), grid, tiles, chosen, seen)
             products.append(OrthoProduct(plan, (one.look,), keyed(project, plan, chosen)))
         else:
-            blind.append(f"{one.name}: sees {_extent(seen[0].bounds)}; the bounds are {_extent(chosen.bounds)}")
+            blind.append(f"{one.name}: sees {extent_text(seen[0].bounds)}; the bounds are {extent_text(chosen.bounds)}")
         events.done()
     refuse_blind(chosen, products, blind)
     _refuse_equal_names(products)
     return OrthoPlan(project, chosen, tuple(products), tuple(blind))
-
-
-@dataclass(frozen=True, eq=False)
-class Looked:
-    """An image that sees terrain."""
-
-    name: str
-    scene: Scene
-    look: Look
 
 
 def chosen_settings(project: Project, settings: OrthoSettings | None, changes: dict[str, Any]) -> OrthoSettings:
@@ -192,36 +169,6 @@ def _painted(project: Project, settings: OrthoSettings) -> Project:
     return project.model_copy(update={"objects": () if settings.hidden == "show" else hiding})
 
 
-def look_at(project: Project, names: Sequence[str], force: bool, events: Events) -> tuple[list[Looked], list[str]]:
-    """Images that see terrain, and a line for each that sees none."""
-    scenes: dict[str, Scene] = {}
-    seen: dict[str, tuple[View, ImagePlausibility]] = {}
-    for place in map_order(project, names):
-        # All that is asked of the terrain for one image, before the next: its blocks are then at hand.
-        scenes[names[place]] = scene = open_scene(project, names[place])
-        if scene.footprint.bounds is not None:
-            seen[names[place]] = judged(project, project.image(names[place]), scene.ground)
-        events.done()
-    if not force:
-        _refuse_faults(project, seen, scenes)
-    looked, blind = [], []
-    for name, scene in ((name, scenes[name]) for name in names):
-        if scene.footprint.bounds is None:
-            blind.append(_sees_no_terrain(scene, name))
-        else:
-            looked.append(Looked(name, scene, Look(scene.footprint, mean_gsd(scene.camera, scene.footprint))))
-    return looked, blind
-
-
-def with_resolution(project: Project, settings: OrthoSettings, looked: Sequence[Looked], force: bool) -> OrthoSettings:
-    """Settings with a resolution: the images' own if none is chosen."""
-    own = two_figures(float(np.mean([one.look.gsd for one in looked]))) if looked else 1.0
-    resolution = settings.resolution or own
-    if looked and not force:
-        _refuse_too_fine(project, resolution, settings, looked)
-    return replace(settings, resolution=resolution)
-
-
 def grid_of(project: Project, settings: OrthoSettings, seen: Sequence[Footprint]) -> MapGrid:
     """Pixels of a product: all that its images see, or the bounds that were chosen."""
     assert settings.resolution is not None
@@ -235,41 +182,6 @@ def refuse_blind(settings: OrthoSettings, products: Sequence[Any], blind: Sequen
     if not products:
         where = "the terrain" if settings.bounds is None else "terrain inside the bounds"
         raise GeometryError(f"no image sees {where} (xmin ymin xmax ymax in metres):\n  " + "\n  ".join(blind))
-
-
-def _refuse_faults(project: Project, seen: dict[str, tuple[View, ImagePlausibility]], scenes: dict[str, Scene]) -> None:
-    """Refuse what `check` calls a fault or read wrongly; images that see no terrain are told otherwise."""
-    if not seen:
-        return
-    faults = [found for _, found in seen.values() if found.fault is not None]
-    other = reading_of_block(project, seen, scenes[next(iter(seen))].ground)
-    forced = "nothing is made of them unless you say `force`"
-    if faults:
-        raise GeometryError(
-            f"image {faults[0].name!r}: {faults[0].fault} ({len(faults)} of {len(seen)} images have such faults, "
-            f"`photoplan check` lists them); {forced}" + ("" if other is None else f". {other}")
-        )
-    if other is not None:
-        raise GeometryError(f"another reading of the orientations fits better; {forced}. {other}")
-
-
-def _refuse_too_fine(project: Project, resolution: float, settings: OrthoSettings, looked: Sequence[Looked]) -> None:
-    """Refuse a resolution at which most pixels would be made up."""
-    finest = min((one.look.gsd for one in looked if one.look.gsd > 0), default=0.0)
-    if not resolution * _FINER < finest:
-        return
-    pixels = tiles = 0.0
-    for name, bounds in ((one.name, settings.bounds or one.look.footprint.bounds) for one in looked):
-        assert bounds is not None
-        width, height = ((bounds[k + 2] - bounds[k]) / resolution for k in (0, 1))
-        refuse_absurd((width, height), settings.tile, f"{name}: resolution {resolution:g} m")
-        pixels += width * height
-        tiles += math.ceil(width / settings.tile) * math.ceil(height / settings.tile)
-    raise UsageError(
-        f"resolution {resolution:g} m is {finest / resolution:.3g} times finer than the images see the ground "
-        f"({finest:.3g} m): {pixels:.3g} pixels in {tiles:.3g} tiles, most of them made up; choose {finest / 2:.2g} m "
-        "or more, or say `force`"
-    )
 
 
 def project_settings(project: Project) -> OrthoSettings:
@@ -371,35 +283,6 @@ def product_key(scenes: Any, plan: ProductPlan, settings: OrthoSettings, regions
         "choice": None if settings.choice is None else {**asdict(settings.choice), "name": "", "seams": regions},
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
-
-
-def two_figures(value: float) -> float:
-    """A positive number rounded to two significant figures."""
-    digits = 1 - math.floor(math.log10(value))
-    return round(value, digits)
-
-
-def _sees_no_terrain(scene: Scene, name: str) -> str:
-    """Extents of both the terrain and what the image looks at, on a level that the terrain has."""
-    x, y, z = scene.camera.center
-    center = f"{name}: projection centre {x:.0f} {y:.0f} {z:.0f}"
-    bounds = scene.ground.bounds
-    if bounds is None:
-        return f"{center} sees nothing of the level terrain; is it above it, and do height systems and angles fit?"
-    level = some_height(scene.ground.surface, bounds, x, y)
-    origin, direction = scene.camera.rays(image_border(scene.camera.size), level)
-    down = (direction[:, 2] < 0) & (origin[:, 2] > level)
-    if down.any():
-        foot = origin[down] + direction[down] * ((level - origin[down, 2]) / direction[down, 2])[:, None]
-        (xmin, ymin), (xmax, ymax) = foot[:, :2].min(axis=0), foot[:, :2].max(axis=0)
-        looks = f"looks at {_extent((xmin, ymin, xmax, ymax))} on the level {level:.0f}"
-    else:
-        looks = f"does not look down to the level {level:.0f}"
-    return f"{center} {looks}; the terrain is {_extent(bounds)}"
-
-
-def _extent(bounds: tuple[float, float, float, float] | None) -> str:
-    return "everywhere" if bounds is None else " ".join(f"{b:.0f}" for b in bounds)
 
 
 def _refuse_equal_names(products: Iterable[OrthoProduct]) -> None:

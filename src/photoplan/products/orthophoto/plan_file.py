@@ -25,8 +25,9 @@ from photoplan.plain import pick
 from photoplan.plan.footprint import Footprint
 from photoplan.plan.product import compile_tile
 from photoplan.plan.tiles import Tiles
+from photoplan.products.orthophoto.look import Look
 from photoplan.products.orthophoto.mosaic import drawn_regions
-from photoplan.products.orthophoto.plan import Look, OrthoPlan, OrthoProduct, keyed, product_plan
+from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, keyed, product_plan
 from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.scene import input_files
 from photoplan.project.scenes import ScenesAddress
