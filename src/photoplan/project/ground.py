@@ -15,7 +15,6 @@ from photoplan.geometry.heights import HeightStep, declared_pair, height_step
 from photoplan.io.names import resolve_input
 from photoplan.io.project.model import Objects, Project
 from photoplan.io.project.model import Terrain as StatedTerrain
-from photoplan.project.objects import Place, with_objects
 from photoplan.project.open_terrain import open_terrain
 from photoplan.surfaces.base import Terrain
 from photoplan.surfaces.level import LevelSurface
@@ -84,6 +83,9 @@ def ground_of(project: Project) -> Ground:
 @lru_cache(maxsize=8)
 def _ground(address: _GroundAddress) -> Ground:
     if address.objects:
+        # Here, since a project without objects does not need the libraries of vector data.
+        from photoplan.project.objects import Place, with_objects
+
         bare = _ground(replace(address, objects=(), stamps=address.stamps[: -len(address.objects)]))
         place = Place(address.crs, bare.working_system, bare.height_systems[0], bare.bounds)
         files = [(resolve_input(Path(address.folder), stated.file), stated) for stated in address.objects]

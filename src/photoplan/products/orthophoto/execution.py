@@ -23,7 +23,6 @@ from photoplan.io.naming import standing, together, when_named
 from photoplan.io.product import ProductFile, is_product
 from photoplan.io.project.model import Project
 from photoplan.io.quicklook import refuse_foreign_overview, write_overview
-from photoplan.io.regions import source_regions, write_regions
 from photoplan.io.run_record import input_entry, run_times, versions, write_run_record
 from photoplan.kernels.rectify import is_compiled
 from photoplan.plan.accuracy import BANDS, radial_error
@@ -247,6 +246,9 @@ def _complete(
         facts, *_ = [None] if tally.failed else [each.complete(_tags(plan, product)) for each in files.values()]
         painted: dict[str, float] | None = None
         if "sources" in files and facts is not None:
+            # Here, since a product without regions does not need the libraries of vector data.
+            from photoplan.io.regions import source_regions, write_regions
+
             shapes = source_regions(standing(files["sources"].path), product.grid)
             painted = {product.images[row - 1]: float(shape.area) for row, shape in shapes.items()}
             write_regions(seams_path(file.path), product.images, shapes, product.grid.crs)
