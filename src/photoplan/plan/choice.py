@@ -112,8 +112,8 @@ class BestImage:
         self, cost: NDArray[np.float32], camera: Projection, ground: TileGround, wide: TileGround, surface: Surface
     ) -> None:
         """Add to an image's penalty what it does not see, and what is near that."""
-        # Here, since orthophotos of single images do without it: a tenth of a second of their start.
-        from scipy.ndimage import distance_transform_edt
+        # Orthophotos of single images do without it: a tenth of a second of their start.
+        from scipy.ndimage import distance_transform_edt  # noqa: PLC0415
 
         hidden = hidden_pixels(camera, wide, surface)
         if not hidden.any():

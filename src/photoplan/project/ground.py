@@ -83,8 +83,8 @@ def ground_of(project: Project) -> Ground:
 @lru_cache(maxsize=8)
 def _ground(address: _GroundAddress) -> Ground:
     if address.objects:
-        # Here, since a project without objects does not need the libraries of vector data.
-        from photoplan.project.objects import Place, with_objects
+        # A project without objects does not need the libraries of vector data.
+        from photoplan.project.objects import Place, with_objects  # noqa: PLC0415
 
         bare = _ground(replace(address, objects=(), stamps=address.stamps[: -len(address.objects)]))
         place = Place(address.crs, bare.working_system, bare.height_systems[0], bare.bounds)

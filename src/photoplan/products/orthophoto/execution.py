@@ -246,8 +246,8 @@ def _complete(
         facts, *_ = [None] if tally.failed else [each.complete(_tags(plan, product)) for each in files.values()]
         painted: dict[str, float] | None = None
         if "sources" in files and facts is not None:
-            # Here, since a product without regions does not need the libraries of vector data.
-            from photoplan.io.regions import source_regions, write_regions
+            # A product without regions does not need the libraries of vector data.
+            from photoplan.io.regions import source_regions, write_regions  # noqa: PLC0415
 
             shapes = source_regions(standing(files["sources"].path), product.grid)
             painted = {product.images[row - 1]: float(shape.area) for row, shape in shapes.items()}
