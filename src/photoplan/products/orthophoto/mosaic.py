@@ -26,6 +26,7 @@ from photoplan.products.orthophoto.plan import (
     refuse_blind,
 )
 from photoplan.products.orthophoto.settings import Choice, OrthoSettings
+from photoplan.surfaces.objects import painted_surface
 
 
 def plan_mosaic(
@@ -71,7 +72,8 @@ def plan_mosaic(
     grid = grid_of(project, chosen, [one.look.footprint for one in looked])
     taking, tiles = [], []
     for one in looked:
-        mine = covered_tiles(one.scene.camera, one.scene.surface, grid, chosen.tile, one.look.footprint.bounds)
+        surface = painted_surface(one.scene.surface)
+        mine = covered_tiles(one.scene.camera, surface, grid, chosen.tile, one.look.footprint.bounds)
         if len(mine):
             taking.append(one)
             tiles.append(mine)
