@@ -136,6 +136,7 @@ def test_fault_13_records_and_overviews_of_other_origin_are_refused(tmp_path: Pa
         assert said.code == 2 and str(other) in said.err, said.err
         assert list(products.iterdir()) == [other]
         other.unlink()
+    folder = inputs(shade, tmp_path / "heights")
     (folder / "shade.run.json").write_text("[]")
     said = run(shade, folder, tmp_path / "said")
     assert said.code == 2 and "shade.run.json" in said.err
@@ -148,7 +149,7 @@ def test_fault_13_marks_of_hidden_ground_do_not_outlive_their_orthophoto(tmp_pat
     products = folder / "block" / "products"
     first = run(ortho, folder, tmp_path / "said")
     marks = products / "one_ortho_hidden.tif"
-    assert first.code == 0 and str(marks) in first.out.splitlines()
+    assert first.code == 0 and marks.exists()
     refused = run(ortho, folder, tmp_path / "said", QUIET, "--hidden", "show")
     assert refused.code == 2 and "and 1 more exist;" in refused.err
     assert run(ortho, folder, tmp_path / "said", QUIET, "--hidden", "show", "--overwrite").code == 0

@@ -65,7 +65,8 @@ def test_hidden_ground_is_left_empty_or_marked(walled: Block, capsys: pytest.Cap
 def test_a_project_states_what_becomes_of_hidden_ground(walled: Block, capsys: pytest.CaptureFixture[str]) -> None:
     photoplan = Here(capsys)
     walled.project.write_text(walled.project.read_text().replace("[ortho]", '[ortho]\nhidden = "mark"'))
-    assert photoplan("ortho", walled.project, "--no-quicklook").code == 0
+    said = photoplan("ortho", walled.project, "--no-quicklook")
+    assert said.code == 0 and str(walled.folder / "products" / "one_ortho_hidden.tif") in said.out.splitlines()
     again = photoplan("ortho", walled.project, "--no-quicklook")
     assert again.code == 2 and "overwrite" in again.err
     wrong = photoplan("ortho", walled.project, "--hidden", "away")

@@ -123,7 +123,7 @@ def refuse_foreign_overview(picture: Path) -> None:
     if not picture.exists():
         return
     try:
-        with not_georeferenced(), open_raster(picture, "PNG") as dataset:
+        with open_raster(picture, "PNG") as dataset:
             own = dataset.tags().get("Software") == _SOFTWARE
     except InputError:
         own = False
