@@ -219,9 +219,11 @@ def test_every_pixel_that_falls_into_the_image_is_in_the_bounds_and_in_a_kept_ti
     assert inside.sum() > 500
     assert (XY[inside] >= seen.bounds[:2]).all() and (XY[inside] <= seen.bounds[2:]).all()
     kept = covered_tiles(camera, surface, target, 30)
+    near = covered_tiles(camera, surface, target, 30, seen.bounds)
     for index, tile in enumerate(target.window.tiles(30)):
-        assert index in kept.indices or not inside[tile.row : tile.stop[1], tile.col : tile.stop[0]].any()
-    assert len(kept) < kept.total
+        shown = inside[tile.row : tile.stop[1], tile.col : tile.stop[0]].any()
+        assert not shown or (index in kept.indices and index in near.indices)
+    assert len(kept) < kept.total and np.isin(near.indices, kept.indices).all()
 
 
 def test_a_hundred_ordinary_images_read_the_ground_below_them_once() -> None:

@@ -191,7 +191,7 @@ def covered_tiles(
     if not np.isfinite(ranges).any():
         return every.only(())
     view = View.of(camera, float(np.nanmin(ranges)), float(np.nanmax(ranges)))
-    return every.only(() if view is None else np.flatnonzero(view.sees(boxes, ranges)))
+    return every.only(() if view is None else every.indices[view.sees(boxes, ranges)])
 
 
 def some_height(terrain: Terrain, near: Bounds, x: float, y: float) -> float:
