@@ -232,3 +232,26 @@ def test_bounds_of_the_pyramid() -> None:
 def test_paths_of_another_shape_are_refused() -> None:
     with pytest.raises(UsageError, match="paths of shape"):
         rough(1).first_hit(np.zeros((4, 3)))
+
+
+def test_normals_are_those_of_the_mesh_the_triangle_and_the_wall() -> None:
+    surface, paths = rough(4, holes=0.0, mesh=1.0), random_rays(4)
+    hits = surface.first_hit(paths)
+    met = np.isfinite(hits.along) & (np.abs(hits.XYZ[:, :2] - np.round(hits.XYZ[:, :2])) > 1e-3).all(axis=1)
+    XY, h = hits.XYZ[met, :2], 2e-4
+    slope = [(surface.heights(XY + d) - surface.heights(XY - d)) / (2 * h) for d in np.eye(2) * h]
+    np.testing.assert_allclose(hits.normal[met, :2] / -hits.normal[met, 2:], np.stack(slope, axis=-1), atol=1e-2)
+    np.testing.assert_allclose(np.linalg.norm(hits.normal[met], axis=1), 1)
+    assert (hits.owner == np.where(np.isfinite(hits.along), 0, -1)).all()
+    layout = UnitLayout(0.0, 40.0, 20.0, 2, 2)
+    wall = line([(-1, 20.3, 254.0), (41, 26.3, 254.0)], [250.0, 250.0])
+    tilted, _ = model(layout, 8, [wall], lambda X, Y: np.where(Y > 20.3 + (X + 1) / 7, 254.0, 250.0 + 0.1 * X))
+    hit = tilted.first_hit([[(10.0, 5, 253.5), (12, 35, 252.5)], [(10.0, 5, 260), (10, 6, 240)]])
+    np.testing.assert_array_equal(hit.result, [WALL, SURFACE])
+    np.testing.assert_allclose(hit.normal[0], np.array([6, -42, 0]) / np.hypot(6, 42), atol=1e-5)
+    np.testing.assert_allclose(hit.normal[1, :2] / hit.normal[1, 2], [-0.1, 0], atol=1e-4)
+    other = RasterSurface(surface.grid, surface.origin, surface.mesh, lambda XY: XY[..., ::-1] * [1, 2])
+    turned = other.first_hit(np.stack([paths[met][..., 1] / 2, paths[met][..., 0], paths[met][..., 2]], axis=-1))
+    n = hits.normal[met][:, [1, 0, 2]] * [2, 1, 1]
+    same = np.isfinite(turned.along)
+    np.testing.assert_allclose(turned.normal[same], (n / np.linalg.norm(n, axis=1, keepdims=True))[same], atol=2e-3)

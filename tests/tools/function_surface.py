@@ -37,9 +37,7 @@ class FunctionSurface:
         """Paths looked at in 4000 places of each piece, then halved: nothing thinner than a step is seen."""
         assert not bend
         paths = np.asarray(paths, float)
-        hits = Hits(*(np.full(shape, value) for shape, value in (
-            ((len(paths), 3), np.nan), (len(paths), np.nan), (len(paths), 0), (len(paths), False)
-        )))  # fmt: skip
+        hits = Hits.none(len(paths))
         for i, path in enumerate(paths):
             t = np.linspace(0, len(path) - 1, 4000 * (len(path) - 1) + 1)
             at = np.minimum(t.astype(int), len(path) - 2)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.warped import Warp, WarpedCamera
+from photoplan.cameras.warped import Warp, WarpedCamera, inverse_by_newton
 from photoplan.errors import InputError
 
 
@@ -58,6 +58,10 @@ class CurvatureCorrection:
         J[..., 1, 0], J[..., 1, 1], J[..., 1, 2] = dy * by_x, factor + dy * by_y, dy * by_z
         J[..., 2, 2] = 1.0
         return J
+
+    def inverse(self, displaced: ArrayLike) -> NDArray[np.float64]:
+        """Where displaced points (..., 3) are; NaN where there is no such point."""
+        return inverse_by_newton(self, displaced)
 
     def _terms(
         self, XYZ: NDArray[np.float64]

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from photoplan.cameras.warped import inverse_by_newton
+
 # ICAO standard atmosphere: temperature falls by 6.5 K/km from 288.15 K to 11 km and stays; density follows from
 # hydrostatic equilibrium. Refractivity n − 1 is proportional to density.
 _LAPSE = 0.0065 / 288.15
@@ -82,6 +84,10 @@ class Refraction:
         J[..., 2, :] = 2.0 * rise[..., None] * away
         J[..., 2, 2] += 1.0 + change * (away**2).sum(axis=-1)
         return J
+
+    def inverse(self, displaced: ArrayLike) -> NDArray[np.float64]:
+        """Where displaced points (..., 3) are; NaN where there is no such point."""
+        return inverse_by_newton(self, displaced)
 
     def _rise(self, h: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """K / (H − h) at ground heights h, per metre, and its derivative by h."""

@@ -26,6 +26,10 @@ class Warp(Protocol):
         """Derivative of the displaced by the given point, shape (..., 3, 3)."""
         ...
 
+    def inverse(self, displaced: ArrayLike) -> NDArray[np.float64]:
+        """Displaced points (..., 3) back to where they are; NaN where there is no such point."""
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class WarpedCamera:
@@ -149,6 +153,21 @@ class WarpedCamera:
         p = self.center + s[:, None] * d
         p[:, 2] = heights
         return p
+
+
+def inverse_by_newton(warp: Warp, displaced: ArrayLike) -> NDArray[np.float64]:
+    """The inverse of a warp that knows none of its own, to 1e-9 m; NaN where it is not found."""
+    wanted = np.asarray(displaced, float)
+    p = wanted.reshape(-1, 3).copy()
+    miss = np.full_like(p, np.nan)
+    with np.errstate(all="ignore"):
+        for _ in range(_ITERATIONS):
+            miss = warp(p) - wanted.reshape(-1, 3)
+            p -= _solve(warp.jacobian(p), miss)
+            if not (np.abs(miss) > 1e-9).any():
+                break
+        p[~(np.abs(miss) < 1e-6).all(axis=1)] = np.nan
+    return p.reshape(wanted.shape)
 
 
 def _solve(J: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -148,6 +148,10 @@ class LocalFrame:
         """East, north, up to map X, Y and height; inverse of `to_local` (to the rounding of coordinates, 1e-9 m)."""
         return self._projection.from_geocentric(np.asarray(enu, float) @ self._R_local_earth + self._origin)
 
+    def inverse(self, displaced: ArrayLike) -> NDArray[np.float64]:
+        """The same as `to_map`."""
+        return self.to_map(displaced)
+
     @property
     def R_local_earth(self) -> NDArray[np.float64]:
         """Takes geocentric axes to east, north, up, shape (3, 3)."""

@@ -91,6 +91,14 @@ class Faces:
                 out[i] = found
         return out.reshape(*boxes.shape[:-1], 2)
 
+    def normals(self, face: NDArray[np.int64], ways: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Normals of faces (n,), of length one, against ways (n, 3); of −1 whatever there is."""
+        a, b, c = np.moveaxis(self._local[face], 1, 0)
+        n = np.cross(b - a, c - a)
+        n[(n * ways).sum(axis=1) > 0] *= -1.0
+        with np.errstate(invalid="ignore"):
+            return np.asarray(n / np.linalg.norm(n, axis=1, keepdims=True))
+
     def first_hit(
         self, paths: ArrayLike, bend: float = 0.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:

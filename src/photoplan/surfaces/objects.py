@@ -62,13 +62,17 @@ class ObjectSurface:
     def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
         """What rays meet first: the ground, as `Terrain.first_hit` has it, or a face, from either side."""
         ground = self.ground.first_hit(paths, bend)
-        along, XYZ, _ = self.faces.first_hit(paths, bend)
+        along, XYZ, face = self.faces.first_hit(paths, bend)
         nearer = np.isfinite(along) & ~(ground.along < along)
         return Hits(
-            np.where(nearer[:, None], XYZ, ground.XYZ),
-            np.where(nearer, along, ground.along),
-            np.where(nearer, SURFACE, ground.result),
-            ground.below & ~nearer,
+            XYZ=np.where(nearer[:, None], XYZ, ground.XYZ),
+            along=np.where(nearer, along, ground.along),
+            result=np.where(nearer, SURFACE, ground.result),
+            below=ground.below & ~nearer,
+            normal=np.where(
+                nearer[:, None], self.faces.normals(face, XYZ - np.asarray(paths, float)[:, 0]), ground.normal
+            ),
+            owner=np.where(nearer, self.faces.owner[face] + 1, ground.owner),
         )
 
 

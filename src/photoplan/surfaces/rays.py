@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
+from photoplan.kernels.normals import hit_normals
 from photoplan.kernels.pyramid import Pyramid, pyramid_of
 from photoplan.kernels.raycast import (
     ABOVE,
@@ -49,6 +50,23 @@ class Hits:
     """`kernels.raycast.MISS`, `SURFACE` or `WALL`, shape (n,)."""
     below: NDArray[np.bool_]
     """True where a ray that met nothing ended below the ground: it started there, or went there through a hole."""
+    normal: NDArray[np.float64]
+    """Of what is met, of length one, shape (n, 3): of the ground upwards, of walls and objects towards where the ray
+    comes from; NaN where a ray meets nothing. A shift of heights does not count."""
+    owner: NDArray[np.int64]
+    """What is met, shape (n,): 0 the ground, else the number of an object, from one; −1 where a ray meets nothing."""
+
+    @classmethod
+    def none(cls, n: int) -> Hits:
+        """Rays that meet nothing."""
+        return cls(
+            XYZ=np.full((n, 3), np.nan),
+            along=np.full(n, np.nan),
+            result=np.full(n, MISS),
+            below=np.zeros(n, bool),
+            normal=np.full((n, 3), np.nan),
+            owner=np.full(n, -1),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +190,7 @@ def follow(parts: Parts, paths: ArrayLike, bend: float = 0.0) -> Hits:
     if at.ndim != 3 or at.shape[1] < 2 or at.shape[2] != 3:
         raise UsageError(f"paths of shape {at.shape}; n paths of two points X, Y, Z or more are needed (n, k, 3)")
     n = len(at)
-    hits = Hits(np.full((n, 3), np.nan), np.full(n, np.nan), np.full(n, MISS), np.zeros(n, bool))
+    hits = Hits.none(n)
     states, away = np.full(n, NONE), np.zeros(n)
     cache: Cache = OrderedDict()
     for piece in range(at.shape[1] - 1):
@@ -186,13 +204,22 @@ def follow(parts: Parts, paths: ArrayLike, bend: float = 0.0) -> Hits:
         todo = np.flatnonzero((hits.result == MISS) & np.isfinite(lines).all(axis=1))
         if not len(todo):
             continue
-        t, states[todo], hits.result[todo] = _over_parts(parts, lines[todo], states[todo], cache)
+        t, states[todo], hits.result[todo], hits.normal[todo] = _over_parts(parts, lines[todo], states[todo], cache)
         there, t = todo[np.isfinite(t)], t[np.isfinite(t)]
         hits.along[there] = piece + t
         hits.XYZ[there] = lines[there, :3] + t[:, None] * lines[there, 3:6]
         hits.XYZ[there, 2] += t**2 * lines[there, 6]
+        _turn(hits.normal, there, step)
     hits.below[:] = (hits.result == MISS) & (states == BELOW)
+    hits.owner[hits.result != MISS] = 0
     return hits
+
+
+def _turn(normal: NDArray[np.float64], there: NDArray[np.int64], ways: NDArray[np.float64]) -> None:
+    """Give normals of some rays the length one, and those of walls the side that rays come from."""
+    n = normal[there]
+    n[(n[:, 2] == 0) & ((n * ways[there]).sum(axis=1) > 0)] *= -1.0
+    normal[there] = n / np.linalg.norm(n, axis=1, keepdims=True)
 
 
 def carried_hits(
@@ -211,7 +238,19 @@ def carried_hits(
     a, b = fine[there, piece], fine[there, piece + 1]
     hits.XYZ[there, :2] = (a + (hits.along[there] - piece)[:, None] * (b - a))[:, :2]
     hits.along[there] *= (paths.shape[1] - 1) / (fine.shape[1] - 1)
+    if len(there):
+        _carry_back(hits, there, carry)
     return hits
+
+
+def _carry_back(hits: Hits, there: NDArray[np.int64], carry: Carry) -> None:
+    """Turn normals from the CRS that `carry` leads to into that of the map."""
+    at, n = hits.XYZ[there, :2], hits.normal[there]
+    here = carry(at)
+    # A plane's gradient by the map is that by the other coordinates times their derivatives by the map.
+    turned = [((carry(at + step) - here) * n[:, :2]).sum(axis=1) for step in np.eye(2)]
+    n[:, :2] = np.stack(turned, axis=-1)
+    hits.normal[there] = n / np.linalg.norm(n, axis=1, keepdims=True)
 
 
 def _over_parts(
@@ -219,10 +258,10 @@ def _over_parts(
     lines: NDArray[np.float64],
     states: NDArray[np.int64],
     cache: OrderedDict[tuple[int, int], Part | None],
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Straight pieces of rays (n, 7): parameters of hits (NaN: none), new states, and results."""
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Straight pieces of rays (n, 7): parameters of hits (NaN: none), new states, results and normals."""
     lines, begin, size = _clipped(lines, parts.inside)
-    t, results = np.full(len(lines), np.nan), np.full(len(lines), MISS)
+    t, results, normals = np.full(len(lines), np.nan), np.full(len(lines), MISS), np.full((len(lines), 3), np.nan)
     # Outside there is no ground.
     states = np.where((begin > 0) | (size < 0), NONE, states)
     rays, window = _in_parts(parts, lines)
@@ -255,8 +294,17 @@ def _over_parts(
             states[here] = state
             met = (result != MISS) & ~asks
             done[here[met]], t[here[met]], results[here[met]] = True, local[met, 7], result[met]
+            if met.any():
+                normals[here[met]] = _normals(part, local[met], result[met])
     states[np.isnan(t) & (begin + size < 1)] = NONE
-    return begin + size * t, states, results
+    return begin + size * t, states, results, normals
+
+
+def _normals(part: Part, local: NDArray[np.float64], result: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Normals of a part's ground where rays have hit it, of no length in particular."""
+    out = np.empty((len(local), 3))
+    hit_normals(part.posts, part.faces, np.ascontiguousarray(local), result, out)
+    return out / (part.mesh[0], -part.mesh[1], 1.0)
 
 
 def _clipped(

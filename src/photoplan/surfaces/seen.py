@@ -1,0 +1,128 @@
+"""Terrain as it is seen from a point: the relief of a view, and what else is known of the ground of each pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import UsageError
+from photoplan.geometry.grid import Window
+from photoplan.surfaces.base import Terrain
+from photoplan.surfaces.rays import Hits
+from photoplan.targets.base import Target
+from photoplan.targets.view import ViewTarget
+
+#: How far one sees where terrain has no end, metres; and how deep the earth's surface reaches.
+_FAR, _DEEP = 300_000.0, 12_000.0
+#: What is a little longer on the ground than on the map.
+_STRETCH = 1.01
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What pixels of a view show, shape (n, …) or (height, width, …)."""
+
+    XYZ: NDArray[np.float64]
+    """Ground on the map, metres; NaN: sky."""
+    uvh: NDArray[np.float64]
+    """The pixels, with the depth that the view's target gives to this ground."""
+    normal: NDArray[np.float64]
+    """See `Hits.normal`."""
+    towards: NDArray[np.float64]
+    """Direction from the ground to the point of view, on the map, of length one."""
+    owner: NDArray[np.int64]
+    """0: terrain; else the number of an object, from one; −1: sky."""
+    below: NDArray[np.bool_]
+    """Sky because the ray ended below the ground."""
+
+    @property
+    def incidence(self) -> NDArray[np.float64]:
+        """Angle between the line of sight and the normal of what it meets, radians, 0 to π/2; NaN: sky."""
+        return np.arccos(np.clip((self.normal * self.towards).sum(axis=-1), 0.0, 1.0))
+
+    def reshaped(self, *shape: int) -> Seen:
+        """The same, with another first shape."""
+        return Seen(**{name: a.reshape(*shape, *a.shape[1:]) for name, a in vars(self).items()})
+
+
+@dataclass(frozen=True, eq=False)
+class SeenSurface:
+    """Terrain, with objects if it has some, as the surface of views."""
+
+    terrain: Terrain
+    bounds: tuple[float, float, float, float] | None = None
+    """Outer edges of the terrain; None: it has no end."""
+    farthest: float = np.inf
+    """Beyond this distance nothing is seen, metres."""
+    bound: float = 0.01
+    """Largest error of the ground across the line of sight, metres; it matters for rays that are not straight."""
+
+    def __post_init__(self) -> None:
+        if not (self.bound > 0 and self.farthest > 0):
+            raise UsageError(f"error bound {self.bound} m, view to {self.farthest} m; positive numbers are needed")
+
+    def relief(self, target: Target, window: Window) -> NDArray[np.float32]:
+        """Depth of what each pixel of a window shows, shape (height, width), metres; NaN: sky."""
+        return self.look(target, window).uvh[..., 2].astype(np.float32)
+
+    def look(self, target: Target, window: Window) -> Seen:
+        """What the pixels of a window show, shape (height, width, …)."""
+        v, u = np.mgrid[window.row : window.stop[1], window.col : window.stop[0]].astype(float)
+        return self.at(target, np.stack([u, v], axis=-1).reshape(-1, 2)).reshaped(window.height, window.width)
+
+    def at(self, target: Target, uv: NDArray[np.float64]) -> Seen:
+        """What pixels (n, 2), whole or not, show.
+
+        Raises
+        ------
+        UsageError
+            The target is no view.
+        """
+        if not isinstance(target, ViewTarget):
+            raise UsageError(f"terrain is seen in views, not in {type(target).__name__}")
+        paths = target.rays(uv, self._reach(target), self.bound / 2)
+        hits = self.terrain.first_hit(paths, target.bend)
+        uvh = np.concatenate([uv, target.to_view(hits.XYZ)[:, 2:]], axis=1)
+        gone = target.distance(uvh) > self.farthest
+        hits.XYZ[gone], hits.normal[gone], hits.owner[gone], uvh[gone, 2] = np.nan, np.nan, -1, np.nan
+        return Seen(
+            XYZ=hits.XYZ,
+            uvh=uvh,
+            normal=hits.normal,
+            towards=_back(target, hits),
+            owner=hits.owner,
+            below=hits.below,
+        )
+
+    def _reach(self, target: ViewTarget) -> float:
+        """Length at which rays have left the terrain, to its side or below it."""
+        away = _FAR
+        if self.bounds is not None:
+            b = np.array(self.bounds).reshape(2, 2)
+            away = float(np.linalg.norm(np.abs(b - target.center[:2]).max(axis=0))) + 1.0
+        down = target.to_cartesian(target.center - (0.0, 0.0, abs(float(target.center[2])) + _DEEP))
+        depth = float(np.linalg.norm(down - target.bundle.center))
+        return _STRETCH * float(min(np.hypot(away, depth), max(self.farthest, depth)))
+
+
+def _back(target: ViewTarget, hits: Hits) -> NDArray[np.float64]:
+    """Directions of rays on the map where they end, backwards, of length one."""
+    way = target.center - hits.XYZ
+    way[:, 2] -= target.bend * (way[:, :2] ** 2).sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(way / np.linalg.norm(way, axis=1, keepdims=True))
+
+
+def ground_size(target: ViewTarget, seen: Seen) -> NDArray[np.float64]:
+    """Side of a square of the area that each pixel covers on what it shows, metres; NaN: sky, infinite edge-on."""
+    uv, half = seen.uvh[..., :2], np.array([0.5, 0.0])
+    across, along = (
+        target.bundle.directions(uv + step) - target.bundle.directions(uv - step) for step in (half, half[::-1])
+    )
+    here = target.bundle.directions(uv)
+    # The solid angle of the pixel, times the squared distance, per unit of depth.
+    area = np.abs((np.cross(across, along) * here).sum(axis=-1)) / np.linalg.norm(here, axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.abs(seen.uvh[..., 2]) * np.sqrt(area / np.cos(seen.incidence)))

@@ -1,0 +1,175 @@
+"""The perspective view as a target: (u, v) is a pixel of a virtual camera, h the depth along its axis.
+
+With a pinhole the ground of a pixel is linear in each of u, v and h, so that everything projective over a tile of it is
+one box of anchors, exactly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.cameras.base import project
+from photoplan.cameras.frame import FrameCamera
+from photoplan.cameras.warped import Warp, WarpedCamera
+from photoplan.geometry.grid import Placement, Window
+
+#: Rays that are bent are followed in at most so many pieces.
+MOST_PIECES = 64
+#: Rays of a window that are looked at to find out how many pieces are needed.
+_SAMPLE = 49
+
+
+class Bundle(Protocol):
+    """Straight rays from one point through the pixels of a picture, in Cartesian space."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the picture, pixels."""
+        ...
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """The point, shape (3,)."""
+        ...
+
+    def directions(self, uv: ArrayLike) -> NDArray[np.float64]:
+        """What is added to the point per unit of depth at pixels (..., 2), shape (..., 3); NaN: no ray."""
+        ...
+
+    def pixels(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """Pixel and depth (..., 3) of points (..., 3); NaN where no ray leads there."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class FrameBundle:
+    """The rays of a frame camera with its lens; depth is that along its axis."""
+
+    camera: FrameCamera
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the picture, pixels."""
+        return self.camera.size
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """Projection centre."""
+        return self.camera.center
+
+    @property
+    def _axis(self) -> NDArray[np.float64]:
+        """The direction of view."""
+        return np.asarray(-self.camera.pose.R_ground_camera[:, 2])
+
+    def directions(self, uv: ArrayLike) -> NDArray[np.float64]:
+        """Directions (..., 3) whose part along the axis is one."""
+        _, unit = self.camera.rays(uv)
+        return np.asarray(unit / (unit @ self._axis)[..., None])
+
+    def pixels(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """Pixel and depth (..., 3); NaN at and behind the camera's plane."""
+        XYZ = np.asarray(XYZ, float)
+        return np.concatenate([project(self.camera, XYZ), ((XYZ - self.center) @ self._axis)[..., None]], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class ViewTarget:
+    """A picture as it is seen from a point: pixels of a bundle of rays, which warps may bend."""
+
+    bundle: Bundle
+    center: NDArray[np.float64]
+    """The point of view in map coordinates, shape (3,)."""
+    warps: tuple[Warp, ...] = ()
+    """What leads from the map to the Cartesian space of the bundle: exaggeration, refraction, a round earth."""
+    bend: float = 0.0
+    """What straight rays of the bundle rise on the map, nearly, per squared distance, 1/m: it decides into how many
+    pieces rays are cut, not where they are."""
+    breaks: None = field(default=None, init=False)
+    """It is nowhere bent."""
+
+    @classmethod
+    def of_camera(cls, camera: FrameCamera | WarpedCamera) -> ViewTarget:
+        """What a camera sees, with its lens, curvature and refraction as they are."""
+        if isinstance(camera, WarpedCamera):
+            return cls(FrameBundle(camera.frame), camera.center, camera.warps, camera.curvature / 2)
+        return cls(FrameBundle(camera), camera.center)
+
+    @property
+    def window(self) -> Window:
+        """All pixels of the picture."""
+        return Window(0, 0, *self.bundle.size)
+
+    @property
+    def placement(self) -> Placement:
+        """A picture lies on no map."""
+        return Placement(self.bundle.size)
+
+    def to_ground(self, uvh: ArrayLike) -> NDArray[np.float64]:
+        """Pixels and depth (..., 3) to map coordinates (..., 3); NaN where there is no ray."""
+        uvh = np.asarray(uvh, float)
+        return self._on_map(self.bundle.center + uvh[..., 2:] * self.bundle.directions(uvh[..., :2]))
+
+    def to_view(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """Map coordinates (..., 3) to pixel and depth (..., 3), whether anything is in between or not; the inverse."""
+        return self.bundle.pixels(self.to_cartesian(XYZ))
+
+    def to_cartesian(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """Map coordinates (..., 3) to the space of the bundle, where rays are straight."""
+        p = np.asarray(XYZ, float)
+        for warp in self.warps:
+            p = warp(p)
+        return p
+
+    def distance(self, uvh: ArrayLike) -> NDArray[np.float64]:
+        """Length of the ray to places (..., 3), shape (...), metres of the bundle's space."""
+        uvh = np.asarray(uvh, float)
+        return np.asarray(uvh[..., 2] * np.linalg.norm(self.bundle.directions(uvh[..., :2]), axis=-1))
+
+    def rays(self, uv: NDArray[np.float64], reach: float, tolerance: float) -> NDArray[np.float64]:
+        """Rays through pixels on the map, less what `bend` raises them: for `Terrain.first_hit`.
+
+        Parameters
+        ----------
+        uv : ndarray, shape (n, 2)
+        reach : float
+            Their length, metres.
+        tolerance : float
+            By how much a ray may leave the pieces of its path, measured at their middles, metres.
+
+        Returns
+        -------
+        ndarray, shape (n, k, 3)
+        """
+        pieces = 1
+        if self.warps:
+            sample = uv[:: max(1, len(uv) // _SAMPLE)]
+            while pieces < MOST_PIECES and self._off(sample, reach, pieces) > tolerance:
+                pieces *= 2
+        return self._path(uv, reach, pieces)
+
+    def _off(self, uv: NDArray[np.float64], reach: float, pieces: int) -> float:
+        """By how much the middles of pieces leave them at most."""
+        path = self._path(uv, reach, 2 * pieces)
+        off = np.linalg.norm(path[:, 1::2] - (path[:, :-1:2] + path[:, 2::2]) / 2, axis=-1)
+        return float(np.nanmax(off, initial=0.0))
+
+    def _path(self, uv: NDArray[np.float64], reach: float, pieces: int) -> NDArray[np.float64]:
+        along = reach * np.arange(1, pieces + 1)[:, None] / pieces
+        unit = self.bundle.directions(uv)
+        unit /= np.linalg.norm(unit, axis=-1, keepdims=True)
+        path = np.empty((len(uv), pieces + 1, 3))
+        path[:, 0] = self.center
+        path[:, 1:] = self._on_map(self.bundle.center + along * unit[:, None])
+        if self.warps:
+            path[..., 2] -= self.bend * ((path[..., :2] - self.center[:2]) ** 2).sum(axis=-1)
+        return path
+
+    def _on_map(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        for warp in reversed(self.warps):
+            points = warp.inverse(points)
+        return points
