@@ -30,6 +30,7 @@ __getattr__, __dir__, __all__ = public(
         "products.orthophoto.plan": "plan_orthophotos render",
         "products.orthophoto.execution": "execute",
         "products.orthophoto.mosaic": "plan_mosaic",
+        "products.orthophoto.objects": "plan_objects",
         "products.orthophoto.plan_file": "read_plan",
         "project.open_terrain": "open_terrain",
         "cameras.frame": "FrameCamera",

@@ -64,9 +64,13 @@ EXAMPLES = list(examples())
 @pytest.mark.parametrize("verb", PLACES)
 def test_options_of_a_verb(verb):
     told, elsewhere = long_options(section_of(verb)), {"run": {"--plan"}}.get(verb, set())
-    # Of a mosaic only those are listed that an orthophoto does not have.
-    same = options_of("ortho") - {"--true", "--ground"} if verb == "mosaic" else set()
-    assert (told - elsewhere - {"--true"} if same else told - elsewhere) | same == options_of(verb)
+    # Of a mosaic only those are listed that an orthophoto does not have, of an object those that a mosaic has not.
+    same = {
+        "mosaic": options_of("ortho") - {"--true", "--ground"},
+        "object": options_of("mosaic") - {"--name", "--seams"},
+    }.get(verb, set())
+    others = {"--true", "--name", "--seams"} if same else set()
+    assert (told - elsewhere - (others - options_of(verb))) | same == options_of(verb)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)

@@ -31,6 +31,7 @@ VERBS = {
     "budget": "What limits the accuracy of products, cause by cause.",
     "ortho": "Make orthophotos.",
     "mosaic": "Make one orthophoto of many images.",
+    "object": "Make a product of each object alone.",
     "run": "Execute a plan written by `ortho --plan`.",
     "dtm": "Terrain models: build, sample, contours, volumes …",
     "monoplot": "Image points to ground points on a terrain model.",

@@ -142,6 +142,53 @@ def product_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
+_PENALTIES = ("slant", "coarseness", "border", "occlusion")
+
+
+def choosing_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """How images are chosen, for verbs that make one product of many."""
+    options = [
+        click.option(
+            "--score",
+            metavar="NAME=WEIGHT,…",
+            multiple=True,
+            callback=lambda c, p, values: listed(values),
+            help=f"Weights of {', '.join(_PENALTIES)} [1, 1, 1, 0.5].",
+        ),
+        click.option(
+            "--prefer",
+            metavar="NAME,…",
+            multiple=True,
+            callback=lambda c, p, values: listed(values),
+            help="Images that come first wherever they see the ground.",
+        ),
+        click.option(
+            "--sources",
+            is_flag=True,
+            help="Also which image painted each pixel: NAME_sources.tif, NAME_seams.gpkg.",
+        ),
+    ]
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def weights(given: Sequence[str]) -> Any:
+    """Weights of the score from NAME=WEIGHT."""
+    from photoplan.plan.choice import Weights
+
+    values: dict[str, float] = {}
+    for text in given:
+        name, _, number = text.partition("=")
+        try:
+            values[name] = float(number)
+        except ValueError:
+            name = ""
+        if name not in _PENALTIES:
+            raise click.BadParameter(f"{text!r}; write NAME=WEIGHT with {', '.join(_PENALTIES)}", param_hint="--score")
+    return Weights(**values)
+
+
 def executing(command: Callable[..., Any]) -> Callable[..., Any]:
     """The options of every verb that executes a plan."""
     options = [

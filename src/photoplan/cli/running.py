@@ -85,7 +85,7 @@ def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling)
         f"hidden {settings.hidden} · {how.workers} {how.executor}"
     )
     for line in plan.blind:
-        events.talk(f"  sees no terrain and is left out: {line}")
+        events.talk(f"  {'' if plan.of_objects else 'sees no terrain and is '}left out: {line}")
     run = Run(how.workers, how.executor, how.memory, how.overwrite, how.quicklook, events)
     failed = None
     try:
@@ -143,6 +143,8 @@ def _summary(results: list[ProductResult], plan: OrthoPlan, seconds: float) -> s
     what = (
         f"{len(results)} orthophotos" if plan.settings.choice is None else f"mosaic of {len(results[0].images)} images"
     )
+    if plan.of_objects:
+        what = f"{len(results)} products of single objects"
     return (
         f"{what} in {seconds:.1f} s · {pixels:.1f} Mpx, {pixels / seconds:.3g} Mpx/s · "
         f"{cells} cells, worst anchor residual {worst:.3g} px{_hidden(results)}"

@@ -24,7 +24,7 @@ def show_plan(plan: OrthoPlan, folder: Path, plan_file: Path | None, how: How, e
     show(plan)
     show(_sums(plan, figures))
     for line in plan.blind:
-        show(f"  sees no terrain: {line}")
+        show(f"  {'left out' if plan.of_objects else 'sees no terrain'}: {line}")
     if plan_file is not None:
         show(plan_file)
 

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import Camera, CentralCamera
 from photoplan.geometry.grid import MapGrid
@@ -179,8 +180,16 @@ def mean_gsd(camera: Camera, seen: Footprint) -> float:
     return float(np.nanmean(1 / np.sqrt(area)))
 
 
+class Ranged(Protocol):
+    """What knows the range of its heights inside map bounds, as `Terrain.height_range` has it."""
+
+    def height_range(self, bounds: ArrayLike) -> NDArray[np.float64]:
+        """Lower and upper bound of the heights inside map bounds (..., 4), shape (..., 2); NaN where there are none."""
+        ...
+
+
 def covered_tiles(
-    camera: CentralCamera, terrain: Terrain, grid: MapGrid, side: int, seen: Bounds | None = None
+    camera: CentralCamera, terrain: Ranged, grid: MapGrid, side: int, seen: Bounds | None = None
 ) -> Tiles:
     """Tiles that can hold a pixel of the image, judged from the range of heights under each tile; others than those
     that meet `seen`, the bounds of its footprint, are not looked at."""

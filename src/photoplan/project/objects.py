@@ -12,17 +12,16 @@ from numpy.typing import NDArray
 from photoplan.errors import HeightSystemError, InputError
 from photoplan.geometry.crs import CrsStep, crs_label, crs_step, require_projected_metres, same_crs
 from photoplan.geometry.heights import OPTIONS, HeightStep, check_height_system, height_step
-from photoplan.io.objects.file import read_objects
+from photoplan.io.objects.file import read_with_faults
 from photoplan.io.objects.model import ObjectFile
 from photoplan.io.project.model import Objects
 from photoplan.surfaces.base import Terrain
 from photoplan.surfaces.faces import Faces
 from photoplan.surfaces.objects import ObjectSurface
+from photoplan.surfaces.polygon_faces import cannot_be_used
 
 #: Objects whose highest point is deeper than this below the ground, metres, are refused.
 DEEP = 0.5
-#: Objects that are named in a message.
-_NAMED = 5
 
 Steps = tuple[CrsStep | HeightStep, ...]
 
@@ -58,26 +57,32 @@ def with_objects(ground: Terrain, files: Sequence[tuple[Path, Objects]], place: 
     Raises
     ------
     InputError
-        A file cannot be used, its CRS is not known or none of its objects is near the terrain, or objects lie below the
-        ground; they are named.
+        A file cannot be used, its CRS is not known or none of its objects is near the terrain, or objects cannot be
+        used, since they cross themselves, have no heights or lie below the ground; each is named.
     HeightSystemError
         Their heights are not declared, or cannot be joined.
     """
     corners, paints, owners = [], [], []
     names: list[str] = []
+    entries: list[int] = []
     steps: list[CrsStep | HeightStep] = []
-    for path, stated in files:
-        own = read_objects(path, stated.layer)
+    for entry, (path, stated) in enumerate(files):
+        own = read_with_faults(path, stated.layer)
+        if not len(own.corners):
+            raise cannot_be_used(str(path), own.faults)
         placed, taken = _placed(path, own, stated, place)
         steps += taken
         roles = [stated.role or role or ("occluder" if own.mesh else "paint") for role in own.roles]
-        _refuse_buried(path, own, placed, ground, place)
+        faults = {**own.faults, **_buried(own, placed, ground)}
+        if faults:
+            raise cannot_be_used(str(path), faults)
         corners.append(placed)
         paints.append(np.array([role == "paint" for role in roles])[own.owner])
         owners.append(own.owner + len(names))
         names += own.names
+        entries += [entry] * len(own.names)
     faces = Faces(np.concatenate(corners), np.concatenate(paints), np.concatenate(owners), tuple(names))
-    return ObjectSurface(ground, faces), tuple(steps)
+    return ObjectSurface(ground, faces, entries=tuple(entries)), tuple(steps)
 
 
 def _placed(path: Path, own: ObjectFile, stated: Objects, place: Place) -> tuple[NDArray[np.float64], Steps]:
@@ -85,13 +90,16 @@ def _placed(path: Path, own: ObjectFile, stated: Objects, place: Place) -> tuple
     corners = own.corners + (stated.offset or (0.0, 0.0, 0.0))
     crs = own.crs or stated.crs
     if crs is None:
-        raise InputError(f'{path}: no CRS; state it as crs = "EPSG:nnnn" in [[objects]], it is not guessed')
+        raise InputError(
+            f'{path}: no CRS (`crs` states it); state it as crs = "EPSG:nnnn" in [[objects]], it is not guessed'
+        )
     if own.crs is not None and stated.crs is not None and not same_crs(own.crs, stated.crs):
         raise InputError(f"{path}: is in {crs_label(own.crs)}; [[objects]] states {crs_label(stated.crs)}: remove that")
     system = own.height_system or stated.height_system
     if system is None:
         raise HeightSystemError(
-            f"{path}: no height system stated → height_system = … in [[objects]]; allowed are {OPTIONS}"
+            f"{path}: no height system stated (`height_system` states it) → height_system = … in [[objects]]; "
+            f"allowed are {OPTIONS}"
         )
     system = check_height_system(system, str(path))
     steps: list[CrsStep | HeightStep] = []
@@ -124,16 +132,13 @@ def _refuse_apart(path: Path, corners: NDArray[np.float64], place: Place) -> Non
         )
 
 
-def _refuse_buried(path: Path, own: ObjectFile, corners: NDArray[np.float64], ground: Terrain, place: Place) -> None:
-    """Refuse objects that lie below the ground as a whole; beyond the terrain nothing is known."""
+def _buried(own: ObjectFile, corners: NDArray[np.float64], ground: Terrain) -> dict[str, str]:
+    """Objects that lie below the ground as a whole, by name; beyond the terrain nothing is known."""
     over = np.full(len(own.names), -np.inf)
     above = corners[..., 2] - ground.heights(corners[..., :2])
     np.maximum.at(over, np.repeat(own.owner, 3), np.where(np.isfinite(above), above, np.inf).ravel())
-    buried = np.flatnonzero(over < -DEEP)
-    if len(buried):
-        told = ", ".join(f"{own.names[k]!r} by {-over[k]:.1f} m" for k in buried[:_NAMED])
-        more = f" and {len(buried) - _NAMED} more" if len(buried) > _NAMED else ""
-        raise InputError(
-            f"{path}: {len(buried)} of {len(own.names)} objects lie below the ground: {told}{more}; check height "
-            "system and offset, or remove them"
-        )
+    there = np.bincount(own.owner, minlength=len(over)) > 0
+    return {
+        own.names[k]: f"lies below the ground, by {-over[k]:.1f} m; are height system and offset right?"
+        for k in np.flatnonzero(there & (over < -DEEP))
+    }

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, overload
 
 from photoplan.engine.base import Source
 from photoplan.io.project.model import Project
 from photoplan.project.scene import Scene, SceneAddress, scene_address
 from photoplan.surfaces.base import Terrain
+from photoplan.surfaces.objects import ObjectSurface, Part
 
 
 @dataclass(frozen=True)
@@ -18,9 +20,11 @@ class ScenesAddress:
 
     scenes: tuple[SceneAddress, ...]
     """One for each row of the table of sources; all over the same ground."""
+    part: Part | None = None
+    """What is shown of the ground's objects, where it is a single one."""
 
     @classmethod
-    def of(cls, project: Project, names: Sequence[str]) -> ScenesAddress:
+    def of(cls, project: Project, names: Sequence[str], part: Part | None = None) -> ScenesAddress:
         """Addresses of images of a project.
 
         Raises
@@ -28,12 +32,13 @@ class ScenesAddress:
         InputError
             A file is missing.
         """
-        return cls(tuple(scene_address(project, name) for name in names))
+        return cls(tuple(scene_address(project, name) for name in names), part)
 
     @property
     def facts(self) -> list[dict[str, Any]]:
         """What moves a pixel, see `SceneAddress.facts`."""
-        return [scene.facts for scene in self.scenes]
+        part = [] if self.part is None else [{"part": [list(self.part.objects), self.part.below]}]
+        return [scene.facts for scene in self.scenes] + part
 
     @property
     def digests(self) -> tuple[tuple[str, str], ...]:
@@ -58,11 +63,21 @@ class Scenes:
 
     @property
     def surface(self) -> Terrain:
-        """The ground that they have in common."""
-        return self[0].surface
+        """The ground that they have in common, or what is shown of it."""
+        return surface_of(self.address)
 
     def __getitem__(self, row: int) -> Scene:
         return self.address.scenes[row].open()
+
+
+@lru_cache(maxsize=16)
+def surface_of(address: ScenesAddress) -> Terrain:
+    """The ground that images have in common, or what is shown of it; kept, since it finds its faces once."""
+    surface = address.scenes[0].open().surface
+    if address.part is None:
+        return surface
+    assert isinstance(surface, ObjectSurface)
+    return replace(surface, part=address.part)
 
 
 @dataclass(frozen=True)

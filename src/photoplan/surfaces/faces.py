@@ -52,10 +52,13 @@ class Faces:
     @cached_property
     def painted(self) -> Faces | None:
         """Those that are painted; None: there are none."""
-        if self.paints.all():
-            return self
-        p = self.paints
-        return Faces(self.corners[p], p[p], self.owner[p], self.names) if p.any() else None
+        return self if self.paints.all() else self.only(self.paints)
+
+    def only(self, use: NDArray[np.bool_]) -> Faces | None:
+        """Some of them, chosen (n,), all painted; None: there are none."""
+        if not use.any():
+            return None
+        return Faces(self.corners[use], np.ones(int(use.sum()), bool), self.owner[use], self.names)
 
     @property
     def in_cells(self) -> tuple[NDArray[np.float64], Cells, NDArray[np.float64]]:

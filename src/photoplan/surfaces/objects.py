@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +18,16 @@ from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
 
 
+@dataclass(frozen=True)
+class Part:
+    """What a product shows where it is the product of a single object."""
+
+    objects: tuple[int, ...]
+    """The object, by its places in `Faces.names`: some are made of several features."""
+    below: bool = False
+    """Whether what lies below it is shown, as if it only hid, and not itself."""
+
+
 @dataclass(frozen=True, eq=False)
 class ObjectSurface:
     """Terrain that is raised by the objects which a product shows, and from which rays are kept by all of them.
@@ -27,17 +38,39 @@ class ObjectSurface:
     ground: Terrain
     """Without objects."""
     faces: Faces
+    part: Part | None = None
+    """What is shown of it; None: the ground, and all that is painted. All of it hides what is behind it."""
+    entries: tuple[int, ...] = ()
+    """Entry of the project that each object is of, by place in `Faces.names`."""
 
     @property
     def painted(self) -> Terrain:
         """The surface without objects that only hide: what a product is an image of."""
         faces = self.faces.painted
-        return self.ground if faces is None else ObjectSurface(self.ground, faces)
+        return self.ground if faces is None else replace(self, faces=faces, part=None)
+
+    @cached_property
+    def shown(self) -> Faces | None:
+        """Faces that a product shows."""
+        if self.part is None:
+            return self.faces.painted
+        own = np.isin(self.faces.owner, self.part.objects)
+        return self.faces.only(self.faces.paints & ~own if self.part.below else own)
+
+    @property
+    def shows_ground(self) -> bool:
+        """Whether a product shows the ground beside them."""
+        return self.part is None or self.part.below
 
     def relief(self, target: Target, window: Window) -> NDArray[np.float32]:
-        """Height of the ground or of the highest painted face above it at the pixel centres of a window of a map
-        target, shape (height, width), metres; NaN where there is neither."""
-        relief, faces = self.ground.relief(target, window), self.faces.painted
+        """Height of the ground or of the highest shown face above it at the pixel centres of a window of a map
+        target, shape (height, width), metres; NaN where there is neither. Of a single object that of its own faces,
+        also where they are below the ground."""
+        faces = self.shown
+        if not self.shows_ground:
+            relief = np.full((window.height, window.width), np.nan, np.float32)
+        else:
+            relief = self.ground.relief(target, window)
         if faces is None:
             return relief
         if not isinstance(target, MapTarget):
@@ -47,8 +80,9 @@ class ObjectSurface:
         return np.where(np.isneginf(raised), relief, np.fmax(relief, raised)).astype(np.float32)
 
     def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
-        """Height of the ground or of the highest painted face above it at map points (..., 2), shape (...)."""
-        heights, faces = self.ground.heights(XY), self.faces.painted
+        """As `relief`, at map points (..., 2), shape (...)."""
+        faces = self.shown
+        heights = self.ground.heights(XY) if self.shows_ground else np.full(np.shape(XY)[:-1], np.nan)
         if faces is None:
             return heights
         raised = faces.heights(XY)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,8 +20,8 @@ Rings = Sequence[NDArray[np.float64]]
 LEAST_AREA = 1e-6
 #: A ring that comes back to itself within this is not yet one that crosses itself, metres: files round to millimetres.
 ROUNDING = 2e-3
-#: Polygons that are named in a message.
-_NAMED = 5
+#: Polygons that are named in a message, each on a line of its own.
+_NAMED = 100
 
 
 def triangles_of(
@@ -52,6 +52,23 @@ def triangles_of(
     InputError
         Polygons have vertices without a height, or cross themselves; they are named.
     """
+    corners, polygon, faults = filled(polygons, names)
+    if faults:
+        raise cannot_be_used(where, faults)
+    return corners, polygon
+
+
+def cannot_be_used(where: str, faults: Mapping[str, str]) -> InputError:
+    """The error that names polygons one by one, each with what is wrong with it."""
+    told = "".join(f"\n  {name!r} {fault}" for name, fault in list(faults.items())[:_NAMED])
+    more = f"\n  and {len(faults) - _NAMED} more" if len(faults) > _NAMED else ""
+    return InputError(f"{where}: {len(faults)} polygons cannot be used; repair or remove them:{told}{more}")
+
+
+def filled(
+    polygons: Sequence[Rings], names: Sequence[str]
+) -> tuple[NDArray[np.float64], NDArray[np.int64], dict[str, str]]:
+    """Triangles as of `triangles_of`, and what is wrong with polygons that have none, by name."""
     flat: list[Any] = []
     bases: list[_Base | None] = []
     faults: dict[str, str] = {}
@@ -61,10 +78,6 @@ def triangles_of(
             faults[name] = fault
         flat.append(plane)
         bases.append(base)
-    if faults:
-        told = "; ".join(f"{name!r} {fault}" for name, fault in list(faults.items())[:_NAMED])
-        more = f"; and {len(faults) - _NAMED} more" if len(faults) > _NAMED else ""
-        raise InputError(f"{where}: {len(faults)} polygons cannot be used: {told}{more}. Repair or remove them")
     found = shapely.constrained_delaunay_triangles(np.array(flat, object))
     pieces, polygon = shapely.get_parts(found, return_index=True)
     uv = shapely.get_coordinates(pieces).reshape(-1, 4, 2)[:, :3]
@@ -73,7 +86,7 @@ def triangles_of(
     for base, first, last in zip(bases, starts[:-1], starts[1:]):
         if base is not None:
             corners[first:last] = base.in_space(uv[first:last])
-    return corners, polygon.astype(np.int64)
+    return corners, polygon.astype(np.int64), faults
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.crs import split_compound
-from photoplan.surfaces.polygon_faces import Rings, triangles_of
+from photoplan.surfaces.polygon_faces import Rings, filled
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +29,8 @@ class ObjectFile:
     height_system: str | None
     mesh: bool = False
     """Whether it is a mesh, which by itself only hides."""
+    faults: Mapping[str, str] = field(default_factory=dict)
+    """What is wrong with polygons that have no triangles for it, by name of the object."""
 
 
 def from_polygons(
@@ -56,11 +59,12 @@ def from_polygons(
     Raises
     ------
     InputError
-        Polygons cross themselves or have no heights, or there is none with an inside.
+        There is no polygon with an inside.
     """
-    corners, polygon = triangles_of(polygons, [names[k] for k in objects], where)
-    if not len(corners):
+    corners, polygon, faults = filled(polygons, [names[k] for k in objects])
+    if not len(corners) and not faults:
         raise InputError(f"{where}: holds no face of an object; give a file or a layer that does")
     horizontal, heights = (None, None) if crs is None else split_compound(crs)
     owner = np.array(objects, np.int32)[polygon]
-    return ObjectFile(corners, owner, tuple(names), tuple(roles or [None] * len(names)), horizontal, heights)
+    said = tuple(roles or [None] * len(names))
+    return ObjectFile(corners, owner, tuple(names), said, horizontal, heights, faults=faults)

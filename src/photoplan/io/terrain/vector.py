@@ -95,7 +95,7 @@ def _is_drawing(path: Path) -> bool:
     with path.open("rb") as file:
         head = file.read(22)
     return head.startswith(b"AutoCAD Binary DXF") or not head.startswith(
-        (b"SQLite", b"\x00\x00\x27\x0a", b"{", b"\xef")
+        (b"SQLite", b"\x00\x00\x27\x0a", b"{", b"\xef", b"fgb")
     )
 
 

@@ -26,6 +26,7 @@ from photoplan.io.quicklook import refuse_foreign_overview, write_overview
 from photoplan.io.run_record import input_entry, run_times, versions, write_run_record
 from photoplan.kernels.rectify import is_compiled
 from photoplan.plan.accuracy import BANDS, radial_error
+from photoplan.plan.tiles import Tiles
 from photoplan.products.orthophoto.finished import (
     ProductResult,
     all_files,
@@ -174,7 +175,7 @@ def _work(
     """What there is to do for a product."""
     if kept is not None:
         return Kept(kept, len(product.plan.tiles))
-    settings, address = plan.settings, ScenesAddress.of(plan.project, product.images)
+    settings, address = plan.settings, product.address(plan.project)
     scenes = address.open()
     scene = scenes[0]
     for note in dict.fromkeys(note for row in range(len(product.images)) for note in scenes[row].notes):
@@ -221,7 +222,7 @@ def _work(
 
 def _pixel_files(plan: OrthoPlan) -> list[Path]:
     """Files that workers open."""
-    addresses = (ScenesAddress.of(plan.project, p.images) for p in plan.products)
+    addresses = (p.address(plan.project) for p in plan.products)
     return [Path(path) for path in dict.fromkeys(path for a in addresses for path, _ in a.digests)]
 
 
@@ -264,7 +265,7 @@ def _complete(
             tiles=product.plan.tiles.total,
             resumed=tally.resumed,
             hidden=_area(tally, "hidden", product) if plan.settings.asks_hidden else None,
-            bare=None if plan.settings.choice is None else _area(tally, "bare", product) + _left_out(product),
+            bare=None if plan.settings.choice is None else _area(tally, "bare", product) + _left_out(product, address),
             painted=painted,
             accuracy=_accuracy(tally.totals["radial_errors"]) if "radial_errors" in tally.totals else None,
             failed=tuple(sorted(tally.failed)),
@@ -296,10 +297,15 @@ def _area(tally: Tally, name: str, product: OrthoProduct) -> float:
     return float(tally.totals.get(name, 0) * product.grid.resolution**2)
 
 
-def _left_out(product: OrthoProduct) -> float:
-    """Area of tiles that no image can paint, m²."""
+def _left_out(product: OrthoProduct, address: ScenesAddress) -> float:
+    """Area of tiles that no image can paint, m²; of a single object the area that it has in them."""
     tiles = product.plan.tiles
-    return float((product.grid.window.size - tiles.windows[:, 2:].prod(axis=1).sum()) * product.grid.resolution**2)
+    pixels = product.grid.window.size - tiles.windows[:, 2:].prod(axis=1).sum()
+    if product.part is not None and not product.part.below:
+        every = Tiles.every(tiles.window, tiles.side)
+        surface, others = address.open().surface, every.only(np.setdiff1d(np.arange(tiles.total), tiles.indices))
+        pixels = sum(np.isfinite(surface.relief(product.plan.target, tile.window)).sum() for tile in others)
+    return float(pixels * product.grid.resolution**2)
 
 
 def _tags(plan: OrthoPlan, product: OrthoProduct) -> dict[str, str]:

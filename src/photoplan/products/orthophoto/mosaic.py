@@ -56,17 +56,10 @@ def plan_mosaic(
         An unknown image or setting, bounds that hold nothing, or a resolution that is much too fine.
     """
     chosen = chosen_settings(project, settings, {"choice": Choice(), "hidden": "nodata", **changes})
-    assert chosen.choice is not None
-    names = project.select(images)
-    first = project.select(chosen.choice.prefer) if chosen.choice.prefer else []
-    apart = [name for name in first if name not in names]
-    if apart:
-        raise UsageError(f"image {apart[0]!r} is preferred, but not among the images of the mosaic")
-    order = [name for pattern in chosen.choice.prefer for name in project.select([pattern])]
-    chosen = replace(chosen, choice=replace(chosen.choice, prefer=tuple(dict.fromkeys(order))))
+    names, chosen = with_preferred(project, images, chosen)
     events.begin("planning", 2 * len(names), "steps")
     looked, blind = look_at(project, names, force, events)
-    _refuse_mixed(looked)
+    refuse_mixed(looked)
     chosen = with_resolution(project, chosen, looked, force)
     refuse_blind(chosen, looked, blind)
     grid = grid_of(project, chosen, [one.look.footprint for one in looked])
@@ -106,7 +99,20 @@ def drawn_regions(project: Project, settings: OrthoSettings, images: tuple[str, 
     return read_regions(project.resolve(settings.choice.seams), images, grid)
 
 
-def _refuse_mixed(looked: Sequence[Looked]) -> None:
+def with_preferred(
+    project: Project, images: Sequence[str] | None, chosen: OrthoSettings
+) -> tuple[list[str], OrthoSettings]:
+    """Names of the images among which is chosen, and settings that name the preferred ones without patterns."""
+    assert chosen.choice is not None
+    names = project.select(images)
+    order = [name for pattern in chosen.choice.prefer for name in project.select([pattern])]
+    apart = [name for name in order if name not in names]
+    if apart:
+        raise UsageError(f"image {apart[0]!r} is preferred, but not among the images of the mosaic")
+    return names, replace(chosen, choice=replace(chosen.choice, prefer=tuple(dict.fromkeys(order))))
+
+
+def refuse_mixed(looked: Sequence[Looked]) -> None:
     """Refuse images that cannot lie in one file."""
     kinds: dict[tuple[int, str], str] = {}
     for one in looked:

@@ -33,7 +33,7 @@ from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.scene import Scene
 from photoplan.project.scenes import ScenesAddress
 from photoplan.project.uncertain import ScenesErrors
-from photoplan.surfaces.objects import painted_surface
+from photoplan.surfaces.objects import Part, painted_surface
 from photoplan.targets.map import MapTarget
 
 #: What it counts that a user prefers an image: more than any penalty of the score.
@@ -50,11 +50,17 @@ class OrthoProduct:
     """What each of its images sees, by row of the table of sources."""
     key: str
     """Hash of all that decides the pixels: inputs, orientation, settings, version."""
+    part: Part | None = None
+    """What it shows, where it is the product of a single object."""
 
     @property
     def images(self) -> tuple[str, ...]:
         """Names of the images."""
         return self.plan.sources
+
+    def address(self, project: Project) -> ScenesAddress:
+        """What its images and its ground are opened by."""
+        return ScenesAddress.of(project, self.images, self.part)
 
     @property
     def gsd(self) -> float:
@@ -78,6 +84,11 @@ class OrthoPlan:
     blind: tuple[str, ...] = ()
     """A line for each image that was asked for and sees nothing of the terrain inside the bounds."""
 
+    @property
+    def of_objects(self) -> bool:
+        """Whether its products are those of single objects."""
+        return any(product.part is not None for product in self.products)
+
     def __getitem__(self, name: str) -> OrthoProduct:
         for product in self.products:
             if name == product.plan.name or product.images == (name,):
@@ -87,6 +98,8 @@ class OrthoPlan:
     def __str__(self) -> str:
         tiles = sum(len(p.plan.tiles) for p in self.products)
         what = f"{len(self.products)} orthophotos" if self.settings.choice is None else "mosaic"
+        if self.of_objects:
+            what = f"{len(self.products)} products of single objects"
         lines = [f"{what}, {tiles} tiles, kernel {self.settings.kernel}"]
         for p in self.products:
             images = "" if self.settings.choice is None else f"{len(p.images)} images, "
@@ -235,15 +248,15 @@ def check_storable(scene: Scene, name: str, grid: MapGrid, settings: OrthoSettin
         )
 
 
-def keyed(project: Project, plan: ProductPlan, settings: OrthoSettings) -> str:
-    """Key of a product of a project.
+def keyed(project: Project, plan: ProductPlan, settings: OrthoSettings, part: Part | None = None) -> str:
+    """Key of a product of a project, or of what it shows of a single object.
 
     Raises
     ------
     InputError
         A file is missing, or nothing is known of errors that are asked for.
     """
-    address = ScenesAddress.of(project, plan.sources)
+    address = ScenesAddress.of(project, plan.sources, part)
     facts = address.facts if not settings.accuracy else [address.facts, known_errors(address, plan, settings).facts]
     regions = None
     if settings.choice is not None and settings.choice.seams is not None:
@@ -319,7 +332,7 @@ def render(
     """
     product = plan[name]
     window = product.grid.window if bounds is None else product.grid.window_of(bounds)
-    scenes = ScenesAddress.of(plan.project, product.images).open()
+    scenes = product.address(plan.project).open()
     tiles = (tile for tile in product.plan.tiles if (tile.window & window).size)
     parts = (
         (tile.window, render_tile(product.plan, tile, scenes.sources, scenes.surface, plan.settings.kernel))

@@ -30,7 +30,7 @@ from photoplan.products.orthophoto.mosaic import drawn_regions
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, keyed, product_plan
 from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.scene import input_files
-from photoplan.project.scenes import ScenesAddress
+from photoplan.surfaces.objects import Part
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ def compile_figures(plan: OrthoPlan, events: Events = SILENT) -> PlanFigures:
     source = np.zeros((len(product), 4), np.int32)
     rows = iter(range(len(product)))
     for p in plan.products:
-        scenes = ScenesAddress.of(plan.project, p.images).open()
+        scenes = p.address(plan.project).open()
         for tile, row in zip(p.plan.tiles, rows):
             cameras = {source: scenes[source].camera for source in tile.sources}
             compiled = compile_tile(p.plan, tile, cameras, scenes.surface)
@@ -225,7 +225,7 @@ def read_plan(path: Path | str) -> tuple[OrthoPlan, Path]:
         changed = [
             p.images[0] if len(p.images) == 1 else p.plan.name
             for p, entry in zip(products, header["products"])
-            if keyed(project, p.plan, settings) != entry["key"]
+            if keyed(project, p.plan, settings, p.part) != entry["key"]
         ]
         if changed:
             raise InputError(
@@ -250,6 +250,7 @@ def _product_header(product: OrthoProduct, tiles: int) -> dict[str, Any]:
         "tile_side": plan.tiles.side,
         "images": [_look_header(image, look) for image, look in zip(product.images, product.looks)],
         "tiles": tiles,
+        **({} if product.part is None else {"part": asdict(product.part)}),
     }
 
 
@@ -294,4 +295,5 @@ def _product(
     looks = tuple(_look(each) for each in entry["images"])
     regions = drawn_regions(project, settings, images, grid)
     plan = product_plan(name, images, grid, tiles, settings, [look.footprint for look in looks], regions)
-    return OrthoProduct(plan, looks, key)
+    part = entry.get("part")
+    return OrthoProduct(plan, looks, key, part and Part(tuple(part["objects"]), bool(part["below"])))
