@@ -69,8 +69,9 @@ def execute_tile(tile: CompiledTile, sources: Sequence[Source], kernel: str) -> 
             values = np.zeros((len(pixels), *tile.relief.shape), pixels.dtype)
         if usable is None or usable.any():
             border = _border(layer, reader.size)
-            owned = ALL_MINE if tile.owner is None else (tile.owner, layer.source + 1, layer.part.tolist())
-            rectify_tile(layer.anchors.arrays, tile.relief, pixels, usable, border, kernel, values, valid, owned=owned)
+            owned = ALL_MINE if layer.owner is None else (layer.owner, layer.source + 1, layer.part.tolist())
+            arrays, tilt = layer.anchors.arrays, tile.tilt
+            rectify_tile(arrays, tile.relief, pixels, usable, border, kernel, values, valid, owned=owned, tilt=tilt)
     bare = 0
     if tile.hidden is not None:
         bare = int(np.count_nonzero(np.isfinite(tile.relief) & ~valid & ~tile.hidden))

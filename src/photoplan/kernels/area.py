@@ -146,35 +146,32 @@ def _sum_blocks(
 
 
 @inner
-def _average_one(
+def _mean_at(
     source: NDArray[Any],
     valid: NDArray[np.uint8],
     spot: tuple[Any, ...],
     rule: tuple[Any, ...],
     work: tuple[Any, ...],
-    result: tuple[Any, ...],
-    place: tuple[Any, ...],
-) -> None:
-    """Average over the widened kernel at spot; written at place = (row, column).
+) -> tuple[float, float]:
+    """Mean under the widened kernel at spot; the weight of the pixels that are usable, and of all.
 
-    spot = (whole x, fraction, widening, whole y, fraction, widening).
+    spot = (whole x, fraction, widening, whole y, fraction, widening). The mean of each band is in the last of `work`,
+    if there is any usable weight.
     """
     table, lanes_tag, limits = rule
-    wx, wy, patch = work
+    wx, wy, patch, means = work
     base, _, totals = patch
-    out, out_valid = result
     groups, height, width, lanes = source.shape
     left, right, in_x, all_x = _wide_weights(table, (spot[0], spot[1]), spot[2], width, wx)
     top, bottom, in_y, all_y = _wide_weights(table, (spot[3], spot[4]), spot[5], height, wy)
     if left >= right or top >= bottom:
-        return
+        return 0.0, all_x * all_y
     ranges = (left, right, top, bottom)
     usable, complete = in_x * in_y, True
     if valid.size > 0:
         usable, complete = _usable(valid, ranges, (wx, wy))
-    if usable < LEAST_WEIGHT * all_x * all_y:
-        return
-    out_valid[place[0], place[1]] = True
+    if usable <= 0.0:
+        return 0.0, all_x * all_y
     is_float = limits[2] == 0.0
     for group in range(groups):
         for lane in range(lanes):
@@ -183,9 +180,44 @@ def _average_one(
         done = (complete or not is_float) and _sum_blocks(source, group, ranges, (wx, wy), patch, lanes_tag)
         if not done:
             _sum_each(source, valid, group, ranges, (wx, wy), patch)
-        for lane in range(min(lanes, out.shape[0] - group * lanes)):
-            value = np.float64(base[lane]) + totals[lane] / usable
-            store(value, limits, out, (group * lanes + lane, place[0], place[1]))
+        for lane in range(lanes):
+            means[group * lanes + lane] = np.float64(base[lane]) + totals[lane] / usable
+    return usable, all_x * all_y
+
+
+@inner
+def _mean_along(
+    source: NDArray[Any],
+    valid: NDArray[np.uint8],
+    spot: tuple[Any, ...],
+    reach: tuple[float, float],
+    rule: tuple[Any, ...],
+    work: tuple[Any, ...],
+    along: NDArray[np.float64],
+) -> tuple[float, float]:
+    """As `_mean_at`, repeated along `reach` to both sides with weights that fall evenly; the means are in `along`.
+
+    n places on each side at a distance d have the variance d² n (n + 2) / 6; a kernel that falls evenly over the reach r
+    has r² / 6. The places are no further apart than the widened kernel reaches.
+    """
+    far = (reach[0] * reach[0] + reach[1] * reach[1]) / (spot[2] * spot[2])
+    n = max(1, int(np.ceil(np.sqrt(1.0 + far) - 1.0)))
+    rate = 1.0 / np.sqrt(float(n * (n + 2)))
+    usable, total = 0.0, 0.0
+    along[:] = 0.0
+    for place in range(-n, n + 1):
+        x, y = place * rate * reach[0], place * rate * reach[1]
+        weight = 1.0 - abs(place) / (n + 1.0)
+        moved = (spot[0], spot[1] + x, spot[2], spot[3], spot[4] + y, spot[5])
+        found, every = _mean_at(source, valid, moved, rule, work)
+        total += weight * every
+        if found > 0.0:
+            usable += weight * found
+            for band in range(along.shape[0]):
+                along[band] += weight * found * work[3][band]
+    for band in range(along.shape[0]):
+        along[band] = along[band] / usable if usable > 0.0 else 0.0
+    return usable, total
 
 
 @kernel
@@ -203,8 +235,8 @@ def average_runs(
 
     Parameters
     ----------
-    scales : (k, 2, RUN) float32
-        See `stretch_runs`.
+    scales : (k, 2, RUN) or (k, 4, RUN) float32
+        See `stretch_runs` and `footprint_runs`.
     rule : tuple
         `weight_table` of the kernel; tag for lanes; limits (low, high, rounding).
 
@@ -213,20 +245,34 @@ def average_runs(
     corner, first, part, kind, fill = block
     before = (rule[0].shape[0] - 2) // TABLE_STEPS - 1
     wx, wy = np.zeros(source.shape[2] + 3 * _BEFORE, np.float32), np.zeros(source.shape[1] + 3 * _BEFORE, np.float32)
-    work = (wx, wy, (np.zeros(4, np.float32), np.zeros(4, np.float32), np.zeros(4)))
+    means, along = np.zeros((2, source.shape[0] * source.shape[3]))
+    work = (wx, wy, (np.zeros(4, np.float32), np.zeros(4, np.float32), np.zeros(4)), means)
+    out, out_valid = result
     for k in range(runs.shape[0]):
         if fill[k] == ALL:
             continue
         row, col = runs[k, 1] - offset[1], runs[k, 3] - offset[0]
         for i in range(runs[k, 4] - runs[k, 3]):
-            if kind[k, i] == AVERAGE:
-                result[1][row, col + i] = False
-                spot = (
-                    corner[k, 0] + first[k, 0, i] + before,
-                    np.float64(part[k, 0, i]) + 0.5,
-                    np.float64(scales[k, 0, i]),
-                    corner[k, 1] + first[k, 1, i] + before,
-                    np.float64(part[k, 1, i]) + 0.5,
-                    np.float64(scales[k, 1, i]),
-                )
-                _average_one(source, valid, spot, rule, work, result, (row, col + i))
+            if kind[k, i] != AVERAGE:
+                continue
+            out_valid[row, col + i] = False
+            spot = (
+                corner[k, 0] + first[k, 0, i] + before,
+                np.float64(part[k, 0, i]) + 0.5,
+                np.float64(scales[k, 0, i]),
+                corner[k, 1] + first[k, 1, i] + before,
+                np.float64(part[k, 1, i]) + 0.5,
+                np.float64(scales[k, 1, i]),
+            )
+            found = means
+            if scales.shape[1] > 2 and (scales[k, 2, i] != 0.0 or scales[k, 3, i] != 0.0):
+                reach = (np.float64(scales[k, 2, i]), np.float64(scales[k, 3, i]))
+                usable, total = _mean_along(source, valid, spot, reach, rule, work, along)
+                found = along
+            else:
+                usable, total = _mean_at(source, valid, spot, rule, work)
+            if usable <= 0.0 or usable < LEAST_WEIGHT * total:
+                continue
+            out_valid[row, col + i] = True
+            for band in range(out.shape[0]):
+                store(found[band], rule[2], out, (band, row, col + i))

@@ -77,7 +77,7 @@ def middle_of_run(rect: NDArray[np.int32], run: NDArray[np.int32]) -> int:
 
 
 @inner
-def _run_origin(coef: NDArray[np.float64], origin: NDArray[np.float64]) -> None:
+def run_origin(coef: NDArray[np.float64], origin: NDArray[np.float64]) -> None:
     """Whole source pixel at the middle of the run, relative to which `_run_positions` works."""
     for c in range(2):
         value = np.floor(coef[0, c] / coef[0, 2])
@@ -225,7 +225,7 @@ def locate_run(
     for box in range(lowest, box_start[run[0] + 1]):
         h_ref = run_coefficients(rect, box_heights[box], corners[box], u_ref, edges, coef)
         if box == lowest:
-            _run_origin(coef, origin)
+            run_origin(coef, origin)
         shift_to(origin, coef)
         if box == lowest:
             _run_positions(coef, run[3] - u_ref, heights, h_ref, dx, dy)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.area import average_runs
 from photoplan.kernels.border import border_runs
+from photoplan.kernels.footprint import footprint_runs
 from photoplan.kernels.gather import gather_runs
 from photoplan.kernels.jit import is_ready
 from photoplan.kernels.pack import as_bytes, pack, solid_patches
@@ -32,6 +33,8 @@ Border = tuple[float, float, float, float]
 
 BLOCK = 64
 """Runs that go through the steps together: small enough to stay in the processor's cache."""
+
+_NO_TILT = np.empty((2, 0, 0), np.float32)
 
 _ANCHOR_TYPES = (np.int32, np.int32, np.float64, np.float64, np.float64, np.float32)
 
@@ -61,6 +64,7 @@ def rectify_tile(
     out_valid: NDArray[np.bool_],
     offset: tuple[int, int] = (0, 0),
     owned: Owned = ALL_MINE,
+    tilt: NDArray[np.float32] | None = None,
 ) -> None:
     """Resample one tile from a source window.
 
@@ -89,11 +93,15 @@ def rectify_tile(
     owned : (raster of uint16, number, part)
         Pixels that the source paints, see `tile_runs`; all others are left as they are. Several sources compose a tile
         one after the other, at the cost of their own pixels.
+    tilt : ndarray, shape (2, rows, cols), float32, optional
+        Change of the relief per column and per row, see `depth_tilt`, where it decides what a pixel covers: in a view.
+        None: on a map, where a step of the relief covers no ground.
 
     Notes
     -----
     Integers are rounded half away from zero and clipped. Where the target is coarser than the source the kernel is
-    widened along image x and y (see `weights.stretch`), except for "nearest", which keeps grey values.
+    widened along image x and y (see `weights.stretch`), except for "nearest", which keeps grey values. With `tilt` it is
+    widened by the width of what a pixel covers, and repeated along its length, see `photoplan.kernels.footprint`.
     """
     packed = source if source.ndim == 4 else pack(source, valid)
     height, width = packed.shape[1:3]
@@ -111,7 +119,8 @@ def rectify_tile(
         image = (_plain(packed, packed.dtype), mask, solid, edges)
         place = (int(offset[0]), int(offset[1]))
         wanted = (_plain(owned[0], np.uint16), int(owned[1]), tuple(int(edge) for edge in owned[2]))
-        _resample(arrays, _plain(relief, np.float32), image, kernel, (place, wanted), (target, target_valid))
+        ground = (_plain(relief, np.float32), _NO_TILT if tilt is None else _plain(tilt, np.float32))
+        _resample(arrays, ground, image, kernel, (place, wanted), (target, target_valid))
     if target is not out:
         out[...] = target
     if target_valid is not out_valid:
@@ -127,7 +136,7 @@ def _plain(array: NDArray[Any], dtype: Any) -> NDArray[Any]:
 
 def _resample(
     anchors: tuple[Any, ...],
-    relief: NDArray[np.float32],
+    ground: tuple[NDArray[np.float32], NDArray[np.float32]],
     image: tuple[Any, ...],
     name: str,
     part: tuple[tuple[int, int], Owned],
@@ -139,21 +148,21 @@ def _resample(
     coarse = np.zeros(len(rects), bool)
     if name != "nearest":
         stretch = frame[4] if field.size else 1.0
-        coarse = ~(stretch * largest_scales(rects, box_start, corners) <= LOOK_CLOSER)
+        coarse = ~(stretch * largest_scales(rects, box_start, corners) <= LOOK_CLOSER) | (ground[1].size > 0)
     for averaging in (False, True):
         chosen = np.flatnonzero(coarse == averaging)
         if not len(chosen):
             continue
-        runs = tile_runs(rects, chosen, offset, relief.shape, owned)
+        runs = tile_runs(rects, chosen, offset, ground[0].shape, owned)
         block = empty_block(min(BLOCK, len(runs)))
         for start in range(0, len(runs), BLOCK):
-            _block(anchors, runs[start : start + BLOCK], relief, image, name, offset, (block, averaging), result)
+            _block(anchors, runs[start : start + BLOCK], ground, image, name, offset, (block, averaging), result)
 
 
 def _block(
     anchors: tuple[Any, ...],
     runs: NDArray[np.int32],
-    relief: NDArray[np.float32],
+    ground: tuple[NDArray[np.float32], NDArray[np.float32]],
     image: tuple[Any, ...],
     name: str,
     offset: tuple[int, int],
@@ -166,11 +175,15 @@ def _block(
     _, height, width, lanes = packed.shape
     coefficients, tags, limits = _rule(name, packed.dtype, lanes)
     taps = KERNELS[name].taps
+    relief, tilt = ground
     doubtful = place_runs(anchors, runs, relief, offset, (taps, width, height, solid, edges), block, result[1])
     averaged = 0
     if averaging:
-        scales = np.empty((len(runs), 2, RUN), np.float32)
-        averaged = stretch_runs(anchors, runs, relief, offset, block, scales)
+        scales = np.empty((len(runs), 4 if tilt.size else 2, RUN), np.float32)
+        if tilt.size:
+            averaged = footprint_runs(anchors, runs, ground, offset, block, scales)
+        else:
+            averaged = stretch_runs(anchors, runs, relief, offset, block, scales)
     gather_runs(packed, runs, offset, block, coefficients, tags, result[0])
     if doubtful:
         border_runs(packed, mask, runs, offset, block, (coefficients, taps, limits), result)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.kernels.jit import inner, kernel
+from photoplan.kernels.jit import inner, kernel, maker
 from photoplan.kernels.place import ALL, AVERAGE, EMPTY, INTERIOR, NOTHING, SOME
 from photoplan.kernels.position import (
     RUN,
@@ -64,12 +64,14 @@ def _run_slopes(
     u_first: float,
     heights: NDArray[np.float32],
     h_ref: float,
+    tilt: NDArray[np.float32],
     slopes: NDArray[np.float32],
 ) -> None:
     """Position and derivatives of the pixels of a run: fills slopes (6, n) with x, ∂x/∂u, ∂x/∂v, y, ∂y/∂u, ∂y/∂v.
 
     coef and slope are the coefficients of the run and of its derivative along v, shifted to its origin. At constant h
-    x = X / w has the derivatives ∂x/∂u = (∂X/∂u − x ∂w/∂u) / w, and so along v; jumps of the relief do not enter.
+    x = X / w has the derivatives ∂x/∂u = (∂X/∂u − x ∂w/∂u) / w, and so along v; jumps of the relief do not enter. With
+    a tilt (2, n), the change of h along u and v, that of ∂x/∂h is added.
     """
     w0, w1, w2, w3 = single(coef, 2)
     b0, b1, b2, b3 = single(slope, 2)
@@ -85,6 +87,12 @@ def _run_slopes(
             at[i] = x
             along_u[i] = ((x1 + x3 * h) - x * (w1 + w3 * h)) * inverse
             along_v[i] = (((a0 + a1 * u) + h * (a2 + a3 * u)) - x * ((b0 + b1 * u) + h * (b2 + b3 * u))) * inverse
+        for i in range(tilt.shape[1]):
+            u, h = first + np.float32(np.int32(i)), heights[i] - h0
+            inverse = one / ((w0 + w1 * u) + h * (w2 + w3 * u))
+            along_h = ((x2 + x3 * u) - at[i] * (w2 + w3 * u)) * inverse
+            along_u[i] += along_h * tilt[0, i]
+            along_v[i] += along_h * tilt[1, i]
 
 
 @inner
@@ -146,16 +154,26 @@ def _widening(along_u: NDArray[np.float32], along_v: NDArray[np.float32], stretc
         stretch[i] = scale if scale >= full else widened
 
 
+@maker
+def slope_space() -> tuple[Any, ...]:
+    """Working space of `slopes_of_run`."""
+    slopes, higher = np.empty((6, RUN), np.float32), np.empty((6, RUN), np.float32)
+    return np.empty((4, 3)), np.empty((4, 3)), slopes, higher, cell_space()
+
+
 @inner
-def _stretch_of_run(
+def slopes_of_run(
     anchors: tuple[Any, ...],
     run: NDArray[np.int32],
     heights: NDArray[np.float32],
+    tilt: NDArray[np.float32],
     origin: NDArray[np.float64],
     work: tuple[Any, ...],
-    stretch: NDArray[np.float32],
 ) -> bool:
-    """Fills stretch (2, RUN) along image x and y; False if nothing in the run is widened."""
+    """Fills work[2], see `_run_slopes`, relative to `origin`; False, and anything, if nothing in the run is widened.
+
+    tilt: see `_run_slopes`; (2, 0): none.
+    """
     rects, box_start, box_heights, corners, frame, field = anchors
     coef, slope, slopes, higher, cells = work
     rect, lowest = rects[run[0]], box_start[run[0]]
@@ -171,12 +189,13 @@ def _stretch_of_run(
         shift_to(origin, coef)
         shift_to(origin, slope)
         largest = longer * longer * _largest_of_run(coef, slope, (first, last, h_ref), box_heights[box])
-        if box == lowest and box + 1 == box_start[run[0] + 1] and largest <= LOOK_CLOSER * LOOK_CLOSER:
+        alone = box == lowest and box + 1 == box_start[run[0] + 1]
+        if alone and tilt.shape[1] == 0 and largest <= LOOK_CLOSER * LOOK_CLOSER:
             return False
         if box == lowest:
-            _run_slopes(coef, slope, run[3] - u_ref, heights, h_ref, slopes)
+            _run_slopes(coef, slope, run[3] - u_ref, heights, h_ref, tilt, slopes)
         else:
-            _run_slopes(coef, slope, run[3] - u_ref, heights, h_ref, higher)
+            _run_slopes(coef, slope, run[3] - u_ref, heights, h_ref, tilt, higher)
             low = np.float32(box_heights[box, 0])
             for i in range(n):
                 if heights[i] >= low:
@@ -185,9 +204,23 @@ def _stretch_of_run(
     if field.size > 0:
         find_cells(frame, field, origin, slopes[0, :n], slopes[3, :n], cells)
         _bend_slopes(frame, field, (cells[0][:n], cells[1], cells[2]), slopes)
-    _widening(slopes[1, :n], slopes[2, :n], stretch[0])
-    _widening(slopes[4, :n], slopes[5, :n], stretch[1])
     return True
+
+
+@inner
+def make_average(wider: NDArray[np.bool_], fill: NDArray[np.uint8], kind: NDArray[np.uint8], k: int) -> int:
+    """Make the pixels of run k AVERAGE whose kernel is wider and that are not EMPTY; returns their number."""
+    whole, count, interior = fill[k] == ALL, 0, 0
+    for i in range(wider.shape[0]):
+        if whole:
+            kind[k, i] = INTERIOR
+        if kind[k, i] != EMPTY and wider[i]:
+            kind[k, i] = AVERAGE
+            count += 1
+        elif kind[k, i] == INTERIOR:
+            interior += 1
+    fill[k] = ALL if interior == wider.shape[0] else (SOME if interior > 0 else NOTHING)
+    return count
 
 
 @kernel
@@ -209,24 +242,17 @@ def stretch_runs(
     See `place_runs` for the others.
     """
     corner, _, _, kind, fill = block
-    slopes = (np.empty((6, RUN), np.float32), np.empty((6, RUN), np.float32))
-    work = (np.empty((4, 3)), np.empty((4, 3)), slopes[0], slopes[1], cell_space())
-    origin = np.empty(2)
+    work, no_tilt, wider = slope_space(), np.empty((2, 0), np.float32), np.empty(RUN, np.bool_)
+    slopes, origin = work[2], np.empty(2)
     count = 0
     for k in range(runs.shape[0]):
         row, col, n = runs[k, 1] - offset[1], runs[k, 3] - offset[0], runs[k, 4] - runs[k, 3]
         origin[0], origin[1] = float(corner[k, 0]), float(corner[k, 1])
-        if not _stretch_of_run(anchors, runs[k], relief[row, col : col + n], origin, work, scales[k]):
+        if not slopes_of_run(anchors, runs[k], relief[row, col : col + n], no_tilt, origin, work):
             continue
-        whole = fill[k] == ALL
-        interior = 0
+        _widening(slopes[1, :n], slopes[2, :n], scales[k, 0])
+        _widening(slopes[4, :n], slopes[5, :n], scales[k, 1])
         for i in range(n):
-            if whole:
-                kind[k, i] = INTERIOR
-            if kind[k, i] != EMPTY and (scales[k, 0, i] > 1.0 or scales[k, 1, i] > 1.0):
-                kind[k, i] = AVERAGE
-                count += 1
-            elif kind[k, i] == INTERIOR:
-                interior += 1
-        fill[k] = ALL if interior == n else (SOME if interior > 0 else NOTHING)
+            wider[i] = scales[k, 0, i] > 1.0 or scales[k, 1, i] > 1.0
+        count += make_average(wider[:n], fill, kind, k)
     return count

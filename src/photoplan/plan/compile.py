@@ -17,6 +17,9 @@ from photoplan.plan.anchors import Anchors, Positions, bend_errors
 from photoplan.plan.field import FieldGrid, FieldTable, field_grid
 from photoplan.plan.ground import CORNERS, SQUARE, Boxes, TileGround
 
+#: Pixels of a reduced source that stay for every target pixel at least: the kernel, widened to them, decides what the
+#: product looks like, not the means before it.
+FINEST = 2.0
 #: A rectangle that still reaches behind the camera at this side is left out, pixels.
 SMALLEST_BEHIND = 4
 #: More layers than this over one rectangle do not pay; the residual that is left is reported.
@@ -36,23 +39,22 @@ class AnchorRule:
     """Half the support of the resampling kernel at scale 1, pixels: what the source window adds all round."""
     reduces: bool = True
     """Whether a source that is much finer than the target is read reduced; not if grey values must stay as they are."""
+    tilted: bool = False
+    """Whether the change of depth from pixel to pixel decides what a pixel covers: in a view, not on a map."""
 
     def __post_init__(self) -> None:
         if not self.tolerance > 0:
             raise UsageError(f"tolerance {self.tolerance} px; a positive number is needed (default 0.02)")
 
     @classmethod
-    def of(cls, kernel: str, tolerance: float) -> AnchorRule:
+    def of(cls, kernel: str, tolerance: float, tilted: bool = False) -> AnchorRule:
         """The rule of a resampling kernel, by its name; ``nearest`` keeps grey values as they are."""
-        return cls(tolerance, max(1, math.ceil(KERNELS[kernel].taps / 2)), reduces=kernel != "nearest")
+        averages = kernel != "nearest"
+        return cls(tolerance, max(1, math.ceil(KERNELS[kernel].taps / 2)), reduces=averages, tilted=tilted and averages)
 
     def level(self, anchors: Anchors) -> int:
-        """How often a source is halved before it is resampled.
-
-        At least two pixels of the reduced source stay for every target pixel, also where the source is coarsest: the
-        kernel, widened to them, decides what the product looks like, not the means before it.
-        """
-        finer = anchors.scales[0] / 2.0
+        """How often a source is halved before it is resampled: by where it is coarsest, see `FINEST`."""
+        finer = anchors.scales[0] / FINEST
         return int(math.log2(finer)) if self.reduces and finer >= 2.0 else 0
 
 
@@ -72,7 +74,11 @@ class _Image:
 
 
 def compile_anchors(
-    projection: Projection, ground: TileGround, rule: AnchorRule, wanted: NDArray[np.float64] | None = None
+    projection: Projection,
+    ground: TileGround,
+    rule: AnchorRule,
+    wanted: NDArray[np.float64] | None = None,
+    longest: float = 0.0,
 ) -> Anchors | None:
     """Cut a tile into boxes whose trilinear homogeneous interpolation meets the tolerance, and tabulate the field.
 
@@ -87,6 +93,8 @@ def compile_anchors(
     wanted : ndarray, shape (2, rows, cols), optional
         What the source is to paint, see `TileGround.owned`: it decides what is read of it, and nothing else, so that a
         pixel keeps its position whoever paints the pixels beside it.
+    longest : float
+        Source pixels along which a target pixel is averaged at most, where that is more than the anchors' scale.
 
     Returns
     -------
@@ -119,7 +127,9 @@ def compile_anchors(
         if not (keep & again).any():
             break
         boxes = ground.boxes(*_finer(boxes, keep, split_u, split_v, thin))
-    return _assemble(image, done, ground.ranges if wanted is None else wanted, residual, rule.radius) if done else None
+    if not done:
+        return None
+    return _assemble(image, done, ground.ranges if wanted is None else wanted, residual, (rule.radius, longest))
 
 
 def _strict(projection: Projection, ground: TileGround, boxes: Boxes) -> Positions:
@@ -178,8 +188,9 @@ def _halved(rects: NDArray[np.int32], in_u: bool, in_v: bool) -> NDArray[np.int3
 
 
 def _assemble(
-    image: _Image, done: list[Piles], ranges: NDArray[np.float64], residual: float, radius: int
+    image: _Image, done: list[Piles], ranges: NDArray[np.float64], residual: float, margin: tuple[int, float]
 ) -> Anchors | None:
+    radius, longest = margin
     rects, heights, corners = (np.concatenate(part) for part in zip(*done))
     starts = [0]
     if len(rects) > 1:
@@ -200,7 +211,7 @@ def _assemble(
         xy = image.grid.field(xy)
         low, high = np.nanmin(xy, axis=(0, 1)), np.nanmax(xy, axis=(0, 1))
         origin = table.origin
-    source = _source_window(low, high, slack + radius * max(1.0, scales[1]), image.size)
+    source = _source_window(low, high, slack + radius * max(1.0, scales[1], longest), image.size)
     origin = np.array([source.col, source.row]) - origin
     if table is not None and image.grid is not None:
         frame = np.array([*(table.first - origin), *(1.0 / np.array(image.grid.spacing)), image.grid.stretch])

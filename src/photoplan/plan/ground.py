@@ -98,6 +98,13 @@ class TileGround:
         nothing = np.array([np.inf, -np.inf])[:, None, None]
         return np.where(squares[:, None], self.ranges, nothing), parts
 
+    def where(self, mine: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """As `owned`, of some pixels: ranges, (2, rows, cols), of their own depths, and the part that they are in."""
+        depth = np.where(mine, self.relief, np.float32(np.nan))
+        ranges = height_ranges(depth, squares(depth.shape)).T.reshape(self.ranges.shape)
+        rows, cols = np.flatnonzero(mine.any(axis=1)), np.flatnonzero(mine.any(axis=0))
+        return np.ascontiguousarray(ranges), np.array([cols[0], rows[0], cols[-1] + 1, rows[-1] + 1])
+
 
 @lru_cache(maxsize=16)
 def squares(shape: tuple[int, int]) -> NDArray[np.int32]:

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from photoplan.cameras.base import Projection
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
+from photoplan.kernels.footprint import depth_tilt, footprint_levels
+from photoplan.kernels.position import tile_runs
 from photoplan.plan.anchors import Anchors
-from photoplan.plan.compile import AnchorRule, compile_anchors
+from photoplan.plan.compile import FINEST, AnchorRule, compile_anchors
 from photoplan.plan.ground import TileGround
 from photoplan.plan.owner import Ownership, Share
 from photoplan.plan.tiles import Tile, Tiles
@@ -32,6 +34,8 @@ class Layer:
     """Where the tile's pixels lie in it."""
     part: NDArray[np.int64]
     """First column, first row, end column, end row in the tile between which are all pixels that it paints."""
+    owner: NDArray[np.uint16] | None
+    """It paints the pixels that are `source` + 1 here; None: all."""
 
     def window(self, size: tuple[int, int]) -> Window:
         """What is read of a source of this size, in its pixels at full size."""
@@ -49,8 +53,10 @@ class CompiledTile:
     """Its pixels in the product."""
     relief: NDArray[np.float32]
     """h of each pixel, shape (height, width); NaN where there is no surface."""
+    tilt: NDArray[np.float32] | None
+    """Change of h per column and row, shape (2, height, width), where it decides what a pixel covers; None: on a map."""
     layers: tuple[Layer, ...]
-    """Sources that paint a part of it, each once; those that show none of it are left out."""
+    """Sources that paint a part of it, each once for every level; those that show none of it are left out."""
     owner: NDArray[np.uint16] | None
     """See `Share.owner`."""
     hidden: NDArray[np.bool_] | None
@@ -107,16 +113,58 @@ def compile_tile(product: ProductPlan, tile: Tile, cameras: Mapping[int, Project
     surface : Surface
         What the target's depth is taken from.
     """
-    relief = surface.relief(product.target, tile.window)
+    relief, tilt = _depth(product, tile.window, surface)
     ground = TileGround.of(product.target, tile.window, relief)
     share = Share(None) if product.owners is None else product.owners.share(ground, cameras, surface)
     wanted, parts = ground.ranges[None], np.array([[0, 0, tile.window.width, tile.window.height]])
     if share.owner is not None:
         wanted, parts = ground.owned(share.owner, tile.sources, len(product.sources))
-    layers = []
+    layers: list[Layer] = []
     for source, mine, part in zip(tile.sources, wanted, parts):
         anchors = compile_anchors(cameras[source], ground, product.rule, mine)
-        if anchors is not None:
+        if anchors is None:
+            continue
+        if tilt is None:
             level = product.rule.level(anchors)
-            layers.append(Layer(source, level, anchors.at_level(level, cameras[source].size), part))
-    return CompiledTile(tile.window, relief, tuple(layers), share.owner, share.hidden)
+            layers.append(Layer(source, level, anchors.at_level(level, cameras[source].size), part, share.owner))
+        else:
+            layers += _layers_by_level(product.rule, ground, tilt, (source, cameras[source], anchors), share.owner)
+    return CompiledTile(tile.window, relief, tilt, tuple(layers), share.owner, share.hidden)
+
+
+def _depth(
+    product: ProductPlan, window: Window, surface: Surface
+) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """Relief of a tile, and its tilt if the product needs it: from a pixel more all round, so that tiles join."""
+    if not product.rule.tilted:
+        return surface.relief(product.target, window), None
+    around = Window(window.col - 1, window.row - 1, window.width + 2, window.height + 2) & product.target.window
+    depth = surface.relief(product.target, around)
+    rows, cols = window.slices(around)
+    right, bottom = around.width - cols.stop, around.height - rows.stop
+    tilt = depth_tilt(np.ascontiguousarray(depth), (cols.start, rows.start, right, bottom))
+    return np.ascontiguousarray(depth[rows, cols]), tilt
+
+
+def _layers_by_level(
+    rule: AnchorRule,
+    ground: TileGround,
+    tilt: NDArray[np.float32],
+    source: tuple[int, Projection, Anchors],
+    owner: NDArray[np.uint16] | None,
+) -> list[Layer]:
+    """What a source gives where neighbouring pixels need it at very different levels: near and far ground of a view."""
+    row, camera, anchors = source
+    runs = tile_runs(anchors.rects, np.arange(len(anchors.rects)), (0, 0), ground.relief.shape)
+    levels, longest = np.zeros(ground.relief.shape, np.uint8), np.zeros(256)
+    footprint_levels(anchors.arrays, runs, (ground.relief, tilt), FINEST, levels, longest)
+    there = np.isfinite(ground.relief) if owner is None else np.isfinite(ground.relief) & (owner == row + 1)
+    layers = []
+    for level in np.unique(levels[there]).tolist():
+        mine = there & (levels == level)
+        wanted, part = ground.where(mine)
+        found = compile_anchors(camera, ground, rule, wanted, float(longest[level]))
+        if found is not None:
+            raster = mine.astype(np.uint16) * np.uint16(row + 1)
+            layers.append(Layer(row, level, found.at_level(level, camera.size), part, raster))
+    return layers
