@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.kernels.border import LEAST_WEIGHT, store
-from photoplan.kernels.jit import inner, kernel
+from photoplan.kernels.jit import inner, kernel, maker
 from photoplan.kernels.place import ALL, AVERAGE
 from photoplan.kernels.sampling import add_block, block_pixels
 from photoplan.kernels.weights import TABLE_STEPS
 
 # Weights stand in the middle of zeros, so that blocks of pixels may reach beyond them.
-_BEFORE = 8
+BEFORE = 8
 
 
 @inner
@@ -42,7 +42,7 @@ def _wide_weights(
     size : int
         Pixels of the source along this axis.
     weights : float32
-        Filled from _BEFORE on with the weights of the pixels start … stop − 1 that are inside, zeros after them.
+        Filled from BEFORE on with the weights of the pixels start … stop − 1 that are inside, zeros after them.
 
     Returns
     -------
@@ -58,10 +58,10 @@ def _wide_weights(
     sum_inside = np.float32(0.0)
     for i in range(stop - start):
         weight = _look_up(table, abs(np.float32(start - whole + i) - middle) * rate)
-        weights[_BEFORE + i] = weight
+        weights[BEFORE + i] = weight
         sum_inside += weight
-    for i in range(max(stop - start, 0), max(stop - start, 0) + _BEFORE):
-        weights[_BEFORE + i] = np.float32(0.0)
+    for i in range(max(stop - start, 0), max(stop - start, 0) + BEFORE):
+        weights[BEFORE + i] = np.float32(0.0)
     total = np.float64(sum_inside)
     for i in range(first, min(start - whole, last + 1)):
         total += np.float64(_look_up(table, abs(np.float32(i) - middle) * rate))
@@ -80,10 +80,10 @@ def _usable(valid: NDArray[np.uint8], ranges: tuple[Any, ...], weights: tuple[An
         along = 0.0
         for col in range(left, right):
             if valid[row, col] != 0:
-                along += np.float64(wx[_BEFORE + col - left])
+                along += np.float64(wx[BEFORE + col - left])
             else:
                 missing += 1
-        total += along * np.float64(wy[_BEFORE + row - top])
+        total += along * np.float64(wy[BEFORE + row - top])
     return total, missing == 0
 
 
@@ -105,7 +105,7 @@ def _sum_each(
         for row in range(top, bottom):
             for col in range(left, right):
                 if valid.size == 0 or valid[row, col] != 0:
-                    weight = np.float64(wx[_BEFORE + col - left]) * np.float64(wy[_BEFORE + row - top])
+                    weight = np.float64(wx[BEFORE + col - left]) * np.float64(wy[BEFORE + row - top])
                     total += weight * (np.float64(source[group, row, col, lane]) - np.float64(base[lane]))
         totals[lane] = total
 
@@ -137,8 +137,8 @@ def _sum_blocks(
         sums[lane] = 0.0
     first = ((group * height + top) * width + start) * lanes
     for block in range(blocks):
-        at = _BEFORE + start - left + block * many
-        place = (first + block * many * lanes, width * lanes, bottom - top, at, _BEFORE)
+        at = BEFORE + start - left + block * many
+        place = (first + block * many * lanes, width * lanes, bottom - top, at, BEFORE)
         add_block(source, place, wx, wy, base, lanes_tag, sums)
     for lane in range(lanes):
         totals[lane] = sums[lane]
@@ -146,7 +146,7 @@ def _sum_blocks(
 
 
 @inner
-def _mean_at(
+def mean_at(
     source: NDArray[Any],
     valid: NDArray[np.uint8],
     spot: tuple[Any, ...],
@@ -180,44 +180,23 @@ def _mean_at(
         done = (complete or not is_float) and _sum_blocks(source, group, ranges, (wx, wy), patch, lanes_tag)
         if not done:
             _sum_each(source, valid, group, ranges, (wx, wy), patch)
-        for lane in range(lanes):
+        for lane in range(min(lanes, means.shape[0] - group * lanes)):
             means[group * lanes + lane] = np.float64(base[lane]) + totals[lane] / usable
     return usable, all_x * all_y
 
 
 @inner
-def _mean_along(
-    source: NDArray[Any],
-    valid: NDArray[np.uint8],
-    spot: tuple[Any, ...],
-    reach: tuple[float, float],
-    rule: tuple[Any, ...],
-    work: tuple[Any, ...],
-    along: NDArray[np.float64],
-) -> tuple[float, float]:
-    """As `_mean_at`, repeated along `reach` to both sides with weights that fall evenly; the means are in `along`.
+def taps_before(rule: tuple[Any, ...]) -> int:
+    """Pixels between the first tap of the kernel as it is and the one before the position."""
+    return (rule[0].shape[0] - 2) // TABLE_STEPS - 1
 
-    n places on each side at a distance d have the variance d² n (n + 2) / 6; a kernel that falls evenly over the reach r
-    has r² / 6. The places are no further apart than the widened kernel reaches.
-    """
-    far = (reach[0] * reach[0] + reach[1] * reach[1]) / (spot[2] * spot[2])
-    n = max(1, int(np.ceil(np.sqrt(1.0 + far) - 1.0)))
-    rate = 1.0 / np.sqrt(float(n * (n + 2)))
-    usable, total = 0.0, 0.0
-    along[:] = 0.0
-    for place in range(-n, n + 1):
-        x, y = place * rate * reach[0], place * rate * reach[1]
-        weight = 1.0 - abs(place) / (n + 1.0)
-        moved = (spot[0], spot[1] + x, spot[2], spot[3], spot[4] + y, spot[5])
-        found, every = _mean_at(source, valid, moved, rule, work)
-        total += weight * every
-        if found > 0.0:
-            usable += weight * found
-            for band in range(along.shape[0]):
-                along[band] += weight * found * work[3][band]
-    for band in range(along.shape[0]):
-        along[band] = along[band] / usable if usable > 0.0 else 0.0
-    return usable, total
+
+@maker
+def mean_space(source: NDArray[Any], bands: int) -> tuple[Any, ...]:
+    """Working space of `mean_at`."""
+    wx, wy = np.zeros(source.shape[2] + 3 * BEFORE, np.float32), np.zeros(source.shape[1] + 3 * BEFORE, np.float32)
+    sums = (np.zeros(4, np.float32), np.zeros(4, np.float32), np.zeros(4))
+    return wx, wy, sums, np.zeros(bands)
 
 
 @kernel
@@ -235,44 +214,34 @@ def average_runs(
 
     Parameters
     ----------
-    scales : (k, 2, RUN) or (k, 4, RUN) float32
-        See `stretch_runs` and `footprint_runs`.
+    scales : (k, 2, RUN) float32
+        See `stretch_runs`.
     rule : tuple
         `weight_table` of the kernel; tag for lanes; limits (low, high, rounding).
 
     See `border_runs` for the others.
     """
     corner, first, part, kind, fill = block
-    before = (rule[0].shape[0] - 2) // TABLE_STEPS - 1
-    wx, wy = np.zeros(source.shape[2] + 3 * _BEFORE, np.float32), np.zeros(source.shape[1] + 3 * _BEFORE, np.float32)
-    means, along = np.zeros((2, source.shape[0] * source.shape[3]))
-    work = (wx, wy, (np.zeros(4, np.float32), np.zeros(4, np.float32), np.zeros(4)), means)
+    before = taps_before(rule)
     out, out_valid = result
+    work = mean_space(source, out.shape[0])
     for k in range(runs.shape[0]):
         if fill[k] == ALL:
             continue
         row, col = runs[k, 1] - offset[1], runs[k, 3] - offset[0]
         for i in range(runs[k, 4] - runs[k, 3]):
-            if kind[k, i] != AVERAGE:
-                continue
-            out_valid[row, col + i] = False
-            spot = (
-                corner[k, 0] + first[k, 0, i] + before,
-                np.float64(part[k, 0, i]) + 0.5,
-                np.float64(scales[k, 0, i]),
-                corner[k, 1] + first[k, 1, i] + before,
-                np.float64(part[k, 1, i]) + 0.5,
-                np.float64(scales[k, 1, i]),
-            )
-            found = means
-            if scales.shape[1] > 2 and (scales[k, 2, i] != 0.0 or scales[k, 3, i] != 0.0):
-                reach = (np.float64(scales[k, 2, i]), np.float64(scales[k, 3, i]))
-                usable, total = _mean_along(source, valid, spot, reach, rule, work, along)
-                found = along
-            else:
-                usable, total = _mean_at(source, valid, spot, rule, work)
-            if usable <= 0.0 or usable < LEAST_WEIGHT * total:
-                continue
-            out_valid[row, col + i] = True
-            for band in range(out.shape[0]):
-                store(found[band], rule[2], out, (band, row, col + i))
+            if kind[k, i] == AVERAGE:
+                spot = (
+                    corner[k, 0] + first[k, 0, i] + before,
+                    np.float64(part[k, 0, i]) + 0.5,
+                    np.float64(scales[k, 0, i]),
+                    corner[k, 1] + first[k, 1, i] + before,
+                    np.float64(part[k, 1, i]) + 0.5,
+                    np.float64(scales[k, 1, i]),
+                )
+                usable, total = mean_at(source, valid, spot, rule, work)
+                good = usable > 0.0 and usable >= LEAST_WEIGHT * total
+                out_valid[row, col + i] = good
+                if good:
+                    for band in range(out.shape[0]):
+                        store(work[3][band], rule[2], out, (band, row, col + i))

@@ -1,7 +1,7 @@
 """What a pixel covers of a source where its depth changes from pixel to pixel: a view over ground that runs away.
 
-At constant depth a pixel of a view is a small square; on ground that is seen at a grazing angle it is an ellipse, ten or
-a hundred times as long as wide, in any direction of the source. It is averaged by widened kernels (as wide as the
+At constant depth a pixel of a view is a small square; on ground that is seen at a grazing angle it is an ellipse, ten
+or a hundred times as long as wide, in any direction of the source. It is averaged by widened kernels (as wide as the
 ellipse) at several places along it.
 """
 
@@ -12,7 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.kernels.area import mean_at, mean_space, taps_before
+from photoplan.kernels.border import LEAST_WEIGHT, store
 from photoplan.kernels.jit import inner, kernel
+from photoplan.kernels.place import ALL, AVERAGE
 from photoplan.kernels.position import RUN, middle_of_run, row_weights, run_coefficients, run_origin
 from photoplan.kernels.scale import make_average, slope_space, slopes_of_run
 from photoplan.kernels.weights import STRETCH_FROM, STRETCH_FULL
@@ -167,3 +170,77 @@ def footprint_levels(
             levels[row, col + i] = level
             if long > longest[level]:
                 longest[level] = long
+
+
+@inner
+def _mean_along(
+    source: NDArray[Any],
+    valid: NDArray[np.uint8],
+    spot: tuple[Any, ...],
+    reach: tuple[float, float],
+    rule: tuple[Any, ...],
+    work: tuple[Any, ...],
+    along: NDArray[np.float64],
+) -> tuple[float, float]:
+    """As `mean_at`, repeated along `reach` to both sides with weights that fall evenly; the means are in `along`.
+
+    n places on each side at a distance d have the variance d² n (n + 2) / 6; a kernel that falls evenly over the reach
+    r has r² / 6. The places are no further apart than the widened kernel reaches.
+    """
+    far = (reach[0] * reach[0] + reach[1] * reach[1]) / (spot[2] * spot[2])
+    n = int(np.ceil(np.sqrt(1.0 + far) - 1.0))
+    rate = 1.0 / np.sqrt(float(max(n * (n + 2), 1)))
+    usable, total = 0.0, 0.0
+    along[:] = 0.0
+    for place in range(-n, n + 1):
+        x, y = place * rate * reach[0], place * rate * reach[1]
+        weight = 1.0 - abs(place) / (n + 1.0)
+        moved = (spot[0], spot[1] + x, spot[2], spot[3], spot[4] + y, spot[5])
+        found, every = mean_at(source, valid, moved, rule, work)
+        total += weight * every
+        if found > 0.0:
+            usable += weight * found
+            for band in range(along.shape[0]):
+                along[band] += weight * found * work[3][band]
+    for band in range(along.shape[0]):
+        along[band] = along[band] / usable if usable > 0.0 else 0.0
+    return usable, total
+
+
+@kernel
+def average_along_runs(
+    source: NDArray[Any],
+    valid: NDArray[np.uint8],
+    runs: NDArray[np.int32],
+    offset: tuple[int, int],
+    block: tuple[Any, ...],
+    scales: NDArray[np.float32],
+    rule: tuple[Any, ...],
+    result: tuple[Any, ...],
+) -> None:
+    """As `average_runs`, with `scales` of `footprint_runs`."""
+    corner, first, part, kind, fill = block
+    before = taps_before(rule)
+    out, out_valid = result
+    work, along = mean_space(source, out.shape[0]), np.zeros(out.shape[0])
+    for k in range(runs.shape[0]):
+        if fill[k] == ALL:
+            continue
+        row, col = runs[k, 1] - offset[1], runs[k, 3] - offset[0]
+        for i in range(runs[k, 4] - runs[k, 3]):
+            if kind[k, i] == AVERAGE:
+                spot = (
+                    corner[k, 0] + first[k, 0, i] + before,
+                    np.float64(part[k, 0, i]) + 0.5,
+                    np.float64(scales[k, 0, i]),
+                    corner[k, 1] + first[k, 1, i] + before,
+                    np.float64(part[k, 1, i]) + 0.5,
+                    np.float64(scales[k, 1, i]),
+                )
+                reach = (np.float64(scales[k, 2, i]), np.float64(scales[k, 3, i]))
+                usable, total = _mean_along(source, valid, spot, reach, rule, work, along)
+                good = usable > 0.0 and usable >= LEAST_WEIGHT * total
+                out_valid[row, col + i] = good
+                if good:
+                    for band in range(out.shape[0]):
+                        store(along[band], rule[2], out, (band, row, col + i))

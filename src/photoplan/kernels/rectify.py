@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.area import average_runs
 from photoplan.kernels.border import border_runs
-from photoplan.kernels.footprint import footprint_runs
+from photoplan.kernels.footprint import average_along_runs, footprint_runs
 from photoplan.kernels.gather import gather_runs
 from photoplan.kernels.jit import is_ready
 from photoplan.kernels.pack import as_bytes, pack, solid_patches
@@ -100,8 +100,8 @@ def rectify_tile(
     Notes
     -----
     Integers are rounded half away from zero and clipped. Where the target is coarser than the source the kernel is
-    widened along image x and y (see `weights.stretch`), except for "nearest", which keeps grey values. With `tilt` it is
-    widened by the width of what a pixel covers, and repeated along its length, see `photoplan.kernels.footprint`.
+    widened along image x and y (see `weights.stretch`), except for "nearest", which keeps grey values. With `tilt` it
+    is widened by the width of what a pixel covers, and repeated along its length, see `photoplan.kernels.footprint`.
     """
     packed = source if source.ndim == 4 else pack(source, valid)
     height, width = packed.shape[1:3]
@@ -188,7 +188,8 @@ def _block(
     if doubtful:
         border_runs(packed, mask, runs, offset, block, (coefficients, taps, limits), result)
     if averaged:
-        average_runs(packed, mask, runs, offset, block, scales, (weight_table(name), tags[1], limits), result)
+        average = average_along_runs if tilt.size else average_runs
+        average(packed, mask, runs, offset, block, scales, (weight_table(name), tags[1], limits), result)
 
 
 def is_compiled(dtype: Any, bands: int, kernel: str) -> bool:

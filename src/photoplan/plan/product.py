@@ -54,7 +54,7 @@ class CompiledTile:
     relief: NDArray[np.float32]
     """h of each pixel, shape (height, width); NaN where there is no surface."""
     tilt: NDArray[np.float32] | None
-    """Change of h per column and row, shape (2, height, width), where it decides what a pixel covers; None: on a map."""
+    """Change of h per column and row, shape (2, height, width), where it decides what a pixel covers: not on a map."""
     layers: tuple[Layer, ...]
     """Sources that paint a part of it, each once for every level; those that show none of it are left out."""
     owner: NDArray[np.uint16] | None
