@@ -183,3 +183,33 @@ def test_a_plan_gives_the_same_bytes_and_another_object_is_another_product(town:
     assert said.code == 0 and "2 products of single objects" in said.out
     assert photoplan("run", town.folder / "plan.gpkg", "--output", town.folder / "again", "--no-quicklook").code == 0
     assert {path.name: path.read_bytes() for path in (town.folder / "again").glob("*.tif")} == made
+
+
+def test_the_quadtree_is_a_layer_of_the_plan_with_its_counts(town: Block, capsys) -> None:  # type: ignore[no-untyped-def]
+    """Behr, section 6.2.2: squares that are inside stay, others are divided until they are no larger than a pixel."""
+    photoplan = Here(capsys)
+    words = ("object", town.project, town.folder / "town.gpkg", "--height-system", "same", *OPTIONS)
+    plan = town.folder / "plan.gpkg"
+    said = photoplan(*words, "--objects", "bridge", "--plan", plan, "--show-quadtree", "--json")
+    assert said.code == 0, said.err
+    (told,) = json.loads(said.out)["quadtree"]
+    meta, _, wkb, values = pyogrio.raw.read(plan, layer="quadtree")
+    squares, columns = shapely.from_wkb(wkb), dict(zip(meta["fields"], values))
+    assert told["object"] == "bridge" and told["squares"] == len(squares) == sum(told["of_level"])
+    np.testing.assert_array_equal(told["of_level"], np.bincount(columns["level"], minlength=8))
+    np.testing.assert_allclose(columns["side"], 128.0 / 2.0 ** columns["level"])
+    inside = shapely.contains_properly(BRIDGE, squares)
+    assert inside.any() and (columns["level"][~inside & ~shapely.within(squares, BRIDGE)] == 7).all()
+    assert shapely.union_all(squares).symmetric_difference(BRIDGE).area < 0.5 * BRIDGE.length
+    assert shapely.area(squares).sum() == pytest.approx(shapely.union_all(squares).area)
+    x = shapely.get_x(shapely.centroid(squares))
+    np.testing.assert_allclose(columns["height"], GROUND + 43 + (x - X0 + 30) * 0.05, atol=1e-6)
+    assert photoplan("run", plan, "--no-quicklook").code == 0
+    said = photoplan(*words, "--show-quadtree")
+    assert said.code == 2 and "--plan" in said.err
+    bare = photoplan("mosaic", town.project, *OPTIONS, "--dry-run", "--show-quadtree")
+    assert bare.code == 2 and "no product of the plan shows an object" in bare.err
+    town.project.write_text(town.project.read_text() + '\n[[objects]]\nfile = "town.gpkg"\nheight_system = "same"\n')
+    said = photoplan("mosaic", town.project, "--resolution", 1, "--plan", town.folder / "b.gpkg", "--show-quadtree")
+    assert (town.folder / "b_quadtree.png").stat().st_size > 5000
+    assert said.code == 0 and "mosaic: bridge: " in said.out and "mosaic: house: " in said.out

@@ -135,6 +135,7 @@ def product_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "--force", is_flag=True, help="Also of orientations with a FAULT, and finer than a quarter of the GSD."
         ),
         click.option("--plan", "plan_file", type=PATH, help="Write the plan (GeoPackage) and stop."),
+        click.option("--show-quadtree", is_flag=True, help="With --plan or --dry-run: objects as squares, too."),
         dry_run_option("Compile the plan, print it, and stop."),
     ]
     for option in reversed(options):

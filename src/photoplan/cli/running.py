@@ -64,13 +64,16 @@ def planned(
     made."""
     folder = options.pop("output") or project.folder / "products"
     plan_file, dry_run, images = (options.pop(name) for name in ("plan_file", "dry_run", "images"))
+    squares = options.pop("show_quadtree")
+    if squares and not dry_run and plan_file is None:
+        raise click.UsageError("--show-quadtree shows a plan: give --plan FILE or --dry-run, too")
     changes = {k: v for k, v in options.items() if v is not None and v != ()}
     made = plan(project, images or None, events=events, **changes)
     if dry_run or plan_file is not None:
         # Here, since plans as files need a library for vector data that a product does not: 30 MB of memory.
         from photoplan.cli.show_plan import show_plan
 
-        return partial(show_plan, made, folder, plan_file, how, events)
+        return partial(show_plan, made, folder, plan_file, how, events, squares)
     return partial(execute_and_report, made, folder, how, events)
 
 

@@ -39,7 +39,9 @@ class PlanTables:
     outlines: list[NDArray[np.float64]]
     """Footprint of each image, shape (k, 2), in the product's CRS."""
     crs: str
-    """CRS of both layers."""
+    """CRS of all layers."""
+    squares: tuple[NDArray[np.float64], dict[str, NDArray[Any]]] | None = None
+    """Outer edges (n, 4) and columns of the layer `quadtree`; None: there is none."""
 
 
 def write_plan_tables(path: Path, plan: PlanTables, overwrite: bool = False) -> None:
@@ -56,10 +58,14 @@ def write_plan_tables(path: Path, plan: PlanTables, overwrite: bool = False) -> 
     partial = path.with_name(f".{path.stem}.partial.gpkg")
     partial.unlink(missing_ok=True)
     try:
-        for start in range(0, len(plan.tile_bounds), _PIECE):
-            some = slice(start, start + _PIECE)
-            boxes, columns = shapely.box(*plan.tile_bounds[some].T), {k: v[some] for k, v in plan.tiles.items()}
-            _write_layer(partial, "tiles", boxes, columns, plan.crs, "Polygon", append=start > 0)
+        for layer, (bounds, table) in {
+            "tiles": (plan.tile_bounds, plan.tiles),
+            "quadtree": plan.squares or ((), {}),
+        }.items():
+            for start in range(0, len(bounds), _PIECE):
+                some = slice(start, start + _PIECE)
+                boxes, columns = shapely.box(*bounds[some].T), {k: v[some] for k, v in table.items()}
+                _write_layer(partial, layer, boxes, columns, plan.crs, "Polygon", append=partial.exists())
         outlines = np.array([shapely.Polygon(o) for o in plan.outlines], object)
         _write_layer(partial, "footprints", outlines, plan.footprints, plan.crs, "Polygon", append=True)
         # A table of its own that GIS programs leave alone; GeoPackage is SQLite and allows it as an attribute table.

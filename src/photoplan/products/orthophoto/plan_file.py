@@ -28,6 +28,7 @@ from photoplan.plan.tiles import Tiles
 from photoplan.products.orthophoto.look import Look
 from photoplan.products.orthophoto.mosaic import drawn_regions
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, keyed, product_plan
+from photoplan.products.orthophoto.quadtree import PlanSquares
 from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.scene import input_files
 from photoplan.surfaces.objects import Part
@@ -108,8 +109,15 @@ def compile_figures(plan: OrthoPlan, events: Events = SILENT) -> PlanFigures:
     return PlanFigures(product, cells, residual, source)
 
 
-def write_plan(path: Path, plan: OrthoPlan, figures: PlanFigures, output: Path, overwrite: bool = False) -> None:
-    """Write a plan as a GeoPackage with the layers `tiles` and `footprints`.
+def write_plan(
+    path: Path,
+    plan: OrthoPlan,
+    figures: PlanFigures,
+    output: Path,
+    overwrite: bool = False,
+    squares: PlanSquares | None = None,
+) -> None:
+    """Write a plan as a GeoPackage with the layers `tiles` and `footprints`, and `quadtree` if there are squares.
 
     Parameters
     ----------
@@ -121,6 +129,8 @@ def write_plan(path: Path, plan: OrthoPlan, figures: PlanFigures, output: Path, 
         Folder for the products when the plan is executed.
     overwrite : bool
         Whether an existing file may be replaced.
+    squares : PlanSquares, optional
+        Objects of this plan, from `plan_squares`.
 
     Raises
     ------
@@ -164,7 +174,8 @@ def write_plan(path: Path, plan: OrthoPlan, figures: PlanFigures, output: Path, 
         "on_terrain": np.array([look.footprint.on_surface for _, _, _, look in seen]),
     }
     outlines = [_outline(p, look.footprint) for p, _, _, look in seen]
-    tables = PlanTables(header, columns, bounds, footprints, outlines, plan.project.crs)
+    layer = None if squares is None else (squares.bounds, squares.columns)
+    tables = PlanTables(header, columns, bounds, footprints, outlines, plan.project.crs, layer)
     try:
         write_plan_tables(path, tables, overwrite)
     except OSError as error:
