@@ -75,7 +75,7 @@ def plan_squares(plan: OrthoPlan) -> PlanSquares:
     if not counts:
         raise UsageError(
             "no product of the plan shows an object: its quadtree is asked for with [[objects]] in the project, and "
-            "`photoplan ortho --true`, `photoplan mosaic` or `photoplan object`"
+            "`photoplan ortho` with `true`, `photoplan mosaic` or `photoplan object`"
         )
     return PlanSquares(np.concatenate(bounds), {k: np.concatenate(v) for k, v in columns.items()}, tuple(counts))
 
