@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation, binary_erosion, map_coordinates
@@ -16,6 +18,7 @@ from photoplan.plan import visibility
 from photoplan.plan.ground import TileGround
 from photoplan.plan.visibility import hidden_pixels, sight_lines
 from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.shifted import ShiftedSurface
 from photoplan.targets.map import MapTarget
 
 SIDE, MESH = 140, 1.0
@@ -150,7 +153,7 @@ def test_what_is_further_away_than_a_raster_reaches_is_found_on_the_terrain(monk
     monkeypatch.setattr(visibility, "MOST_AROUND", 3)
     far = hidden_pixels(camera, ground, surface)
     agree(far, near)
-    monkeypatch.setattr(visibility, "_met", lambda *args: np.zeros(len(args[3]), bool))
+    monkeypatch.setattr(visibility._OverTerrain, "_met", lambda self, uvh, *more: np.zeros(len(uvh), bool))
     assert hidden_pixels(camera, ground, surface).sum() < far.sum() - 20
 
 
@@ -201,3 +204,95 @@ def test_a_tower_beyond_a_level_tile_hides_its_ground() -> None:
     whole = hidden_pixels(camera, tile(surface, target().window), surface)[window.slices(target().window)]
     assert whole.sum() > 50
     np.testing.assert_array_equal(hidden_pixels(camera, tile(surface, window), surface), whole)
+
+
+FINE = 0.5
+
+
+def fine_town(side: int = 240) -> np.ndarray:
+    """Posts of 0.5 m: waves, with buildings whose walls are one mesh wide."""
+    rng = np.random.default_rng(1)
+    u, v = np.meshgrid(np.arange(side), np.arange(side))
+    posts = 3 * np.sin(u / 45) + 2 * np.cos(v / 30)
+    for _ in range(14):
+        row, col = rng.integers(5, side - 50, 2)
+        height, width = rng.integers(12, 40, 2)
+        posts[row : row + height, col : col + width] = rng.uniform(5, 15)
+    return posts.astype(np.float32)
+
+
+def walked_over_posts(posts: np.ndarray, XYZ: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """Places (..., 3) whose line to a centre lies below the posts' bilinear surface, in steps of 1/16 mesh."""
+    places = XYZ.reshape(-1, 3)
+    way = center - places
+    end = np.clip((posts.max() - places[:, 2]) / way[:, 2], 0, 1)
+    steps = 16 * np.abs(way[:, :2]).max(axis=-1) * end / FINE
+    hidden, on = np.zeros(len(places), bool), np.arange(len(places))
+    for step in range(1, int(steps.max()) + 1):
+        on = on[(step < steps[on]) & ~hidden[on]]
+        at = places[on] + (step / steps[on] * end[on])[:, None] * way[on]
+        rows, columns = ((len(posts) - 0.5) - at[:, 1] / FINE, at[:, 0] / FINE - 0.5)
+        hidden[on] = map_coordinates(posts, [rows, columns], order=1, cval=-1e9) > at[:, 2] + 1e-3
+    return hidden.reshape(XYZ.shape[:-1])
+
+
+def turned(XY: np.ndarray) -> np.ndarray:
+    """To a map whose axes are turned by a degree."""
+    c, s = np.cos(np.radians(1.0)), np.sin(np.radians(1.0))
+    return np.asarray(XY) @ np.array([[c, s], [-s, c]])
+
+
+CARRIES = {"posts": None, "posts of another map": turned}
+
+
+@pytest.mark.parametrize("carry", CARRIES)
+@pytest.mark.parametrize("resolution", [0.2, 0.5, 1.0, 2.0])
+def test_hidden_ground_is_as_large_whatever_the_pixels(resolution: float, carry: str) -> None:
+    """Walls of the terrain's own posts stay as steep as they are in pixels of four times their width."""
+    posts = fine_town()
+    side = len(posts) * FINE
+    surface = replace(raster_surface(posts, FINE / 2, side - FINE / 2, FINE), to_grid_crs=CARRIES[carry])
+    place = MapTarget(MapGrid.covering((4.0, 4.0, side - 4, side - 4), resolution, "EPSG:32632"))
+    camera = Pinhole(Pose.from_angles((60, 55, 200), (0.02, -0.03, 0.4)), 900, (1600, 1500))
+    ground = TileGround.of(place, place.window, surface.relief(place, place.window))
+    found = hidden_pixels(camera, ground, surface)
+    v, u = np.mgrid[: place.window.height, : place.window.width].astype(float)
+    XYZ = place.to_ground(np.stack([u, v, ground.relief], axis=-1))
+    center = np.array(camera.center)
+    if CARRIES[carry]:
+        XYZ, center = (np.concatenate([turned(p[..., :2]), p[..., 2:]], axis=-1) for p in (XYZ, center))
+    truth = walked_over_posts(posts, XYZ, center)
+    assert truth.mean() > 0.02
+    assert found.sum() == pytest.approx(truth.sum(), rel=0.03)
+    assert (found != truth).mean() < 0.001
+
+
+def test_coarse_tiles_join_and_are_looked_at_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    posts = fine_town()
+    surface = raster_surface(posts, FINE / 2, len(posts) * FINE - FINE / 2, FINE)
+    place = MapTarget(MapGrid.covering((4.0, 4.0, 116.0, 116.0), 2.0, "EPSG:32632"))
+    camera = CAMERAS["oblique"]
+
+    def hidden(window: Window) -> np.ndarray:
+        return hidden_pixels(camera, TileGround.of(place, window, surface.relief(place, window)), surface)
+
+    whole = hidden(place.window)
+    assert whole.mean() > 0.05
+    monkeypatch.setattr(visibility, "MOST_POSTS", 40)
+    np.testing.assert_array_equal(hidden(place.window), whole)
+    for window in place.window.tiles(20):
+        np.testing.assert_array_equal(hidden(window), whole[window.slices(place.window)])
+
+
+def test_ground_in_other_heights_hides_what_it_hides() -> None:
+    """A shift of heights that is a slope: the same as posts that are shifted."""
+    posts = fine_town()
+    v, u = np.mgrid[: len(posts), : len(posts)] * FINE
+    low, high = (raster_surface(h, FINE / 2, len(posts) * FINE - FINE / 2, FINE) for h in (posts, posts + u * 0.1))
+    shifted = ShiftedSurface(low, lambda XY: (np.asarray(XY)[..., 0] - FINE / 2) * 0.1)
+    place = MapTarget(MapGrid.covering((4.0, 4.0, 116.0, 116.0), 1.0, "EPSG:32632"))
+    a, b = (
+        hidden_pixels(CAMERAS["oblique"], TileGround.of(place, place.window, s.relief(place, place.window)), s)
+        for s in (shifted, high)
+    )
+    assert b.mean() > 0.05 and (a != b).mean() < 0.001

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from photoplan.surfaces.lattice import Lattice
 from photoplan.surfaces.raster import RasterSurface
 from photoplan.surfaces.rays import Hits
 
@@ -32,6 +33,9 @@ class FunctionSurface:
         y = bounds[..., 1:2, None] + part[:, None] * (bounds[..., 3:4, None] - bounds[..., 1:2, None])
         z = self.heights(np.stack(np.broadcast_arrays(x, y), axis=-1)).reshape(*bounds.shape[:-1], -1)
         return np.stack([np.fmin.reduce(z, axis=-1), np.fmax.reduce(z, axis=-1)], axis=-1)
+
+    def lattice(self, grid, window):
+        return Lattice.of_relief(self, grid)
 
     def first_hit(self, paths, bend=0.0):
         """Paths looked at in 4000 places of each piece, then halved: nothing thinner than a step is seen."""

@@ -52,16 +52,17 @@ def _follow(
     way: tuple[float, float],
     top: float,
     eye: float,
+    begin: float,
     stop: bool,
 ) -> float:
-    """Smallest height at the target, not below `top`, whose line of sight to the height `eye`, `way` from it, is free;
-    with `stop` infinity as soon as `top` is not enough."""
+    """Smallest height at the target, not below `top`, whose line of sight to the height `eye`, `way` from it, is free
+    from its part `begin` on; with `stop` infinity as soon as `top` is not enough."""
     _, values, levels = pyramid
     x, y = target
     # A line that is all but along a row or column is: else steps that round to nothing would not leave it.
     dx, dy = way[0] if abs(way[0]) > _ALONG else 0.0, way[1] if abs(way[1]) > _ALONG else 0.0
     nudge = _NUDGE / max(abs(dx), abs(dy))
-    u, level, last = 0.0, 0, levels.shape[0] - 1
+    u, level, last = begin, 0, levels.shape[0] - 1
     while u < 1.0:
         ahead = u + nudge
         col = min(max(np.int64(np.floor(x + ahead * dx)), 0), heights.shape[1] - 2)
@@ -124,7 +125,7 @@ def sight_rows(
                 continue
             top = h + target_height
             if dx != 0.0 or dy != 0.0:
-                top = _follow(heights, pyramid, (float(col), float(row)), (dx, dy), top, 0.0, stop)
+                top = _follow(heights, pyramid, (float(col), float(row)), (dx, dy), top, 0.0, 0.0, stop)
             out[row, col] = top - h
 
 
@@ -138,7 +139,7 @@ QUIET = 8
 
 @kernel
 def quiet_blocks(heights: NDArray[np.float32], slope: float, top: float) -> NDArray[np.bool_]:
-    """Blocks of `QUIET` × `QUIET` posts from which every line that rises at least so much is free.
+    """Blocks of `QUIET` × `QUIET` meshes from which every line that rises at least so much is free.
 
     Near by the terrain is nowhere as steep as the line; further away it is lower than the line has risen to by then.
 
@@ -177,7 +178,8 @@ def quiet_blocks(heights: NDArray[np.float32], slope: float, top: float) -> NDAr
         return quiet
     _widen(high)
     for ring in range(1, max(down, across) + 1):
-        risen = slope * QUIET * ring
+        # A line may begin below the lowest post of its block, but in a mesh that is less steep than the line.
+        risen = slope * (QUIET * ring - 2.0)
         _widen(high)
         for j in range(down):
             for i in range(across):
@@ -224,12 +226,12 @@ def _toward(nodes: NDArray[np.float64], part: tuple[float, float, float], d: NDA
 def find_hidden(
     heights: NDArray[np.float32],
     pyramid: Pyramid,
-    corner: tuple[int, int],
+    frame: tuple[float, float, float, float, float, float],
     relief: NDArray[np.float32],
     nodes: NDArray[np.float64],
     levels: tuple[float, float],
     top: float,
-    limits: tuple[float, float],
+    limits: tuple[float, float, float],
     quiet: NDArray[np.bool_],
     out: NDArray[np.uint8],
 ) -> None:
@@ -241,20 +243,22 @@ def find_hidden(
         Ground of the tile and of what is around it; NaN = no surface, which hides nothing.
     pyramid : tuple
         `pyramid_of(heights)`.
-    corner : (int, int)
-        Column and row of the tile's first pixel in `heights`.
+    frame : six floats
+        x, y, a, b, c, d: the pixel in a column and row of the tile lies in `heights` at x + a · column + b · row and
+        y + c · column + d · row.
     relief : ndarray, shape (height, width), float32
         Where lines begin: on the ground or above it; NaN = no surface.
     nodes : ndarray, shape (2, m, n, 5)
         Directions to the source at two levels, m rows and n columns of nodes spread over the tile from its first to its
-        last pixel: steps in column, row and height, and what is left of the depth and by how much a step lessens it.
+        last pixel: steps in pixels of columns and rows, and in height, and what is left of the depth and by how much a step lessens it.
         Interpolated linearly; a source at a point is the case where that is exact.
     levels : (float, float)
         Their heights.
     top : float
         A height that nothing exceeds.
-    limits : (float, float)
-        By how much ground may rise above a line, in heights, and how far a line is followed, columns or rows.
+    limits : (float, float, float)
+        By how much ground may rise above a line, in heights; how far a line is followed, and up to where the ground is
+        that of the place itself, in columns or rows of `heights`.
     quiet : ndarray of bool
         `quiet_blocks` of the heights: lines from there are not followed.
     out : ndarray, shape (height, width), uint8
@@ -265,12 +269,14 @@ def find_hidden(
     d = np.empty(5)
     for row in range(out.shape[0]):
         for col in range(out.shape[1]):
-            x, y = corner[0] + col, corner[1] + row
+            x = frame[0] + col * frame[2] + row * frame[3]
+            y = frame[1] + col * frame[4] + row * frame[5]
             h = np.float64(relief[row, col])
             out[row, col] = SEEN
-            if np.isnan(h) or quiet[y // QUIET, x // QUIET]:
+            if np.isnan(h) or quiet[np.int64(y) // QUIET, np.int64(x) // QUIET]:
                 continue
             _toward(nodes, (row * step_v, col * step_u, (h - levels[0]) / (levels[1] - levels[0])), d)
+            d[0], d[1] = d[0] * frame[2] + d[1] * frame[3], d[0] * frame[4] + d[1] * frame[5]
             t = (top - h) / d[2] if d[2] > 0.0 else np.inf
             if d[4] > 0.0:
                 t = min(t, d[3] / d[4])
@@ -286,9 +292,9 @@ def find_hidden(
                     cut = min(cut, -at / d[k])
             dx, dy = d[0] * cut, d[1] * cut
             if max(abs(dx), abs(dy)) >= 1e-3:
-                begin = h + limits[0]
-                end = begin + d[2] * cut
-                if _follow(heights, pyramid, (float(x), float(y)), (dx, dy), begin, end, True) == np.inf:
+                low = h + limits[0]
+                near = limits[2] / max(abs(dx), abs(dy))
+                if _follow(heights, pyramid, (x, y), (dx, dy), low, low + d[2] * cut, near, True) == np.inf:
                     out[row, col] = HIDDEN
                     continue
             if cut < t:

@@ -1,9 +1,10 @@
 """Which pixels of a tile a source sees: lines of sight through the product's own coordinates.
 
 A line of sight is where (u, v, h) keeps its image position. For a source at a point over a map it is straight, and its
-direction at a pixel, times the depth, is linear in (u, v, h): a few nodes tell all directions of a tile. Relief of the
-tile and of what is around it, as far as anything there can be in the way, decides; lines that leave that part too low
-are followed to the terrain itself. A product's depth grows towards whoever looks at it.
+direction at a pixel, times the depth, is linear in (u, v, h): a few nodes tell all directions of a tile. Posts of the
+terrain below the tile and around it, as far as anything there can be in the way, decide, however coarse the product is;
+lines that leave that part too low are followed to the terrain itself. A product's depth grows towards whoever looks at
+it.
 """
 
 from __future__ import annotations
@@ -18,25 +19,29 @@ from photoplan.cameras.base import Projection, project
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
 from photoplan.kernels.pyramid import pyramid_of
-from photoplan.kernels.visibility import BEYOND, HIDDEN, find_behind, find_hidden, quiet_blocks
+from photoplan.kernels.visibility import BEYOND, HIDDEN, SEEN, find_behind, find_hidden, quiet_blocks
 from photoplan.plan.ground import TileGround
 from photoplan.surfaces.base import Surface, Terrain
+from photoplan.surfaces.lattice import Lattice
 from photoplan.surfaces.objects import ObjectSurface, without_objects
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
 
 #: Nodes of directions along a side of a tile.
 _NODES = 5
-#: What is looked at around a tile as a raster, pixels to each side; longer lines are followed to the terrain itself.
-MOST_AROUND = 512
+#: Posts along a side of what is looked at together, and around that to each side; longer lines are followed to the
+#: terrain itself.
+MOST_POSTS, MOST_AROUND = 768, 512
 #: Points from which derivatives of the projection are taken are so far apart, pixels.
 _STEP = 8.0
 #: A source is at a point only if that is less than this many pixels away; else its lines of sight are parallel.
 _FAR = 1e8
 #: No line is followed further than this, pixels.
 _MOST_PIXELS = 1e6
-#: Ground that is met no further than this before a place is the place itself, pixels.
+#: What is met no further than this before a place is the place itself, pixels or posts.
 _SHORT = 0.1
+#: The same of posts that a place lies between, which are known better: to rounding.
+_BESIDE = 0.01
 #: Lines that are followed at once.
 _BATCH = 200_000
 
@@ -56,6 +61,11 @@ class SightLines:
         """Steps to the source, shape (...); infinite where lines are parallel."""
         with np.errstate(divide="ignore"):
             return np.abs(self.depth[..., 0] / self.depth[..., 1])
+
+    @property
+    def nodes(self) -> NDArray[np.float64]:
+        """Both, shape (..., 5)."""
+        return np.concatenate([self.step, self.depth], axis=-1)
 
 
 def sight_lines(projection: Projection, target: Target, uvh: NDArray[np.float64]) -> SightLines:
@@ -97,9 +107,9 @@ def hidden_pixels(projection: Projection, ground: TileGround, surface: Surface) 
     Returns
     -------
     ndarray of bool, shape (height, width)
-        The surface counts as bilinear between the pixels' centres, so that the border of a hidden area is known to half
-        a pixel; False where there is no surface, and outside the image. What a pixel gets does not depend on the tile
-        if the projection is linear but for its field; else pixels at such borders may.
+        Whether something is in the way to a pixel's centre, over the surface's own posts (`Terrain.lattice`); False
+        where there is no surface, and outside the image. What a pixel gets does not depend on the tile if the
+        projection is linear but for its field; else pixels at borders of hidden areas may.
 
     Raises
     ------
@@ -118,52 +128,71 @@ def hidden_pixels(projection: Projection, ground: TileGround, surface: Surface) 
     lines = sight_lines(projection, target, _nodes(window, levels))
     if not np.isfinite(lines.step).all() or not (lines.depth[..., 0] > 0).any():
         return none
+    # Over a map every surface is terrain.
+    whole: Any = surface
+    terrain = without_objects(whole)
+    over = _OverTerrain(projection, target, terrain, levels)
     found = np.zeros(none.shape, np.uint8)
-    nodes = np.concatenate([lines.step, lines.depth], axis=-1)
-    _behind_ground(projection, ground, surface, lines, levels, found)
+    for part in window.tiles(max(1, int(MOST_POSTS / terrain.lattice(target.grid, window).per_pixel))):
+        at = part.slices(window)
+        toward = lines if part == window else sight_lines(projection, target, _nodes(part, levels))
+        found[at] = over.behind(part, np.ascontiguousarray(ground.relief[at]), toward)
     if isinstance(surface, ObjectSurface):
         local, cells, origin = surface.faces.in_cells
         x, y = (target.grid.to_map((window.col, window.row)) - origin[:2]).tolist()
         frame = x, y, target.grid.resolution
-        find_behind(local, cells, frame, ground.relief, nodes, levels, _SHORT * target.grid.resolution, found)
+        find_behind(local, cells, frame, ground.relief, lines.nodes, levels, _SHORT * target.grid.resolution, found)
     hidden = found == HIDDEN
     there = np.argwhere(hidden)
-    xy = project(projection, target.to_ground(_places(ground, there)))
+    xy = project(projection, target.to_ground(_places(window, ground.relief, there)))
     hidden[tuple(there.T)] = ((xy >= -0.5) & (xy <= np.array(projection.size) - 0.5)).all(axis=-1)
     return hidden
 
 
-def _behind_ground(
-    projection: Projection,
-    ground: TileGround,
-    surface: Surface,
-    lines: SightLines,
-    levels: tuple[float, float],
-    found: NDArray[np.uint8],
-) -> None:
-    """Enter the pixels of a tile that terrain hides."""
-    window, target = ground.window, ground.target
-    assert isinstance(target, MapTarget)
-    # Over a map every surface is terrain.
-    whole: Any = surface
-    terrain = without_objects(whole)
-    top, needed = _search(terrain, target, window, lines, levels)
-    m = MOST_AROUND
-    around = needed & Window(window.col - m, window.row - m, window.width + 2 * m, window.height + 2 * m)
-    mine = around == window and terrain is whole
-    heights = ground.relief if mine else terrain.relief(target, around)
-    # Where the raster ends before the lines do, no part of it is quiet.
-    quiet = quiet_blocks(heights, _flattest(lines) if around == needed else 0.0, top)
-    if quiet.all():
-        return
-    nodes = np.concatenate([lines.step, lines.depth], axis=-1)
-    corner = window.col - around.col, window.row - around.row
-    slack = 4 * float(np.finfo(np.float32).eps) * max(*np.abs(levels), 1.0)
-    limits = slack, float(MOST_AROUND)
-    find_hidden(heights, pyramid_of(heights), corner, ground.relief, nodes, levels, top, limits, quiet, found)
-    far = np.argwhere(found == BEYOND)
-    for part in np.array_split(far, -(-len(far) // _BATCH)) if len(far) else ():
-        found[tuple(part.T)] = np.where(_met(projection, terrain, target, _places(ground, part), top), HIDDEN, 0)
+@dataclass(frozen=True, eq=False)
+class _OverTerrain:
+    """Lines of sight from a map to a source, over terrain."""
+
+    projection: Projection
+    target: MapTarget
+    terrain: Terrain
+    levels: tuple[float, float]
+    """Heights of the nodes of lines of sight."""
+
+    def behind(self, window: Window, relief: NDArray[np.float32], lines: SightLines) -> NDArray[np.uint8]:
+        """`HIDDEN` for the pixels of a window that terrain hides, else `SEEN`; `lines` at the nodes of the window."""
+        top, needed = _search(self.terrain, self.target, window, lines, self.levels)
+        lattice, m = self.terrain.lattice(self.target.grid, window), MOST_AROUND
+        near, every = lattice.around(window), lattice.around(needed)
+        around = every & Window(near.col - m, near.row - m, near.width + 2 * m, near.height + 2 * m)
+        heights = lattice.read(around)
+        # Where the raster ends before the lines do, no part of it is quiet.
+        quiet = quiet_blocks(heights, _flattest(lines, lattice) if around == every else 0.0, top)
+        found = np.zeros(relief.shape, np.uint8)
+        if quiet.all():
+            return found
+        x, y = (lattice.at((window.col, window.row)) - (around.col, around.row)).tolist()
+        frame = x, y, *lattice.steps.ravel().tolist()
+        slack = 4 * float(np.finfo(np.float32).eps) * max(*np.abs(self.levels), 1.0)
+        limits = slack, float(MOST_AROUND), _BESIDE
+        find_hidden(heights, pyramid_of(heights), frame, relief, lines.nodes, self.levels, top, limits, quiet, found)
+        far = np.argwhere(found == BEYOND)
+        short = _SHORT * self.target.grid.resolution / max(1.0, lattice.per_pixel)
+        for part in np.array_split(far, -(-len(far) // _BATCH)) if len(far) else ():
+            found[tuple(part.T)] = np.where(self._met(_places(window, relief, part), top, short), HIDDEN, SEEN)
+        return found
+
+    def _met(self, uvh: NDArray[np.float64], top: float, short: float) -> NDArray[np.bool_]:
+        """Whether terrain is met on the way down from the source to places (n, 3), more than `short` metres before."""
+        lines = sight_lines(self.projection, self.target, uvh)
+        with np.errstate(divide="ignore"):
+            rise = np.where(lines.step[:, 2] > 0, (top - uvh[:, 2]) / lines.step[:, 2], np.inf)
+            longest = _MOST_PIXELS / np.abs(lines.step[:, :2]).max(axis=-1)
+        start = uvh + np.minimum(np.minimum(rise, lines.length), longest)[:, None] * lines.step
+        paths = self.target.to_ground(np.stack([start, uvh], axis=1))
+        hits = self.terrain.first_hit(paths)
+        before = np.linalg.norm((hits.XYZ - paths[:, 1])[:, :2], axis=1) > short
+        return np.asarray(np.isfinite(hits.along) & before)
 
 
 def _nodes(window: Window, levels: tuple[float, float]) -> NDArray[np.float64]:
@@ -196,29 +225,15 @@ def _search(
         top = highest
 
 
-def _flattest(lines: SightLines) -> float:
-    """Least slope of the lines of sight of a tile, height per pixel; the quotient of a linear and a convex function is
+def _flattest(lines: SightLines, lattice: Lattice) -> float:
+    """Least slope of the lines of sight of a tile, height per post; the quotient of a linear and a convex function is
     least at a node."""
+    across = lines.step[..., :2] @ lattice.steps.T
     with np.errstate(divide="ignore"):
-        return float((lines.step[..., 2] / np.hypot(lines.step[..., 0], lines.step[..., 1])).min())
+        return float((lines.step[..., 2] / np.hypot(across[..., 0], across[..., 1])).min())
 
 
-def _places(ground: TileGround, pixels: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(u, v, h) of pixels (n, 2) of a tile given by row and column."""
+def _places(window: Window, relief: NDArray[np.float32], pixels: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(u, v, h) of pixels (n, 2) of a window given by row and column."""
     row, col = pixels.T
-    return np.stack([col + ground.window.col, row + ground.window.row, ground.relief[row, col].astype(float)], axis=-1)
-
-
-def _met(
-    projection: Projection, terrain: Terrain, target: MapTarget, uvh: NDArray[np.float64], top: float
-) -> NDArray[np.bool_]:
-    """Whether terrain is met on the way down from the source to places (n, 3), before they are reached."""
-    lines = sight_lines(projection, target, uvh)
-    with np.errstate(divide="ignore"):
-        rise = np.where(lines.step[:, 2] > 0, (top - uvh[:, 2]) / lines.step[:, 2], np.inf)
-        longest = _MOST_PIXELS / np.abs(lines.step[:, :2]).max(axis=-1)
-    start = uvh + np.minimum(np.minimum(rise, lines.length), longest)[:, None] * lines.step
-    paths = target.to_ground(np.stack([start, uvh], axis=1))
-    hits = terrain.first_hit(paths)
-    short = np.linalg.norm((hits.XYZ - paths[:, 1])[:, :2], axis=1) > _SHORT * target.grid.resolution
-    return np.asarray(np.isfinite(hits.along) & short)
+    return np.stack([col + window.col, row + window.row, relief[row, col].astype(float)], axis=-1)

@@ -7,7 +7,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.geometry.grid import Window
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.surfaces.lattice import Lattice
 from photoplan.surfaces.rays import Hits
 from photoplan.targets.base import Target
 
@@ -32,6 +33,13 @@ class Terrain(Surface, Protocol):
 
         Never narrower than the surface inside; cheap for many boxes and when asked again. NaN, NaN where there is no
         surface.
+        """
+        ...
+
+    def lattice(self, grid: MapGrid, window: Window) -> Lattice:
+        """Heights that, bilinear in between, are as good as all of them, around a window of a map.
+
+        At best the surface's own posts; else the pixels of the map, cut as finely as the surface needs it.
         """
         ...
 

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import UsageError
-from photoplan.geometry.grid import Window
+from photoplan.geometry.grid import MapGrid, Window
 from photoplan.kernels.extent import height_ranges
 from photoplan.kernels.hybrid import sample_hybrid, scan_faces
 from photoplan.kernels.sample_grid import sample_lattice
 from photoplan.surfaces.carried import box_points, carried_positions
+from photoplan.surfaces.lattice import Lattice
 from photoplan.surfaces.rays import NO_FACES, Hits, Part, carried_hits
 from photoplan.surfaces.units import MeshFaces, Unit, UnitSource
 from photoplan.targets.base import Target
@@ -77,6 +78,10 @@ class HybridSurface:
         out = np.stack([height_ranges(np.ascontiguousarray(ranges[..., k]), units)[:, k] for k in (0, 1)], axis=-1)
         out[np.isinf(out)] = np.nan
         return out.reshape(*boxes.shape[:-1], 2)
+
+    def lattice(self, grid: MapGrid, window: Window) -> Lattice:
+        """The pixels of the map in parts of half a mesh of the finest unit: triangles bend between posts."""
+        return Lattice.of_relief(self, grid, 2 * grid.resolution / self.source.finest)
 
     def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
         """Where rays first come down onto the surface; see `Terrain.first_hit`."""

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.geometry.grid import Window
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.surfaces.lattice import Lattice
 from photoplan.surfaces.rays import Hits, Part, follow
 from photoplan.targets.base import Target
 
@@ -30,6 +31,10 @@ class LevelSurface:
     def height_range(self, bounds: ArrayLike) -> NDArray[np.float64]:
         """The height, twice, for map bounds (..., 4)."""
         return np.full((*np.shape(bounds)[:-1], 2), self.height)
+
+    def lattice(self, grid: MapGrid, window: Window) -> Lattice:
+        """The pixels of the map."""
+        return Lattice.of_relief(self, grid)
 
     def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
         """Where rays first come down to the height; see `Terrain.first_hit`."""

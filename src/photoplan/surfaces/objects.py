@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import UsageError
-from photoplan.geometry.grid import Window
+from photoplan.geometry.grid import MapGrid, Window
 from photoplan.kernels.raycast import SURFACE
 from photoplan.surfaces.base import Terrain
 from photoplan.surfaces.faces import Faces
+from photoplan.surfaces.lattice import Lattice
 from photoplan.surfaces.rays import Hits
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
@@ -92,6 +93,10 @@ class ObjectSurface:
         """Bounds of ground and faces, painted or not, inside map bounds (..., 4), shape (..., 2)."""
         ground, faces = self.ground.height_range(bounds), self.faces.height_range(bounds)
         return np.stack([np.fmin(ground[..., 0], faces[..., 0]), np.fmax(ground[..., 1], faces[..., 1])], axis=-1)
+
+    def lattice(self, grid: MapGrid, window: Window) -> Lattice:
+        """That of the ground: faces are no raster."""
+        return self.ground.lattice(grid, window)
 
     def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
         """What rays meet first: the ground, as `Terrain.first_hit` has it, or a face, from either side."""

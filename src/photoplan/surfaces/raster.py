@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import InputError, UsageError
-from photoplan.geometry.grid import Window
+from photoplan.geometry.grid import MapGrid, Window
 from photoplan.kernels.extent import height_ranges
 from photoplan.kernels.sample_grid import sample_lattice, sample_points
 from photoplan.surfaces.carried import box_points, carried_positions
+from photoplan.surfaces.lattice import Lattice
 from photoplan.surfaces.rays import Hits, Part, carried_hits
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
@@ -114,6 +115,28 @@ class RasterSurface:
         windows = np.concatenate([np.where(there[:, None], low, 0), np.where(there[:, None], high, 0)], axis=1)
         windows = np.clip(windows, 0, np.tile(self.grid.size, 2)).astype(np.int64)
         return self._ranges.of(windows).reshape(*boxes.shape[:-1], 2)
+
+    def lattice(self, grid: MapGrid, window: Window) -> Lattice:
+        """The posts; where they are those of another CRS, the map lies on them as it does in the middle of the window."""
+        half = max(window.width, window.height, 2) / 2
+        middle = np.array((window.col, window.row)) + (np.array((window.width, window.height)) - 1) / 2
+        cross = middle + half * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
+        XY = grid.to_map(cross)
+        center, right, left, down, up = self._posts(XY if self.to_grid_crs is None else self.to_grid_crs(XY))
+        steps = np.stack([right - left, down - up], axis=1) / (2 * half)
+        if not (np.isfinite(steps).all() and np.linalg.det(steps)):
+            return Lattice.of_relief(self, grid)
+        # Rounded, so that pixels that are posts lie on them.
+        steps = np.round(steps, 12)
+        return Lattice(np.round(center - steps @ middle, 6), steps, self._part)
+
+    def _part(self, window: Window) -> NDArray[np.float32]:
+        """Posts of any window; NaN beyond the grid."""
+        posts = np.full((window.height, window.width), np.nan, np.float32)
+        inside = window & Window(0, 0, *self.grid.size)
+        if inside.size:
+            posts[inside.slices(window)] = self.grid.read(inside)
+        return posts
 
     def first_hit(self, paths: ArrayLike, bend: float = 0.0) -> Hits:
         """Where rays first come down onto the surface; see `Terrain.first_hit`."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.geometry.grid import Window
+from photoplan.geometry.grid import MapGrid, Window
 from photoplan.surfaces.base import Terrain
+from photoplan.surfaces.lattice import Lattice
 from photoplan.surfaces.rays import Hits, chords
 from photoplan.targets.base import Target
 
@@ -25,16 +26,18 @@ class ShiftedSurface:
 
     def relief(self, target: Target, window: Window) -> NDArray[np.float32]:
         """Relief of the surface with the shift added; NaN where there is no surface."""
-        relief = self.surface.relief(target, window)
-        u = np.linspace(window.col, window.stop[0] - 1, 3)
-        v = np.linspace(window.row, window.stop[1] - 1, 3)
-        uvh = np.stack([*np.meshgrid(u, v), np.zeros((3, 3))], axis=-1)
-        nodes = self.shift(target.to_ground(uvh)[..., :2])
-        along_v = np.arange(window.row, window.stop[1])
-        along_u = np.arange(window.col, window.stop[0])
-        columns = np.stack([np.interp(along_v, v, nodes[:, i]) for i in range(3)], axis=1)
-        full = np.stack([np.interp(along_u, u, row) for row in columns])
-        return (relief + full).astype(np.float32)
+        nodes = self.shift(target.to_ground(_nodes(window))[..., :2])
+        return _raised(self.surface.relief(target, window), nodes, window)
+
+    def lattice(self, grid: MapGrid, window: Window) -> Lattice:
+        """That of the surface, with the shift added."""
+        own = self.surface.lattice(grid, window)
+
+        def read(part: Window) -> NDArray[np.float32]:
+            nodes = self.shift(grid.to_map(own.to_pixels(_nodes(part)[..., :2])))
+            return _raised(own.read(part), nodes, part)
+
+        return replace(own, read=read)
 
     def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
         """Heights at map points (..., 2) with the shift added."""
@@ -63,3 +66,20 @@ class ShiftedSurface:
     def _lowered(self, XYZ: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points as the surface that was shifted has them."""
         return np.concatenate([XYZ[..., :2], XYZ[..., 2:] - self.shift(XYZ[..., :2])[..., None]], axis=-1)
+
+
+def _nodes(window: Window) -> NDArray[np.float64]:
+    """(u, v, 0) of nine places over a window, from its first to its last pixel, shape (3, 3, 3)."""
+    u = np.linspace(window.col, window.stop[0] - 1, 3)
+    v = np.linspace(window.row, window.stop[1] - 1, 3)
+    return np.stack([*np.meshgrid(u, v), np.zeros((3, 3))], axis=-1)
+
+
+def _raised(heights: NDArray[np.float32], shift: NDArray[np.float64], window: Window) -> NDArray[np.float32]:
+    """Heights of a window with a shift added that is bilinear between its nodes."""
+    u, v, _ = _nodes(window).T
+    along_v = np.arange(window.row, window.stop[1])
+    along_u = np.arange(window.col, window.stop[0])
+    columns = np.stack([np.interp(along_v, v[0], shift[:, i]) for i in range(3)], axis=1)
+    full = np.stack([np.interp(along_u, u[:, 0], row) for row in columns])
+    return (heights + full).astype(np.float32)

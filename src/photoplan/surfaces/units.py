@@ -156,6 +156,11 @@ class UnitSource(Protocol):
         """Lowest and highest height of every unit, shape (rows, columns, 2); NaN for empty units."""
         ...
 
+    @property
+    def finest(self) -> float:
+        """Smallest grid width, metres."""
+        ...
+
     def unit(self, column: int, row: int) -> Unit | None:
         """The unit, or None if it is empty."""
         ...
@@ -181,6 +186,11 @@ class MemoryUnits:
                 )
             ranges[row, column] = unit_range(unit)
         object.__setattr__(self, "ranges", ranges)
+
+    @property
+    def finest(self) -> float:
+        """Smallest grid width, metres."""
+        return min((unit.width for unit in self.units.values()), default=self.layout.side)
 
     def unit(self, column: int, row: int) -> Unit | None:
         """The unit, or None if it is empty."""
