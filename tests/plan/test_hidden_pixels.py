@@ -287,8 +287,8 @@ def test_coarse_tiles_join_and_are_looked_at_in_parts(monkeypatch: pytest.Monkey
 def test_ground_in_other_heights_hides_what_it_hides() -> None:
     """A shift of heights that is a slope: the same as posts that are shifted."""
     posts = fine_town()
-    v, u = np.mgrid[: len(posts), : len(posts)] * FINE
-    low, high = (raster_surface(h, FINE / 2, len(posts) * FINE - FINE / 2, FINE) for h in (posts, posts + u * 0.1))
+    rise = 0.1 * FINE * np.arange(len(posts))
+    low, high = (raster_surface(h, FINE / 2, len(posts) * FINE - FINE / 2, FINE) for h in (posts, posts + rise))
     shifted = ShiftedSurface(low, lambda XY: (np.asarray(XY)[..., 0] - FINE / 2) * 0.1)
     place = MapTarget(MapGrid.covering((4.0, 4.0, 116.0, 116.0), 1.0, "EPSG:32632"))
     a, b = (

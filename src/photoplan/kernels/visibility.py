@@ -250,8 +250,8 @@ def find_hidden(
         Where lines begin: on the ground or above it; NaN = no surface.
     nodes : ndarray, shape (2, m, n, 5)
         Directions to the source at two levels, m rows and n columns of nodes spread over the tile from its first to its
-        last pixel: steps in pixels of columns and rows, and in height, and what is left of the depth and by how much a step lessens it.
-        Interpolated linearly; a source at a point is the case where that is exact.
+        last pixel: steps in columns and rows of pixels, and in height, and what is left of the depth and by how much a
+        step lessens it. Interpolated linearly; a source at a point is the case where that is exact.
     levels : (float, float)
         Their heights.
     top : float

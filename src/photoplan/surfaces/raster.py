@@ -117,7 +117,7 @@ class RasterSurface:
         return self._ranges.of(windows).reshape(*boxes.shape[:-1], 2)
 
     def lattice(self, grid: MapGrid, window: Window) -> Lattice:
-        """The posts; where they are those of another CRS, the map lies on them as it does in the middle of the window."""
+        """The posts; if they are those of another CRS, the map lies on them as it does in the middle of the window."""
         half = max(window.width, window.height, 2) / 2
         middle = np.array((window.col, window.row)) + (np.array((window.width, window.height)) - 1) / 2
         cross = middle + half * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
