@@ -67,8 +67,13 @@ class Projection(Protocol):
         ...
 
 
-class Camera(Projection, Protocol):
-    """A projection that can be followed back to the ground. Rays and derivatives are those of both factors."""
+class Rays(Protocol):
+    """What can be followed from image points to the ground, whether or not ground can be projected."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the image in pixels."""
+        ...
 
     def rays(self, xy: ArrayLike, height: float | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Image points (..., 2) to rays: an origin and a unit direction (pointing away from the camera), each (..., 3).
@@ -78,6 +83,10 @@ class Camera(Projection, Protocol):
         is its tangent there; `height` is then required. Points that no ray reaches give NaN.
         """
         ...
+
+
+class Camera(Projection, Rays, Protocol):
+    """A projection that can be followed back to the ground. Rays and derivatives are those of both factors."""
 
     def derivatives(self, XYZ: ArrayLike) -> NDArray[np.float64]:
         """∂(x, y)/∂(X, Y, Z), shape (..., 2, 3), pixels per metre; NaN behind the camera."""

@@ -34,6 +34,8 @@ class ImageForm:
     """Packet of XMP."""
     units: tuple[str, ...] = ()
     """Unit of every band."""
+    offsets: tuple[float, ...] = ()
+    """What readers add to the stored values of every band."""
 
     @property
     def photometric(self) -> str | None:
@@ -92,6 +94,8 @@ def dress(dataset: Any, form: ImageForm) -> None:
         dataset.descriptions = form.descriptions
     if form.units:
         dataset.units = form.units
+    if form.offsets:
+        dataset.offsets = form.offsets
     if form.colours:
         known = {each.name: each for each in rasterio.enums.ColorInterp}
         dataset.colorinterp = [known.get(name, known["undefined"]) for name in form.colours]

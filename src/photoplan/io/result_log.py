@@ -49,7 +49,12 @@ class ResultLog:
     @classmethod
     def beside(cls, product: Path, key: str, *, locked: bool) -> ResultLog:
         """The hidden log beside a product, till it is complete; `locked`: its caller holds the product's lock."""
-        return cls(product.with_name(f".{product.name}.steps"), key, None if locked else lock_of(product))
+        return cls(cls.place(product), key, None if locked else lock_of(product))
+
+    @staticmethod
+    def place(product: Path) -> Path:
+        """Where that log is."""
+        return product.with_name(f".{product.name}.steps")
 
     def __enter__(self) -> ResultLog:
         with ExitStack() as stack:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.cameras.base import CentralCamera
+from photoplan.cameras.base import CentralCamera, Rays
 from photoplan.surfaces.base import Terrain
 
 #: A curved ray is followed along chords that it leaves by less than this, metres …
@@ -14,6 +14,8 @@ CURVED = 1e-4
 MOST_CHORDS = 64
 #: What is looked through above and below the heights of the terrain, metres.
 _MARGIN = 0.01
+#: Rays that do not leave the heights of a scene are followed so far on the map, metres.
+FAR = 30_000.0
 
 
 def intersect(
@@ -46,7 +48,37 @@ def intersect(
     return terrain.first_hit(_paths(camera, xy, high, low)).XYZ
 
 
-def _paths(camera: CentralCamera, xy: NDArray[np.float64], high: float, low: float) -> NDArray[np.float64]:
+def ray_paths(camera: Rays, xy: ArrayLike, height_range: tuple[float, float]) -> NDArray[np.float64]:
+    """Rays of image points through the heights of a scene, whichever way they run: paths for `Terrain.first_hit`.
+
+    Parameters
+    ----------
+    camera : Rays
+    xy : array_like, shape (n, 2)
+        Image points in pixels.
+    height_range : (float, float)
+        Heights between which the scene lies, metres; for curved rays the upper one is below the camera.
+
+    Returns
+    -------
+    ndarray, shape (n, k, 3)
+        From where a ray starts, or enters these heights, to where it leaves them, or 30 km further. NaN where there is
+        no ray, or it does not reach them; curved rays also where they do not go down.
+    """
+    low, high = height_range[0] - _MARGIN, height_range[1] + _MARGIN
+    xy = np.asarray(xy, float)
+    origin, direction = camera.rays(xy, high)
+    if not np.array_equal(origin, camera.rays(xy, low)[0], equal_nan=True):
+        return _paths(camera, xy, high, low)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = (np.array([[low], [high]]) - origin[:, 2]) / direction[:, 2]
+        start = np.maximum(ends.min(axis=0), 0.0)
+        end = np.minimum(ends.max(axis=0), start + FAR / np.hypot(direction[:, 0], direction[:, 1]))
+        along = np.where(start < end, (start, end), np.nan)
+        return np.moveaxis(origin + along[..., None] * direction, 0, 1)
+
+
+def _paths(camera: Rays, xy: NDArray[np.float64], high: float, low: float) -> NDArray[np.float64]:
     """Rays between two heights as paths (n, k, 3), from above; NaN where they do not come down."""
     ends = _at_height(camera, xy, high), _at_height(camera, xy, low)
     paths = np.stack([end[0] for end in ends], axis=1)
@@ -66,9 +98,7 @@ def _paths(camera: CentralCamera, xy: NDArray[np.float64], high: float, low: flo
     return paths
 
 
-def _at_height(
-    camera: CentralCamera, xy: NDArray[np.float64], height: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _at_height(camera: Rays, xy: NDArray[np.float64], height: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Points of the rays at a height, NaN for rays that do not go down, and the points that rays start from."""
     origin, direction = camera.rays(xy, height)
     with np.errstate(divide="ignore", invalid="ignore"):

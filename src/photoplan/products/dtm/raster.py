@@ -17,6 +17,7 @@ from photoplan.errors import ResourceError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import Placement, Window, refuse_absurd
 from photoplan.io.disk import free_megabytes
+from photoplan.io.image_form import ImageForm
 from photoplan.io.naming import together
 from photoplan.io.product import ProductFacts, ProductFile, check_output
 from photoplan.io.run_record import input_entry, run_key, run_times, settings_of, write_run_record
@@ -58,6 +59,8 @@ class GridOptions:
     """Colour table of one band of uint8: red, green, blue, 0 to 255, of each value."""
     tags: Mapping[str, str] | None = None
     """Tags of the file."""
+    form: ImageForm | None = None
+    """Names, units and offsets of its bands."""
 
     @classmethod
     def of(cls, request: Any, kind: str, inputs: Sequence[Path], events: Events, **more: Any) -> GridOptions:
@@ -137,6 +140,7 @@ def write_grid(
         threads=workers,
         resampling=options.resampling,
         colours=options.colours,
+        form=options.form,
     )
     windows = Tiles.every(file.placement.window, file.tile)
     kept = file.log_path.stat().st_size if file.log_path.exists() else 0

@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.engine.steps import steps
-from photoplan.errors import InputError, ResourceError, UsageError
+from photoplan.errors import InputError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import Window
-from photoplan.io.product import check_output
 from photoplan.io.raster import RasterReader
-from photoplan.io.result_log import ResultLog
-from photoplan.io.run_record import run_key, run_times, write_run_record
 from photoplan.plain import pick
-from photoplan.products.simulate.model import SimulatedImage, count_parts, form_frames, is_kept, read_model
-from photoplan.quality.formation.model import MOST_PIXELS, ImageModel, model_mtf50
-from photoplan.quality.formation.parts import Quantisation
+from photoplan.products.simulate.form import Forming, SimulateReport, check_fit, stated_model
+from photoplan.quality.formation.model import ImageModel
 from photoplan.quality.formation.scenes import PATTERNS, LightScene, PatternScene, parse_pattern
 
 _MOST_FRAMES = 10_000
-_BITS = {"uint8": 8, "uint16": 16}
 
 
 @dataclass(frozen=True)
@@ -57,30 +48,6 @@ class SimulateRequest:
     workers: int = 1
     overwrite: bool = False
     dry_run: bool = False
-
-
-@dataclass(frozen=True)
-class SimulateReport:
-    """What was made, or would be."""
-
-    images: tuple[SimulatedImage, ...]
-    size: tuple[int, int]
-    bands: int
-    dtype: str
-    mtf50: tuple[float, float]
-    """What the model puts in, along x and y in the middle of the image, cycles per pixel; NaN: above 20."""
-    notes: tuple[str, ...]
-    record: Path | None
-
-    def json_fields(self) -> dict[str, Any]:
-        """The images with what is known of each."""
-        images = [{**pick(i, "path", "frame", "exposure", automatic_gain="gain"), **i.facts} for i in self.images]
-        mtf50 = dict(zip("xy", self.mtf50))
-        return {
-            **pick(self, "size", "bands", "dtype", "notes", run_record="record"),
-            "images": images,
-            "model_mtf50": mtf50,
-        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,73 +119,31 @@ def simulate(
     InputError
         Scene or model cannot be used.
     """
-    times = run_times()
-    model, dtype = _model(request)
+    model, dtype = stated_model(request.model, request.seed, request.dtype)
     scene = _scene(request, model)
     exposures = _exposures(request)
-    output = _output(request)
-    paths, inputs = _paths(request), _inputs(request)
     settings = {
         "model": model,
         "scene": Path(request.scene).name,
         "size": scene.size,
         "oversampling": scene.oversampling,
     }
-    settings |= {**pick(request, "levels", "phase"), "exposures": exposures, "dtype": dtype}
-    key = run_key("simulated images", settings, inputs)
-    if request.dry_run:
-        for path in paths:
-            check_output(path, inputs, overwrite=request.overwrite)
-        images = [SimulatedImage(p, n, e, 1.0, {}) for n, (p, e) in enumerate(zip(paths, exposures))]
-        return _report(model, scene, dtype, images)
-    with ResultLog.beside(output, key, locked=False) as log:
-        for frame, path in enumerate(paths):
-            check_output(path, inputs, overwrite=request.overwrite or is_kept(log, frame, path))
-        tags = {"PHOTOPLAN_SCENE": Path(request.scene).name, "PHOTOPLAN_SEED": str(model.seed)}
-        with steps(output.name, request.workers, events, log) as run:
-            events.begin("images", count_parts(model, scene, len(paths)), "parts")
-            try:
-                images = form_frames(model, scene, list(zip(paths, exposures)), (dtype, tags), run, log)
-            except MemoryError:
-                text = f"{scene.bands} × {scene.size[0]} × {scene.size[1]}"
-                raise ResourceError(f"too little memory for an image of {text} pixels; cut the scene") from None
-        report = _report(model, scene, dtype, images)
-        ran = {"workers": request.workers, **times()}
-        record = write_run_record(
-            output, key=key, inputs=inputs, run=ran, kind="simulated images", product=report, settings=settings
-        )
-        log.remove()
-    return dataclasses.replace(report, record=record)
-
-
-def _report(model: ImageModel, scene: LightScene, dtype: str, images: list[SimulatedImage]) -> SimulateReport:
-    return SimulateReport(
-        images=tuple(images),
-        size=scene.size,
-        bands=scene.bands,
+    masked = isinstance(scene, FileScene) and scene.reader.info.has_mask
+    forming = Forming(
+        kind="simulated images",
+        name=Path(request.scene).name,
+        scene=scene,
+        model=model,
         dtype=dtype,
-        mtf50=(model_mtf50(model, 0.0), model_mtf50(model, 90.0)),
-        notes=tuple(_notes(scene, dtype, images)),
-        record=None,
+        frames=tuple(zip(_paths(request), exposures)),
+        output=_output(request),
+        inputs=_inputs(request),
+        settings=settings | {**pick(request, "levels", "phase"), "exposures": exposures, "dtype": dtype},
+        notes=("pixels without value in the scene count as 0",) if masked else (),
+        workers=request.workers,
+        overwrite=request.overwrite,
     )
-
-
-def _model(request: SimulateRequest) -> tuple[ImageModel, str]:
-    """The model, and the type of the files."""
-    model = ImageModel() if request.model is None else read_model(request.model)
-    if request.seed is not None:
-        if not 0 <= request.seed < 2**62:
-            raise UsageError(f"seed {request.seed}; a whole number from 0 on is needed")
-        model = dataclasses.replace(model, seed=request.seed)
-    dtype = request.dtype
-    if model.quantisation is None and dtype in _BITS:
-        model = dataclasses.replace(model, quantisation=Quantisation(_BITS[dtype]))
-    if model.quantisation is None:
-        return model, dtype or "float32"
-    bits = model.quantisation.bits
-    if dtype == "uint8" and bits > 8:
-        raise UsageError(f"uint8 files for grey values of {bits} bits; choose uint16, or other bits in the model")
-    return model, dtype or ("uint8" if bits <= 8 else "uint16")
+    return forming.planned() if request.dry_run else forming.form(events)
 
 
 def _scene(request: SimulateRequest, model: ImageModel) -> LightScene:
@@ -244,17 +169,7 @@ def _scene(request: SimulateRequest, model: ImageModel) -> LightScene:
             request.phase or (0.0, 0.0),
             bands,
         )
-    if scene.size[0] * scene.size[1] * scene.bands > MOST_PIXELS:
-        raise InputError(
-            f"{request.scene}: {scene.bands} × {scene.size[0]} × {scene.size[1]} pixels; at most {MOST_PIXELS:,} are "
-            "formed at once: cut the scene"
-        )
-    absent = [each.band for each in model.lateral if each.band > scene.bands]
-    if absent:
-        raise InputError(
-            f"{request.model}: [[lateral]] describes band {absent[0]}, but {request.scene} has "
-            f"{scene.bands} {'band' if scene.bands == 1 else 'bands'}; leave the entry out, or give a scene with it"
-        )
+    check_fit(scene, request.scene, model, request.model)
     if isinstance(scene, FileScene) and not scene.has_values:
         raise InputError(f"{request.scene}: not one pixel has a value; nothing can be imaged, give another file")
     return scene
@@ -294,16 +209,3 @@ def _inputs(request: SimulateRequest) -> list[Path]:
     """Files that decide what is formed."""
     scene = [] if parse_pattern(request.scene) is not None else [Path(request.scene)]
     return scene + ([] if request.model is None else [request.model])
-
-
-def _notes(scene: LightScene, dtype: str, images: list[SimulatedImage]) -> Iterator[str]:
-    """What a user should know."""
-    clipped = [i for i in images if i.facts.get("saturated_pixels")]
-    if clipped:
-        most = max(int(str(i.facts["saturated_pixels"])) for i in clipped)
-        yield f"saturated pixels in {len(clipped)} of {len(images)} frames, up to {most}"
-    lost = max((float(str(i.facts.get("lost", 0.0))) for i in images), default=0.0)
-    if lost > 0.5:
-        yield f"charge that overflowed beyond the border: up to {lost:.0f} electrons"
-    if isinstance(scene, FileScene) and scene.reader.info.has_mask:
-        yield "pixels without value in the scene count as 0"
