@@ -23,6 +23,7 @@ from photoplan.cli.options import PATH, choosing_options, executing, listed, pro
 @click.option("--crs", metavar="CRS", help="Of a file that states none.")
 @click.option("--height-system", metavar="NAME", help="Of its heights; same: that of the terrain.")
 @click.option("--offset", type=float, nargs=3, default=None, metavar="X Y Z", help="Added to all coordinates, metres.")
+@click.option("--sigma", type=float, nargs=2, default=None, metavar="XY Z", help="Its standard deviations, metres.")
 @executing
 def command(project: Path, polygons: Path, score: tuple[str, ...], prefer: tuple[str, ...], **options: Any) -> None:
     """Make a product of each object in POLYGONS alone: NAME_object.tif, its pixels and no others.
@@ -36,7 +37,7 @@ def command(project: Path, polygons: Path, score: tuple[str, ...], prefer: tuple
     from photoplan.products.orthophoto.objects import plan_objects
     from photoplan.products.orthophoto.settings import Choice
 
-    names = ("layer", "crs", "height_system", "offset")
+    names = ("layer", "crs", "height_system", "offset", "sigma")
     stated = {name: value for name in names if (value := options.pop(name)) is not None}
     plan = partial(plan_objects, polygons=Objects(file=str(polygons.resolve()), **stated))
     choice = Choice(weights=weights(score), prefer=prefer)

@@ -83,8 +83,14 @@ def _height(corners: NDArray[np.float64], f: int, x: float, y: float) -> float:
 
 
 @kernel
-def highest(corners: NDArray[np.float64], cells: Cells, XY: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """Height of the highest triangle above or below map points.
+def highest(
+    corners: NDArray[np.float64],
+    cells: Cells,
+    XY: NDArray[np.float64],
+    out: NDArray[np.float64],
+    faces: NDArray[np.int64],
+) -> None:
+    """The highest triangle above or below map points, and its height.
 
     Parameters
     ----------
@@ -94,18 +100,22 @@ def highest(corners: NDArray[np.float64], cells: Cells, XY: NDArray[np.float64],
     XY : ndarray, shape (m, 2), float64
     out : ndarray, shape (m,), float64
         −inf where there is none.
+    faces : ndarray, shape (m,), int64
+        Which; −1: none.
     """
     start, members, _, frame = cells
     side, columns, rows = frame[0], np.int64(frame[1]), np.int64(frame[2])
     for i in range(XY.shape[0]):
         x, y = XY[i, 0], XY[i, 1]
-        out[i] = -np.inf
+        out[i], faces[i] = -np.inf, -1
         # Not so for NaN, too.
         if not (-_EDGE <= x <= side * columns + _EDGE and -_EDGE <= y <= side * rows + _EDGE):
             continue
         cell = _cell(y, side, rows) * columns + _cell(x, side, columns)
         for k in range(start[cell], start[cell + 1]):
-            out[i] = max(out[i], _height(corners, members[k], x, y))
+            height = _height(corners, members[k], x, y)
+            if height > out[i]:
+                out[i], faces[i] = height, members[k]
 
 
 @inner

@@ -62,8 +62,9 @@ class SceneAddress:
         camera.pop("restore", None)
         for name in ("name", "file", "camera", "sigma_center", "sigma_angles", "correlation"):
             image.pop(name, None)
-        files = [(part, "file") for part in (project["terrain"], *project.get("objects", ()))]
-        for entries, name in (*files, (project["terrain"], "sigma"), (camera, "sigma")):
+        ground = (project["terrain"], *project.get("objects", ()))
+        idle = [(part, name) for part in ground for name in ("file", "sigma")]
+        for entries, name in (*idle, (camera, "sigma")):
             entries.pop(name, None)
         table = None
         if restored is not None:

@@ -17,11 +17,13 @@ from photoplan.geometry.grid import Window
 from photoplan.io.camera.model import CameraEntry
 from photoplan.io.project.file import parse_project
 from photoplan.io.project.model import Image, Project
-from photoplan.plan.accuracy import Cause, SourceErrors
+from photoplan.plan.accuracy import Cause, DepthErrors, SourceErrors
 from photoplan.project.ground import Ground
 from photoplan.project.open_terrain import open_terrain
 from photoplan.project.scene import SceneAddress, camera_of
+from photoplan.project.scenes import ScenesAddress, surface_of
 from photoplan.surfaces.hybrid import HybridSurface
+from photoplan.surfaces.objects import ObjectSurface
 from photoplan.targets.base import Target
 
 #: Cameras are moved by so many standard deviations: far above rounding, and small where an angle is badly known.
@@ -123,8 +125,8 @@ def _moved(image: Image, camera: CameraEntry, change: NDArray[np.float64]) -> tu
 class ScenesErrors(Mapping[int, SourceErrors]):
     """What is known of the errors of some images over one ground; made from it where it is opened."""
 
-    scenes: tuple[SceneAddress, ...]
-    """One for each row of the table of sources."""
+    address: ScenesAddress
+    """Of the images, in the order of the table of sources."""
     in_image: tuple[float, ...]
     """Standard deviation of image coordinates of each, pixels."""
 
@@ -135,16 +137,17 @@ class ScenesErrors(Mapping[int, SourceErrors]):
         Raises
         ------
         InputError
-            Nothing is known of the terrain or of an image.
+            Nothing is known of the terrain, of objects or of an image.
         """
-        height_errors(_project_of(self.scenes[0]))
+        _heights_of(self.address)
         out: list[object] = []
-        for scene in self.scenes:
+        for scene in self.address.scenes:
             project = _project_of(scene)
             (image,) = project.images
             camera = project.cameras[image.camera]
             deviations = [(name, d.tolist()) for name, d in _deviations(project, image, camera)]
-            out.append([deviations, camera.sigma, project.ground.sigma])
+            objects = [part.sigma for part in project.objects]
+            out.append([deviations, camera.sigma, project.ground.sigma, *objects])
         return [out, list(self.in_image)]
 
     @property
@@ -153,24 +156,24 @@ class ScenesErrors(Mapping[int, SourceErrors]):
         return self
 
     @property
-    def depth(self) -> StatedHeightErrors | ModelHeightErrors:
-        """Of the ground."""
-        return _heights_of(self.scenes[0])
+    def depth(self) -> DepthErrors:
+        """Of the ground and its objects."""
+        return _heights_of(self.address)
 
     def open(self) -> ScenesErrors:
         """Itself: what it opens is kept."""
         return self
 
     def __getitem__(self, row: int) -> SourceErrors:
-        if not 0 <= row < len(self.scenes):
+        if not 0 <= row < len(self):
             raise KeyError(row)
-        return _errors_of(self.scenes[row], self.in_image[row])
+        return _errors_of(self.address.scenes[row], self.in_image[row])
 
     def __iter__(self) -> Iterator[int]:
-        return iter(range(len(self.scenes)))
+        return iter(range(len(self)))
 
     def __len__(self) -> int:
-        return len(self.scenes)
+        return len(self.address.scenes)
 
 
 def _project_of(address: SceneAddress) -> Project:
@@ -184,8 +187,12 @@ def _errors_of(address: SceneAddress, in_image: float) -> SourceErrors:
 
 
 @lru_cache(maxsize=8)
-def _heights_of(address: SceneAddress) -> StatedHeightErrors | ModelHeightErrors:
-    return height_errors(_project_of(address))
+def _heights_of(address: ScenesAddress) -> DepthErrors:
+    project, surface = _project_of(address.scenes[0]), surface_of(address)
+    if not isinstance(surface, ObjectSurface):
+        return height_errors(project)
+    ground = height_errors(project) if surface.shows_ground else StatedHeightErrors(np.nan)
+    return ground if surface.shown is None else object_errors(project, surface, ground)
 
 
 @dataclass(frozen=True)
@@ -208,6 +215,50 @@ class ModelHeightErrors:
     def __call__(self, target: Target, window: Window) -> NDArray[np.floating]:
         """See `photoplan.plan.accuracy.DepthErrors`."""
         return self.surface.relief_with_sigma(target, window)[1]
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectHeightErrors:
+    """Standard deviations of objects where they are shown, and of the ground elsewhere.
+
+    What a face truly looks like at a place is moved as a whole: by its height, and down its slope by its position.
+    """
+
+    surface: ObjectSurface
+    of_face: NDArray[np.float64]
+    """Standard deviation of the height at a place of each face that is shown, shape (n,), metres."""
+    ground: DepthErrors
+
+    def __call__(self, target: Target, window: Window) -> NDArray[np.floating]:
+        """See `photoplan.plan.accuracy.DepthErrors`."""
+        face = self.surface.top(target, window)[1]
+        return np.where(face < 0, self.ground(target, window), self.of_face[face])
+
+
+def object_errors(project: Project, surface: ObjectSurface, ground: DepthErrors) -> ObjectHeightErrors:
+    """Errors of the objects that a surface shows, as [[objects]] state them.
+
+    Raises
+    ------
+    InputError
+        An entry of objects that are shown states none.
+    """
+    faces = surface.shown
+    assert faces is not None
+    entry = np.array(surface.entries)[faces.owner]
+    for place in np.unique(entry):
+        if project.objects[place].sigma is None:
+            raise InputError(
+                f"nothing is known of the accuracy of the objects in {project.objects[place].file}: state sigma = "
+                "[HORIZONTAL, HEIGHT], metres, in [[objects]]"
+            )
+    position, height = np.array([part.sigma or (np.nan, np.nan) for part in project.objects])[entry].T
+    a, b, c = np.moveaxis(faces.corners, 1, 0)
+    normal = np.cross(b - a, c - a)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slope = np.hypot(normal[:, 0], normal[:, 1]) / np.abs(normal[:, 2])
+        of_face = np.hypot(height, np.where(position > 0, position * slope, 0.0))
+    return ObjectHeightErrors(surface, of_face, ground)
 
 
 def height_errors(project: Project) -> StatedHeightErrors | ModelHeightErrors:

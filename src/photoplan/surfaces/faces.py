@@ -70,11 +70,15 @@ class Faces:
 
         Exact on the plane of a triangle; upright faces are above no point.
         """
+        return self.highest(XY)[0]
+
+    def highest(self, XY: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Heights as of `heights`, and which face has them, shape (...); −1 where there is none."""
         XY = np.asarray(XY, float)
-        out = np.empty(XY.shape[:-1])
+        out, faces = np.empty(XY.shape[:-1]), np.empty(XY.shape[:-1], np.int64)
         local = np.ascontiguousarray((XY - self._corner[:2]).reshape(-1, 2))
-        highest(self._local, self._cells, local, out.reshape(-1))
-        return out
+        highest(self._local, self._cells, local, out.reshape(-1), faces.reshape(-1))
+        return out, faces
 
     def height_range(self, bounds: ArrayLike) -> NDArray[np.float64]:
         """Bounds of the heights of all cells of faces that map bounds (..., 4) touch, shape (..., 2); NaN: none."""

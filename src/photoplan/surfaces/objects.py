@@ -67,18 +67,20 @@ class ObjectSurface:
         """Height of the ground or of the highest shown face above it at the pixel centres of a window of a map
         target, shape (height, width), metres; NaN where there is neither. Of a single object that of its own faces,
         also where they are below the ground."""
-        faces = self.shown
-        if not self.shows_ground:
-            relief = np.full((window.height, window.width), np.nan, np.float32)
-        else:
-            relief = self.ground.relief(target, window)
+        return self.top(target, window)[0]
+
+    def top(self, target: Target, window: Window) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """Relief of a window, and which of the faces `shown` is there, shape (height, width); −1: none."""
+        faces, none = self.shown, np.full((window.height, window.width), -1)
+        relief = self.ground.relief(target, window) if self.shows_ground else np.full(none.shape, np.nan, np.float32)
         if faces is None:
-            return relief
+            return relief, none
         if not isinstance(target, MapTarget):
             raise UsageError(f"objects give relief for map targets, not for {type(target).__name__}")
         v, u = np.mgrid[window.row : window.stop[1], window.col : window.stop[0]].astype(float)
-        raised = faces.heights(target.grid.to_map(np.stack([u, v], axis=-1)))
-        return np.where(np.isneginf(raised), relief, np.fmax(relief, raised)).astype(np.float32)
+        raised, face = faces.highest(target.grid.to_map(np.stack([u, v], axis=-1)))
+        face[raised < relief] = -1
+        return np.where(face < 0, relief, raised).astype(np.float32), face
 
     def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
         """As `relief`, at map points (..., 2), shape (...)."""

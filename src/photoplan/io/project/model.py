@@ -126,6 +126,8 @@ class Objects(Entry):
     """Where the file does not state it; "same": that of the terrain."""
     offset: Triple | None = None
     """What is added to X, Y, Z of the file, metres: of meshes with an origin of their own."""
+    sigma: tuple[NotNegative, NotNegative] | None = None
+    """Standard deviations of each horizontal coordinate and of the height of an object as a whole, metres."""
 
     @field_validator("file")
     @classmethod

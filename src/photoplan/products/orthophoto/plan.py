@@ -267,7 +267,7 @@ def keyed(project: Project, plan: ProductPlan, settings: OrthoSettings, part: Pa
 def known_errors(address: ScenesAddress, plan: ProductPlan, settings: OrthoSettings) -> ScenesErrors:
     """What is known of the errors of a product's images and of its ground."""
     sigma = in_image(settings.kernel, plan.rule.tolerance)
-    return ScenesErrors(address.scenes, (sigma,) * len(address.scenes))
+    return ScenesErrors(address, (sigma,) * len(address.scenes))
 
 
 def product_key(scenes: Any, plan: ProductPlan, settings: OrthoSettings, regions: str | None = None) -> str:
