@@ -268,9 +268,9 @@ def _of_image(project: Project, name: str, ground: Ground, heights: Any, request
 
 def _level(camera: CentralCamera, ground: Ground, name: str) -> float:
     """Height of the ground below an image."""
-    height = float(ground.surface.heights(camera.center[:2]))
+    height = float(ground.bare.heights(camera.center[:2]))
     if not np.isfinite(height) and ground.bounds is not None:
-        low, high = ground.surface.height_range(np.array(ground.bounds))
+        low, high = ground.bare.height_range(np.array(ground.bounds))
         height = float(low + high) / 2
     if not height < camera.center[2]:
         raise InputError(

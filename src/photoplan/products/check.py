@@ -133,10 +133,11 @@ def _check_image(project: Project, ground: Ground, looked: ImagePlausibility) ->
     file = project.resolve(project.image(name).file)
     if is_there(file):
         scene = open_scene(project, name)
-        camera, seen, notes = scene.camera, scene.footprint, scene.notes
+        camera, notes = scene.camera, scene.notes
     else:
         camera, notes = camera_without_pixels(project, name), (f"{file} is not there: all but its pixels is checked",)
-        seen = footprint(camera, ground.surface, ground.bounds)
+    # Figures are those of the ground, whether a product will show objects or not.
+    seen = footprint(camera, ground.bare, ground.bounds)
     nan = float("nan")
     if seen.bounds is None:
         fault = fault or f"sees nothing of the terrain (tilt {tilt:.1f}°)"

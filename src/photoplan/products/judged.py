@@ -42,6 +42,8 @@ _NEIGHBOURS = 40
 def judged(project: Project, image: Image, ground: Ground) -> tuple[View, ImagePlausibility]:
     """An oriented image, and what follows from its orientation: by its CRS, its file's own position, and the terrain.
 
+    Objects do not count: a camera below a bridge is not below the ground.
+
     Raises
     ------
     InputError
@@ -49,7 +51,7 @@ def judged(project: Project, image: Image, ground: Ground) -> tuple[View, ImageP
     """
     center = pose_of(project, image, ground).center
     view = view_of(image, project.cameras[image.camera], project.orientation, center)
-    found = look(view, ground.surface.heights)
+    found = look(view, ground.bare.heights)
     odd = area_fault(project.crs, center) or position_fault(project, image)
     return view, found if odd is None else replace(found, fault=odd)
 
@@ -70,9 +72,9 @@ def reading_of_block(
             view = view_of(
                 image, project.cameras[image.camera], project.orientation, pose_of(project, image, ground).center
             )
-            looked[image.name] = view, look(view, ground.surface.heights)
+            looked[image.name] = view, look(view, ground.bare.heights)
     views, looks = [view for view, _ in looked.values()], [found for _, found in looked.values()]
-    return other_reading(views, looks, ground.surface.heights)
+    return other_reading(views, looks, ground.bare.heights)
 
 
 def geodetic_positions(files: Iterable[Path | None]) -> _Floats:

@@ -29,6 +29,8 @@ from photoplan.project.scene import camera_without_pixels, input_files, pose_of
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.terrain.monoplot import REASONS, MonoplotErrors, MonoplotPoints, monoplot
 
+#: Points higher than this above the bare ground lie on objects, metres.
+_ON_OBJECT = 0.01
 #: Flatter than this the ray grazes the terrain: small errors move the point far, and not linearly. Radians.
 GRAZING = math.radians(5.0)
 ROLES = {"x": ("x", "column", "col"), "y": ("y", "row", "line"), "name": ("name", "id", "point")}
@@ -112,7 +114,9 @@ def monoplot_file(request: MonoplotRequest) -> MonoplotReport:
     if request.vectors is not None and request.vectors.suffix.lower() != ".gpkg":
         raise UsageError(f"{request.vectors}: vectors are written as GeoPackage; give a name that ends with .gpkg")
     terrain = project.terrain and project.terrain.file
-    with recording("monoplot", request, [*inputs[:2], terrain and project.resolve(terrain)]) as record:
+    ground_files = [terrain, *(objects.file for objects in project.objects)]
+    used = [*inputs[:2], *(file and project.resolve(file) for file in ground_files)]
+    with recording("monoplot", request, used) as record:
         name = _image_name(project, request.image)
         given = _read(request)
         camera, ground = camera_without_pixels(project, name), ground_of(project)
@@ -133,6 +137,8 @@ def monoplot_file(request: MonoplotRequest) -> MonoplotReport:
         )
         seen = footprint(camera, ground.surface, ground.bounds)
         found = monoplot(camera, given.xy, ground.surface, seen.height_range, errors, mesh)
+        if sigma is not None and request.sigma_terrain is None:
+            notes += _unknown_on_objects(found, ground)
         if (found.reasons != "").all():
             bounds = "nowhere" if seen.bounds is None else " ".join(f"{v:.8g}" for v in seen.bounds)
             center = " ".join(f"{v:.8g}" for v in camera.center)
@@ -161,6 +167,19 @@ def _mesh_and_sigma(
     terrain, _ = open_terrain(ground.file, project.ground.crs).in_crs(project.crs)
     surface = terrain.surface
     return terrain.resolution, surface.sigmas if isinstance(surface, HybridSurface) else None
+
+
+def _unknown_on_objects(found: MonoplotPoints, ground: Ground) -> list[str]:
+    """Take standard deviations, which are those of the terrain, from points that lie on objects; a note if there are
+    such."""
+    on_object = found.XYZ[:, 2] > ground.bare.heights(found.XYZ[:, :2]) + _ON_OBJECT
+    if not on_object.any():
+        return []
+    found.covariance[on_object] = np.nan
+    return [
+        f"{int(on_object.sum())} points lie on objects, whose accuracy is not known: no standard deviations; "
+        "`sigma_terrain` METRES counts for objects, too"
+    ]
 
 
 def _axes(R_ground_camera: NDArray[np.float64], order: str) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ from photoplan.io.project.model import Terrain as StatedTerrain
 from photoplan.project.open_terrain import open_terrain
 from photoplan.surfaces.base import Terrain
 from photoplan.surfaces.level import LevelSurface
-from photoplan.surfaces.objects import without_objects
+from photoplan.surfaces.objects import ObjectSurface, without_objects
 from photoplan.surfaces.shifted import ShiftedSurface
 
 
@@ -43,6 +43,12 @@ class Ground:
     def bare(self) -> Terrain:
         """The surface without objects."""
         return without_objects(self.surface)
+
+    def is_open(self, XY: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether no object stands at map points (..., 2) or hangs over them, shape (...)."""
+        if not isinstance(self.surface, ObjectSurface):
+            return np.ones(XY.shape[:-1], bool)
+        return np.isneginf(self.surface.faces.heights(XY))
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from photoplan.cameras.base import CentralCamera
 from photoplan.errors import UsageError
 from photoplan.surfaces.base import Terrain
 from photoplan.surfaces.intersect import intersect
+from photoplan.surfaces.objects import without_objects
 
 REASONS = {
     "": "met",
@@ -137,7 +138,8 @@ def _before(
     direction = _directions(camera, xy, np.full(len(xy), height_range[0]))
     reasons[inside & np.isnan(direction[:, 2])] = "no ray"
     reasons[inside & (direction[:, 2] >= 0)] = "up"
-    if float(terrain.heights(camera.center[:2])) > camera.center[2]:
+    # A camera below a bridge is not below the ground.
+    if float(without_objects(terrain).heights(camera.center[:2])) > camera.center[2]:
         reasons[:] = "below"
     return reasons
 

@@ -73,7 +73,7 @@ def nadir_heights(project: Project, XY: _Floats, otherwise: float) -> _Floats:
     """Height of the ground below stations (n, 2), metres: the terrain's, or `otherwise` where there is none."""
     if project.terrain is None:
         return np.full(len(XY), otherwise)
-    heights = np.asarray(ground_of(project).surface.heights(XY), float)
+    heights = np.asarray(ground_of(project).bare.heights(XY), float)
     return np.where(np.isfinite(heights), heights, otherwise)
 
 

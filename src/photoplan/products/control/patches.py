@@ -17,8 +17,8 @@ from photoplan.matching.control import best_place
 from photoplan.matching.grey import GreyImage
 from photoplan.matching.ortho import OrthoPatch, patch_on
 from photoplan.plan.footprint import image_border
+from photoplan.project.ground import Ground
 from photoplan.project.scene import Scene
-from photoplan.surfaces.base import Terrain
 
 #: Cells of the search at most, along each side.
 _LARGEST = 600
@@ -68,6 +68,7 @@ def choose_patches(
 ) -> tuple[tuple[float, int, int, float], list[OrthoPatch]]:
     """Patches spread over what the images see: one in every square of the map, where its texture is best.
 
+    Places where objects stand are not taken: whether the orthophoto shows them there or beside is not known.
     Squares are the `grid`-th part of a footprint. Patches are of the coarser resolution of orthophoto and photos.
 
     Returns
@@ -99,13 +100,13 @@ def choose_patches(
     step = max(float(np.median([np.sqrt(area.area) for area, _ in areas])) / grid, resolution)
     union = shapely.unary_union([area for area, _ in areas])
     settings = (resolution, radius, cells, search)
-    return settings, _in_squares(ortho, union, scenes[0].ground.surface, (step, resolution, radius, factor))
+    return settings, _in_squares(ortho, union, scenes[0].ground, (step, resolution, radius, factor))
 
 
 def _seen(scene: Scene) -> tuple[shapely.Geometry, tuple[int, int]] | None:
     """Footprint on the level of the ground below."""
     camera: CentralCamera = scene.camera
-    level = float(scene.surface.heights(camera.center[:2]))
+    level = float(scene.ground.bare.heights(camera.center[:2]))
     if not np.isfinite(level):
         level = sum(scene.footprint.height_range) / 2
     if not np.isfinite(level):
@@ -122,7 +123,7 @@ def _seen(scene: Scene) -> tuple[shapely.Geometry, tuple[int, int]] | None:
 
 
 def _in_squares(
-    ortho: Ortho, union: shapely.Geometry, surface: Terrain, sizes: tuple[float, float, int, int]
+    ortho: Ortho, union: shapely.Geometry, ground: Ground, sizes: tuple[float, float, int, int]
 ) -> list[OrthoPatch]:
     step, resolution, radius, factor = sizes
     xmin, ymin, xmax, ymax = union.bounds
@@ -136,6 +137,8 @@ def _in_squares(
             if part is None or min(part[0].shape) <= 2 * radius + 2:
                 continue
             values, (left, top), side = part
+            v, u = np.indices(values.shape) * side
+            values = np.where(ground.is_open(np.stack([left + u, top - v], axis=-1)), values, np.float32(np.nan))
             place = best_place(values, radius, radius)
             if place is None:
                 continue
@@ -143,7 +146,7 @@ def _in_squares(
             patch = values[row - radius : row + radius + 1, col - radius : col + radius + 1].astype(float)
             at = left + col * side, top - row * side
             v, u = np.mgrid[-radius : radius + 1, -radius : radius + 1] * side
-            made = patch_on(patch, at, surface.heights(np.stack([at[0] + u, at[1] - v], axis=-1)), side)
+            made = patch_on(patch, at, ground.bare.heights(np.stack([at[0] + u, at[1] - v], axis=-1)), side)
             if made is not None:
                 found.append(made)
     return found

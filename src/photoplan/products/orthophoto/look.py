@@ -119,7 +119,7 @@ def _sees_no_terrain(scene: Scene, name: str) -> str:
     bounds = scene.ground.bounds
     if bounds is None:
         return f"{center} sees nothing of the level terrain; is it above it, and do height systems and angles fit?"
-    level = some_height(scene.ground.surface, bounds, x, y)
+    level = some_height(scene.ground.bare, bounds, x, y)
     origin, direction = scene.camera.rays(image_border(scene.camera.size), level)
     down = (direction[:, 2] < 0) & (origin[:, 2] > level)
     if down.any():

@@ -151,7 +151,7 @@ def _placed(project_: Project, images: Sequence[Image]) -> tuple[list[CentralCam
             continue
         pose = pose_of(project_, image, ground)
         cameras[k] = oriented_camera(interior_of(description, image), lens_of(description), pose)
-        levels[k] = float(ground.surface.heights(pose.center[:2]))
+        levels[k] = float(ground.bare.heights(pose.center[:2]))
     if np.isfinite(levels).any():
         levels = np.where(np.isfinite(levels), levels, np.nanmedian(levels))
     return cameras, levels.tolist()
