@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from photoplan.cameras.base import Vantage
 from photoplan.geometry.pose import Pose
 
 
@@ -25,6 +26,10 @@ class Pinhole:
     @property
     def center(self) -> NDArray[np.float64]:
         return self.pose.center
+
+    @property
+    def vantage(self) -> Vantage:
+        return Vantage(self.center)
 
     def project_homogeneous(self, XYZ: ArrayLike) -> NDArray[np.float64]:
         c = self.pose.to_camera(XYZ)

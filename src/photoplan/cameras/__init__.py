@@ -5,11 +5,12 @@ from photoplan.public import public
 __getattr__, __dir__, __all__ = public(
     __name__,
     {
-        "cameras.base": "Camera CentralCamera Projection project",
+        "cameras.base": "Camera CentralCamera Projection Vantage project",
         "cameras.frame": "FrameCamera",
         "cameras.interior": "Interior",
         "cameras.plane": "Affine2D Bilinear2D",
         "cameras.build": "oriented_camera",
+        "cameras.rpc": "RationalFunctions RpcCamera",
         "cameras.refraction": "Refraction",
         "cameras.observed": "GroundPoints ImagePoints ObservedAttitudes ObservedPositions",
         "cameras.lenses.none": "NoLens",
@@ -18,6 +19,7 @@ __getattr__, __dir__, __all__ = public(
         "cameras.lenses.fisheye": "Fisheye",
         "cameras.lenses.radial_table": "RadialTable",
         "cameras.lenses.reversed": "Reversed",
+        "geometry.geodetic": "GeodeticGround",
         "geometry.pose": "Pose",
     },
 )

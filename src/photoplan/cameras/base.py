@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -67,6 +69,25 @@ class Projection(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class Vantage:
+    """From where a camera looks down, as far as a plan has to know it: whether or not its rays meet in a point."""
+
+    point: NDArray[np.float64]
+    """X, Y near what the camera sees, and a height above which it sees nothing; shape (3,). The projection centre of a
+    central camera."""
+    floor: float = -math.inf
+    """Nothing below it is seen, metres: there the camera's geometry is not known any more."""
+    reach: float | None = None
+    """Ground that is seen lies no further than this from the point, on the map, metres; None: the camera is central,
+    and sees whatever is not too flat."""
+
+    @property
+    def central(self) -> bool:
+        """Whether all rays pass through the point."""
+        return self.reach is None
+
+
 class Rays(Protocol):
     """What can be followed from image points to the ground, whether or not ground can be projected."""
 
@@ -87,6 +108,11 @@ class Rays(Protocol):
 
 class Camera(Projection, Rays, Protocol):
     """A projection that can be followed back to the ground. Rays and derivatives are those of both factors."""
+
+    @property
+    def vantage(self) -> Vantage:
+        """Where it looks from."""
+        ...
 
     def derivatives(self, XYZ: ArrayLike) -> NDArray[np.float64]:
         """∂(x, y)/∂(X, Y, Z), shape (..., 2, 3), pixels per metre; NaN behind the camera."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.cameras.base import ImageField
+from photoplan.cameras.base import ImageField, Vantage
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
 from photoplan.cameras.lenses.field import FieldLimited, field_limited
@@ -107,6 +107,11 @@ class FrameCamera:
     def center(self) -> NDArray[np.float64]:
         """Projection centre in ground coordinates, shape (3,)."""
         return self.pose.center
+
+    @property
+    def vantage(self) -> Vantage:
+        """The projection centre."""
+        return Vantage(self.center)
 
     def project_homogeneous(self, XYZ: ArrayLike) -> NDArray[np.float64]:
         """Ground (..., 3) to ideal (x·w, y·w, w), w = depth in metres; linear in XYZ but for a wide fisheye."""

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.cameras.base import ImageField
+from photoplan.cameras.base import ImageField, Vantage
 from photoplan.cameras.frame import FrameCamera
 from photoplan.errors import UsageError
 
@@ -63,6 +63,11 @@ class WarpedCamera:
     def breaks(self) -> None:
         """Warps are smooth."""
         return None
+
+    @property
+    def vantage(self) -> Vantage:
+        """The projection centre."""
+        return Vantage(self.center)
 
     def project_homogeneous(self, XYZ: ArrayLike) -> NDArray[np.float64]:
         """Ground (..., 3) to ideal (x·w, y·w, w), w = depth in the warped space; NaN where a warp is not defined."""

@@ -178,8 +178,7 @@ class CrsStep:
             A point lies where the operation is not defined.
         """
         XY = np.asarray(XY, float)
-        X, Y = self._transformer().transform(XY[..., 0], XY[..., 1])
-        out = np.stack([np.asarray(X, float), np.asarray(Y, float)], axis=-1)
+        out = self.where_defined(XY)
         lost = ~np.isfinite(out).all(axis=-1) & np.isfinite(XY).all(axis=-1)
         if lost.any():
             x, y = np.atleast_2d(XY[lost])[0]
@@ -187,7 +186,14 @@ class CrsStep:
                 f"X {x:.3f}, Y {y:.3f} of {crs_label(self.source)} has no coordinates in {crs_label(self.target)}; "
                 "is it the right CRS, and are X and Y in the right order?"
             )
-        out[~np.isfinite(XY).all(axis=-1)] = np.nan
+        return out
+
+    def where_defined(self, XY: ArrayLike) -> NDArray[np.float64]:
+        """As a call; points where the operation is not defined become NaN."""
+        XY = np.asarray(XY, float)
+        X, Y = self._transformer().transform(XY[..., 0], XY[..., 1])
+        out = np.stack([np.asarray(X, float), np.asarray(Y, float)], axis=-1)
+        out[~(np.isfinite(out) & np.isfinite(XY)).all(axis=-1)] = np.nan
         return out
 
     def _transformer(self) -> Transformer:

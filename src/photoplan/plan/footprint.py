@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.cameras.base import Camera, CentralCamera
+from photoplan.cameras.base import Camera
 from photoplan.geometry.grid import MapGrid
 from photoplan.plan.tiles import Tiles
 from photoplan.surfaces.base import Terrain
@@ -58,29 +58,30 @@ class Footprint:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What an image can show of each level: how far it extends from the projection centre in some directions.
+    """What an image can show of each level: how far it extends from the camera's vantage in some directions.
 
     Straight rays cross levels at places that move linearly with the level, so an extent, the largest of many such
     places, is a convex function of the level: between two levels it is no larger than on the line between its values.
     """
 
     center: NDArray[np.float64]
-    """Projection centre, shape (3,)."""
+    """The camera's vantage, a projection centre if it has one, shape (3,)."""
     directions: NDArray[np.float64]
     """Unit vectors of the map, shape (k, 2); the first are +X, +Y, −X, −Y."""
     levels: NDArray[np.float64]
     """Ascending heights, shape (m,), metres; the image shows nothing above the last one that is finite."""
     extents: NDArray[np.float64]
-    """Largest coordinate along each direction, from the projection centre, shape (m, k), metres."""
+    """Largest coordinate along each direction, from the vantage, shape (m, k), metres."""
     far: float
-    """What lies further than this from the projection centre, along any direction, does not count, metres."""
+    """What lies further than this from the vantage, along any direction, does not count, metres."""
 
     @classmethod
-    def of(cls, camera: CentralCamera, low: float, high: float, far: float = math.inf) -> View | None:
-        """The view between two levels, cut off `far` from the projection centre; None: no ray gets there."""
-        center = np.asarray(camera.center, float)
+    def of(cls, camera: Camera, low: float, high: float, far: float = math.inf) -> View | None:
+        """The view between two levels, cut off `far` from the vantage; None: no ray gets there."""
+        vantage = camera.vantage
+        center = vantage.point
         # A little more, for surfaces whose ranges are rounded.
-        low, high = low - 0.5, high + 0.5
+        low, high = max(low - 0.5, vantage.floor), high + 0.5
         xy = _border(camera, min(low, float(center[2]) - 1.0))
         if xy is None:
             return None
@@ -93,6 +94,9 @@ class View:
             return None
         levels = np.union1d(np.linspace(*ends, 2 if straight else _LEVELS), np.clip(center[2], *ends))
         feet = np.stack([_feet(camera, xy, level, rays[0] if straight else None) for level in levels]) - center[:2]
+        for above in range(1, len(feet)):
+            # A ray that ends between the levels, since nothing is known of it there, stays where it was.
+            feet[above] = np.where(np.isnan(feet[above]), feet[above - 1], feet[above])
         directions = _directions(feet[0] if down else feet[-1])
         along = feet @ directions.T
         extents = along.max(axis=1)
@@ -140,12 +144,12 @@ def image_border(size: tuple[int, int], per_side: int = 16) -> NDArray[np.float6
     return np.concatenate(sides)
 
 
-def footprint(camera: CentralCamera, terrain: Terrain, bounds: Bounds | None) -> Footprint:
+def footprint(camera: Camera, terrain: Terrain, bounds: Bounds | None) -> Footprint:
     """Footprint of an image on the ground.
 
     Parameters
     ----------
-    camera : CentralCamera
+    camera : Camera
     terrain : Terrain
         In the CRS of the camera.
     bounds : (float, float, float, float) or None
@@ -188,9 +192,7 @@ class Ranged(Protocol):
         ...
 
 
-def covered_tiles(
-    camera: CentralCamera, terrain: Ranged, grid: MapGrid, side: int, seen: Bounds | None = None
-) -> Tiles:
+def covered_tiles(camera: Camera, terrain: Ranged, grid: MapGrid, side: int, seen: Bounds | None = None) -> Tiles:
     """Tiles that can hold a pixel of the image, judged from the range of heights under each tile; others than those
     that meet `seen`, the bounds of its footprint, are not looked at."""
     near = grid.window if seen is None else grid.window_of(seen)
@@ -215,15 +217,17 @@ def some_height(terrain: Terrain, near: Bounds, x: float, y: float) -> float:
     return float(np.nanmedian(some)) if np.isfinite(some).any() else math.nan
 
 
-def _seen(camera: CentralCamera, terrain: Terrain, bounds: Bounds | None) -> Bounds | None:
+def _seen(camera: Camera, terrain: Terrain, bounds: Bounds | None) -> Bounds | None:
     """Bounds of the ground that can fall into the image; None: there is none.
 
     Between two levels the rays stay inside known bounds. If the ground there does not leave the levels, no ray has met
     ground elsewhere; otherwise the level that failed is moved, each time a little further than was found, so that
     slopes do not take many rounds. Ground far from the footprint is never asked for.
     """
-    x, y, z = (float(c) for c in camera.center)
-    near = (x - FAR, y - FAR, x + FAR, y + FAR)
+    vantage = camera.vantage
+    x, y, z = (float(c) for c in vantage.point)
+    away = FAR if vantage.reach is None else vantage.reach
+    near = (x - away, y - away, x + away, y + away)
     near = near if bounds is None else _common(near, bounds)
     if not _holds(near):
         return None
@@ -234,7 +238,7 @@ def _seen(camera: CentralCamera, terrain: Terrain, bounds: Bounds | None) -> Bou
             (low, high), whole = terrain.height_range(near), True
         if not low < z:
             return None
-        view = View.of(camera, low, high, min(FAR, FLATTEST * (z - low)))
+        view = View.of(camera, low, high, min(away, FLATTEST * (z - low)) if vantage.central else away)
         cut = near if view is None else _common(near, view.bounds)
         if view is None or not _holds(cut):
             return None
@@ -275,7 +279,7 @@ def _closely(view: View, terrain: Terrain, bounds: Bounds) -> Bounds | None:
     return bounds
 
 
-def _border(camera: CentralCamera, level: float) -> NDArray[np.float64] | None:
+def _border(camera: Camera, level: float) -> NDArray[np.float64] | None:
     """Points of the image's border whose rays reach a level; None if no ray does.
 
     Where the border has no ray (beyond the circle of a fisheye, above the horizon of a curved earth) the last point
@@ -302,17 +306,18 @@ def _border(camera: CentralCamera, level: float) -> NDArray[np.float64] | None:
 
 
 def _feet(
-    camera: CentralCamera,
+    camera: Camera,
     xy: NDArray[np.float64],
     level: float,
     rays: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
 ) -> NDArray[np.float64]:
     """Where rays cross a level, X and Y (n, 2); those that never do, or far away, end far away in their direction."""
-    z = float(camera.center[2])
-    if abs(level - z) < 1e-6:
-        return np.broadcast_to(camera.center[:2], xy.shape)
+    vantage = camera.vantage
+    z = float(vantage.point[2])
+    if vantage.central and abs(level - z) < 1e-6:
+        return np.broadcast_to(vantage.point[:2], xy.shape)
     origin, direction = camera.rays(xy, level) if rays is None else rays
-    sign = np.sign(level - z)
+    sign = np.sign(level - z) or -1.0
     least = _GRAZING * np.hypot(direction[:, 0], direction[:, 1]) + 1e-12
     drop = sign * np.maximum(sign * direction[:, 2], least)
     foot = origin[:, :2] + direction[:, :2] * ((level - origin[:, 2]) / drop)[:, None]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.cameras.base import CentralCamera, Rays
+from photoplan.cameras.base import Camera, Rays
 from photoplan.surfaces.base import Terrain
 
 #: A curved ray is followed along chords that it leaves by less than this, metres …
@@ -19,7 +19,7 @@ FAR = 30_000.0
 
 
 def intersect(
-    camera: CentralCamera, xy: ArrayLike, terrain: Terrain, height_range: tuple[float, float]
+    camera: Camera, xy: ArrayLike, terrain: Terrain, height_range: tuple[float, float]
 ) -> NDArray[np.float64]:
     """First point of the terrain that each image ray meets, coming from the camera.
 
@@ -27,7 +27,7 @@ def intersect(
 
     Parameters
     ----------
-    camera : CentralCamera
+    camera : Camera
     xy : array_like, shape (n, 2)
         Image points in pixels.
     terrain : Terrain
@@ -42,7 +42,9 @@ def intersect(
         beyond the terrain, or goes below it through a hole or the model's border.
     """
     xy = np.asarray(xy, float)
-    low, high = height_range[0] - _MARGIN, min(height_range[1] + _MARGIN, float(camera.center[2]) - 1e-6)
+    vantage = camera.vantage
+    low = max(height_range[0] - _MARGIN, vantage.floor)
+    high = min(height_range[1] + _MARGIN, float(vantage.point[2]) - 1e-6)
     if not (np.isfinite([low, high]).all() and low <= high and len(xy)):
         return np.full((len(xy), 3), np.nan)
     return terrain.first_hit(_paths(camera, xy, high, low)).XYZ

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.cameras.base import CentralCamera
+from photoplan.cameras.base import Camera
 from photoplan.errors import UsageError
 from photoplan.surfaces.base import Terrain
 from photoplan.surfaces.intersect import intersect
@@ -74,7 +74,7 @@ class MonoplotPoints:
 
 
 def monoplot(
-    camera: CentralCamera,
+    camera: Camera,
     xy: ArrayLike,
     terrain: Terrain,
     height_range: tuple[float, float],
@@ -93,7 +93,7 @@ def monoplot(
 
     Parameters
     ----------
-    camera : CentralCamera
+    camera : Camera
     xy : array_like, shape (n, 2)
         Image points, pixels.
     terrain : Terrain
@@ -125,7 +125,7 @@ def monoplot(
 
 
 def _before(
-    camera: CentralCamera, xy: NDArray[np.float64], terrain: Terrain, height_range: tuple[float, float]
+    camera: Camera, xy: NDArray[np.float64], terrain: Terrain, height_range: tuple[float, float]
 ) -> NDArray[np.str_]:
     """Reasons that are known before the terrain is looked at."""
     reasons = np.full(len(xy), "", "U8")
@@ -139,12 +139,13 @@ def _before(
     reasons[inside & np.isnan(direction[:, 2])] = "no ray"
     reasons[inside & (direction[:, 2] >= 0)] = "up"
     # A camera below a bridge is not below the ground.
-    if float(without_objects(terrain).heights(camera.center[:2])) > camera.center[2]:
+    vantage = camera.vantage
+    if vantage.central and float(without_objects(terrain).heights(vantage.point[:2])) > vantage.point[2]:
         reasons[:] = "below"
     return reasons
 
 
-def _directions(camera: CentralCamera, xy: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
+def _directions(camera: Camera, xy: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Directions of the rays near some heights, (n, 3)."""
     if not np.isfinite(heights).any():
         return np.full((len(xy), 3), np.nan)
@@ -166,7 +167,7 @@ def _slope(terrain: Terrain, XY: NDArray[np.float64], reach: float) -> NDArray[n
 
 
 def _covariance(
-    camera: CentralCamera, XYZ: NDArray[np.float64], slope: NDArray[np.float64], errors: MonoplotErrors
+    camera: Camera, XYZ: NDArray[np.float64], slope: NDArray[np.float64], errors: MonoplotErrors
 ) -> NDArray[np.float64]:
     """Covariance matrices (n, 3, 3) of ground points."""
     out = np.full((len(XYZ), 3, 3), np.nan)
@@ -176,7 +177,7 @@ def _covariance(
     P, n = XYZ[there], int(there.sum())
     A = camera.derivatives(P)
     # A camera that moves by t and turns by ε about its centre shows P where it would have shown P − t − ε × (P − C).
-    r = P - camera.center
+    r = P - camera.vantage.point
     axes = np.eye(3) if errors.axes is None else errors.axes
     turned = np.stack([np.cross(axis, r) for axis in axes], axis=-1)
     motion = np.concatenate([A, A @ turned], axis=2)
@@ -195,14 +196,14 @@ def _covariance(
 
 
 def _holes(
-    camera: CentralCamera, xy: NDArray[np.float64], XYZ: NDArray[np.float64], terrain: Terrain, high: float
+    camera: Camera, xy: NDArray[np.float64], XYZ: NDArray[np.float64], terrain: Terrain, high: float
 ) -> NDArray[np.bool_]:
     """Whether rays cross places without terrain between the highest terrain and the point."""
     crossed = np.zeros(len(xy), bool)
     there = np.flatnonzero(np.isfinite(XYZ[:, 0]))
     if not len(there):
         return crossed
-    top = min(high, float(camera.center[2]))
+    top = min(high, float(camera.vantage.point[2]))
     origin, direction = camera.rays(xy[there], top)
     t = (top - origin[:, 2]) / direction[:, 2]
     start = origin + t[:, None] * direction

@@ -1,0 +1,276 @@
+"""Rational polynomials (RPC00B): what satellite images are delivered with instead of a camera.
+
+Sample and line are quotients of polynomials of third degree in longitude, latitude and ellipsoidal height, all of them
+brought to the range −1 to 1 by offsets and scales (NIMA, STDI-0002, The Compendium of Controlled Extensions for NITF,
+section 8.2). Sample and line 0, 0 are the centre of the upper-left pixel, as everywhere in photoplan.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.cameras.base import Vantage
+from photoplan.cameras.plane import Affine2D
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.geodetic import GeodeticGround
+
+#: Polynomials hold for normalised coordinates from −1 to 1; as far as this they are followed: images reach a little
+#: beyond what the coefficients were fitted to. Further out there is no position.
+BOUND = 1.5
+#: A denominator below this part of its value in the middle is near a pole: no position.
+_POLE = 1e-3
+#: Powers of longitude, latitude and height of the 20 terms, in the order of RPC00B.
+_POWERS = np.array(
+    [
+        *((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (2, 0, 0), (0, 2, 0), (0, 0, 2)),
+        *((1, 1, 1), (3, 0, 0), (1, 2, 0), (1, 0, 2), (2, 1, 0), (0, 3, 0), (0, 1, 2), (2, 0, 1), (0, 2, 1), (0, 0, 3)),
+    ]
+)
+_ITERATIONS = 20
+#: A position is found again to this, pixels; what rounds map coordinates to 1e-9 m is below it.
+_FOUND = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class RationalFunctions:
+    """The numbers of RPC00B, checked at birth.
+
+    Raises
+    ------
+    InputError
+        A number is not finite, a scale not positive, an offset no place on earth, or a denominator vanishes in the
+        middle.
+    """
+
+    image_offset: tuple[float, float]
+    """Sample and line offset, pixels; (0, 0) is the centre of the upper-left pixel."""
+    image_scale: tuple[float, float]
+    ground_offset: tuple[float, float, float]
+    """Of longitude and latitude (degrees, WGS 84) and ellipsoidal height (metres)."""
+    ground_scale: tuple[float, float, float]
+    coefficients: NDArray[np.float64]
+    """Numerator and denominator of the sample, then of the line, shape (4, 20)."""
+
+    def __post_init__(self) -> None:
+        coefficients = np.array(self.coefficients, float)
+        if coefficients.shape != (4, 20):
+            raise InputError(f"{coefficients.shape} coefficients; RPC00B has 4 × 20")
+        coefficients.setflags(write=False)
+        object.__setattr__(self, "coefficients", coefficients)
+        parts = (self.image_offset, self.image_scale, self.ground_offset, self.ground_scale)
+        if not (np.isfinite(np.concatenate(parts)).all() and np.isfinite(coefficients).all()):
+            raise InputError("an offset, scale or coefficient is not a finite number")
+        scales = (*self.image_scale, *self.ground_scale)
+        if not min(scales) > 0:
+            told = ", ".join(f"{scale:g}" for scale in scales)
+            raise InputError(f"scales {told} (sample, line, longitude, latitude, height); all of them are positive")
+        lon, lat, height = self.ground_offset
+        if not (abs(lon) <= 360 and abs(lat) <= 90 and abs(height) < 1e4):
+            raise InputError(
+                f"its middle is at longitude {lon:g}°, latitude {lat:g}°, height {height:g} m, which is nowhere on "
+                "earth; are the offsets in degrees and metres?"
+            )
+        if (coefficients[1::2, 0] == 0).any():
+            raise InputError("a denominator vanishes in the middle of the image; the first of its coefficients is 0")
+        if (coefficients[::2, 1:3] == 0).all(axis=1).any():
+            raise InputError("a numerator does not change with longitude and latitude; coefficients are missing")
+
+    @property
+    def heights(self) -> tuple[float, float]:
+        """Lowest and highest ellipsoidal height at which there are positions, metres."""
+        middle, half = self.ground_offset[2], self.ground_scale[2] * BOUND
+        return middle - half, middle + half
+
+    def __call__(self, geodetic: ArrayLike) -> NDArray[np.float64]:
+        """Longitude, latitude (degrees) and ellipsoidal height (..., 3) to sample and line (..., 2).
+
+        NaN where a normalised coordinate is beyond `BOUND`, and near a pole.
+        """
+        return self._evaluate(geodetic, None)[0]
+
+    def with_derivatives(self, geodetic: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Sample and line (..., 2), and their derivatives by longitude, latitude and height (..., 2, 3)."""
+        return self._evaluate(geodetic, 3)
+
+    def inverse(self, xy: ArrayLike, height: ArrayLike) -> NDArray[np.float64]:
+        """Longitude, latitude and height (n, 3) of sample and line (n, 2) at ellipsoidal heights (n,), by Newton.
+
+        It starts in the middle of the polynomials, which are nearly linear. NaN where no position is found.
+        """
+        xy = np.asarray(xy, float)
+        ground = np.broadcast_to(self.ground_offset, (len(xy), 3)).copy()
+        ground[:, 2] = height
+        found = np.zeros(len(xy), np.bool_)
+        with np.errstate(all="ignore"):
+            for _ in range(_ITERATIONS):
+                at, J = self._evaluate(ground, 2, bound=np.inf)
+                miss = at - xy
+                ground[:, :2] -= solve(J, miss)
+                found = np.asarray((np.abs(miss) < _FOUND).all(axis=1))
+                if found.all():
+                    break
+        ground[~found | np.isnan(self(ground)[:, 0])] = np.nan
+        return ground
+
+    def _evaluate(
+        self, geodetic: ArrayLike, by: int | None, bound: float = BOUND
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Sample and line, and their derivatives by the first `by` ground coordinates (none: an empty array)."""
+        geodetic = np.asarray(geodetic, float)
+        away = geodetic - self.ground_offset
+        # Longitudes of files may be counted from 0 to 360°.
+        away[..., 0] -= 360.0 * np.round(away[..., 0] / 360.0)
+        n = away / self.ground_scale
+        C = self.coefficients
+        powers = np.ones((4, *n.shape))
+        for k in range(3):
+            np.multiply(powers[k], n, out=powers[k + 1])
+        p = _terms(powers, _POWERS) @ C.T
+        with np.errstate(all="ignore"):
+            good = np.all(np.abs(n) <= bound, axis=-1) & np.all(p[..., 1::2] / C[1::2, 0] > _POLE, axis=-1)
+            top, bottom = p[..., ::2], np.where(np.expand_dims(good, -1), p[..., 1::2], np.nan)
+            value = top / bottom
+            xy = value * self.image_scale + self.image_offset
+            J = np.empty((*value.shape, by or 0))
+            for k in range(by or 0):
+                lower = _POWERS.copy()
+                lower[:, k] -= 1
+                dp = (_terms(powers, np.maximum(lower, 0)) * _POWERS[:, k]) @ C.T
+                slope = (dp[..., ::2] - value * dp[..., 1::2]) / bottom
+                J[..., k] = slope * self.image_scale / self.ground_scale[k]
+        return xy, J
+
+
+def _terms(powers: NDArray[np.float64], exponents: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Products of powers (4, ..., 3) of the three coordinates, shape (..., 20)."""
+    L, P, H = (np.moveaxis(powers[exponents[:, k], ..., k], 0, -1) for k in range(3))
+    return L * P * H
+
+
+def solve(J: NDArray[np.float64], miss: NDArray[np.float64]) -> NDArray[np.float64]:
+    """x of J x = miss for (n, 2, 2 or more) and (n, 2) by Cramer's rule; NaN where there is none."""
+    det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
+    u = (J[:, 1, 1] * miss[:, 0] - J[:, 0, 1] * miss[:, 1]) / det
+    v = (J[:, 0, 0] * miss[:, 1] - J[:, 1, 0] * miss[:, 0]) / det
+    return np.stack([u, v], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class RpcCamera:
+    """An image with rational polynomials over the ground of a project: a camera without a projection centre."""
+
+    functions: RationalFunctions
+    ground: GeodeticGround
+    size: tuple[int, int]
+    """Width and height of the image in pixels."""
+    correction: Affine2D | None = None
+    """From the polynomials' positions to those in the image (Fraser & Hanley 2003, eq. 4): a shift, a drift along the
+    lines, or all six parameters; None: there is none."""
+
+    @property
+    def field(self) -> None:
+        """All is in the first factor."""
+        return None
+
+    @property
+    def breaks(self) -> None:
+        """Polynomials are smooth."""
+        return None
+
+    def project_homogeneous(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """Ground (..., 3) to (x, y, 1); NaN where the polynomials do not hold."""
+        XYZ = np.asarray(XYZ, float)
+        out = np.ones(XYZ.shape)
+        out[..., :2] = self._corrected(self.functions(self.ground(XYZ)))
+        out[np.isnan(out[..., 0])] = np.nan
+        return out
+
+    def derivatives(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        """∂(x, y)/∂(X, Y, Z), shape (..., 2, 3), pixels per metre; NaN where the polynomials do not hold."""
+        return self._with_derivatives(np.asarray(XYZ, float))[1]
+
+    def rays(self, xy: ArrayLike, height: ArrayLike | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Image points (..., 2) to rays: the point of the ray at `height` and its tangent there, each (..., 3).
+
+        `height` is one number or one for each point. NaN where the polynomials do not hold.
+
+        Raises
+        ------
+        UsageError
+            `height` is missing.
+        """
+        if height is None:
+            raise UsageError("rays of an image with rational polynomials begin nowhere; give a height")
+        xy = np.asarray(xy, float)
+        shape = (*xy.shape[:-1], 3)
+        heights = np.broadcast_to(np.asarray(height, float), shape[:-1]).ravel()
+        point = self._meet(xy.reshape(-1, 2), heights)
+        with np.errstate(all="ignore"):
+            A = self.derivatives(point)
+            # Along the ray neither x nor y changes; it leads down.
+            d = np.cross(A[:, 0], A[:, 1])
+            d *= -np.sign(d[:, 2:]) / np.linalg.norm(d, axis=1, keepdims=True)
+        return point.reshape(shape), d.reshape(shape)
+
+    @cached_property
+    def vantage(self) -> Vantage:
+        """The highest point of a ray in the middle, and how far from it the ground is that the image may show."""
+        low, high = self._levels()
+        corners = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5), (0.0, 0.0)])
+        t = np.linspace(0.0, 1.0, 9)[:, None, None]
+        border = (corners + t * (np.roll(corners, -1, axis=0) - corners)).reshape(-1, 2)
+        xy = border * self.size + (np.array(self.size) - 1) / 2
+        feet = np.concatenate([self.rays(xy, level)[0][:, :2] for level in (low, high)])
+        if np.isnan(feet).all():
+            raise InputError("the polynomials of the image do not hold anywhere in it; are they those of this image?")
+        middle = (np.nanmin(feet, axis=0) + np.nanmax(feet, axis=0)) / 2
+        reach = 1.1 * float(np.nanmax(np.linalg.norm(feet - middle, axis=1)))
+        return Vantage(np.array([*middle, high]), low, reach)
+
+    @cached_property
+    def _undulation(self) -> float:
+        """Ellipsoidal height minus the ground's, in the middle of the polynomials, metres."""
+        middle = self.functions.ground_offset
+        return middle[2] - float(self.ground.to_map(middle)[2])
+
+    def _levels(self) -> tuple[float, float]:
+        """Heights of the ground between which the polynomials hold, a little inside."""
+        lon, lat, _ = self.functions.ground_offset
+        half_lon, half_lat, _ = self.functions.ground_scale
+        levels = []
+        for height, inwards in zip(self.functions.heights, (1, -1)):
+            places = [(lon + u * half_lon, lat + v * half_lat, height) for u in (-1, 0, 1) for v in (-1, 0, 1)]
+            known = self.ground.to_map(places)[:, 2]
+            levels.append(inwards * float(np.nanmax(inwards * known)) + inwards * 1e-3)
+        return levels[0], levels[1]
+
+    def _corrected(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        return xy if self.correction is None else self.correction(xy)
+
+    def _with_derivatives(self, XYZ: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        xy, J = self.functions.with_derivatives(self.ground(XYZ))
+        J = J @ self.ground.jacobian(XYZ)
+        if self.correction is not None:
+            J = self.correction.derivative(xy) @ J
+        return self._corrected(xy), J
+
+    def _meet(self, xy: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Map points (n, 3) at given heights that have the positions xy; NaN where there is none."""
+        wanted = xy if self.correction is None else self.correction.inverse(xy)
+        # The height above the ellipsoid changes from place to place, by so little that Newton's method puts it right.
+        point = self.ground.to_map(self.functions.inverse(wanted, heights + self._undulation))
+        point[:, 2] = heights
+        miss = np.full_like(xy, np.nan)
+        with np.errstate(all="ignore"):
+            for _ in range(3):
+                at, A = self._with_derivatives(point)
+                miss = at - xy
+                if not (np.abs(miss) > 1e-9).any():
+                    break
+                point[:, :2] -= solve(A, miss)
+            point[~(np.abs(miss) < _FOUND).all(axis=1)] = np.nan
+        return point
