@@ -143,7 +143,7 @@ def product_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
-_PENALTIES = ("slant", "coarseness", "border", "occlusion")
+_PENALTIES = ("slant", "coarseness", "border", "occlusion", "sharpness")
 
 
 def choosing_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -154,7 +154,7 @@ def choosing_options(command: Callable[..., Any]) -> Callable[..., Any]:
             metavar="NAME=WEIGHT,…",
             multiple=True,
             callback=lambda c, p, values: listed(values),
-            help=f"Weights of {', '.join(_PENALTIES)} [1, 1, 1, 0.5].",
+            help=f"Weights of {', '.join(_PENALTIES)} [1, 1, 1, 0.5, 0].",
         ),
         click.option(
             "--prefer",

@@ -6,6 +6,7 @@ slowly over the ground but for the last, so that one image paints a region and n
 - slant: tangent of the angle between the line of sight and the vertical, by which an error of the height moves a pixel;
 - coarseness: logarithm to base 2 of the ground sampling distance in pixels of the product;
 - border: 1 at the image's border, falling with the square of the distance to 0 at a tenth of the image's shorter side;
+- sharpness: by how many powers of two fine detail is weaker than in the sharpest image, one figure for each image;
 - occlusion: 1 beside ground that the image does not see, falling to 0 at some distance on the map. Behr (1989, section
   6.3.2.1) takes the image whose line of sight passes furthest from what hides ground; here the distance is that of the
   pixels on the map.
@@ -54,9 +55,10 @@ class Weights:
     coarseness: float = 1.0
     border: float = 1.0
     occlusion: float = 0.5
+    sharpness: float = 0.0
 
     def __post_init__(self) -> None:
-        values = (self.slant, self.coarseness, self.border, self.occlusion)
+        values = (self.slant, self.coarseness, self.border, self.occlusion, self.sharpness)
         if not all(0 <= value <= 1000 for value in values) or not any(values):
             raise UsageError(f"weights {values}; allowed are numbers from 0 to 1000, not all of them 0")
 
@@ -77,7 +79,7 @@ class BestImage:
     """Lowest and highest ground of the product, metres: between them positions are interpolated."""
     weights: Weights = Weights()
     ranks: tuple[float, ...] = ()
-    """A penalty of each source, by row: the user's own ranking; none if empty."""
+    """A penalty of each source, by row: the user's own ranking, and its blur; none if empty."""
     drawn: Drawn | None = None
     """Regions that come before the score, where their image sees them."""
     paints_hidden: bool = False

@@ -361,5 +361,6 @@ def _image_record(name: str, scene: Scene, look: Look) -> dict[str, Any]:
         "name": name,
         "projection_centre": [float(c) for c in scene.camera.center],
         "gsd_m": look.gsd,
+        "blur": look.blur,
         "restored": None if step is None else step.describe(),
     }

@@ -30,6 +30,9 @@ class Look:
     """Where it lies."""
     gsd: float
     """Its mean ground sampling distance, metres."""
+    blur: float = 0.0
+    """By how many powers of two its fine detail, beside the coarser, is weaker than that of the sharpest image of the
+    same ground; 0 where nobody has asked."""
 
 
 @dataclass(frozen=True, eq=False)

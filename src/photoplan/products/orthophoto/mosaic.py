@@ -26,6 +26,7 @@ from photoplan.products.orthophoto.plan import (
     refuse_blind,
 )
 from photoplan.products.orthophoto.settings import Choice, OrthoSettings
+from photoplan.products.orthophoto.sharpness import with_blur
 from photoplan.surfaces.objects import painted_surface
 
 
@@ -38,7 +39,7 @@ def plan_mosaic(
     force: bool = False,
     **changes: Any,
 ) -> OrthoPlan:
-    """Plan one orthophoto of many images; no pixel is touched.
+    """Plan one orthophoto of many images; no pixel is touched but those that sharpness is measured in, if it counts.
 
     Parameters
     ----------
@@ -57,13 +58,15 @@ def plan_mosaic(
     """
     chosen = chosen_settings(project, settings, {"choice": Choice(), "hidden": "nodata", **changes})
     names, chosen = with_preferred(project, images, chosen)
-    events.begin("planning", 2 * len(names), "steps")
+    events.begin("planning", len(names), "images")
     looked, blind = look_at(project, names, force, events)
     refuse_mixed(looked)
     chosen = with_resolution(project, chosen, looked, force)
     refuse_blind(chosen, looked, blind)
     grid = grid_of(project, chosen, [one.look.footprint for one in looked])
+    looked = with_blur(looked, grid, chosen, events)
     taking, tiles = [], []
+    events.begin("planning", len(looked), "images")
     for one in looked:
         surface = painted_surface(one.scene.surface)
         mine = covered_tiles(one.scene.camera, surface, grid, chosen.tile, one.look.footprint.bounds)
@@ -78,11 +81,10 @@ def plan_mosaic(
     name = safe_stem(chosen.choice.name)
     check_storable(taking[0].scene, name, grid, chosen)
     taken = tuple(one.name for one in taking)
-    seen = [one.look.footprint for one in taking]
-    plan = product_plan(
-        name, taken, grid, Tiles.shared(tiles), chosen, seen, drawn_regions(project, chosen, taken, grid)
-    )
-    product = OrthoProduct(plan, tuple(one.look for one in taking), keyed(project, plan, chosen))
+    looks = tuple(one.look for one in taking)
+    regions = drawn_regions(project, chosen, taken, grid)
+    plan = product_plan(name, taken, grid, Tiles.shared(tiles), chosen, looks, regions)
+    product = OrthoProduct(plan, looks, keyed(project, plan, chosen))
     return OrthoPlan(project, chosen, (product,), tuple(blind))
 
 

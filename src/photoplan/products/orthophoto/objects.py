@@ -23,11 +23,13 @@ from photoplan.products.orthophoto.plan import (
     OrthoProduct,
     check_storable,
     chosen_settings,
+    grid_of,
     keyed,
     product_plan,
     refuse_blind,
 )
 from photoplan.products.orthophoto.settings import Choice, OrthoSettings
+from photoplan.products.orthophoto.sharpness import with_blur
 from photoplan.surfaces.faces import Faces
 from photoplan.surfaces.objects import ObjectSurface, Part
 from photoplan.surfaces.polygon_faces import LEAST_AREA
@@ -80,6 +82,7 @@ def plan_objects(
     refuse_mixed(looked)
     chosen = with_resolution(project, chosen, looked, force)
     refuse_blind(chosen, looked, blind)
+    looked = with_blur(looked, grid_of(project, chosen, [one.look.footprint for one in looked]), chosen, events)
     surface = looked[0].scene.surface
     assert isinstance(surface, ObjectSurface)
     found = _placed(_named(surface, entry, objects), chosen, project.crs, blind)
@@ -202,7 +205,7 @@ def _product(project: Project, chosen: OrthoSettings, one: _Single, looked: Sequ
     check_storable(taking[0][0].scene, one.stem, one.grid, chosen)
     # Between its own heights the score is interpolated.
     seen = [replace(each.look.footprint, height_range=(levels[0], levels[1])) for each, _ in taking]
-    shared, images = Tiles.shared([mine for _, mine in taking]), tuple(each.name for each, _ in taking)
-    plan = product_plan(one.stem, images, one.grid, shared, chosen, seen)
     looks = tuple(replace(each.look, footprint=footprint) for (each, _), footprint in zip(taking, seen))
+    shared, images = Tiles.shared([mine for _, mine in taking]), tuple(each.name for each, _ in taking)
+    plan = product_plan(one.stem, images, one.grid, shared, chosen, looks)
     return OrthoProduct(plan, looks, keyed(project, plan, chosen, one.surface.part), one.surface.part)

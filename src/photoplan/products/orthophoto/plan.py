@@ -153,15 +153,15 @@ def plan_orthophotos(
     chosen = with_resolution(project, chosen, looked, force)
     products = []
     for one in looked:
-        seen = (one.look.footprint,)
-        grid = grid_of(project, chosen, seen)
+        grid = grid_of(project, chosen, [one.look.footprint])
         check_storable(one.scene, one.name, grid, chosen)
         tiles = covered_tiles(one.scene.camera, painted_surface(one.scene.surface), grid, chosen.tile)
         if len(tiles):
-            plan = product_plan(product_name(one.name), (one.name,), grid, tiles, chosen, seen)
+            plan = product_plan(product_name(one.name), (one.name,), grid, tiles, chosen, [one.look])
             products.append(OrthoProduct(plan, (one.look,), keyed(project, plan, chosen)))
         else:
-            blind.append(f"{one.name}: sees {extent_text(seen[0].bounds)}; the bounds are {extent_text(chosen.bounds)}")
+            seen = extent_text(one.look.footprint.bounds)
+            blind.append(f"{one.name}: sees {seen}; the bounds are {extent_text(chosen.bounds)}")
         events.done()
     refuse_blind(chosen, products, blind)
     _refuse_equal_names(products)
@@ -208,26 +208,27 @@ def product_plan(
     grid: MapGrid,
     tiles: Tiles,
     settings: OrthoSettings,
-    seen: Sequence[Footprint],
+    looks: Sequence[Look],
     regions: Drawn | None = None,
 ) -> ProductPlan:
     """A product of one image or of many, from what each of them sees of the terrain."""
     rule = AnchorRule.of(settings.kernel, settings.tolerance)
-    return ProductPlan(name, images, MapTarget(grid), rule, tiles, _owners(images, settings, seen, regions))
+    return ProductPlan(name, images, MapTarget(grid), rule, tiles, _owners(images, settings, looks, regions))
 
 
 def _owners(
-    images: tuple[str, ...], settings: OrthoSettings, seen: Sequence[Footprint], regions: Drawn | None
+    images: tuple[str, ...], settings: OrthoSettings, looks: Sequence[Look], regions: Drawn | None
 ) -> Ownership | None:
     """Who paints a pixel."""
     if settings.choice is None:
         return None if settings.hidden == "show" else InSight(paints_hidden=settings.hidden == "mark")
-    ranges = np.array([one.height_range for one in seen])
-    first = settings.choice.prefer
+    ranges = np.array([look.footprint.height_range for look in looks])
+    first, weights = settings.choice.prefer, settings.choice.weights
+    ranks = [float(first.index(name) - len(first)) * PREFERRED if name in first else 0.0 for name in images]
     return BestImage(
         levels=(float(np.nanmin(ranges[:, 0])), float(np.nanmax(ranges[:, 1]))),
-        weights=settings.choice.weights,
-        ranks=tuple(float(first.index(name) - len(first)) * PREFERRED if name in first else 0.0 for name in images),
+        weights=weights,
+        ranks=tuple(rank + weights.sharpness * look.blur for rank, look in zip(ranks, looks)),
         drawn=regions,
         paints_hidden=settings.hidden != "nodata",
     )

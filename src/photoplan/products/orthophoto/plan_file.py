@@ -270,6 +270,7 @@ def _look_header(image: str, look: Look) -> dict[str, Any]:
     return {
         "image": image,
         "gsd": look.gsd,
+        "blur": look.blur,
         "outline": seen.outline.tolist(),
         **pick(seen, "bounds", "on_surface", "height_range"),
     }
@@ -279,7 +280,7 @@ def _look(entry: dict[str, Any]) -> Look:
     outline = np.array(entry["outline"], float).reshape(-1, 3)
     bounds = None if entry["bounds"] is None else tuple(entry["bounds"])
     low, high = entry["height_range"]
-    return Look(Footprint(outline, bounds, entry["on_surface"], (low, high)), entry["gsd"])
+    return Look(Footprint(outline, bounds, entry["on_surface"], (low, high)), entry["gsd"], entry["blur"])
 
 
 def _product(
@@ -305,6 +306,6 @@ def _product(
         key = hashlib.sha256(f"{key} {tiles.indices.tolist()}".encode()).hexdigest()
     looks = tuple(_look(each) for each in entry["images"])
     regions = drawn_regions(project, settings, images, grid)
-    plan = product_plan(name, images, grid, tiles, settings, [look.footprint for look in looks], regions)
+    plan = product_plan(name, images, grid, tiles, settings, looks, regions)
     part = entry.get("part")
     return OrthoProduct(plan, looks, key, part and Part(tuple(part["objects"]), bool(part["below"])))
