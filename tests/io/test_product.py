@@ -214,7 +214,7 @@ def test_a_run_continues_with_its_own_key_only(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"dtype": np.dtype("float64")}, "type float64; allowed are uint8"),
+        ({"dtype": np.dtype("int32")}, "type int32; allowed are uint8"),
         ({"compress": "lzma"}, "compression 'lzma'; allowed are none"),
         ({"compress": "jpeg", "bands": 4}, "JPEG takes one or three bands"),
         ({"nodata": 300}, "whole numbers from 0 to 255"),

@@ -95,6 +95,11 @@ def tie(inputs: Path, out: Path) -> list[object]:
     return ["tie", project, "-o", out / "product.csv", *words]
 
 
+def view(*what: object) -> Words:
+    words = ["--from", 500240, 5300150, "--height", 40, "--look-at", 500320, 5300210, "--size", 540, 530]
+    return lambda inputs, out: ["view", *what[:-1], inputs / "block" / "dem.tif", *words, "-o", out / str(what[-1])]
+
+
 CASES: dict[str, tuple[Words, str]] = {
     "ortho": (ortho, "one_ortho.tif"),
     "mosaic": (mosaic, "mosaic.tif"),
@@ -110,6 +115,8 @@ CASES: dict[str, tuple[Words, str]] = {
     "visible": (terrain("visible", "--resolution", 1.1, "--from", 500300, 5300200), "product.tif"),
     "flow": (terrain("flow", "--resolution", 1.1), "product.tif"),
     "volume": (volume, "product.tif"),
+    "view": (view("--samples", 1, "product.png"), "product.png"),
+    "view matrix": (view("matrix", "product.tif"), "product.tif"),
 }
 """Command and name of the product that comes last."""
 

@@ -34,6 +34,7 @@ VERBS = {
     "object": "Make a product of each object alone.",
     "run": "Execute a plan written by `ortho --plan`.",
     "dtm": "Terrain models: build, sample, contours, volumes …",
+    "view": "Perspective views, with the ground of every pixel.",
     "monoplot": "Image points to ground points on a terrain model.",
     "mtf": "Measure spread function and MTF from edges and patterns.",
     "restore": "Restore images with a filter, given or measured.",

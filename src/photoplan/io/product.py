@@ -24,9 +24,11 @@ from photoplan.io.naming import give_name, is_unfinished, standing, when_named
 from photoplan.io.plain_tiff import write_plain_tiff
 from photoplan.io.product_check import check_product
 from photoplan.io.run_record import record_path, refuse_foreign_record
-from photoplan.io.storage import PRODUCT_TYPES, BlockCoder, CogOptions, Nodata, nodata_for, write_cog
+from photoplan.io.storage import PRODUCT_TYPES, BlockCoder, CogOptions, Nodata, nodata_for, write_cog, write_picture
 from photoplan.io.tile_log import TileLog
 
+#: The tag in which a product describes itself, where its place does not.
+DESCRIPTION = "PHOTOPLAN_VIEW"
 _SAMPLES = 12
 _BIG = 3_900_000_000
 
@@ -109,7 +111,7 @@ class ProductFile:
     bands: int
     """Bands."""
     dtype: np.dtype[Any]
-    """uint8, uint16, int16 or float32."""
+    """uint8, uint16, int16, float32 or float64."""
     _: KW_ONLY
     run_key: str
     """A digest of inputs, parameters and version: another key starts afresh."""
@@ -134,6 +136,9 @@ class ProductFile:
     """How the overviews are made: `average`, `mode` or `nearest`."""
     colours: Mapping[int, tuple[int, int, int]] | None = None
     """Colour table of one band of uint8."""
+    driver: str = "COG"
+    """Format of the file: COG, or a picture without a place, PNG or JPEG, of one or three bands of uint8 that are all
+    valid; its description is the tag PHOTOPLAN_VIEW."""
     form: ImageForm | None = None
     """Of an image whose copy the product is: its names and colours of bands and its metadata are taken over."""
     _log: TileLog | None = field(default=None, init=False, repr=False)
@@ -148,6 +153,8 @@ class ProductFile:
                 f"{self.path}: {self.bands} bands of {self.dtype} with compression {self.compress}; JPEG takes one or "
                 "three bands of uint8, the others one band and more"
             )
+        if self.driver != "COG" and (self.dtype != np.uint8 or self.bands not in (1, 3) or self.placement.transform):
+            raise UsageError(f"{self.path}: {self.bands} bands of {self.dtype}; a picture has one or three of uint8")
         self._options = CogOptions(
             self.compress,
             self.overviews,
@@ -298,7 +305,7 @@ class ProductFile:
             crs = rasterio.crs.CRS.from_user_input(stated) if stated else None
         except GDAL_ERRORS as error:
             raise UsageError(f"{self.path}: the reference system {stated!r} is not understood ({error})") from error
-        photometric = "RGB" if self.bands in (3, 4) and self.dtype != np.float32 else "MINISBLACK"
+        photometric = "RGB" if self.bands in (3, 4) and self.dtype.kind != "f" else "MINISBLACK"
         if self.form is not None:
             photometric = self.form.photometric or photometric
         return {
@@ -331,14 +338,17 @@ class ProductFile:
         write_plain_tiff(part if direct else plain, profile | colours, tags, blocks, log.descriptor, dresser)
         if direct:
             return part
-        if self._coder.mask_bytes:
+        if self._coder.mask_bytes and self.driver == "COG":
             mask = {"count": 1, "dtype": "uint8", "nodata": None, "photometric": "MINISBLACK"}
             blocks = ((i, position + pixels, self._coder.mask_bytes) for i, position, _ in stored)
             msk = plain.with_name(plain.name + ".msk")
             # Flag 2: the mask holds for all bands.
             flags = {f"INTERNAL_MASK_FLAGS_{band + 1}": "2" for band in range(self.bands)}
             write_plain_tiff(msk, profile | mask, flags, blocks, log.descriptor)
-        write_cog(plain, part, self._options, self.dtype)
+        if self.driver != "COG":
+            write_picture(plain, part, self.driver, self.quality, tags.get(DESCRIPTION, ""))
+        else:
+            write_cog(plain, part, self._options, self.dtype)
         return part
 
     def _check(self, log: TileLog, part: Path) -> None:
@@ -355,8 +365,9 @@ class ProductFile:
             self._profile(),
             list(samples),
             expected,
-            lossy=self.compress == "jpeg",
-            overviews=self.overviews and max(self.placement.size) > self.tile,
+            lossy="JPEG" in (self.compress.upper(), self.driver),
+            overviews=self.overviews and self.driver == "COG" and max(self.placement.size) > self.tile,
+            driver=self.driver,
         )
 
     def _facts(self, log: TileLog) -> ProductFacts:

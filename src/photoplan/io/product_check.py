@@ -30,6 +30,7 @@ def check_product(
     *,
     lossy: bool,
     overviews: bool,
+    driver: str = "COG",
 ) -> None:
     """Compare a file with what it must hold.
 
@@ -47,6 +48,8 @@ def check_product(
         The compression changes values a little.
     overviews
         There must be overviews.
+    driver
+        Format of the file, see `ProductFile`.
 
     Raises
     ------
@@ -55,8 +58,9 @@ def check_product(
     InputError
         If blocks of any directory lie beyond the end of the file, or cannot be decoded.
     """
-    read_tiff_layouts(path)
-    with open_raster(path, "GTiff") as dataset, gdal_settings():
+    if driver == "COG":
+        read_tiff_layouts(path)
+    with open_raster(path, "GTiff" if driver == "COG" else driver) as dataset, gdal_settings():
         for name in ("width", "height", "count", "transform"):
             if getattr(dataset, name) != profile[name]:
                 raise PhotoplanError(f"{path}: {name} is {getattr(dataset, name)}, not {profile[name]}")

@@ -16,14 +16,14 @@ from photoplan.io.gdal import gdal_settings, warnings_of_gdal
 from photoplan.kernels.pack import fill_block
 
 COMPRESSIONS = ("none", "deflate", "zstd", "lzw", "jpeg")
-PRODUCT_TYPES = ("uint8", "uint16", "int16", "float32")
+PRODUCT_TYPES = ("uint8", "uint16", "int16", "float32", "float64")
 Nodata = float | Literal["auto", "mask"]
 
 
 def nodata_for(dtype: np.dtype[Any], wanted: Nodata, compress: str) -> float | None:
     """The nodata value of a product; None stands for a mask band.
 
-    `auto` is 0 for unsigned integers, -32768 for int16 and NaN for float32. JPEG changes values, so it always takes a
+    `auto` is 0 for unsigned integers, -32768 for int16 and NaN for floats. JPEG changes values, so it always takes a
     mask.
     """
     if wanted == "mask" or compress == "jpeg":
@@ -104,6 +104,37 @@ class BlockCoder:
             return pixels, mask[: shape[0], : shape[1]] > 0
         empty = np.isnan(pixels) if np.isnan(self.nodata) else pixels == self.nodata
         return pixels, ~empty.all(axis=0)
+
+
+#: Formats of pictures, by the suffix of a file's name.
+PICTURES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
+
+
+def write_picture(source: Path, target: Path, driver: str, quality: int, note: str) -> None:
+    """Copy a raster of one or three bands of bytes into a PNG or JPEG, row by row.
+
+    Parameters
+    ----------
+    source, target : Path
+    driver : str
+        A value of `PICTURES`.
+    quality : int
+        Of JPEG.
+    note : str
+        What the picture says of itself, as its comment; a PNG also takes over the tags of the source.
+
+    Raises
+    ------
+    PhotoplanError, rasterio.errors.RasterioError
+        As `write_cog`.
+    """
+    options: dict[str, Any] = {"quality": quality, "comment": note} if driver == "JPEG" else {}
+    if driver == "PNG":
+        options = {"write_metadata_as_text": "YES", "description": note}
+    with gdal_settings(GDAL_PAM_ENABLED=False), warnings_of_gdal() as found:
+        rasterio.shutil.copy(source, target, driver=driver, **options)
+    if found:
+        raise PhotoplanError(f"{target}: GDAL could not write it cleanly ({found[0]})")
 
 
 RESAMPLINGS = ("average", "mode", "nearest")

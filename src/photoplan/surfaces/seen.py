@@ -16,8 +16,14 @@ from photoplan.targets.view import ViewTarget
 
 #: How far one sees where terrain has no end, metres; and how deep the earth's surface reaches.
 _FAR, _DEEP = 300_000.0, 12_000.0
+#: Rays that are followed at once: each takes about a kilobyte.
+MOST_RAYS = 1 << 17
 #: What is a little longer on the ground than on the map.
 _STRETCH = 1.01
+
+
+#: Cosine of the flattest incidence that sizes of pixels know.
+_EDGE_ON = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +88,9 @@ class SeenSurface:
         """
         if not isinstance(target, ViewTarget):
             raise UsageError(f"terrain is seen in views, not in {type(target).__name__}")
+        if len(uv) > MOST_RAYS:
+            parts = [vars(self.at(target, uv[k : k + MOST_RAYS])) for k in range(0, len(uv), MOST_RAYS)]
+            return Seen(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
         paths = target.rays(uv, self._reach(target), self.bound / 2)
         hits = self.terrain.first_hit(paths, target.bend)
         uvh = np.concatenate([uv, target.to_view(hits.XYZ)[:, 2:]], axis=1)
@@ -115,14 +124,18 @@ def _back(target: ViewTarget, hits: Hits) -> NDArray[np.float64]:
         return np.asarray(way / np.linalg.norm(way, axis=1, keepdims=True))
 
 
-def ground_size(target: ViewTarget, seen: Seen) -> NDArray[np.float64]:
-    """Side of a square of the area that each pixel covers on what it shows, metres; NaN: sky, infinite edge-on."""
-    uv, half = seen.uvh[..., :2], np.array([0.5, 0.0])
+def pixel_size(target: ViewTarget, uvh: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Side of a square of the area that pixels (..., 3) cover at their depth, across the line of sight, metres."""
+    uv, half = uvh[..., :2], np.array([0.5, 0.0])
     across, along = (
         target.bundle.directions(uv + step) - target.bundle.directions(uv - step) for step in (half, half[::-1])
     )
     here = target.bundle.directions(uv)
     # The solid angle of the pixel, times the squared distance, per unit of depth.
     area = np.abs((np.cross(across, along) * here).sum(axis=-1)) / np.linalg.norm(here, axis=-1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.abs(seen.uvh[..., 2]) * np.sqrt(area / np.cos(seen.incidence)))
+    return np.asarray(np.abs(uvh[..., 2]) * np.sqrt(area))
+
+
+def ground_size(target: ViewTarget, seen: Seen) -> NDArray[np.float64]:
+    """Side of a square of the area that each pixel covers on what it shows, metres; NaN: sky; edge-on very large."""
+    return np.asarray(pixel_size(target, seen.uvh) / np.sqrt(np.maximum(np.cos(seen.incidence), _EDGE_ON)))

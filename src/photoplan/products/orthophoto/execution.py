@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,18 +12,17 @@ import numpy as np
 
 from photoplan import __version__
 from photoplan.engine.cluster import Question
-from photoplan.engine.execute import MOST_SOURCE_BYTES, OutputName, RenderJob
-from photoplan.engine.executors import Workers, executor_factory, open_workers
-from photoplan.engine.run import Kept, Runner, Tally, Work, tiles_in_flight
-from photoplan.errors import TilesFailed, UsageError
-from photoplan.events import SILENT, Events
+from photoplan.engine.execute import OutputName, RenderJob
+from photoplan.engine.executors import Workers, open_workers
+from photoplan.engine.run import Kept, Runner, Tally, Work
+from photoplan.errors import TilesFailed
 from photoplan.io.disk import make_folder
 from photoplan.io.image_form import ImageForm, bands_of
 from photoplan.io.naming import standing, together, when_named
 from photoplan.io.product import ProductFile, is_product
 from photoplan.io.project.model import Project
 from photoplan.io.quicklook import refuse_foreign_overview, write_overview
-from photoplan.io.run_record import input_entry, run_times, versions, write_run_record
+from photoplan.io.run_record import input_entry, versions, write_run_record
 from photoplan.kernels.rectify import is_compiled
 from photoplan.plan.accuracy import BANDS, radial_error
 from photoplan.plan.tiles import Tiles
@@ -37,61 +36,13 @@ from photoplan.products.orthophoto.finished import (
 )
 from photoplan.products.orthophoto.look import Look
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, known_errors
+from photoplan.products.run import Run, clock, refuse_inputs
 from photoplan.project.restored import RestoreStep
 from photoplan.project.scene import Scene, input_files
 from photoplan.project.scenes import Scenes, ScenesAddress
 
 #: Names and units of the bands of an accuracy raster.
 _BANDS = ImageForm(descriptions=tuple(name for name, _ in BANDS), units=tuple(unit for _, unit in BANDS))
-#: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
-BASE_MEMORY = 320 * 2**20
-
-
-@dataclass(frozen=True)
-class Run:
-    """How a plan is executed; none of it changes a pixel."""
-
-    workers: int = 1
-    """Threads or processes."""
-    executor: str = "threads"
-    """``threads``, ``processes`` or a Dask scheduler's address."""
-    memory: int | None = None
-    """Bytes the run should stay under; None: no bound but the tiles in flight."""
-    overwrite: bool = False
-    """Whether finished products may be replaced."""
-    quicklook: bool = True
-    """Whether to write `overview.png`."""
-    events: Events = SILENT
-    """Told of tiles that are done, and of each product's result, also if some of its tiles failed."""
-
-    def check(self) -> None:
-        """Refuse what cannot work, before any work.
-
-        Raises
-        ------
-        UsageError
-            An unknown executor, less than one worker, or too little memory for one tile.
-        """
-        executor_factory(self.executor, self.workers)
-        self.in_flight()
-
-    def in_flight(self, threads: int | None = None) -> int:
-        """Tiles that may be under way at once.
-
-        Parameters
-        ----------
-        threads : int, optional
-            Those of a cluster; the workers of this machine if it is None.
-
-        Raises
-        ------
-        UsageError
-            `memory` does not suffice for one tile.
-        """
-        workers = threads or self.workers
-        wanted = workers if workers == 1 else 2 * workers
-        # A tile holds its source window as read and as packed for the kernel, relief, anchors and result.
-        return tiles_in_flight(wanted, self.memory, BASE_MEMORY, 3 * MOST_SOURCE_BYTES)
 
 
 def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list[ProductResult]:
@@ -129,7 +80,7 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     run.check()
     picture = folder / "overview.png" if run.quicklook else None
     rasters = [path for p in plan.products for path in all_files(folder, p, plan.settings)]
-    _refuse_inputs(plan, [*rasters, *([] if picture is None else [picture])])
+    refuse_inputs(input_files(plan.project), [*rasters, *([] if picture is None else [picture])])
     kept = finished_products(plan, folder, run.overwrite, picture)
     if picture is not None and not run.overwrite:
         refuse_foreign_overview(picture)
@@ -150,23 +101,6 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
             + "\n  ".join(failed)
         )
     return results
-
-
-def _refuse_inputs(plan: OrthoPlan, outputs: list[Path]) -> None:
-    """No output may be an input of the project, whichever product it belongs to and by whatever link."""
-    inputs = {_identity(file) for file in input_files(plan.project)}
-    for path in outputs:
-        if _identity(path) in inputs:
-            raise UsageError(f"{path}: the output is an input of the project; choose another `output`")
-
-
-def _identity(path: Path) -> object:
-    """What two names of one file have in common."""
-    try:
-        state = path.stat()
-        return state.st_dev, state.st_ino
-    except OSError:
-        return path.resolve()
 
 
 def _work(
@@ -215,7 +149,7 @@ def _work(
         tiles=product.plan.tiles,
         count=product.plan.tiles.total,
         sinks=tuple(files.values()),
-        complete=partial(_complete, plan, product, address, run, files, _clock(workers)),
+        complete=partial(_complete, plan, product, address, run, files, clock(workers)),
         scratch=paths["picture"].with_name(f".{paths['picture'].name}.parcels"),
     )
 
@@ -224,12 +158,6 @@ def _pixel_files(plan: OrthoPlan) -> list[Path]:
     """Files that workers open."""
     addresses = (p.address(plan.project) for p in plan.products)
     return [Path(path) for path in dict.fromkeys(path for a in addresses for path, _ in a.digests)]
-
-
-def _clock(workers: Workers) -> Callable[[], dict[str, Any]]:
-    """Gives times and the workers' versions when a product is complete."""
-    times = run_times()
-    return lambda: {**times(), "workers_versions": workers.versions}
 
 
 def _complete(

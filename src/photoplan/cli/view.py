@@ -1,0 +1,35 @@
+"""`photoplan view`: what is seen from a point."""
+
+from __future__ import annotations
+
+import click
+
+from photoplan.cli.lazy import LazyGroup
+
+#: Verb and its one-line help; the command is `photoplan.cli.view_<verb>:command`.
+VERBS = {
+    "picture": "A picture of terrain, rasters or photos (this word may be left out).",
+    "matrix": "The ground of every pixel as a raster.",
+    "pick": "Pixels to ground, ground to pixels.",
+}
+
+
+class _Views(LazyGroup):
+    """`photoplan view FILE …` is `photoplan view picture FILE …`."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        return super().resolve_command(ctx, args if args[0] in self.verbs else ["picture", *args])
+
+
+command = _Views(
+    name="view",
+    verbs=VERBS,
+    package="photoplan.cli.view_",
+    help="""Perspective views of a project or a terrain model: photoplan view FILE --from X Y --look-at X Y -o PICTURE.
+
+    Pictures can be measured: `matrix` gives the ground point of every pixel, `pick` that of single ones.
+    """,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)

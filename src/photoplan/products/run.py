@@ -1,0 +1,94 @@
+"""How every product that is made of images runs, and what it may not do to its inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from photoplan.engine.execute import MOST_SOURCE_BYTES
+from photoplan.engine.executors import Workers, executor_factory
+from photoplan.engine.run import tiles_in_flight
+from photoplan.errors import UsageError
+from photoplan.events import SILENT, Events
+from photoplan.io.run_record import run_times
+
+#: Memory of the interpreter with all libraries, GDAL's cache and the assembly of a product, bytes.
+BASE_MEMORY = 320 * 2**20
+
+
+@dataclass(frozen=True)
+class Run:
+    """How a plan is executed; none of it changes a pixel."""
+
+    workers: int = 1
+    """Threads or processes."""
+    executor: str = "threads"
+    """``threads``, ``processes`` or a Dask scheduler's address."""
+    memory: int | None = None
+    """Bytes the run should stay under; None: no bound but the tiles in flight."""
+    overwrite: bool = False
+    """Whether finished products may be replaced."""
+    quicklook: bool = True
+    """Whether to write `overview.png`."""
+    events: Events = SILENT
+    """Told of tiles that are done, and of each product's result, also if some of its tiles failed."""
+
+    def check(self) -> None:
+        """Refuse what cannot work, before any work.
+
+        Raises
+        ------
+        UsageError
+            An unknown executor, less than one worker, or too little memory for one tile.
+        """
+        executor_factory(self.executor, self.workers)
+        self.in_flight()
+
+    def in_flight(self, threads: int | None = None) -> int:
+        """Tiles that may be under way at once.
+
+        Parameters
+        ----------
+        threads : int, optional
+            Those of a cluster; the workers of this machine if it is None.
+
+        Raises
+        ------
+        UsageError
+            `memory` does not suffice for one tile.
+        """
+        workers = threads or self.workers
+        wanted = workers if workers == 1 else 2 * workers
+        # A tile holds its source window as read and as packed for the kernel, relief, anchors and result.
+        return tiles_in_flight(wanted, self.memory, BASE_MEMORY, 3 * MOST_SOURCE_BYTES)
+
+
+def refuse_inputs(inputs: Iterable[Path], outputs: Iterable[Path]) -> None:
+    """No output may be an input, whichever product it belongs to and by whatever link.
+
+    Raises
+    ------
+    UsageError
+        One is.
+    """
+    known = {_identity(file) for file in inputs}
+    for path in outputs:
+        if _identity(path) in known:
+            raise UsageError(f"{path}: the output is an input of the project; choose another `output`")
+
+
+def _identity(path: Path) -> object:
+    """What two names of one file have in common."""
+    try:
+        state = path.stat()
+        return state.st_dev, state.st_ino
+    except OSError:
+        return path.resolve()
+
+
+def clock(workers: Workers) -> Callable[[], dict[str, Any]]:
+    """Gives times and the workers' versions when a product is complete."""
+    times = run_times()
+    return lambda: {**times(), "workers_versions": workers.versions}

@@ -1,0 +1,351 @@
+"""From where, whereto and how a view is taken: an image's own orientation, or a standpoint on the ground."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.frame import FrameCamera
+from photoplan.cameras.interior import Interior
+from photoplan.cameras.lenses.none import NoLens
+from photoplan.cameras.risen import EarthBend, Exaggeration
+from photoplan.cameras.warped import Warp, WarpedCamera
+from photoplan.errors import GeometryError, InputError, UsageError
+from photoplan.geometry.grid import USUAL_TILE, refuse_absurd
+from photoplan.geometry.local import LocalFrame, earth_radius
+from photoplan.geometry.pose import Pose
+from photoplan.products.view.ground import ViewGround
+from photoplan.project.scene import camera_without_pixels
+from photoplan.surfaces.seen import SeenSurface
+from photoplan.targets.panorama import Panorama
+from photoplan.targets.view import Bundle, FrameBundle, ViewTarget
+
+CURVATURES = ("none", "bend", "strict")
+PANORAMAS = ("cylinder", "sphere")
+#: Coefficient of refraction that is usual by day (Ecker 1991, §5.7.6).
+USUAL_REFRACTION = 0.13
+#: Sides of pictures, pixels.
+_LARGEST = 200_000
+
+
+@dataclass(frozen=True)
+class CameraRequest:
+    """A camera as a user states it; angles in degrees, lengths in metres."""
+
+    image: str | None = None
+    """An image of the project: its orientation, camera and lens as they are; with a standpoint None."""
+    position: tuple[float, float] | None = None
+    """X, Y of the standpoint."""
+    height: float = 1.7
+    """Of the eye above ground; an exaggeration leaves it as it is."""
+    altitude: float | None = None
+    """Height of the eye in the system of the terrain, instead of `height`."""
+    look_at: tuple[float, ...] | None = None
+    """X, Y or X, Y, Z of the point in the middle of the picture."""
+    azimuth: float | None = None
+    """Direction of view from grid north, clockwise, instead of `look_at`."""
+    pitch: float = 0.0
+    """Of the direction of view above the horizon, with `azimuth`."""
+    roll: float = 0.0
+    """Of the camera about its axis, clockwise."""
+    field_of_view: float | None = None
+    """From the left to the right edge of the picture; None: 60, of panoramas 360."""
+    size: tuple[int, int] = (1200, 800)
+    """Width and height of the picture, pixels."""
+    pixel_aspect: float = 1.0
+    """Width of a pixel divided by its height."""
+    panorama: str | None = None
+    """`cylinder` or `sphere` instead of a plane picture."""
+    curvature: str | None = None
+    """`none`; `bend`: ground is lowered by s²/2R (Ecker 1991, eq. 5.6); `strict`: through the local system of the
+    standpoint. None: `bend` from a standpoint, and as the project has it for an image."""
+    refraction: float | None = None
+    """Coefficient k (eq. 5.7); None: 0.13 where the earth is round."""
+    earth_radius: float | None = None
+    """R; None: that of the ellipsoid at the standpoint."""
+    exaggeration: float = 1.0
+    reference: float | None = None
+    """Height that an exaggeration leaves; None: where the middle of the picture meets the ground."""
+
+    def __post_init__(self) -> None:
+        if (self.image is None) == (self.position is None):
+            raise UsageError("a view needs one `camera`: an image of the project, or a standpoint `position` X Y")
+        numbers = {f.name: getattr(self, f.name) for f in fields(self)}
+        for name, value in numbers.items():
+            flat = value if isinstance(value, tuple) else (value,)
+            if any(isinstance(v, float | int) and not math.isfinite(v) for v in flat):
+                raise UsageError(f"`{name}` {value}; finite numbers are needed")
+        if self.position is not None and (self.look_at is None) == (self.azimuth is None):
+            raise UsageError("a standpoint needs either `look_at` X Y [Z] or `azimuth`")
+        if self.look_at is not None and len(self.look_at) not in (2, 3):
+            raise UsageError(f"`look_at` {self.look_at}; X Y or X Y Z are needed")
+        for name, allowed in (("curvature", CURVATURES), ("panorama", PANORAMAS)):
+            if numbers[name] not in (None, *allowed):
+                raise UsageError(f"`{name}` {numbers[name]!r}; allowed are {', '.join(allowed)}")
+        most = 360.0 if self.panorama else 170.0
+        if self.field_of_view is not None and not 1e-4 <= self.field_of_view <= most:
+            raise UsageError(f"`field_of_view` {self.field_of_view}°; 0.0001 to {most:g} are allowed")
+        if not all(1 <= side <= _LARGEST for side in self.size):
+            raise UsageError(f"picture of {self.size[0]} × {self.size[1]} pixels; sides of 1 to {_LARGEST} are allowed")
+        refuse_absurd(self.size, USUAL_TILE, "the picture")
+        if not 0.01 <= self.pixel_aspect <= 100:
+            raise UsageError(f"`pixel_aspect` {self.pixel_aspect}; 0.01 to 100 are allowed")
+        if self.refraction is not None and not -1 <= self.refraction < 1:
+            raise UsageError(f"`refraction` {self.refraction}; from -1 to below 1, usual is {USUAL_REFRACTION}")
+        if self.earth_radius is not None and not 1e6 <= self.earth_radius <= 1e8:
+            raise UsageError(f"`earth_radius` {self.earth_radius} m; that of the earth is 6380000")
+        if self.exaggeration != 1.0:
+            Exaggeration(0.0, self.exaggeration)
+        if not abs(self.pitch) <= 90:
+            raise UsageError(f"`pitch` {self.pitch}°; -90 to 90 are allowed")
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any], where: str) -> CameraRequest:
+        """From plain values, as a file has them; `where` names it.
+
+        Raises
+        ------
+        InputError
+            A name or a value is not allowed.
+        """
+        known = {f.name: f for f in fields(cls)}
+        for name, value in values.items():
+            if name not in known:
+                raise InputError(f"{where}: {name!r} is no part of a camera; known are {', '.join(known)}")
+            kind, text = str(known[name].type), isinstance(value, str)
+            if (
+                isinstance(value, bool | dict)
+                or ("str" in kind) != text
+                or ("tuple" in kind) != isinstance(value, list)
+            ):
+                raise InputError(f"{where}: {name} = {value!r} is not of the kind {kind}")
+        try:
+            given: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+            return cls(**given)
+        except (TypeError, UsageError) as error:
+            raise InputError(f"{where}: {str(error).replace('`', '')}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class ViewCamera:
+    """A camera that has found its place."""
+
+    request: CameraRequest
+    """With numbers instead of what depends on the ground: the same view, made again, is the same."""
+    target: ViewTarget
+    above_ground: float
+    """Height of the point of view above the ground below it, metres; NaN: there is none."""
+    bend: float
+    """(1 − k) / 2R, 1/m."""
+    earth_radius: float | None
+
+    def json_fields(self) -> dict[str, Any]:
+        """What a record states of it."""
+        c = self.target.center
+        return {
+            "standpoint": [float(v) for v in c],
+            "height_above_ground": self.above_ground,
+            "camera": {k: v for k, v in vars(self.request).items() if v is not None},
+            "earth_radius": self.earth_radius,
+            "bend_per_metre": self.bend,
+        }
+
+
+def view_camera(request: CameraRequest, ground: ViewGround, force: bool = False) -> ViewCamera:
+    """Put a camera on the ground.
+
+    Parameters
+    ----------
+    request : CameraRequest
+    ground : ViewGround
+    force : bool
+        Also where the point of view lies below the ground.
+
+    Raises
+    ------
+    InputError
+        The project has no such image, or the ground has no height where one is needed.
+    GeometryError
+        The point of view lies below the ground, or an exaggeration finds no height to leave as it is.
+    """
+    made = _of_image(request, ground) if request.image is not None else _of_standpoint(request, ground)
+    if made.above_ground < 0 and not force:
+        x, y, z = made.target.center
+        raise GeometryError(
+            f"the point of view {x:.2f} {y:.2f} {z:.2f} lies {-made.above_ground:.2f} m below the ground; check its "
+            "height and the height system (or an exaggeration that raises the ground), or say `force`"
+        )
+    return made
+
+
+def _of_image(request: CameraRequest, ground: ViewGround) -> ViewCamera:
+    assert request.image is not None
+    project = ground.named
+    camera = camera_without_pixels(project, project.select([request.image])[0])
+    if not isinstance(camera, FrameCamera | WarpedCamera):
+        raise InputError(f"image {request.image!r}: its camera is no frame camera; views know no other yet")
+    plain = ViewTarget.of_camera(camera)
+    radius = None
+    if request.curvature in ("bend", "strict"):
+        if plain.warps:
+            raise UsageError("the project states its own earth curvature or refraction; leave `curvature` to it")
+        warps, bend, radius = _round(replace(request, curvature="bend"), ground, camera.center)
+        plain = ViewTarget(plain.bundle, camera.center, warps, bend)
+    return _stretched(request, ground, plain, radius)
+
+
+def _round(
+    request: CameraRequest, ground: ViewGround, center: NDArray[np.float64]
+) -> tuple[tuple[Warp, ...], float, float | None]:
+    """The round earth as warps, by how much rays rise over it, and its radius."""
+    kind = request.curvature or "bend"
+    if kind == "none" and not request.refraction:
+        return (), 0.0, None
+    radius = request.earth_radius or earth_radius(ground.crs, center[:2])
+    k = USUAL_REFRACTION if request.refraction is None else request.refraction
+    at = (float(center[0]), float(center[1]))
+    lift = -k / (2 * radius)
+    if kind == "strict":
+        # Refraction first, on the map; the round earth is the local system's.
+        return (EarthBend(at, lift), LocalFrame(ground.crs, at)), (1 - k) / (2 * radius), radius
+    bend = lift if kind == "none" else (1 - k) / (2 * radius)
+    return (EarthBend(at, bend),), bend, radius
+
+
+def _of_standpoint(request: CameraRequest, ground: ViewGround) -> ViewCamera:
+    assert request.position is not None
+    X, Y = request.position
+    floor = float(ground.terrain.heights(np.array([X, Y])))
+    if request.altitude is None and not math.isfinite(floor):
+        raise InputError(f"standpoint {X:.10g} {Y:.10g}: the terrain has no height there; give its `altitude`")
+    Z = floor + request.height if request.altitude is None else request.altitude
+    center = np.array([X, Y, Z])
+    look_at = None
+    if request.look_at is not None:
+        look_at = np.array(request.look_at, float)
+        if len(look_at) == 2:
+            look_at = np.append(look_at, ground.terrain.heights(look_at))
+            if not math.isfinite(look_at[2]):
+                raise InputError(f"look-at point {look_at[0]:.10g} {look_at[1]:.10g}: the terrain has no height there")
+        if request.reference is None and request.exaggeration != 1.0:
+            request = replace(request, reference=float(look_at[2]))
+    warps, bend, radius = _round(request, ground, center)
+    plain = ViewTarget(_bundle(request, center, warps, look_at), center, warps, bend)
+    if request.exaggeration != 1.0:
+        reference = _reference(plain, ground) if request.reference is None else request.reference
+        request = replace(request, reference=reference)
+        if request.altitude is None:
+            # The eye keeps its height above the ground that is raised.
+            stretch = Exaggeration(reference, request.exaggeration)
+            lifted = stretch([X, Y, floor]) + np.array([0.0, 0.0, request.height])
+            plain = ViewTarget(_bundle(request, lifted, warps, look_at), lifted, warps, bend)
+    made = _stretched(request, ground, plain, radius)
+    return replace(made, request=_resolved(made, plain.bundle))
+
+
+def _bundle(
+    request: CameraRequest, center: NDArray[np.float64], warps: tuple[Warp, ...], look_at: NDArray[np.float64] | None
+) -> Bundle:
+    """Rays of a standpoint, in the space that the warps lead to."""
+    origin, axes = center, np.eye(3)
+    for warp in warps:
+        origin = warp(origin)
+        if isinstance(warp, LocalFrame):
+            axes = warp.axes(center)
+    if look_at is not None:
+        way = look_at
+        for warp in warps:
+            way = warp(way)
+        way = (way - origin) @ axes
+        if not np.linalg.norm(way) > 1e-6:
+            raise UsageError("the look-at point is the standpoint itself")
+        azimuth, pitch = math.atan2(way[0], way[1]), math.atan2(way[2], math.hypot(way[0], way[1]))
+    else:
+        azimuth, pitch = math.radians(request.azimuth or 0.0), math.radians(request.pitch)
+    width, height = request.size
+    if request.panorama:
+        if request.roll:
+            raise UsageError("a panorama has no `roll`")
+        scale = width / math.radians(request.field_of_view or 360.0)
+        rise = pitch if request.panorama == "sphere" else math.tan(pitch)
+        north = axes @ (0.0, 1.0, 0.0)
+        turned = azimuth + math.atan2(north[0], north[1])
+        row = (height - 1) / 2 + rise * scale
+        return Panorama(origin, request.size, turned, scale, row, request.panorama == "sphere")
+    focal = width / 2 / math.tan(math.radians(request.field_of_view or 60.0) / 2)
+    interior = Interior.digital(request.size, (focal, focal * request.pixel_aspect))
+    R = axes @ _rotation(azimuth, pitch, math.radians(request.roll))
+    return FrameBundle(FrameCamera(interior, NoLens(), Pose(origin, R)))
+
+
+def _rotation(azimuth: float, pitch: float, roll: float) -> NDArray[np.float64]:
+    """Camera axes x right, y up, z backwards on the map."""
+    sa, ca, sp, cp = math.sin(azimuth), math.cos(azimuth), math.sin(pitch), math.cos(pitch)
+    axis = np.array([sa * cp, ca * cp, sp])
+    right = np.array([ca, -sa, 0.0])
+    up = np.cross(right, axis)
+    s, c = math.sin(roll), math.cos(roll)
+    return np.stack([c * right - s * up, s * right + c * up, -axis], axis=1)
+
+
+def _stretched(request: CameraRequest, ground: ViewGround, target: ViewTarget, radius: float | None) -> ViewCamera:
+    """The camera with its exaggeration, if there is one; `target` is the one without."""
+    bend = target.bend
+    if request.exaggeration != 1.0:
+        reference = _reference(target, ground) if request.reference is None else request.reference
+        stretch = Exaggeration(reference, request.exaggeration)
+        request = replace(request, reference=reference)
+        center, warps = stretch.inverse(target.center), (stretch, *target.warps)
+        target = ViewTarget(target.bundle, center, warps, bend / request.exaggeration)
+    above = request.exaggeration * float(target.center[2] - ground.terrain.heights(target.center[:2]))
+    return ViewCamera(request, target, above, bend, radius)
+
+
+def _reference(target: ViewTarget, ground: ViewGround) -> float:
+    """Height where the middle of the picture meets the ground (Ecker 1991, §5.7.10)."""
+    middle = (np.array([target.bundle.size], float) - 1) / 2
+    Z = float(SeenSurface(ground.terrain, ground.bounds).at(target, middle).XYZ[0, 2])
+    if not math.isfinite(Z):
+        raise GeometryError("the middle of the picture meets no ground; give the `reference` height of `exaggeration`")
+    return Z
+
+
+def _resolved(made: ViewCamera, bundle: Bundle) -> CameraRequest:
+    """The request of a standpoint in numbers that no ground decides."""
+    request, target = made.request, made.target
+    x, y = (float(v) for v in target.center[:2])
+    altitude = target.center[2]
+    if request.exaggeration != 1.0:
+        assert request.reference is not None
+        altitude = Exaggeration(request.reference, request.exaggeration)(target.center)[2]
+    bare = [warp for warp in target.warps if not isinstance(warp, Exaggeration)]
+    axes = np.eye(3)
+    for warp in bare:
+        if isinstance(warp, LocalFrame):
+            axes = warp.axes(target.center)
+    azimuth, pitch = math.radians(request.azimuth or 0.0), math.radians(request.pitch)
+    if request.look_at is not None and isinstance(bundle, Panorama):
+        north = axes @ (0.0, 1.0, 0.0)
+        azimuth = bundle.azimuth - math.atan2(north[0], north[1])
+        rise = (bundle.horizon - (bundle.size[1] - 1) / 2) / bundle.scale
+        pitch = rise if bundle.spherical else math.atan(rise)
+    elif request.look_at is not None and isinstance(bundle, FrameBundle):
+        axis = -axes.T @ bundle.camera.pose.R_ground_camera[:, 2]
+        azimuth, pitch = math.atan2(axis[0], axis[1]), math.asin(max(-1.0, min(1.0, axis[2])))
+    kind = request.curvature or "bend"
+    usual = None if kind == "none" else USUAL_REFRACTION
+    return replace(
+        request,
+        position=(x, y),
+        altitude=float(altitude),
+        look_at=None,
+        azimuth=math.degrees(azimuth) % 360,
+        pitch=math.degrees(pitch),
+        curvature=kind,
+        refraction=usual if request.refraction is None else request.refraction,
+        earth_radius=made.earth_radius,
+    )

@@ -1,0 +1,336 @@
+"""What a view shows: rasters on the map, the terrain's own shades, tints and slopes, or oriented photos."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.base import Projection
+from photoplan.cameras.frame import FrameCamera
+from photoplan.cameras.map import MapProjection
+from photoplan.cameras.warped import WarpedCamera
+from photoplan.engine.base import Reader, Source
+from photoplan.engine.execute import render
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.crs import crs_label, crs_step, same_crs
+from photoplan.geometry.grid import Window
+from photoplan.geometry.levels import level_size
+from photoplan.io.image_form import placement_of
+from photoplan.io.raster import RasterReader
+from photoplan.plan.compile import AnchorRule
+from photoplan.plan.ground import TileGround
+from photoplan.plan.owner import Share
+from photoplan.plan.product import ProductPlan
+from photoplan.plan.tiles import Tile, Tiles
+from photoplan.products.view.ground import ViewGround
+from photoplan.project.scene import open_scene
+from photoplan.surfaces.base import Surface
+from photoplan.surfaces.seen import Seen, SeenSurface, pixel_size
+from photoplan.targets.base import Target
+from photoplan.targets.view import ViewTarget
+from photoplan.terrain.shading import RAMPS, Light, Ramp, built_in_ramp, shaded
+
+OWN = ("shade", "tint", "slope")
+#: Colours of slopes, at degrees.
+SLOPES = Ramp(
+    np.array([0.0, 10, 20, 30, 45]),
+    np.array([(255, 255, 212), (254, 217, 142), (254, 153, 41), (204, 76, 2), (120, 30, 10)], float),
+)
+#: A photo shows a place if what is met first on its ray is no nearer than the place by more than this, of its distance.
+_SAME = 1e-4
+#: Longer sides of the reduced image from which the range of grey values is taken, pixels.
+_LOOKED = 512
+_PERCENT = (2.0, 98.0)
+
+Colours = NDArray[np.float32]
+"""Red, green, blue, shape (3, height, width), 0 to 255."""
+
+
+@dataclass(frozen=True)
+class ContentRequest:
+    """One layer of what a view shows; later ones lie over earlier ones."""
+
+    kind: str
+    """`shade`, `tint`, `slope`, `raster`, `photo` or `photos`."""
+    value: str = ""
+    """Of a raster its file, of a photo its name, of tints the ramp with its lowest and highest height."""
+    opacity: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.opacity <= 1:
+            raise UsageError(f"content {self.value or self.kind}: opacity {self.opacity}; above 0 and up to 1")
+
+    @classmethod
+    def parse(cls, text: str) -> ContentRequest:
+        """From ``WHAT`` or ``WHAT@OPACITY``: ``shade``, ``slope``, ``photos``, ``photo:NAME``, ``tint``,
+        ``tint:RAMP``, ``tint:RAMP:LOW:HIGH``, or the file of a raster.
+
+        Raises
+        ------
+        UsageError
+            It is none of these.
+        """
+        opacity, head, tail = 1.0, *text.rpartition("@")[::2]
+        if head and not Path(text).exists():
+            try:
+                opacity, text = float(tail), head
+            except ValueError:
+                opacity = 1.0
+        kind, _, value = text.partition(":")
+        if kind in ("shade", "slope", "photos") and not value:
+            return cls(kind, "", opacity)
+        if kind == "tint" or (kind == "photo" and value):
+            return cls(kind, value, opacity)
+        if not Path(text).is_file():
+            raise UsageError(
+                f"content {text!r}: no such file; other contents are shade, slope, tint, tint:RAMP:LOW:HIGH, photos "
+                "and photo:NAME, each with @OPACITY if you like"
+            )
+        return cls("raster", text, opacity)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A part of a view before it has colours."""
+
+    target: ViewTarget
+    tile: Tile
+    """Its window in the target."""
+    seen: Seen
+    """Shape (height, width, …)."""
+    surface: SeenSurface
+    kernel: str
+
+    def relief(self, target: Target, window: Window) -> NDArray[np.float32]:
+        """Depth of pixels of the part: the engine need not look again."""
+        return self.seen.uvh[(*window.slices(self.tile.window), 2)].astype(np.float32)
+
+
+class Layer(Protocol):
+    """What gives colours to a part of a view."""
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """What it reads."""
+        ...
+
+    def paint(self, scene: Scene, under: Colours) -> tuple[Colours, NDArray[np.bool_]]:
+        """Colours with its own over those `under` it, and where it has any."""
+        ...
+
+
+@dataclass(frozen=True)
+class Shade:
+    """Light on the terrain: alone a hillshade, over other content it darkens and lightens that."""
+
+    light: Light
+    strength: float
+    first: bool
+    files: tuple[Path, ...] = ()
+
+    def paint(self, scene: Scene, under: Colours) -> tuple[Colours, NDArray[np.bool_]]:
+        """See `Layer`."""
+        there, light = scene.seen.owner >= 0, illumination(scene.seen.normal, self.light)
+        if self.first:
+            return np.broadcast_to(255 * light, under.shape).astype(np.float32), there
+        return shaded(under, light, self.light.level, self.strength), there
+
+
+@dataclass(frozen=True)
+class Tint:
+    """Colours by height, or by slope."""
+
+    ramp: Ramp
+    slope: bool = False
+    files: tuple[Path, ...] = ()
+
+    def paint(self, scene: Scene, under: Colours) -> tuple[Colours, NDArray[np.bool_]]:
+        """See `Layer`."""
+        seen = scene.seen
+        values = np.degrees(np.arccos(np.clip(seen.normal[..., 2], 0, 1))) if self.slope else seen.XYZ[..., 2]
+        return self.ramp(values.astype(np.float32)), seen.owner >= 0
+
+
+@dataclass(frozen=True, eq=False)
+class Resampled:
+    """Images that are resampled by the engine: a raster on the map, or photos, of which each pixel takes the best."""
+
+    sources: tuple[Source, ...]
+    files: tuple[Path, ...]
+    span: tuple[float, float]
+    """Values that become black and white."""
+    photos: bool
+
+    def paint(self, scene: Scene, under: Colours) -> tuple[Colours, NDArray[np.bool_]]:
+        """See `Layer`."""
+        rule = AnchorRule.of(scene.kernel, 0.02)
+        rows, window = tuple(range(len(self.sources))), scene.tile.window
+        owners = None
+        if self.photos:
+            owner = best_photos([source.camera for source in self.sources], scene.seen, scene.surface)
+            owners = _Given(window, owner)
+        tiles = Tiles(window, max(window.width, window.height), np.zeros(1, np.uint32), rows)
+        plan = ProductPlan("view", tuple(map(str, rows)), scene.target, rule, tiles, owners)
+        painted = render(plan, Tile(0, window, rows), self.sources, scene, scene.kernel)
+        if painted.values is None or painted.valid is None:
+            return under, np.zeros(under.shape[1:], bool)
+        colours = painted.values[[0, 1, 2] if len(painted.values) >= 3 else [0, 0, 0]].astype(np.float32)
+        if self.span != (0.0, 255.0):
+            colours = np.clip((colours - self.span[0]) * (255 / (self.span[1] - self.span[0])), 0, 255)
+        return colours.astype(np.float32), painted.valid
+
+
+@dataclass(frozen=True, eq=False)
+class _Given:
+    """Owners of the pixels of a window."""
+
+    window: Window
+    owner: NDArray[np.uint16]
+
+    def share(self, ground: TileGround, cameras: Mapping[int, Projection], surface: Surface) -> Share:
+        """See `Ownership`."""
+        return Share(self.owner[ground.window.slices(self.window)])
+
+
+def best_photos(cameras: Sequence[Any], seen: Seen, surface: SeenSurface) -> NDArray[np.uint16]:
+    """The camera, counted from one, that sees the ground of each pixel best; 0: none sees it.
+
+    Best is the one that is nearest, counted in its own pixels: the pixel in its middle, at that distance, is smallest.
+
+    Parameters
+    ----------
+    cameras : sequence of FrameCamera or WarpedCamera
+    seen : Seen
+        Shape (height, width, …).
+    surface : SeenSurface
+        What may be in the way.
+    """
+    shape = seen.owner.shape
+    there = np.flatnonzero(seen.owner.ravel() >= 0)
+    flat = {name: getattr(seen, name).reshape(-1, 3)[there] for name in ("XYZ", "normal")}
+    targets = [ViewTarget.of_camera(camera) for camera in cameras]
+    size = np.full((len(cameras), len(there)), np.inf)
+    places: list[NDArray[np.float64]] = []
+    for row, target in enumerate(targets):
+        uvh = target.to_view(flat["XYZ"])
+        places.append(uvh)
+        half = np.array(target.bundle.size) / 2
+        inside = (uvh[:, 2] > 0) & (np.abs(uvh[:, :2] + 0.5 - half) < half).all(axis=1)
+        # By the distance alone: sizes on slopes change from mesh to mesh, and each photo shall paint a region.
+        way = target.center - flat["XYZ"][inside]
+        faces = (flat["normal"][inside] * way).sum(axis=1) > 0
+        middle = pixel_size(target, np.append(half - 0.5, 1.0))
+        size[row, inside] = np.where(faces, middle * np.linalg.norm(way, axis=1), np.inf)
+    asked = np.zeros(size.shape, bool)
+    while True:
+        best = np.argmin(size, axis=0)
+        open_ = np.isfinite(size[best, np.arange(len(there))]) & ~asked[best, np.arange(len(there))]
+        if not open_.any():
+            break
+        for row in np.unique(best[open_]).tolist():
+            at = np.flatnonzero(open_ & (best == row))
+            uvh = places[row][at]
+            found = surface.at(targets[row], uvh[:, :2]).uvh[:, 2]
+            asked[row, at] = True
+            size[row, at[found < uvh[:, 2] * (1 - _SAME)]] = np.inf
+    owner = np.zeros(shape, np.uint16)
+    seen_by = np.isfinite(size.min(axis=0, initial=np.inf))
+    owner.reshape(-1)[there[seen_by]] = best[seen_by] + 1
+    return owner
+
+
+def illumination(normal: NDArray[np.float64], light: Light) -> NDArray[np.float32]:
+    """Light on a matt surface with these normals, 0 to 1; NaN where there is none."""
+    n = normal * (light.exaggeration, light.exaggeration, 1.0)
+    sun = light.directions[0]
+    return np.asarray(np.clip(n @ sun / np.linalg.norm(n, axis=-1), 0, None), np.float32)
+
+
+def open_layers(
+    requests: Sequence[ContentRequest], ground: ViewGround, light: Light, heights: tuple[float, float]
+) -> tuple[Layer, ...]:
+    """Contents, ready to paint.
+
+    Parameters
+    ----------
+    requests
+    ground
+    light
+        For shades.
+    heights : (float, float)
+        Of what is seen, for tints whose range is not stated.
+
+    Raises
+    ------
+    InputError
+        A file cannot be used, or lies nowhere.
+    UsageError
+        A ramp is unknown, or there is no such photo.
+    """
+    return tuple(_layer(request, k == 0, ground, light, heights) for k, request in enumerate(requests))
+
+
+def _layer(
+    request: ContentRequest, first: bool, ground: ViewGround, light: Light, heights: tuple[float, float]
+) -> Layer:
+    if request.kind == "shade":
+        return Shade(light, request.opacity, first)
+    if request.kind == "slope":
+        return Tint(SLOPES, slope=True)
+    if request.kind == "tint":
+        return Tint(_ramp(request.value, heights))
+    if request.kind == "raster":
+        return _raster(Path(request.value), ground)
+    project = ground.named
+    names = project.select([request.value] if request.kind == "photo" else None)
+    names = [name for name in names if project.image(name).center is not None]
+    scenes = [open_scene(project, name) for name in names]
+    if not scenes or any(not isinstance(s.camera, FrameCamera | WarpedCamera) for s in scenes):
+        raise InputError("photos as content need oriented images of frame cameras; the project has others")
+    kinds = {(s.reader.bands, s.reader.dtype) for s in scenes}
+    if len(kinds) > 1:
+        raise InputError("photos of one content have the same bands and type of pixels; choose one with photo:NAME")
+    sources = tuple(Source(s.camera, s.reader) for s in scenes)
+    return Resampled(sources, tuple(s.reader.path for s in scenes), _span(scenes[0].reader), photos=True)
+
+
+def _ramp(text: str, heights: tuple[float, float]) -> Ramp:
+    name, *span = text.split(":") if text else ["hypsometric"]
+    if name not in RAMPS or len(span) not in (0, 2):
+        raise UsageError(f"tint {text!r}; give tint, tint:RAMP or tint:RAMP:LOW:HIGH with RAMP of {', '.join(RAMPS)}")
+    try:
+        low, high = (float(v) for v in span) if span else heights
+    except ValueError:
+        raise UsageError(f"tint {text!r}: heights of the ramp are two numbers, metres") from None
+    return built_in_ramp(name, low, high)
+
+
+def _raster(path: Path, ground: ViewGround) -> Layer:
+    reader = RasterReader(path)
+    placement = placement_of(reader.info)
+    if placement.transform is None:
+        raise InputError(f"{path}: lies nowhere (no georeference); a content is a raster on the map, or photo:NAME")
+    crs = placement.crs or ground.crs
+    carry = None if same_crs(crs, ground.crs) else crs_step(ground.crs, crs, ground.bounds)
+    if placement.crs is None:
+        raise InputError(f"{path}: no CRS; it is not guessed. That of the terrain is {crs_label(ground.crs)}")
+    source = Source(MapProjection(placement, carry), reader)
+    return Resampled((source,), (reader.path,), _span(reader), photos=False)
+
+
+def _span(reader: Reader) -> tuple[float, float]:
+    """Values that become black and white: all of a byte, else from the second to the ninety-eighth percentile."""
+    if reader.dtype == np.uint8:
+        return 0.0, 255.0
+    level = max(0, math.ceil(math.log2(max(reader.size) / _LOOKED)))
+    values, valid = reader.read(Window(0, 0, *level_size(reader.size, level)), level)
+    known = values[:, valid] if valid is not None else values.reshape(len(values), -1)
+    known = known[np.isfinite(known)]
+    low, high = np.percentile(known, _PERCENT) if known.size else (0.0, 1.0)
+    return float(low), float(max(high, low + 1e-9))

@@ -1,0 +1,82 @@
+"""What a view is of: the ground of a project, or a terrain model alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from photoplan.errors import InputError, UsageError
+from photoplan.io.project.file import load_project
+from photoplan.io.project.model import Project
+from photoplan.project.ground import ground_of
+from photoplan.project.open_terrain import open_terrain
+from photoplan.project.scene import input_files
+from photoplan.surfaces.base import Terrain
+from photoplan.surfaces.objects import ObjectSurface, painted_surface
+
+
+@dataclass(frozen=True, eq=False)
+class ViewGround:
+    """Terrain, and the project that it belongs to if there is one."""
+
+    terrain: Terrain
+    """With the objects that are painted."""
+    bounds: tuple[float, float, float, float] | None
+    """Outer edges of the terrain; None: it has no end."""
+    crs: str
+    height_system: str | None
+    """That of all heights; None: not stated."""
+    project: Project | None
+    files: tuple[Path, ...]
+    """That decide the ground."""
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Names of the objects, by their numbers from one."""
+        return self.terrain.faces.names if isinstance(self.terrain, ObjectSurface) else ()
+
+    @property
+    def named(self) -> Project:
+        """The project.
+
+        Raises
+        ------
+        UsageError
+            There is only a terrain model.
+        """
+        if self.project is None:
+            raise UsageError("a terrain model has no images; give a project, or a standpoint `position`")
+        return self.project
+
+
+def open_view_ground(path: Path, crs: str | None = None) -> ViewGround:
+    """The ground of a project file (``.toml``) or of a terrain model.
+
+    Parameters
+    ----------
+    path : Path
+    crs : str, optional
+        CRS of a terrain model that does not state its own.
+
+    Raises
+    ------
+    InputError
+        The file cannot be used.
+    """
+    if path.suffix.lower() != ".toml":
+        model = open_terrain(path, crs, "with `crs` EPSG:nnnn")
+        return ViewGround(model.surface, model.bounds, model.crs, model.height_system, None, (model.path,))
+    if not path.is_file():
+        raise InputError(f"{path}: is no file; give a project.toml or a terrain model")
+    project = load_project(path)
+    ground = ground_of(project)
+    images = {project.resolve(image.file) for image in project.images}
+    files = [file for file in input_files(project) if file not in images and file.is_file()]
+    return ViewGround(
+        terrain=painted_surface(ground.surface),
+        bounds=ground.bounds,
+        crs=project.crs,
+        height_system=ground.working_system,
+        project=project,
+        files=tuple(dict.fromkeys([path, *files])),
+    )

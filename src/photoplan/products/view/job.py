@@ -1,0 +1,266 @@
+"""A tile of a view: what its pixels show, and its colours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.engine.run import Made, Output, Tally
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.grid import Window
+from photoplan.io.fingerprint import fingerprint
+from photoplan.io.matrix_file import MatrixFile
+from photoplan.plan.tiles import Tile
+from photoplan.products.view.camera import CameraRequest, view_camera
+from photoplan.products.view.content import Colours, ContentRequest, Layer, Scene, open_layers
+from photoplan.products.view.ground import ViewGround, open_view_ground
+from photoplan.surfaces.rays import Hits
+from photoplan.surfaces.seen import Seen, SeenSurface, ground_size
+from photoplan.targets.view import Bundle, ViewTarget
+from photoplan.terrain.shading import Light
+
+#: Places of shadows are lifted by this, metres, and part of their distance from the eye.
+_LIFT, _LIFT_PART = 0.02, 1e-6
+
+Colour = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class LookRequest:
+    """How a view looks."""
+
+    contents: tuple[ContentRequest, ...] = (ContentRequest("tint"), ContentRequest("shade", "", 0.8))
+    azimuth: float = 315.0
+    """Of the sun, degrees clockwise from grid north."""
+    altitude: float = 45.0
+    """Of the sun above the horizon, degrees."""
+    shadows: bool = False
+    """Whether terrain and objects cast shadows."""
+    haze: float = 0.0
+    """Coefficient α of eq. 5.8 of Ecker 1991, per kilometre."""
+    haze_colour: Colour = (200, 210, 222)
+    """The brightness of the horizon in that equation."""
+    sky: Colour = (186, 212, 238)
+    nodata: Colour = (214, 214, 214)
+    """Ground that no content shows."""
+    samples: int = 2
+    """Rays along each side of a pixel, of which its colour is the mean."""
+    kernel: str = "bicubic"
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.haze <= 100:
+            raise UsageError(f"`haze` {self.haze} per kilometre; 0 to 100 are allowed, 0.1 is much")
+        if not 1 <= self.samples <= 8:
+            raise UsageError(f"`samples` {self.samples}; 1 to 8 rays along each side of a pixel are allowed")
+        for name in ("haze_colour", "sky", "nodata"):
+            if not all(0 <= v <= 255 for v in getattr(self, name)):
+                raise UsageError(f"`{name}` {getattr(self, name)}; red, green and blue from 0 to 255 are needed")
+        Light(self.azimuth, self.altitude)
+
+
+@dataclass(frozen=True)
+class ViewAddress:
+    """All that a worker needs to make tiles of a view: small, hashable, pickles."""
+
+    source: str
+    """Project or terrain model."""
+    crs: str | None
+    camera: CameraRequest
+    look: LookRequest
+    heights: tuple[float, float]
+    """Of what is seen, for tints."""
+    farthest: float
+    bound: float
+    matrix: str | None
+    digests: tuple[tuple[str, str], ...]
+    """Path and content digest of each input file."""
+
+    def open(self) -> OpenView:
+        """The view; kept for the next tile.
+
+        Raises
+        ------
+        InputError
+            An input has changed since it was planned.
+        """
+        return _open(self)
+
+
+@dataclass(frozen=True, eq=False)
+class OpenView:
+    """A view, ready to be made."""
+
+    target: ViewTarget
+    surface: SeenSurface
+    layers: tuple[Layer, ...]
+    light: Light
+    matrix: MatrixFile | None
+
+
+@lru_cache(maxsize=4)
+def _open(address: ViewAddress) -> OpenView:
+    for path, digest in address.digests:
+        if fingerprint(path).digest != digest:
+            raise InputError(f"{path}: has changed since the run was planned; run it again")
+    ground = open_view_ground(Path(address.source), address.crs)
+    camera = view_camera(address.camera, ground, force=True)
+    light = Light(address.look.azimuth, address.look.altitude, camera.request.exaggeration)
+    layers = open_layers(address.look.contents, ground, light, address.heights)
+    matrix = None if address.matrix is None else MatrixFile(Path(address.matrix))
+    return OpenView(camera.target, seen_surface(ground, address.farthest, address.bound), layers, light, matrix)
+
+
+def seen_surface(ground: ViewGround, farthest: float, bound: float) -> SeenSurface:
+    """The ground as the surface of views."""
+    return SeenSurface(ground.terrain, ground.bounds, farthest, bound)
+
+
+@dataclass(frozen=True, eq=False)
+class _Finer:
+    """A bundle with n × n pixels for each."""
+
+    bundle: Bundle
+    n: int
+    size: tuple[int, int] = field(init=False)
+    center: NDArray[np.float64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        width, height = self.bundle.size
+        object.__setattr__(self, "size", (width * self.n, height * self.n))
+        object.__setattr__(self, "center", self.bundle.center)
+
+    def directions(self, uv: ArrayLike) -> NDArray[np.float64]:
+        return self.bundle.directions((np.asarray(uv, float) + 0.5) / self.n - 0.5)
+
+    def pixels(self, XYZ: ArrayLike) -> NDArray[np.float64]:
+        out = self.bundle.pixels(XYZ)
+        out[..., :2] = (out[..., :2] + 0.5) * self.n - 0.5
+        return out
+
+
+@dataclass(frozen=True)
+class ViewJob:
+    """What a worker is told once of a view."""
+
+    address: ViewAddress
+    matrix: bool = False
+    """Whether tiles are those of the coordinate matrix, or of the picture."""
+
+    def __call__(self, tile: Tile) -> Made:
+        """Colours or ground of a tile, and counts of its pixels."""
+        view = self.address.open()
+        if self.matrix:
+            seen = view.surface.look(view.target, tile.window)
+            return Made((matrix_bands(view.target, seen),), _counts(view.target, seen))
+        n, window = (1 if view.matrix else self.address.look.samples), tile.window
+        picture, tally = np.empty((3, window.height, window.width), np.uint8), Tally()
+        target = view.target if n == 1 else replace(view.target, bundle=_Finer(view.target.bundle, n))
+        for part in window.tiles(-(-max(window.width, window.height) // n)):
+            fine = Window(part.col * n, part.row * n, part.width * n, part.height * n)
+            seen = view.surface.look(target, fine) if view.matrix is None else from_matrix(view, fine)
+            scene = Scene(target, Tile(tile.index, fine), seen, view.surface, self.address.look.kernel)
+            colours = colours_of(scene, view, self.address.look)
+            means = colours.reshape(3, part.height, n, part.width, n).mean(axis=(2, 4))
+            at = part.slices(window)
+            picture[:, at[0], at[1]] = np.clip(np.rint(means), 0, 255)
+            tally.add(_counts(target, seen))
+        return Made(((picture, None),), tally.totals)
+
+
+def colours_of(scene: Scene, view: OpenView, look: LookRequest) -> Colours:
+    """Colours of a part of a view: contents one over the other, shadows, haze, sky."""
+    seen = scene.seen
+    out = np.empty((3, *seen.owner.shape), np.float32)
+    out[:] = np.array(look.nodata, np.float32)[:, None, None]
+    for k, (request, layer) in enumerate(zip(look.contents, view.layers)):
+        over, there = layer.paint(scene, out)
+        opacity = np.float32(1.0 if request.kind == "shade" and k else request.opacity)
+        out = np.where(there, out + opacity * (over - out), out)
+    if look.shadows:
+        dark = in_shadow(scene, view.light)
+        out = np.where(dark, out * 0.45, out)
+    if look.haze:
+        out = hazy(out, scene.target.distance(seen.uvh), look.haze, look.haze_colour)
+    sky = np.array(look.sky, np.float32)[:, None, None]
+    return np.where(seen.owner >= 0, out, sky).astype(np.float32)
+
+
+def hazy(colours: Colours, distance: NDArray[np.float64], alpha: float, horizon: Colour) -> Colours:
+    """Colours at a distance, metres, through haze (Ecker 1991, eq. 5.8, after Kuhn 1989); α per kilometre."""
+    left = np.exp(-alpha * np.nan_to_num(distance) / 1000).astype(np.float32)
+    return np.asarray(colours * left + np.array(horizon, np.float32)[:, None, None] * (1 - left))
+
+
+def in_shadow(scene: Scene, light: Light) -> NDArray[np.bool_]:
+    """Pixels whose ground looks away from the sun, or that something stands before."""
+    seen, sun = scene.seen, light.directions[0]
+    dark = seen.normal @ sun <= 0
+    ask = np.flatnonzero((~dark & (seen.owner >= 0)).ravel())
+    start = seen.XYZ.reshape(-1, 3)[ask]
+    start = start + np.array([0, 0, 1.0]) * (_LIFT + _LIFT_PART * scene.target.distance(seen.uvh).ravel()[ask, None])
+    surface = scene.surface
+    away = 50_000.0
+    if surface.bounds is not None:
+        xmin, ymin, xmax, ymax = surface.bounds
+        away = float(np.hypot(xmax - xmin, ymax - ymin))
+    length = min(away / max(float(np.hypot(sun[0], sun[1])), 1e-6), 20_000 / max(float(sun[2]), 1e-6))
+    hits: Hits = surface.terrain.first_hit(np.stack([start, start + length * sun], axis=1))
+    dark.ravel()[ask[np.isfinite(hits.along)]] = True
+    return np.asarray(dark)
+
+
+def matrix_bands(target: ViewTarget, seen: Seen) -> Output | None:
+    """Bands of `io.matrix_file`, float64, and where there is ground; None: only sky."""
+    there = seen.owner >= 0
+    if not there.any():
+        return None
+    bands = np.stack(
+        [
+            *np.moveaxis(seen.XYZ, -1, 0),
+            target.distance(seen.uvh),
+            np.degrees(seen.incidence),
+            ground_size(target, seen),
+            seen.owner,
+            *np.moveaxis(seen.normal[..., :2], -1, 0),
+        ]
+    )
+    bands[4:, there] = np.nan_to_num(bands[4:, there])
+    return bands, there
+
+
+def from_matrix(view: OpenView, window: Window) -> Seen:
+    """What pixels show, as a coordinate matrix has it."""
+    assert view.matrix is not None
+    bands = view.matrix.read(window)
+    XYZ = np.moveaxis(bands[:3], 0, -1)
+    v, u = np.mgrid[window.row : window.stop[1], window.col : window.stop[0]].astype(float)
+    uvh = np.stack([u, v, view.target.to_view(XYZ)[..., 2]], axis=-1)
+    level = np.moveaxis(bands[7:9], 0, -1)
+    up = np.sqrt(np.clip(1 - (level**2).sum(axis=-1), 0, None))
+    way = view.target.center - XYZ
+    there = np.isfinite(XYZ[..., 2])
+    with np.errstate(invalid="ignore"):
+        towards = way / np.linalg.norm(way, axis=-1, keepdims=True)
+    return Seen(
+        XYZ=XYZ,
+        uvh=uvh,
+        normal=np.concatenate([level, up[..., None]], axis=-1),
+        towards=towards,
+        owner=np.where(there, np.nan_to_num(bands[6]), -1).astype(np.int64),
+        below=np.zeros(there.shape, bool),
+    )
+
+
+def _counts(target: ViewTarget, seen: Seen) -> dict[str, Any]:
+    """Figures of a tile, to be added up."""
+    there = seen.owner >= 0
+    figures: dict[str, Any] = {"pixels": there.size, "ground": int(there.sum()), "below": int(seen.below.sum())}
+    if there.any():
+        away = target.distance(seen.uvh[there])
+        figures |= {"worst_distance": float(away.max()), "worst_nearness": -float(away.min())}
+    return figures

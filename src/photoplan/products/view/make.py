@@ -1,0 +1,360 @@
+"""Make views: pictures and coordinate matrices, with what can be said of them before."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from photoplan import __version__
+from photoplan.engine.cluster import Question
+from photoplan.engine.executors import open_workers
+from photoplan.engine.run import Runner, Tally, Work
+from photoplan.errors import GeometryError, InputError, UsageError
+from photoplan.io.disk import make_folder
+from photoplan.io.image_form import ImageForm
+from photoplan.io.matrix_file import BANDS, MatrixFile
+from photoplan.io.naming import together
+from photoplan.io.product import DESCRIPTION, ProductFile, check_output
+from photoplan.io.run_record import input_entry, run_key, versions, write_run_record
+from photoplan.io.storage import PICTURES
+from photoplan.plain import json_text, pick, plain
+from photoplan.plan.tiles import Tiles
+from photoplan.products.run import Run, clock, refuse_inputs
+from photoplan.products.view.camera import CameraRequest, ViewCamera, view_camera
+from photoplan.products.view.content import open_layers
+from photoplan.products.view.ground import ViewGround, open_view_ground
+from photoplan.products.view.job import LookRequest, ViewAddress, ViewJob, seen_surface
+from photoplan.surfaces.seen import SeenSurface
+from photoplan.targets.view import ViewTarget
+from photoplan.terrain.shading import Light
+
+TILE = 512
+#: Rays along the longer side of a picture that are looked at before it is made.
+_FIRST_LOOK = 64
+
+
+@dataclass(frozen=True)
+class ViewRequest:
+    """What is asked."""
+
+    source: Path
+    """Project file or terrain model."""
+    camera: CameraRequest | None
+    """None: that of `matrix`."""
+    output: Path | None = None
+    """The picture (``.png``, ``.jpg`` or ``.tif``), or the matrix (``.tif``); None: nothing is written."""
+    look: LookRequest = field(default_factory=LookRequest)
+    kind: str = "picture"
+    """`picture` or `matrix`."""
+    matrix: Path | None = None
+    """A coordinate matrix of the same view: nothing is looked for again."""
+    farthest: float = math.inf
+    """Beyond this distance nothing is seen, metres."""
+    bound: float = 0.01
+    """Largest error of ground coordinates across the line of sight, metres."""
+    crs: str | None = None
+    """CRS of a terrain model that does not state it."""
+    force: bool = False
+    """Also where the point of view lies below the ground."""
+
+
+@dataclass(frozen=True)
+class FirstLook:
+    """What a few rays tell of a view."""
+
+    ground: float
+    """Share of pixels that show ground, 0 to 1."""
+    nearest: float | None
+    farthest: float | None
+    """Distances of ground, metres; None: there is none."""
+    lowest: float | None
+    highest: float | None
+    """Heights of ground, metres."""
+    pixel: float | None
+    """Median size of a pixel on the ground, across the line of sight, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewPlan:
+    """A view before its pixels."""
+
+    request: ViewRequest
+    camera: ViewCamera
+    first: FirstLook
+    address: ViewAddress
+    key: str
+
+    @property
+    def field_of_view(self) -> tuple[float, float]:
+        """Angles between the middles of opposite sides of the picture, degrees."""
+        bundle = self.camera.target.bundle
+        (w, h), panorama = bundle.size, self.camera.request.panorama is not None
+        if panorama:
+            return (self.camera.request.field_of_view or 360.0, math.nan)
+        edges = np.array([(-0.5, (h - 1) / 2), (w - 0.5, (h - 1) / 2), ((w - 1) / 2, -0.5), ((w - 1) / 2, h - 0.5)])
+        d = bundle.directions(edges)
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        across, along = (float(np.degrees(np.arccos(np.clip(d[k] @ d[k + 1], -1, 1)))) for k in (0, 2))
+        return across, along
+
+    def json_fields(self) -> dict[str, Any]:
+        """What will be seen."""
+        return {
+            **self.camera.json_fields(),
+            "size": list(self.camera.target.bundle.size),
+            "field_of_view_deg": list(self.field_of_view),
+            "farthest_m": self.request.farthest,
+            "error_bound_m": self.request.bound,
+            "expected": self.first,
+        }
+
+
+@dataclass(frozen=True)
+class ViewResult:
+    """What came out."""
+
+    path: Path
+    size: tuple[int, int]
+    sky: int
+    """Pixels that show no ground (of a picture with several rays to a pixel: rays)."""
+    rays: int
+    below: int
+    """Rays that are sky because they ended below the ground."""
+    nearest: float | None
+    farthest: float | None
+    """Distances of ground, metres."""
+    resumed: int
+    """Tiles of an earlier run."""
+    seconds: float
+
+    def json_fields(self) -> dict[str, Any]:
+        """Counts of rays."""
+        counts = pick(self, "rays", sky_rays="sky", rays_below_ground="below")
+        return {**pick(self, "path", "size", nearest_m="nearest", farthest_m="farthest"), **counts,
+                **pick(self, "seconds", resumed_tiles="resumed")}  # fmt: skip
+
+
+def plan_view(request: ViewRequest) -> ViewPlan:
+    """Put the camera on the ground and look what it will see; nothing is written.
+
+    Raises
+    ------
+    UsageError
+        The output exists or is an input, or a choice makes no sense.
+    InputError
+        A file cannot be used.
+    GeometryError
+        The point of view lies below the ground, or sees none of it.
+    """
+    ground = open_view_ground(request.source, request.crs)
+    camera = view_camera(camera_request(request), ground, request.force)
+    _check_driver(request)
+    surface = seen_surface(ground, request.farthest, request.bound)
+    first = first_look(camera.target, surface)
+    if first.ground == 0 and not request.force:
+        raise GeometryError(_sees_nothing(camera, ground))
+    heights = (0.0, 1.0) if first.lowest is None or first.highest is None else _rounded(first.lowest, first.highest)
+    contents = () if request.kind == "matrix" else request.look.contents
+    light = Light(request.look.azimuth, request.look.altitude, camera.request.exaggeration)
+    layers = open_layers(contents, ground, light, heights)
+    matrix = None if request.matrix is None else _fitting(request.matrix, camera)
+    files = dict.fromkeys([*ground.files, *(f for each in layers for f in each.files)])
+    files |= {} if matrix is None else {matrix: None}
+    inputs = [input_entry(path) for path in files]
+    address = ViewAddress(
+        source=str(request.source.resolve()),
+        crs=request.crs,
+        camera=camera.request,
+        look=replace(request.look, contents=contents),
+        heights=heights,
+        farthest=request.farthest,
+        bound=request.bound,
+        matrix=None if matrix is None else str(matrix.resolve()),
+        digests=tuple((str(Path(each["path"]).resolve()), each["sampled_sha256"]) for each in inputs),
+    )
+    told = [camera.request, _look_facts(address.look), heights, request.farthest, request.bound, TILE]
+    return ViewPlan(request, camera, first, address, run_key(f"view {request.kind}", told, inputs))
+
+
+def camera_request(request: ViewRequest) -> CameraRequest:
+    """The camera that is stated, or that of the matrix.
+
+    Raises
+    ------
+    UsageError
+        There is neither.
+    InputError
+        The matrix does not say it.
+    """
+    if request.camera is not None:
+        return request.camera
+    if request.matrix is None:
+        raise UsageError("a view needs one `camera`: an image of the project, or a standpoint `position` X Y")
+    try:
+        values = json.loads(MatrixFile(request.matrix).description)["camera"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{request.matrix}: does not say which view it is of; make it again") from error
+    return CameraRequest.from_dict(values, str(request.matrix))
+
+
+def _fitting(path: Path, camera: ViewCamera) -> Path:
+    """A matrix, if it is of this view."""
+    file = MatrixFile(path)
+    stated = json.loads(file.description).get("camera")
+    if file.info.size != camera.target.bundle.size or stated != plain(camera.json_fields()["camera"]):
+        raise InputError(f"{path}: is of another view; leave out the camera to take that of the matrix")
+    return path
+
+
+def _look_facts(look: LookRequest) -> dict[str, Any]:
+    """What decides colours: of files the content counts, which is among the inputs."""
+    contents = [(each.kind, "" if each.kind == "raster" else each.value, each.opacity) for each in look.contents]
+    return {**vars(look), "contents": contents}
+
+
+def _check_driver(request: ViewRequest) -> None:
+    if request.output is None:
+        return
+    suffix = request.output.suffix.lower()
+    allowed = (".tif", ".tiff") if request.kind == "matrix" else (*PICTURES, ".tif", ".tiff")
+    if suffix not in allowed:
+        raise UsageError(f"{request.output}: a {request.kind} is written as {', '.join(allowed)}")
+
+
+def first_look(target: ViewTarget, surface: SeenSurface) -> FirstLook:
+    """What some rays over the whole picture meet."""
+    width, height = target.bundle.size
+    step = max(1.0, max(width, height) / _FIRST_LOOK)
+    u, v = (np.arange((side % step) / 2 if side > step else 0.0, side, step) for side in (width, height))
+    uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    seen = surface.at(target, uv)
+    there = seen.owner >= 0
+    if not there.any():
+        return FirstLook(0.0, None, None, None, None, None)
+    away, Z = target.distance(seen.uvh[there]), seen.XYZ[there, 2]
+    beside = target.bundle.directions(uv[there] + (1.0, 0.0)) - target.bundle.directions(uv[there])
+    pixel = np.median(np.abs(seen.uvh[there, 2]) * np.linalg.norm(beside, axis=1))
+    return FirstLook(
+        ground=float(there.mean()),
+        nearest=float(away.min()),
+        farthest=float(away.max()),
+        lowest=float(Z.min()),
+        highest=float(Z.max()),
+        pixel=float(pixel),
+    )
+
+
+def _rounded(low: float, high: float) -> tuple[float, float]:
+    """Heights of a ramp, rounded outwards to a tenth of their range."""
+    step = 10 ** math.floor(math.log10(max(high - low, 1.0)))
+    return math.floor(low / step) * step, math.ceil(high / step + 1e-9) * step
+
+
+def _sees_nothing(camera: ViewCamera, ground: ViewGround) -> str:
+    x, y, z = camera.target.center
+    b = ground.bounds
+    covered = "everywhere" if b is None else f"{b[0]:.0f} {b[1]:.0f} {b[2]:.0f} {b[3]:.0f}"
+    return (
+        f"from {x:.2f} {y:.2f} {z:.2f} no ground is seen; the terrain is {covered}. Check position, height and "
+        "direction (or say `force` for a picture of the sky)"
+    )
+
+
+def make_view(plan: ViewPlan, run: Run) -> ViewResult:
+    """Make the picture or the matrix of a plan; a run that was killed is continued by the same request.
+
+    Raises
+    ------
+    UsageError
+        The output exists or is an input.
+    RunLocked
+        Another run is writing it.
+    TilesFailed
+        A tile failed again and again; nothing stays under the name then.
+    ResourceError
+        Disk or memory ran out.
+    """
+    path, request = plan.request.output, plan.request
+    assert path is not None
+    run.check()
+    refuse_inputs([Path(each) for each, _ in plan.address.digests], [path])
+    check_output(path, [each for each, _ in plan.address.digests], overwrite=run.overwrite)
+    make_folder(path.parent)
+    target, is_matrix = plan.camera.target, request.kind == "matrix"
+    file = ProductFile(
+        path,
+        target.placement,
+        len(BANDS) if is_matrix else 3,
+        np.dtype(np.float64 if is_matrix else np.uint8),
+        run_key=plan.key,
+        nodata="auto" if is_matrix else "mask",
+        overviews=False,
+        tile=TILE,
+        overwrite=run.overwrite,
+        inputs=[each for each, _ in plan.address.digests],
+        threads=run.workers,
+        driver=PICTURES.get(path.suffix.lower(), "COG"),
+        form=ImageForm(descriptions=tuple(n for n, _ in BANDS), units=tuple(u for _, u in BANDS))
+        if is_matrix
+        else None,
+    )
+    tiles = Tiles.every(target.window, TILE)
+    run.events.begin(path.name, len(tiles))
+    question = Question(versions, tuple(each for each, _ in plan.address.digests), str(path.parent.resolve()))
+    with open_workers(run.executor, run.workers, question, run.events) as workers, together():
+        work = Work(
+            name=path.stem,
+            job=ViewJob(plan.address, is_matrix),
+            tiles=tiles,
+            count=len(tiles),
+            sinks=(file,),
+            complete=partial(_complete, plan, file, run, clock(workers)),
+            scratch=path.with_name(f".{path.name}.parcels"),
+        )
+        (result,) = Runner[ViewResult](workers, run.in_flight(workers.threads), run.events).run([work])
+    return result
+
+
+def _complete(
+    plan: ViewPlan, file: ProductFile, run: Run, times: Callable[[], dict[str, Any]], tally: Tally
+) -> ViewResult:
+    tally.check(file.path)
+    facts = plan.json_fields()
+    told = {name: facts[name] for name in ("standpoint", "camera", "earth_radius", "bend_per_metre", "error_bound_m")}
+    tags = {
+        "PHOTOPLAN_VERSION": __version__,
+        "PHOTOPLAN_KEY": plan.key,
+        DESCRIPTION: json_text(told, "view", indent=None),
+    }
+    made = file.complete(tags)
+    ran, totals = times(), tally.totals
+    result = ViewResult(
+        path=file.path,
+        size=plan.camera.target.bundle.size,
+        sky=totals["pixels"] - totals["ground"],
+        rays=totals["pixels"],
+        below=totals["below"],
+        nearest=-totals["worst_nearness"] if "worst_nearness" in totals else None,
+        farthest=totals.get("worst_distance"),
+        resumed=tally.resumed,
+        seconds=ran["seconds"],
+    )
+    write_run_record(
+        file.path,
+        key=plan.key,
+        inputs=[input_entry(path, digest) for path, digest in plan.address.digests],
+        run={"workers": run.workers, "executor": run.executor, "memory": run.memory, **ran},
+        kind=f"view {plan.request.kind}",
+        product=result,
+        settings={"look": plan.address.look, "farthest": plan.request.farthest},
+        view=plan,
+        bytes=made.bytes,
+    )
+    return result

@@ -1,0 +1,242 @@
+"""Views: pictures and matrices of a small block, contents, cameras, what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from tools.command import inside
+from tools.small_block import SIZE, X0, Y0, Block, write_block
+
+from photoplan.errors import GeometryError, InputError, UsageError
+from photoplan.products.run import Run
+from photoplan.products.view.camera import CameraRequest, view_camera
+from photoplan.products.view.content import ContentRequest, best_photos
+from photoplan.products.view.ground import open_view_ground
+from photoplan.products.view.job import LookRequest, ViewAddress, hazy
+from photoplan.products.view.make import ViewPlan, ViewRequest, make_view, plan_view
+from photoplan.products.view.pick import PickRequest, pick
+
+STAND = CameraRequest(position=(X0 - 80, Y0 - 60), height=40.0, look_at=(X0 + 20, Y0 + 10), size=(60, 40))
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Block:
+    return write_block(tmp_path_factory.mktemp("views") / "block")
+
+
+def made(request: ViewRequest) -> tuple[ViewPlan, np.ndarray]:
+    plan = plan_view(request)
+    make_view(plan, Run(overwrite=True))
+    assert request.output is not None
+    with rasterio.open(request.output) as file:
+        return plan, file.read()
+
+
+def test_a_matrix_holds_ground_that_lies_in_its_pixels_on_the_terrain(small: Block, tmp_path: Path) -> None:
+    request = ViewRequest(small.terrain, STAND, tmp_path / "m.tif", kind="matrix")
+    plan, bands = made(request)
+    ground = open_view_ground(small.terrain)
+    XYZ = np.moveaxis(bands[:3], 0, -1)
+    there = np.isfinite(XYZ[..., 2])
+    assert 0.3 < there.mean() < 1 and bands.dtype == np.float64
+    np.testing.assert_allclose(ground.terrain.heights(XYZ[there][:, :2]), XYZ[there][:, 2], atol=1e-4)
+    v, u = np.nonzero(there)
+    uvh = plan.camera.target.to_view(XYZ[there])
+    np.testing.assert_allclose(uvh[:, :2], np.stack([u, v], axis=-1), atol=1e-4)
+    np.testing.assert_allclose(
+        bands[3][there], np.linalg.norm(XYZ[there] - plan.camera.target.center, axis=1), rtol=1e-5
+    )
+    assert ((bands[4][there] >= 0) & (bands[4][there] <= 90)).all() and (bands[6][there] == 0).all()
+    record = json.loads((tmp_path / "m.run.json").read_text())
+    assert (
+        record["view"]["camera"]["azimuth"] == plan.camera.request.azimuth and record["view"]["error_bound_m"] == 0.01
+    )
+    assert record["product"]["sky_rays"] == int((~there).sum())
+    with rasterio.open(tmp_path / "m.tif") as file:
+        assert file.descriptions[:3] == ("E", "N", "H") and file.units[0] == "metre" and file.crs is None
+
+
+def test_a_matrix_gives_the_picture_that_looking_again_gives(small: Block, tmp_path: Path) -> None:
+    made(ViewRequest(small.terrain, STAND, tmp_path / "m.tif", kind="matrix"))
+    look = LookRequest(
+        contents=tuple(map(ContentRequest.parse, ("tint:grey:50:150", "shade@0.7", "slope@0.2"))), samples=1
+    )
+    _, again = made(ViewRequest(small.terrain, STAND, tmp_path / "a.png", look))
+    _, kept = made(ViewRequest(small.terrain, None, tmp_path / "b.png", look, matrix=tmp_path / "m.tif"))
+    np.testing.assert_array_equal(again, kept)
+    other = CameraRequest(position=(X0, Y0), azimuth=0.0)
+    with pytest.raises(InputError, match="of another view"):
+        plan_view(ViewRequest(small.terrain, other, None, look, matrix=tmp_path / "m.tif"))
+    with pytest.raises(InputError, match="is no coordinate matrix"):
+        plan_view(ViewRequest(small.terrain, None, None, look, matrix=small.terrain))
+
+
+def test_the_orthophoto_seen_by_the_camera_that_took_it_is_its_image(small: Block, tmp_path: Path) -> None:
+    words = ["--images", "one", "--resolution", 0.8, "--no-quicklook", "--output", tmp_path]
+    assert inside("ortho", small.project, *words).code == 0
+    look = LookRequest(contents=(ContentRequest.parse(str(tmp_path / "one_ortho.tif")),), samples=1)
+    camera = CameraRequest(image="one")
+    plan, seen = made(ViewRequest(small.project, camera, tmp_path / "v.tif", look))
+    assert plan.camera.target.bundle.size == SIZE
+    with rasterio.open(small.images[0]) as file:
+        image = file.read(1).astype(float)
+    inner = np.s_[20:-20, 20:-20]
+    # Resampled twice: half a grey step of a texture whose grey values spread by more than twenty.
+    off = seen[0][inner].astype(float) - image[inner]
+    assert np.std(image[inner]) > 15 and np.median(np.abs(off)) < 2 and np.abs(off).mean() < 4
+    # The photo itself as content is the image, resampled at its own pixels.
+    look = LookRequest((ContentRequest.parse("photo:one"),), samples=1)
+    _, direct = made(ViewRequest(small.project, camera, tmp_path / "d.png", look))
+    assert np.abs(direct[0][inner].astype(float) - image[inner]).max() <= 1
+
+
+def test_each_pixel_takes_the_photo_that_shows_it_finest(small: Block, tmp_path: Path) -> None:
+    camera = CameraRequest(position=(X0 + 60, Y0), altitude=500.0, azimuth=0.0, pitch=-90.0, size=(90, 30))
+    pictures = {}
+    for what in ("photos", "photo:one", "photo:two", "photo:three"):
+        look = LookRequest((ContentRequest.parse(what),), samples=1, kernel="nearest")
+        pictures[what] = made(ViewRequest(small.project, camera, tmp_path / "p.png", look))[1][0]
+    best = pictures.pop("photos")
+    nodata = LookRequest().nodata[0]
+    ours = [(picture == best) & (picture != nodata) for picture in pictures.values()]
+    assert np.mean(np.any(ours, axis=0) | (best == nodata)) == 1
+    # The projection centres lie from west to east, 60 m apart: so do their regions.
+    plan = plan_view(ViewRequest(small.project, camera, None, LookRequest((ContentRequest.parse("photos"),))))
+    view = plan.address.open()
+    seen = view.surface.look(view.target, view.target.window)
+    (layer,) = view.layers
+    cameras = [source.camera for source in layer.sources]
+    owner = best_photos(cameras, seen, view.surface)
+    first, second, third = np.argsort([camera.center[0] for camera in cameras]) + 1
+    east = [seen.XYZ[owner == k, 0].mean() for k in (first, second, third)]
+    assert east[0] < east[1] < east[2] and (owner[seen.owner < 0] == 0).all()
+
+
+def test_a_raster_of_another_crs_lies_where_it_belongs(small: Block, tmp_path: Path) -> None:
+    """Grey values are the north-south position in UTM zone 33; the raster lies in zone 32."""
+    from photoplan.geometry.crs import crs_step
+
+    step = crs_step("EPSG:32633", "EPSG:32632", (X0 - 500, Y0 - 500, X0 + 500, Y0 + 500))
+    back = crs_step("EPSG:32632", "EPSG:32633", (0, 5_200_000, 1_000_000, 5_400_000))
+    x, y = step(np.array([X0, Y0]))
+    at = np.stack(np.meshgrid(x + np.arange(-400, 400, 2.0) + 1, y - np.arange(-400, 400, 2.0) - 1), axis=-1)
+    values = (back(at)[..., 1] - Y0).astype(np.float32)
+    profile = {"driver": "GTiff", "width": 400, "height": 400, "count": 1, "dtype": "float32", "crs": "EPSG:32632"}
+    transform = rasterio.transform.from_origin(x - 400, y + 400, 2, 2)
+    with rasterio.open(tmp_path / "north.tif", "w", transform=transform, **profile) as file:
+        file.write(values, 1)
+    look = LookRequest((ContentRequest.parse(str(tmp_path / "north.tif")),), samples=1)
+    _, bands = made(ViewRequest(small.terrain, STAND, tmp_path / "m.tif", kind="matrix"))
+    _, picture = made(ViewRequest(small.terrain, STAND, tmp_path / "p.png", look))
+    low, high = np.percentile(values, (2, 98))
+    wanted = np.clip((bands[1] - Y0 - low) * 255 / (high - low), 0, 255)
+    there = np.isfinite(wanted)
+    assert np.abs(picture[0][there] - wanted[there]).max() < 1.0
+
+
+def test_haze_follows_equation_5_8_of_ecker() -> None:
+    got = hazy(np.full((3, 1, 2), 40.0, np.float32), np.array([[0.0, 5000.0]]), 0.1, (128, 128, 128))
+    np.testing.assert_allclose(got[0, 0], [40, 40 * np.exp(-0.5) + 128 * (1 - np.exp(-0.5))], rtol=1e-6)
+
+
+def test_shadows_darken_what_the_sun_does_not_reach(small: Block, tmp_path: Path) -> None:
+    camera = CameraRequest(position=(X0, Y0), altitude=600.0, azimuth=0.0, pitch=-90.0, size=(60, 40))
+    grey = (ContentRequest.parse("tint:grey:-1000:9000"),)
+    lit, low = ({"azimuth": 90.0, "altitude": a, "shadows": True, "samples": 1} for a in (80.0, 1.0))
+    bright, dark = (
+        made(ViewRequest(small.terrain, camera, tmp_path / "s.png", LookRequest(grey, **how)))[1] for how in (lit, low)
+    )
+    share = np.mean(dark[0] < bright[0])
+    assert 0.05 < share < 0.95 and (dark[0] <= bright[0]).all()
+
+
+@pytest.mark.parametrize("changes", [{"panorama": "cylinder"}, {"panorama": "sphere"}, {"curvature": "strict"},
+                                     {"exaggeration": 2.0}, {"curvature": "none"}, {"roll": 30.0}])  # fmt: skip
+def test_a_resolved_camera_is_the_same_camera(small: Block, changes: dict) -> None:
+    """A record or matrix says in numbers what a user has said by the ground."""
+    ground = open_view_ground(small.terrain)
+    given = {**vars(STAND), **changes}
+    made_once = view_camera(CameraRequest(**given), ground)
+    again = view_camera(made_once.request, ground)
+    uvh = np.stack([*np.meshgrid(np.arange(0.0, 60, 7), np.arange(0.0, 40, 7)), np.full((6, 9), 90.0)], axis=-1)
+    np.testing.assert_allclose(again.target.to_ground(uvh), made_once.target.to_ground(uvh), atol=1e-5)
+    assert again.request == made_once.request or changes.get("curvature") == "strict"
+    middle = made_once.target.to_view(np.append(STAND.look_at, ground.terrain.heights(np.array(STAND.look_at))))
+    np.testing.assert_allclose(middle[:2], [29.5, 19.5], atol=1e-6)
+    height = 40.0
+    assert made_once.above_ground == pytest.approx(height, abs=1e-6)
+
+
+def test_what_cannot_be_seen_or_written_is_refused(small: Block, tmp_path: Path) -> None:
+    def view(camera: CameraRequest, **more: object) -> ViewPlan:
+        return plan_view(ViewRequest(small.terrain, camera, **more))  # type: ignore[arg-type]
+
+    at = {"position": (X0, Y0)}
+    with pytest.raises(GeometryError, match=r"lies .* m below the ground"):
+        view(CameraRequest(**at, altitude=0.0, azimuth=0.0))
+    with pytest.raises(GeometryError, match="no ground is seen; the terrain is"):
+        view(CameraRequest(**at, azimuth=0.0, pitch=60.0))
+    assert view(CameraRequest(**at, azimuth=0.0, pitch=60.0), force=True).first.ground == 0
+    with pytest.raises(InputError, match="no height there"):
+        view(CameraRequest(position=(0.0, 0.0), azimuth=0.0))
+    with pytest.raises(UsageError, match="has no images"):
+        view(CameraRequest(image="one"))
+    with pytest.raises(UsageError, match="is written as"):
+        view(CameraRequest(**at, azimuth=0.0), output=tmp_path / "picture.gif")
+    for wrong in ({}, {"azimuth": 0.0, "look_at": (1.0, 2.0)}, {"azimuth": 0.0, "size": (0, 5)},
+                  {"azimuth": 0.0, "field_of_view": 200.0}, {"azimuth": float("nan")},
+                  {"azimuth": 0.0, "size": (300_000, 10)}, {"azimuth": 0.0, "exaggeration": -1.0}):  # fmt: skip
+        with pytest.raises(UsageError):
+            CameraRequest(**at, **wrong)  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="no such file"):
+        ContentRequest.parse("nothing.tif")
+
+
+def test_picking_goes_both_ways_and_says_what_hides(small: Block, tmp_path: Path) -> None:
+    view = ViewRequest(small.project, CameraRequest(image="two"))
+    pixels = ((20.0, 30.0), (100.25, 71.5), (190.0, 140.0))
+    ground = pick(PickRequest(view, pixels=pixels))
+    points = tuple((each.E, each.N, each.H) for each in ground)
+    back = pick(PickRequest(view, points=points, output=tmp_path / "picked.csv"))
+    np.testing.assert_allclose([(b.x, b.y) for b in back], pixels, atol=1e-6)
+    assert all(each.seen and each.surface == "terrain" for each in (*ground, *back))
+    below = pick(PickRequest(view, points=((points[1][0], points[1][1], points[1][2] - 10),)))[0]
+    assert not below.seen
+    lines = (tmp_path / "picked.csv").read_text().splitlines()
+    assert lines[0].startswith("name,x,y,E,N,H") and len(lines) == 4
+    with pytest.raises(UsageError, match="nothing to pick"):
+        pick(PickRequest(view))
+
+
+def test_commands_say_what_will_be_seen_and_take_files_of_cameras(small: Block, tmp_path: Path) -> None:
+    (tmp_path / "camera.toml").write_text(
+        f"position = [{X0 - 80}, {Y0 - 60}]\nheight = 40\nlook_at = [{X0 + 20}, {Y0 + 10}]\nsize = [60, 40]\n"
+    )
+    words = [small.terrain, "--camera", tmp_path / "camera.toml"]
+    said = inside("view", *words, "--dry-run")
+    assert said.code == 0 and "m above ground" in said.out and "sky" in said.out
+    facts = json.loads(inside("view", *words, "--fov", 30, "--dry-run", "--json").out)
+    assert facts["field_of_view_deg"][0] == pytest.approx(30) and facts["camera"]["height"] == 40
+    assert inside("view", *words).code == 2
+    out = tmp_path / "new" / "v.jpg"
+    said = inside("view", *words, "-o", out, "--json", "-q")
+    assert said.code == 0 and json.loads(said.out)["sky_rays"] > 0 and out.exists()
+    assert inside("view", *words, "-o", out).code == 2
+    assert inside("view", *words, "-o", small.terrain, "--overwrite").code == 2
+    picked = inside("view", "pick", *words, "--pixel", 30, 35, "--json")
+    assert json.loads(picked.out)["picked"][0]["seen"] is True
+    (tmp_path / "camera.toml").write_text("position = 'here'\n")
+    assert inside("view", *words, "--dry-run").code == 3
+
+
+def test_an_input_that_changes_is_noticed(small: Block, tmp_path: Path) -> None:
+    model = tmp_path / "dem.tif"
+    model.write_bytes(small.terrain.read_bytes())
+    plan = plan_view(ViewRequest(model, STAND))
+    digests = tuple((path, "0" * 64) for path, _ in plan.address.digests)
+    with pytest.raises(InputError, match="has changed"):
+        ViewAddress(**{**vars(plan.address), "digests": digests}).open()
