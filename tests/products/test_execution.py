@@ -17,8 +17,9 @@ from photoplan.engine import execute as engine_execute
 from photoplan.errors import InputError, ResourceError, TilesFailed, UsageError
 from photoplan.io.product import ProductFile
 from photoplan.io.project.file import load_project
-from photoplan.products.orthophoto.execution import BASE_MEMORY, Run, execute
+from photoplan.products.orthophoto.execution import Run, execute
 from photoplan.products.orthophoto.plan import OrthoPlan, plan_orthophotos
+from photoplan.products.run import BASE_MEMORY
 from photoplan.project import scene
 from photoplan.project.scene import open_scene
 

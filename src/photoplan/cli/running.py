@@ -16,8 +16,9 @@ from photoplan.cli.telling import Telling
 from photoplan.engine.executors import available_cpus
 from photoplan.errors import TilesFailed
 from photoplan.io.project.model import Project
-from photoplan.products.orthophoto.execution import ProductResult, Run, execute, seams_path
+from photoplan.products.orthophoto.execution import ProductResult, execute, seams_path
 from photoplan.products.orthophoto.plan import OrthoPlan
+from photoplan.products.run import Run
 
 
 @dataclass(frozen=True)
