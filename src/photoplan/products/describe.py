@@ -1,4 +1,4 @@
-"""What a file holds, in words: rasters, terrain models, projects, plans, filters."""
+"""What a file holds, in words: rasters, rational polynomials, terrain models, projects, plans, filters."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import height_label
 from photoplan.io.appearance import looks_like
+from photoplan.io.camera.rpc.file import is_rpc, read_rpc, rpc_beside, rpc_in
 from photoplan.io.filter_file import is_filter
 from photoplan.io.plan_file import read_plan_tables
 from photoplan.io.project.file import load_project
@@ -82,6 +83,8 @@ def describe(path: Path) -> dict[str, Any]:
         return _plan(path)
     if kind == ".json":
         return _record(path)
+    if is_rpc(path):
+        return {"file": str(path), **read_rpc(path).describe()}
     return _raster(read_info(path))
 
 
@@ -144,6 +147,11 @@ def _raster(info: RasterInfo) -> dict[str, Any]:
         x0, xx, _, y0, _, yy = info.to_map
         facts["first pixel's centre"] = f"X {x0:.4f}, Y {y0:.4f}"
         facts["pixel"] = f"{xx:g} × {abs(yy):g}"
+    rpc, beside = rpc_in(info.path), rpc_beside(info.path)
+    if rpc is not None:
+        facts |= rpc.describe()
+    elif beside is not None:
+        facts["rational polynomials"] = f"in {beside.name} beside it"
     if info.warnings:
         facts["note"] = list(info.warnings)
     return facts

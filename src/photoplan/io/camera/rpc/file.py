@@ -1,0 +1,86 @@
+"""Rational polynomials from files of any known format, and where they lie beside an image."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+from photoplan.cameras.rpc import RationalFunctions
+from photoplan.errors import InputError
+from photoplan.io.appearance import looks_like
+from photoplan.io.camera.rpc import digitalglobe, dimap, rpb, tags, text
+from photoplan.io.camera.rpc.model import MAX_BYTES, StatedRpc
+from photoplan.io.markup_files import read_xml
+from photoplan.io.plain_files import read_head
+
+#: What `rpc` of an image says if the image file holds them itself.
+TAGS = "tags"
+#: Kinds of XML documents.
+_DOCUMENTS = (digitalglobe, dimap)
+
+
+def _document(path: Path) -> StatedRpc:
+    root = read_xml(path, MAX_BYTES)
+    for kind in _DOCUMENTS:
+        if kind.is_it(root):
+            return StatedRpc(path, kind.FORM, kind.read(root, path))
+    raise InputError(f"{path}: an XML document of <{root.tag}> without rational polynomials")
+
+
+def _plain(form: str, read: Callable[[Path], RationalFunctions]) -> Callable[[Path], StatedRpc]:
+    return lambda path: StatedRpc(path, form, read(path))
+
+
+#: Reader of every format, by file suffix.
+RPC_FORMATS: dict[str, Callable[[Path], StatedRpc]] = {
+    ".txt": _plain(text.FORM, text.read),
+    ".rpb": _plain(rpb.FORM, rpb.read),
+    ".xml": _document,
+}
+
+
+def read_rpc(path: Path) -> StatedRpc:
+    """Rational polynomials of a file: ``_RPC.TXT``, ``.RPB``, XML of DIMAP or DigitalGlobe, or an image's own.
+
+    Raises
+    ------
+    InputError
+        The format is unknown, or the file cannot be used.
+    """
+    read = RPC_FORMATS.get(path.suffix.lower())
+    if read is not None:
+        return read(path)
+    found = rpc_in(path)
+    if found is None:
+        known = ", ".join(RPC_FORMATS)
+        raise InputError(
+            f"{path}: the image holds no rational polynomials (RPC); give the file that does ({known})"
+            f"{looks_like(path)}"
+        )
+    return found
+
+
+def rpc_in(image: Path) -> StatedRpc | None:
+    """Rational polynomials that an image file holds itself; None: it holds none."""
+    functions = tags.read(image)
+    return None if functions is None else StatedRpc(image, tags.FORM, functions)
+
+
+def is_rpc(path: Path) -> bool:
+    """Whether a text or XML file speaks of rational polynomials."""
+    return path.suffix.lower() in RPC_FORMATS and _MARKS.search(read_head(path)) is not None
+
+
+_MARKS = re.compile(r"LINE_OFF\s*[:=]|lineOffset\s*=|<LINEOFFSET>|<Global_RFM>|<RPB>|<isd>")
+
+
+def rpc_beside(image: Path) -> Path | None:
+    """The file of rational polynomials that belongs to an image by its name; None: there is none."""
+    stem = image.stem
+    product = re.sub(r"^IMG_", "RPC_", re.sub(r"_R1C1$", "", stem))
+    names = {f"{stem}_rpc.txt", f"{stem}.rpb", f"{stem}.xml"}
+    names |= {f"{product}.xml".casefold()} if product.startswith("RPC_") else set()
+    wanted = {name.casefold() for name in names}
+    beside = sorted(p for p in image.parent.iterdir() if p.name.casefold() in wanted and p.is_file())
+    return next((path for path in beside if is_rpc(path)), None)
