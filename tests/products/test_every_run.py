@@ -20,7 +20,8 @@ from tools.forked import QUIET, Mishap, Ran, content, forked
 from tools.landxml import write_landxml
 from tools.real_projects import drone_project
 from tools.recorded import checked
-from tools.small_block import texture, write_block, write_image
+from tools.small_block import CRS, X0, Y0, texture, write_block, write_image
+from tools.town import write_town
 
 from photoplan.io.lock import FileLock, lock_of
 from photoplan.io.run_record import record_path
@@ -62,8 +63,16 @@ def ortho(inputs: Path, out: Path) -> list[object]:
     return ["ortho", project, "--images", "one", "--resolution", 1, "--tile", 128, "--no-quicklook", "--output", out]
 
 
+def true_ortho(inputs: Path, out: Path) -> list[object]:
+    """Of a house, a deck and a mast, with a raster of what they hide."""
+    project = inputs / "block" / "town.toml"
+    words = ["--true", "--hidden", "mark", "--resolution", 1, "--tile", 128, "--no-quicklook", "--output", out]
+    return ["ortho", project, "--images", "one", *words]
+
+
 def mosaic(inputs: Path, out: Path) -> list[object]:
-    project = inputs / "block" / "project.toml"
+    """Of ground with objects."""
+    project = inputs / "block" / "town.toml"
     bounds = ["--bounds", 500_200, 5_300_100, 500_520, 5_300_300, "--resolution", 1, "--tile", 128]
     return ["mosaic", project, *bounds, "--sources", "--no-quicklook", "--output", out]
 
@@ -102,6 +111,7 @@ def view(*what: object) -> Words:
 
 CASES: dict[str, tuple[Words, str]] = {
     "ortho": (ortho, "one_ortho.tif"),
+    "true": (true_ortho, "one_ortho.tif"),
     "mosaic": (mosaic, "mosaic.tif"),
     "restore": (restore, "scan_restored.tif"),
     "simulate": (simulate, "product_0003.tif"),
@@ -124,7 +134,7 @@ CASES: dict[str, tuple[Words, str]] = {
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory: pytest.TempPathFactory, block: Path) -> Path:
     folder = tmp_path_factory.mktemp("inputs")
-    write_block(folder / "block")
+    write_town(write_block(folder / "block").project, (X0, Y0), 100.0, CRS)
     pixels = np.tile(texture(bands=1), (1, 5, 4))[:, :700, :700]
     write_image(folder / "scan.tif", np.ascontiguousarray(pixels), tiled=True)
     (folder / "weights.csv").write_text("0,-0.8,0\n-0.8,4.2,-0.8\n0,-0.8,0\n")
@@ -244,9 +254,10 @@ def test_fault_26_more_workers_in_any_order(
     assert sorted(said.tasks) == sorted(quiet.tasks) and product.same(tmp_path, undisturbed)
 
 
-def test_fault_26_processes(inputs: Path, tmp_path: Path) -> None:
-    """The one command that can have processes for workers."""
-    product = Product("ortho", inputs, tmp_path)
+@pytest.mark.parametrize("name", ["ortho", pytest.param("mosaic", marks=pytest.mark.slow)])
+def test_fault_26_processes(name: str, inputs: Path, tmp_path: Path) -> None:
+    """The commands that can have processes for workers."""
+    product = Product(name, inputs, tmp_path)
     for out, more in ((tmp_path / "threads", ()), (tmp_path / "processes", ("--executor", "processes"))):
         said = product.run(out, QUIET, 2, *more)
         assert said.code == 0, said.err

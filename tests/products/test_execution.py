@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -11,13 +12,15 @@ import numpy as np
 import pytest
 import rasterio
 from tools.events import Told
-from tools.small_block import CRS, NAMES, SIZE, Block, make_project, texture, write_image
+from tools.small_block import CRS, NAMES, SIZE, X0, Y0, Block, make_project, texture, write_image
+from tools.town import write_town
 
 from photoplan.engine import execute as engine_execute
 from photoplan.errors import InputError, ResourceError, TilesFailed, UsageError
 from photoplan.io.product import ProductFile
 from photoplan.io.project.file import load_project
 from photoplan.products.orthophoto.execution import Run, execute
+from photoplan.products.orthophoto.mosaic import plan_mosaic
 from photoplan.products.orthophoto.plan import OrthoPlan, plan_orthophotos
 from photoplan.products.run import BASE_MEMORY
 from photoplan.project import scene
@@ -52,6 +55,21 @@ class TestFault26Equality:
         ) as cluster:
             execute(plan, tmp_path, Run(2, cluster.scheduler_address, quicklook=False))
         assert products(tmp_path) == serial
+
+    def test_fault_26_a_mosaic_with_objects_on_a_dask_cluster(self, pristine: Block, tmp_path: Path) -> None:
+        distributed = pytest.importorskip("distributed")
+        made = []
+        town = write_town(shutil.copytree(pristine.folder, tmp_path / "block") / "project.toml", (X0, Y0), 100.0, CRS)
+        plan = plan_mosaic(
+            load_project(town), resolution=1.0, tile=128, bounds=(500_200, 5_300_100, 500_520, 5_300_300)
+        )
+        with distributed.LocalCluster(
+            n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None, protocol="tcp"
+        ) as cluster:
+            for executor, workers in (("threads", 1), (cluster.scheduler_address, 2)):
+                execute(plan, tmp_path / str(workers), Run(workers, executor, quicklook=False))
+                made.append((tmp_path / str(workers) / "mosaic.tif").read_bytes())
+        assert made[0] == made[1]
 
     def test_fault_26_memory_does_not_change_a_byte(
         self, plan: OrthoPlan, serial: dict[str, bytes], tmp_path: Path
@@ -164,6 +182,28 @@ def test_fault_05_failed_tiles_cost_their_product_only(
     results = execute(plan, tmp_path, QUIET)
     assert results[1].resumed == len(plan["three"].plan.tiles) - 2
     assert products(tmp_path) == serial
+
+
+def test_fault_05_failed_tiles_of_a_mosaic_with_objects(
+    pristine: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    render = engine_execute.render
+
+    def failing(product: Any, tile: Any, *rest: Any) -> Any:
+        if tile.index == 3:
+            raise RuntimeError("out of luck")
+        return render(product, tile, *rest)
+
+    town = write_town(shutil.copytree(pristine.folder, tmp_path / "block") / "project.toml", (X0, Y0), 100.0, CRS)
+    plan = plan_mosaic(load_project(town), resolution=1.0, tile=128, sources=True)
+    monkeypatch.setattr(engine_execute, "render", failing)
+    with pytest.raises(TilesFailed, match=r"mosaic\.tif: tiles 3 \(tile 3") as error:
+        execute(plan, tmp_path, Run(2, quicklook=False))
+    assert error.value.exit_code == 4
+    assert not list(tmp_path.glob("mosaic*"))
+    monkeypatch.undo()
+    (made,) = execute(plan, tmp_path, QUIET)
+    assert made.resumed == len(plan.products[0].plan.tiles) - 1
 
 
 def test_an_input_that_changes_after_planning_is_refused(small: Block) -> None:

@@ -11,7 +11,8 @@ import pytest
 import rasterio
 import shapely
 from tools.command import Here
-from tools.small_block import CRS, NAMES, Block, make_project, texture, write_image
+from tools.small_block import CRS, NAMES, SIZE, X0, Y0, Block, make_project, texture, write_image
+from tools.town import write_town
 
 BOUNDS = (500_180, 5_300_100, 500_540, 5_300_300)
 OPTIONS = ("--bounds", *BOUNDS, "--resolution", 1, "--tile", 128, "--no-quicklook")
@@ -84,7 +85,9 @@ def write(path: Path, shapes: list[object], images: list[str]) -> None:
                       layer="regions", driver="GPKG", geometry_type="Polygon", crs=CRS)  # fmt: skip
 
 
-def test_regions_that_cannot_be_meant(small: Block, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_fault_19_regions_that_cannot_be_meant(
+    small: Block, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     photoplan = Here(capsys)
     box = shapely.box(500_330, 5_300_180, 500_380, 5_300_220)
     bow = shapely.Polygon([(500_330, 5_300_180), (500_380, 5_300_220), (500_380, 5_300_180), (500_330, 5_300_220)])
@@ -132,6 +135,43 @@ def test_the_record_names_every_image(mosaic) -> None:  # type: ignore[no-untype
     assert all(len(image["projection_centre"]) == 3 and image["gsd_m"] > 0 for image in record["images"])
     assert len(record["inputs"]) == 4
     assert photoplan("mosaic", block.project, *OPTIONS).code == 2
+
+
+def test_fault_12_files_of_two_mosaics_do_not_meet(mosaic) -> None:  # type: ignore[no-untyped-def]
+    block, photoplan, _ = mosaic
+    before = (block.folder / "products" / "mosaic_sources.tif").read_bytes()
+    said = photoplan("mosaic", block.project, *OPTIONS, "--name", "mosaic_sources")
+    assert said.code == 2 and "mosaic_sources.tif exists" in said.err
+    assert (block.folder / "products" / "mosaic_sources.tif").read_bytes() == before
+    text = block.project.read_text()
+    block.project.write_text(text.replace('name = "one"', 'name = "THREE"'))
+    said = photoplan("mosaic", block.project, *OPTIONS, "--name", "other")
+    assert said.code == 3 and "THREE" in said.err and "three" in said.err
+
+
+@pytest.mark.parametrize("kind", ["nodata", "mask"])
+def test_fault_22_no_dark_fringes_at_holes_seams_and_hidden_ground(
+    small: Block, capsys: pytest.CaptureFixture[str], kind: str
+) -> None:
+    """Bright images, one with a hole; objects hide ground in all: no valid pixel is darker than the images."""
+    for path in small.images:
+        pixels = np.full((3, SIZE[1], SIZE[0]), 200, np.uint8)
+        hole = np.zeros(pixels.shape[1:], bool)
+        if path == small.images[0]:
+            hole[40:90, 70:130] = True
+            pixels[:, hole] = 0
+        write_image(path, pixels, **({"nodata": 0} if kind == "nodata" else {}))
+        if kind == "mask":
+            with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(path, "r+") as file:
+                file.write_mask(~hole)
+    make_project(small)
+    town = write_town(small.project, (X0, Y0), 100.0, CRS)
+    said = Here(capsys)("mosaic", town, *OPTIONS, "--sources", "--json")
+    assert said.code == 0, said.err
+    (told,) = json.loads(said.out)["products"]
+    pixels, owner = (made(small.folder / "products" / name) for name in ("mosaic.tif", "mosaic_sources.tif"))
+    assert (pixels[:, owner[0] > 0] == 200).all() and not pixels[:, owner[0] == 0].any()
+    assert told["hidden_m2"] > 100 and told["outside_m2"] > 500
 
 
 def test_images_of_different_kinds_are_named(small: Block, capsys: pytest.CaptureFixture[str]) -> None:

@@ -157,17 +157,42 @@ def test_objects_that_change_are_other_products(town: Block, capsys) -> None:  #
     assert replaced.code == 0
 
 
-def test_fault_02_objects_without_heights_or_crs_declared_are_refused(town: Block, capsys) -> None:  # type: ignore[no-untyped-def]
+COMMANDS = {"ortho": ("ortho", "--true"), "hidden": ("ortho", "--hidden", "nodata"), "mosaic": ("mosaic",)}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_fault_19_objects_that_cannot_be_are_named_one_by_one(town: Block, capsys, command: str) -> None:  # type: ignore[no-untyped-def]
     photoplan = Here(capsys)
+    verb, *options = COMMANDS[command]
+    bow = DECK[[0, 2, 1, 3]]
+    flat = np.full((4, 3), np.nan)
+    flat[:, :2] = DECK[:, :2]
+    deep = DECK - (0, 0, 60)
+    write_objects(town, [*POLYGONS, [bow], [flat]], [*NAMES, "bow", "flat"])
+    said = photoplan(verb, town.project, *options)
+    assert said.code == 3 and "2 polygons" in said.err
+    assert "'bow' crosses itself" in said.err and "'flat' has vertices without a height" in said.err
+    write_objects(town, [*POLYGONS, [deep], [deep - (0, 0, 5)]], [*NAMES, "deep", "deeper"])
+    said = photoplan(verb, town.project, *options)
+    assert said.code == 3 and "2 polygons" in said.err
+    assert "'deep' lies below the ground, by 20.0 m" in said.err
+    assert "'deeper' lies below the ground, by 25.0 m" in said.err
+    assert not (town.folder / "products").exists()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_fault_02_objects_without_heights_or_crs_declared_are_refused(town: Block, capsys, command: str) -> None:  # type: ignore[no-untyped-def]
+    photoplan = Here(capsys)
+    words = (COMMANDS[command][0], town.project, *COMMANDS[command][1:])
     state(town, 'file = "objects.gpkg"')
-    said = photoplan("ortho", town.project, "--true")
+    said = photoplan(*words)
     assert said.code == 3 and "height_system" in said.err
     state(town, 'file = "objects.gpkg"\nheight_system = "same"\nrole = "paints"')
-    said = photoplan("ortho", town.project, "--true")
+    said = photoplan(*words)
     assert said.code != 0 and "occluder" in said.err
     state(town, 'file = "objects.gpkg"\nheight_system = "same"\noffset = [0.0, 0.0, -200.0]')
-    said = photoplan("ortho", town.project, "--true")
+    said = photoplan(*words)
     assert said.code == 3 and "'house' lies below the ground, by" in said.err
     state(town, 'file = "objects.gpkg"\nheight_system = "same"\noffset = [90000.0, 0.0, 0.0]')
-    said = photoplan("ortho", town.project, "--true")
+    said = photoplan(*words)
     assert said.code == 3 and "do not meet the terrain" in said.err

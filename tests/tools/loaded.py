@@ -7,4 +7,5 @@ from tools.command import verbs
 for name in ("orthophoto.execution", "restore.run", "simulate.run", "tie.run", "dtm.build", "dtm.export", "dtm.flow",
              "dtm.shading", "dtm.visible", "dtm.volume"):  # fmt: skip
     importlib.import_module(f"photoplan.products.{name}")
+importlib.import_module("photoplan.project.objects")
 verbs()

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import shapely
 
+from photoplan.io.geopackage import VectorLayer, write_geopackage
 from photoplan.surfaces.faces import Faces
 from photoplan.surfaces.polygon_faces import triangles_of
 
@@ -88,3 +91,20 @@ def town_faces(town: list[House], paints: bool = True) -> Faces:
 
 DECK = [np.array([(20.0, 62.3, 9.0), (120.0, 72.7, 12.0), (120.0, 82.7, 12.0), (20.0, 72.3, 9.0)])]
 """A bridge deck, a plane that rises from west to east."""
+
+
+def write_town(project: Path, middle: tuple[float, float], ground: float, crs: str) -> Path:
+    """A project beside another one, with a house of 40 m, a deck in the air and a mast that only hides."""
+    at = np.array([*middle, ground])
+    house = House(at[0] + 40, at[1] + 25, 0.3, 50.0, 36.0, ground - 10, ground + 40, ground + 40)
+    deck = np.array([(-110.0, -60, 40), (-20, -60, 40), (-20, -40, 46), (-110, -40, 46)]) + at
+    mast = np.array([(0.0, -30, -10), (4, -30, -10), (4, -30, 60), (0, -30, 60)]) + at
+    polygons = [*(rings[0] for rings in house.polygons), deck, mast]
+    names = [*("house",) * len(house.polygons), "deck", "mast"]
+    roles = [*("",) * (len(names) - 1), "occluder"]
+    columns = {"name": np.array(names, object), "role": np.array(roles, object)}
+    layer = VectorLayer("town", "Polygon Z", [shapely.Polygon(p) for p in polygons], columns)
+    write_geopackage(project.with_name("town.gpkg"), [layer], crs)
+    path = project.with_name("town.toml")
+    path.write_text(project.read_text() + '\n[[objects]]\nfile = "town.gpkg"\nheight_system = "same"\n')
+    return path
