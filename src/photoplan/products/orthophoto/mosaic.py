@@ -66,7 +66,7 @@ def plan_mosaic(
     grid = grid_of(project, chosen, [one.look.footprint for one in looked])
     looked = with_blur(looked, grid, chosen, events)
     taking, tiles = [], []
-    events.begin("planning", len(looked), "images")
+    events.begin("finding tiles", len(looked), "images")
     for one in looked:
         surface = painted_surface(one.scene.surface)
         mine = covered_tiles(one.scene.camera, surface, grid, chosen.tile, one.look.footprint.bounds)
