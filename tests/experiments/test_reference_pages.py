@@ -11,6 +11,7 @@ import pytest
 
 from photoplan.cli.dtm import VERBS as DTM_VERBS
 from photoplan.cli.main import VERBS
+from photoplan.cli.view import VERBS as VIEW_VERBS
 from photoplan.io.project.file import project_schema
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -18,8 +19,10 @@ DOCS = ROOT / "docs"
 PAGES = [*sorted(DOCS.rglob("*.md")), ROOT / "README.md"]
 #: Options of other programs on the pages.
 OTHERS = {"--help"}
-#: Verbs as they are typed, and the page that explains them; `dtm` itself is a group of verbs without options.
-PLACES = {verb: "command-line" for verb in VERBS if verb != "dtm"} | {f"dtm {verb}": "dtm" for verb in DTM_VERBS}
+#: Verbs as they are typed, and the page that explains them; `dtm` and `view` are groups of verbs without options.
+GROUPS = {"dtm": DTM_VERBS, "view": VIEW_VERBS}
+PLACES = {verb: "command-line" for verb in VERBS if verb not in GROUPS}
+PLACES |= {f"dtm {verb}": "dtm" for verb in DTM_VERBS} | {f"view {verb}": "views" for verb in VIEW_VERBS}
 PLACES |= dict.fromkeys(("convert", "fiducials", "interior", "tie", "control", "resect", "adjust"), "orientation")
 PLACES |= {verb: verb for verb in ("mtf", "restore", "characterise", "sensor", "simulate")}
 
@@ -54,7 +57,9 @@ def examples():
                 if not call or re.search(r"…|\[options\]|\[-", call[1]):
                     continue
                 words = shlex.split(re.split(r"\s+#", call[1])[0])
-                verb = " ".join(words[:2]) if words[0] == "dtm" else words[0]
+                if words[0] == "view" and words[1] not in VIEW_VERBS:
+                    words.insert(1, "picture")
+                verb = " ".join(words[:2]) if words[0] in GROUPS else words[0]
                 yield pytest.param(verb, words[len(verb.split()) :], id=f"{page.stem}: {call[1][:40]}")
 
 

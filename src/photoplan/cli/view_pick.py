@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, json_option, overwrite_option
+from photoplan.cli.options import PATH, json_option, overwrite_option, quiet_option
 from photoplan.cli.view_options import camera_options, take_request
 
 
@@ -22,6 +22,7 @@ from photoplan.cli.view_options import camera_options, take_request
 @click.option("-o", "--output", type=PATH, metavar="CSV", help="Write them as a table, too.")
 @overwrite_option
 @json_option
+@quiet_option
 def command(matrix: Path | None, **options: Any) -> None:
     """The ground of pixels of a view, and the pixels of ground points, with what is seen there.
 
@@ -30,7 +31,7 @@ def command(matrix: Path | None, **options: Any) -> None:
     from photoplan.cli.output import show, show_json
     from photoplan.products.view.pick import PickRequest, pick
 
-    as_json = options.pop("as_json")
+    as_json, _ = options.pop("as_json"), options.pop("quiet")
     own = {name: options.pop(name) for name in ("pixels", "points", "file", "output", "overwrite")}
     found = pick(PickRequest(take_request(options, matrix=matrix), **own))
     if as_json:
