@@ -71,7 +71,7 @@ def test_options_of_a_verb(verb):
     told, elsewhere = long_options(section_of(verb)), {"run": {"--plan"}}.get(verb, set())
     # Of a mosaic only those are listed that an orthophoto does not have, of an object those that a mosaic has not.
     same = {
-        "mosaic": options_of("ortho") - {"--true", "--ground"},
+        "mosaic": options_of("ortho") - {"--true", "--ground", "--method", "--fill"},
         "object": options_of("mosaic") - {"--name", "--seams"},
     }.get(verb, set())
     others = {"--true", "--name", "--seams"} if same else set()

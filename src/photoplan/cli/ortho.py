@@ -14,6 +14,8 @@ from photoplan.cli.options import PATH, executing, product_options
 @click.argument("project", type=PATH)
 @product_options
 @click.option("--true/--ground", "true", default=None, help="Show objects where they stand, or the ground [ground].")
+@click.option("--method", help="indirect, or direct: pixels of the image are carried to the ground [indirect].")
+@click.option("--fill", type=int, metavar="PX", help="Fill gaps of the direct method from pixels this near [0].")
 @executing
 def command(project: Path, **options: Any) -> None:
     """Make an orthophoto of each image: NAME_ortho.tif (a cloud-optimised GeoTIFF) and its run record.

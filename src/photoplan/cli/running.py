@@ -160,4 +160,6 @@ def _hidden(results: list[ProductResult]) -> str:
     areas = [r.hidden for r in results if r.hidden is not None]
     outside = [r.bare for r in results if r.bare is not None]
     hidden = f" · hidden {sum(areas):.4g} m²" if areas else ""
+    gaps = [r.gaps for r in results if r.gaps is not None]
+    hidden += f" · gaps {sum(gaps):.4g} m²" if gaps else ""
     return f"{hidden} · in no image {sum(outside):.4g} m²" if outside else hidden

@@ -46,6 +46,8 @@ class Painted:
     """Worst residual of the anchors, pixels of the source image."""
     cells: int
     """Boxes that the anchors have."""
+    gaps: int | None = None
+    """Pixels that the source sees, but that none of its pixels has reached; None: all are reached."""
 
 
 def execute_tile(tile: CompiledTile, sources: Sequence[Source], kernel: str) -> Painted:
@@ -188,6 +190,14 @@ class ErrorsAddress(Protocol):
         ...
 
 
+class Paint(Protocol):
+    """Another way to paint a tile than by resampling where its pixels lie in the sources; small, and pickles."""
+
+    def render(self, product: ProductPlan, tile: Tile, sources: Sequence[Source], surface: Surface) -> Painted:
+        """A tile of a product; what a pixel gets does not depend on the tile."""
+        ...
+
+
 @dataclass(frozen=True)
 class RenderJob:
     """What a worker is told once of a product that is resampled."""
@@ -202,13 +212,19 @@ class RenderJob:
     ``accuracy``, the bands of `photoplan.plan.accuracy`."""
     errors: ErrorsAddress | None = None
     """Needed for the output ``accuracy``."""
+    paint: Paint | None = None
+    """What paints a tile; None: `render`, with the kernel."""
 
     def __call__(self, tile: Tile) -> Made:
         """Outputs of a tile, and its figures: of its anchors, and how many pixels are hidden or in no image if somebody
         has asked."""
         opened = self.address.open()
-        painted = render(self.product, tile, opened.sources, opened.surface, self.kernel)
+        if self.paint is None:
+            painted = render(self.product, tile, opened.sources, opened.surface, self.kernel)
+        else:
+            painted = self.paint.render(self.product, tile, opened.sources, opened.surface)
         record: dict[str, Any] = {"worst_residual": painted.residual, "cells": painted.cells}
+        record |= {} if painted.gaps is None else {"gaps": painted.gaps}
         if painted.hidden is not None:
             record |= {"hidden": int(np.count_nonzero(painted.hidden)), "bare": painted.bare}
         made = {name: find(painted) for name, find in _OUTPUTS.items()}

@@ -35,7 +35,7 @@ from photoplan.products.orthophoto.finished import (
     stale_files,
 )
 from photoplan.products.orthophoto.look import Look
-from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, known_errors
+from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, known_errors, painting
 from photoplan.products.run import Run, clock, refuse_inputs
 from photoplan.project.restored import RestoreStep
 from photoplan.project.scene import Scene, input_files
@@ -142,7 +142,7 @@ def _work(
     files = {name: open_file(path, **forms[name]) for name, path in paths.items()}
     told = replace(product.plan, tiles=product.plan.tiles.only(()))
     errors = known_errors(address, told, settings) if settings.accuracy else None
-    job = RenderJob(address, told, settings.kernel, tuple(files), errors)
+    job = RenderJob(address, told, settings.kernel, tuple(files), errors, painting(product, settings))
     return Work(
         name=product.plan.name,
         job=job,
@@ -194,6 +194,7 @@ def _complete(
             resumed=tally.resumed,
             hidden=_area(tally, "hidden", product) if plan.settings.asks_hidden else None,
             bare=None if plan.settings.choice is None else _area(tally, "bare", product) + _left_out(product, address),
+            gaps=_area(tally, "gaps", product) if plan.settings.method == "direct" else None,
             painted=painted,
             accuracy=_accuracy(tally.totals["radial_errors"]) if "radial_errors" in tally.totals else None,
             failed=tuple(sorted(tally.failed)),

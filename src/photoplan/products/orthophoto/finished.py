@@ -38,6 +38,8 @@ class ProductResult:
     """Ground in the images that none of them sees, m²; None: nobody has asked."""
     bare: float | None
     """Ground of a mosaic that lies in none of its images, m²; None: it is no mosaic."""
+    gaps: float | None
+    """Ground that the image sees and the direct method has not reached, m²; None: it was the indirect one."""
     painted: dict[str, float] | None
     """Ground that each image paints, m², where that is asked for."""
     accuracy: dict[str, float] | None
@@ -58,6 +60,7 @@ class ProductResult:
                 self,
                 *own,
                 hidden_m2="hidden",
+                gaps_m2="gaps",
                 painted_m2="painted",
                 accuracy_m="accuracy",
                 other_files="others",
@@ -154,6 +157,7 @@ def _kept(plan: OrthoPlan, product: OrthoProduct, folder: Path) -> ProductResult
             resumed=made["tiles"],
             hidden=made.get("hidden_m2"),
             bare=made.get("outside_m2"),
+            gaps=made.get("gaps_m2"),
             painted=made.get("painted_m2"),
             accuracy=made.get("accuracy_m"),
             failed=(),

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan import __version__
-from photoplan.engine.execute import joined
+from photoplan.engine.direct import Direct
+from photoplan.engine.execute import Painted, joined
 from photoplan.engine.execute import render as render_tile
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
@@ -27,7 +28,7 @@ from photoplan.plan.compile import AnchorRule
 from photoplan.plan.footprint import Footprint, covered_tiles
 from photoplan.plan.owner import InSight, Ownership
 from photoplan.plan.product import ProductPlan
-from photoplan.plan.tiles import Tiles
+from photoplan.plan.tiles import Tile, Tiles
 from photoplan.products.orthophoto.look import Look, extent_text, look_at, with_resolution
 from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.scene import Scene
@@ -294,6 +295,7 @@ def product_key(scenes: Any, plan: ProductPlan, settings: OrthoSettings, regions
         "kernel": settings.kernel,
         "nodata": settings.nodata,
         "hidden": settings.hidden,
+        "method": [settings.method, settings.fill],
         "choice": None if settings.choice is None else {**asdict(settings.choice), "name": "", "seams": regions},
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
@@ -310,6 +312,11 @@ def _refuse_equal_names(products: Iterable[OrthoProduct]) -> None:
                 "one"
             )
         seen[name] = product.images[0]
+
+
+def painting(product: OrthoProduct, settings: OrthoSettings) -> Direct | None:
+    """What paints the tiles of a product, where it is not the engine's resampling."""
+    return None if settings.method == "indirect" else Direct(product.looks[0].footprint.height_range, settings.fill)
 
 
 def render(
@@ -335,10 +342,14 @@ def render(
     window = product.grid.window if bounds is None else product.grid.window_of(bounds)
     scenes = product.address(plan.project).open()
     tiles = (tile for tile in product.plan.tiles if (tile.window & window).size)
-    parts = (
-        (tile.window, render_tile(product.plan, tile, scenes.sources, scenes.surface, plan.settings.kernel))
-        for tile in tiles
-    )
+    paint = painting(product, plan.settings)
+
+    def painted(tile: Tile) -> Painted:
+        if paint is not None:
+            return paint.render(product.plan, tile, scenes.sources, scenes.surface)
+        return render_tile(product.plan, tile, scenes.sources, scenes.surface, plan.settings.kernel)
+
+    parts = ((tile.window, painted(tile)) for tile in tiles)
     whole = joined(window, parts, scenes[0].reader)
     assert whole.values is not None and whole.valid is not None
     return whole.values, whole.valid

@@ -11,7 +11,12 @@ from photoplan.plan.choice import Weights
 
 Kernel = Literal["nearest", "bilinear", "bicubic", "bicubic-1", "lanczos3"]
 Hidden = Literal["show", "nodata", "mark"]
+Method = Literal["indirect", "direct"]
 Compression = Literal["deflate", "zstd", "lzw", "jpeg", "none"]
+
+
+#: Gaps wider than twice this are not filled, pixels.
+MOST_FILLED = 32
 
 
 @dataclass(frozen=True)
@@ -65,6 +70,11 @@ class OrthoSettings:
     """How images are chosen for one mosaic of them; None: an orthophoto of each."""
     accuracy: bool = False
     """Whether a second raster holds the standard deviations of what each pixel shows; all errors must be stated."""
+    method: Method = "indirect"
+    """``indirect``: every pixel of the product is looked up in the image; ``direct``: every pixel of the image is
+    carried to the ground."""
+    fill: int = 0
+    """Gaps that the direct method leaves are filled from pixels no further away than this; 0: they stay empty."""
     sources: bool = False
     """Whether a second raster says which image painted each pixel, and a GeoPackage where its regions are."""
 
@@ -72,10 +82,11 @@ class OrthoSettings:
         if self.resolution is not None:
             check_resolution(self.resolution)
         if self.hidden is None:
-            object.__setattr__(self, "hidden", "nodata" if self.true else "show")
+            object.__setattr__(self, "hidden", "nodata" if self.true or self.method == "direct" else "show")
         if self.kernel not in get_args(Kernel):
             raise UsageError(f"kernel {self.kernel!r}; allowed are {', '.join(get_args(Kernel))}")
-        for what, value, allowed in (("compression", self.compress, Compression), ("hidden", self.hidden, Hidden)):
+        names = ("compression", self.compress, Compression), ("hidden", self.hidden, Hidden)
+        for what, value, allowed in (*names, ("method", self.method, Method)):
             if value not in get_args(allowed):
                 raise UsageError(f"{what} {value!r}; allowed are {', '.join(get_args(allowed))}")
         if not 1e-6 <= self.tolerance <= 10:
@@ -89,6 +100,14 @@ class OrthoSettings:
                 float(self.nodata)
             except ValueError:
                 raise UsageError(f"nodata {self.nodata!r}; allowed are auto, mask or a number") from None
+
+        if not 0 <= self.fill <= MOST_FILLED or (self.fill and self.method != "direct"):
+            raise UsageError(f"`fill` {self.fill}; allowed are 0 to {MOST_FILLED} pixels, with `method` direct")
+        if self.method == "direct" and (self.choice is not None or self.accuracy or self.hidden != "nodata"):
+            raise UsageError(
+                "`method` direct makes orthophotos of single images, paints no hidden ground and knows no `accuracy`: "
+                "leave `hidden` and `accuracy` out, or take the indirect method"
+            )
 
     @property
     def asks_hidden(self) -> bool:
