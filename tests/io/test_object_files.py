@@ -13,6 +13,7 @@ import shapely
 
 from photoplan.errors import InputError
 from photoplan.io.geopackage import VectorLayer, write_geopackage
+from photoplan.io.objects import mesh
 from photoplan.io.objects.file import read_objects
 
 CUBE = [[0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0], [0, 0, 10], [10, 0, 10], [10, 10, 10], [0, 10, 10]]
@@ -223,6 +224,89 @@ def test_fault_31_a_ply_that_promises_more_than_it_holds_is_refused(tmp_path: Pa
         read_objects(path)
     path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex x\nend_header\n")
     with pytest.raises(InputError, match="not understood"):
+        read_objects(path)
+
+
+@pytest.mark.parametrize("name", ["mesh.obj", "mesh.ply", "roofs.geojson", "town.json"])
+def test_fault_18_marks_and_line_ends_of_object_files_change_nothing(tmp_path: Path, name: str) -> None:
+    text = {
+        "mesh.obj": OBJ,
+        "mesh.ply": ply("ascii", False).decode(),
+        "roofs.geojson": json.dumps(geojson(feature("Polygon", [HIGH], name="good")), indent=1),
+        "town.json": json.dumps(city(), indent=1),
+    }[name]
+    plain = read_objects(written(tmp_path, text, name)).corners
+    for k, mark in enumerate(("", "\ufeff") if name != "mesh.ply" else ("",)):
+        path = tmp_path / f"{k}_{name}"
+        path.write_bytes((mark + text).replace("\n", "\r\n").encode())
+        np.testing.assert_array_equal(read_objects(path).corners, plain)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "told"),
+    [
+        ("comma.obj", OBJ.replace("v 4 0 0", "v 4,5 0 0"), r":3: 'v 4,5 0 0' is no v \(numbers, with a point"),
+        ("ragged.obj", OBJ.replace("v 4 0 0", "v 4 0"), ":3: 'v 4 0' is no v"),
+        ("two.obj", OBJ.replace("v 4 0 0", "v 4 0\nv 4 0 0 0"), ":3: 'v 4 0' is no v"),
+        ("half.obj", OBJ + "f 1 2 2.5\n", ":9: 'f 1 2 2.5' is no f"),
+        ("word.obj", OBJ + "f 1 2 x\n", ":9: 'f 1 2 x' is no f"),
+        ("header.obj", "# tree\nvn 0 0 1\n", "holds no faces"),
+        ("header.ply", ply("ascii", True).decode().split("end_header")[0] + "end_header\n", "damaged|promises"),
+        ("comma.ply", ply("ascii", True).decode().replace("4 0 5", "4,5 0 5"), "damaged.*with a point"),
+        ("ragged.ply", ply("ascii", True).decode().replace("4 0 5", "4 0"), "damaged.*a vertex of 2 instead of 3"),
+        ("corners.ply", ply("ascii", True).decode().replace("3 0 1 2 7", "9 0 1 2 7"), "damaged.*fewer corners"),
+    ],
+)
+def test_fault_18_meshes_with_a_fault_are_named(tmp_path: Path, name: str, text: str, told: str) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(InputError, match=told):
+        read_objects(path)
+
+
+def grid_of_faces(side: int, triangles: bool) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Vertices of a grid, and its meshes: triangles, or two triangles and a quadrangle in turn."""
+    y, x = np.mgrid[:side, :side].reshape(2, -1)
+    vertices = np.stack([x * 0.25, y * 0.25, np.sin(x / 9) + np.cos(y / 7)], axis=1)
+    k = np.arange(side * side).reshape(side, side)
+    a, b, c, d = (part.ravel() for part in (k[:-1, :-1], k[:-1, 1:], k[1:, 1:], k[1:, :-1]))
+    if triangles:
+        return vertices, [*np.stack([a, b, c], axis=1), *np.stack([a, c, d], axis=1)]
+    quads = np.stack([a, b, c, d], axis=1)
+    odd = np.arange(len(a)) % 2 == 1
+    return vertices, [*quads[odd], *np.stack([a, b, c], axis=1)[~odd], *np.stack([a, c, d], axis=1)[~odd]]
+
+
+@pytest.mark.parametrize("kind", ["obj", "ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("triangles", [True, False])
+def test_large_meshes_are_read_in_batches(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, triangles: bool
+) -> None:
+    monkeypatch.setattr(mesh, "_BATCH", 100)
+    vertices, faces = grid_of_faces(25, triangles)
+    rows = [" ".join(f"{v:.6f}" for v in p) for p in vertices]
+    path = tmp_path / ("mesh.obj" if kind == "obj" else "mesh.ply")
+    if kind == "obj":
+        lines = [f"v {row}" for row in rows] + ["f " + " ".join(f"{v + 1}//7" for v in f) for f in faces]
+        lines[300:300] = ["# half"]
+        path.write_text("\n".join(lines))
+    else:
+        head = f"ply\nformat {kind} 1.0\ncomment x\nelement vertex {len(vertices)}\nproperty float x\n"
+        head += f"property float y\nproperty float z\nelement face {len(faces)}\nproperty uchar red\n"
+        head += "property list uchar uint vertex_indices\nproperty float q\nend_header\n"
+        order = "<" if "little" in kind else ">"
+        body = b"".join(
+            bytes([9, len(f)]) + f.astype(order + "u4").tobytes() + np.array(0.5, order + "f4").tobytes() for f in faces
+        )
+        text = "\n".join(rows + [f"9 {len(f)} " + " ".join(map(str, f)) + " 0.5" for f in faces]) + "\n"
+        path.write_bytes(
+            head.encode() + (text.encode() if kind == "ascii" else vertices.astype(order + "f4").tobytes() + body)
+        )
+    found = read_objects(path)
+    want = [[vertices[f[[0, k, k + 1]]] for k in range(1, len(f) - 1)] for f in faces]
+    np.testing.assert_allclose(found.corners, np.concatenate(want), atol=2e-6)
+    monkeypatch.setattr(mesh, "_MOST", 500)
+    with pytest.raises(InputError, match="more than 500 faces or vertices; cut out"):
         read_objects(path)
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import re
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +15,11 @@ from photoplan.errors import InputError
 from photoplan.io.objects.model import ObjectFile
 
 _MOST_BYTES = 4 << 30
+#: Faces or vertices of a mesh at most: kept, a face takes some 300 bytes.
+_MOST = 20_000_000
+#: Lines of a text that are read together.
+_BATCH = 100_000
+_VERTEX, _FACE = (b"v ", b"v\t"), (b"f ", b"f\t")
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
@@ -34,25 +42,56 @@ def read_obj(path: Path) -> ObjectFile:
         A line cannot be read, or a face names a vertex that is not there.
     """
     _size(path)
-    vertices: list[list[float]] = []
-    faces: list[tuple[int, int, int]] = []
-    with path.open(encoding="utf-8", errors="replace") as file:
-        for number, line in enumerate(file, 1):
-            word, *rest = line.split() or [""]
+    vertices, faces = [np.empty((0, 3))], [np.empty((0, 3), np.int64)]
+    count = first = 0
+    with path.open("rb") as file:
+        while lines := [line.lstrip() for line in itertools.islice(file, _BATCH)]:
+            lines[0] = lines[0].removeprefix(b"\xef\xbb\xbf")
             try:
-                if word == "v":
-                    x, y, z = (float(v) for v in rest[:3])
-                    vertices.append([x, y, z])
-                elif word == "f":
-                    # Counted from 1, or backwards from the last vertex so far.
-                    at = [int(part.split("/")[0]) for part in rest]
-                    at = [k - 1 if k > 0 else len(vertices) + k for k in at]
-                    if len(at) < 3 or min(at) < 0:
-                        raise ValueError("a face needs three corners that are there")
-                    faces += [(at[0], at[k], at[k + 1]) for k in range(1, len(at) - 1)]
-            except ValueError as error:
-                raise InputError(f"{path}:{number}: {line.strip()[:60]!r} is no {word} ({error}); repair it") from None
-    return _mesh(path, np.array(vertices, float).reshape(-1, 3), np.array(faces, np.int64).reshape(-1, 3))
+                part = _obj_lines(lines, count)
+            except ValueError:
+                _name_line(path, lines, first + 1, count)
+                raise
+            vertices.append(part[0])
+            faces.append(part[1])
+            count, first = count + len(part[0]), first + len(lines)
+            _refuse_many(path, sum(map(len, faces)), count)
+    return _mesh(path, np.concatenate(vertices), np.concatenate(faces))
+
+
+def _obj_lines(lines: list[bytes], before: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices and triangles of some lines, with so many vertices before them.
+
+    Raises
+    ------
+    ValueError
+        One of them is no vertex and no face.
+    """
+    of_v, of_f = (
+        np.fromiter((line.startswith(words) for line in lines), bool, len(lines)) for words in (_VERTEX, _FACE)
+    )
+    values, counts = _numbers([lines[k][1:] for k in np.flatnonzero(of_v)])
+    if (counts < 3).any():
+        raise ValueError("a vertex needs three numbers")
+    start = np.cumsum(counts) - counts
+    vertices = values[start[:, None] + np.arange(3)]
+    values, counts = _numbers([lines[k][1:] for k in np.flatnonzero(of_f)], rb"/\S*")
+    # Counted from 1, or backwards from the last vertex so far.
+    so_far = np.repeat((before + np.cumsum(of_v))[of_f], counts)
+    places = np.where(values > 0, values - 1, so_far + values)
+    if (counts < 3).any() or (places < 0).any() or (places != np.rint(places)).any():
+        raise ValueError("a face needs three corners that are there")
+    return vertices, _fans(places.astype(np.int64), counts)
+
+
+def _name_line(path: Path, lines: list[bytes], first: int, before: int) -> None:
+    """Refuse the first of some lines that cannot be read by itself."""
+    for number, line in enumerate(lines, first):
+        try:
+            before += len(_obj_lines([line], before)[0])
+        except ValueError as error:
+            said = line.decode("utf-8", "replace").strip()[:60]
+            raise InputError(f"{path}:{number}: {said!r} is no {said[:1]} ({error}); repair it") from None
 
 
 def read_ply(path: Path) -> ObjectFile:
@@ -74,6 +113,7 @@ def read_ply(path: Path) -> ObjectFile:
     for name, count, _ in elements:
         if not 0 <= count <= size - body:
             raise InputError(f"{path}: promises {count} of {name!r} in {size} bytes; the file is damaged")
+        _refuse_many(path, count, 0)
     try:
         found = _text(path, body, elements) if form == "ascii" else _binary(path, body, form, elements)
     except (ValueError, IndexError, KeyError, TypeError) as error:
@@ -106,19 +146,40 @@ def _header(path: Path, text: str) -> tuple[str, list[tuple[str, int, list[_Prop
 
 
 def _text(path: Path, body: int, elements: list[Any]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    vertices, faces = np.empty((0, 3)), np.empty((0, 3), np.int64)
+    found: dict[str, list[Any]] = {"vertex": [np.empty((0, 3))], "face": [np.empty((0, 3), np.int64)]}
     with path.open("rb") as file:
         file.seek(body)
         for name, count, properties in elements:
-            rows = [file.readline().split() for _ in range(count)]
-            if name == "vertex":
-                columns = [[p[0] for p in properties].index(axis) for axis in "xyz"]
-                vertices = np.array([[float(row[k]) for k in columns] for row in rows]).reshape(-1, 3)
-            elif name == "face":
-                before = _before_list(properties)
-                lists = [[int(v) for v in row[before + 1 : before + 1 + int(row[before])]] for row in rows]
-                faces = _fans(lists)
-    return vertices, faces
+            for start in range(0, count, _BATCH):
+                rows = list(itertools.islice(file, min(_BATCH, count - start)))
+                if name in found:
+                    values, counts = _numbers(rows)
+                    if len(rows) < min(_BATCH, count - start) or not counts.all():
+                        raise ValueError(f"less than {count} rows of {name!r}")
+                    read = _vertex_rows if name == "vertex" else _face_rows
+                    found[name].append(read(values, counts, properties))
+    return np.concatenate(found["vertex"]), np.concatenate(found["face"])
+
+
+def _vertex_rows(
+    values: NDArray[np.float64], counts: NDArray[np.int64], properties: list[_Property]
+) -> NDArray[np.float64]:
+    columns = [[p[0] for p in properties].index(axis) for axis in "xyz"]
+    if (counts != len(properties)).any():
+        raise ValueError(f"a vertex of {counts[counts != len(properties)][0]} instead of {len(properties)} numbers")
+    return values.reshape(-1, len(properties))[:, columns]
+
+
+def _face_rows(
+    values: NDArray[np.float64], counts: NDArray[np.int64], properties: list[_Property]
+) -> NDArray[np.int64]:
+    before = _before_list(properties)
+    start = np.cumsum(counts) - counts
+    corners = values[np.minimum(start + before, start + counts - 1)].astype(np.int64)
+    if (before + 1 + corners > counts).any() or (corners < 0).any():
+        raise ValueError("a face of fewer corners than it says")
+    at = np.repeat(start + before + 1, corners) + _within(corners)
+    return _fans(values[at].astype(np.int64), corners)
 
 
 def _binary(path: Path, body: int, order: str, elements: list[Any]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -146,27 +207,35 @@ def _binary(path: Path, body: int, order: str, elements: list[Any]) -> tuple[NDA
                 faces = table[lists[0][0]].astype(np.int64)
                 at += count * row.itemsize
                 continue
-        corners, at = _rows(raw, at, count, order, properties)
-        faces = _fans(corners)
+        corners, counts, at = _rows(raw, at, count, order, properties)
+        faces = _fans(corners, counts)
     return vertices, faces
 
 
-def _rows(raw: Any, at: int, count: int, order: str, properties: list[_Property]) -> tuple[list[list[int]], int]:
-    """Lists of faces of several lengths, one by one, and where they end."""
-    corners = []
-    for _ in range(count):
-        for _, kind, length in properties:
-            many = 1
-            if length is not None:
-                counted = np.dtype(order + length)
-                many = int(np.frombuffer(raw[at : at + counted.itemsize], counted, 1)[0])
-                at += counted.itemsize
-            item = np.dtype(order + kind)
-            values = np.frombuffer(raw[at : at + many * item.itemsize], item, many)
-            at += many * item.itemsize
-            if length is not None:
-                corners.append(values.astype(int).tolist())
-    return corners, at
+def _rows(
+    raw: Any, at: int, count: int, order: str, properties: list[_Property]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
+    """Corners of faces of several lengths, how many each has, and where they end."""
+    place = _before_list(properties)
+    _, kind, length = properties[place]
+    item, counted = np.dtype(order + kind), np.dtype(order + str(length))
+    before, after = (
+        sum(np.dtype(p[1]).itemsize for p in part) for part in (properties[:place], properties[place + 1 :])
+    )
+    body = raw[at:].tobytes()
+    counts, starts, here = np.empty(count, np.int64), np.empty(count, np.int64), 0
+    for k in range(count):
+        here += before + counted.itemsize
+        if here > len(body):
+            raise ValueError(f"less than {count} faces")
+        many = int.from_bytes(body[here - counted.itemsize : here], "little" if order == "<" else "big")
+        counts[k], starts[k] = many, here
+        here += many * item.itemsize + after
+    if here > len(body):
+        raise ValueError(f"less than {count} faces")
+    first = np.repeat(starts, counts) + _within(counts) * item.itemsize
+    content = np.frombuffer(body, np.uint8)[first[:, None] + np.arange(item.itemsize)]
+    return content.copy().view(item)[:, 0].astype(np.int64), counts, at + here
 
 
 def _before_list(properties: list[_Property]) -> int:
@@ -176,9 +245,44 @@ def _before_list(properties: list[_Property]) -> int:
     return places[0]
 
 
-def _fans(lists: list[list[int]]) -> NDArray[np.int64]:
-    faces = [(at[0], at[k], at[k + 1]) for at in lists for k in range(1, len(at) - 1)]
-    return np.array(faces, np.int64).reshape(-1, 3)
+def _numbers(lines: list[bytes], idle: bytes = b"") -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """All numbers of some lines, one after the other, and how many each line has; what fits `idle` is left out.
+
+    Raises
+    ------
+    ValueError
+        A word is no number.
+    """
+    text = b"\n".join(line.rstrip() for line in lines)
+    text = re.sub(idle, b"", text) if idle else text
+    if not text:
+        return np.empty(0), np.zeros(len(lines), np.int64)
+    raw = np.frombuffer(text, np.uint8)
+    begins = raw > 32
+    begins[1:] &= raw[:-1] <= 32
+    counts = np.bincount(np.cumsum(raw == 10)[begins], minlength=len(lines))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)
+        try:
+            values = np.fromstring(text, sep=" ")
+        except (DeprecationWarning, ValueError):  # older and newer versions of NumPy
+            raise ValueError("numbers, with a point, are needed") from None
+    if len(values) != counts.sum():
+        raise ValueError("numbers, with a point, are needed")
+    return values, counts
+
+
+def _within(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """0, 1, 2 … for each of the counts."""
+    return np.arange(int(counts.sum())) - np.repeat(np.cumsum(counts) - counts, counts)
+
+
+def _fans(corners: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Triangles of faces from their first corners, given all corners and how many each has; less than three: none."""
+    triangles = np.maximum(counts - 2, 0)
+    first = np.repeat(np.cumsum(counts) - counts, triangles)
+    second = first + 1 + _within(triangles)
+    return corners[np.stack([first, second, second + 1], axis=1)]
 
 
 def _size(path: Path) -> int:
@@ -186,6 +290,13 @@ def _size(path: Path) -> int:
     if size > _MOST_BYTES:
         raise InputError(f"{path}: {size} bytes; at most {_MOST_BYTES} are read of a mesh: cut out what is needed")
     return size
+
+
+def _refuse_many(path: Path, faces: int, vertices: int) -> None:
+    if max(faces, vertices) > _MOST:
+        raise InputError(
+            f"{path}: more than {_MOST:,} faces or vertices; cut out what is needed, or make the mesh coarser"
+        )
 
 
 def _mesh(path: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> ObjectFile:
