@@ -71,6 +71,85 @@ def test_cityjson_gives_the_finest_faces_of_what_stands(tmp_path: Path) -> None:
     assert found.crs == "EPSG:2056" and found.height_system is None and found.corners.max() == 10
 
 
+def trees(**changes: Any) -> dict[str, Any]:
+    """Two trees of one template: a square of 2 m, upright; one of them twice as large, turned by a right angle."""
+    template = {"type": "MultiSurface", "lod": "2", "boundaries": [[[0, 1, 2, 3]]]}
+    plain = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+    turned = [0.0, -2, 0, 5, 2, 0, 0, 0, 0, 0, 2, 1, 0, 0, 0, 1]
+    instance = {"type": "GeometryInstance", "template": 0, "boundaries": [6], "transformationMatrix": plain}
+    data = city()
+    data["geometry-templates"] = {
+        "templates": [template], "vertices-templates": [[0.0, 0, 0], [2, 0, 0], [2, 0, 2], [0, 0, 2]]
+    }  # fmt: skip
+    data["CityObjects"] = {
+        "oak": {"type": "SolitaryVegetationObject", "geometry": [instance]},
+        "elm": {
+            "type": "SolitaryVegetationObject",
+            "geometry": [{**instance, "transformationMatrix": turned, **changes}],
+        },
+    }
+    return data
+
+
+def test_templates_of_cityjson_stand_in_their_places(tmp_path: Path) -> None:
+    found = read_objects(written(tmp_path, trees()), "SolitaryVegetationObject")
+    assert found.names == ("oak", "elm")
+    # Vertex 6 is (10, 10, 10) of a file in half metres from (1000, 2000, 3); templates are in metres.
+    oak, elm = (found.corners[found.owner == k].reshape(-1, 3) for k in (0, 1))
+    assert oak.min(axis=0).tolist() == [1005, 2005, 8] and oak.max(axis=0).tolist() == [1007, 2005, 10]
+    assert elm.min(axis=0).tolist() == [1010, 2005, 9] and elm.max(axis=0).tolist() == [1010, 2009, 13]
+    both = city()
+    both["geometry-templates"] = trees()["geometry-templates"]
+    both["CityObjects"]["house"]["geometry"].append({**trees()["CityObjects"]["oak"]["geometry"][0]})
+    finest = read_objects(written(tmp_path, both))
+    assert area(finest.corners[finest.owner == 0]) == pytest.approx(5 * 25)  # the solid comes first of two of LoD 2
+    both["geometry-templates"]["templates"][0]["lod"] = "2.2"
+    finest = read_objects(written(tmp_path, both))
+    assert area(finest.corners[finest.owner == 0]) == pytest.approx(4)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"template": 1}, "'elm'.*template 1 of 1"),
+        ({"template": -1}, "'elm'.*template -1 of 1"),
+        ({"boundaries": [99]}, "'elm'.*vertex 99 of 8"),
+        ({"boundaries": []}, "'elm'.*damaged"),
+        ({"transformationMatrix": [1, 2]}, "'elm'.*damaged"),
+        ({"transformationMatrix": [1.0] * 16}, "'elm'.*transformationMatrix"),
+        ({"transformationMatrix": None}, "'elm'.*damaged"),
+    ],
+)
+def test_fault_19_templates_that_cannot_be_are_named(tmp_path: Path, changes: dict[str, Any], told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        read_objects(written(tmp_path, trees(**changes)), "SolitaryVegetationObject")
+
+
+@pytest.mark.parametrize("mark", ["", "\x1e"])
+def test_a_sequence_of_cityjson_is_the_file_in_parts(tmp_path: Path, mark: str) -> None:
+    """Each feature has vertices of its own; scale, origin, CRS and templates are those of the first line."""
+    data = city()
+    whole = read_objects(written(tmp_path, data))
+    head = {**data, "CityObjects": {}, "vertices": []}
+    lines = [head]
+    deck = {"type": "MultiSurface", "lod": 1, "boundaries": [[[5, 6, 7, 8]]]}
+    for name, item, vertices in (
+        ("house", data["CityObjects"]["house"], CUBE),
+        ("deck", {"type": "BridgePart", "geometry": [deck]}, [[0, 0, 0], *CUBE]),
+    ):
+        lines.append({"type": "CityJSONFeature", "id": name, "CityObjects": {name: item}, "vertices": vertices})
+    path = written(tmp_path, "".join(f"{mark}{json.dumps(line)}\n" for line in lines), "town.city.jsonl")
+    found = read_objects(path)
+    assert found.names == whole.names and (found.crs, found.height_system) == (whole.crs, whole.height_system)
+    np.testing.assert_array_equal(found.corners, whole.corners)
+    path.write_text(path.read_text() + '{"type": "Feature"}\n')
+    with pytest.raises(InputError, match="no CityJSONFeature"):
+        read_objects(path)
+    path.write_text(path.read_text() + "{\n")
+    with pytest.raises(InputError, match=r"town.city.jsonl:5: not valid JSON"):
+        read_objects(path)
+
+
 def broken(**changes: Any) -> dict[str, Any]:
     data = city()
     geometry = data["CityObjects"]["house"]["geometry"][1]

@@ -87,15 +87,35 @@ def read_json(path: Path, max_bytes: int = 1_000_000_000) -> Any:
     InputError
         The file is not JSON, or nested without reason.
     """
-    text = read_text(path, max_bytes)
+    return _from_json(path, read_text(path, max_bytes))
 
+
+def read_json_lines(path: Path, max_bytes: int = 1_000_000_000) -> list[Any]:
+    """Plain contents of a file that has a JSON document in each line, with the marks of a JSON sequence (RFC 8142) or
+    without, or a single one in all lines.
+
+    Raises
+    ------
+    InputError
+        As of `read_json`.
+    """
+    text = read_text(path, max_bytes)
+    lines = [line.lstrip("\x1e") for line in text.split("\n")]
+    first = next((line for line in lines if line.strip()), "")
+    # The first line of a document in many lines is no document.
+    if not (first.rstrip().endswith("}") and first.lstrip().startswith("{")):
+        return [_from_json(path, text)]
+    return [_from_json(path, line, number) for number, line in enumerate(lines, 1) if line.strip()]
+
+
+def _from_json(path: Path, text: str, first_line: int = 1) -> Any:
     def refuse(word: str) -> NoReturn:
         raise InputError(f"{path}: holds {word}, which is no number in JSON; repair the file")
 
     try:
         return json.loads(text, parse_constant=refuse)
     except json.JSONDecodeError as error:
-        raise InputError(f"{path}:{error.lineno}: not valid JSON ({error.msg})") from None
+        raise InputError(f"{path}:{error.lineno + first_line - 1}: not valid JSON ({error.msg})") from None
     except RecursionError:
         raise InputError(f"{path}: nested far too deep for a file of this kind") from None
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.objects.model import ObjectFile, from_polygons
-from photoplan.io.plain_files import finite, read_json
+from photoplan.io.plain_files import finite, read_json_lines
 
 #: Types that are read if nobody says which: what stands on the ground, not what is the ground.
 STANDING = ("Building", "Bridge")
@@ -26,51 +26,59 @@ _MOST_BYTES = 1 << 29
 def read(path: Path, layer: str | None) -> ObjectFile:
     """Faces of the objects of a CityJSON file; `layer`: of one type, with its parts (``Bridge``, ``BridgePart`` …).
 
-    Where surfaces have a meaning, ground and closure surfaces are left out. Templates are not read.
+    Where surfaces have a meaning, ground and closure surfaces are left out. A file may be a sequence (CityJSONSeq): the
+    first line states what all have in common, each other one is a feature with vertices of its own.
 
     Raises
     ------
     InputError
         The file is damaged, of another version, or holds no such objects with faces; the object is named.
     """
-    data = read_json(path, _MOST_BYTES)
+    data, *features = read_json_lines(path, _MOST_BYTES)
     version = str(data.get("version", "")) if isinstance(data, dict) else ""
     if not version or data.get("type") != "CityJSON" or not re.fullmatch(r"(1\.[01]|2\.0)(\.\d+)?", version):
         raise InputError(f"{path}: not CityJSON 1.0 to 2.0 (version {version[:20]!r}); convert it with cjio")
-    vertices = _vertices(path, data)
-    city = data.get("CityObjects")
-    if not isinstance(city, dict):
-        raise InputError(f"{path}: no CityObjects; get a fresh copy")
+    templates = _templates(path, data)
     types = STANDING if layer is None else (layer,)
     polygons: list[list[NDArray[np.float64]]] = []
     objects: list[int] = []
     names: list[str] = []
-    for name, item in city.items():
-        if not isinstance(item, dict) or not str(item.get("type", "")).lstrip("+").startswith(types):
-            continue
-        try:
-            found = [[_ring(ring, vertices) for ring in face] for face in _faces(item.get("geometry") or [])]
-        except (TypeError, KeyError, IndexError, ValueError, AttributeError, RecursionError) as error:
-            raise InputError(f"{path}: object {name[:100]!r}: damaged geometry ({error}); get a fresh copy") from None
-        if found:
-            polygons += found
-            objects += [len(names)] * len(found)
-            names.append(name)
+    there: set[str] = set()
+    for holder in (data, *features):
+        if holder is not data and (not isinstance(holder, dict) or holder.get("type") != "CityJSONFeature"):
+            raise InputError(f"{path}: a line of the sequence is no CityJSONFeature; get a fresh copy")
+        vertices = _vertices(path, holder.get("vertices"), data.get("transform"))
+        city = holder.get("CityObjects")
+        if not isinstance(city, dict):
+            raise InputError(f"{path}: no CityObjects; get a fresh copy")
+        for name, item in city.items():
+            kind = str(item.get("type", "")).lstrip("+") if isinstance(item, dict) else ""
+            there.add(kind)
+            if not kind.startswith(types):
+                continue
+            try:
+                found = list(_faces(item.get("geometry") or [], vertices, templates))
+            except (TypeError, KeyError, IndexError, ValueError, AttributeError, RecursionError) as error:
+                raise InputError(
+                    f"{path}: object {name[:100]!r}: damaged geometry ({error}); get a fresh copy"
+                ) from None
+            if found:
+                polygons += found
+                objects += [len(names)] * len(found)
+                names.append(name)
     if not polygons:
-        there = sorted({str(item.get("type")) for item in city.values() if isinstance(item, dict)})
+        told = ", ".join(sorted(there - {""}))[:300] or "none"
         raise InputError(
-            f"{path}: no {' or '.join(types)} with faces; its types are {', '.join(there)[:300] or 'none'}; layer = … "
-            "in [[objects]] chooses one"
+            f"{path}: no {' or '.join(types)} with faces; its types are {told}; layer = … in [[objects]] chooses one"
         )
     return from_polygons(str(path), polygons, objects, names, _crs(data))  # type: ignore[arg-type]
 
 
-def _vertices(path: Path, data: dict[str, Any]) -> NDArray[np.float64]:
+def _vertices(path: Path, stated: Any, transform: Any) -> NDArray[np.float64]:
     try:
-        vertices = np.array(data["vertices"], float).reshape(-1, 3)
-    except (KeyError, TypeError, ValueError):
+        vertices = np.array(stated, float).reshape(-1, 3)
+    except (TypeError, ValueError):
         raise InputError(f"{path}: `vertices` are not a list of X, Y, Z; get a fresh copy") from None
-    transform = data.get("transform")
     if transform is not None:
         scale, translate = (
             finite((transform or {}).get(k), f"{path}: transform {k}", 3) for k in ("scale", "translate")
@@ -81,15 +89,47 @@ def _vertices(path: Path, data: dict[str, Any]) -> NDArray[np.float64]:
     return vertices
 
 
-def _faces(geometries: list[Any]) -> Iterator[list[list[int]]]:
+_Templates = tuple[list[Any], NDArray[np.float64]]
+"""Geometries that objects share, and their vertices."""
+
+
+def _templates(path: Path, data: dict[str, Any]) -> _Templates:
+    stated = data.get("geometry-templates")
+    if stated is None:
+        return [], np.empty((0, 3))
+    if not isinstance(stated, dict) or not isinstance(stated.get("templates"), list):
+        raise InputError(f"{path}: `geometry-templates` hold no templates; get a fresh copy")
+    return stated["templates"], _vertices(path, stated.get("vertices-templates"), None)
+
+
+def _faces(
+    geometries: list[Any], vertices: NDArray[np.float64], templates: _Templates
+) -> Iterator[list[NDArray[np.float64]]]:
     """Surfaces, each a list of rings, of the finest geometry that has some."""
-    usable = [g for g in geometries if g["type"] in _DEPTH]
+    placed = [_placed(g, vertices, templates) for g in geometries]
+    usable = [each for each in placed if each[0]["type"] in _DEPTH]
     if not usable:
         return
-    finest = max(usable, key=lambda g: float(g.get("lod", 0)))
+    finest, own = max(usable, key=lambda each: float(each[0].get("lod", 0)))
     semantics = finest.get("semantics") or {}
     none = {k for k, s in enumerate(semantics.get("surfaces", ())) if s["type"] in _NO_FACES}
-    yield from _of_depth(finest["boundaries"], semantics.get("values"), _DEPTH[finest["type"]], none)
+    for face in _of_depth(finest["boundaries"], semantics.get("values"), _DEPTH[finest["type"]], none):
+        yield [_ring(ring, own) for ring in face]
+
+
+def _placed(
+    geometry: dict[str, Any], vertices: NDArray[np.float64], templates: _Templates
+) -> tuple[dict[str, Any], NDArray[np.float64]]:
+    """A geometry and the vertices that it counts; an instance is its template, moved to its place."""
+    if geometry["type"] != "GeometryInstance":
+        return geometry, vertices
+    number, (anchor,) = geometry["template"], geometry["boundaries"]
+    if not 0 <= number < len(templates[0]):
+        raise ValueError(f"template {number} of {len(templates[0])}")
+    M = np.array(geometry["transformationMatrix"], float).reshape(4, 4)
+    if not (np.isfinite(M).all() and (M[3] == (0, 0, 0, 1)).all()):
+        raise ValueError("a transformationMatrix that moves and turns nothing in space")
+    return templates[0][number], templates[1] @ M[:3, :3].T + M[:3, 3] + _ring([anchor], vertices)[0]
 
 
 def _of_depth(items: list[Any], values: Any, depth: int, none: set[int]) -> Iterator[list[list[int]]]:

@@ -37,10 +37,14 @@ def read_with_faults(path: Path, layer: str | None = None) -> ObjectFile:
         It cannot be used.
     """
     path = check_plain_file(path, "object file")
-    head = read_head(path).lstrip()
+    head = read_head(path).lstrip("\x1e \t\n")
     if head.startswith("ply"):
         return mesh.read_ply(path)
-    if re.search(r'"type"\s*:\s*"CityJSON"', head) or ("CityObjects" in head) or path.name.endswith(".city.json"):
+    if (
+        re.search(r'"type"\s*:\s*"CityJSON"', head)
+        or ("CityObjects" in head)
+        or path.name.endswith((".city.json", ".city.jsonl"))
+    ):
         return cityjson.read(path, layer)
     if re.search(r"^(v|f|o|g|vn|vt|mtllib|usemtl) ", head, re.MULTILINE) and path.suffix.casefold() == ".obj":
         return mesh.read_obj(path)
