@@ -22,8 +22,9 @@ from photoplan.products.adjust.frame import nadir_heights
 from photoplan.products.control.patches import Ortho, choose_patches
 from photoplan.products.monoplot import _unknown_on_objects
 from photoplan.products.tie.inputs import _placed
+from photoplan.project.cameras import camera_without_pixels
 from photoplan.project.ground import ground_of
-from photoplan.project.scene import camera_without_pixels, open_scene
+from photoplan.project.scene import open_scene
 from photoplan.terrain.monoplot import MonoplotErrors, monoplot
 
 GROUND, DECK = 100.0, 250.0

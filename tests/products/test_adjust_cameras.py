@@ -11,7 +11,7 @@ from pydantic import TypeAdapter
 from photoplan.cameras.interior import Interior
 from photoplan.io.camera.kinds import Camera
 from photoplan.io.project.cameras import interior_of, lens_of
-from photoplan.io.project.model import Image
+from photoplan.io.project.posed import Image
 from photoplan.orientation.bundle.block import AdjustedCamera, BlockCamera
 from photoplan.products.adjust.cameras import block_camera, calibrated, camera_entries
 

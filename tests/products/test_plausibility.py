@@ -14,11 +14,12 @@ from photoplan.geometry.rotation import angles_from_rotation, rotation_from_angl
 from photoplan.io.camera.file import read_cameras
 from photoplan.io.camera.frame import FrameEntry
 from photoplan.io.orientation.file import read_orientation
-from photoplan.io.project.model import Image, Orientation
+from photoplan.io.project.model import Orientation
+from photoplan.io.project.posed import Image
 from photoplan.io.terrain.reader import TerrainReader
 from photoplan.orientation.other_readings import DECLARED, readings
 from photoplan.orientation.plausibility import Heights, ImagePlausibility, View, look, other_reading
-from photoplan.project.scene import view_of
+from photoplan.project.posed import view_of
 from photoplan.surfaces.raster import RasterSurface
 
 EAST = np.array([1100.0, 0, 0])

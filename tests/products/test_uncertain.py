@@ -21,8 +21,8 @@ from photoplan.orientation.bundle.block import AdjustSettings
 from photoplan.products.adjust.block import adjust_prepared, map_result, prepare, stated_accuracy
 from photoplan.products.adjust.inputs import read_inputs
 from photoplan.products.adjust.start import started
+from photoplan.project.cameras import camera_without_pixels
 from photoplan.project.ground import ground_of
-from photoplan.project.scene import camera_without_pixels
 from photoplan.project.uncertain import StatedHeightErrors, height_errors, source_errors
 from photoplan.targets.map import MapTarget
 

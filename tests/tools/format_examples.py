@@ -19,7 +19,7 @@ from photoplan.io.orientation.block import OrientationBlock
 from photoplan.io.orientation.file import read_orientation_block, write_orientation
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.project.cameras import interior_of, lens_of
-from photoplan.io.project.model import Image
+from photoplan.io.project.posed import Image
 
 LENSES: dict[str, Any] = {
     "none": IdealLens(),

@@ -26,7 +26,7 @@ _FILE = PATH
 @click.argument("folder", metavar="DIR", type=FOLDER)
 @click.option("--images", multiple=True, required=True, metavar="PATTERN,…", help="Files; may be repeated.",
               callback=lambda context, parameter, values: listed(values))  # fmt: skip
-@click.option("--camera", required=True, type=PATH, help="Cameras: TOML, YAML or JSON.")
+@click.option("--camera", type=PATH, help="Cameras: TOML, YAML or JSON [images have RPC].")
 @click.option("--orientation", type=_FILE, help="Orientation: TOML, JSON, table … [images are to be oriented].")
 @click.option(
     "--terrain", metavar="FILE|HEIGHT", help="Raster of heights, or one height in metres; needed for products."

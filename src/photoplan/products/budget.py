@@ -16,8 +16,8 @@ from photoplan.io.project.file import load_project, parse_project
 from photoplan.io.project.model import Project
 from photoplan.kernels.weights import KERNELS
 from photoplan.plan.accuracy import SourceErrors, figures_at, in_image, resampling_sigma
+from photoplan.project.cameras import central_without_pixels
 from photoplan.project.ground import Ground, ground_of
-from photoplan.project.scene import camera_without_pixels
 from photoplan.project.uncertain import StatedHeightErrors, height_errors, source_errors
 from photoplan.targets.map import MapTarget
 
@@ -228,7 +228,7 @@ def _stated(project: Project, request: BudgetRequest) -> tuple[Project, list[str
 
 
 def _of_image(project: Project, name: str, ground: Ground, heights: Any, request: BudgetRequest) -> ImageBudget:
-    camera = camera_without_pixels(project, name)
+    camera = central_without_pixels(project, name)
     whole = source_errors(project, project.image(name), ground, camera, in_image(request.kernel, request.tolerance))
     w, h = camera.size
     level = _level(camera, ground, name)

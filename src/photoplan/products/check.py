@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from photoplan.cameras.base import CentralCamera
+from photoplan.cameras.base import Camera
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.local import MEAN_RADIUS
 from photoplan.io.project.model import Project
@@ -17,8 +17,9 @@ from photoplan.plain import pick
 from photoplan.plan.footprint import Footprint, footprint, mean_gsd
 from photoplan.products.judged import against_files, judged, reading_of_block
 from photoplan.products.orthophoto.look import two_figures
+from photoplan.project.cameras import camera_without_pixels, is_there
 from photoplan.project.ground import Ground, ground_of
-from photoplan.project.scene import camera_without_pixels, is_there, map_order, open_scene
+from photoplan.project.scene import map_order, open_scene
 
 #: Terrain displacements of curvature above this deserve a strict model, pixels.
 _CURVATURE_MATTERS = 0.3
@@ -111,10 +112,10 @@ def check_project(project: Project, images: Sequence[str] | None = None) -> Proj
     """
     names = project.select(images)
     ground = ground_of(project)
-    looked: dict[int, tuple[View, ImagePlausibility, ImageCheck]] = {}
+    looked: dict[int, tuple[View | None, ImagePlausibility, ImageCheck]] = {}
     for place in map_order(project, names):
         # All that is asked of the terrain for one image, before the next: its blocks are then at hand.
-        view, found = judged(project, project.image(names[place]), ground)
+        view, found = judged(project, project.any_image(names[place]), ground)
         looked[place] = view, found, _check_image(project, ground, found)
     views, looks, checks = zip(*(looked[place] for place in range(len(names))))
     gsds = [c.gsd for c in checks if np.isfinite(c.gsd)]
@@ -130,7 +131,7 @@ def check_project(project: Project, images: Sequence[str] | None = None) -> Proj
 
 def _check_image(project: Project, ground: Ground, looked: ImagePlausibility) -> ImageCheck:
     name, tilt, fault = looked.name, looked.tilt, looked.fault
-    file = project.resolve(project.image(name).file)
+    file = project.resolve(project.any_image(name).file)
     if is_there(file):
         scene = open_scene(project, name)
         camera, notes = scene.camera, scene.notes
@@ -169,7 +170,7 @@ def _check_image(project: Project, ground: Ground, looked: ImagePlausibility) ->
     )
 
 
-def _sensitivity(camera: CentralCamera, seen: Footprint) -> tuple[float, float]:
+def _sensitivity(camera: Camera, seen: Footprint) -> tuple[float, float]:
     """Largest displacement by 1 m of height, and by the earth's curvature, over the footprint; pixels."""
     outline = seen.outline
     points = outline[np.isfinite(outline).all(axis=1)]
@@ -177,7 +178,10 @@ def _sensitivity(camera: CentralCamera, seen: Footprint) -> tuple[float, float]:
         return float("nan"), float("nan")
     per_metre = np.linalg.norm(camera.derivatives(points)[..., 2], axis=-1)
     # Ecker 1991, eq. 4.17 with Z̄ = 0: the ground falls away from the tangential plane by d² / 2R.
-    drop = ((points[:, :2] - camera.center[:2]) ** 2).sum(axis=1) / (2 * MEAN_RADIUS)
+    # Polynomials hold it.
+    vantage = camera.vantage
+    away = points[:, :2] - vantage.point[:2] if vantage.central else np.zeros((len(points), 2))
+    drop = (away**2).sum(axis=1) / (2 * MEAN_RADIUS)
     return float(np.nanmax(per_metre)), float(np.nanmax(per_metre * drop))
 
 

@@ -32,7 +32,7 @@ from photoplan.io.orientation.file import (
 from photoplan.io.orientation.table import Direction, OrientationTable, OrientedImage, TableFormat, degrees_of
 from photoplan.io.product import check_output
 from photoplan.io.project.cameras import interior_of, lens_of
-from photoplan.io.project.model import Image
+from photoplan.io.project.posed import Image
 from photoplan.orientation.readings import (
     FittedReading,
     Reading,
@@ -46,7 +46,7 @@ from photoplan.plain import pick
 from photoplan.products.init.match import camera_name
 from photoplan.products.init.run import placed
 from photoplan.products.judged import differences, on_map, stated_positions
-from photoplan.project.scene import is_there
+from photoplan.project.cameras import is_there
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from photoplan.io.camera.rpc.file import is_rpc, read_rpc, rpc_beside, rpc_in
 from photoplan.io.filter_file import is_filter
 from photoplan.io.plan_file import read_plan_tables
 from photoplan.io.project.file import load_project
+from photoplan.io.project.image import ImageEntry
 from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
 from photoplan.io.terrain.model_tables import GrossError
@@ -99,8 +100,13 @@ def _project(path: Path) -> dict[str, Any]:
         "cameras": [f"{name}: {camera.type}, lens {camera.lens.type}" for name, camera in project.cameras.items()],
         "orientation": f"{project.orientation.rotation}, {project.orientation.angle_unit}, "
         f"earth curvature {project.orientation.earth_curvature}",
-        "images": [f"{image.name}: {image.file}" for image in project.images],
+        "images": [_image(image) for image in project.images],
     }
+
+
+def _image(image: ImageEntry) -> str:
+    geometry = "" if image.described_by else f", geometry in {image.geometry_file or 'the file itself'}"
+    return f"{image.name}: {image.file}{geometry}"
 
 
 def _plan(path: Path) -> dict[str, Any]:

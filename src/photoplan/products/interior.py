@@ -17,7 +17,8 @@ from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.io.project.cameras import fiducial_fit
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
-from photoplan.io.project.model import Image, Project
+from photoplan.io.project.model import Project
+from photoplan.io.project.posed import Image
 from photoplan.io.scan_pitch import parse_pitch, read_pitch
 from photoplan.plain import pick
 

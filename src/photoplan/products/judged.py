@@ -20,10 +20,14 @@ from photoplan.geometry.crs import crs_step
 from photoplan.io.image_metadata import read_image_metadata
 from photoplan.io.orientation.exif import SUFFIXES
 from photoplan.io.orientation.table import OrientationTable
-from photoplan.io.project.model import Image, Project
+from photoplan.io.project.image import ImageEntry
+from photoplan.io.project.model import Project
+from photoplan.io.project.posed import Image
 from photoplan.orientation.plausibility import ImagePlausibility, View, look, other_reading
+from photoplan.plan.footprint import footprint, mean_gsd
+from photoplan.project.cameras import camera_without_pixels, is_there
 from photoplan.project.ground import Ground
-from photoplan.project.scene import is_there, pose_of, view_of
+from photoplan.project.posed import pose_of, view_of
 
 _Floats = NDArray[np.float64]
 
@@ -39,8 +43,10 @@ _ENOUGH = 4
 _NEIGHBOURS = 40
 
 
-def judged(project: Project, image: Image, ground: Ground) -> tuple[View, ImagePlausibility]:
+def judged(project: Project, image: ImageEntry, ground: Ground) -> tuple[View | None, ImagePlausibility]:
     """An oriented image, and what follows from its orientation: by its CRS, its file's own position, and the terrain.
+
+    Without a pose there is nothing that could be read in another way, and so no view.
 
     Objects do not count: a camera below a bridge is not below the ground.
 
@@ -49,6 +55,8 @@ def judged(project: Project, image: Image, ground: Ground) -> tuple[View, ImageP
     InputError
         The image is not oriented.
     """
+    if not isinstance(image, Image):
+        return None, _without_pose(project, image.name, ground)
     center = pose_of(project, image, ground).center
     view = view_of(image, project.cameras[image.camera], project.orientation, center)
     found = look(view, ground.bare.heights)
@@ -56,16 +64,42 @@ def judged(project: Project, image: Image, ground: Ground) -> tuple[View, ImageP
     return view, found if odd is None else replace(found, fault=odd)
 
 
+def _without_pose(project: Project, name: str, ground: Ground) -> ImagePlausibility:
+    """What follows for an image whose rays meet nowhere."""
+    camera = camera_without_pixels(project, name)
+    place = camera.vantage.point
+    seen = footprint(camera, ground.bare, ground.bounds)
+    nan = float("nan")
+    found = ImagePlausibility(
+        name=name,
+        tilt=nan,
+        azimuth=nan,
+        height_above_ground=nan,
+        gsd=nan,
+        on_terrain=seen.on_surface,
+        middle_on_terrain=seen.on_surface > 0,
+        fault=area_fault(project.crs, place),
+    )
+    if seen.bounds is None:
+        return found
+    middle = (np.array(camera.size) - 1) / 2
+    d = camera.rays(middle, float(np.clip(np.mean(seen.height_range), camera.vantage.floor, place[2])))[1]
+    tilt, azimuth = np.degrees([np.arccos(-d[2]), np.arctan2(d[0], d[1])])
+    return replace(found, tilt=float(tilt), azimuth=float(azimuth) % 360, gsd=mean_gsd(camera, seen))
+
+
 def reading_of_block(
-    project: Project, seen: Mapping[str, tuple[View, ImagePlausibility]], ground: Ground
+    project: Project, seen: Mapping[str, tuple[View | None, ImagePlausibility]], ground: Ground
 ) -> str | None:
     """The reading of the orientation that would fit better than the declared one, see `other_reading`.
 
     Few images say little of tilts and flight lines: the other images of the block beside them are looked at, too.
     """
-    looked = dict(seen)
+    looked = {name: (view, found) for name, (view, found) in seen.items() if view is not None}
+    if not looked:
+        return None
     first = next((view.center for view, _ in looked.values()), None)
-    others = [image for image in project.images if image.center is not None and image.name not in looked]
+    others = [image for image in project.posed if image.center is not None and image.name not in looked]
     if first is not None and len(looked) < _NEIGHBOURS:
         others.sort(key=lambda image: float(np.hypot(*(np.array(image.center)[:2] - first[:2]))))
         for image in others[: _NEIGHBOURS - len(looked)]:
@@ -127,9 +161,9 @@ def position_fault(project: Project, image: Image) -> str | None:
 
 def against_files(project: Project, names: Sequence[str]) -> tuple[str, ...]:
     """Sentences on how the oriented images of a project lie to the positions of their files, those far off left out."""
-    images = [image for image in map(project.image, names) if image.center is not None]
+    images = [image for image in project.posed if image.name in names and image.center is not None]
     stated = on_map(geodetic_positions(project.resolve(image.file) for image in images), project.crs)
-    return common_differences([image.center or () for image in images], stated)
+    return common_differences(np.array([image.center for image in images], float).reshape(-1, 3), stated)
 
 
 def differences(names: Sequence[str], centers: ArrayLike, stated: ArrayLike) -> tuple[str, ...]:

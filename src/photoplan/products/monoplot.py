@@ -18,14 +18,18 @@ from photoplan.io.orientation.table import angle_in_radians
 from photoplan.io.polygons import read_features, write_features
 from photoplan.io.product import check_output
 from photoplan.io.project.file import load_project
+from photoplan.io.project.image import ImageEntry
 from photoplan.io.project.model import Project
+from photoplan.io.project.posed import Image
 from photoplan.io.run_record import recording
 from photoplan.io.tables import Columns, read_table, write_table
 from photoplan.plain import pick
 from photoplan.plan.footprint import footprint
+from photoplan.project.cameras import camera_without_pixels
 from photoplan.project.ground import Ground, ground_of
 from photoplan.project.open_terrain import open_terrain
-from photoplan.project.scene import camera_without_pixels, input_files, pose_of
+from photoplan.project.posed import pose_of
+from photoplan.project.scene import input_files
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.terrain.monoplot import REASONS, MonoplotErrors, MonoplotPoints, monoplot
 
@@ -126,14 +130,13 @@ def monoplot_file(request: MonoplotRequest) -> MonoplotReport:
         notes = []
         if sigma is None:
             notes.append("no standard deviations: the terrain has none of its own; give `sigma_terrain` METRES")
-        pose = pose_of(project, project.image(name), ground)
         unit = project.orientation.angle_unit
         errors = MonoplotErrors(
             request.sigma_image,
             sigma,
             request.sigma_position,
             tuple(float(a) for a in angle_in_radians(np.array(request.sigma_angles), unit)),  # type: ignore[arg-type]
-            _axes(pose.R_ground_camera, project.orientation.rotation),
+            _axes_of(project, project.any_image(name), ground, request),
         )
         seen = footprint(camera, ground.surface, ground.bounds)
         found = monoplot(camera, given.xy, ground.surface, seen.height_range, errors, mesh)
@@ -141,7 +144,7 @@ def monoplot_file(request: MonoplotRequest) -> MonoplotReport:
             notes += _unknown_on_objects(found, ground)
         if (found.reasons != "").all():
             bounds = "nowhere" if seen.bounds is None else " ".join(f"{v:.8g}" for v in seen.bounds)
-            center = " ".join(f"{v:.8g}" for v in camera.center)
+            center = " ".join(f"{v:.8g}" for v in camera.vantage.point)
             notes.append(f"no point is on the ground; camera at {center}, terrain in its reach {bounds}")
         _write_table(request.output, given, found)
         if request.vectors is not None:
@@ -180,6 +183,20 @@ def _unknown_on_objects(found: MonoplotPoints, ground: Ground) -> list[str]:
         f"{int(on_object.sum())} points lie on objects, whose accuracy is not known: no standard deviations; "
         "`sigma_terrain` METRES counts for objects, too"
     ]
+
+
+def _axes_of(
+    project: Project, image: ImageEntry, ground: Ground, request: MonoplotRequest
+) -> NDArray[np.float64] | None:
+    """Axes about which an image's orientation may be wrong; None: it has none."""
+    if isinstance(image, Image):
+        return _axes(pose_of(project, image, ground).R_ground_camera, project.orientation.rotation)
+    if any((*request.sigma_position, *request.sigma_angles)):
+        raise UsageError(
+            f"image {image.name!r} has no projection centre and no angles that could have standard deviations; state "
+            "the accuracy of its geometry with `sigma_image`"
+        )
+    return None
 
 
 def _axes(R_ground_camera: NDArray[np.float64], order: str) -> NDArray[np.float64]:

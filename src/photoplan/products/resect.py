@@ -22,7 +22,8 @@ from photoplan.geometry.rotation import ANGLE_UNITS, angles_from_rotation
 from photoplan.io.project.cameras import interior_of, lens_of
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
-from photoplan.io.project.model import Image, Project
+from photoplan.io.project.model import Project
+from photoplan.io.project.posed import Image
 from photoplan.io.run_record import recording
 from photoplan.orientation.bundle.block import AdjustedCamera
 from photoplan.orientation.bundle.frame import angle_derivatives
@@ -34,7 +35,7 @@ from photoplan.products.adjust.block import decimals_of, stated_accuracy
 from photoplan.products.adjust.cameras import Calibrated, block_camera, calibrated, camera_entries
 from photoplan.products.adjust.frame import block_frame, nadir_heights
 from photoplan.products.adjust.inputs import AdjustInputs, read_inputs
-from photoplan.project.scene import stated_pose
+from photoplan.project.posed import stated_pose
 
 #: Control points from which an image is tried where none is named.
 _LEAST = 3

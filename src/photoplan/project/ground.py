@@ -82,7 +82,7 @@ def ground_of(project: Project) -> Ground:
     stamps = tuple(stamp_of(project.resolve(file)) for file in files)
     folder = str(project.folder)
     return _ground(
-        _GroundAddress(project.ground, orientation.height_system, strict, project.crs, folder, stamps, project.objects)
+        _GroundAddress(project.ground, project.height_system, strict, project.crs, folder, stamps, project.objects)
     )
 
 

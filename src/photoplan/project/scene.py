@@ -10,25 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from photoplan.cameras.base import CentralCamera
-from photoplan.cameras.build import oriented_camera
+from photoplan.cameras.base import Camera
 from photoplan.engine.base import Source
 from photoplan.errors import InputError
-from photoplan.geometry.heights import height_step
-from photoplan.geometry.pose import Pose
-from photoplan.geometry.rotation import rotation_from_angles
-from photoplan.io.camera.model import CameraEntry
 from photoplan.io.fingerprint import fingerprint
-from photoplan.io.orientation.table import angle_in_radians
-from photoplan.io.project.cameras import image_size, interior_of, lens_of
 from photoplan.io.project.file import parse_project
-from photoplan.io.project.model import Image, Orientation, Project
+from photoplan.io.project.image import ImageEntry
+from photoplan.io.project.model import Project
+from photoplan.io.project.posed import Image
 from photoplan.io.raster import RasterReader
-from photoplan.io.raster_info import read_info
-from photoplan.orientation.plausibility import View
 from photoplan.plan.footprint import Footprint, footprint
+from photoplan.project.cameras import camera_of
 from photoplan.project.filter_files import load_filter
 from photoplan.project.ground import Ground, ground_of, stamp_of
 from photoplan.project.linearisation import linearisation_of
@@ -57,10 +50,10 @@ class SceneAddress:
         """
         project = json.loads(self.text)
         (image,) = project.pop("images")
-        (camera,) = project.pop("cameras").values()
+        camera: dict[str, Any] = next(iter(project.pop("cameras").values()), {})
         restored = image.pop("restore", None) or camera.get("restore")
         camera.pop("restore", None)
-        for name in ("name", "file", "camera", "sigma_center", "sigma_angles", "correlation"):
+        for name in ("name", "file", "camera", "rpc", "sigma_center", "sigma_angles", "correlation"):
             image.pop(name, None)
         ground = (project["terrain"], *project.get("objects", ()))
         idle = [(part, name) for part in ground for name in ("file", "sigma")]
@@ -88,7 +81,7 @@ class SceneAddress:
 class Scene:
     """One image with its camera and the ground below it."""
 
-    camera: CentralCamera
+    camera: Camera
     surface: Terrain
     reader: SteppedReader
     ground: Ground
@@ -121,7 +114,7 @@ class Scene:
 
 def input_files(project: Project) -> list[Path]:
     """All files that a project names; nothing that is written may replace one of them."""
-    files = [image.file for image in project.images]
+    files = [file for image in project.images for file in (image.file, image.geometry_file) if file is not None]
     restored = [project.restoration(image) for image in project.images]
     files += [file for each in restored if each is not None for file in each.files]
     files += [] if project.terrain is None or project.terrain.file is None else [project.terrain.file]
@@ -143,38 +136,20 @@ def open_scene(project: Project, name: str) -> Scene:
     return _open(scene_address(project, name))
 
 
-def is_there(file: Path) -> bool:
-    """Whether anything is found under a name, be it one that no file can have."""
-    try:
-        file.stat()
-    except (OSError, ValueError):
-        return False
-    return True
-
-
-def camera_without_pixels(project: Project, name: str) -> CentralCamera:
-    """Camera of one image by numbers alone: the image file need not be there; where it is, its size is compared.
-
-    Raises
-    ------
-    InputError
-        No size is known, that of the file is another one, or the image is not oriented.
-    """
-    image = project.image(name)
-    file = project.resolve(image.file)
-    size = read_info(file).size if is_there(file) else image_size(project.cameras[image.camera], image)
-    return camera_of(project, image, ground_of(project), size)
-
-
 def map_order(project: Project, names: Sequence[str]) -> list[int]:
     """Places in `names` such that images that are near on the map come soon after each other (a curve of Morton).
 
     What was read of the terrain for one is then at hand for the next; along strips each strip would read its own.
     """
-    XY = np.array([(project.image(name).center or (0.0, 0.0))[:2] for name in names])
+    XY = np.array([_place(project.any_image(name)) for name in names])
     cell = (1023 * (XY - XY.min(axis=0)) / max(1e-9, float(np.ptp(XY, axis=0).max()))).astype(int)
     code = sum((cell[:, axis] >> bit & 1) << (2 * bit + axis) for bit in range(10) for axis in (0, 1))
     return [int(place) for place in np.argsort(code, kind="stable")]
+
+
+def _place(image: ImageEntry) -> tuple[float, ...]:
+    """Where an image is on the map, as far as that is known without opening it."""
+    return image.center[:2] if isinstance(image, Image) and image.center is not None else (0.0, 0.0)
 
 
 def scene_address(project: Project, name: str) -> SceneAddress:
@@ -185,9 +160,9 @@ def scene_address(project: Project, name: str) -> SceneAddress:
     InputError
         A file is missing.
     """
-    image = project.image(name)
-    alone = project.model_copy(update={"images": (image,), "cameras": {image.camera: project.cameras[image.camera]}})
-    files = [project.resolve(image.file)]
+    image = project.any_image(name)
+    alone = project.alone([name])
+    files = [project.resolve(file) for file in (image.file, image.geometry_file) if file is not None]
     if project.ground.file is not None:
         files.append(project.resolve(project.ground.file))
     files += [project.resolve(objects.file) for objects in project.objects]
@@ -218,7 +193,7 @@ def _open(address: SceneAddress) -> Scene:
     return Scene(camera, ground.surface, reader, ground, address)
 
 
-def _reader(project: Project, image: Image) -> SteppedReader:
+def _reader(project: Project, image: ImageEntry) -> SteppedReader:
     """The image's pixels, restored if the project says so."""
     source = SteppedReader(RasterReader(project.resolve(image.file)))
     restoration = project.restoration(image)
@@ -227,80 +202,3 @@ def _reader(project: Project, image: Image) -> SteppedReader:
     table = restoration.linearisation
     light = linearisation_of(table if table in ("linear", "srgb") else str(project.resolve(table)))
     return restored(source, load_filter(project.resolve(restoration.filter)), light)
-
-
-def stated_pose(project: Project, image: Image) -> Pose:
-    """Exterior orientation of an image as the project states it, in the orientation's height system.
-
-    Raises
-    ------
-    InputError
-        It states none.
-    """
-    orientation = project.orientation
-    center, angles = image.pose_numbers
-    radians = angle_in_radians(np.array(angles), orientation.angle_unit)
-    return Pose(np.array(center, float), rotation_from_angles(radians, orientation.rotation))
-
-
-def pose_of(project: Project, image: Image, ground: Ground) -> Pose:
-    """Exterior orientation of an image, in the height system that the ground has."""
-    stated = stated_pose(project, image)
-    center = stated.center.copy()
-    center[2] = height_step(ground.height_systems[1], ground.working_system, project.crs)(center)
-    return Pose(center, stated.R_ground_camera)
-
-
-def camera_of(project: Project, image: Image, ground: Ground, size: tuple[int, int]) -> CentralCamera:
-    """Camera of an image by the project's numbers; `size` is that of its file, another one stated is an InputError."""
-    description = project.cameras[image.camera]
-    stated = image.size or description.size
-    if stated is not None and tuple(stated) != size:
-        raise InputError(
-            f"{image.file}: {size[0]} × {size[1]} pixels, but camera {image.camera!r} has {stated[0]} × {stated[1]}; "
-            "an image that was cropped or scaled needs a camera of its own"
-        )
-    interior = interior_of(description, image, size)
-    pose = pose_of(project, image, ground)
-    nadir = float(ground.bare.heights(pose.center[:2]))
-    return oriented_camera(
-        interior,
-        lens_of(description),
-        pose,
-        crs=project.crs,
-        earth_curvature=project.orientation.earth_curvature,
-        refraction=project.orientation.refraction,
-        mean_ground=nadir if np.isfinite(nadir) else 0.0,
-    )
-
-
-#: Points on a side of the grid over an image.
-_POINTS = 5
-
-
-def view_of(image: Image, camera: CameraEntry, orientation: Orientation, center: ArrayLike) -> View:
-    """View of a project's image.
-
-    Parameters
-    ----------
-    image : Image
-    camera : CameraEntry
-        Description of its camera.
-    orientation : Orientation
-        What its angles mean.
-    center : array_like, shape (3,)
-        Projection centre in the terrain's height system.
-    """
-    interior, lens = interior_of(camera, image), lens_of(camera)
-    w, h = interior.size
-    part = np.linspace(0.0, 1.0, _POINTS)
-    x, y = (g.ravel() for g in np.meshgrid(part * (w - 1), part * (h - 1)))
-    middle, half = np.array([(w - 1) / 2, (h - 1) / 2]), np.array([0.5, 0.0])
-    xy = np.concatenate([[middle, middle + half, middle - half], np.column_stack([x, y])])
-    t = lens.undistort(interior.tangent_to_pixel.inverse(xy))
-    pixel = float(np.linalg.norm(t[1] - t[2]))
-    angles = angle_in_radians(np.array(image.pose_numbers[1]), orientation.angle_unit)
-    points = np.delete(t, [1, 2], axis=0)
-    return View(
-        image.name, np.asarray(center, float), angles, orientation.rotation, points, pixel, orientation.angle_unit
-    )

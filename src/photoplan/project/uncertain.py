@@ -16,11 +16,13 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.camera.model import CameraEntry
 from photoplan.io.project.file import parse_project
-from photoplan.io.project.model import Image, Project
+from photoplan.io.project.model import Project
+from photoplan.io.project.posed import Image
 from photoplan.plan.accuracy import Cause, DepthErrors, SourceErrors
 from photoplan.project.ground import Ground
 from photoplan.project.open_terrain import open_terrain
-from photoplan.project.scene import SceneAddress, camera_of
+from photoplan.project.posed import posed_camera
+from photoplan.project.scene import SceneAddress
 from photoplan.project.scenes import ScenesAddress, surface_of
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.objects import ObjectSurface
@@ -57,7 +59,7 @@ def source_errors(
     def at(change: NDArray[np.float64]) -> Projection:
         moved, entry = _moved(image, camera, change)
         changed = project.model_copy(update={"cameras": {**project.cameras, image.camera: entry}})
-        return camera_of(changed, moved, ground, projection.size)
+        return posed_camera(changed, moved, ground, projection.size)
 
     causes = (Cause(name, at(_STEP * d), at(-_STEP * d), _STEP) for name, d in _deviations(project, image, camera))
     return SourceErrors(projection, tuple(causes), in_image)
@@ -143,7 +145,7 @@ class ScenesErrors(Mapping[int, SourceErrors]):
         out: list[object] = []
         for scene in self.address.scenes:
             project = _project_of(scene)
-            (image,) = project.images
+            image = project.image(project.images[0].name)
             camera = project.cameras[image.camera]
             deviations = [(name, d.tolist()) for name, d in _deviations(project, image, camera)]
             objects = [part.sigma for part in project.objects]
@@ -183,7 +185,7 @@ def _project_of(address: SceneAddress) -> Project:
 @lru_cache(maxsize=64)
 def _errors_of(address: SceneAddress, in_image: float) -> SourceErrors:
     scene, project = address.open(), _project_of(address)
-    return source_errors(project, project.images[0], scene.ground, scene.camera, in_image)
+    return source_errors(project, project.image(project.images[0].name), scene.ground, scene.camera, in_image)
 
 
 @lru_cache(maxsize=8)

@@ -7,7 +7,7 @@ from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.base import Lens
 from photoplan.errors import InputError
 from photoplan.io.camera.model import CameraEntry
-from photoplan.io.project.model import Image
+from photoplan.io.project.posed import Image
 
 
 def image_size(camera: CameraEntry, image: Image) -> tuple[int, int]:

@@ -15,76 +15,17 @@ from photoplan.geometry.bounds import odd_angles, odd_place
 from photoplan.io.camera.kinds import Camera
 from photoplan.io.camera.model import (
     Entry,
-    Fiducials,
     Name,
     NotNegative,
     Number,
-    Pixels,
     Positive,
     Restoration,
-    Restore,
     Triple,
 )
-from photoplan.io.names import check_input_name, resolve_input, unique_stems
-
-InputName = Annotated[str, Field(max_length=4000)]
-
-Correlation = tuple[Annotated[float, Strict(), Field(ge=-1, le=1)], ...]
-
-
-class Image(Entry):
-    """One oriented image."""
-
-    name: Name
-    """Products are called after it."""
-    file: InputName
-    camera: Name
-    center: Triple | None = None
-    """Projection centre X0, Y0, Z0 in the project's CRS and the orientation's height system, metres; None: the image
-    is not oriented yet."""
-    angles: Triple | None = None
-    """Three angles in the sequence and unit that [orientation] states."""
-    sigma_center: tuple[NotNegative, NotNegative, NotNegative] | None = None
-    """Standard deviations of the projection centre, metres, as `photoplan adjust` and `resect` found them."""
-    sigma_angles: tuple[NotNegative, NotNegative, NotNegative] | None = None
-    """Standard deviations of the angles, in their unit."""
-    correlation: Correlation | None = None
-    """The correlation matrix of centre, angles and, after a calibration, what `sigma` of the camera lists, below its
-    diagonal, row by row; None: they are not correlated."""
-    fiducials: Fiducials | None = None
-    """Measured fiducial marks of a film scan: name = [column, row], pixels."""
-    size: tuple[Pixels, Pixels] | None = None
-    """Width and height of this scan, where the camera does not state them."""
-    restore: Restore | None = None
-    """Filter that it is restored with before anything is made of it; None: that of its camera, if there is one."""
-
-    @field_validator("file")
-    @classmethod
-    def _file(cls, text: str) -> str:
-        return _plain_file(text)
-
-    @model_validator(mode="after")
-    def _both(self) -> Self:
-        if (self.center is None) != (self.angles is None):
-            raise ValueError("center and angles go together: give both, or none for an image that is not oriented")
-        if self.correlation is not None and (self.sigma_center is None or self.sigma_angles is None):
-            raise ValueError("correlation goes with sigma_center and sigma_angles")
-        return self
-
-    @property
-    def pose_numbers(self) -> tuple[Triple, Triple]:
-        """Projection centre and angles as stated.
-
-        Raises
-        ------
-        InputError
-            The image is not oriented.
-        """
-        if self.center is None or self.angles is None:
-            raise InputError(
-                f"image {self.name!r} has no orientation; `photoplan resect` or `photoplan adjust` determines it"
-            )
-        return self.center, self.angles
+from photoplan.io.names import resolve_input, unique_stems
+from photoplan.io.project.image import ImageEntry, InputName, plain_file
+from photoplan.io.project.kinds import AnyImage
+from photoplan.io.project.posed import Image
 
 
 class Terrain(Entry):
@@ -101,7 +42,7 @@ class Terrain(Entry):
     @field_validator("file")
     @classmethod
     def _file(cls, text: str | None) -> str | None:
-        return None if text is None else _plain_file(text)
+        return None if text is None else plain_file(text)
 
     @model_validator(mode="after")
     def _one(self) -> Self:
@@ -132,7 +73,7 @@ class Objects(Entry):
     @field_validator("file")
     @classmethod
     def _file(cls, text: str) -> str:
-        return _plain_file(text)
+        return plain_file(text)
 
 
 class Orientation(Entry):
@@ -172,12 +113,12 @@ class ObservationsEntry(Entry):
     @field_validator("image_points", "control")
     @classmethod
     def _files(cls, files: tuple[str, ...]) -> tuple[str, ...]:
-        return tuple(_plain_file(text) for text in files)
+        return tuple(plain_file(text) for text in files)
 
     @field_validator("positions")
     @classmethod
     def _positions(cls, text: str | None) -> str | None:
-        return None if text is None else _plain_file(text)
+        return None if text is None else plain_file(text)
 
 
 Parameter = Literal["c", "x0", "y0", "k1", "k2", "k3", "p1", "p2", "b1", "b2"]
@@ -231,8 +172,8 @@ class Project(Entry):
     orientation: Orientation = Orientation()
     observations: ObservationsEntry = ObservationsEntry()
     adjustment: Adjustment = Adjustment()
-    cameras: dict[Name, Camera]
-    images: tuple[Image, ...]
+    cameras: dict[Name, Camera] = Field(default_factory=dict)
+    images: tuple[AnyImage, ...]
     ortho: OrthoDefaults = OrthoDefaults()
     folder: SkipJsonSchema[Path] = Field(default=Path(), exclude=True)
     """Folder of the project file, from which relative paths start; not an entry of the file."""
@@ -247,19 +188,8 @@ class Project(Entry):
             if image.name in names:
                 raise ValueError(f"{where}: the name is given twice")
             names.add(image.name)
-            if image.camera not in self.cameras:
-                known = ", ".join(map(repr, self.cameras)) or "none"
-                raise ValueError(f"{where}: camera {image.camera!r} is not described; cameras are {known}")
-            camera = self.cameras[image.camera]
-            if image.fiducials is not None:
-                try:
-                    camera.check_fiducials(image.fiducials, bool(image.size or camera.size), image.camera)
-                except ValueError as error:
-                    raise ValueError(f"{where}: {error}") from None
-            if image.center is not None and image.angles is not None:
-                odd = odd_angles(image.angles, self.orientation.angle_unit) or odd_place(image.center, camera=True)
-                if odd is not None:
-                    raise ValueError(f"{where}: {odd}")
+            if isinstance(image, Image):
+                self._check_posed(image, where)
         unknown = [name for name in self.adjustment.calibrate if name not in self.cameras]
         if unknown:
             raise ValueError(f"[adjustment] calibrate: camera {unknown[0]!r} is not described")
@@ -268,6 +198,22 @@ class Project(Entry):
         except InputError as error:
             raise ValueError(str(error)) from None
         return self
+
+    def _check_posed(self, image: Image, where: str) -> None:
+        """Refuse an image whose camera is not described, or whose marks or pose cannot be."""
+        if image.camera not in self.cameras:
+            known = ", ".join(map(repr, self.cameras)) or "none"
+            raise ValueError(f"{where}: camera {image.camera!r} is not described; cameras are {known}")
+        camera = self.cameras[image.camera]
+        if image.fiducials is not None:
+            try:
+                camera.check_fiducials(image.fiducials, bool(image.size or camera.size), image.camera)
+            except ValueError as error:
+                raise ValueError(f"{where}: {error}") from None
+        if image.center is not None and image.angles is not None:
+            odd = odd_angles(image.angles, self.orientation.angle_unit) or odd_place(image.center, camera=True)
+            if odd is not None:
+                raise ValueError(f"{where}: {odd}")
 
     @property
     def ground(self) -> Terrain:
@@ -308,9 +254,10 @@ class Project(Entry):
             chosen.update(found)
         return [n for n in names if n in chosen]
 
-    def restoration(self, image: Image) -> Restoration | None:
+    def restoration(self, image: ImageEntry) -> Restoration | None:
         """How an image of the project is restored: as it states itself, else as its camera does; None: not at all."""
-        return image.restore or self.cameras[image.camera].restore
+        camera = image.described_by
+        return image.restore or (None if camera is None else self.cameras[camera].restore)
 
     def ortho_settings(self) -> dict[str, Any]:
         """What the `[ortho]` table states, by the names of `photoplan.products.orthophoto.settings.OrthoSettings`."""
@@ -319,8 +266,39 @@ class Project(Entry):
             stated["nodata"] = str(stated["nodata"])
         return stated
 
+    @property
+    def posed(self) -> tuple[Image, ...]:
+        """The images with a camera and a pose of their own, known or to be determined."""
+        return tuple(image for image in self.images if isinstance(image, Image))
+
+    @property
+    def height_system(self) -> str | None:
+        """Height system of all geometry: the orientation's. Rational polynomials alone need none: it is ellipsoidal."""
+        return self.orientation.height_system or (None if self.posed else "ellipsoidal")
+
+    def alone(self, names: Sequence[str]) -> Self:
+        """The project with these images only, and the cameras that they need."""
+        images = tuple(self.any_image(name) for name in names)
+        cameras = {image.described_by: self.cameras[image.described_by] for image in images if image.described_by}
+        return self.model_copy(update={"images": images, "cameras": cameras})
+
     def image(self, name: str) -> Image:
-        """The image of this name.
+        """The image of this name, which has a camera and a pose.
+
+        Raises
+        ------
+        InputError
+            There is none, or its geometry is of another kind.
+        """
+        image = self.any_image(name)
+        if not isinstance(image, Image):
+            raise InputError(
+                f"image {name!r} has no pose, its geometry is in a file; this is done with frame images alone"
+            )
+        return image
+
+    def any_image(self, name: str) -> AnyImage:
+        """The image of this name, whatever its geometry.
 
         Raises
         ------
@@ -334,10 +312,3 @@ class Project(Entry):
             f"image {name!r} is not in the project; its {len(self.images)} images begin with "
             f"{', '.join(i.name for i in self.images[:5])}"
         )
-
-
-def _plain_file(text: str) -> str:
-    try:
-        return check_input_name(text)
-    except InputError as error:
-        raise ValueError(str(error)) from None

@@ -10,9 +10,9 @@ from typing import Any
 from pydantic import BaseModel
 
 from photoplan.io.camera.model import CameraEntry
+from photoplan.io.project.image import ImageEntry
 from photoplan.io.project.model import (
     Adjustment,
-    Image,
     Objects,
     ObservationsEntry,
     Orientation,
@@ -209,6 +209,6 @@ def _stated(entry: str, value: Any) -> Any:
     return value.model_dump(exclude_none=True, exclude_defaults=entry == "marks")
 
 
-def _image(image: Image) -> list[str]:
+def _image(image: ImageEntry) -> list[str]:
     given = image.model_dump(exclude_none=True)
     return ["", "[[images]]", *_entries((key, value, "") for key, value in given.items())]

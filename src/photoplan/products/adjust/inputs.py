@@ -19,7 +19,8 @@ from photoplan.io.observed_positions import PositionTable, read_observed_positio
 from photoplan.io.orientation.exif import image_files
 from photoplan.io.orientation.table import TableFormat, angle_in_radians
 from photoplan.io.project.cameras import image_size
-from photoplan.io.project.model import Image, Project
+from photoplan.io.project.model import Project
+from photoplan.io.project.posed import Image
 from photoplan.products.init.match import some
 
 #: Part of the measurements that may be wrong in a way that makes one think of the whole file.
@@ -97,7 +98,7 @@ def read_inputs(project: Project, names: Sequence[str]) -> AdjustInputs:
             "[observations]"
         )
     wanted = set(names)
-    images = tuple(image for image in project.images if image.name in wanted)
+    images = tuple(image for image in project.posed if image.name in wanted)
     return AdjustInputs(
         project=project,
         images=images,

@@ -16,7 +16,7 @@ from photoplan.products.adjust.cameras import block_camera
 from photoplan.products.adjust.frame import block_frame
 from photoplan.products.adjust.inputs import AdjustInputs
 from photoplan.products.init.match import some
-from photoplan.project.scene import stated_pose
+from photoplan.project.posed import stated_pose
 
 #: Farther from its image, no control point is believed, metres.
 _SIGHT = 50e3

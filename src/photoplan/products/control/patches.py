@@ -9,7 +9,6 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from photoplan.cameras.base import CentralCamera
 from photoplan.errors import GeometryError, UsageError
 from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
@@ -105,8 +104,8 @@ def choose_patches(
 
 def _seen(scene: Scene) -> tuple[shapely.Geometry, tuple[int, int]] | None:
     """Footprint on the level of the ground below."""
-    camera: CentralCamera = scene.camera
-    level = float(scene.ground.bare.heights(camera.center[:2]))
+    camera = scene.camera
+    level = float(scene.ground.bare.heights(camera.vantage.point[:2]))
     if not np.isfinite(level):
         level = sum(scene.footprint.height_range) / 2
     if not np.isfinite(level):

@@ -29,6 +29,7 @@ from photoplan.matching.grey import GreyImage
 from photoplan.matching.ortho import ImageControl, OrthoPatch, Photo, Settings, control_of_image
 from photoplan.plain import pick
 from photoplan.products.control.patches import Ortho, choose_patches
+from photoplan.project.cameras import central_without_pixels
 from photoplan.project.scene import input_files, open_scene
 
 
@@ -103,7 +104,8 @@ def propose_control(request: ControlRequest, events: Events = SILENT) -> Control
     """
     project = _with_heights(load_project(request.project), request)
     output, image_output = _check(request, project)
-    names = [n for n in project.select(request.images or None) if project.image(n).center is not None]
+    chosen = project.select(request.images or None)
+    names = [image.name for image in project.posed if image.center is not None and image.name in chosen]
     if not names:
         raise InputError(
             f"{request.project}: none of the images has an approximate orientation; give center and angles, or find "
@@ -113,7 +115,8 @@ def propose_control(request: ControlRequest, events: Events = SILENT) -> Control
     ortho = _open_ortho(request, project)
     sizes, patches = choose_patches(ortho, scenes, request.grid, request.radius, request.search)
     settings = Settings(*sizes, request.correlation)
-    photos = [Photo(scene.camera, GreyImage(scene.reader)) for scene in scenes]
+    cameras = [central_without_pixels(project, name) for name in names]
+    photos = [Photo(camera, GreyImage(scene.reader)) for camera, scene in zip(cameras, scenes)]
     if request.dry_run or not patches:
         if not patches:
             raise GeometryError("the orthophoto has no textured place with heights that one of the images could see")

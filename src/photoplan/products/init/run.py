@@ -20,7 +20,9 @@ from photoplan.io.names import check_input_name, match_key, relative_path
 from photoplan.io.orientation.file import read_orientation
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.project.file import parse_project, write_project
-from photoplan.io.project.model import Image, Project, Terrain
+from photoplan.io.project.image import ImageEntry
+from photoplan.io.project.model import Project, Terrain
+from photoplan.io.project.posed import Image
 from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.products.init.match import (
     Unoriented,
@@ -31,6 +33,7 @@ from photoplan.products.init.match import (
     some,
     unoriented,
 )
+from photoplan.products.init.own_geometry import own_geometry
 from photoplan.products.init.systems import (
     check_joined,
     height_systems,
@@ -57,8 +60,8 @@ class InitRequest:
     """Folder of the project; `project.toml` is written into it."""
     images: tuple[str, ...]
     """Files, or patterns with ``*``, ``?`` and ``**``."""
-    camera: Path
-    """File with cameras: TOML, YAML or JSON."""
+    camera: Path | None
+    """File with cameras: TOML, YAML or JSON; None: all images have rational polynomials."""
     orientation: Path | None = None
     """File with orientations, of any format of `photoplan.io.orientation.file`; None: the images are to be oriented."""
     terrain: str | None = None
@@ -141,20 +144,25 @@ def init_project(request: InitRequest, talk: Callable[[str], None] = lambda line
 def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line: None) -> InitResult:
     """The project of the given files, without writing anything; see `init_project`."""
     files = image_files(request.images)
-    cameras = read_cameras(request.camera)
     table = None
     if request.orientation is not None:
         table = read_orientation(request.orientation, request.form, request.format)
-    pairs, lonely_files, lonely_names = match_images(files, table) if table else (unoriented(files), [], [])
+    pairs, lonely_files, lonely_names = match_images(files, table) if table else ([], files, [])
+    own = own_geometry(lonely_files, request.folder)
+    lonely_files = [file for file in lonely_files if file not in own]
+    if table is None:
+        pairs, lonely_files = unoriented(lonely_files), []
     infos = {file: read_info(file) for file, _ in pairs}
     terrain, terrain_info = terrain_entry(request)
-    crs, origin_of_crs = project_crs(request, table, terrain_info)
-    used = _cameras(pairs, cameras, infos, table.file if table else None)
-    for line in _summary(used, pairs, f"{crs_label(crs)} ({origin_of_crs})", (lonely_files, lonely_names), table):
+    place = next((each.place for each in own.values()), None)
+    crs, origin_of_crs = project_crs(request, table, terrain_info, place)
+    used = _cameras(pairs, _described(request, pairs), infos, table.file if table else None)
+    lonely = lonely_files, lonely_names
+    for line in _summary(used, (pairs, len(own)), f"{crs_label(crs)} ({origin_of_crs})", lonely, table):
         talk(line)
-    systems = height_systems(request, table, terrain_info)
+    systems = height_systems(request, table, terrain_info, ellipsoidal=not pairs)
     of_terrain = f"terrain {height_label(systems[0])}, " if terrain is not None else ""
-    of_others = "orientation" if table else "control"
+    of_others = "orientation" if table else "control" if pairs else "images"
     talk(f"  height systems: {of_terrain}{of_others} {height_label(systems[1])}")
     poses: dict[str, tuple[Triple, Triple]] = {}
     if table is not None:
@@ -164,7 +172,7 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
         stated = on_map(stated_positions(table, {oriented.name: file for file, oriented in pairs}), crs)
         for said in differences([i.name for i in table.images], centers, stated):
             talk(f"  warning: {said}")
-    images = []
+    images: list[ImageEntry] = [each.image for each in own.values()]
     for file, oriented in pairs:
         camera, described = used[oriented.name]
         center, turned = poses.get(oriented.name, (None, None))
@@ -182,6 +190,24 @@ def make_project(request: InitRequest, talk: Callable[[str], None] = lambda line
         )
     project = _checked(request, terrain, systems, crs, dict(used.values()), images)
     return InitResult(request.path, project, tuple(f.name for f in lonely_files), tuple(lonely_names))
+
+
+def _described(request: InitRequest, pairs: Sequence[tuple[Path, object]]) -> CameraFile:
+    """Cameras of the images that need one.
+
+    Raises
+    ------
+    UsageError
+        No file of cameras is given.
+    """
+    if request.camera is not None:
+        return read_cameras(request.camera)
+    if pairs:
+        raise UsageError(
+            f"{pairs[0][0]}: no rational polynomials (RPC) in it nor beside it; give `camera`, the file that describes "
+            "its camera"
+        )
+    return CameraFile(Path(), {}, False)
 
 
 def _triple(values: NDArray[np.float64]) -> Triple:
@@ -221,7 +247,7 @@ def _checked(
     systems: tuple[str | None, str],
     crs: str,
     cameras: dict[str, CameraEntry],
-    images: list[Image],
+    images: Sequence[ImageEntry],
 ) -> Project:
     """The project, checked as if it had been read."""
     orientation = {
@@ -265,13 +291,15 @@ def _present(file: Path, folder: Path, *, or_folder: bool = False) -> str:
 
 def _summary(
     used: dict[str, tuple[str, CameraEntry]],
-    pairs: Sequence[tuple[Path, OrientedImage | Unoriented]],
+    images: tuple[Sequence[tuple[Path, OrientedImage | Unoriented]], int],
     crs: str,
     lonely: tuple[list[Path], list[str]],
     table: OrientationTable | None,
 ) -> list[str]:
-    """What was found, in a few lines."""
-    parts = [f"{len(pairs)} images" + ("" if table else " without orientation")]
+    """What was found, in a few lines; `images` are those with a camera, and the number of those with polynomials."""
+    pairs, own = images
+    parts = [f"{len(pairs)} images" + ("" if table else " without orientation")] if pairs else []
+    parts += [f"{own} images with rational polynomials (RPC)"] if own else []
     for name, camera in dict(used.values()).items():
         size = f", {camera.size[0]} × {camera.size[1]} px" if camera.size is not None else ""
         film = "film, " if camera.fiducial_system is not None else ""

@@ -19,6 +19,7 @@ from photoplan.geometry.crs import (
     require_projected_metres,
     same_crs,
     topocentric_poses,
+    utm_codes,
 )
 from photoplan.geometry.heights import check_height_system, declared_pair, height_label, height_step
 from photoplan.io.names import check_input_name, relative_path
@@ -114,8 +115,13 @@ def terrain_entry(request: Systems) -> tuple[Terrain | None, TerrainSource | Non
     return Terrain(file=relative_path(file.absolute(), request.folder), crs=crs), replace(info, crs=stated)
 
 
-def project_crs(request: Systems, table: OrientationTable | None, terrain: TerrainSource | None) -> tuple[str, str]:
-    """The project's CRS and where it comes from.
+def project_crs(
+    request: Systems,
+    table: OrientationTable | None,
+    terrain: TerrainSource | None,
+    place: tuple[float, float] | None = None,
+) -> tuple[str, str]:
+    """The project's CRS and where it comes from; `place` is the latitude and longitude of a satellite image, degrees.
 
     Raises
     ------
@@ -124,6 +130,8 @@ def project_crs(request: Systems, table: OrientationTable | None, terrain: Terra
     """
     if request.crs is not None:
         crs, source = request.crs, "as given"
+    elif table is None and place is not None:
+        crs, source = _map_of(terrain) or (utm_codes(*place)[0], "UTM zone of the images")
     elif table is None:
         raise InputError(
             "without an orientation nothing states the CRS of the project; declare that of the control points with "
@@ -139,15 +147,29 @@ def project_crs(request: Systems, table: OrientationTable | None, terrain: Terra
     return canonical_crs(crs), source
 
 
+def _map_of(terrain: TerrainSource | None) -> tuple[str, str] | None:
+    """The CRS of a terrain file, if products can be in it."""
+    if terrain is None or terrain.crs is None:
+        return None
+    crs = _horizontal(terrain.crs)
+    try:
+        require_projected_metres(crs)
+    except InputError:
+        return None
+    return crs, f"from {terrain.path.name}"
+
+
 def _horizontal(text: str) -> str:
     crs = parse_crs(text)
     return str((crs.sub_crs_list[0] if crs.is_compound else crs).to_wkt())
 
 
 def height_systems(
-    request: Systems, table: OrientationTable | None, terrain: TerrainSource | None
+    request: Systems, table: OrientationTable | None, terrain: TerrainSource | None, ellipsoidal: bool = False
 ) -> tuple[str | None, str]:
     """Height systems of terrain and orientation (with that of control): as declared, else as the files state.
+
+    That of images which bring their geometry along is `ellipsoidal`.
 
     Raises
     ------
@@ -157,7 +179,7 @@ def height_systems(
         Declared is another one than both files state.
     """
     stated_terrain = terrain.vertical_crs if terrain is not None else None
-    stated_table = table.height_system if table is not None else None
+    stated_table = table.height_system if table is not None else "ellipsoidal" if ellipsoidal else None
     stated = [
         request.terrain_height_system or stated_terrain or request.height_system,
         request.orientation_height_system or stated_table or request.height_system,

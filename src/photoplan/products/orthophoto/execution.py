@@ -20,7 +20,6 @@ from photoplan.io.disk import make_folder
 from photoplan.io.image_form import ImageForm, bands_of
 from photoplan.io.naming import standing, together, when_named
 from photoplan.io.product import ProductFile, is_product
-from photoplan.io.project.model import Project
 from photoplan.io.quicklook import refuse_foreign_overview, write_overview
 from photoplan.io.run_record import input_entry, versions, write_run_record
 from photoplan.kernels.rectify import is_compiled
@@ -252,7 +251,7 @@ def _record(plan: OrthoPlan, product: OrthoProduct, scenes: Scenes, result: Prod
     scene = scenes[0]
     return {
         "product": result,
-        "project": _project_of(plan.project, product.images).model_dump(mode="json", exclude_none=True),
+        "project": plan.project.alone(product.images).model_dump(mode="json", exclude_none=True),
         "settings": plan.settings,
         "grid": {
             "crs": product.grid.crs,
@@ -276,19 +275,12 @@ def _record(plan: OrthoPlan, product: OrthoProduct, scenes: Scenes, result: Prod
     }
 
 
-def _project_of(project: Project, names: tuple[str, ...]) -> Project:
-    """The project without what the product does not use: enough to make it again."""
-    images = tuple(project.image(name) for name in names)
-    cameras = {image.camera: project.cameras[image.camera] for image in images}
-    return project.model_copy(update={"images": images, "cameras": cameras})
-
-
 def _image_record(name: str, scene: Scene, look: Look) -> dict[str, Any]:
     """An image as it took part."""
-    step = scene.reader.step(RestoreStep)
+    step, vantage = scene.reader.step(RestoreStep), scene.camera.vantage
     return {
         "name": name,
-        "projection_centre": [float(c) for c in scene.camera.center],
+        "projection_centre": [float(c) for c in vantage.point] if vantage.central else None,
         "gsd_m": look.gsd,
         "blur": look.blur,
         "restored": None if step is None else step.describe(),

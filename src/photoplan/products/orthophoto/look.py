@@ -47,12 +47,12 @@ class Looked:
 def look_at(project: Project, names: Sequence[str], force: bool, events: Events) -> tuple[list[Looked], list[str]]:
     """Images that see terrain, and a line for each that sees none."""
     scenes: dict[str, Scene] = {}
-    seen: dict[str, tuple[View, ImagePlausibility]] = {}
+    seen: dict[str, tuple[View | None, ImagePlausibility]] = {}
     for place in map_order(project, names):
         # All that is asked of the terrain for one image, before the next: its blocks are then at hand.
         scenes[names[place]] = scene = open_scene(project, names[place])
         if scene.footprint.bounds is not None:
-            seen[names[place]] = judged(project, project.image(names[place]), scene.ground)
+            seen[names[place]] = judged(project, project.any_image(names[place]), scene.ground)
         events.done()
     if not force:
         _refuse_faults(project, seen, scenes)
@@ -74,7 +74,9 @@ def with_resolution(project: Project, settings: OrthoSettings, looked: Sequence[
     return replace(settings, resolution=resolution)
 
 
-def _refuse_faults(project: Project, seen: dict[str, tuple[View, ImagePlausibility]], scenes: dict[str, Scene]) -> None:
+def _refuse_faults(
+    project: Project, seen: dict[str, tuple[View | None, ImagePlausibility]], scenes: dict[str, Scene]
+) -> None:
     """Refuse what `check` calls a fault or read wrongly; images that see no terrain are told otherwise."""
     if not seen:
         return
@@ -117,14 +119,19 @@ def two_figures(value: float) -> float:
 
 def _sees_no_terrain(scene: Scene, name: str) -> str:
     """Extents of both the terrain and what the image looks at, on a level that the terrain has."""
-    x, y, z = scene.camera.center
+    vantage = scene.camera.vantage
+    x, y, z = vantage.point
     center = f"{name}: projection centre {x:.0f} {y:.0f} {z:.0f}"
+    if not vantage.central:
+        center = f"{name}: near {x:.0f} {y:.0f}, known for heights from {vantage.floor:.0f} to {z:.0f},"
     bounds = scene.ground.bounds
     if bounds is None:
         return f"{center} sees nothing of the level terrain; is it above it, and do height systems and angles fit?"
     level = some_height(scene.ground.bare, bounds, x, y)
+    if not (vantage.central or vantage.floor < level < z):
+        level = (vantage.floor + z) / 2
     origin, direction = scene.camera.rays(image_border(scene.camera.size), level)
-    down = (direction[:, 2] < 0) & (origin[:, 2] > level)
+    down = (direction[:, 2] < 0) & ((origin[:, 2] > level) | (not vantage.central))
     if down.any():
         foot = origin[down] + direction[down] * ((level - origin[down, 2]) / direction[down, 2])[:, None]
         (xmin, ymin), (xmax, ymax) = foot[:, :2].min(axis=0), foot[:, :2].max(axis=0)

@@ -20,7 +20,7 @@ from photoplan.plain import pick
 from photoplan.products.dtm.raster import GridOptions
 from photoplan.products.simulate.form import Forming, SimulateReport, check_fit, stated_model
 from photoplan.products.simulate.scene import ProjectScene, TruthRaster, image_truth, true_orthophoto, usual_grain
-from photoplan.project.scene import camera_without_pixels
+from photoplan.project.cameras import central_without_pixels
 
 _ORTHO = "true_orthophoto.tif"
 
@@ -168,7 +168,7 @@ def _works(
             overwrite=request.overwrite,
         )
         if request.truth:
-            camera = camera_without_pixels(project, name)
+            camera = central_without_pixels(project, name)
             truth = path.with_name(f"{path.stem}_truth.tif")
             yield image_truth(seen, camera, truth, raster("truth of a rendered image", settings))
     if request.resolution is not None:

@@ -19,8 +19,8 @@ from photoplan.plan.footprint import FAR
 from photoplan.products.dtm.raster import GridOptions, GridTile, write_grid
 from photoplan.products.orthophoto.look import two_figures
 from photoplan.products.simulate.drape import DrapedTexture
+from photoplan.project.cameras import central_without_pixels
 from photoplan.project.ground import Ground, ground_of
-from photoplan.project.scene import camera_without_pixels
 from photoplan.quality.formation.rendered import FromAbove, RenderedScene, SolidTexture, Texture
 from photoplan.surfaces.objects import painted_surface
 
@@ -64,7 +64,7 @@ class ProjectScene:
         GeometryError
             There is nothing within 30 km.
         """
-        camera = camera_without_pixels(self.project, name)
+        camera = central_without_pixels(self.project, name)
         x, y, z = camera.center.tolist()
         low, high = self._heights((x - FAR, y - FAR, x + FAR, y + FAR), f"image {name!r}")
         orientation = self.project.orientation

@@ -24,7 +24,8 @@ from photoplan.io.observed_positions import read_observed_positions
 from photoplan.io.orientation.table import TableFormat
 from photoplan.io.plain_files import read_text
 from photoplan.io.project.cameras import interior_of, lens_of
-from photoplan.io.project.model import Image, Project
+from photoplan.io.project.model import Project
+from photoplan.io.project.posed import Image
 from photoplan.io.raster import RasterReader
 from photoplan.matching.features import Features, FeatureSettings, extract_features
 from photoplan.matching.grey import GreyImage
@@ -39,7 +40,7 @@ from photoplan.matching.pairs import (
 from photoplan.matching.tracks import Tracks
 from photoplan.matching.verify import Calibration, PairMatches, VerifySettings, verify_pair
 from photoplan.project.ground import ground_of
-from photoplan.project.scene import pose_of
+from photoplan.project.posed import pose_of
 
 #: Up to so many images all pairs are tried where nothing is known of their places.
 FEW_IMAGES = 30

@@ -19,7 +19,7 @@ from photoplan.geometry.grid import USUAL_TILE, refuse_absurd
 from photoplan.geometry.local import LocalFrame, earth_radius
 from photoplan.geometry.pose import Pose
 from photoplan.products.view.ground import ViewGround
-from photoplan.project.scene import camera_without_pixels
+from photoplan.project.cameras import central_without_pixels
 from photoplan.surfaces.seen import SeenSurface
 from photoplan.targets.panorama import Panorama
 from photoplan.targets.view import Bundle, FrameBundle, ViewTarget
@@ -185,7 +185,7 @@ def view_camera(request: CameraRequest, ground: ViewGround, force: bool = False)
 def _of_image(request: CameraRequest, ground: ViewGround) -> ViewCamera:
     assert request.image is not None
     project = ground.named
-    camera = camera_without_pixels(project, project.select([request.image])[0])
+    camera = central_without_pixels(project, project.select([request.image])[0])
     if not isinstance(camera, FrameCamera | WarpedCamera):
         raise InputError(f"image {request.image!r}: its camera is no frame camera; views know no other yet")
     plain = ViewTarget.of_camera(camera)

@@ -14,8 +14,6 @@ from photoplan.io.camera.rpc.model import MAX_BYTES, StatedRpc
 from photoplan.io.markup_files import read_xml
 from photoplan.io.plain_files import read_head
 
-#: What `rpc` of an image says if the image file holds them itself.
-TAGS = "tags"
 #: Kinds of XML documents.
 _DOCUMENTS = (digitalglobe, dimap)
 

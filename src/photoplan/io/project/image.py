@@ -1,0 +1,53 @@
+"""What is common to all images of a project, whatever their geometry."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Annotated
+
+from pydantic import Field, field_validator
+
+from photoplan.errors import InputError
+from photoplan.io.camera.model import Entry, Name, Pixels, Restore
+from photoplan.io.names import check_input_name
+
+InputName = Annotated[str, Field(max_length=4000)]
+
+
+class ImageEntry(Entry, ABC):
+    """An image, of whatever geometry.
+
+    A kind of geometry is a file of its own with a subclass, a line in `photoplan.io.project.kinds` and one in
+    `photoplan.project.cameras`.
+    """
+
+    name: Name
+    """Products are called after it."""
+    file: InputName
+    size: tuple[Pixels, Pixels] | None = None
+    """Width and height of this image, where nothing else states them."""
+    restore: Restore | None = None
+    """Filter that it is restored with before anything is made of it; None: that of its camera, if there is one."""
+
+    @field_validator("file")
+    @classmethod
+    def _file(cls, text: str) -> str:
+        return plain_file(text)
+
+    @property
+    @abstractmethod
+    def geometry_file(self) -> str | None:
+        """File that its geometry is read from, beside that of its pixels; None: there is none."""
+
+    @property
+    @abstractmethod
+    def described_by(self) -> str | None:
+        """Name of the [cameras.NAME] table that it needs; None: it needs none."""
+
+
+def plain_file(text: str) -> str:
+    """A name of a file as an entry states it; raises ValueError where no file can have it."""
+    try:
+        return check_input_name(text)
+    except InputError as error:
+        raise ValueError(str(error)) from None

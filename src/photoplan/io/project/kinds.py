@@ -1,0 +1,25 @@
+"""The registry of image geometries: what a project may say in an ``[[images]]`` entry."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import Discriminator, Tag
+
+from photoplan.io.project.posed import Image
+from photoplan.io.project.rpc import RpcImage
+
+#: The entry that only images of a kind have; an image without any of them has a pose.
+_BY_ENTRY = {"rpc": RpcImage}
+
+
+def _kind(value: Any) -> str:
+    if isinstance(value, dict):
+        return next((kind.__name__ for entry, kind in _BY_ENTRY.items() if entry in value), Image.__name__)
+    return type(value).__name__
+
+
+AnyImage = Annotated[
+    Annotated[Image, Tag("Image")] | Annotated[RpcImage, Tag("RpcImage")],
+    Discriminator(_kind),
+]

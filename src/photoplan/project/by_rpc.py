@@ -1,0 +1,40 @@
+"""Images with rational polynomials: what a project states of them becomes a camera."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+from photoplan.cameras.rpc import RationalFunctions, RpcCamera
+from photoplan.errors import InputError
+from photoplan.geometry.geodetic import GeodeticGround
+from photoplan.io.camera.rpc.file import read_rpc
+from photoplan.io.project.model import Project
+from photoplan.io.project.rpc import RpcImage
+from photoplan.project.ground import Ground, stamp_of
+
+
+def rpc_camera(project: Project, image: RpcImage, ground: Ground, size: tuple[int, int]) -> RpcCamera:
+    """Camera of an image with rational polynomials, over the ground as it is worked in.
+
+    Raises
+    ------
+    InputError
+        The polynomials cannot be read, or the image has another size than is stated.
+    HeightSystemError
+        The grid that leads from the ground's heights to the ellipsoid is missing.
+    """
+    if image.size is not None and tuple(image.size) != size:
+        raise InputError(
+            f"{image.file}: {size[0]} × {size[1]} pixels, but {image.size[0]} × {image.size[1]} are stated; "
+            "polynomials fit an image of full size only"
+        )
+    file = project.resolve(image.geometry_file or image.file)
+    functions = _read(file, stamp_of(file))
+    return RpcCamera(functions, GeodeticGround(project.crs, ground.working_system), size, image.correction)
+
+
+@lru_cache(maxsize=256)
+def _read(file: Path, stamp: tuple[int, int]) -> RationalFunctions:
+    """Read again only when the file changes."""
+    return read_rpc(file).functions
