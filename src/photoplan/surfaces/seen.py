@@ -48,6 +48,10 @@ class Seen:
         """Angle between the line of sight and the normal of what it meets, radians, 0 to π/2; NaN: sky."""
         return np.arccos(np.clip((self.normal * self.towards).sum(axis=-1), 0.0, 1.0))
 
+    def part(self, rows: slice, cols: slice) -> Seen:
+        """Some rows and columns."""
+        return Seen(**{name: a[rows, cols] for name, a in vars(self).items()})
+
     def reshaped(self, *shape: int) -> Seen:
         """The same, with another first shape."""
         return Seen(**{name: a.reshape(*shape, *a.shape[1:]) for name, a in vars(self).items()})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -47,6 +47,8 @@ _SAME = 1e-4
 #: Longer sides of the reduced image from which the range of grey values is taken, pixels.
 _LOOKED = 512
 _PERCENT = (2.0, 98.0)
+
+Look = Callable[[Window], Seen]
 
 Colours = NDArray[np.float32]
 """Red, green, blue, shape (3, height, width), 0 to 255."""
@@ -104,12 +106,24 @@ class Scene:
     """Its window in the target."""
     seen: Seen
     """Shape (height, width, …)."""
+    around: tuple[Window, NDArray[np.float32]]
+    """The part with a pixel more all round, as far as the view goes, and the depth of its pixels."""
     surface: SeenSurface
     kernel: str
 
+    @classmethod
+    def of(cls, target: ViewTarget, tile: Tile, look: Look, surface: SeenSurface, kernel: str) -> Scene:
+        """What a part of a view shows; `look` tells it for a window."""
+        window = tile.window
+        around = Window(window.col - 1, window.row - 1, window.width + 2, window.height + 2) & target.window
+        seen = look(around)
+        depth = seen.uvh[..., 2].astype(np.float32)
+        return cls(target, tile, seen.part(*window.slices(around)), (around, depth), surface, kernel)
+
     def relief(self, target: Target, window: Window) -> NDArray[np.float32]:
         """Depth of pixels of the part: the engine need not look again."""
-        return self.seen.uvh[(*window.slices(self.tile.window), 2)].astype(np.float32)
+        around, depth = self.around
+        return depth[window.slices(around)]
 
 
 class Layer(Protocol):
@@ -169,7 +183,7 @@ class Resampled:
 
     def paint(self, scene: Scene, under: Colours) -> tuple[Colours, NDArray[np.bool_]]:
         """See `Layer`."""
-        rule = AnchorRule.of(scene.kernel, 0.02)
+        rule = AnchorRule.of(scene.kernel, 0.02, tilted=True)
         rows, window = tuple(range(len(self.sources))), scene.tile.window
         owners = None
         if self.photos:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -162,13 +162,13 @@ class ViewJob:
         target = view.target if n == 1 else replace(view.target, bundle=_Finer(view.target.bundle, n))
         for part in window.tiles(-(-max(window.width, window.height) // n)):
             fine = Window(part.col * n, part.row * n, part.width * n, part.height * n)
-            seen = view.surface.look(target, fine) if view.matrix is None else from_matrix(view, fine)
-            scene = Scene(target, Tile(tile.index, fine), seen, view.surface, self.address.look.kernel)
+            look = partial(view.surface.look, target) if view.matrix is None else partial(from_matrix, view)
+            scene = Scene.of(target, Tile(tile.index, fine), look, view.surface, self.address.look.kernel)
             colours = colours_of(scene, view, self.address.look)
             means = colours.reshape(3, part.height, n, part.width, n).mean(axis=(2, 4))
             at = part.slices(window)
             picture[:, at[0], at[1]] = np.clip(np.rint(means), 0, 255)
-            tally.add(_counts(target, seen))
+            tally.add(_counts(target, scene.seen))
         return Made(((picture, None),), tally.totals)
 
 
