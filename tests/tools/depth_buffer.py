@@ -34,8 +34,8 @@ def depth_buffer(camera, triangles, finer: int):
     return buffer
 
 
-def hidden_in_buffer(camera, XYZ, buffer, finer: int, near: float):
-    """Whether something is nearer than places (..., 3), by more than `near` metres; False outside the image."""
+def hidden_in_buffer(camera, XYZ, buffer, finer: int, near):
+    """Whether something is nearer than places (..., 3), by more than `near` metres (...); False outside the image."""
     homogeneous = camera.project_homogeneous(XYZ)
     xy = project(camera, XYZ)
     inside = ((xy >= -0.5) & (xy <= np.array(camera.size) - 0.5)).all(axis=-1)
