@@ -115,6 +115,23 @@ def test_fault_03_killed_between_two_names(quiet: tuple[Words, Path, set[str]], 
     assert done.code == 2 and "exist" in done.err
 
 
+@pytest.mark.parametrize(("case", "names"), [(ortho, 3), (restore, 3)])
+def test_fault_03_killed_after_the_last_name_of_a_product(case: Words, names: int, tmp_path: Path) -> None:
+    """It is finished; what the dead run had beside it goes, but not the tiles of another run."""
+    folder = inputs(case, tmp_path / "in")
+    assert run(case, folder, tmp_path / "killed", Mishap(names=names)).code == -9
+    left = [path for path in files(folder).values() if path.suffix == ".unfinished"]
+    assert len(left) >= 3 and all(path.with_name(path.name[1:-11]).exists() for path in left)
+    again = run(case, folder, tmp_path / "said")
+    assert again.tasks == [] and again.code == (2 if case is restore else 0), again.err
+    there = set(files(folder))
+    assert not [name for name in there if Path(name).name.startswith(".")]
+    log = next(path for name, path in files(folder).items() if name.endswith(("_ortho.tif", "_restored.tif")))
+    log = log.with_name(f".{log.name}.tiles")
+    log.write_text("of a run with other settings")
+    assert run(case, folder, tmp_path / "twice").code == 2 and log.exists()
+
+
 def test_fault_13_a_file_of_other_origin_under_a_name_that_a_dead_run_gave(tmp_path: Path) -> None:
     folder = inputs(flow, tmp_path / "in")
     assert run(flow, folder, tmp_path / "killed", Mishap(names=1)).code == -9

@@ -159,6 +159,11 @@ def is_unfinished(path: Path) -> bool:
     return now is not None and _noted(path)["identity"] == [*now]
 
 
+def forget(path: Path) -> None:
+    """Remove the note that a file is of an unfinished product."""
+    _note(path).unlink(missing_ok=True)
+
+
 def _noted(path: Path) -> dict[str, Any]:
     """What a run that died has noted: all files that were to get their names, and which one this is."""
     try:

@@ -9,6 +9,7 @@ from typing import Any
 from photoplan.engine.execute import OutputName
 from photoplan.errors import UsageError
 from photoplan.io.naming import is_unfinished
+from photoplan.io.product import tidy
 from photoplan.io.run_record import record_path, recorded_result, refuse_foreign_record
 from photoplan.plain import pick
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct
@@ -117,6 +118,7 @@ def finished_products(plan: OrthoPlan, folder: Path, overwrite: bool, picture: P
         found = _kept(plan, product, folder) if files[0].exists() else None
         if found is not None:
             kept[product.plan.name] = found
+            tidy([*files, record_path(files[0])])
             continue
         existing += there
         if not there:

@@ -21,8 +21,9 @@ from photoplan.io.filter_file import filter_text
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.image_form import ImageForm, form_of
 from photoplan.io.names import unique_stems
-from photoplan.io.product import check_output
+from photoplan.io.product import check_output, tidy
 from photoplan.io.raster import RasterReader
+from photoplan.io.run_record import record_path
 from photoplan.io.storage import Nodata
 from photoplan.plain import pick
 from photoplan.products.chromatic import load_chromatic, measured_once, model_figures
@@ -222,6 +223,9 @@ def restore_images(request: RestoreRequest, events: Events = SILENT) -> RestoreR
     plan = plan_restoration(request)
     settings = request.settings
     kept = {job.target: earlier_result(job, settings) for job in plan.jobs} if not request.overwrite else {}
+    for job in plan.jobs:
+        if kept.get(job.target):
+            tidy([job.target, job.picture, job.chromatic_file, record_path(job.target)])
     if plan.jobs and all(kept.get(job.target) for job in plan.jobs):
         first = plan.jobs[0].target
         raise UsageError(f"{first}: exists already; choose another output or say `overwrite`")
