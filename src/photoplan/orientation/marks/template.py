@@ -12,6 +12,7 @@ from scipy import ndimage
 
 from photoplan.cameras.mark_pattern import MarkExample, MarkPattern
 from photoplan.errors import InputError
+from photoplan.kernels.coverage import cover
 
 _LARGEST = 4096
 """Side of a template in pixels beyond which the scale must be wrong."""
@@ -41,9 +42,6 @@ class Template:
 def coverage(outline: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
     """Share of each pixel's area that a polygon covers, exact.
 
-    The area to the right of every edge is summed with the sign of its direction: each edge is cut at the borders of
-    pixels, and a piece inside a pixel covers a trapezoid of it and all pixels to its right.
-
     Parameters
     ----------
     outline : (n, 2) float64
@@ -56,29 +54,9 @@ def coverage(outline: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np
     (rows, columns) float64
         0 outside to 1 inside.
     """
-    rows, columns = shape
-    total = np.zeros((rows, columns + 1))
-    start = np.asarray(outline, np.float64) + 0.5
-    for a, b in zip(start, np.roll(start, -1, axis=0), strict=True):
-        if a[1] == b[1]:
-            continue
-        cuts = [np.array([0.0, 1.0])]
-        for axis, most in ((0, columns), (1, rows)):
-            low, high = sorted((a[axis], b[axis]))
-            lines = np.arange(max(np.ceil(low), 0.0), min(np.floor(high), most) + 1)
-            if low < high:
-                cuts.append((lines - a[axis]) / (b[axis] - a[axis]))
-        t = np.sort(np.clip(np.concatenate(cuts), 0.0, 1.0))
-        middle = a + (t[:-1] + t[1:])[:, None] / 2 * (b - a)
-        height = np.diff(t) * (b[1] - a[1])
-        row = np.floor(middle[:, 1]).astype(np.int64)
-        x = np.clip(middle[:, 0], 0.0, columns)
-        column = np.minimum(np.floor(x).astype(np.int64), columns - 1)
-        seen = (row >= 0) & (row < rows)
-        row, column, x, height = row[seen], column[seen], x[seen], height[seen]
-        np.add.at(total, (row, column), height * (column + 1 - x))
-        np.add.at(total, (row, column + 1), height * (x - column))
-    return np.clip(np.abs(np.cumsum(total[:, :-1], axis=1)), 0.0, 1.0)
+    total = np.empty((shape[0], shape[1] + 1))
+    cover(np.asarray(outline, np.float64) + 0.5, total)
+    return np.clip(np.abs(total[:, :-1]), 0.0, 1.0)
 
 
 def render(

@@ -51,10 +51,10 @@ class EdgeShape:
         at = np.linspace(low, high, int((high - low) / spacing) + 2)
         frequency = np.linspace(0.0, highest, max(2, round(highest * FREQUENCIES) + 1))
         far = (np.full(at.size, 0.5), np.zeros(at.size), (frequency == 0.0) + 0.0j, 1.0)
-        near = (basis.edge(at), basis.line(at), basis.transfer(frequency), basis.steps())
+        near = (basis.edge(at), basis.line(at), basis.transfer(frequency), basis.steps)
         edge, line, transfer, steps = (np.append(a, np.expand_dims(b, -1), axis=-1) for a, b in zip(near, far))
         ends = np.append(basis.edge(np.array([basis.low, basis.high])), [[0.5], [0.5]], axis=-1)
-        return cls(at, edge, ends, line, frequency, transfer, steps, np.append(basis.tails(), 1.0))
+        return cls(at, edge, ends, line, frequency, transfer, steps, np.append(basis.tails, 1.0))
 
     def allowed(self, shapes: NDArray[np.float64]) -> NDArray[np.float64]:
         """Coefficients (k, size + 1) with what makes negative tails none."""

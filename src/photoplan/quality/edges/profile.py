@@ -25,7 +25,7 @@ cusp of its transfer function at frequency 0, 1 − 4 λN |f| / π (Goodman, Int
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from math import asinh, ceil, pi, sinh, sqrt
 
@@ -82,7 +82,7 @@ class ProfileBasis:
         """Where the functions of the signal have their middle, pixels, shape (size − 3,)."""
         return self.knots[2:-2]
 
-    @property
+    @cached_property
     def _wider(self) -> tuple[PixelEdge, PixelEdge, float]:
         """The trend with a wider and a narrower blur, and the difference of their variances."""
         variance = self.model.blur**2
@@ -94,23 +94,29 @@ class ProfileBasis:
             (variance + change - least) / self.model.total**2,
         )
 
-    @property
+    @cached_property
     def _tails(self) -> NDArray[np.float64]:
         """Light of the functions of the signal beyond both ends, where they fade with the square, shape (2, k)."""
         ends = np.array([self.low, self.high])
-        return np.asarray(np.abs(ends)[:, None] * self._signal(1)(ends))
+        return np.asarray(np.abs(ends)[:, None] * self._signal(ends))
 
-    def _signal(self, derivative: int) -> BSpline:
-        spline = BSpline(self.knots, np.eye(self.knots.size - 4), 3, extrapolate=False)
-        return spline if derivative == 1 else spline.antiderivative()
+    @cached_property
+    def _signal(self) -> BSpline:
+        """Line spread functions of the signal."""
+        return BSpline(self.knots, np.eye(self.knots.size - 4), 3, extrapolate=False)
+
+    @cached_property
+    def _rise(self) -> BSpline:
+        """Edge profiles of the signal, but for constants."""
+        return self._signal.antiderivative()
 
     def edge(self, distance: NDArray[np.float64]) -> NDArray[np.float64]:
         """Edge profiles of all functions at distances (n,), shape (n, size)."""
         wide, narrow, difference = self._wider
         rise, spread, _ = self.model.profile(distance)
         width = (wide.profile(distance)[0] - narrow.profile(distance)[0]) / difference
-        inside = self._signal(0)(np.clip(distance, self.low, self.high))
-        signal = inside - self._signal(0)(np.array([self.low])) + self._tails[0]
+        inside = self._rise(np.clip(distance, self.low, self.high))
+        signal = inside - self._rise(np.array([self.low])) + self._tails[0]
         return np.concatenate([rise[:, None], spread[:, None] * self.model.total, width[:, None], signal], axis=1)
 
     def line(self, distance: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -118,7 +124,7 @@ class ProfileBasis:
         wide, narrow, difference = self._wider
         _, spread, tilt = self.model.profile(distance)
         width = (wide.profile(distance)[1] - narrow.profile(distance)[1]) / difference
-        signal = np.nan_to_num(self._signal(1)(distance))
+        signal = np.nan_to_num(self._signal(distance))
         return np.concatenate([spread[:, None], tilt[:, None] * self.model.total, width[:, None], signal], axis=1)
 
     def transfer(self, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
@@ -133,20 +139,22 @@ class ProfileBasis:
         inner = self.knots[(self.knots > self.low) & (self.knots < self.high)]
         at, weight = _quadrature(np.concatenate([[self.low], inner, [self.high]]), float(frequency.max()))
         waves = np.exp(-2j * pi * np.multiply.outer(frequency, at)) * weight
-        signal = waves @ self._signal(1)(at)
+        signal = waves @ self._signal(at)
         for end, tail in zip((self.low, self.high), self._tails):
             signal += np.multiply.outer(_faded(2.0 * pi * frequency * end), tail)
         shift = 2j * pi * frequency * own * self.model.total
         return np.concatenate([own[:, None], shift[:, None], width[:, None], signal], axis=1)
 
+    @cached_property
     def steps(self) -> NDArray[np.float64]:
         """What each function adds to the step from dark to bright, shape (size,)."""
-        inside = np.diff(self._signal(0)(np.array([self.low, self.high])), axis=0)[0]
+        inside = np.diff(self._rise(np.array([self.low, self.high])), axis=0)[0]
         return np.concatenate([[1.0, 0.0, 0.0], inside + self._tails.sum(axis=0)])
 
+    @cached_property
     def tails(self) -> NDArray[np.float64]:
         """What each function adds to the step beyond the window, shape (size,)."""
-        return np.asarray(self.steps() - np.diff(self.edge(np.array([self.low, self.high])), axis=0)[0])
+        return np.asarray(self.steps - np.diff(self.edge(np.array([self.low, self.high])), axis=0)[0])
 
     def root(self, correlation: float) -> NDArray[np.float64]:
         """Matrix R with R Rᵀ the covariance of the signal's coefficients, for unit variance in the middle.
@@ -189,19 +197,19 @@ class EdgeFit:
     @property
     def missing(self) -> float:
         """Light that lies beyond the window beside that of the shape: where its tails are negative, they are none."""
-        return max(0.0, -float(self.basis.tails() @ self.shape))
+        return max(0.0, -float(self.basis.tails @ self.shape))
 
     @property
     def step(self) -> float:
         """Difference of both levels, far away."""
-        return float(self.basis.steps() @ self.shape) + self.missing
+        return float(self.basis.steps @ self.shape) + self.missing
 
     @property
     def beyond(self) -> tuple[float, float]:
         """Share of the light beyond the window, and its standard deviation by the covariance."""
-        tails, step = self.basis.tails(), self.step
+        tails, step = self.basis.tails, self.step
         share = (float(tails @ self.shape) + self.missing) / step
-        change = (tails - share * self.basis.steps()) / step
+        change = (tails - share * self.basis.steps) / step
         return share, sqrt(max(float(change @ self.covariance @ change), 0.0))
 
 

@@ -373,7 +373,7 @@ def _profiles(found: _Context, step: float, gap: float) -> dict[str, EdgeProfile
     first, last = np.ceil(fit.basis.low / SPACING), np.floor(fit.basis.high / SPACING)
     at = np.arange(first, last + 1.0) * SPACING
     edge, line = fit.basis.edge(at) / step, fit.basis.line(at) / step
-    area = fit.basis.steps() / step
+    area = fit.basis.steps / step
     profiles = {}
     far = BEYOND * fit.beyond[0]
     for name, rows, base in (("esf", edge, 0.5), ("lsf", line, 0.0)):
