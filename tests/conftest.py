@@ -29,7 +29,20 @@ CHECKOUT = Path(__file__).resolve().parents[1]
 DEAR = (
     "real/test_brighton_chain.py",
     "products/test_every_run.py",
+    "kernels/test_rectify.py",
     "cli/test_run_faults.py",
+    "terrain/test_fit.py",
+    "products/test_restore_design.py",
+    "orientation/test_mark_search.py",
+    "cli/test_tie.py",
+    "kernels/test_area.py",
+    "real/test_brighton_ties.py",
+    "real/test_usgs_marks.py",
+    "quality/test_edge_response.py",
+    "orientation/test_mark_catalogue.py",
+    "terrain/test_build.py",
+    "terrain/test_known_noise.py",
+    "terrain/test_predict.py",
 )
 
 

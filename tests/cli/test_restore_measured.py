@@ -28,6 +28,7 @@ def image(tmp_path_factory):
 def test_a_measured_filter_is_printed_kept_and_gives_the_same_again(photoplan, image, tmp_path):
     first = photoplan("restore", image, "--output", tmp_path / "a", "--linearisation", "linear")
     assert first.code == 0
+    assert "linearisation: linear (by default" not in first.err
     assert "spread function along rows 0.6" in first.err
     assert "condition: along rows: A/Z = 0.3" in first.err
     assert "rule: regularised: least expected error; noise " in first.err
@@ -44,6 +45,11 @@ def test_a_measured_filter_is_printed_kept_and_gives_the_same_again(photoplan, i
 
 
 def test_the_same_command_goes_on_and_another_filter_is_not_overwritten(photoplan, image, tmp_path):
+    with rasterio.open(image) as whole:
+        cut = whole.read(1)[:200, :200]
+    image = tmp_path / "scene.tif"
+    with rasterio.open(image, "w", driver="GTiff", width=200, height=200, count=1, dtype="uint8") as file:
+        file.write(cut, 1)
     kept = tmp_path / "mine.toml"
     command = ["restore", image, "--output", tmp_path / "a", "--save-filter", kept]
     assert photoplan(*command).code == 0
@@ -58,16 +64,9 @@ def test_the_same_command_goes_on_and_another_filter_is_not_overwritten(photopla
     assert "exists" in again.err
 
 
-def test_what_is_taken_as_light_by_default_is_said(photoplan, image, tmp_path):
-    silent = photoplan("restore", image, "--output", tmp_path / "a", "--dry-run", "--linearisation", "linear")
-    assert "linearisation: linear (by default" not in silent.err
-    said = photoplan("restore", image, "--output", tmp_path / "a", "--dry-run")
-    assert "linearisation: linear (by default" in said.err
-
-
-def test_dry_run_writes_nothing(photoplan, image, tmp_path):
+def test_dry_run_writes_nothing_and_says_what_is_taken_as_light_by_default(photoplan, image, tmp_path):
     said = photoplan("restore", image, "--output", tmp_path / "a", "--dry-run", "--json")
-    assert said.code == 0
+    assert said.code == 0 and "linearisation: linear (by default" in said.err
     plan = json.loads(said.out)
     assert plan["filter"]["noise_gain"] > 1.5
     assert plan["filter"]["facts"]["parts"][0]["method"] == "regularised"

@@ -43,12 +43,16 @@ def estimated(xyz: NDArray[np.float64], family: str) -> Covariance:
     return estimate_all(seen, neighbours, members, settings)
 
 
+_FIELDS = [("gaussian", 3.0, 0.1, 3), ("matern", 3.0, 0.1, 3), ("exponential", 3.0, 0.3, 5)]
+
+
 @pytest.mark.parametrize(
-    "family, length, noise", [("gaussian", 3.0, 0.1), ("matern", 3.0, 0.1), ("exponential", 3.0, 0.3)]
+    ("family", "length", "noise", "fields"),
+    [*_FIELDS, *(pytest.param(*each[:3], 5, marks=pytest.mark.slow) for each in _FIELDS[:2])],
 )
-def test_parameters_of_random_fields_are_recovered(family: str, length: float, noise: float) -> None:
+def test_parameters_of_random_fields_are_recovered(family: str, length: float, noise: float, fields: int) -> None:
     """The mean of several fields within 20 %: a single one's own variance scatters by 10 to 20 %."""
-    found = [estimated(sample(family, length, seed, noise), family) for seed in range(5)]
+    found = [estimated(sample(family, length, seed, noise), family) for seed in range(fields)]
     assert {one.name for one in found} == {family}
     mean = np.exp(np.median([(np.log(f.variance), np.log(f.length), np.log(f.noise)) for f in found], axis=0))
     relative = mean / (1.0, length, noise)
@@ -114,12 +118,14 @@ class TestGrossErrors:
     NOISE = 0.05
     RIDGE = np.column_stack([np.full(31, 30.0), np.linspace(0, 60, 31), np.full(31, 106.0)])
 
-    def ridge(self) -> MeasuredLine:
-        xyz = self.RIDGE.copy()
+    @staticmethod
+    def ridge() -> MeasuredLine:
+        xyz = TestGrossErrors.RIDGE.copy()
         xyz[:, 2] += 0.4 * np.sin(xyz[:, 1] / 8)
         return line(xyz)
 
-    def spoiled(self, roof: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[int]]:
+    @staticmethod
+    def spoiled(roof: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[int]]:
         """Twelve errors of 20 noises anywhere, up and down, and four beside the ridge."""
         rng = np.random.default_rng(6)
         xyz, far = roof.copy(), np.abs(roof[:, 0] - 30) > 4
@@ -132,7 +138,7 @@ class TestGrossErrors:
         bad = single[4:]
         bad += single[:4]
         sign = np.where(np.arange(len(bad)) % 2 == 0, 1, -1)
-        xyz[bad, 2] += 20 * self.NOISE * sign
+        xyz[bad, 2] += 20 * TestGrossErrors.NOISE * sign
         return xyz, bad
 
     def nearest(self, xyz: NDArray[np.float64], k: int) -> int:
@@ -146,7 +152,7 @@ class TestGrossErrors:
         xyz[pair, 2] += 20 * self.NOISE
         assert set(pair) <= set(built(terrain(xyz, self.ridge())).fit.gross.tolist())
 
-    @pytest.fixture
+    @pytest.fixture(scope="class")
     def model(self, roof: NDArray[np.float64]) -> tuple[Built, list[int]]:
         xyz, bad = self.spoiled(roof)
         return built(terrain(xyz, self.ridge())), bad

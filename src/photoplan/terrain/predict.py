@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, map_coordinates
+from scipy.ndimage import binary_dilation, distance_transform_edt, map_coordinates
 
 from photoplan.events import Map
 from photoplan.kernels.patch import predict
@@ -59,7 +59,7 @@ class Domain:
         occupied[((top - xy[:, 1]) / cell).astype(int), ((xy[:, 0] - left) / cell).astype(int)] = True
         grown = distance_transform_edt(~occupied) * cell <= reach
         closed = distance_transform_edt(grown) * cell > reach
-        near = distance_transform_edt(~(closed | occupied)) < 1.5
+        near = binary_dilation(closed | occupied, np.ones((3, 3), bool))
         if polygon is not None:
             shapely.prepare(polygon)
         return cls(float(left), float(top), cell, near, polygon)
