@@ -135,7 +135,10 @@ def test_a_raster_of_another_crs_lies_where_it_belongs(small: Block, tmp_path: P
     low, high = np.percentile(values, (2, 98))
     wanted = np.clip((bands[1] - Y0 - low) * 255 / (high - low), 0, 255)
     there = np.isfinite(wanted)
-    assert np.abs(picture[0][there] - wanted[there]).max() < 1.0
+    # A pixel is the mean of what it covers: on a crest, seen at 86°, that is 35 m and not known to a hundredth.
+    assert np.abs(picture[0][there] - wanted[there]).max() < 2.0
+    steep = there & (bands[4] < 85)
+    assert steep.sum() > 0.99 * there.sum() and np.abs(picture[0][steep] - wanted[steep]).max() < 1.0
 
 
 def test_haze_follows_equation_5_8_of_ecker() -> None:
