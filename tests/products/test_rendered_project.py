@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,7 +11,17 @@ import rasterio
 import shapely
 from rasterio.transform import from_origin
 from tools.command import Said, inside
-from tools.rendered_block import Flight, edge_shifts, judge, pixels_of, seen, shifts, upper_edges, write_project
+from tools.rendered_block import (
+    Flight,
+    edge_shifts,
+    judge,
+    pixels_of,
+    rendered_mosaic,
+    seen,
+    shifts,
+    upper_edges,
+    write_project,
+)
 from tools.small_block import CRS, X0, Y0, write_image
 from tools.town import House
 
@@ -22,6 +31,7 @@ from photoplan.io.project.file import load_project
 from photoplan.products.simulate.scene import ProjectScene
 from photoplan.quality.formation.rendered import RenderedScene, SolidTexture
 from photoplan.surfaces.level import LevelSurface
+from photoplan.surfaces.objects import ObjectSurface
 
 GROUND, GRAIN = 100.0, 8.0
 HOUSES = [
@@ -96,20 +106,17 @@ def test_every_pixel_is_known(town: Town) -> None:
 
 def test_a_mosaic_of_it_shows_what_is_there(town: Town) -> None:
     folder = town.path.parent
-    words = ["--bounds", *BOUNDS, "--resolution", 1, "--sources", "--no-quicklook", "--output", folder / "products"]
-    told = json.loads(town("mosaic", *words, "--json", "--tile", 128).out)["products"][0]
-    truth = seen(town.path, folder / "products" / "mosaic.tif")
-    figures, painted = judge(truth, folder / "products" / "mosaic_sources.tif", told["images"], NAMES)
-    assert figures.visible > 20_000 and (~truth.visible).sum() > 30
-    assert figures.right >= 0.998, figures
-    made, valid = pixels_of(folder / "products" / "mosaic.tif")
+    images = rendered_mosaic(town.path, town.path, BOUNDS, 1)
+    truth = seen(town.path, folder / "project" / "mosaic.tif")
+    judged = judge(truth, folder / "project" / "mosaic.tif", images, NAMES)
+    assert judged.visible > 20_000 and (~truth.visible).sum() > 30
+    assert judged.right >= 0.998 and judged.wrong == judged.double == 0
     true, _ = pixels_of(folder / "rendered" / "true_orthophoto.tif")
-    # Windows on one surface: ground, roofs, deck.
-    same = np.abs(np.stack(np.gradient(truth.XYZ[..., 2]))).max(axis=0) < 0.5
-    found = shifts(made, true, valid & (painted > 0) & same)
+    found = shifts(judged, true, truth)
     assert len(found) > 50 and np.sqrt((found**2).mean()) < 0.1 and np.abs(found).max() < 0.3
     surface = ProjectScene.of(load_project(town.path), None, GRAIN, 0, 1).ground.surface
-    edges = edge_shifts(made, true, valid & (painted > 0), upper_edges(surface, truth.grid, 12.0))  # type: ignore[arg-type]
+    assert isinstance(surface, ObjectSurface)
+    edges = edge_shifts(judged, true, truth, upper_edges(surface, truth.grid, 12.0))
     assert np.isfinite(edges).sum() >= 4 and np.nanmax(np.abs(edges)) < 0.5
 
 

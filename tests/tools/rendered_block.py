@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -17,9 +18,12 @@ from photoplan.geometry.grid import MapGrid
 from photoplan.io.project.file import load_project
 from photoplan.products.simulate.scene import ProjectScene
 from photoplan.surfaces.objects import ObjectSurface
+from tools.command import inside
 
 #: Grain of the pattern does not matter for what rays meet.
 _ANY_GRAIN = 1.0
+#: Grey values per pixel that an edge needs to be measured.
+_CONTRAST = 7.0
 
 
 @dataclass(frozen=True)
@@ -85,8 +89,11 @@ class Seen:
         return self.sees.any(axis=0)
 
 
-def seen(project_path: Path, product: Path, near: float = 0.01) -> Seen:
-    """Rays from above to every pixel of a product, and from every image back to it."""
+def seen(project_path: Path, product: Path) -> Seen:
+    """Rays from above to every pixel of a product, and from every image back to it.
+
+    What is met within a tenth of a pixel is the place itself, as products have it (design/021).
+    """
     project = load_project(project_path)
     scene = ProjectScene.of(project, None, _ANY_GRAIN, 0, 1)
     with rasterio.open(product) as file:
@@ -98,11 +105,10 @@ def seen(project_path: Path, product: Path, near: float = 0.01) -> Seen:
         view = scene.seen_by(image.name)
         xy = project_points(view.camera, met.XYZ)  # type: ignore[arg-type]
         inside = ((xy >= -0.5) & (xy <= np.array(view.size) - 0.5)).all(axis=1)
-        far = np.full(len(xy), np.inf)
-        back = view.hits(xy[inside]).XYZ - met.XYZ[inside]
-        far[inside] = np.where(np.isnan(back[:, 0]), np.inf, np.linalg.norm(back, axis=1))
-        sees.append(far < near)
-        missed.append(far)
+        off = np.full((len(xy), 3), np.inf)
+        off[inside] = np.nan_to_num(view.hits(xy[inside]).XYZ - met.XYZ[inside], nan=np.inf)
+        sees.append(np.linalg.norm(off, axis=1) < 0.1 * grid.resolution)
+        missed.append(np.hypot(off[:, 0], off[:, 1]))
     shape = (grid.height, grid.width)
     return Seen(
         met.XYZ.reshape(*shape, 3),
@@ -113,7 +119,20 @@ def seen(project_path: Path, product: Path, near: float = 0.01) -> Seen:
     )
 
 
-@dataclass(frozen=True)
+def rendered_mosaic(scene: Path, product: Path, bounds: tuple[float, ...], resolution: float) -> list[str]:
+    """Make a mosaic and what it needs, in the folder of the projects, by commands; its images by their rows."""
+    where = ["--bounds", *bounds, "--resolution", resolution, "--workers", 2, "-q"]
+    if not (scene.parent / "rendered").exists():
+        said = inside("simulate", "--scene", scene, *where, "--seed", 63)
+        assert said.code == 0, said.err
+    output = scene.parent / product.stem
+    said = inside("mosaic", product, *where, "--sources", "--no-quicklook", "--json", "--output", output)
+    assert said.code == 0, said.err
+    images: list[str] = json.loads(said.out)["products"][0]["images"]
+    return images
+
+
+@dataclass(frozen=True, eq=False)
 class Judged:
     """How a mosaic differs from what there is to see."""
 
@@ -122,27 +141,32 @@ class Judged:
     right: float
     """Share of them that are painted by an image that sees them."""
     wrong: int
-    """Pixels that are painted by an image that does not see them, which shows something else there: ground or roof that
-    is there twice."""
-    empty: int
-    """Visible pixels that are empty."""
+    """Pixels that are painted by an image that does not see them."""
+    double: int
+    """Those of them whose image shows there what is more than a pixel away on the map: it is there twice."""
+    made: NDArray[np.float64]
+    """Mean of the bands, shape (h, w)."""
+    good: NDArray[np.bool_]
+    """Pixels that show what is there, shape (h, w)."""
 
 
-def judge(truth: Seen, sources: Path, images: list[str], names: list[str]) -> tuple[Judged, NDArray[np.int64]]:
-    """Figures of a mosaic from its raster of sources; `images`: as its record lists them, `names`: as the project."""
-    with rasterio.open(sources) as file:
+def judge(truth: Seen, mosaic: Path, images: list[str], names: list[str]) -> Judged:
+    """Figures of a mosaic and its raster of sources; `images`: by their rows, `names`: as the project lists them."""
+    with rasterio.open(mosaic.with_name(f"{mosaic.stem}_sources.tif")) as file:
         owner = file.read(1).astype(np.int64)
-    rows = np.array([0, *(names.index(name) + 1 for name in images)])
-    painted = rows[owner]
+    painted = np.array([0, *(names.index(name) + 1 for name in images)])[owner]
     mine = np.take_along_axis(truth.sees, np.maximum(painted - 1, 0)[None], axis=0)[0] & (painted > 0)
-    visible = truth.visible
-    figures = Judged(
-        visible=int(visible.sum()),
-        right=float(mine[visible].mean()),
-        wrong=int(((painted > 0) & ~mine).sum()),
-        empty=int((visible & (painted == 0)).sum()),
+    made, valid = pixels_of(mosaic)
+    wrong = (painted > 0) & ~mine
+    away = np.take_along_axis(truth.missed, np.maximum(painted - 1, 0)[None], axis=0)[0] > truth.grid.resolution
+    return Judged(
+        visible=int(truth.visible.sum()),
+        right=float(mine[truth.visible].mean()),
+        wrong=int(wrong.sum()),
+        double=int((wrong & away).sum()),
+        made=made,
+        good=mine & valid,
     )
-    return figures, np.where(mine, painted, 0)
 
 
 def pixels_of(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -151,15 +175,16 @@ def pixels_of(path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         return file.read().astype(float).mean(axis=0), file.read_masks(1) > 0
 
 
-def shifts(
-    made: NDArray[np.float64], true: NDArray[np.float64], good: NDArray[np.bool_], side: int = 17
-) -> NDArray[np.float64]:
-    """Displacements (n, 2) in pixels of what windows show, where all their pixels are good: by least squares."""
-    a, b = (gaussian_filter(each, 1.0) for each in (made, true))
+def shifts(judged: Judged, true: NDArray[np.float64], truth: Seen, side: int = 17) -> NDArray[np.float64]:
+    """Displacements (n, 2) in pixels of what windows show, where all of it is good and of one surface: by least
+    squares."""
+    even = np.abs(np.stack(np.gradient(truth.XYZ[..., 2]))).max(axis=0) < 2.5 * truth.grid.resolution
+    good = judged.good & even
+    a, b = (gaussian_filter(each, 1.0) for each in (judged.made, true))
     gy, gx = np.gradient(b)
     found = []
-    for row in range(4, made.shape[0] - side - 4, side // 2):
-        for col in range(4, made.shape[1] - side - 4, side // 2):
+    for row in range(4, true.shape[0] - side - 4, side // 2):
+        for col in range(4, true.shape[1] - side - 4, side // 2):
             at = slice(row, row + side), slice(col, col + side)
             if not good[row - 4 : row + side + 4, col - 4 : col + side + 4].all():
                 continue
@@ -172,36 +197,36 @@ def shifts(
 
 
 def edge_shifts(
-    made: NDArray[np.float64],
-    true: NDArray[np.float64],
-    good: NDArray[np.bool_],
-    lines: list[NDArray[np.float64]],
-    reach: float = 3.0,
+    judged: Judged, true: NDArray[np.float64], truth: Seen, lines: list[NDArray[np.float64]]
 ) -> NDArray[np.float64]:
-    """Displacement across each line (2, 2), in pixels (column, row): of all that is within `reach` pixels of it.
+    """Displacement across each line (2, 2), in pixels (column, row): of all that is within 3 pixels of it.
 
-    NaN where there is no contrast, or where pixels are missing.
+    NaN where there is no contrast, where pixels are missing, or where a third object comes near.
     """
     gy, gx = np.gradient(true)
     out = np.full(len(lines), np.nan)
     for k, (a, b) in enumerate(lines):
         along = (b - a) / np.linalg.norm(b - a)
         across = np.array([-along[1], along[0]])
-        low = np.floor(np.minimum(a, b) - reach).astype(int).clip(0)
-        high = np.ceil(np.maximum(a, b) + reach).astype(int) + 1
+        low = np.floor(np.minimum(a, b) - 3).astype(int).clip(0)
+        high = np.ceil(np.maximum(a, b) + 3).astype(int) + 1
+        if (low >= true.shape[::-1]).any() or (high <= 0).any():
+            continue
         rows, cols = np.mgrid[low[1] : min(high[1], true.shape[0]), low[0] : min(high[0], true.shape[1])]
         at = np.stack([cols, rows], axis=-1) - a
         s, t = at @ along, at @ across
-        inside = (np.abs(t) <= reach) & (s >= 3) & (s <= np.linalg.norm(b - a) - 3)
-        r, c = rows[inside], cols[inside]
-        if inside.sum() < 30 or good[r, c].mean() < 0.98:
+        inside = (np.abs(t) <= 3) & (s >= 0) & (s <= np.linalg.norm(b - a))
+        r, c, t = rows[inside], cols[inside], t[inside]
+        sides = [truth.owner[r[on], c[on]] for on in (t > 0.1, t < -0.1)]
+        if min(len(side) for side in sides) < 15 or judged.good[r, c].mean() < 0.98:
+            continue
+        if any((side != np.median(side)).mean() > 0.02 for side in sides):
             continue
         g = gx[r, c] * across[0] + gy[r, c] * across[1]
-        near = np.abs(t[inside]) <= 1.0
-        if np.abs(g[near]).mean() < 6.0:
+        if np.abs(g[np.abs(t) <= 1.0]).mean() < _CONTRAST:
             continue
         design = np.stack([g, np.ones(len(g))], axis=1)
-        out[k] = -np.linalg.lstsq(design, (made - true)[r, c], rcond=None)[0][0]
+        out[k] = -np.linalg.lstsq(design, (judged.made - true)[r, c], rcond=None)[0][0]
     return out
 
 
