@@ -38,7 +38,7 @@ def test_a_city_is_seen_once_and_where_it_stands(
     scene = ProjectScene.of(load_project(city.path), None, 1.0, 0, 1)
     surface = scene.ground.surface
     assert isinstance(surface, ObjectSurface)
-    edges = edge_shifts(judged, true, truth, upper_edges(surface, truth.grid, 20.0))
+    edges = edge_shifts(judged, true, truth, upper_edges(surface, truth.grid, 20.0 * PIXEL))
     edges = np.abs(edges[np.isfinite(edges)])
     agree = np.array([agreement(scene, name, truth.XYZ, sees) for name, sees in zip(NAMES, truth.sees)])
     print(town.__name__, judged.visible, judged.right, judged.wrong, judged.double)
