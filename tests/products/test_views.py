@@ -137,8 +137,8 @@ def test_a_raster_of_another_crs_lies_where_it_belongs(small: Block, tmp_path: P
     there = np.isfinite(wanted)
     # A pixel is the mean of what it covers: on a crest, seen at 86°, that is 35 m and not known to a hundredth.
     assert np.abs(picture[0][there] - wanted[there]).max() < 2.0
-    steep = there & (bands[4] < 85)
-    assert steep.sum() > 0.99 * there.sum() and np.abs(picture[0][steep] - wanted[steep]).max() < 1.0
+    flatter = there & (bands[4] < 85)
+    assert flatter.sum() > 0.9 * there.sum() and np.abs(picture[0][flatter] - wanted[flatter]).max() < 1.0
 
 
 def test_haze_follows_equation_5_8_of_ecker() -> None:
