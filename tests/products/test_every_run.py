@@ -77,6 +77,16 @@ def mosaic(inputs: Path, out: Path) -> list[object]:
     return ["mosaic", project, *bounds, "--sources", "--no-quicklook", "--output", out]
 
 
+def single(inputs: Path, out: Path) -> list[object]:
+    """A house alone, in four tiles."""
+    words = ["--objects", "house", "--resolution", 0.25, "--force", "--tile", 128, "--no-quicklook", "--output", out]
+    return ["object", inputs / "block" / "town.toml", inputs / "block" / "town.gpkg", *words]
+
+
+def direct(inputs: Path, out: Path) -> list[object]:
+    return [*ortho(inputs, out), "--method", "direct", "--fill", 2]
+
+
 def restore(inputs: Path, out: Path) -> list[object]:
     return ["restore", inputs / "scan.tif", "--filter", inputs / "weights.csv", "--no-quicklook", "--output", out]
 
@@ -113,6 +123,8 @@ CASES: dict[str, tuple[Words, str]] = {
     "ortho": (ortho, "one_ortho.tif"),
     "true": (true_ortho, "one_ortho.tif"),
     "mosaic": (mosaic, "mosaic.tif"),
+    "object": (single, "house_object.tif"),
+    "direct": (direct, "one_ortho.tif"),
     "restore": (restore, "scan_restored.tif"),
     "simulate": (simulate, "product_0003.tif"),
     "tie": (tie, "product.csv"),

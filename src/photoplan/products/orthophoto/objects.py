@@ -88,7 +88,7 @@ def plan_objects(
     found = _placed(_named(surface, entry, objects), chosen, project.crs, blind)
     near = _near(found, looked)
     products = []
-    events.begin("planning", len(found), "objects")
+    events.begin("planning objects", len(found), "objects")
     for one, among in zip(found, near):
         for part in (False, True) if below else (False,):
             product = _product(project, chosen, one.below() if part else one, [looked[k] for k in among])
