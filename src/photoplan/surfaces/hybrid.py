@@ -273,6 +273,10 @@ class HybridParts:
         """Bounds of units, shape (height, width, 2)."""
         return self.surface.source.ranges[window.row : window.stop[1], window.col : window.stop[0]]
 
+    def range(self, column: int, row: int) -> NDArray[np.float64]:
+        """Bounds of a unit."""
+        return np.asarray(self.surface.source.ranges[row, column])
+
     def part(self, column: int, row: int) -> Part | None:
         """A unit; None if it is empty."""
         unit = self.surface.source.unit(column, row)

@@ -68,6 +68,10 @@ class LevelParts:
         """The height, twice, shape (height, width, 2)."""
         return np.full((window.height, window.width, 2), self.surface.height)
 
+    def range(self, column: int, row: int) -> NDArray[np.float64]:
+        """The height, twice."""
+        return np.full(2, self.surface.height)
+
     def part(self, column: int, row: int) -> Part:
         """The mesh."""
         return Part(self.corner, self.step, np.zeros((2, 2), np.float32), self.surface.height)

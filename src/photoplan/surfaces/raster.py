@@ -240,10 +240,17 @@ class RasterParts:
 
     def ranges(self, window: Window) -> NDArray[np.float64]:
         """Bounds of parts, as far as they are known; shape (height, width, 2)."""
+        return self._ranges(window, learn=False)
+
+    def range(self, column: int, row: int) -> NDArray[np.float64]:
+        """Bounds of a part; what is read for them is read once."""
+        return np.asarray(self._ranges(Window(column, row, 1, 1), learn=True)[0, 0])
+
+    def _ranges(self, window: Window, learn: bool) -> NDArray[np.float64]:
         row, col = np.mgrid[window.row : window.stop[1], window.col : window.stop[0]].reshape(2, -1) * self.side
         posts = np.stack([col - 1, row - 1, col + self.side, row + self.side], axis=1)
         posts = np.clip(posts, 0, np.tile(self.surface.grid.size, 2))
-        return self.surface._ranges.of(posts, learn=False).reshape(window.height, window.width, 2)
+        return self.surface._ranges.of(posts, learn).reshape(window.height, window.width, 2)
 
     def part(self, column: int, row: int) -> Part | None:
         """A part; None if it has no ground."""

@@ -89,12 +89,6 @@ class Part:
         object.__setattr__(self, "pyramid", pyramid_of(self.posts, *faces))
 
     @property
-    def range(self) -> tuple[float, float]:
-        """Lowest and highest ground; NaN, NaN if there is none."""
-        low, high = float(self.pyramid[0][-1]), float(self.pyramid[1][-1])
-        return (low + self.datum, high + self.datum) if low <= high else (np.nan, np.nan)
-
-    @property
     def bytes(self) -> int:
         """Memory that it takes, nearly."""
         return 4 * self.posts.nbytes + self.faces[0].nbytes + self.faces[1].nbytes + self.faces[2].nbytes
@@ -124,6 +118,10 @@ class Parts(Protocol):
 
     def ranges(self, window: Window) -> NDArray[np.float64]:
         """Bounds of the parts of a window, shape (height, width, 2): NaN: no ground, infinite: not known yet."""
+        ...
+
+    def range(self, column: int, row: int) -> NDArray[np.float64]:
+        """Bounds of a part, found out now if they were not known, shape (2,): NaN: no ground."""
         ...
 
     def part(self, column: int, row: int) -> Part | None:
@@ -278,10 +276,15 @@ def _over_parts(
         active, place = active[place[:, 0] >= 0], place[place[:, 0] >= 0]
         for group in _groups(place):
             column, row = (int(v) for v in place[group[0]])
-            part = _kept(parts, (column + window.col, row + window.row), cache)
-            if part is None or np.isinf(low[row, column]):
-                # Only now it is known whether the rays have to go there.
-                low[row, column], high[row, column] = (np.inf, -np.inf) if part is None else part.range
+            at = column + window.col, row + window.row
+            if np.isinf(low[row, column]):
+                # Only then it is known whether the rays have to go there.
+                found = parts.range(*at)
+                low[row, column], high[row, column] = (np.inf, -np.inf) if np.isnan(found[0]) else found
+                continue
+            part = _kept(parts, at, cache)
+            if part is None:
+                low[row, column], high[row, column] = np.inf, -np.inf
                 continue
             here = active[group]
             local = _in_part(part, lines[here], rays[here])
