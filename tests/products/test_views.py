@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -243,3 +244,28 @@ def test_an_input_that_changes_is_noticed(small: Block, tmp_path: Path) -> None:
     digests = tuple((path, "0" * 64) for path, _ in plan.address.digests)
     with pytest.raises(InputError, match="has changed"):
         ViewAddress(**{**vars(plan.address), "digests": digests}).open()
+
+
+def test_fault_20_terrain_in_degrees_or_without_a_crs_is_refused(tmp_path: Path) -> None:
+    for crs, told in (("EPSG:4326", "geographic|degrees"), (None, "no CRS")):
+        path = tmp_path / "t.tif"
+        transform = rasterio.transform.from_origin(11, 47, 1e-4, 1e-4)
+        with rasterio.open(path, "w", driver="GTiff", width=9, height=9, count=1, dtype="float32", crs=crs,
+                           transform=transform) as file:  # fmt: skip
+            file.write(np.full((1, 9, 9), 500, np.float32))
+        said = inside("view", path, "--from", 11.0004, 46.9996, "--azimuth", 0, "--dry-run")
+        assert said.code == 3 and re.search(told, said.err), said.err
+
+
+def test_faults_30_32_absurd_numbers_and_pictures_are_refused(small: Block) -> None:
+    for words in (["--from", 1e300, 5e6], ["--from", X0, Y0, "--altitude", 1e300],
+                  ["--from", X0, Y0, "--size", 10**9, 5],
+                  ["--from", X0, Y0, "--fov", 1e-9], ["--from", X0, Y0, "--earth-radius", 6.38]):  # fmt: skip
+        said = inside("view", small.terrain, *words, "--azimuth", 0, "--dry-run")
+        assert said.code in (1, 2, 3) and "photoplan:" in said.err, said.err
+
+
+def test_fault_06_a_bound_on_memory_is_kept_or_refused(small: Block, tmp_path: Path) -> None:
+    words = [small.terrain, "--from", X0, Y0, "--azimuth", 0, "--size", 50, 40, "-o", tmp_path / "v.png"]
+    said = inside("view", *words, "--memory", "10MB")
+    assert said.code == 2 and "at least" in said.err

@@ -19,6 +19,7 @@ from photoplan.kernels.jit import COMPILED
 from photoplan.surfaces.faces import Faces
 from photoplan.surfaces.level import LevelSurface
 from photoplan.surfaces.objects import ObjectSurface
+from photoplan.surfaces.raster import RasterSurface
 from photoplan.surfaces.seen import SeenSurface, ground_size
 from photoplan.targets.map import MapTarget
 from photoplan.targets.panorama import Panorama
@@ -197,3 +198,60 @@ def test_what_is_farther_than_asked_is_not_seen_and_targets_must_be_views() -> N
     assert np.nanmax(target.distance(seen.uvh)) <= 600 and (seen.owner[np.isnan(seen.uvh[..., 2])] == -1).all()
     with pytest.raises(UsageError, match="views"):
         surface.relief(MapTarget(MapGrid(0, 10, 1, 10, 10, "EPSG:32633")), target.window)
+
+
+class CountedGrid:
+    """Posts in memory that count how often they are read."""
+
+    def __init__(self, heights: np.ndarray) -> None:
+        self.heights, self.reads = heights, 0
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.heights.shape[1], self.heights.shape[0]
+
+    def read(self, window):
+        self.reads += 1
+        return self.heights[window.row : window.stop[1], window.col : window.stop[0]]
+
+
+def test_what_rays_fly_over_is_read_once_and_then_known() -> None:
+    grid = CountedGrid(np.zeros((640, 640), np.float32))
+    terrain = RasterSurface(grid, (0.0, 640.0), (1.0, 1.0), part=(32, 32))
+    down = np.array([[(5.0, 5.0, 400.0), (630.0, 630.0, -1.0)]] * 3)
+    first = terrain.first_hit(down)
+    count = grid.reads
+    again = terrain.first_hit(down + np.array([0.2, 0, 0]))
+    # Only the part in which they end, and no more than its neighbour.
+    assert 20 < count < 200 and grid.reads - count <= 2
+    np.testing.assert_allclose(again.XYZ[:, 1:], first.XYZ[:, 1:], atol=1e-9)
+
+
+def test_fault_34_coincident_objects_and_tiles_do_not_flicker() -> None:
+    camera = looking(near(-80, -60, 160), near(0, 0, 104))
+    roof = near(0, 0, 0) + np.array([[(-20, -20, 110.0), (20, -20, 112), (0, 25, 118)]])
+    faces = Faces(np.concatenate([roof, roof]), np.ones(2, bool), np.array([0, 1], np.int32), ("one", "same"))
+    surface = SeenSurface(ObjectSurface(raster_surface(hills() - 270, LEFT, TOP, MESH), faces), BOUNDS)
+    target = ViewTarget.of_camera(camera)
+    whole = surface.look(target, target.window)
+    assert set(np.unique(whole.owner)) == {-1, 0, 1} or not COMPILED
+    for window in target.window.tiles(17):
+        part = surface.look(target, window)
+        for name, values in vars(part).items():
+            np.testing.assert_array_equal(values, getattr(whole, name)[window.slices(target.window)], err_msg=name)
+
+
+def test_fault_21_holes_let_rays_through_and_are_counted() -> None:
+    heights = hills()
+    heights[8:14, 8:14] = np.nan
+    surface = SeenSurface(raster_surface(heights, LEFT, TOP, MESH), BOUNDS)
+    target = ViewTarget.of_camera(VIEWS["vanishing point inside"])
+    seen = surface.look(target, target.window)
+    sky = seen.owner == -1
+    assert sky.any() and np.isnan(seen.XYZ[sky]).all() and np.isnan(seen.incidence[sky]).all()
+    # The camera looks down: all that shows no ground is counted.
+    np.testing.assert_array_equal(seen.lost, sky)
+    assert np.isfinite(seen.XYZ[~sky]).all()
+    # A camera below the ground sees nothing until its rays have come out.
+    buried = surface.look(ViewTarget.of_camera(looking(near(-100, 0, 100), near(0, 0, 90))), target.window)
+    assert (buried.owner == -1).all()

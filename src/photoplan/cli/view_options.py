@@ -141,8 +141,9 @@ def run_view(request: Any, options: dict[str, Any]) -> None:
     if not quiet:
         share = result.sky / result.rays
         near = "" if result.nearest is None else f"; ground from {result.nearest:.4g} to {result.farthest:.6g} m"
-        under = f"; {result.below} rays end below the ground" if result.below else ""
-        say(f"{result.size[0]} × {result.size[1]} pixels in {result.seconds:.1f} s, {share:.1%} sky{near}{under}")
+        lost = result.lost / result.rays
+        beyond = f" ({lost:.1%} downwards, past the terrain's border or through holes)" if lost else ""
+        say(f"{result.size[0]} × {result.size[1]} pixels in {result.seconds:.1f} s, {share:.1%} sky{beyond}{near}")
 
 
 def told(plan: Any) -> list[str]:

@@ -40,8 +40,8 @@ class Seen:
     """Direction from the ground to the point of view, on the map, of length one."""
     owner: NDArray[np.int64]
     """0: terrain; else the number of an object, from one; −1: sky."""
-    below: NDArray[np.bool_]
-    """Sky because the ray ended below the ground."""
+    lost: NDArray[np.bool_]
+    """Sky although the ray points downwards: it passes the border of the terrain, or a hole of it."""
 
     @property
     def incidence(self) -> NDArray[np.float64]:
@@ -106,7 +106,7 @@ class SeenSurface:
             normal=hits.normal,
             towards=_back(target, hits),
             owner=hits.owner,
-            below=hits.below,
+            lost=(hits.owner < 0) & (target.bundle.directions(uv)[:, 2] < 0),
         )
 
     def _reach(self, target: ViewTarget) -> float:

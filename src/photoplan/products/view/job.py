@@ -252,14 +252,14 @@ def from_matrix(view: OpenView, window: Window) -> Seen:
         normal=np.concatenate([level, up[..., None]], axis=-1),
         towards=towards,
         owner=np.where(there, np.nan_to_num(bands[6]), -1).astype(np.int64),
-        below=np.zeros(there.shape, bool),
+        lost=~there & (view.target.bundle.directions(uvh[..., :2])[..., 2] < 0),
     )
 
 
 def _counts(target: ViewTarget, seen: Seen) -> dict[str, Any]:
     """Figures of a tile, to be added up."""
     there = seen.owner >= 0
-    figures: dict[str, Any] = {"pixels": there.size, "ground": int(there.sum()), "below": int(seen.below.sum())}
+    figures: dict[str, Any] = {"pixels": there.size, "ground": int(there.sum()), "lost": int(seen.lost.sum())}
     if there.any():
         away = target.distance(seen.uvh[there])
         figures |= {"worst_distance": float(away.max()), "worst_nearness": -float(away.min())}

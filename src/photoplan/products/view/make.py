@@ -125,8 +125,8 @@ class ViewResult:
     sky: int
     """Pixels that show no ground (of a picture with several rays to a pixel: rays)."""
     rays: int
-    below: int
-    """Rays that are sky because they ended below the ground."""
+    lost: int
+    """Those of them that point downwards: they pass the border of the terrain, or a hole of it."""
     nearest: float | None
     farthest: float | None
     """Distances of ground, metres."""
@@ -136,7 +136,7 @@ class ViewResult:
 
     def json_fields(self) -> dict[str, Any]:
         """Counts of rays."""
-        counts = pick(self, "rays", sky_rays="sky", rays_below_ground="below")
+        counts = pick(self, "rays", sky_rays="sky", downward_sky_rays="lost")
         return {**pick(self, "path", "size", nearest_m="nearest", farthest_m="farthest"), **counts,
                 **pick(self, "seconds", resumed_tiles="resumed")}  # fmt: skip
 
@@ -340,7 +340,7 @@ def _complete(
         size=plan.camera.target.bundle.size,
         sky=totals["pixels"] - totals["ground"],
         rays=totals["pixels"],
-        below=totals["below"],
+        lost=totals["lost"],
         nearest=-totals["worst_nearness"] if "worst_nearness" in totals else None,
         farthest=totals.get("worst_distance"),
         resumed=tally.resumed,

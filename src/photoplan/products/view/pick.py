@@ -118,7 +118,7 @@ def _of_points(request: PickRequest, ground: ViewGround, camera: ViewCamera) -> 
         inside = ((uvh[:, :2] >= -0.5) & (uvh[:, :2] <= np.array(target.bundle.size) - 0.5)).all(axis=1)
         free = ~(met.uvh[:, 2] < uvh[:, 2] * (1 - _SAME) - _SAME_METRES)
     shown = inside & free & (uvh[:, 2] > 0) & (target.distance(uvh) <= request.view.farthest)
-    own = Seen(XYZ=XYZ, uvh=uvh, normal=met.normal, towards=met.towards, owner=met.owner, below=met.below)
+    own = Seen(XYZ=XYZ, uvh=uvh, normal=met.normal, towards=met.towards, owner=met.owner, lost=met.lost)
     return _told(names, ground, camera, own, shown)
 
 
