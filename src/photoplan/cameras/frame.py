@@ -130,10 +130,14 @@ class FrameCamera:
 
     def rays(self, xy: ArrayLike, height: float | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Image points (..., 2) to the projection centre and unit directions, each (..., 3); `height` is not used."""
-        t = self._lens.undistort(self.interior.tangent_to_pixel.inverse(xy))
-        d = np.concatenate([t, np.ones((*t.shape[:-1], 1))], axis=-1) @ self._axes.T
+        d = self.directions(xy)
         d /= np.linalg.norm(d, axis=-1, keepdims=True)
         return np.broadcast_to(self.pose.center, d.shape).copy(), d
+
+    def directions(self, xy: ArrayLike) -> NDArray[np.float64]:
+        """Directions (..., 3) of the rays of image points (..., 2), as long as it takes to go one metre into depth."""
+        t = self._lens.undistort(self.interior.tangent_to_pixel.inverse(xy))
+        return np.asarray(t @ self._axes[:, :2].T + self._axes[:, 2])
 
     def derivatives(self, XYZ: ArrayLike) -> NDArray[np.float64]:
         """∂(x, y)/∂(X, Y, Z), shape (..., 2, 3), pixels per metre; NaN behind the camera."""

@@ -95,18 +95,22 @@ class SeenSurface:
         if len(uv) > MOST_RAYS:
             parts = [vars(self.at(target, uv[k : k + MOST_RAYS])) for k in range(0, len(uv), MOST_RAYS)]
             return Seen(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
-        paths = target.rays(uv, self._reach(target), self.bound / 2)
-        hits = self.terrain.first_hit(paths, target.bend)
-        uvh = np.concatenate([uv, target.to_view(hits.XYZ)[:, 2:]], axis=1)
-        gone = target.distance(uvh) > self.farthest
-        hits.XYZ[gone], hits.normal[gone], hits.owner[gone], uvh[gone, 2] = np.nan, np.nan, -1, np.nan
+        ways = target.bundle.directions(uv)
+        hits = self.terrain.first_hit(target.rays(ways, self._reach(target), self.bound / 2), target.bend)
+        # The depth of the ray's own point: a hit lies beside it by the rounding of its pieces.
+        away = target.to_cartesian(hits.XYZ) - target.bundle.center
+        squared = (ways**2).sum(axis=1)
+        depth = (away * ways).sum(axis=1) / squared
+        if np.isfinite(self.farthest):
+            gone = depth * np.sqrt(squared) > self.farthest
+            hits.XYZ[gone], hits.normal[gone], hits.owner[gone], depth[gone] = np.nan, np.nan, -1, np.nan
         return Seen(
             XYZ=hits.XYZ,
-            uvh=uvh,
+            uvh=np.column_stack([uv, depth]),
             normal=hits.normal,
             towards=_back(target, hits),
             owner=hits.owner,
-            lost=(hits.owner < 0) & (target.bundle.directions(uv)[:, 2] < 0),
+            lost=(hits.owner < 0) & (ways[:, 2] < 0),
         )
 
     def _reach(self, target: ViewTarget) -> float:

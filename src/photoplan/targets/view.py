@@ -68,8 +68,7 @@ class FrameBundle:
 
     def directions(self, uv: ArrayLike) -> NDArray[np.float64]:
         """Directions (..., 3) whose part along the axis is one."""
-        _, unit = self.camera.rays(uv)
-        return np.asarray(unit / (unit @ self._axis)[..., None])
+        return self.camera.directions(uv)
 
     def pixels(self, XYZ: ArrayLike) -> NDArray[np.float64]:
         """Pixel and depth (..., 3); NaN at and behind the camera's plane."""
@@ -130,12 +129,13 @@ class ViewTarget:
         uvh = np.asarray(uvh, float)
         return np.asarray(uvh[..., 2] * np.linalg.norm(self.bundle.directions(uvh[..., :2]), axis=-1))
 
-    def rays(self, uv: NDArray[np.float64], reach: float, tolerance: float) -> NDArray[np.float64]:
-        """Rays through pixels on the map, less what `bend` raises them: for `Terrain.first_hit`.
+    def rays(self, ways: NDArray[np.float64], reach: float, tolerance: float) -> NDArray[np.float64]:
+        """Rays on the map, less what `bend` raises them: for `Terrain.first_hit`.
 
         Parameters
         ----------
-        uv : ndarray, shape (n, 2)
+        ways : ndarray, shape (n, 3)
+            Their directions, of whatever length, see `Bundle.directions`.
         reach : float
             Their length, metres.
         tolerance : float
@@ -147,22 +147,21 @@ class ViewTarget:
         """
         pieces = 1
         if self.warps:
-            sample = uv[:: max(1, len(uv) // _SAMPLE)]
+            sample = ways[:: max(1, len(ways) // _SAMPLE)]
             while pieces < MOST_PIECES and self._off(sample, reach, pieces) > tolerance:
                 pieces *= 2
-        return self._path(uv, reach, pieces)
+        return self._path(ways, reach, pieces)
 
-    def _off(self, uv: NDArray[np.float64], reach: float, pieces: int) -> float:
+    def _off(self, ways: NDArray[np.float64], reach: float, pieces: int) -> float:
         """By how much the middles of pieces leave them at most."""
-        path = self._path(uv, reach, 2 * pieces)
+        path = self._path(ways, reach, 2 * pieces)
         off = np.linalg.norm(path[:, 1::2] - (path[:, :-1:2] + path[:, 2::2]) / 2, axis=-1)
         return float(np.nanmax(off, initial=0.0))
 
-    def _path(self, uv: NDArray[np.float64], reach: float, pieces: int) -> NDArray[np.float64]:
+    def _path(self, ways: NDArray[np.float64], reach: float, pieces: int) -> NDArray[np.float64]:
         along = reach * np.arange(1, pieces + 1)[:, None] / pieces
-        unit = self.bundle.directions(uv)
-        unit /= np.linalg.norm(unit, axis=-1, keepdims=True)
-        path = np.empty((len(uv), pieces + 1, 3))
+        unit = ways / np.linalg.norm(ways, axis=-1, keepdims=True)
+        path = np.empty((len(ways), pieces + 1, 3))
         path[:, 0] = self.center
         path[:, 1:] = self._on_map(self.bundle.center + along * unit[:, None])
         if self.warps:
