@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
+from tools.forked import scripted
 
 from photoplan.errors import ResourceError, RunLocked, UsageError
 from photoplan.geometry.grid import MapGrid
@@ -123,7 +122,9 @@ here.run(Path(sys.argv[1]), overwrite=sys.argv[4] == "old")
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 @pytest.mark.parametrize("before", ["absent", "old"])
 @pytest.mark.parametrize("moment", ["append", "cog", "check", "sync"])
-def test_fault_03_killed_while_writing(tmp_path: Path, moment: str, before: str) -> None:
+def test_fault_03_killed_while_writing(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, moment: str, before: str
+) -> None:
     """The name stays absent or old; the next run continues and its product equals an undisturbed one."""
     whole = tmp_path / "whole" / "a.tif"
     whole.parent.mkdir()
@@ -131,8 +132,7 @@ def test_fault_03_killed_while_writing(tmp_path: Path, moment: str, before: str)
     path = tmp_path / "a.tif"
     if before == "old":
         path.write_text("old")
-    command = [sys.executable, "-c", KILLED, str(path), str(Path(__file__).parent), moment, before]
-    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
+    assert scripted(KILLED, tmp_path_factory.mktemp("said"), path, Path(__file__).parent, moment, before)[0] == -9
     assert path.read_text() == "old" if before == "old" else not path.exists()
     with ProductFile(path, PLACE, 3, np.dtype("uint8"), run_key="k", tile=128, overwrite=True) as file:
         assert len(file.finished) == (30 if moment == "append" else 80)
@@ -165,11 +165,13 @@ _LOG = 80 * (128 * 128 * 3 + 48) + 44
     [(2_000_000, "none", "0"), (_LOG + 100, "deflate", "1"), (_LOG + 240_000, "none", "1")],
     ids=["log", "copy", "overviews"],
 )
-def test_fault_04_no_more_room(tmp_path: Path, limit: int, compress: str, overviews: str) -> None:
+def test_fault_04_no_more_room(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, limit: int, compress: str, overviews: str
+) -> None:
     path = tmp_path / "a.tif"
-    command = [sys.executable, "-c", LIMITED, str(path), str(Path(__file__).parent), str(limit), compress, overviews]
-    out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert out.startswith(f"5 {tmp_path}")
+    words = path, Path(__file__).parent, limit, compress, overviews
+    code, out = scripted(LIMITED, tmp_path_factory.mktemp("said"), *words)
+    assert code == 0 and out.startswith(f"5 {tmp_path}")
     assert "finished tiles are kept" in out
     assert [p.name for p in tmp_path.iterdir()] == [".a.tif.tiles"]
     with ProductFile(path, PLACE, 3, np.dtype("uint8"), run_key="k", tile=128) as file:

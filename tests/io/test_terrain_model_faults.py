@@ -6,8 +6,6 @@ import os
 import resource
 import signal
 import sqlite3
-import subprocess
-import sys
 import zlib
 from collections.abc import Callable
 from contextlib import closing
@@ -16,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tools.forked import scripted
 from tools.small_model import LAYOUT, grid_unit, same_unit, unit_at, write_small
 
 from photoplan.errors import InputError, ResourceError, RunLocked, UsageError
@@ -73,8 +72,8 @@ def test_fault_03_killed_while_writing(tmp_path: Path, moment: str, before: str)
     path = folder / "m.gpkg"
     if before == "old":
         path.write_text("old")
-    words = [str(path), str(Path(__file__).parents[1]), moment, before]
-    assert subprocess.run([sys.executable, "-c", KILLED, *words], check=False).returncode == -signal.SIGKILL
+    words = path, Path(__file__).parents[1], moment, before
+    assert scripted(KILLED, tmp_path / "said", *words)[0] == -signal.SIGKILL
     assert path.read_text() == "old" if before == "old" else not path.exists()
     with ModelWriter(path, LAYOUT, "k", overwrite=True) as writer:
         assert len(writer.done()) == (5 if moment == "add" else len(PLACES))
@@ -113,13 +112,13 @@ except PhotoplanError as error:
 
 @pytest.mark.skipif(os.name != "posix", reason="needs RLIMIT_FSIZE")
 @pytest.mark.parametrize("allowed", [3_000, 30_000, 110_000, 190_000])
-def test_fault_04_disk_full(tmp_path: Path, allowed: int) -> None:
+def test_fault_04_disk_full(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, allowed: int) -> None:
     """While units are added, and at each step of the assembly: exit 5, and nothing half-written stays."""
     path = tmp_path / "m.gpkg"
-    words = [str(path), str(Path(__file__).parents[1]), str(allowed)]
-    done = subprocess.run([sys.executable, "-c", FULL, *words], capture_output=True, text=True, check=False)
-    assert done.returncode == ResourceError.exit_code, done
-    assert "m.gpkg" in done.stdout and "run the same command again" in done.stdout
+    words = path, Path(__file__).parents[1], allowed
+    code, out = scripted(FULL, tmp_path_factory.mktemp("said"), *words)
+    assert code == ResourceError.exit_code, out
+    assert "m.gpkg" in out and "run the same command again" in out
     assert [f.name for f in tmp_path.iterdir()] == [".m.gpkg.units"]
     assert write_small(path) is not None
     assert [f.name for f in tmp_path.iterdir()] == ["m.gpkg"]

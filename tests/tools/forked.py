@@ -75,6 +75,23 @@ def forked(words: Sequence[object], folder: Path, mishap: Mishap = QUIET) -> Ran
     return Ran(code, out, err, tasks, [tuple(phase) for phase in phases])
 
 
+def scripted(script: str, folder: Path, *words: object) -> tuple[int, str]:
+    """Exit code and stdout of a script that finds `words` in `sys.argv`; `folder` gets what it says."""
+    folder.mkdir(parents=True, exist_ok=True)
+    child = _server().Process(target=_script, args=(script, [str(word) for word in words], folder / "out"))
+    child.start()
+    child.join()
+    assert child.exitcode is not None
+    return child.exitcode, (folder / "out").read_text()
+
+
+def _script(script: str, words: list[str], out: Path) -> None:
+    assert _LOADED in sys.modules  # or each script would cost a start
+    os.dup2(os.open(out, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 1)
+    sys.argv = ["-c", *words]
+    exec(script, {"__name__": "__main__"})
+
+
 @cache
 def _server() -> ForkServerContext:
     context = multiprocessing.get_context("forkserver")
