@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from tools.photos import turned_by
+from tools.thinned import thinned
 
 from photoplan.errors import GeometryError
 from photoplan.geometry.pose import Pose
@@ -59,9 +60,10 @@ def test_five_points_give_the_essential_matrix(relief: float) -> None:
 
 @pytest.mark.parametrize("relief", [0.0, 0.002, 0.1])
 @pytest.mark.parametrize("wrong", [0.0, 0.5])
-def test_pairs_with_gross_errors_flat_and_hilly(relief: float, wrong: float) -> None:
+@thinned("pairs", 3, 8)
+def test_pairs_with_gross_errors_flat_and_hilly(relief: float, wrong: float, pairs: int) -> None:
     rng = np.random.default_rng(2)
-    for _ in range(8):
+    for _ in range(pairs):
         pose, X = pair(rng, 150, relief)
         a, b = seen(ORIGIN, X), seen(pose, X)
         a, b = (t + rng.normal(0, SIGMA, t.shape) for t in (a, b))

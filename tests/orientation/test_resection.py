@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from tools.photos import AERIAL, PLACE, aerial_pose, at, frame, ground_below, measured, turned_by
+from tools.thinned import thinned
 
 from photoplan.cameras.base import Camera
 from photoplan.cameras.build import oriented_camera
@@ -231,10 +232,11 @@ def test_three_points_need_an_approximate_pose_or_leave_several() -> None:
 
 
 @pytest.mark.parametrize("count", [4, 5])
-def test_few_noisy_points_never_give_another_pose(count: int) -> None:
+@thinned("poses", 40, 100)
+def test_few_noisy_points_never_give_another_pose(count: int, poses: int) -> None:
     rng = np.random.default_rng(1)
     refused = 0
-    for k in range(100):
+    for k in range(poses):
         pose = aerial_pose(rng, tilt=0.03 if k % 2 else 0.2)
         X = ground_below(rng, pose, count, 300.0)
         points = measured(frame(pose), X, rng, 0.5)
@@ -245,7 +247,7 @@ def test_few_noisy_points_never_give_another_pose(count: int) -> None:
             refused += "positions of the camera possible" in str(error)
             continue
         assert np.abs(found.center - pose.center).max() < 60.0
-    assert refused <= 5
+    assert refused <= 0.05 * poses
 
 
 def test_fault_16_a_fourth_point_beside_the_first_decides_nothing() -> None:

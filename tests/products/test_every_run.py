@@ -110,7 +110,7 @@ def tie(inputs: Path, out: Path) -> list[object]:
     project = inputs / "ties" / f"{out.name}.toml"  # the command adds its table
     if not project.exists():
         shutil.copy(inputs / "ties" / "project.toml", project)
-    words = ["--features", 600, "--per-image", 60, "--scale", 0.5, "--no-picture"]
+    words = ["--features", 600, "--per-image", 60, "--scale", 0.3, "--no-picture"]
     return ["tie", project, "-o", out / "product.csv", *words]
 
 

@@ -135,11 +135,12 @@ def test_short_edges_with_tails_reach_the_bound_of_fwhm():
 
 
 @pytest.mark.parametrize("angle", [0.0, 90.0, 180.0, 270.0, 45.0])
-def test_an_edge_along_the_pixels_says_that_its_phases_are_few(angle):
+@thinned("edges", 8, 20)
+def test_an_edge_along_the_pixels_says_that_its_phases_are_few(angle, edges):
     random = np.random.default_rng(int(angle))
     spread = gaussian(0.8)
     errors = []
-    for _ in range(20):
+    for _ in range(edges):
         edge = measure_edge(_edge(angle, spread, random))
         errors.append([edge.mtf50 / true_mtf50(angle, spread) - 1.0, edge.fwhm / true_fwhm(angle, spread) - 1.0])
         assert edge.sampling == "few phases"
