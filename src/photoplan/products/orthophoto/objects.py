@@ -90,10 +90,10 @@ def plan_objects(
     products = []
     events.begin("planning objects", len(found), "objects")
     for one, among in zip(found, near):
-        for part in (False, True) if below else (False,):
-            product = _product(project, chosen, one.below() if part else one, [looked[k] for k in among])
+        for wanted in (one, one.below()) if below else (one,):
+            product = _product(project, chosen, wanted, [looked[k] for k in among])
             products += [] if product is None else [product]
-            if product is None and not part:
+            if product is None and wanted is one:
                 blind.append(f"object {one.name!r} lies in no image")
         events.done()
     refuse_blind(chosen, products, blind)
