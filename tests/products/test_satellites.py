@@ -17,6 +17,7 @@ from tools.rpc_images import CRS, camera, functions
 from photoplan.cameras.rpc import RationalFunctions, RpcCamera
 from photoplan.errors import InputError
 from photoplan.geometry.grid import MapGrid
+from photoplan.io.camera.rpc.file import read_rpc
 from photoplan.io.project.file import load_project
 from photoplan.plan.compile import AnchorRule, compile_anchors
 from photoplan.plan.ground import TileGround
@@ -158,6 +159,20 @@ def test_wrong_entries_are_named(project: Path, old: str, new: str, told: str) -
     project.write_text(project.read_text().replace(old, new, 1))
     with pytest.raises(InputError, match=told):
         load_project(project)
+
+
+def test_polynomials_are_written_for_others(project: Path, photoplan: Here, tmp_path: Path) -> None:
+    """Of an image with polynomials they are these again, over the heights of its terrain."""
+    done = photoplan("convert", project, "--to", "rpc", "-o", tmp_path / "rpc")
+    assert done.code == 0, done.err
+    assert "off by at most" in done.err
+    found = read_rpc(tmp_path / "rpc" / "a_RPC.TXT").functions
+    seen = replace(camera(SIZE), functions=small())
+    xy = np.random.default_rng(5).uniform(0, 1, (100, 2)) * SIZE - 0.5
+    geodetic = seen.ground(seen.rays(xy, 250.0)[0])
+    assert np.abs(found(geodetic) - xy).max() < 1e-4
+    refused = photoplan("convert", project, "--to", "rpc", "-o", tmp_path / "rpc")
+    assert refused.code == 2
 
 
 def test_cells_of_a_tile_stay_few() -> None:

@@ -15,6 +15,7 @@ from scipy.ndimage import map_coordinates, spline_filter
 from photoplan.cameras.base import project
 from photoplan.cameras.plane import Affine2D
 from photoplan.cameras.rpc import RpcCamera
+from photoplan.cameras.rpc_fit import fitted_functions
 from photoplan.geometry.geodetic import GeodeticGround
 from photoplan.io.camera.rpc.file import read_rpc
 
@@ -120,3 +121,19 @@ def test_quickbird_and_its_control(shared: Path) -> None:
     miss = xy - read_rpc(folder / "qb2_basic1b.tif").functions(at)
     assert np.hypot(*miss.mean(axis=0)) == pytest.approx(3.64, abs=0.05)
     assert np.abs(miss - miss.mean(axis=0)).max() < 0.15
+
+
+def test_polynomials_fitted_to_the_location_grid_of_pleiades(shared: Path) -> None:
+    """All its heights, −30 to 4900 m; every second node is kept for the check."""
+    folder = shared / "data/pleiades_line_model"
+    with rasterio.open(next(folder.glob("GRID*.tif"))) as grid:
+        bands, tags = grid.read().astype(float), grid.tags()
+    heights = np.array([float(tags[f"ALTITUDE_B{k}"]) for k in range(0, len(bands), 2)])
+    H = np.broadcast_to(heights[:, None, None], (len(heights), 65, 65))
+    at = np.stack([bands[::2], bands[1::2], H], axis=-1)
+    i, j = np.mgrid[0:65, 0:65]
+    xy = np.broadcast_to(np.stack([624.984375 * j, 597.609375 * i], axis=-1), (*H.shape, 2))
+    kept = np.broadcast_to((i + j) % 2 == 1, H.shape)
+    found = fitted_functions(at[~kept], xy[~kept])
+    miss = found(at[kept]) - xy[kept]
+    assert miss.std(axis=0).max() <= 0.001

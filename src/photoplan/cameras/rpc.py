@@ -126,9 +126,7 @@ class RationalFunctions:
         away[..., 0] -= 360.0 * np.round(away[..., 0] / 360.0)
         n = away / self.ground_scale
         C = self.coefficients
-        powers = np.ones((4, *n.shape))
-        for k in range(3):
-            np.multiply(powers[k], n, out=powers[k + 1])
+        powers = _powers_of(n)
         p = _terms(powers, _POWERS) @ C.T
         with np.errstate(all="ignore"):
             good = np.all(np.abs(n) <= bound, axis=-1) & np.all(p[..., 1::2] / C[1::2, 0] > _POLE, axis=-1)
@@ -143,6 +141,19 @@ class RationalFunctions:
                 slope = (dp[..., ::2] - value * dp[..., 1::2]) / bottom
                 J[..., k] = slope * self.image_scale / self.ground_scale[k]
         return xy, J
+
+
+def terms(normalised: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The twenty terms of normalised longitude, latitude and height (..., 3), in the order of RPC00B, (..., 20)."""
+    return _terms(_powers_of(normalised), _POWERS)
+
+
+def _powers_of(n: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Powers 0 to 3, shape (4, ...)."""
+    powers = np.ones((4, *n.shape))
+    for k in range(3):
+        np.multiply(powers[k], n, out=powers[k + 1])
+    return powers
 
 
 def _terms(powers: NDArray[np.float64], exponents: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -21,7 +21,7 @@ from photoplan.cli.output import say, show, show_json
 
 @click.command("convert")
 @click.argument("orientation", type=PATH)
-@click.option("--to", "target", metavar="FORMAT", help="Format to write: csv, toml, patb, bingo, bluh, inpho, …")
+@click.option("--to", "target", metavar="FORMAT", help="Format to write: csv, toml, patb, bingo, rpc (of a project) …")
 @click.option("--camera", type=PATH, help="Cameras (TOML, YAML, JSON) [the orientation's].")
 @reading_options
 @click.option(
@@ -75,6 +75,9 @@ def command(
         return
     if target is None:
         raise click.UsageError("say the format to write with --to FORMAT")
+    if target == "rpc":
+        _polynomials(orientation, request.output, request.overwrite, as_json, quiet)
+        return
     if image_points is not None or control is not None:
         raise click.UsageError("--image-points and --control go with --list-readings")
     _convert(request, as_json, quiet)
@@ -98,6 +101,21 @@ def _convert(request: Any, as_json: bool, quiet: bool) -> None:
             say(f"  {note}")
         for loss in done.lost:
             say(f"  {done.target_format} holds {loss.text}")
+
+
+def _polynomials(project: Path, output: Path | None, overwrite: bool, as_json: bool, quiet: bool) -> None:
+    from photoplan.products.polynomials import PolynomialsRequest, write_polynomials
+
+    done = write_polynomials(PolynomialsRequest(project, output, overwrite))
+    if as_json:
+        show_json(done)
+    else:
+        for file in done.files:
+            show(file)
+    if not quiet:
+        for image in done.images:
+            low, high = image.heights
+            say(f"  {image.image}: off by at most {image.worst:.2g} px for heights from {low:.0f} to {high:.0f} m")
 
 
 def _list(request: Any, image_points: Path, control: Path, as_json: bool, quiet: bool) -> None:

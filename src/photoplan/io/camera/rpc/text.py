@@ -13,6 +13,17 @@ from photoplan.io.plain_files import read_text
 FORM = "text (_RPC.TXT)"
 
 
+def rpc_text(functions: RationalFunctions) -> str:
+    """The file's text; numbers are written so that reading gives the same again."""
+    f = functions
+    lines = ["ERR_BIAS: -1", "ERR_RAND: -1"]
+    offsets, scales = (*f.image_offset, *f.ground_offset), (*f.image_scale, *f.ground_scale)
+    lines += [f"{name}: {value!r}" for name, value in zip(SINGLE, (*offsets, *scales))]
+    for name, row in zip(GROUPS, f.coefficients.tolist()):
+        lines += [f"{name}_{k}: {value!r}" for k, value in enumerate(row, 1)]
+    return "\n".join(lines) + "\n"
+
+
 def read(path: Path) -> RationalFunctions:
     """Polynomials of ``LINE_OFF: +002345.00 pixels``, ``LINE_NUM_COEFF_1: …`` and so on; what else there is, is left.
 
