@@ -14,7 +14,7 @@ from photoplan.io.project.file import load_project
 from photoplan.products.tie import inputs as tie_work
 
 NEAR = ("DJI_0025", "DJI_0026", "DJI_0033")
-FAST = ("--features", 1200, "--per-image", 150, "--workers", 1)
+FAST = ("--scale", 0.5, "--features", 1200, "--per-image", 150, "--workers", 1)
 
 
 @pytest.fixture(scope="module")
