@@ -29,7 +29,7 @@ CAMERA = FrameEntry(size=(4000, 3000), focal_px=4000.0)
 
 def hills(XY: np.ndarray) -> np.ndarray:
     """Terrain 4 km × 4 km about the origin, 300 to 340 m high; nothing outside."""
-    X, Y = np.moveaxis(np.asarray(XY, float), -1, 0)
+    X, Y = XY[..., 0], XY[..., 1]
     inside = (np.abs(X - 700_000) < 2000) & (np.abs(Y - 5_300_000) < 2000)
     return np.where(inside, 320 + 20 * np.sin(X / 300) * np.cos(Y / 400), np.nan)
 
