@@ -17,10 +17,9 @@ VERBS = {
 class _Views(LazyGroup):
     """`photoplan view FILE …` is `photoplan view picture FILE …`."""
 
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        return super().resolve_command(ctx, args if args[0] in self.verbs else ["picture", *args])
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        given = not args or args[0] in (*self.verbs, *ctx.help_option_names)
+        return super().parse_args(ctx, args if given else ["picture", *args])
 
 
 command = _Views(
