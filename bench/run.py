@@ -26,6 +26,7 @@ from pathlib import Path
 import rasterio
 from agreement import compare
 from filter import report_filter
+from mosaics import report_mosaics
 from oblique import report_oblique
 from orientation import report_orientation
 from owners import report_owners
@@ -214,6 +215,7 @@ def main() -> int:
     results["terrain"] = report_terrain(options.quick, options.large)
     results["orientation"] = report_orientation(options.quick)
     results["planning"] = report_planning(options.quick)
+    results["mosaics"] = report_mosaics(options.quick)
     if options.json:
         options.json.write_text(json.dumps(results, indent=2) + "\n")
     return 0

@@ -30,6 +30,9 @@ from photoplan.project.stepped import SteppedReader
 from photoplan.surfaces.base import Terrain
 from photoplan.surfaces.objects import painted_surface
 
+#: Scenes that are kept open, some 20 kB each: more than the images of a row of a mosaic's tiles.
+_KEPT = 2048
+
 
 @dataclass(frozen=True)
 class SceneAddress:
@@ -180,7 +183,7 @@ def _digest(path: str, stamp: tuple[int, int]) -> str:
     return fingerprint(path).digest
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=_KEPT)
 def _open(address: SceneAddress) -> Scene:
     for path, digest in address.digests:
         if _digest(path, stamp_of(Path(path))) != digest:
