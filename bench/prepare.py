@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import rasterio
 import yaml
-from pyproj import Transformer
-from rpc import fit_rpc
+from rpc import rasterio_rpc
 
+from photoplan.cameras.rpc_fit import fit_rpc
+from photoplan.geometry.geodetic import GeodeticGround
 from photoplan.io.project.file import load_project
 from photoplan.products.init.run import InitRequest, init_project
 from photoplan.project.scene import open_scene
@@ -123,8 +124,9 @@ def _write_rpc(source: Source) -> None:
         heights = data.read(1)
     scene_project = load_project(source.project)
     camera = open_scene(scene_project, FRAME).camera
-    to_lonlat = Transformer.from_crs(scene_project.crs, "EPSG:4326", always_xy=True).transform
-    fitted = fit_rpc(camera, (float(np.nanmin(heights)), float(np.nanmax(heights))), to_lonlat)
+    # Heights stay what they are: camera and terrain are in one system.
+    ground = GeodeticGround(scene_project.crs, "same")
+    fitted = fit_rpc(camera, ground, (float(np.nanmin(heights)), float(np.nanmax(heights))))
     with rasterio.open(source.image) as data:
-        _write(source.image_with_rpc, data.read(), rpcs=fitted.rpc)
+        _write(source.image_with_rpc, data.read(), rpcs=rasterio_rpc(fitted.functions))
     source.rpc_residual.write_text(f"{fitted.worst:.6f}\n")

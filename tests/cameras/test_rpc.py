@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from affine import Affine
 from rasterio.rpc import RPC
 from rasterio.transform import RPCTransformer
-from tools.rpc_images import camera, functions, gdal_form
+from rasterio.warp import Resampling, reproject
+from tools.rpc_images import CRS, camera, functions, gdal_form
 
 from photoplan.cameras.base import project
 from photoplan.cameras.plane import Affine2D
@@ -141,3 +143,25 @@ def test_heights_above_the_sea_are_brought_to_the_ellipsoid() -> None:
     xy = np.array([[100.0, 100.0], [2900.0, 4000.0]])
     assert np.abs(seen.rays(xy, 256.0)[0] + np.array([0, 0, 44.0]) - plain.rays(xy, 300.0)[0]).max() < 1e-6
     assert seen.vantage.point[2] == pytest.approx(plain.vantage.point[2] - 44.0, abs=1e-6)
+
+
+def test_gdals_warper_looks_for_pixels_at_the_same_places() -> None:
+    """Map, ellipsoid and polynomials together; only the first and last pixel of its lines GDAL computes exactly."""
+    seen = camera((300, 440))
+    x, y = seen.rays((150.0, 220.0), 300.0)[0][:2]
+    pixel, places = 4.0, np.array([[c, r] for r in range(3) for c in range(2)])
+    rows, cols = np.mgrid[0.0:440.0, 0.0:300.0]
+    found = np.full((2, 3, 2), np.nan)
+    reproject(
+        np.stack([cols, rows]),
+        found,
+        rpcs=RPC.from_gdal(gdal_form(seen.functions)),
+        src_crs="EPSG:4326",
+        dst_crs=CRS,
+        dst_transform=Affine(pixel, 0, x - pixel, 0, -pixel, y + pixel),
+        resampling=Resampling.bilinear,
+        RPC_HEIGHT=250.0,
+    )
+    XY = (x, y) + pixel * (places - (0.5, 0.5)) * (1, -1)
+    mine = project(seen, np.column_stack([XY, np.full(len(XY), 250.0)]))
+    assert np.abs(found.reshape(2, -1).T - mine).max() < 1e-8
