@@ -8,6 +8,7 @@ __getattr__, __dir__, __all__ = public(
         "cameras.base": "Camera CentralCamera Projection Vantage project",
         "cameras.frame": "FrameCamera",
         "cameras.interior": "Interior",
+        "cameras.map": "MapProjection",
         "cameras.plane": "Affine2D Bilinear2D",
         "cameras.build": "oriented_camera",
         "cameras.rpc": "RationalFunctions RpcCamera",

@@ -10,6 +10,7 @@ __getattr__, __dir__, __all__ = public(
         "surfaces.raster": "RasterSurface",
         "surfaces.hybrid": "HybridSurface",
         "surfaces.shifted": "ShiftedSurface",
+        "surfaces.seen": "SeenSurface",
         "surfaces.measured": "MeasuredLine MeasuredTerrain PointGroup Tin",
     },
 )

@@ -7,6 +7,8 @@ __getattr__, __dir__, __all__ = public(
     {
         "targets.base": "Target",
         "targets.map": "MapTarget",
+        "targets.view": "FrameBundle ViewTarget",
+        "targets.panorama": "Panorama",
         "geometry.grid": "MapGrid Placement Window",
     },
 )

@@ -330,10 +330,9 @@ def _raster(path: Path, ground: ViewGround) -> Layer:
     placement = placement_of(reader.info)
     if placement.transform is None:
         raise InputError(f"{path}: lies nowhere (no georeference); a content is a raster on the map, or photo:NAME")
-    crs = placement.crs or ground.crs
-    carry = None if same_crs(crs, ground.crs) else crs_step(ground.crs, crs, ground.bounds)
     if placement.crs is None:
         raise InputError(f"{path}: no CRS; it is not guessed. That of the terrain is {crs_label(ground.crs)}")
+    carry = None if same_crs(placement.crs, ground.crs) else crs_step(ground.crs, placement.crs, ground.bounds)
     source = Source(MapProjection(placement, carry), reader)
     return Resampled((source,), (reader.path,), _span(reader), photos=False)
 
