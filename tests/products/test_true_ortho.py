@@ -172,9 +172,13 @@ def test_fault_19_objects_that_cannot_be_are_named_one_by_one(town: Block, capsy
     said = photoplan(verb, town.project, *options)
     assert said.code == 3 and "2 polygons" in said.err
     assert "'bow' crosses itself" in said.err and "'flat' has vertices without a height" in said.err
-    write_objects(town, [*POLYGONS, [deep], [deep - (0, 0, 5)]], [*NAMES, "deep", "deeper"])
+    high, highest = (DECK - (0, 0, -z) for z in (2500, 1e300))
+    given = [*POLYGONS, [deep], [deep - (0, 0, 5)], [high], [highest]]
+    write_objects(town, given, [*NAMES, "deep", "deeper", "high", "highest"])
     said = photoplan(verb, town.project, *options)
-    assert said.code == 3 and "2 polygons" in said.err
+    assert said.code == 3 and "4 polygons" in said.err
+    assert "'high' rises to 25" in said.err and "m above the ground; are its heights in metres?" in said.err
+    assert "'highest' rises to 1e+300 m above" in said.err
     assert "'deep' lies below the ground, by 20.0 m" in said.err
     assert "'deeper' lies below the ground, by 25.0 m" in said.err
     assert not (town.folder / "products").exists()

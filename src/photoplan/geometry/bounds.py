@@ -17,7 +17,7 @@ from photoplan.geometry.rotation import ANGLE_UNITS
 #: Map coordinates beyond this lie on no map of the earth, metres.
 _FAR = 1e8
 #: Heights of anything that is photographed, and of cameras, metres: from ocean trenches to low orbits.
-_LOW, _HIGH, _ORBIT = -12_000.0, 10_000.0, 1_000_000.0
+_LOW, MOST_HEIGHT, _ORBIT = -12_000.0, 10_000.0, 1_000_000.0
 #: Frame cameras fly lower than this above ground, metres; what is higher is in another unit.
 HIGHEST_FLIGHT = 60_000.0
 #: How far beyond the area of use of its CRS a place may lie, degrees: neighbouring zones are in use.
@@ -42,7 +42,7 @@ def odd_place(XYZ: Sequence[float], *, camera: bool) -> str | None:
     for axis, value in (("X", x), ("Y", y)):
         if abs(value) > _FAR:
             return f"{axis} = {value:g} m lies on no map; are coordinates in millimetres or centimetres?"
-    high = _ORBIT if camera else _HIGH
+    high = _ORBIT if camera else MOST_HEIGHT
     if z < _LOW or z > high:
         return f"Z = {z:g} m; heights lie between {_LOW:g} and {high:g} m: is it in millimetres, or another coordinate?"
     return None

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import HeightSystemError, InputError
+from photoplan.geometry.bounds import MOST_HEIGHT
 from photoplan.geometry.crs import CrsStep, crs_label, crs_step, require_projected_metres, same_crs
 from photoplan.geometry.heights import OPTIONS, HeightStep, check_height_system, height_step
 from photoplan.io.objects.file import read_with_faults
@@ -22,6 +23,8 @@ from photoplan.surfaces.polygon_faces import cannot_be_used
 
 #: Objects whose highest point is deeper than this below the ground, metres, are refused.
 DEEP = 0.5
+#: Objects that rise higher than this above the ground, metres, are refused: nothing that stands does.
+TALL = 2000.0
 
 Steps = tuple[CrsStep | HeightStep, ...]
 
@@ -58,7 +61,7 @@ def with_objects(ground: Terrain, files: Sequence[tuple[Path, Objects]], place: 
     ------
     InputError
         A file cannot be used, its CRS is not known or none of its objects is near the terrain, or objects cannot be
-        used, since they cross themselves, have no heights or lie below the ground; each is named.
+        used, since they cross themselves, have no heights, or lie below the ground or far above it; each is named.
     HeightSystemError
         Their heights are not declared, or cannot be joined.
     """
@@ -73,7 +76,7 @@ def with_objects(ground: Terrain, files: Sequence[tuple[Path, Objects]], place: 
         placed, taken = _placed(path, own, stated, place)
         steps += taken
         roles = [stated.role or role or ("occluder" if own.mesh else "paint") for role in own.roles]
-        faults = {**own.faults, **_buried(own, placed, ground)}
+        faults = {**own.faults, **_misplaced(own, placed, ground)}
         if faults:
             raise cannot_be_used(str(path), faults)
         corners.append(placed)
@@ -132,13 +135,19 @@ def _refuse_apart(path: Path, corners: NDArray[np.float64], place: Place) -> Non
         )
 
 
-def _buried(own: ObjectFile, corners: NDArray[np.float64], ground: Terrain) -> dict[str, str]:
-    """Objects that lie below the ground as a whole, by name; beyond the terrain nothing is known."""
+def _misplaced(own: ObjectFile, corners: NDArray[np.float64], ground: Terrain) -> dict[str, str]:
+    """Objects below the ground as a whole or far above it, by name; beyond the terrain only their own heights tell."""
     over = np.full(len(own.names), -np.inf)
-    above = corners[..., 2] - ground.heights(corners[..., :2])
-    np.maximum.at(over, np.repeat(own.owner, 3), np.where(np.isfinite(above), above, np.inf).ravel())
+    below = ground.heights(corners[..., :2])
+    owner, above = np.repeat(own.owner, 3), (corners[..., 2] - np.nan_to_num(below)).ravel()
+    np.maximum.at(over, owner, above)
+    known = np.bincount(owner, np.isnan(below).ravel(), len(over)) == 0
     there = np.bincount(own.owner, minlength=len(over)) > 0
-    return {
+    faults = {
         own.names[k]: f"lies below the ground, by {-over[k]:.1f} m; are height system and offset right?"
-        for k in np.flatnonzero(there & (over < -DEEP))
+        for k in np.flatnonzero(there & known & (over < -DEEP))
     }
+    for k in np.flatnonzero(there & (over > np.where(known, TALL, MOST_HEIGHT))):
+        above_what = "the ground" if known[k] else "zero"
+        faults[own.names[k]] = f"rises to {over[k]:.6g} m above {above_what}; are its heights in metres?"
+    return faults
