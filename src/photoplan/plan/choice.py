@@ -58,9 +58,10 @@ class Weights:
     sharpness: float = 0.0
 
     def __post_init__(self) -> None:
-        values = (self.slant, self.coarseness, self.border, self.occlusion, self.sharpness)
-        if not all(0 <= value <= 1000 for value in values) or not any(values):
-            raise UsageError(f"weights {values}; allowed are numbers from 0 to 1000, not all of them 0")
+        odd = [f"{name}={value:g}" for name, value in vars(self).items() if not 0 <= value <= 1000]
+        if odd or not any(vars(self).values()):
+            what = f"weight {', '.join(odd)}" if odd else "all weights are 0"
+            raise UsageError(f"score: {what}; allowed are numbers from 0 to 1000, not all of them 0")
 
 
 class Drawn(Protocol):
