@@ -152,5 +152,5 @@ def test_a_drawn_region_comes_before_the_score() -> None:
 
 @pytest.mark.parametrize("values", [(-1, 0, 0, 0), (0, 0, 0, 0), (np.nan, 1, 1, 1), (1e9, 0, 0, 0)])
 def test_weights_that_cannot_be_meant(values: tuple[float, ...]) -> None:
-    with pytest.raises(UsageError, match="weights"):
+    with pytest.raises(UsageError, match="weight"):
         Weights(*values)
