@@ -63,3 +63,8 @@ def test_a_kind_is_complete(kind: type[CameraEntry]) -> None:
     """It has no abstract part, and a comment for every entry that is written."""
     assert not inspect.isabstract(kind)
     assert set(kind.comments) | {"lens", "restore", "sigma"} == set(kind.model_fields)
+
+
+def test_no_file_is_longer_than_400_lines() -> None:
+    long = {str(file.relative_to(ROOT)): len(file.read_text().splitlines()) for file in ROOT.rglob("*.py")}
+    assert {name: lines for name, lines in long.items() if lines > 400} == {}

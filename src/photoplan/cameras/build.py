@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from photoplan.cameras.base import CentralCamera
+from photoplan.cameras.base import CentralCamera, Projection
 from photoplan.cameras.corrected import corrected_camera
 from photoplan.cameras.curved import curved_camera
 from photoplan.cameras.frame import FrameCamera
@@ -67,3 +67,13 @@ def oriented_camera(
         radius = MEAN_RADIUS if crs is None else earth_radius(crs, (X, Y))
         return corrected_camera(frame, mean_ground, radius + mean_ground, before)
     return WarpedCamera(frame, before, pose.center) if before else frame
+
+
+def taken_apart(camera: Projection) -> tuple[FrameCamera, tuple[Warp, ...], float] | None:
+    """A camera as one with straight rays, and the warps and the curvature, 1/m, that lead from the map to its space.
+
+    None: its rays do not meet in a point.
+    """
+    if isinstance(camera, WarpedCamera):
+        return camera.frame, camera.warps, camera.curvature
+    return (camera, (), 0.0) if isinstance(camera, FrameCamera) else None

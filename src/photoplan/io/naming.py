@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from photoplan.errors import UsageError
+from photoplan.errors import PhotoplanError, UsageError
 from photoplan.io.disk import disk_error, sync_file, sync_folder
+from photoplan.io.lock import FileLock, lock_of
+from photoplan.io.tile_log import log_of
 
 _Identity = tuple[int, int, int]
 
@@ -188,3 +190,14 @@ def _identity(path: Path) -> _Identity | None:
     except OSError:
         return None
     return state.st_ino, state.st_size, state.st_mtime_ns
+
+
+def tidy(paths: Iterable[Path]) -> None:
+    """Remove what a run that was killed after it had given the last name left beside the files of its product.
+
+    Files that another run is writing are left alone, and so is what cannot be removed: the product is finished.
+    """
+    for path in filter(is_unfinished, paths):
+        with suppress(PhotoplanError, OSError), FileLock(lock_of(path)):
+            log_of(path).unlink(missing_ok=True)
+            forget(path)

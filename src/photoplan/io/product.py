@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -21,12 +20,12 @@ from photoplan.io.disk import disk_error, free_megabytes
 from photoplan.io.gdal import GDAL_ERRORS, first_cause, open_raster
 from photoplan.io.image_form import ImageForm, dress
 from photoplan.io.lock import FileLock, lock_of
-from photoplan.io.naming import forget, give_name, is_unfinished, standing, when_named
+from photoplan.io.naming import give_name, is_unfinished, standing, when_named
 from photoplan.io.plain_tiff import write_plain_tiff
 from photoplan.io.product_check import check_product
 from photoplan.io.run_record import record_path, refuse_foreign_record
 from photoplan.io.storage import PRODUCT_TYPES, BlockCoder, CogOptions, Nodata, nodata_for, write_cog, write_picture
-from photoplan.io.tile_log import TileLog
+from photoplan.io.tile_log import TileLog, log_of
 
 #: The tag in which a product describes itself, where its place does not.
 DESCRIPTION = "PHOTOPLAN_VIEW"
@@ -82,17 +81,6 @@ def is_product(path: Path) -> bool:
             return "PHOTOPLAN_KEY" in dataset.tags()
     except InputError:
         return False
-
-
-def tidy(paths: Iterable[Path]) -> None:
-    """Remove what a run that was killed after it had given the last name left beside the files of its product.
-
-    Files that another run is writing are left alone, and so is what cannot be removed: the product is finished.
-    """
-    for path in filter(is_unfinished, paths):
-        with suppress(PhotoplanError, OSError), FileLock(lock_of(path)):
-            _log_of(path).unlink(missing_ok=True)
-            forget(path)
 
 
 @dataclass(eq=False)
@@ -211,7 +199,7 @@ class ProductFile:
     @property
     def log_path(self) -> Path:
         """Where finished tiles are kept."""
-        return _log_of(self.path)
+        return log_of(self.path)
 
     @property
     def finished(self) -> frozenset[int]:
@@ -398,10 +386,6 @@ class ProductFile:
             f"{self.path}: could not be written ({cause}; {free_megabytes(self.path)} MB are free there); free some "
             "space and run the same command again: finished tiles are kept"
         )
-
-
-def _log_of(path: Path) -> Path:
-    return path.with_name(f".{path.name}.tiles")
 
 
 def _escaped(name: str) -> str:

@@ -44,6 +44,11 @@ class _Place:
     notes: tuple[int, int]
 
 
+def log_of(path: Path) -> Path:
+    """Where the finished tiles of a file that is being made are kept."""
+    return path.with_name(f".{path.name}.tiles")
+
+
 class TileLog:
     """Finished tiles by their index; a context manager that closes the file and leaves it in place.
 

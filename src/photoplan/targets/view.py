@@ -12,10 +12,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photoplan.cameras.base import project
-from photoplan.cameras.frame import FrameCamera
-from photoplan.cameras.warped import Warp, WarpedCamera
+from photoplan.cameras.base import CentralCamera, project
+from photoplan.cameras.build import taken_apart
+from photoplan.cameras.warped import Warp
+from photoplan.errors import UsageError
 from photoplan.geometry.grid import Placement, Window
+from photoplan.geometry.pose import Pose
 
 #: Rays that are bent are followed in at most so many pieces.
 MOST_PIECES = 64
@@ -45,11 +47,24 @@ class Bundle(Protocol):
         ...
 
 
+class Posed(CentralCamera, Protocol):
+    """A camera whose rays are straight, and which has an axis."""
+
+    @property
+    def pose(self) -> Pose:
+        """Its exterior orientation."""
+        ...
+
+    def directions(self, xy: ArrayLike) -> NDArray[np.float64]:
+        """Directions (..., 3) of the rays of image points (..., 2), as long as it takes to go one metre into depth."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class FrameBundle:
     """The rays of a frame camera with its lens; depth is that along its axis."""
 
-    camera: FrameCamera
+    camera: Posed
 
     @property
     def size(self) -> tuple[int, int]:
@@ -92,11 +107,19 @@ class ViewTarget:
     """It is nowhere bent."""
 
     @classmethod
-    def of_camera(cls, camera: FrameCamera | WarpedCamera) -> ViewTarget:
-        """What a camera sees, with its lens, curvature and refraction as they are."""
-        if isinstance(camera, WarpedCamera):
-            return cls(FrameBundle(camera.frame), camera.center, camera.warps, camera.curvature / 2)
-        return cls(FrameBundle(camera), camera.center)
+    def of_camera(cls, camera: CentralCamera) -> ViewTarget:
+        """What a camera sees, with its lens, curvature and refraction as they are.
+
+        Raises
+        ------
+        UsageError
+            Its rays do not meet in a point.
+        """
+        parts = taken_apart(camera)
+        if parts is None:
+            raise UsageError(f"a view from {type(camera).__name__}; its rays do not meet in a point")
+        straight, warps, curvature = parts
+        return cls(FrameBundle(straight), camera.center, warps, curvature / 2)
 
     @property
     def window(self) -> Window:

@@ -8,8 +8,7 @@ from typing import Any
 
 from photoplan.engine.execute import OutputName
 from photoplan.errors import UsageError
-from photoplan.io.naming import is_unfinished
-from photoplan.io.product import tidy
+from photoplan.io.naming import is_unfinished, tidy
 from photoplan.io.run_record import record_path, recorded_result, refuse_foreign_record
 from photoplan.plain import pick
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct

@@ -21,7 +21,8 @@ from photoplan.io.filter_file import filter_text
 from photoplan.io.fingerprint import fingerprint
 from photoplan.io.image_form import ImageForm, form_of
 from photoplan.io.names import unique_stems
-from photoplan.io.product import check_output, tidy
+from photoplan.io.naming import tidy
+from photoplan.io.product import check_output
 from photoplan.io.raster import RasterReader
 from photoplan.io.run_record import record_path
 from photoplan.io.storage import Nodata

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.cameras.frame import FrameCamera
+from photoplan.cameras.build import oriented_camera, taken_apart
 from photoplan.cameras.interior import Interior
 from photoplan.cameras.lenses.none import NoLens
 from photoplan.cameras.risen import EarthBend, Exaggeration
-from photoplan.cameras.warped import Warp, WarpedCamera
+from photoplan.cameras.warped import Warp
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.geometry.grid import USUAL_TILE, refuse_absurd
 from photoplan.geometry.local import LocalFrame, earth_radius
@@ -186,7 +186,7 @@ def _of_image(request: CameraRequest, ground: ViewGround) -> ViewCamera:
     assert request.image is not None
     project = ground.named
     camera = central_without_pixels(project, project.select([request.image])[0])
-    if not isinstance(camera, FrameCamera | WarpedCamera):
+    if taken_apart(camera) is None:
         raise InputError(f"image {request.image!r}: its camera is no frame camera; views know no other yet")
     plain = ViewTarget.of_camera(camera)
     radius = None
@@ -279,7 +279,7 @@ def _bundle(
     focal = width / 2 / math.tan(math.radians(request.field_of_view or 60.0) / 2)
     interior = Interior.digital(request.size, (focal, focal * request.pixel_aspect))
     R = axes @ _rotation(azimuth, pitch, math.radians(request.roll))
-    return FrameBundle(FrameCamera(interior, NoLens(), Pose(origin, R)))
+    return ViewTarget.of_camera(oriented_camera(interior, NoLens(), Pose(origin, R))).bundle
 
 
 def _rotation(azimuth: float, pitch: float, roll: float) -> NDArray[np.float64]:

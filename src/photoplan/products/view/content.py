@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.base import Projection
-from photoplan.cameras.frame import FrameCamera
+from photoplan.cameras.build import taken_apart
 from photoplan.cameras.map import MapProjection
-from photoplan.cameras.warped import WarpedCamera
 from photoplan.engine.base import Reader, Source
 from photoplan.engine.execute import render
 from photoplan.errors import InputError, UsageError
@@ -219,7 +218,7 @@ def best_photos(cameras: Sequence[Any], seen: Seen, surface: SeenSurface) -> NDA
 
     Parameters
     ----------
-    cameras : sequence of FrameCamera or WarpedCamera
+    cameras : sequence of CentralCamera
     seen : Seen
         Shape (height, width, …).
     surface : SeenSurface
@@ -305,7 +304,7 @@ def _layer(
     names = project.select([request.value] if request.kind == "photo" else None)
     names = [name for name in names if project.image(name).center is not None]
     scenes = [open_scene(project, name) for name in names]
-    if not scenes or any(not isinstance(s.camera, FrameCamera | WarpedCamera) for s in scenes):
+    if not scenes or any(taken_apart(s.camera) is None for s in scenes):
         raise InputError("photos as content need oriented images of frame cameras; the project has others")
     kinds = {(s.reader.bands, s.reader.dtype) for s in scenes}
     if len(kinds) > 1:
