@@ -10,9 +10,8 @@ LOW, HIGH = 0.9, 1.15
 
 MISSED = {
     ("slope 3", "0 to 0.5 spacings"): 0.89,
-    ("terraces", "all"): 0.86,
-    ("terraces", "0 to 0.5 spacings"): 0.81,
-    ("terraces", "1 to 1.5 spacings"): 0.86,
+    ("terraces", "0 to 0.5 spacings"): 0.88,
+    ("terraces", "1 to 1.5 spacings"): 0.87,
     ("embankment", "beside it"): 1.22,
     ("cliff", "0.5 to 1 spacings"): 0.87,
     ("contours", "1 to 1.5 spacings"): 0.83,
