@@ -71,6 +71,9 @@ def strict(weights: Weights) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             + weights.occlusion * around
             + np.where(near < 3, 1e7, 0)
         )
+        if hidden.any():
+            beside = distance_transform_edt(~hidden)[24:-24, 24:-24] <= np.maximum(2, 2 / np.sqrt(area))
+            cost[-1] += np.where(beside, 1e7, 0)
         inside.append(near >= 0)
         unseen.append(hidden[24:-24, 24:-24])
     return np.array(cost), np.array(inside), np.array(unseen)

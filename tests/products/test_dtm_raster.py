@@ -164,7 +164,7 @@ def test_a_run_is_continued_with_the_same_inputs_settings_and_place(tmp_path: Pa
 @pytest.mark.parametrize(
     ("dtype", "bands", "options"),
     [
-        ("float64", 1, {}),
+        ("int64", 1, {}),
         ("uint8", 3, {"colours": {1: (1, 2, 3)}}),
         ("uint8", 1, {"workers": 0}),
         ("uint8", 1, {"resampling": "cubic"}),

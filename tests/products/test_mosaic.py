@@ -110,7 +110,7 @@ def test_a_preferred_image_and_the_weights(mosaic) -> None:  # type: ignore[no-u
     assert (made(folder / "p_sources.tif") > 0).sum() == (made(folder / "mosaic_sources.tif") > 0).sum()
     for words, text in (
         (("--score", "slant=x"), "NAME=WEIGHT"),
-        (("--score", "slant=-1"), "weights"),
+        (("--score", "slant=-1"), "weight slant=-1"),
         (("--prefer", "nine"), "'nine' is not in the project"),
         (("--images", "one,two", "--prefer", "three"), "not among the images of the mosaic"),
     ):

@@ -15,7 +15,7 @@ from photoplan.geometry.grid import Window
 from photoplan.kernels.position import ALL_MINE
 from photoplan.kernels.rectify import rectify_tile
 from photoplan.plan.accuracy import DepthErrors, SourceErrors, radial_counts, tile_accuracy
-from photoplan.plan.product import CompiledTile, Layer, ProductPlan, compile_tile
+from photoplan.plan.product import CompiledTile, Layer, ProductPlan, compile_next, compile_tile
 from photoplan.plan.tiles import Tile
 from photoplan.surfaces.base import Surface
 
@@ -61,7 +61,18 @@ def execute_tile(tile: CompiledTile, sources: Sequence[Source], kernel: str) -> 
     kernel : str
         Name of a resampling kernel.
     """
-    values, valid = np.zeros((0, *tile.relief.shape)), np.zeros(tile.relief.shape, bool)
+    values, valid = _paint(tile, sources, kernel, np.zeros((0, *tile.relief.shape)), np.zeros(tile.relief.shape, bool))
+    return _painted(tile, values, valid)
+
+
+def _paint(
+    tile: CompiledTile,
+    sources: Sequence[Source],
+    kernel: str,
+    values: NDArray[Any],
+    valid: NDArray[np.bool_],
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """Paint a tile into pixels that are there; no bands yet: they are made."""
     for layer in tile.layers:
         window, reader = layer.anchors.source_window, sources[layer.source].reader
         if not window.size:
@@ -74,6 +85,10 @@ def execute_tile(tile: CompiledTile, sources: Sequence[Source], kernel: str) -> 
             owned = ALL_MINE if layer.owner is None else (layer.owner, layer.source + 1, layer.part.tolist())
             arrays, tilt = layer.anchors.arrays, tile.tilt
             rectify_tile(arrays, tile.relief, pixels, usable, border, kernel, values, valid, owned=owned, tilt=tilt)
+    return values, valid
+
+
+def _painted(tile: CompiledTile, values: NDArray[Any], valid: NDArray[np.bool_]) -> Painted:
     bare = 0
     if tile.hidden is not None:
         bare = int(np.count_nonzero(np.isfinite(tile.relief) & ~valid & ~tile.hidden))
@@ -89,16 +104,43 @@ def render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface:
     Whether and how it is cut depends on the tile and the sources alone, so that the result does not depend on
     memory, workers or order.
     """
-    window = tile.window
-    compiled = compile_tile(product, tile, {row: sources[row].camera for row in tile.sources}, surface)
+    window, cameras = tile.window, {row: sources[row].camera for row in tile.sources}
+    compiled = compile_tile(product, tile, cameras, surface)
     needed = max((_bytes(layer, sources[layer.source]) for layer in compiled.layers), default=0)
     if needed <= MOST_SOURCE_BYTES or max(window.width, window.height) <= SMALLEST_PART:
-        return execute_tile(compiled, sources, kernel)
+        values, valid = np.zeros((0, *compiled.relief.shape)), np.zeros(compiled.relief.shape, bool)
+        values, valid = _paint(compiled, sources, kernel, values, valid)
+        refused: dict[int, NDArray[np.bool_]] = {}
+        while len(cameras) > 1 and _refuse(compiled, valid, refused):
+            again = compile_next(product, tile, cameras, surface, compiled, refused)
+            values, valid = _paint(again, sources, kernel, values, valid)
+            compiled = _with_others(compiled, again, np.any(list(refused.values()), axis=0))
+        return _painted(compiled, values, valid)
     side = max(SMALLEST_PART, -(-max(window.width, window.height) // 2))
     cut = [replace(tile, window=part) for part in window.tiles(side)]
     parts = ((part.window, render(product, part, sources, surface, kernel)) for part in cut)
     whole = joined(window, parts, sources[tile.sources[0]].reader)
     return whole if np.any(whole.valid) else replace(whole, values=None, valid=None, owner=None)
+
+
+def _refuse(tile: CompiledTile, valid: NDArray[np.bool_], refused: dict[int, NDArray[np.bool_]]) -> bool:
+    """Enter the pixels in which their source was of no use; whether there are any that nobody has asked for before."""
+    if tile.owner is None:
+        return False
+    bad = ~valid & (tile.owner > 0)
+    for row in (np.unique(tile.owner[bad]).astype(int) - 1).tolist():
+        refused[row] = refused.get(row, False) | (bad & (tile.owner == row + 1))
+    return bool(bad.any())
+
+
+def _with_others(tile: CompiledTile, again: CompiledTile, given: NDArray[np.bool_]) -> CompiledTile:
+    """A tile with the owners of those pixels that were given away again."""
+    hidden = tile.hidden
+    if hidden is not None and again.hidden is not None:
+        hidden = hidden | again.hidden
+    assert tile.owner is not None and again.owner is not None
+    owner = np.where(given, again.owner, tile.owner)
+    return replace(tile, owner=owner, hidden=hidden, layers=tile.layers + again.layers)
 
 
 def _bytes(layer: Layer, source: Source) -> int:

@@ -1,4 +1,4 @@
-"""Where the pixels of a tile lie in an image, with a value that is known at nodes: what choosing images needs."""
+"""Where the pixels of a tile lie in an image, with values that are known at nodes: what choosing images needs."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ def between_nodes(
     corner: tuple[int, int],
     spacing: int,
     xy: NDArray[np.float64],
-    value: NDArray[np.float32],
+    values: NDArray[np.float32],
 ) -> None:
-    """Positions and a value of each pixel, by linear interpolation in (u, v, h) between nodes.
+    """Positions and two values of each pixel, by linear interpolation in (u, v, h) between nodes.
 
-    nodes (2, rows, columns, 4): homogeneous position and value at two levels; the first node lies `corner` (columns,
-    rows) before the first pixel. Writes xy (height, width, 2) and value (height, width); NaN without surface, and at
-    and behind the camera's plane.
+    nodes (2, rows, columns, 5): homogeneous position and values at two levels; the first node lies `corner` (columns,
+    rows) before the first pixel. Writes xy (height, width, 2) and values (2, height, width); NaN without surface, and
+    at and behind the camera's plane.
     """
     height, width = relief.shape
     low, thick = levels[0], levels[1] - levels[0]
-    found = np.empty(4)
+    found = np.empty(5)
     for i in range(height):
         v = (i + corner[1]) / spacing
         row = min(np.int64(v), nodes.shape[1] - 2)
@@ -36,7 +36,7 @@ def between_nodes(
             col = min(np.int64(u), nodes.shape[2] - 2)
             fu = u - col
             fh = (np.float64(relief[i, j]) - low) / thick
-            for k in range(4):
+            for k in range(5):
                 total = 0.0
                 for level in range(2):
                     upper = nodes[level, row, col, k] * (1.0 - fu) + fu * nodes[level, row, col + 1, k]
@@ -46,4 +46,5 @@ def between_nodes(
             w = found[2] if found[2] > 0.0 else np.nan
             xy[i, j, 0] = found[0] / w
             xy[i, j, 1] = found[1] / w
-            value[i, j] = found[3] if w > 0.0 else np.nan
+            values[0, i, j] = found[3] if w > 0.0 else np.nan
+            values[1, i, j] = found[4] if w > 0.0 else np.nan

@@ -39,6 +39,8 @@ _SPACING = 32
 _RIM = 0.1
 #: Pixels at an image's border that it does not paint where others can: kernels need what is around a position.
 _MARGIN = 3.0
+#: The same beside what it does not see: pixels of the image, or of the product if they are larger.
+_BESIDE = 2.0
 #: Penalty of lines of sight that do not come from above.
 _LEVEL = 100.0
 #: Distance in which what hides ground counts, pixels of the product.
@@ -90,17 +92,18 @@ class BestImage:
         """The least penalty of those that see a pixel; visibility is asked only of images that come first somewhere."""
         rows = sorted(cameras)
         drawn = None if self.drawn is None else self.drawn.rows(ground.window)
-        cost = np.stack([self._penalty(row, cameras[row], ground, drawn) for row in rows])
+        scores = [self._penalty(row, cameras[row], ground, drawn) for row in rows]
+        cost = np.stack([penalty for penalty, _ in scores])
         inside = cost.min(axis=0)
         blind = cost if not self.paints_hidden else cost.copy()
-        wide = _wide(ground, surface) if self.weights.occlusion else ground
+        wide = _wide(ground, surface)
         looked: set[int] = set()
         while True:
             best = np.argmin(cost, axis=0)
             ahead = np.unique(best[np.isfinite(cost.min(axis=0))])
             asked = [int(k) for k in ahead if k not in looked]
             for k in asked:
-                self._look(cost[k], cameras[rows[k]], ground, wide, surface)
+                self._look(cost[k], scores[k][1], cameras[rows[k]], (ground, wide), surface)
             looked.update(asked)
             if not asked:
                 break
@@ -112,9 +115,15 @@ class BestImage:
         return Share(np.where(paints, np.array(rows)[best] + 1, 0).astype(np.uint16), hidden)
 
     def _look(
-        self, cost: NDArray[np.float32], camera: Projection, ground: TileGround, wide: TileGround, surface: Surface
+        self,
+        cost: NDArray[np.float32],
+        scale: NDArray[np.float32],
+        camera: Projection,
+        grounds: tuple[TileGround, TileGround],
+        surface: Surface,
     ) -> None:
-        """Add to an image's penalty what it does not see, and what is near that."""
+        """Add to an image's penalty what it does not see, and what is near that; `scale`: its pixels per pixel."""
+        ground, wide = grounds
         # Orthophotos of single images do without it: a tenth of a second of their start.
         from scipy.ndimage import distance_transform_edt  # noqa: PLC0415
 
@@ -122,19 +131,23 @@ class BestImage:
         if not hidden.any():
             return
         at = ground.window.slices(wide.window)
-        if self.weights.occlusion:
-            near = 1.0 - distance_transform_edt(~hidden)[at] / _AROUND
-            cost += np.float32(self.weights.occlusion) * np.clip(near, 0.0, 1.0).astype(np.float32)
+        away = distance_transform_edt(~hidden)[at]
+        near = np.clip(1.0 - away / _AROUND, 0.0, 1.0)
+        cost += np.float32(self.weights.occlusion) * near.astype(np.float32)
+        # Kernels mix what hides ground into what lies beside it, as far as they do at the image's border.
+        cost[away <= np.maximum(_BESIDE, _BESIDE / scale)] += np.float32(_RIMMED)
         cost[hidden[at]] = np.inf
 
     def _penalty(
         self, row: int, camera: Projection, ground: TileGround, drawn: NDArray[np.uint16] | None
-    ) -> NDArray[np.float32]:
-        """Penalty of each pixel without what hides it; infinite outside the image, and without a surface."""
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Penalty of each pixel without what hides it; infinite outside the image, and without a surface. Also the
+        image's pixels per pixel."""
         xy = np.empty((*ground.relief.shape, 2))
-        cost = np.empty(ground.relief.shape, np.float32)
+        values = np.empty((2, *ground.relief.shape), np.float32)
         nodes, levels, corner = self._nodes(camera, ground)
-        between_nodes(ground.relief, nodes, levels, corner, _SPACING, xy, cost)
+        between_nodes(ground.relief, nodes, levels, corner, _SPACING, xy, values)
+        cost = values[0]
         near = _to_border(camera, xy)
         rim = np.clip(1.0 - near / (_RIM * min(camera.size)), 0.0, 1.0)
         cost += (self.weights.border * rim**2 + (self.ranks[row] if self.ranks else 0.0)).astype(np.float32)
@@ -143,13 +156,13 @@ class BestImage:
         # Beyond the margin an image only comes after all others.
         cost[near < _MARGIN] += _RIMMED
         cost[~(near >= 0.0) | np.isnan(cost)] = np.inf
-        return cost
+        return cost, np.exp2(-values[1])
 
     def _nodes(
         self, camera: Projection, ground: TileGround
     ) -> tuple[NDArray[np.float64], tuple[float, float], tuple[int, int]]:
-        """Homogeneous positions and smooth penalties at nodes of two levels (2, rows, columns, 4), the levels, and by
-        how many pixels the first node lies before the tile."""
+        """Homogeneous positions, smooth penalties and coarseness at nodes of two levels (2, rows, columns, 5), the
+        levels, and by how many pixels the first node lies before the tile."""
         target, window = ground.target, ground.window
         assert isinstance(target, MapTarget)
         (right, bottom), (low, high) = window.stop, self.levels
@@ -173,7 +186,8 @@ class BestImage:
             )
             coarse = np.clip(np.nan_to_num(-np.log2(size), nan=_LEVEL, posinf=_LEVEL), -_LEVEL, _LEVEL)
         smooth = self.weights.slant * slant + self.weights.coarseness * coarse
-        nodes = np.concatenate([camera.project_homogeneous(target.to_ground(uvh)), smooth[..., None]], axis=-1)
+        values = np.stack([smooth, coarse], axis=-1)
+        nodes = np.concatenate([camera.project_homogeneous(target.to_ground(uvh)), values], axis=-1)
         return nodes, levels, (window.col - first[0] * _SPACING, window.row - first[1] * _SPACING)
 
 

@@ -116,6 +116,55 @@ def compile_tile(product: ProductPlan, tile: Tile, cameras: Mapping[int, Project
     relief, tilt = _depth(product, tile.window, surface)
     ground = TileGround.of(product.target, tile.window, relief)
     share = Share(None) if product.owners is None else product.owners.share(ground, cameras, surface)
+    return _compiled(product, tile, cameras, (ground, tilt), share)
+
+
+def compile_next(
+    product: ProductPlan,
+    tile: Tile,
+    cameras: Mapping[int, Projection],
+    surface: Surface,
+    first: CompiledTile,
+    refused: Mapping[int, NDArray[np.bool_]],
+) -> CompiledTile:
+    """A tile once more, for pixels whose source has nothing there that can be used: a mask, nodata.
+
+    Parameters
+    ----------
+    product, tile, cameras, surface
+        As for `compile_tile`.
+    first : CompiledTile
+        What came of it.
+    refused : mapping
+        By row of the table of sources, pixels (height, width) in which it is of no use. Pixels that are in none of them
+        get no owner; of the others the best source that is left, or none.
+    """
+    owner, hidden = np.zeros(first.relief.shape, np.uint16), np.zeros(first.relief.shape, bool)
+    ground = TileGround.of(product.target, tile.window, first.relief)
+    rows = np.array(list(refused))
+    tables = np.stack([refused[row] for row in rows])
+    asked = tables.any(axis=0)
+    for alike in np.unique(tables[:, asked], axis=1).T:
+        left = {row: camera for row, camera in cameras.items() if row not in rows[alike]}
+        if left and product.owners is not None:
+            share = product.owners.share(ground, left, surface)
+            at = asked & (tables == alike[:, None, None]).all(axis=0)
+            if share.owner is not None:
+                owner[at] = share.owner[at]
+            if share.hidden is not None:
+                hidden[at] = share.hidden[at]
+    return _compiled(product, tile, cameras, (ground, first.tilt), Share(owner, hidden))
+
+
+def _compiled(
+    product: ProductPlan,
+    tile: Tile,
+    cameras: Mapping[int, Projection],
+    depth: tuple[TileGround, NDArray[np.float32] | None],
+    share: Share,
+) -> CompiledTile:
+    """Anchors of those that paint a tile."""
+    ground, tilt = depth
     wanted, parts = ground.ranges[None], np.array([[0, 0, tile.window.width, tile.window.height]])
     if share.owner is not None:
         wanted, parts = ground.owned(share.owner, tile.sources, len(product.sources))
@@ -129,7 +178,7 @@ def compile_tile(product: ProductPlan, tile: Tile, cameras: Mapping[int, Project
             layers.append(Layer(source, level, anchors.at_level(level, cameras[source].size), part, share.owner))
         else:
             layers += _layers_by_level(product.rule, ground, tilt, (source, cameras[source], anchors), share.owner)
-    return CompiledTile(tile.window, relief, tilt, tuple(layers), share.owner, share.hidden)
+    return CompiledTile(tile.window, ground.relief, tilt, tuple(layers), share.owner, share.hidden)
 
 
 def _depth(
