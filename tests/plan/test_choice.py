@@ -51,6 +51,15 @@ def strict(weights: Weights) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     XYZ = TARGET.to_ground(np.stack([u, v, ground.relief.astype(float)], axis=-1))
     wide = tile(Window(-24, -24, SIDE + 48, SIDE + 48))
     cost, inside, unseen = [], [], []
+    h = wide.relief.astype(float)
+    slopes = []
+    for across, up in ((4, 0), (0, 4)):
+        here, east, west = (
+            h[24 - k * up : 24 + SIDE - k * up, 24 + k * across : 24 + SIDE + k * across] for k in (0, 1, -1)
+        )
+        steps = np.stack([here - west, east - here]) / 4
+        even = (steps > 0).all(axis=0) | (steps < 0).all(axis=0)
+        slopes.append(np.where(even, np.where(np.abs(steps[0]) < np.abs(steps[1]), steps[0], steps[1]), 0.0))
     for camera in CAMERAS.values():
         centre = camera.pose.center
         slant = np.hypot(XYZ[..., 0] - centre[0], XYZ[..., 1] - centre[1]) / (centre[2] - XYZ[..., 2])
@@ -58,6 +67,8 @@ def strict(weights: Weights) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             project(camera, XYZ + d) - project(camera, XYZ - d) for d in (np.array([0.5, 0, 0]), np.array([0, 0.5, 0]))
         ]
         area = np.abs(shift[0][..., 0] * shift[1][..., 1] - shift[0][..., 1] * shift[1][..., 0])
+        way = (centre - XYZ) / (centre[2] - XYZ[..., 2])[..., None]
+        larger = np.clip(np.abs(1 - way[..., 0] * slopes[0] - way[..., 1] * slopes[1]), 1 / 64, 2)
         xy, (w, h) = project(camera, XYZ), camera.size
         near = np.minimum(
             np.minimum(xy[..., 0] + 0.5, w - 0.5 - xy[..., 0]), np.minimum(xy[..., 1] + 0.5, h - 0.5 - xy[..., 1])
@@ -66,7 +77,7 @@ def strict(weights: Weights) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         around = np.clip(1 - distance_transform_edt(~hidden) / 24, 0, 1)[24:-24, 24:-24] if hidden.any() else 0.0
         cost.append(
             weights.slant * slant
-            - weights.coarseness * np.log2(area) / 2
+            - weights.coarseness * np.log2(area * larger) / 2
             + weights.border * np.clip(1 - near / (0.1 * min(w, h)), 0, 1) ** 2
             + weights.occlusion * around
             + np.where(near < 3, 1e7, 0)

@@ -18,15 +18,15 @@ def between_nodes(
     xy: NDArray[np.float64],
     values: NDArray[np.float32],
 ) -> None:
-    """Positions and two values of each pixel, by linear interpolation in (u, v, h) between nodes.
+    """Positions and k values of each pixel, by linear interpolation in (u, v, h) between nodes.
 
-    nodes (2, rows, columns, 5): homogeneous position and values at two levels; the first node lies `corner` (columns,
-    rows) before the first pixel. Writes xy (height, width, 2) and values (2, height, width); NaN without surface, and
-    at and behind the camera's plane.
+    nodes (2, rows, columns, 3 + k): homogeneous position and values at two levels; the first node lies `corner`
+    (columns, rows) before the first pixel. Writes xy (height, width, 2) and values (k, height, width); NaN without
+    surface, and at and behind the camera's plane.
     """
     height, width = relief.shape
     low, thick = levels[0], levels[1] - levels[0]
-    found = np.empty(5)
+    found = np.empty(nodes.shape[3])
     for i in range(height):
         v = (i + corner[1]) / spacing
         row = min(np.int64(v), nodes.shape[1] - 2)
@@ -36,7 +36,7 @@ def between_nodes(
             col = min(np.int64(u), nodes.shape[2] - 2)
             fu = u - col
             fh = (np.float64(relief[i, j]) - low) / thick
-            for k in range(5):
+            for k in range(nodes.shape[3]):
                 total = 0.0
                 for level in range(2):
                     upper = nodes[level, row, col, k] * (1.0 - fu) + fu * nodes[level, row, col + 1, k]
@@ -46,5 +46,5 @@ def between_nodes(
             w = found[2] if found[2] > 0.0 else np.nan
             xy[i, j, 0] = found[0] / w
             xy[i, j, 1] = found[1] / w
-            values[0, i, j] = found[3] if w > 0.0 else np.nan
-            values[1, i, j] = found[4] if w > 0.0 else np.nan
+            for k in range(3, nodes.shape[3]):
+                values[k - 3, i, j] = found[k] if w > 0.0 else np.nan

@@ -1,10 +1,11 @@
 """Which of many images paints which pixel: the best of those that see it, by a stated score.
 
 The score is a sum of penalties, each without a unit; the least wins, of equal ones the first image. All of them change
-slowly over the ground but for the last, so that one image paints a region and not single pixels:
+slowly over an even ground but for the last, so that one image paints a region and not single pixels:
 
 - slant: tangent of the angle between the line of sight and the vertical, by which an error of the height moves a pixel;
-- coarseness: logarithm to base 2 of the ground sampling distance in pixels of the product;
+- coarseness: logarithm to base 2 of the ground sampling distance in pixels of the product, on the slope that the image
+  sees: a roof that falls away from it is coarse;
 - border: 1 at the image's border, falling with the square of the distance to 0 at a tenth of the image's shorter side;
 - sharpness: by how many powers of two fine detail is weaker than in the sharpest image, one figure for each image;
 - occlusion: 1 beside ground that the image does not see, falling to 0 at some distance on the map. Behr (1989, section
@@ -43,6 +44,11 @@ _MARGIN = 3.0
 _BESIDE = 2.0
 #: Penalty of lines of sight that do not come from above.
 _LEVEL = 100.0
+#: Pixels to both sides over which the slope of the ground is taken, the smaller one counts: edges and rough ground
+#: then have none. What a slope makes of the area of a pixel in the image, between these factors.
+_REACH, _FLATTEST, _STEEPEST = 4, 1 / 64, 2.0
+#: Lines of sight that are flatter than by so many pixels a metre count as these.
+_MOVES = 1e4
 #: Distance in which what hides ground counts, pixels of the product.
 _AROUND = 24
 #: What a drawn region is worth, more than all penalties; and what the margin costs, more than that.
@@ -92,11 +98,12 @@ class BestImage:
         """The least penalty of those that see a pixel; visibility is asked only of images that come first somewhere."""
         rows = sorted(cameras)
         drawn = None if self.drawn is None else self.drawn.rows(ground.window)
-        scores = [self._penalty(row, cameras[row], ground, drawn) for row in rows]
+        wide = _wide(ground, surface)
+        slope = _slope(wide, ground.window)
+        scores = [self._penalty(row, cameras[row], (ground, slope), drawn) for row in rows]
         cost = np.stack([penalty for penalty, _ in scores])
         inside = cost.min(axis=0)
         blind = cost if not self.paints_hidden else cost.copy()
-        wide = _wide(ground, surface)
         looked: set[int] = set()
         while True:
             best = np.argmin(cost, axis=0)
@@ -139,15 +146,24 @@ class BestImage:
         cost[hidden[at]] = np.inf
 
     def _penalty(
-        self, row: int, camera: Projection, ground: TileGround, drawn: NDArray[np.uint16] | None
+        self,
+        row: int,
+        camera: Projection,
+        sloping: tuple[TileGround, NDArray[np.float32]],
+        drawn: NDArray[np.uint16] | None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Penalty of each pixel without what hides it; infinite outside the image, and without a surface. Also the
         image's pixels per pixel."""
+        ground, slope = sloping
         xy = np.empty((*ground.relief.shape, 2))
-        values = np.empty((2, *ground.relief.shape), np.float32)
+        values = np.empty((4, *ground.relief.shape), np.float32)
         nodes, levels, corner = self._nodes(camera, ground)
         between_nodes(ground.relief, nodes, levels, corner, _SPACING, xy, values)
         cost = values[0]
+        if self.weights.coarseness:
+            # By this the image's area of a pixel is larger on the slope than on the level.
+            larger = np.abs(1.0 - values[2] * slope[0] - values[3] * slope[1])
+            cost -= np.float32(0.5 * self.weights.coarseness) * np.log2(np.clip(larger, _FLATTEST, _STEEPEST))
         near = _to_border(camera, xy)
         rim = np.clip(1.0 - near / (_RIM * min(camera.size)), 0.0, 1.0)
         cost += (self.weights.border * rim**2 + (self.ranks[row] if self.ranks else 0.0)).astype(np.float32)
@@ -161,8 +177,9 @@ class BestImage:
     def _nodes(
         self, camera: Projection, ground: TileGround
     ) -> tuple[NDArray[np.float64], tuple[float, float], tuple[int, int]]:
-        """Homogeneous positions, smooth penalties and coarseness at nodes of two levels (2, rows, columns, 5), the
-        levels, and by how many pixels the first node lies before the tile."""
+        """Homogeneous positions, smooth penalties, coarseness, and how many columns and rows a line of sight moves per
+        metre, at nodes of two levels (2, rows, columns, 7), the levels, and by how many pixels the first node lies
+        before the tile."""
         target, window = ground.target, ground.window
         assert isinstance(target, MapTarget)
         (right, bottom), (low, high) = window.stop, self.levels
@@ -186,7 +203,9 @@ class BestImage:
             )
             coarse = np.clip(np.nan_to_num(-np.log2(size), nan=_LEVEL, posinf=_LEVEL), -_LEVEL, _LEVEL)
         smooth = self.weights.slant * slant + self.weights.coarseness * coarse
-        values = np.stack([smooth, coarse], axis=-1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            moves = np.where(up > 0, np.clip(step[:2] / up, -_MOVES, _MOVES), 0.0)
+        values = np.stack([smooth, coarse, *moves], axis=-1)
         nodes = np.concatenate([camera.project_homogeneous(target.to_ground(uvh)), values], axis=-1)
         return nodes, levels, (window.col - first[0] * _SPACING, window.row - first[1] * _SPACING)
 
@@ -196,6 +215,19 @@ def _wide(ground: TileGround, surface: Surface) -> TileGround:
     at, r = ground.window, _AROUND
     window = Window(at.col - r, at.row - r, at.width + 2 * r, at.height + 2 * r)
     return TileGround.of(ground.target, window, surface.relief(ground.target, window))
+
+
+def _slope(wide: TileGround, window: Window) -> NDArray[np.float32]:
+    """Slope of the ground of a window along columns and rows, metres per pixel, shape (2, height, width); 0 where it is
+    not known."""
+    rows, cols = window.slices(wide.window)
+    found = []
+    for axis in (1, 0):
+        before, after = (np.roll(wide.relief, step, axis)[rows, cols] for step in (_REACH, -_REACH))
+        here = wide.relief[rows, cols]
+        back, on = (here - before) / _REACH, (after - here) / _REACH
+        found.append(np.where(back * on > 0, np.where(np.abs(back) < np.abs(on), back, on), 0.0))
+    return np.asarray(found, np.float32)
 
 
 def _to_border(camera: Projection, ideal: NDArray[np.float64]) -> NDArray[np.float64]:
