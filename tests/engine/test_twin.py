@@ -197,6 +197,8 @@ def test_owners_are_chosen_among_the_sources_of_the_tile_and_nobody_else_is_open
     class LastCamera:
         def share(self, ground: Any, cameras: Any, surface: Any) -> Share:
             asked.append((ground.window, dict(cameras), surface))
+            if 3 not in cameras:
+                return Share(np.zeros(ground.relief.shape, np.uint16))
             return Share(np.full(ground.relief.shape, max(cameras) + 1, np.uint16))
 
     grid, surface = MapGrid.covering((-25, -25, 25, 25), 0.8, "EPSG:32615"), LevelSurface(0.0)
@@ -204,7 +206,36 @@ def test_owners_are_chosen_among_the_sources_of_the_tile_and_nobody_else_is_open
     table: list[Any] = [None, one, None, two]
     plan = product(grid, names=("a", "b", "c", "d"), owners=LastCamera())
     got = render(plan, Tile(0, grid.window, (1, 3)), table, surface, "bilinear")
-    assert asked == [(grid.window, {1: one.camera, 3: two.camera}, surface)]
+    assert asked[0] == (grid.window, {1: one.camera, 3: two.camera}, surface)
+    # Once more for pixels in which the one that was chosen has nothing.
+    assert asked[1:] == [(grid.window, {1: one.camera}, surface)]
     alone = render(product(grid), Tile(0, grid.window), [two], surface, "bilinear")
     np.testing.assert_array_equal(got.values, alone.values)
     np.testing.assert_array_equal(got.owner, 4 * alone.valid)
+
+
+def test_where_a_source_has_nothing_to_use_the_next_one_paints() -> None:
+    """Masks and nodata are known when pixels are read, after owners were chosen."""
+
+    class First:
+        def share(self, ground: Any, cameras: Any, surface: Any) -> Share:
+            hidden = np.zeros(ground.relief.shape, bool)
+            hidden[:, :4] = 0 not in cameras
+            owner = np.full(ground.relief.shape, min(cameras) + 1, np.uint16)
+            return Share(np.where(hidden, 0, owner).astype(np.uint16), hidden)
+
+    grid, surface = MapGrid.covering((-10, -10, 10, 10), 0.8, "EPSG:32615"), LevelSurface(0.0)
+    masks = [np.ones((SIZE[1], SIZE[0]), bool) for _ in range(3)]
+    masks[0][:, : SIZE[0] // 2] = masks[1][: SIZE[1] // 2] = False
+    table = [
+        Source(camera(0.0), ArrayReader(np.full((1, SIZE[1], SIZE[0]), 50 * (k + 1), np.uint8), mask))
+        for k, mask in enumerate(masks)
+    ]
+    plan = product(grid, names=("a", "b", "c"), owners=First())
+    got = render(plan, Tile(0, grid.window, (0, 1, 2)), table, surface, "bilinear")
+    assert got.values is not None and got.valid is not None and got.owner is not None and got.hidden is not None
+    np.testing.assert_array_equal(got.values[0], 50 * got.owner)
+    assert set(np.unique(got.owner)) == {0, 1, 2, 3} and got.bare == 0
+    # Only what the others do not see stays empty, and is told as hidden.
+    np.testing.assert_array_equal(got.valid, ~got.hidden)
+    assert (got.owner[:, -4:] == 1).all() and not got.hidden[:, 4:].any()

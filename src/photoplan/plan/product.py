@@ -150,7 +150,8 @@ def compile_next(
             share = product.owners.share(ground, left, surface)
             at = asked & (tables == alike[:, None, None]).all(axis=0)
             if share.owner is not None:
-                owner[at] = share.owner[at]
+                # A rule that knows no others, as a drawn raster, gives the same again: then nobody paints.
+                owner[at] = np.where(np.isin(share.owner[at], rows[alike] + 1), 0, share.owner[at])
             if share.hidden is not None:
                 hidden[at] = share.hidden[at]
     return _compiled(product, tile, cameras, (ground, first.tilt), Share(owner, hidden))
