@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.engine.arrays import ArrayReader
 from photoplan.engine.base import Source
-from photoplan.engine.execute import Painted, execute_tile
+from photoplan.engine.execute import Painted, render
 from photoplan.geometry.grid import Placement, Window
 from photoplan.kernels.footprint import depth_tilt
 from photoplan.plan.compile import AnchorRule
@@ -83,8 +83,9 @@ def seen(
         rule=AnchorRule.of(kernel, 0.02, tilted=tilted),
         tiles=Tiles.every(picture.window, 512),
     )
-    compiled = compile_tile(plan, Tile(0, window or picture.window), {0: Map()}, Plain())
-    return compiled, execute_tile(compiled, [Source(Map(), ArrayReader(pixels))], kernel)
+    tile = Tile(0, window or picture.window)
+    compiled = compile_tile(plan, tile, {0: Map()}, Plain())
+    return compiled, render(plan, tile, [Source(Map(), ArrayReader(pixels))], Plain(), kernel)
 
 
 def chess(cell: int) -> NDArray[np.uint8]:

@@ -50,7 +50,12 @@ class Painted:
     """Pixels that the source sees, but that none of its pixels has reached; None: all are reached."""
 
 
-def execute_tile(tile: CompiledTile, sources: Sequence[Source], kernel: str) -> Painted:
+def execute_tile(
+    tile: CompiledTile,
+    sources: Sequence[Source],
+    kernel: str,
+    onto: tuple[NDArray[Any], NDArray[np.bool_]] | None = None,
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """Compose one compiled tile: each source paints the pixels that it owns, and nothing else is computed.
 
     Parameters
@@ -60,19 +65,16 @@ def execute_tile(tile: CompiledTile, sources: Sequence[Source], kernel: str) -> 
         One for each row of the table of sources; all with the same bands and type of pixels.
     kernel : str
         Name of a resampling kernel.
+    onto : (values, valid), optional
+        What of the tile has been painted before.
+
+    Returns
+    -------
+    values : ndarray, shape (bands, height, width)
+        In the sources' dtype, 0 where invalid; without bands if nothing was read.
+    valid : ndarray of bool, shape (height, width)
     """
-    values, valid = _paint(tile, sources, kernel, np.zeros((0, *tile.relief.shape)), np.zeros(tile.relief.shape, bool))
-    return _painted(tile, values, valid)
-
-
-def _paint(
-    tile: CompiledTile,
-    sources: Sequence[Source],
-    kernel: str,
-    values: NDArray[Any],
-    valid: NDArray[np.bool_],
-) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """Paint a tile into pixels that are there; no bands yet: they are made."""
+    values, valid = onto or (np.zeros((0, *tile.relief.shape)), np.zeros(tile.relief.shape, bool))
     for layer in tile.layers:
         window, reader = layer.anchors.source_window, sources[layer.source].reader
         if not window.size:
@@ -89,6 +91,7 @@ def _paint(
 
 
 def _painted(tile: CompiledTile, values: NDArray[Any], valid: NDArray[np.bool_]) -> Painted:
+    """What was painted, with its figures."""
     bare = 0
     if tile.hidden is not None:
         bare = int(np.count_nonzero(np.isfinite(tile.relief) & ~valid & ~tile.hidden))
@@ -108,12 +111,11 @@ def render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface:
     compiled = compile_tile(product, tile, cameras, surface)
     needed = max((_bytes(layer, sources[layer.source]) for layer in compiled.layers), default=0)
     if needed <= MOST_SOURCE_BYTES or max(window.width, window.height) <= SMALLEST_PART:
-        values, valid = np.zeros((0, *compiled.relief.shape)), np.zeros(compiled.relief.shape, bool)
-        values, valid = _paint(compiled, sources, kernel, values, valid)
+        values, valid = execute_tile(compiled, sources, kernel)
         refused: dict[int, NDArray[np.bool_]] = {}
         while len(cameras) > 1 and _refuse(compiled, valid, refused):
             again = compile_next(product, tile, cameras, surface, compiled, refused)
-            values, valid = _paint(again, sources, kernel, values, valid)
+            values, valid = execute_tile(again, sources, kernel, (values, valid))
             compiled = _with_others(compiled, again, np.any(list(refused.values()), axis=0))
         return _painted(compiled, values, valid)
     side = max(SMALLEST_PART, -(-max(window.width, window.height) // 2))
