@@ -199,6 +199,37 @@ def mean_space(source: NDArray[Any], bands: int) -> tuple[Any, ...]:
     return wx, wy, sums, np.zeros(bands)
 
 
+@inner
+def spot_of(block: tuple[Any, ...], scales: NDArray[np.float32], before: int, k: int, i: int) -> tuple[Any, ...]:
+    """Where the kernel of pixel i of run k stands, as `mean_at` wants it."""
+    corner, first, part = block[0], block[1], block[2]
+    return (
+        corner[k, 0] + first[k, 0, i] + before,
+        np.float64(part[k, 0, i]) + 0.5,
+        np.float64(scales[k, 0, i]),
+        corner[k, 1] + first[k, 1, i] + before,
+        np.float64(part[k, 1, i]) + 0.5,
+        np.float64(scales[k, 1, i]),
+    )
+
+
+@inner
+def settle(
+    means: NDArray[np.float64],
+    weights: tuple[float, float],
+    limits: tuple[Any, ...],
+    result: tuple[Any, ...],
+    place: tuple[int, int],
+) -> None:
+    """Write the means at place = (row, column) if enough of the weights = (usable, all) is usable."""
+    out, out_valid = result
+    good = weights[0] > 0.0 and weights[0] >= LEAST_WEIGHT * weights[1]
+    out_valid[place[0], place[1]] = good
+    if good:
+        for band in range(out.shape[0]):
+            store(means[band], limits, out, (band, place[0], place[1]))
+
+
 @kernel
 def average_runs(
     source: NDArray[Any],
@@ -221,27 +252,14 @@ def average_runs(
 
     See `border_runs` for the others.
     """
-    corner, first, part, kind, fill = block
-    before = taps_before(rule)
-    out, out_valid = result
-    work = mean_space(source, out.shape[0])
+    kind, fill = block[3], block[4]
+    before, work = taps_before(rule), mean_space(source, result[0].shape[0])
     for k in range(runs.shape[0]):
         if fill[k] == ALL:
             continue
         row, col = runs[k, 1] - offset[1], runs[k, 3] - offset[0]
         for i in range(runs[k, 4] - runs[k, 3]):
             if kind[k, i] == AVERAGE:
-                spot = (
-                    corner[k, 0] + first[k, 0, i] + before,
-                    np.float64(part[k, 0, i]) + 0.5,
-                    np.float64(scales[k, 0, i]),
-                    corner[k, 1] + first[k, 1, i] + before,
-                    np.float64(part[k, 1, i]) + 0.5,
-                    np.float64(scales[k, 1, i]),
-                )
+                spot = spot_of(block, scales, before, k, i)
                 usable, total = mean_at(source, valid, spot, rule, work)
-                good = usable > 0.0 and usable >= LEAST_WEIGHT * total
-                out_valid[row, col + i] = good
-                if good:
-                    for band in range(out.shape[0]):
-                        store(work[3][band], rule[2], out, (band, row, col + i))
+                settle(work[3], (usable, total), rule[2], result, (row, col + i))

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.kernels.area import mean_at, mean_space, taps_before
-from photoplan.kernels.border import LEAST_WEIGHT, store
+from photoplan.kernels.area import mean_at, mean_space, settle, spot_of, taps_before
 from photoplan.kernels.jit import inner, kernel
 from photoplan.kernels.place import ALL, AVERAGE
 from photoplan.kernels.position import RUN, middle_of_run, row_weights, run_coefficients, run_origin
@@ -219,28 +218,16 @@ def average_along_runs(
     result: tuple[Any, ...],
 ) -> None:
     """As `average_runs`, with `scales` of `footprint_runs`."""
-    corner, first, part, kind, fill = block
-    before = taps_before(rule)
-    out, out_valid = result
-    work, along = mean_space(source, out.shape[0]), np.zeros(out.shape[0])
+    kind, fill = block[3], block[4]
+    before, bands = taps_before(rule), result[0].shape[0]
+    work, along = mean_space(source, bands), np.zeros(bands)
     for k in range(runs.shape[0]):
         if fill[k] == ALL:
             continue
         row, col = runs[k, 1] - offset[1], runs[k, 3] - offset[0]
         for i in range(runs[k, 4] - runs[k, 3]):
             if kind[k, i] == AVERAGE:
-                spot = (
-                    corner[k, 0] + first[k, 0, i] + before,
-                    np.float64(part[k, 0, i]) + 0.5,
-                    np.float64(scales[k, 0, i]),
-                    corner[k, 1] + first[k, 1, i] + before,
-                    np.float64(part[k, 1, i]) + 0.5,
-                    np.float64(scales[k, 1, i]),
-                )
+                spot = spot_of(block, scales, before, k, i)
                 reach = (np.float64(scales[k, 2, i]), np.float64(scales[k, 3, i]))
                 usable, total = _mean_along(source, valid, spot, reach, rule, work, along)
-                good = usable > 0.0 and usable >= LEAST_WEIGHT * total
-                out_valid[row, col + i] = good
-                if good:
-                    for band in range(out.shape[0]):
-                        store(along[band], rule[2], out, (band, row, col + i))
+                settle(along, (usable, total), rule[2], result, (row, col + i))
