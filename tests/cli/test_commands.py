@@ -133,7 +133,7 @@ def test_a_reader_that_goes_away_is_met_in_silence(undisturbed: Undisturbed) -> 
 def test_dry_run_touches_nothing(photoplan: Here, pristine: Block, tmp_path: Path) -> None:
     said = photoplan("ortho", pristine.project, *OPTIONS, "--output", tmp_path / "out", "--dry-run")
     assert said.code == 0
-    assert re.search(r"plan: 3 products, \d+ tiles, \d+ cells, worst anchor residual [\d.e-]+ px", said.out)
+    assert re.search(r"plan: 3 orthophotos, \d+ tiles, \d+ cells, worst anchor residual [\d.e-]+ px", said.out)
     assert list(tmp_path.iterdir()) == []
     said = photoplan("ortho", pristine.project, *OPTIONS, "--output", tmp_path / "out", "--dry-run", "--json")
     facts = json.loads(said.out)

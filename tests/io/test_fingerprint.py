@@ -56,3 +56,9 @@ def test_ten_gigabytes_take_no_time(tmp_path: Path) -> None:
 def test_an_absent_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="absent: cannot be read"):
         fingerprint(tmp_path / "absent")
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "objects.obj")
+    with pytest.raises(InputError, match=r"objects\.obj: is a pipe"):
+        fingerprint(tmp_path / "objects.obj")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from photoplan.errors import RunLocked, UsageError
+from photoplan.errors import ResourceError, RunLocked, UsageError
 from photoplan.io.lock import FileLock
 
 HOLDER = """
@@ -67,3 +68,19 @@ def test_a_lock_file_removed_while_waiting_guards_nothing(tmp_path: Path) -> Non
 def test_fault_29_no_such_folder(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"absent/\.a\.lock: cannot be made \(No such file or directory\)"):
         FileLock(tmp_path / "absent" / ".a.lock").acquire()
+
+
+def test_fault_04_a_disk_that_is_full_at_once_is_named_and_the_lock_given_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(descriptor: int, content: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    path = tmp_path / ".a.tif.lock"
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", full)
+        with pytest.raises(ResourceError, match=r"\.a\.tif\.lock: cannot be written"):
+            FileLock(path).acquire()
+    assert not path.exists()
+    with FileLock(path):
+        pass

@@ -145,3 +145,9 @@ def test_fault_09_a_relative_path_cannot_become_virtual(tmp_path: Path) -> None:
 )
 def test_names_are_compared_without_folder_and_suffix(a: str, b: str, same: bool) -> None:
     assert (match_key(a) == match_key(b)) is same
+
+
+def test_a_link_to_itself_is_an_input_that_leads_nowhere(tmp_path: Path) -> None:
+    (tmp_path / "loop.obj").symlink_to(tmp_path / "loop.obj")
+    with pytest.raises(InputError, match="leads to no file"):
+        resolve_input(tmp_path, "loop.obj")

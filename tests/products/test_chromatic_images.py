@@ -132,6 +132,7 @@ def test_faults_of_a_file(text: str, message: str, tmp_path: Path) -> None:
     assert "c.toml" in str(raised.value)
 
 
+@pytest.mark.slow
 def test_bands_of_a_real_camera_agree_between_frames(block: Path) -> None:
     """The drone's camera corrects its images: bands within 0.03 px everywhere, the same in all frames."""
     corners = []

@@ -119,6 +119,7 @@ def _with_tails(length, number):
     return error, float(np.mean(covered))
 
 
+@pytest.mark.slow
 def test_edges_with_tails_reach_the_bounds_from_800_pixels_on():
     error, covered = _with_tails(800, 12)
     assert error[0] < 0.015 and error[1] < 0.01 and covered > 0.8

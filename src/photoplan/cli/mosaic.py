@@ -29,7 +29,7 @@ def command(project: Path, name: str, score: tuple[str, ...], prefer: tuple[str,
     from photoplan.products.orthophoto.mosaic import plan_mosaic
     from photoplan.products.orthophoto.settings import Choice
 
-    choice = Choice(name, weights(score), prefer, None if seams is None else str(seams.resolve()))
+    choice = Choice(name, weights(score), prefer, None if seams is None else str(seams.absolute()))
     how = running.How.from_options(options)
     with running.telling(how) as events:
         running.planned(load_project(project), plan_mosaic, {**options, "choice": choice}, how, events)()

@@ -39,7 +39,7 @@ def command(project: Path, polygons: Path, score: tuple[str, ...], prefer: tuple
 
     names = ("layer", "crs", "height_system", "offset", "sigma")
     stated = {name: value for name in names if (value := options.pop(name)) is not None}
-    plan = partial(plan_objects, polygons=Objects(file=str(polygons.resolve()), **stated))
+    plan = partial(plan_objects, polygons=Objects(file=str(polygons.absolute()), **stated))
     choice = Choice(weights=weights(score), prefer=prefer)
     how = running.How.from_options(options)
     with running.telling(how) as events:

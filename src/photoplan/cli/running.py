@@ -84,7 +84,7 @@ def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling)
     settings = plan.settings
     tiles = sum(len(p.plan.tiles) for p in plan.products)
     events.talk(
-        f"plan: {len(plan.products)} products, {tiles} tiles · {settings.resolution:g} m · kernel {settings.kernel} · "
+        f"plan: {plan.what}, {tiles} tiles · {settings.resolution:g} m · kernel {settings.kernel} · "
         f"tolerance {settings.tolerance:g} px · nodata {settings.nodata} · "
         f"hidden {settings.hidden} · {how.workers} {how.executor}"
     )
@@ -144,13 +144,8 @@ def _summary(results: list[ProductResult], plan: OrthoPlan, seconds: float) -> s
     pixels = sum(p.grid.width * p.grid.height for p in plan.products) / 1e6
     worst = max(r.residual for r in results)
     cells = sum(r.cells for r in results)
-    what = (
-        f"{len(results)} orthophotos" if plan.settings.choice is None else f"mosaic of {len(results[0].images)} images"
-    )
-    if plan.of_objects:
-        what = f"{len(results)} products of single objects"
     return (
-        f"{what} in {seconds:.1f} s · {pixels:.1f} Mpx, {pixels / seconds:.3g} Mpx/s · "
+        f"{plan.what} in {seconds:.1f} s · {pixels:.1f} Mpx, {pixels / seconds:.3g} Mpx/s · "
         f"{cells} cells, worst anchor residual {worst:.3g} px{_hidden(results)}"
     )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,6 +40,8 @@ def fingerprint(path: str | os.PathLike[str]) -> Fingerprint:
     path = Path(path)
     digest = hashlib.sha256()
     try:
+        if stat.S_ISFIFO(path.stat().st_mode):
+            raise InputError(f"{path}: is a pipe, which can be read once only; give a file")
         with path.open("rb", buffering=0) as file:
             state = os.fstat(file.fileno())
             digest.update(str(state.st_size).encode())

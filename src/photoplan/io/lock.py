@@ -32,6 +32,8 @@ class FileLock:
         On entry, if another run holds it.
     UsageError
         On entry, if the file cannot be made (folder absent or read-only).
+    ResourceError
+        On entry, if the disk is full.
     """
 
     def __init__(self, path: Path) -> None:
@@ -65,8 +67,12 @@ class FileLock:
             # a file without a name, and the next run would make a new one.
             if _same_file(descriptor, self._path):
                 self._descriptor = descriptor
-                os.ftruncate(descriptor, 0)
-                os.write(descriptor, f" {os.getpid()}\n".encode())
+                try:
+                    os.ftruncate(descriptor, 0)
+                    os.write(descriptor, f" {os.getpid()}\n".encode())
+                except OSError as error:
+                    self.release()
+                    raise disk_error(self._path, error) from error
             else:
                 os.close(descriptor)
 

@@ -106,7 +106,10 @@ def resolve_input(folder: Path, text: str) -> Path:
     """Absolute path of an input, relative ones from `folder`; virtual paths are refused after resolving too."""
     path = Path(check_input_name(text)).expanduser()
     full = Path((folder / path).absolute())
-    full = Path(*full.parts).resolve()
+    try:
+        full = Path(*full.parts).resolve()
+    except (OSError, RuntimeError, ValueError) as error:  # links that lead to themselves, names no file can have
+        raise InputError(f"input {text[:200]!r}: leads to no file ({error}); give the path of a file") from error
     check_input_name(str(full))
     return full
 

@@ -20,6 +20,8 @@ Rings = Sequence[NDArray[np.float64]]
 LEAST_AREA = 1e-6
 #: A ring that comes back to itself within this is not yet one that crosses itself, metres: files round to millimetres.
 ROUNDING = 2e-3
+#: Coordinates on a map are smaller, metres.
+_FARTHEST = 1e9
 #: Polygons that are named in a message, each on a line of its own.
 _NAMED = 100
 
@@ -62,7 +64,8 @@ def cannot_be_used(where: str, faults: Mapping[str, str]) -> InputError:
     """The error that names polygons one by one, each with what is wrong with it."""
     told = "".join(f"\n  {name!r} {fault}" for name, fault in list(faults.items())[:_NAMED])
     more = f"\n  and {len(faults) - _NAMED} more" if len(faults) > _NAMED else ""
-    return InputError(f"{where}: {len(faults)} polygons cannot be used; repair or remove them:{told}{more}")
+    what = "1 polygon" if len(faults) == 1 else f"{len(faults)} polygons"
+    return InputError(f"{where}: {what} cannot be used; repair or remove what is named:{told}{more}")
 
 
 def filled(
@@ -110,8 +113,8 @@ def _flattened(rings: Rings) -> tuple[_Base | None, Any, str]:
     """Vertices of a polygon, the polygon in its mean plane, and what is wrong with it; none of them if it has no
     inside."""
     clean = [_opened(np.asarray(ring, float)) for ring in rings]
-    if not all(np.isfinite(ring[:, :2]).all() for ring in clean):
-        return None, None, "has coordinates that are no numbers"
+    if not all((np.abs(ring[:, :2]) < _FARTHEST).all() for ring in clean):
+        return None, None, "has coordinates that lie nowhere on a map"
     if not all(np.isfinite(ring[:, 2]).all() for ring in clean):
         return None, None, "has vertices without a height"
     if not clean or len(clean[0]) < 3:

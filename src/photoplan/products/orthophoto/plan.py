@@ -90,6 +90,16 @@ class OrthoPlan:
         """Whether its products are those of single objects."""
         return any(product.part is not None for product in self.products)
 
+    @property
+    def what(self) -> str:
+        """What it makes, counted."""
+        count, several = len(self.products), "" if len(self.products) == 1 else "s"
+        if self.of_objects:
+            return f"{count} product{several} of single objects"
+        if self.settings.choice is not None:
+            return f"mosaic of {len(self.products[0].images)} images"
+        return f"{count} orthophoto{several}"
+
     def __getitem__(self, name: str) -> OrthoProduct:
         for product in self.products:
             if name == product.plan.name or product.images == (name,):
@@ -98,10 +108,7 @@ class OrthoPlan:
 
     def __str__(self) -> str:
         tiles = sum(len(p.plan.tiles) for p in self.products)
-        what = f"{len(self.products)} orthophotos" if self.settings.choice is None else "mosaic"
-        if self.of_objects:
-            what = f"{len(self.products)} products of single objects"
-        lines = [f"{what}, {tiles} tiles, kernel {self.settings.kernel}"]
+        lines = [f"{self.what}, {tiles} tiles, kernel {self.settings.kernel}"]
         for p in self.products:
             images = "" if self.settings.choice is None else f"{len(p.images)} images, "
             lines.append(
