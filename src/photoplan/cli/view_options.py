@@ -138,6 +138,12 @@ def run_view(request: Any, options: dict[str, Any]) -> None:
         show_json(result, view=plan)
         return
     show(result.path)
+    if result.svg is not None:
+        show(result.svg)
+    if not quiet and result.drawn is not None:
+        d = result.drawn
+        room = f", no room for {d.unplaced}" if d.unplaced else ""
+        say(f"{d.seen} of {d.features} lines and points are seen; {d.labels} labels{room}")
     if not quiet:
         share = result.sky / result.rays
         near = "" if result.nearest is None else f"; ground from {result.nearest:.4g} to {result.farthest:.6g} m"

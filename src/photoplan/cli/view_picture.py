@@ -30,6 +30,11 @@ _LOOK = ("haze", "haze_colour", "sky", "nodata", "samples", "kernel", "shadows")
 @click.option("--nodata", help="Colour of ground that no content shows [214 214 214].", **_RGB)
 @click.option("--samples", type=int, help="Rays along each side of a pixel [2].")
 @click.option("--kernel", help="nearest, bilinear, bicubic, bicubic-1 or lanczos3 [bicubic].")
+@click.option("--lines", multiple=True, metavar="WHAT",
+              help="FILE[:LAYER] of points and lines, or contours:INTERVAL; may be repeated. With "
+              "@colour=#d55e00,width=2,dash=6-3,label=name,height=yes,distance=yes,rank=field,drape=yes.")  # fmt: skip
+@click.option("--text-size", type=float, default=13.0, show_default=True, help="Of labels, pixels.")
+@click.option("--svg", type=PATH, help="Lines and labels as a layer over the picture, too.")
 @click.option("-o", "--output", type=PATH, metavar="PICTURE", help="PNG, JPEG or GeoTIFF; not needed with --dry-run.")
 @running_options
 def command(contents: tuple[str, ...], sun: tuple[float, float] | None, output: Path | None, **options: Any) -> None:
@@ -40,6 +45,7 @@ def command(contents: tuple[str, ...], sun: tuple[float, float] | None, output: 
     from photoplan.errors import UsageError
     from photoplan.products.view.content import ContentRequest
     from photoplan.products.view.job import LookRequest
+    from photoplan.products.view.lines import LinesRequest
 
     look = {name: value for name in _LOOK if (value := options.pop(name)) is not None}
     if sun is not None:
@@ -50,5 +56,12 @@ def command(contents: tuple[str, ...], sun: tuple[float, float] | None, output: 
         look["contents"] = (ContentRequest("photos"),)
     if output is None and not options["dry_run"]:
         raise UsageError("no `output`; give the name of the picture, or `dry_run`")
-    request = take_request(options, output=output, look=LookRequest(**look), matrix=options.pop("matrix"))
+    drawn: dict[str, Any] = {name: options.pop(name) for name in ("lines", "text_size", "svg")}
+    if drawn["lines"]:
+        drawn["lines"] = tuple(LinesRequest.parse(text) for text in drawn["lines"])
+        if any("label" in dict(each.options) for each in drawn["lines"]):
+            from photoplan.report.lettering import lettering
+
+            drawn["lettering"] = lettering(drawn["text_size"])
+    request = take_request(options, output=output, look=LookRequest(**look), matrix=options.pop("matrix"), **drawn)
     run_view(request, options)

@@ -165,7 +165,7 @@ def make_contours(request: ContourRequest, events: Events = SILENT) -> ContourFa
     bounds = _bounds(request, terrain)
     facts = ContourFacts([], sketch=ContourSketch(bounds) if request.sketch else None)
     run = _Run(facts, _labeller(request, bounds), request.label_all or request.options.index == 0)
-    parts, count = _parts(terrain, request)
+    parts, count = contour_parts(terrain, request)
     events.begin("contours", count, "parts")
     lines = trace_contours(_counted(parts, events), request.options)
     labels = (lambda: facts.labels) if request.labels else None
@@ -195,7 +195,7 @@ def _labeller(request: ContourRequest, bounds: tuple[float, float, float, float]
     return Labeller(size, spacing, decimals_of(request.options.interval, request.options.base))
 
 
-def _parts(terrain: OpenTerrain, request: ContourRequest) -> tuple[Iterator[SurfacePart], int]:
+def contour_parts(terrain: OpenTerrain, request: ContourRequest) -> tuple[Iterator[SurfacePart], int]:
     """Parts of the terrain, and about how many there are."""
     if terrain.model is not None:
         layout = terrain.model.layout

@@ -19,6 +19,7 @@ from photoplan.plan.tiles import Tile
 from photoplan.products.view.camera import CameraRequest, view_camera
 from photoplan.products.view.content import Colours, ContentRequest, Layer, Scene, open_layers
 from photoplan.products.view.ground import ViewGround, open_view_ground
+from photoplan.products.view.overlay import Overlay
 from photoplan.surfaces.rays import Hits
 from photoplan.surfaces.seen import Seen, SeenSurface, ground_size
 from photoplan.targets.view import Bundle, ViewTarget
@@ -150,6 +151,8 @@ class ViewJob:
     address: ViewAddress
     matrix: bool = False
     """Whether tiles are those of the coordinate matrix, or of the picture."""
+    overlay: Overlay | None = None
+    """What is drawn over the picture."""
 
     def __call__(self, tile: Tile) -> Made:
         """Colours or ground of a tile, and counts of its pixels."""
@@ -169,6 +172,8 @@ class ViewJob:
             at = part.slices(window)
             picture[:, at[0], at[1]] = np.clip(np.rint(means), 0, 255)
             tally.add(_counts(target, scene.seen))
+        if self.overlay is not None:
+            self.overlay.paint(picture, window)
         return Made(((picture, None),), tally.totals)
 
 

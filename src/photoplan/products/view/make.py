@@ -20,7 +20,7 @@ from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.io.disk import make_folder
 from photoplan.io.image_form import ImageForm
 from photoplan.io.matrix_file import BANDS, MatrixFile
-from photoplan.io.naming import together
+from photoplan.io.naming import together, write_atomically
 from photoplan.io.product import DESCRIPTION, ProductFile, check_output
 from photoplan.io.run_record import input_entry, run_key, versions, write_run_record
 from photoplan.io.storage import PICTURES
@@ -29,15 +29,15 @@ from photoplan.plan.tiles import Tiles
 from photoplan.products.run import Run, clock, refuse_inputs
 from photoplan.products.view.camera import CameraRequest, ViewCamera, view_camera
 from photoplan.products.view.content import open_layers
+from photoplan.products.view.first_look import FirstLook, first_look
 from photoplan.products.view.ground import ViewGround, open_view_ground
 from photoplan.products.view.job import LookRequest, ViewAddress, ViewJob, seen_surface
-from photoplan.surfaces.seen import SeenSurface
-from photoplan.targets.view import ViewTarget
+from photoplan.products.view.lines import LinesRequest, open_drawing
+from photoplan.products.view.overlay import Lettering, Overlay, OverlayFacts, overlay
+from photoplan.surfaces.seen_lines import Sight
 from photoplan.terrain.shading import Light
 
 TILE = 512
-#: Rays along the longer side of a picture that are looked at before it is made.
-_FIRST_LOOK = 64
 
 
 @dataclass(frozen=True)
@@ -63,22 +63,22 @@ class ViewRequest:
     """CRS of a terrain model that does not state it."""
     force: bool = False
     """Also where the point of view lies below the ground."""
+    lines: tuple[LinesRequest, ...] = ()
+    """What is drawn over the picture."""
+    text_size: float = 13.0
+    """Of labels, pixels."""
+    lettering: Lettering | None = None
+    """What draws texts; None: points have no labels."""
+    svg: Path | None = None
+    """A file for what is drawn, over the picture."""
 
-
-@dataclass(frozen=True)
-class FirstLook:
-    """What a few rays tell of a view."""
-
-    ground: float
-    """Share of pixels that show ground, 0 to 1."""
-    nearest: float | None
-    farthest: float | None
-    """Distances of ground, metres; None: there is none."""
-    lowest: float | None
-    highest: float | None
-    """Heights of ground, metres."""
-    pixel: float | None
-    """Median size of a pixel on the ground, across the line of sight, metres."""
+    def __post_init__(self) -> None:
+        if self.svg is not None and not self.lines:
+            raise UsageError(f"{self.svg}: nothing is drawn; give `lines`, too")
+        if self.svg is not None and self.svg.suffix.lower() != ".svg":
+            raise UsageError(f"{self.svg}: what is drawn is written as .svg")
+        if not 4 <= self.text_size <= 400:
+            raise UsageError(f"`text_size` {self.text_size} pixels; 4 to 400 are allowed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,12 +133,16 @@ class ViewResult:
     resumed: int
     """Tiles of an earlier run."""
     seconds: float
+    svg: Path | None = None
+    drawn: OverlayFacts | None = None
+    """What became of lines and labels."""
 
     def json_fields(self) -> dict[str, Any]:
         """Counts of rays."""
         counts = pick(self, "rays", sky_rays="sky", downward_sky_rays="lost")
         return {**pick(self, "path", "size", nearest_m="nearest", farthest_m="farthest"), **counts,
-                **pick(self, "seconds", resumed_tiles="resumed")}  # fmt: skip
+                **pick(self, "seconds", resumed_tiles="resumed"),
+                **({} if self.drawn is None else pick(self, "svg", "drawn"))}  # fmt: skip
 
 
 def plan_view(request: ViewRequest) -> ViewPlan:
@@ -167,6 +171,7 @@ def plan_view(request: ViewRequest) -> ViewPlan:
     matrix = None if request.matrix is None else _fitting(request.matrix, camera)
     files = dict.fromkeys([*ground.files, *(f for each in layers for f in each.files)])
     files |= {} if matrix is None else {matrix: None}
+    files |= {each.path: None for each in request.lines if each.path is not None}
     inputs = [input_entry(path) for path in files]
     address = ViewAddress(
         source=str(request.source.resolve()),
@@ -179,7 +184,10 @@ def plan_view(request: ViewRequest) -> ViewPlan:
         matrix=None if matrix is None else str(matrix.resolve()),
         digests=tuple((str(Path(each["path"]).resolve()), each["sampled_sha256"]) for each in inputs),
     )
-    told = [camera.request, _look_facts(address.look), heights, request.farthest, request.bound, TILE]
+    told: list[Any] = [camera.request, _look_facts(address.look), heights, request.farthest, request.bound, TILE]
+    if request.lines:
+        drawn = [(each.layer, each.interval, each.options) for each in request.lines]
+        told += [drawn, request.text_size, request.lettering is not None]
     return ViewPlan(request, camera, first, address, run_key(f"view {request.kind}", told, inputs))
 
 
@@ -228,29 +236,6 @@ def _check_driver(request: ViewRequest) -> None:
         raise UsageError(f"{request.output}: a {request.kind} is written as {', '.join(allowed)}")
 
 
-def first_look(target: ViewTarget, surface: SeenSurface) -> FirstLook:
-    """What some rays over the whole picture meet."""
-    width, height = target.bundle.size
-    step = max(1.0, max(width, height) / _FIRST_LOOK)
-    u, v = (np.arange((side % step) / 2 if side > step else 0.0, side, step) for side in (width, height))
-    uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    seen = surface.at(target, uv)
-    there = seen.owner >= 0
-    if not there.any():
-        return FirstLook(0.0, None, None, None, None, None)
-    away, Z = target.distance(seen.uvh[there]), seen.XYZ[there, 2]
-    beside = target.bundle.directions(uv[there] + (1.0, 0.0)) - target.bundle.directions(uv[there])
-    pixel = np.median(np.abs(seen.uvh[there, 2]) * np.linalg.norm(beside, axis=1))
-    return FirstLook(
-        ground=float(there.mean()),
-        nearest=float(away.min()),
-        farthest=float(away.max()),
-        lowest=float(Z.min()),
-        highest=float(Z.max()),
-        pixel=float(pixel),
-    )
-
-
 def _rounded(low: float, high: float) -> tuple[float, float]:
     """Heights of a ramp, rounded outwards to a tenth of their range."""
     step = 10 ** math.floor(math.log10(max(high - low, 1.0)))
@@ -284,9 +269,11 @@ def make_view(plan: ViewPlan, run: Run) -> ViewResult:
     path, request = plan.request.output, plan.request
     assert path is not None
     run.check()
-    refuse_inputs([Path(each) for each, _ in plan.address.digests], [path])
-    check_output(path, [each for each, _ in plan.address.digests], overwrite=run.overwrite)
-    make_folder(path.parent)
+    outputs = [path] if request.svg is None else [path, request.svg]
+    refuse_inputs([Path(each) for each, _ in plan.address.digests], outputs)
+    for each in outputs:
+        check_output(each, [name for name, _ in plan.address.digests], overwrite=run.overwrite)
+        make_folder(each.parent)
     target, is_matrix = plan.camera.target, request.kind == "matrix"
     file = ProductFile(
         path,
@@ -305,25 +292,42 @@ def make_view(plan: ViewPlan, run: Run) -> ViewResult:
         if is_matrix
         else None,
     )
-    tiles = Tiles.every(target.window, TILE)
+    tiles, drawn = Tiles.every(target.window, TILE), draw(plan)
     run.events.begin(path.name, len(tiles))
     question = Question(versions, tuple(each for each, _ in plan.address.digests), str(path.parent.resolve()))
     with open_workers(run.executor, run.workers, question, run.events) as workers, together():
         work = Work(
             name=path.stem,
-            job=ViewJob(plan.address, is_matrix),
+            job=ViewJob(plan.address, is_matrix, drawn),
             tiles=tiles,
             count=len(tiles),
             sinks=(file,),
-            complete=partial(_complete, plan, file, run, clock(workers)),
+            complete=partial(_complete, plan, drawn, file, run, clock(workers)),
             scratch=path.with_name(f".{path.name}.parcels"),
         )
         (result,) = Runner[ViewResult](workers, run.in_flight(workers.threads), run.events).run([work])
     return result
 
 
+def draw(plan: ViewPlan) -> Overlay | None:
+    """What is drawn over the picture; None: nothing."""
+    request = plan.request
+    if not request.lines:
+        return None
+    ground = open_view_ground(request.source, request.crs)
+    reach = min(request.farthest, 1.5 * (plan.first.farthest or 0.0) + 1000.0)
+    drawing = open_drawing(request.lines, ground, reach, plan.camera.target.center)
+    sight = Sight(plan.camera.target, seen_surface(ground, request.farthest, request.bound))
+    return overlay(drawing, sight, request.lettering, request.text_size)
+
+
 def _complete(
-    plan: ViewPlan, file: ProductFile, run: Run, times: Callable[[], dict[str, Any]], tally: Tally
+    plan: ViewPlan,
+    drawn: Overlay | None,
+    file: ProductFile,
+    run: Run,
+    times: Callable[[], dict[str, Any]],
+    tally: Tally,
 ) -> ViewResult:
     tally.check(file.path)
     facts = plan.json_fields()
@@ -333,7 +337,10 @@ def _complete(
         "PHOTOPLAN_KEY": plan.key,
         DESCRIPTION: json_text(told, "view", indent=None),
     }
-    made = file.complete(tags)
+    made, svg = file.complete(tags), plan.request.svg
+    if svg is not None and drawn is not None:
+        below = file.path.name if file.path.suffix.lower() in PICTURES and file.path.parent == svg.parent else None
+        write_atomically(svg, drawn.svg(below).encode())
     ran, totals = times(), tally.totals
     result = ViewResult(
         path=file.path,
@@ -345,6 +352,8 @@ def _complete(
         farthest=totals.get("worst_distance"),
         resumed=tally.resumed,
         seconds=ran["seconds"],
+        svg=svg,
+        drawn=None if drawn is None else drawn.facts,
     )
     write_run_record(
         file.path,

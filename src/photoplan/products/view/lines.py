@@ -1,0 +1,317 @@
+"""What is drawn over a view: features of files and contours, with the style of each, on the map of the ground."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.crs import canonical_crs, crs_label, crs_step, same_crs
+from photoplan.io.drawn_features import DrawnFeatures, read_drawn_features
+from photoplan.products.dtm.contours import ContourRequest, contour_parts
+from photoplan.products.view.ground import ViewGround
+from photoplan.project.open_terrain import open_terrain
+from photoplan.surfaces.seen_lines import Lines
+from photoplan.terrain.contours.run import ContourOptions, trace_contours
+
+T = TypeVar("T")
+Colour = tuple[int, int, int]
+NAMES: dict[str, Colour] = {
+    "black": (0, 0, 0), "white": (255, 255, 255), "grey": (128, 128, 128), "red": (213, 94, 0), "blue": (0, 114, 178),
+    "green": (0, 158, 115), "yellow": (240, 228, 66), "orange": (230, 159, 0), "purple": (204, 121, 167),
+    "sky": (86, 180, 233), "brown": (122, 74, 30),
+}  # fmt: skip
+KEYS = ("colour", "width", "dash", "label", "height", "distance", "rank", "crs", "drape")
+#: Widths, dashes and sizes of marks, pixels.
+_WIDEST = 200.0
+#: Vertices that one layer may have.
+_MOST = 5_000_000
+
+
+@dataclass(frozen=True)
+class LinesRequest:
+    """A layer that is drawn: a file of features, or contours."""
+
+    path: Path | None
+    """None: contours of the terrain."""
+    layer: str | None = None
+    interval: float = 0.0
+    """Of contours, metres."""
+    options: tuple[tuple[str, str], ...] = ()
+    """Keys of `KEYS`, each a value or the name of an attribute."""
+
+    @classmethod
+    def parse(cls, text: str) -> LinesRequest:
+        """From ``FILE``, ``FILE:LAYER`` or ``contours:INTERVAL``, each with ``@KEY=VALUE,KEY=VALUE``.
+
+        Raises
+        ------
+        UsageError
+            It is none of these.
+        """
+        head, _, tail = text.rpartition("@") if "=" in text.rpartition("@")[2] else (text, "", "")
+        pairs = [tuple(part.strip() for part in each.split("=", 1)) for each in tail.split(",")] if tail else []
+        wrong = [each for each in pairs if len(each) != 2 or each[0] not in KEYS]
+        if wrong:
+            raise UsageError(f"lines {text!r}: {'='.join(wrong[0])!r}; options are KEY=VALUE with {', '.join(KEYS)}")
+        options = tuple((key, value) for key, value in pairs)
+        kind, _, value = head.partition(":")
+        if kind == "contours" and not Path(head).is_file():
+            interval = _number(value, f"lines {text!r}: interval", 1e-3, 1e5)
+            return cls(None, None, interval, options)
+        if Path(head).is_file():
+            return cls(Path(head), None, 0.0, options)
+        file, _, layer = head.rpartition(":")
+        if not (file and layer and Path(file).is_file()):
+            raise UsageError(f"lines {text!r}: no such file; give FILE, FILE:LAYER or contours:INTERVAL")
+        return cls(Path(file), layer, 0.0, options)
+
+
+@dataclass(frozen=True)
+class LineStyle:
+    """How a line looks; of points the width is the diameter of the mark."""
+
+    colour: Colour
+    width: float
+    """Pixels."""
+    dash: tuple[float, ...] = ()
+    """Lengths of strokes and gaps, pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """What is drawn, on the map of the ground."""
+
+    styles: tuple[LineStyle, ...]
+    lines: Lines
+    style: NDArray[np.int64]
+    """Style of each line."""
+    points: NDArray[np.float64]
+    """Shape (k, 3); NaN height: on the ground."""
+    point_style: NDArray[np.int64]
+    labels: tuple[str, ...]
+    """Of the points; ``{H}`` and ``{distance}`` in them stand for numbers that the view knows."""
+    rank: NDArray[np.float64]
+    """Of the points; labels of lower ranks come first. NaN: by height."""
+
+
+def open_drawing(requests: Sequence[LinesRequest], ground: ViewGround, reach: float, center: Any) -> Drawing:
+    """All layers, one after the other.
+
+    Parameters
+    ----------
+    requests
+    ground
+    reach : float
+        Contours are traced so far around the standpoint, metres.
+    center : array_like
+        The standpoint.
+
+    Raises
+    ------
+    InputError
+        A file cannot be used, or an attribute holds what is no value.
+    """
+    made = [
+        _contours(each, ground, reach, np.asarray(center)) if each.path is None else _features(each, ground)
+        for each in requests
+    ]
+    styles, lines, shift = [], [], 0
+    for each in made:
+        lines.append(each.lines.line + shift)
+        shift += len(each.style)
+        styles.append(len(each.styles))
+    first = np.cumsum(styles) - styles
+    return Drawing(
+        styles=tuple(s for each in made for s in each.styles),
+        lines=Lines(np.concatenate([each.lines.XYZ for each in made]), np.concatenate(lines)),
+        style=np.concatenate([each.style + k for each, k in zip(made, first)]),
+        points=np.concatenate([each.points for each in made]),
+        point_style=np.concatenate([each.point_style + k for each, k in zip(made, first)]),
+        labels=tuple(label for each in made for label in each.labels),
+        rank=np.concatenate([each.rank for each in made]),
+    )
+
+
+def _contours(request: LinesRequest, ground: ViewGround, reach: float, center: NDArray[np.float64]) -> Drawing:
+    project, path, crs = ground.project, ground.files[0], ground.crs
+    if project is not None:
+        if project.ground.file is None:
+            raise UsageError("contours of a project whose ground has one height everywhere; leave them out")
+        path, crs = project.resolve(project.ground.file), project.ground.crs or ground.crs
+    terrain = open_terrain(path, crs)
+    XY = center[:2]
+    if not same_crs(terrain.crs, ground.crs):
+        XY = crs_step(ground.crs, terrain.crs, ground.bounds)(XY)
+    bounds = (float(XY[0] - reach), float(XY[1] - reach), float(XY[0] + reach), float(XY[1] + reach))
+    asked = ContourRequest(path, path, ContourOptions(request.interval), bounds=bounds)
+    vertices: list[NDArray[np.float64]] = []
+    index: list[bool] = []
+    for line in trace_contours(contour_parts(terrain, asked)[0], asked.options):
+        vertices.append(line.xy)
+        index.append(line.index)
+        if sum(map(len, vertices[-1000:])) * max(1, len(vertices) // 1000) > _MOST:
+            raise UsageError(f"contours every {request.interval:g} m: too many; give a larger interval or `farthest`")
+    XY = np.concatenate([np.empty((0, 2)), *vertices])
+    if not same_crs(terrain.crs, ground.crs):
+        XY = crs_step(terrain.crs, ground.crs, terrain.bounds)(XY)
+    options = dict(request.options)
+    plain = LineStyle(
+        _colour(options.get("colour", "brown"), "contours"),
+        _number(options.get("width", "0.8"), "contours: width", 0.1, _WIDEST),
+        _dash(options.get("dash", ""), "contours"),
+    )
+    number = np.repeat(np.arange(len(vertices)), [len(xy) for xy in vertices])
+    return Drawing(
+        styles=(plain, replace(plain, width=2 * plain.width)),
+        lines=Lines(np.column_stack([XY, np.full(len(XY), np.nan)]), number),
+        style=np.array(index, np.int64),
+        points=np.empty((0, 3)),
+        point_style=np.empty(0, np.int64),
+        labels=(),
+        rank=np.empty(0),
+    )
+
+
+def _features(request: LinesRequest, ground: ViewGround) -> Drawing:
+    assert request.path is not None
+    table, options = read_drawn_features(request.path, request.layer), dict(request.options)
+    if len(table.XYZ) > _MOST:
+        raise InputError(f"{table.path}: {len(table.XYZ)} vertices; up to {_MOST} are drawn. Choose a part of it")
+    XYZ = _carried(table, options, ground)
+    values = _Values(table, options)
+    point_vertex = table.is_point[table.part]
+    is_line = np.flatnonzero(~table.is_point)
+    number = np.cumsum(~table.is_point) - 1
+    lines = Lines(XYZ[~point_vertex], number[table.part[~point_vertex]])
+    looks: dict[LineStyle, int] = {}
+    style = [looks.setdefault(values.style(row, "red", "1.5"), len(looks)) for row in table.row[is_line].tolist()]
+    rows = table.row[table.is_point].tolist()
+    marks = [looks.setdefault(values.style(row, "black", "5"), len(looks)) for row in rows]
+    return Drawing(
+        styles=tuple(looks),
+        lines=lines,
+        style=np.array(style, np.int64),
+        points=XYZ[point_vertex],
+        point_style=np.array(marks, np.int64),
+        labels=tuple(values.label(row) for row in rows),
+        rank=np.array([values.rank(row) for row in rows], float),
+    )
+
+
+def _carried(table: DrawnFeatures, options: dict[str, str], ground: ViewGround) -> NDArray[np.float64]:
+    """Vertices in the CRS of the ground; heights as they are, or left out where all lies on the ground."""
+    XYZ = table.XYZ.copy()
+    drape = options.get("drape", "no")
+    if drape not in ("yes", "no"):
+        raise UsageError(f"{table.path}: drape={drape}; allowed are yes and no")
+    if drape == "yes":
+        XYZ[:, 2] = np.nan
+    crs = options.get("crs", table.crs)
+    suffix = table.path.suffix.lower()
+    if crs is None and suffix in (".geojson", ".json") and np.abs(XYZ[:, :2]).max() <= 360:
+        crs = "EPSG:4326"
+    if crs is None and suffix != ".dxf":
+        raise InputError(
+            f"{table.path}: states no CRS, and it is not guessed; say crs={canonical_crs(ground.crs)} if it is that of "
+            "the ground"
+        )
+    stated, known = table.height_system, ground.height_system
+    if not np.isnan(XYZ[:, 2]).all() and stated is not None and known is not None and not same_crs(stated, known):
+        raise InputError(
+            f"{table.path}: heights in {crs_label(stated)}, those of the ground are in {crs_label(known)}; convert "
+            "them, or say drape=yes"
+        )
+    if crs is not None and not same_crs(crs, ground.crs):
+        low, high = XYZ[:, :2].min(axis=0), XYZ[:, :2].max(axis=0)
+        bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+        XYZ[:, :2] = crs_step(crs, ground.crs, bounds)(XYZ[:, :2])
+    return XYZ
+
+
+@dataclass(frozen=True, eq=False)
+class _Values:
+    """Values of style: of an attribute that the option names, of the option itself, or of an attribute of that name."""
+
+    table: DrawnFeatures
+    options: dict[str, str]
+
+    def __post_init__(self) -> None:
+        for key in ("label", "rank"):
+            value = self.options.get(key, "")
+            if value and value.casefold() not in self.table.fields:
+                known = ", ".join(self.table.fields) or "none"
+                raise InputError(f"{self.table.path}: {key}={value}: no such attribute; there are {known}")
+
+    def style(self, row: int, colour: str, width: str) -> LineStyle:
+        where = f"{self.table.path}: feature {row + 1}"
+        return LineStyle(
+            self._of("colour", row, colour, lambda text: _colour(text, where), "color"),
+            self._of("width", row, width, lambda text: _number(text, f"{where}: width", 0.1, _WIDEST)),
+            self._of("dash", row, "", lambda text: _dash(text, where)),
+        )
+
+    def label(self, row: int) -> str:
+        """Text of a point, empty: none."""
+        text = self._of("label", row, "", str, "name")
+        if text and self.options.get("height", "no") == "yes":
+            text += " {H}"
+        if text and self.options.get("distance", "no") == "yes":
+            text += " · {distance}"
+        return text
+
+    def rank(self, row: int) -> float:
+        """Lower ones come first."""
+        name = self.options.get("rank", "").casefold()
+        if not name:
+            return float("nan")
+        return _number(self._text(name, row) or "nan", f"{self.table.path}: feature {row + 1}: rank", -1e12, 1e12)
+
+    def _of(self, key: str, row: int, default: str, read: Callable[[str], T], also: str = "") -> T:
+        stated = self.options.get(key)
+        if stated is not None and stated.casefold() not in self.table.fields:
+            return read(stated)
+        names: Iterator[str] = iter((stated.casefold(),) if stated is not None else (key, also))
+        text = next((t for t in (self._text(n, row) for n in names if n in self.table.fields) if t), "")
+        return read(text or default)
+
+    def _text(self, field: str, row: int) -> str:
+        value = self.table.fields[field][row]
+        if value is None or (isinstance(value, float | np.floating) and np.isnan(value)):
+            return ""
+        return " ".join(str(value).split())[:80]
+
+
+def _colour(text: str, where: str) -> Colour:
+    name = text.strip().casefold()
+    if name in NAMES:
+        return NAMES[name]
+    if not re.fullmatch(r"#[0-9a-f]{6}", name):
+        raise InputError(f"{where}: colour {text[:40]!r}; allowed are #rrggbb and {', '.join(NAMES)}")
+    return int(name[1:3], 16), int(name[3:5], 16), int(name[5:7], 16)
+
+
+def _number(text: str, where: str, least: float, most: float) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = least - 1
+    if text == "nan":
+        return value
+    if not least <= value <= most:
+        raise InputError(f"{where} {text[:40]!r}; {least:g} to {most:g} is allowed")
+    return value
+
+
+def _dash(text: str, where: str) -> tuple[float, ...]:
+    parts = [part for part in re.split(r"[-\s]+", text.strip()) if part]
+    dash = tuple(_number(part, f"{where}: dash", 0.1, _WIDEST) for part in parts)
+    if len(dash) % 2:
+        raise InputError(f"{where}: dash {text[:40]!r}; strokes and gaps in pixels are needed, such as 6-3")
+    return dash
