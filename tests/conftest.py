@@ -27,7 +27,6 @@ CHECKOUT = Path(__file__).resolve().parents[1]
 
 #: Files that take longest, the longest first: one that began last would keep one process busy when all others are done.
 DEAR = (
-    "real/test_brighton_chain.py",
     "products/test_every_run.py",
     "kernels/test_rectify.py",
     "cli/test_run_faults.py",

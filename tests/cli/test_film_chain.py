@@ -111,6 +111,7 @@ def test_the_renderer_goes_both_ways(case: Case) -> None:
         assert (case.ground.height_at(up[:, 0], up[:, 1]) < up[:, 2] + 0.1).all()
 
 
+@pytest.mark.slow
 def test_orientation_that_is_true_gives_the_true_orthophoto(case: Case, tmp_path: Path) -> None:
     """Rendering and orthophoto share no code, and agree: what is found below is due to the orientation."""
     (tmp_path / "true.toml").write_text(

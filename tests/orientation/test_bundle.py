@@ -222,7 +222,8 @@ def with_smooth_errors(simulated: Simulated, seed: int, size: float, reach: floa
     return replace(simulated, block=replace(simulated.block, observations=replace(seen, xy=xy)))
 
 
-@thinned("count", 3, 8)
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [8])
 def test_correlated_image_errors_are_noticed_and_covariances_stay_calibrated(count: int) -> None:
     """Errors that are alike over 500 of 4000 pixels: taken as independent, accuracies are twice too good."""
     spreads = {}

@@ -53,7 +53,8 @@ def below_deck(made: Motorway) -> Path:
     return folder / "true_orthophoto.tif"
 
 
-@pytest.mark.parametrize("part", [0.3, pytest.param(1.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("part", [0.3, 1.0])
 def test_every_edge_is_where_it_is(tmp_path: Path, part: float) -> None:
     made = write_motorway(tmp_path, part, PIXEL)
     for product, scene in ((made.product, made.scene), (made.below, made.road)):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import ndimage
+from tools.thinned import thinned
 
 from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.grid import Window
@@ -64,11 +65,12 @@ def test_simulated_parts_are_recovered_with_true_standard_deviations() -> None:
     assert found.corners[0].artificial == pytest.approx(1 - MODEL.artificial(*CORNERS)[0], abs=0.004)
 
 
-def test_camera_constant_and_point_of_a_pure_natural_fall_off() -> None:
+@thinned("count", 15, 40)
+def test_camera_constant_and_point_of_a_pure_natural_fall_off(count: int) -> None:
     model = FallOffModel(SIZE, POINT, FOCAL, (), ())
     settings = FallOffSettings("estimated", estimate_principal_point=True, artificial="none")
     errors = []
-    for seed in range(40):
+    for seed in range(count):
         found = fit_fall_off(flat(model, seed), settings)
         assert found.sigma_camera_constant is not None and found.sigma_principal_point is not None
         errors.append((found.camera_constant - FOCAL) / found.sigma_camera_constant)

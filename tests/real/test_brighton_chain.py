@@ -25,6 +25,9 @@ from tools.matching import match
 from tools.pictures import gray
 
 pytest.importorskip("cv2")
+# In every run tie points of this block are measured by `test_brighton_ties.py`, a real block is adjusted by
+# `test_ign_block.py` and each command is tried in `tests/cli`; here one follows the other.
+pytestmark = pytest.mark.slow
 
 
 def command(*words: object) -> str:
@@ -117,7 +120,6 @@ def test_the_camera_constant_is_not_determined_by_such_a_block(chain: Chain, tie
     assert camera["parameters"]["c"]["sigma"] > 5.0
 
 
-@pytest.mark.slow
 def test_without_any_orientation_to_orthophotos(chain: Chain, tied: Path, block: Path) -> None:
     """Eight control points, four check points, tie points; no position, no attitude.
 

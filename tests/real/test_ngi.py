@@ -25,6 +25,7 @@ def against_satellite(shared, ngi):
     return [(one.keep(one.quality > QUALITY), len(one)) for one in found]
 
 
+@pytest.mark.slow
 def test_offsets_to_the_satellite_scatter_less_than_1_5_m(against_satellite):
     for kept, found in against_satellite:
         assert len(kept) >= 90 and len(kept) >= 0.8 * found
@@ -32,6 +33,7 @@ def test_offsets_to_the_satellite_scatter_less_than_1_5_m(against_satellite):
         assert max(scatter) <= 1.5, f"robust standard deviation {scatter} m"  # measured: 0.49 to 0.83
 
 
+@pytest.mark.slow
 def test_frames_agree_with_each_other_within_1_m(against_satellite):
     medians = np.array([[np.median(kept.dx), np.median(kept.dy)] for kept, _ in against_satellite])
     spread = np.ptp(medians, axis=0)

@@ -14,7 +14,8 @@ def chart(shared):
     return shared / "data" / "slanted_edges" / "sfrmat3" / "ISO_DSC_300a.jpg"
 
 
-@pytest.mark.parametrize("method", [pytest.param("exact", marks=pytest.mark.slow), "regularised"])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["exact", "regularised"])
 def test_the_mtf_of_other_edges_is_restored(chart, tmp_path, method):
     from restored_chart import FREQUENCIES, restore_chart
 

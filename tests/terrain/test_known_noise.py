@@ -34,7 +34,8 @@ def check(ground: Ground, lines: list[MeasuredLine], count: int, noise: float, s
     assert max(of_class, own) <= 1.03 * unknown  # which of two all but equal functions is found, is chance
 
 
-@pytest.mark.parametrize("lines", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("lines", [True, False])
 def test_terraces(lines: bool) -> None:
     """With their 15 edges: 16 mm became 7 mm when known noise began to be used in the estimation."""
     edges = [line(xyz, name=f"e{k}") for k, xyz in enumerate(bench_edges())] if lines else []
