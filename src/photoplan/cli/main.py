@@ -29,6 +29,7 @@ VERBS = {
     "adjust": "Adjust a block of images (bundle adjustment).",
     "check": "Validate a project and print what to expect of it.",
     "budget": "What limits the accuracy of products, cause by cause.",
+    "balance": "Even colours: tables by which images agree where they overlap.",
     "ortho": "Make orthophotos.",
     "mosaic": "Make one orthophoto of many images.",
     "object": "Make a product of each object alone.",

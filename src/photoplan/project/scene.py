@@ -21,6 +21,7 @@ from photoplan.io.project.model import Project
 from photoplan.io.project.posed import Image
 from photoplan.io.raster import RasterReader
 from photoplan.plan.footprint import Footprint, footprint
+from photoplan.project.balance import load_balance
 from photoplan.project.cameras import camera_of
 from photoplan.project.filter_files import load_filter
 from photoplan.project.ground import Ground, ground_of, stamp_of
@@ -56,7 +57,7 @@ class SceneAddress:
         camera: dict[str, Any] = next(iter(project.pop("cameras").values()), {})
         restored = image.pop("restore", None) or camera.get("restore")
         camera.pop("restore", None)
-        for name in ("name", "file", "camera", "rpc", "sigma_center", "sigma_angles", "correlation"):
+        for name in ("name", "file", "balance", "camera", "rpc", "sigma_center", "sigma_angles", "correlation"):
             image.pop(name, None)
         ground = (project["terrain"], *project.get("objects", ()))
         idle = [(part, name) for part in ground for name in ("file", "sigma")]
@@ -117,7 +118,8 @@ class Scene:
 
 def input_files(project: Project) -> list[Path]:
     """All files that a project names; nothing that is written may replace one of them."""
-    files = [file for image in project.images for file in (image.file, image.geometry_file) if file is not None]
+    each = [file for image in project.images for file in (image.file, image.geometry_file, image.balance)]
+    files = [file for file in each if file is not None]
     restored = [project.restoration(image) for image in project.images]
     files += [file for each in restored if each is not None for file in each.files]
     files += [] if project.terrain is None or project.terrain.file is None else [project.terrain.file]
@@ -165,7 +167,8 @@ def scene_address(project: Project, name: str) -> SceneAddress:
     """
     image = project.any_image(name)
     alone = project.alone([name])
-    files = [project.resolve(file) for file in (image.file, image.geometry_file) if file is not None]
+    own = image.file, image.geometry_file, image.balance
+    files = [project.resolve(file) for file in own if file is not None]
     if project.ground.file is not None:
         files.append(project.resolve(project.ground.file))
     files += [project.resolve(objects.file) for objects in project.objects]
@@ -197,11 +200,11 @@ def _open(address: SceneAddress) -> Scene:
 
 
 def _reader(project: Project, image: ImageEntry) -> SteppedReader:
-    """The image's pixels, restored if the project says so."""
+    """The image's pixels, restored and balanced if the project says so."""
     source = SteppedReader(RasterReader(project.resolve(image.file)))
     restoration = project.restoration(image)
-    if restoration is None:
-        return source
-    table = restoration.linearisation
-    light = linearisation_of(table if table in ("linear", "srgb") else str(project.resolve(table)))
-    return restored(source, load_filter(project.resolve(restoration.filter)), light)
+    if restoration is not None:
+        table = restoration.linearisation
+        light = linearisation_of(table if table in ("linear", "srgb") else str(project.resolve(table)))
+        source = restored(source, load_filter(project.resolve(restoration.filter)), light)
+    return source if image.balance is None else source.then(load_balance(project.resolve(image.balance)))

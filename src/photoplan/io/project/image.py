@@ -28,11 +28,13 @@ class ImageEntry(Entry, ABC):
     """Width and height of this image, where nothing else states them."""
     restore: Restore | None = None
     """Filter that it is restored with before anything is made of it; None: that of its camera, if there is one."""
+    balance: InputName | None = None
+    """Balance file by which its grey values agree with those of other images, after all else; None: they stay."""
 
-    @field_validator("file")
+    @field_validator("file", "balance")
     @classmethod
-    def _file(cls, text: str) -> str:
-        return plain_file(text)
+    def _file(cls, text: str | None) -> str | None:
+        return None if text is None else plain_file(text)
 
     @property
     @abstractmethod

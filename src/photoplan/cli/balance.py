@@ -1,0 +1,99 @@
+"""`photoplan balance`: even colours between the images of a project."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from photoplan.cli.options import (
+    PATH,
+    dry_run_option,
+    images_option,
+    json_option,
+    overwrite_option,
+    quiet_option,
+    workers_option,
+)
+from photoplan.cli.output import say, show, show_json
+
+if TYPE_CHECKING:
+    from photoplan.products.balance.run import BalanceReport
+
+#: Pairs that are listed; all are in the table.
+_LISTED = 12
+
+
+@click.command("balance")
+@click.argument("project", type=PATH)
+@images_option()
+@click.option("--reference-image", metavar="NAME", help="This image stays as it is [mean and contrast of all stay].")
+@click.option("--degree", type=int, default=2, show_default=True, help="Of the trend over an image; 0: tables alone.")
+@click.option("--resolution", type=float, metavar="R", help="Pixels that are compared, metres [by the images' size].")
+@click.option("-o", "--output", type=PATH, metavar="FOLDER", help="[balance by the project]")
+@click.option("--no-picture", is_flag=True, help="Do not draw balance.png.")
+@workers_option
+@dry_run_option("Look at the images and stop.")
+@overwrite_option
+@json_option
+@quiet_option
+def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> None:
+    """Find tables by which the images of PROJECT agree in colour where they overlap.
+
+    Each image gets a file with a table for every band, and an entry `balance` in PROJECT: `ortho` and `mosaic` apply it
+    from then on.
+    """
+    from photoplan.cli.telling import Telling
+    from photoplan.engine.executors import available_cpus
+    from photoplan.io.naming import together
+    from photoplan.products.balance.run import BalanceRequest, balance_project
+    from photoplan.report.balance import BalancePlots
+    from photoplan.report.drawing import has_matplotlib
+    from photoplan.report.page import open_picture
+
+    options["workers"] = options["workers"] or available_cpus()
+    request = BalanceRequest(**options)
+    wanted = not no_picture and not request.dry_run and has_matplotlib()
+    place = request.folder / "balance.png" if wanted else None
+    drawing = open_picture(place, [request.project], overwrite=request.overwrite)
+    with together():
+        with Telling(quiet) as events:
+            found = balance_project(request, events)
+        picture = None if drawing is None else drawing.write(BalancePlots(drawing.mpl).balance(found))
+    if as_json:
+        show_json(found, picture=picture)
+    elif found.pairs is None:
+        grid = found.survey.grid
+        pixels = f"{grid.width} × {grid.height} pixels of {grid.resolution:g} m"
+        show(f"{len(found.survey.names)} images, compared on {pixels}")
+    else:
+        show(request.table)
+        if picture is not None:
+            show(picture)
+        _print(found)
+    if not quiet:
+        for note in found.notes:
+            say(note)
+
+
+def _print(found: BalanceReport) -> None:
+    pairs, made = found.pairs, found.balanced
+    assert pairs is not None and made is not None
+    before, after = found.rms()
+    resolution = found.survey.grid.resolution
+    show(f"{len(made.images)} images, {len(pairs.images)} overlaps at {resolution:g} m: rms differences, grey values")
+    show(f"{'':32}  {'before':>24}  {'after':>24}")
+    show(f"{'mean of the overlaps':32}  {_values(before):>24}  {_values(after):>24}")
+    worst = (-pairs.after.mean(axis=1)).argsort()[:_LISTED]
+    for k in worst.tolist():
+        both = " – ".join(found.named(i)[-15:] for i in pairs.images[k])
+        show(f"{both:32}  {_values(pairs.before[k]):>24}  {_values(pairs.after[k]):>24}")
+    if len(pairs.images) > _LISTED:
+        show(f"and {len(pairs.images) - _LISTED} more, better ones")
+    if made.shoulder:
+        show("bright and dark ends of the tables are bent to stay inside the range")
+    show(f"{len(found.files)} balance files are entered in the project; `ortho` and `mosaic` apply them")
+
+
+def _values(values: Any) -> str:
+    return " ".join(f"{value:6.1f}" for value in values)

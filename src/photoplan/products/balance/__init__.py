@@ -1,0 +1,1 @@
+"""`balance`: tables by which the images of a project agree in colour."""

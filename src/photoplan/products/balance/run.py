@@ -1,0 +1,258 @@
+"""Tables for the images of a project, from all that they show in common; written, and entered into the project file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import GeometryError, UsageError
+from photoplan.events import SILENT, Events
+from photoplan.io.balance_file import BalanceBand, write_balance_file
+from photoplan.io.names import safe_stem
+from photoplan.io.naming import together
+from photoplan.io.product import check_output
+from photoplan.io.project.edit import ProjectChanges, edit_project
+from photoplan.io.project.file import load_project
+from photoplan.io.project.model import Project
+from photoplan.io.run_record import input_entry, run_key, run_times, write_run_record
+from photoplan.io.tables import write_table
+from photoplan.plain import pick
+from photoplan.products.balance.sample import Survey, sample, survey
+from photoplan.project.scene import input_files
+from photoplan.radiometry.balance import Balanced, Pairs, balance, even_images, pairs_of
+from photoplan.radiometry.cells import Cells
+
+
+@dataclass(frozen=True)
+class BalanceRequest:
+    """What is asked."""
+
+    project: Path
+    images: tuple[str, ...] = ()
+    """Names or patterns; none: all."""
+    reference_image: str | None = None
+    """The image that stays as it is; None: the block keeps its mean and its contrast."""
+    degree: int = 2
+    """Of the trend over an image; 0: tables alone."""
+    resolution: float | None = None
+    """Side of the pixels that are compared, metres."""
+    output: Path | None = None
+    workers: int = 1
+    overwrite: bool = False
+    dry_run: bool = False
+
+    @property
+    def folder(self) -> Path:
+        """Where tables are written."""
+        return self.output or self.project.resolve().parent / "balance"
+
+    @property
+    def table(self) -> Path:
+        """The table of overlaps."""
+        return self.folder / "overlaps.csv"
+
+
+@dataclass(frozen=True, eq=False)
+class BalanceReport:
+    """What was found."""
+
+    survey: Survey
+    notes: tuple[str, ...]
+    """Images without tables, and other things that a user should know."""
+    cells: Cells | None = None
+    """None after a dry run, as all that follows."""
+    balanced: Balanced | None = None
+    pairs: Pairs | None = None
+    files: tuple[Path, ...] = ()
+    """Balance files, by image as in `balanced`."""
+
+    def named(self, number: int) -> str:
+        """Name of an image."""
+        return self.survey.names[number]
+
+    def rms(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Mean over the pairs of images of their differences before and after, by band, grey values."""
+        assert self.pairs is not None
+        return self.pairs.before.mean(axis=0), self.pairs.after.mean(axis=0)
+
+    def json_fields(self) -> dict[str, Any]:
+        """Figures by name."""
+        fields: dict[str, Any] = {
+            "images": self.survey.names,
+            "resolution": self.survey.grid.resolution,
+            "notes": self.notes,
+        }
+        if self.pairs is None or self.balanced is None:
+            return fields
+        before, after = self.rms()
+        pairs = [
+            {"images": [self.named(i) for i in both], "pixels": n, "rms_before": b, "rms_after": a}
+            for both, n, b, a in zip(self.pairs.images, self.pairs.pixels, self.pairs.before, self.pairs.after)
+        ]
+        found = self.balanced
+        return {
+            **fields,
+            "rms_before": before,
+            "rms_after": after,
+            "contrast": found.contrast,
+            "shoulder": found.shoulder,
+            "sigma": [each.sigma for each in found.bands],
+            "weighted_down": [each.down for each in found.bands],
+            "files": {self.named(int(k)): path for k, path in zip(found.images, self.files)},
+            "pairs": pairs,
+        }
+
+
+def balance_project(request: BalanceRequest, events: Events = SILENT) -> BalanceReport:
+    """Find tables by which the images of a project agree, write them, and enter them into the project.
+
+    Tables that images have already are not applied before: the same command gives the same tables.
+
+    Raises
+    ------
+    UsageError
+        An output exists, or an option cannot be.
+    InputError
+        An input cannot be used, or images differ in bands or type of pixels.
+    GeometryError
+        No two images have enough ground in common.
+    """
+    times, project = run_times(), _plain(load_project(request.project))
+    names = project.select(request.images or None)
+    fixed = _check(request, project, names)
+    found = survey(project, names, request.resolution, events)
+    notes = [f"left out, sees no terrain: {line}" for line in found.blind]
+    if request.dry_run:
+        return BalanceReport(found, tuple(notes))
+    cells = sample(found, request.workers, events)
+    limits = limits_of(cells, found.looked[0].scene.reader.dtype)
+    usable, even = _usable(cells, found, limits, notes)
+    number = None if fixed is None else found.names.index(fixed) if fixed in found.names else -1
+    _refuse_useless(usable, found, number, notes)
+    events.begin("adjusting", cells.bands, "bands")
+    made = balance(usable, found.sizes, limits, degree=request.degree, fixed=number, done=events.done)
+    _note(made, found, even, notes)
+    tones = dict(zip(made.images.tolist(), made.tones))
+    pairs = pairs_of(usable.shared, tones, found.sizes)
+    stems = {int(k): safe_stem(found.names[k]) for k in made.images}
+    files = tuple(request.folder / f"{stems[k]}.toml" for k in made.images.tolist())
+    report = BalanceReport(found, tuple(notes), cells, made, pairs, files)
+    inputs = [input_entry(request.project), *(input_entry(one.scene.reader.path) for one in found.looked)]
+    settings = pick(request, "reference_image", "degree", "resolution")
+    with together():
+        _write(request, project, report)
+        write_run_record(
+            request.table,
+            key=run_key("balance", settings, inputs),
+            inputs=inputs,
+            run={"workers": request.workers, **times()},
+            kind="balance",
+            product=report,
+            settings=settings,
+        )
+    return report
+
+
+def limits_of(cells: Cells, dtype: np.dtype[Any]) -> tuple[float, float]:
+    """Least and largest grey value: of the type for bytes; of others what images show, since few fill their type."""
+    if dtype == np.uint8:
+        return 0.0, 255.0
+    low, high = float(cells.pixels.min()), float(cells.pixels.max())
+    return (0.0 if dtype.kind == "u" else low), max(high, low + 1.0)
+
+
+def _plain(project: Project) -> Project:
+    """The project without tables."""
+    images = tuple(image.model_copy(update={"balance": None}) for image in project.images)
+    return project.model_copy(update={"images": images})
+
+
+def _check(request: BalanceRequest, project: Project, names: Sequence[str]) -> str | None:
+    """Name of the reference image, and everything that can be refused before any work."""
+    if len(names) < 2:
+        raise UsageError(f"{len(names)} image; two at least are compared")
+    if not 0 <= request.degree <= 4:
+        raise UsageError(f"degree {request.degree}; allowed are 0 (tables alone) to 4, usual is 2")
+    if not request.dry_run:
+        for path in (request.table, *(request.folder / f"{safe_stem(name)}.toml" for name in names)):
+            check_output(path, [request.project, *input_files(project)], overwrite=request.overwrite)
+    if request.reference_image is None:
+        return None
+    (fixed, *more) = project.select([request.reference_image])
+    if more or fixed not in names:
+        raise UsageError(f"reference image {request.reference_image!r}; give the name of one of the images")
+    return fixed
+
+
+def _usable(
+    cells: Cells, found: Survey, limits: tuple[float, float], notes: list[str]
+) -> tuple[Cells, NDArray[np.bool_]]:
+    """Cells without images that are all of one colour; these are named."""
+    even = even_images(cells, len(found.names), limits[1] - limits[0])
+    for k in np.flatnonzero(even):
+        grey = float(np.median(cells.pixels[cells.image == k]))
+        notes.append(
+            f"left out: {found.names[k]!r} has the grey value {grey:.0f} everywhere; look at its file, or take the "
+            "image out of the project"
+        )
+    return cells.some(~even[cells.image]), even
+
+
+def _refuse_useless(cells: Cells, found: Survey, fixed: int | None, notes: Sequence[str]) -> None:
+    shared = cells.shared
+    if not len(shared):
+        more = "\n  ".join(["", *notes])
+        raise GeometryError(
+            f"no two of {len(found.names)} images show enough of the same ground to be compared at "
+            f"{found.grid.resolution:g} m; give a finer resolution if their overlap is narrow{more}"
+        )
+    if fixed is not None and (fixed < 0 or fixed not in shared.image):
+        raise UsageError("the reference image shows no ground that another image shows; choose another one")
+
+
+def _note(made: Balanced, found: Survey, even: NDArray[np.bool_], notes: list[str]) -> None:
+    """Images that get no tables, and parts of the block that do not hang together."""
+    alone = [found.names[k] for k in range(len(found.names)) if k not in made.images and not even[k]]
+    if alone:
+        some = ", ".join(map(repr, alone[:5])) + (f" and {len(alone) - 5} more" if len(alone) > 5 else "")
+        notes.append(f"no overlap with other images, so no tables: {some}; they stay as they are")
+    parts, counts = np.unique(made.parts, return_counts=True)
+    if len(parts) > 1:
+        sizes = ", ".join(map(str, sorted(counts.tolist(), reverse=True)))
+        notes.append(f"the images hang together in {len(parts)} parts ({sizes} images), each is balanced by itself")
+
+
+def _write(request: BalanceRequest, project: Project, report: BalanceReport) -> None:
+    """Balance files, the table of overlaps, entries of the project."""
+    found, names = report.balanced, report.survey.names
+    assert found is not None and report.pairs is not None
+    request.folder.mkdir(parents=True, exist_ok=True)
+    gauge = f"{request.reference_image} stays" if request.reference_image else "the block keeps mean and contrast"
+    home = request.project.resolve().parent
+    entries: dict[str, dict[str, str | None]] = {}
+    for k, path, tones, sigmas in zip(found.images.tolist(), report.files, found.tones, found.sigmas):
+        bands = [
+            BalanceBand(grey=tone.grey, becomes=tone.becomes, sigma=sigma, trend=tone.terms)
+            for tone, sigma in zip(tones, sigmas)
+        ]
+        width, height = report.survey.sizes[k].tolist()
+        write_balance_file(path, (width, height), f"{names[k]}, among {len(found.images)} images; {gauge}", bands)
+        whole = path.resolve()
+        entry = whole.relative_to(home).as_posix() if whole.is_relative_to(home) else str(whole)
+        entries[names[k]] = {"balance": entry}
+    # Tables of an earlier run do not fit to those of this one.
+    entries |= {name: {"balance": None} for name in project.select(request.images or None) if name not in entries}
+    pairs = report.pairs
+    bands_ = range(1, pairs.before.shape[1] + 1)
+    header = ["image", "other", "pixels", *(f"before_{b}" for b in bands_), *(f"after_{b}" for b in bands_)]
+    rows = [
+        [names[i], names[j], int(n), *(f"{v:.2f}" for v in before), *(f"{v:.2f}" for v in after)]
+        for (i, j), n, before, after in zip(pairs.images.tolist(), pairs.pixels, pairs.before, pairs.after)
+    ]
+    write_table(request.table, header, rows)
+    edit_project(request.project, ProjectChanges(images=entries))

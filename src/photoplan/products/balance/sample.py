@@ -1,0 +1,135 @@
+"""What the images of a project show of the same ground, at a coarse resolution."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.base import project as into_image
+from photoplan.engine.execute import render
+from photoplan.engine.steps import steps
+from photoplan.errors import GeometryError
+from photoplan.events import Events
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.io.project.model import Project
+from photoplan.plan.compile import AnchorRule
+from photoplan.plan.footprint import covered_tiles
+from photoplan.plan.owner import InSight
+from photoplan.plan.product import ProductPlan
+from photoplan.plan.tiles import Tile, Tiles
+from photoplan.products.orthophoto.look import Looked, look_at, two_figures
+from photoplan.products.orthophoto.mosaic import refuse_mixed
+from photoplan.radiometry.cells import SIDE, Cells, cells_of
+from photoplan.surfaces.objects import painted_surface
+from photoplan.targets.map import MapTarget
+
+#: Pixels of the map along the shorter side of an image, unless a resolution is chosen.
+ACROSS = 256
+#: Cells along the side of a tile.
+_CELLS = 8
+_KERNEL, _TOLERANCE = "bilinear", 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """The images that see terrain, and the map on which they are compared."""
+
+    looked: tuple[Looked, ...]
+    blind: tuple[str, ...]
+    """A line for each image that sees none."""
+    grid: MapGrid
+    tiles: Tiles
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the images."""
+        return tuple(one.name for one in self.looked)
+
+    @property
+    def sizes(self) -> NDArray[np.int64]:
+        """Width and height of the images, (n, 2)."""
+        return np.array([one.scene.reader.size for one in self.looked], np.int64)
+
+
+def survey(project: Project, names: Sequence[str], resolution: float | None, events: Events) -> Survey:
+    """Look at images, and choose the map; no pixel is read.
+
+    Raises
+    ------
+    InputError
+        Images differ in bands or type of pixels.
+    GeometryError
+        No two images see terrain, or an orientation cannot be right.
+    """
+    events.begin("planning", len(names), "images")
+    looked, blind = look_at(project, names, False, events)
+    if len(looked) < 2:
+        seen = "one image sees" if looked else "no image sees"
+        raise GeometryError(f"{seen} terrain, two at least are compared:\n  " + "\n  ".join(blind or ["the others"]))
+    refuse_mixed(looked)
+    if resolution is None:
+        coarser = [one.look.gsd * max(1.0, min(one.scene.reader.size) / ACROSS) for one in looked]
+        resolution = two_figures(float(np.median(coarser)))
+    bounds = np.array([one.look.footprint.bounds for one in looked], float)
+    extent = (*bounds[:, :2].min(axis=0).tolist(), *bounds[:, 2:].max(axis=0).tolist())
+    grid = MapGrid.covering(extent, resolution, project.crs)
+    taken = []
+    for one in looked:
+        surface = painted_surface(one.scene.surface)
+        taken.append(covered_tiles(one.scene.camera, surface, grid, _CELLS * SIDE, one.look.footprint.bounds))
+    return Survey(tuple(looked), tuple(blind), grid, Tiles.shared(taken))
+
+
+def sample(found: Survey, workers: int, events: Events) -> Cells:
+    """What all images show, cell by cell; tiles are looked at one by one and forgotten."""
+    tiles = list(found.tiles)
+    events.begin("comparing", len(tiles), "tiles")
+    with steps("balance", workers, events) as run:
+        return Cells.joined(list(run(_Sampling(found).cells, tiles, pixels=lambda tile: tile.pixels)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Sampling:
+    """From a tile to its cells."""
+
+    survey: Survey
+
+    def cells(self, tile: Tile) -> Cells:
+        """Cells of a tile, with all images that see a part of it."""
+        window, values, valid, rows = tile.window, [], [], []
+        for row in tile.sources:
+            painted = self._pixels(self.survey.looked[row], window)
+            if painted is not None:
+                values.append(painted[0])
+                valid.append(painted[1])
+                rows.append(row)
+        if not rows:
+            bands = self.survey.looked[0].scene.reader.bands
+            values, valid = [np.zeros((bands, 1, 1), np.float32)], [np.zeros((1, 1), bool)]
+        number = tile.index * _CELLS**2
+        cells, middle = cells_of(np.stack(values), np.stack(valid), np.array(rows or [0], np.int64), number)
+        return self._placed(cells, middle + np.array([window.col, window.row]))
+
+    def _pixels(self, one: Looked, window: Window) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
+        """What an image shows of a window where nothing hides the ground; None: nothing."""
+        scene, grid = one.scene, self.survey.grid
+        rule = AnchorRule.of(_KERNEL, _TOLERANCE)
+        every = Tiles.every(grid.window, _CELLS * SIDE)
+        plan = ProductPlan(one.name, (one.name,), MapTarget(grid), rule, every, InSight())
+        made = render(plan, Tile(0, window, (0,)), scene.sources, scene.surface, _KERNEL)
+        if made.values is None or made.valid is None:
+            return None
+        return made.values.astype(np.float32), made.valid
+
+    def _placed(self, cells: Cells, at: NDArray[np.float64]) -> Cells:
+        """Cells with their places in the images; those that have none are left out."""
+        uv = np.full((len(cells), 2), np.nan)
+        XY = self.survey.grid.to_map(at)
+        for image in np.unique(cells.image).tolist():
+            rows, scene = cells.image == image, self.survey.looked[image].scene
+            heights = scene.surface.heights(XY[rows])
+            uv[rows] = into_image(scene.camera, np.concatenate([XY[rows], heights[:, None]], axis=1))
+        return replace(cells, uv=uv).some(np.isfinite(uv).all(axis=1))

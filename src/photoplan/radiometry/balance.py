@@ -1,0 +1,229 @@
+"""From what images show of the same ground to a tone for each of their bands, and what that brings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from photoplan.radiometry.adjust import Adjusted, Gauge, adjust
+from photoplan.radiometry.cells import Cells
+from photoplan.radiometry.equations import Band
+from photoplan.radiometry.tone import Tone, powers_of
+
+_Floats = NDArray[np.float64]
+
+#: Nodes of a table in the adjustment, and grey values of the table that comes of it.
+NODES, ENTRIES = 17, 33
+#: Where a shoulder begins, parts of the range from its ends; what of the pixels may lie beyond it without one.
+_SHOULDER, _BEYOND = 0.12, 0.0005
+#: An image whose grey values differ by less than this part of the range is all of one colour.
+_EVEN = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Balanced:
+    """Tones of the images of one block."""
+
+    images: NDArray[np.int64]
+    """Numbers of those that have tones."""
+    tones: tuple[tuple[Tone, ...], ...]
+    """For each of them one for each band."""
+    sigmas: tuple[tuple[tuple[float, ...], ...], ...]
+    """Standard deviations of what the tables' grey values become, in the same order."""
+    parts: NDArray[np.int64]
+    """Images of one number hang together by what they show."""
+    bands: tuple[Adjusted, ...]
+    """What each band's adjustment found."""
+    contrast: tuple[float, ...]
+    """Local contrast of the block after the adjustment, per band, before a common factor made it what it was."""
+    shoulder: bool
+    """Whether a common shoulder keeps bright and dark grey values inside the range."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """How much images of a pair differ, root mean square of single pixels of the map."""
+
+    images: NDArray[np.int64]
+    """Numbers of both, (n, 2)."""
+    pixels: NDArray[np.int64]
+    """Pixels that are compared, (n,)."""
+    before: _Floats
+    """(n, bands), grey values."""
+    after: _Floats
+
+
+def even_images(cells: Cells, images: int, span: float) -> NDArray[np.bool_]:
+    """Images that are all of one colour, black ones among them, (images,); `span`: range of their type."""
+    low, high = np.full(images, np.inf), np.full(images, -np.inf)
+    np.minimum.at(low, cells.image, cells.levels[..., 0].min(axis=1))
+    np.maximum.at(high, cells.image, cells.levels[..., -1].max(axis=1))
+    return np.asarray(np.isfinite(low) & (high - low < _EVEN * span))
+
+
+def parts_of(cells: Cells, images: int) -> NDArray[np.int64]:
+    """A number for each image (images,), the same for those that hang together."""
+    shape = images, int(cells.cell.max(initial=0)) + 1
+    seen = coo_array((np.ones(len(cells)), (cells.image, cells.cell)), shape=shape).tocsr()
+    return np.asarray(connected_components(seen @ seen.T, directed=False)[1], np.int64)
+
+
+def balance(
+    cells: Cells,
+    sizes: NDArray[np.int64],
+    limits: tuple[float, float],
+    *,
+    degree: int = 2,
+    fixed: int | None = None,
+    done: Callable[[], None] = lambda: None,
+) -> Balanced:
+    """Tones by which images agree where they show the same ground.
+
+    Parameters
+    ----------
+    cells : Cells
+        Of all images.
+    sizes : ndarray, shape (images, 2)
+        Width and height of the images.
+    limits : (float, float)
+        Least and largest grey value of their type.
+    degree : int
+        Of the trend over an image; 0: tables alone.
+    fixed : int, optional
+        Number of the image that stays as it is; else the block keeps its mean and its contrast.
+    done : callable
+        Called after each band.
+    """
+    shared = cells.shared
+    images, of = np.unique(shared.image, return_inverse=True)
+    inner = replace(shared, image=np.asarray(of, np.int64).reshape(-1))
+    parts = parts_of(inner, len(images))
+    place = None if fixed is None else int(np.flatnonzero(images == fixed)[0])
+    powers = powers_of(degree)
+    nodes, found = np.linspace(*limits, NODES), []
+    for band in range(cells.bands):
+        found.append(adjust(Band.of(inner, band, sizes[images], powers, nodes), Gauge(parts, place)))
+        done()
+    seen = cells.some(np.isin(cells.image, images))
+    raw = [[_tone(nodes, each, k, powers) for each in found] for k in range(len(images))]
+    kept = np.ones((cells.bands, 2)) * [0.0, 1.0] if place is not None else _kept(seen, images, sizes, raw)
+    moved = [[_mapped(tone, partial(_linear, *kept[b])) for b, tone in enumerate(each)] for each in raw]
+    beyond = _beyond(seen, images, sizes, moved, limits)
+    if beyond:
+        bent = [[_mapped(tone, partial(shoulder, limits=limits)) for tone in each] for each in moved]
+        moved = [each if k == place else bent[k] for k, each in enumerate(moved)]
+    sigmas = tuple(
+        tuple(_sigmas(nodes, each, k, raw[k][b], moved[k][b]) for b, each in enumerate(found))
+        for k in range(len(images))
+    )
+    contrast = tuple(1.0 / kept[:, 1])
+    return Balanced(images, tuple(map(tuple, moved)), sigmas, parts, tuple(found), contrast, beyond)
+
+
+def shoulder(value: _Floats, limits: tuple[float, float]) -> _Floats:
+    """Grey values bent so that they stay between limits; in the middle they are what they were."""
+    low, high = limits
+    room = _SHOULDER * (high - low)
+    top, bottom = high - room, low + room
+    out = np.where(value > top, high - room * np.exp(-np.maximum(value - top, 0.0) / room), value)
+    return np.asarray(np.where(value < bottom, low + room * np.exp(-np.maximum(bottom - value, 0.0) / room), out))
+
+
+def pairs_of(cells: Cells, tones: dict[int, Sequence[Tone]], sizes: NDArray[np.int64]) -> Pairs:
+    """How images differ before and after; those without tones stay as they are."""
+    after = _values(cells, tones, sizes)
+    first, second = [], []
+    for apart in range(1, len(cells)):
+        near = np.flatnonzero(cells.cell[apart:] == cells.cell[:-apart])
+        if not len(near):
+            break
+        first.append(near)
+        second.append(near + apart)
+    a, b = (np.concatenate(rows) if rows else np.empty(0, np.int64) for rows in (first, second))
+    pair, of, count = np.unique(
+        np.stack([cells.image[a], cells.image[b]], axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    squares = []
+    for values in (cells.pixels.astype(float), after):
+        mean = np.square(values[a] - values[b]).mean(axis=2)
+        total = np.zeros((len(pair), cells.bands))
+        np.add.at(total, of.reshape(-1), mean)
+        squares.append(np.sqrt(total / count[:, None]))
+    return Pairs(pair, count * cells.pixels.shape[2], squares[0], squares[1])
+
+
+def _tone(nodes: _Floats, found: Adjusted, image: int, powers: Sequence[tuple[int, int]]) -> Tone:
+    """The tone of an image: its table the other way, with equal steps of grey between entries."""
+    table = Tone(tuple(found.state.tables[image].tolist()), tuple(nodes.tolist()))
+    grey = np.linspace(nodes[0], nodes[-1], ENTRIES)
+    terms = tuple((i, j, float(c)) for (i, j), c in zip(powers, found.state.trends[image]))
+    return Tone(tuple(grey.tolist()), tuple(table.table(grey).tolist()), terms)
+
+
+def _mapped(tone: Tone, function: Callable[[_Floats], _Floats]) -> Tone:
+    """A tone after which a rising function comes."""
+    becomes = np.maximum.accumulate(function(np.asarray(tone.becomes)))
+    return replace(tone, becomes=tuple(becomes.tolist()))
+
+
+def _linear(shift: float, factor: float, value: _Floats) -> _Floats:
+    return shift + factor * value
+
+
+def _values(cells: Cells, tones: dict[int, Sequence[Tone]], sizes: NDArray[np.int64]) -> _Floats:
+    """The cells' pixels after the tones, (m, bands, pixels)."""
+    return _toned(cells, cells.pixels, tones, sizes)
+
+
+def _toned(
+    cells: Cells, values: NDArray[np.float32], tones: dict[int, Sequence[Tone]], sizes: NDArray[np.int64]
+) -> _Floats:
+    out = values.astype(float)
+    order = np.argsort(cells.image, kind="stable")
+    starts = np.searchsorted(cells.image[order], np.arange(len(sizes) + 1))
+    for image, tone in tones.items():
+        rows = order[starts[image] : starts[image + 1]]
+        (x, y), size = cells.uv[rows].T, (int(sizes[image][0]), int(sizes[image][1]))
+        for band, each in enumerate(tone):
+            trend = each.trend(x, y, size)[:, None] if each.terms else 1.0
+            out[rows, band] = each.table(out[rows, band] / trend)
+    return out
+
+
+def _kept(
+    cells: Cells, images: NDArray[np.int64], sizes: NDArray[np.int64], tones: Sequence[Sequence[Tone]]
+) -> _Floats:
+    """For each band the shift and the factor by which the block keeps its mean and its local contrast, (bands, 2)."""
+    low, high = cells.levels.shape[2] // 5, -1 - cells.levels.shape[2] // 5
+    after = _toned(cells, cells.levels, dict(zip(images.tolist(), tones)), sizes)
+    before = cells.levels.astype(float)
+    spread = [(each[..., high] - each[..., low]).sum(axis=0) for each in (before, after)]
+    factor = np.where(spread[1] > 0, spread[0] / np.maximum(spread[1], 1e-12), 1.0)
+    shift = before.mean(axis=(0, 2)) - factor * after.mean(axis=(0, 2))
+    return np.stack([shift, factor], axis=1)
+
+
+def _beyond(
+    cells: Cells,
+    images: NDArray[np.int64],
+    sizes: NDArray[np.int64],
+    tones: Sequence[Sequence[Tone]],
+    limits: tuple[float, float],
+) -> bool:
+    """Whether more pixels leave the range than may."""
+    after = _values(cells, dict(zip(images.tolist(), tones)), sizes)
+    inside = (cells.pixels > limits[0]) & (cells.pixels < limits[1])
+    beyond = inside & ((after <= limits[0]) | (after >= limits[1]))
+    return bool(beyond.mean(axis=(0, 2)).max(initial=0.0) > _BEYOND)
+
+
+def _sigmas(nodes: _Floats, found: Adjusted, image: int, before: Tone, after: Tone) -> tuple[float, ...]:
+    """Standard deviations of a table's entries, scaled by what came after the adjustment."""
+    shown = np.interp(before.becomes, nodes, found.sigmas.tables[image])
+    return tuple((shown * np.gradient(np.asarray(after.becomes), np.asarray(after.grey))).tolist())

@@ -1,0 +1,126 @@
+"""Equations of one band: the same ground has its grey value in every image, quantile by quantile.
+
+An image shows ground of grey value G as grey = F(G) · v. F is a table, the image's own; v, near 1, changes slowly over
+the image: vignetting, haze, the angles of sun and view. A quantile of an image in a cell is an observation of that;
+all images of a cell have the G of their quantiles in common, which is an unknown as well, and is taken out of the
+equations before they are solved. Errors are those of the grey values that images have: if tables were asked to make
+images equal, they would do so by taking their contrast away.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from photoplan.radiometry.cells import Cells
+from photoplan.radiometry.tone import LEAST, surface
+
+_Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Unknowns of all images of one band."""
+
+    tables: _Floats
+    """(images, nodes): F at the nodes."""
+    trends: _Floats
+    """(images, terms): coefficients of v."""
+    ground: _Floats
+    """(groups,): G of what the images of a cell have in common."""
+
+    @property
+    def width(self) -> int:
+        """Unknowns of an image."""
+        return self.tables.shape[1] + self.trends.shape[1]
+
+    @property
+    def vector(self) -> _Floats:
+        """Those of all images, (images · width,)."""
+        return np.concatenate([self.tables, self.trends], axis=1).ravel()
+
+    def with_vector(self, vector: _Floats) -> State:
+        """The same ground with other images."""
+        each = vector.reshape(len(self.tables), self.width)
+        nodes = self.tables.shape[1]
+        return replace(self, tables=each[:, :nodes], trends=each[:, nodes:])
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """The observations of one band: one for every quantile of every image in every cell."""
+
+    image: NDArray[np.int64]
+    """(n,)."""
+    group: NDArray[np.int64]
+    """Cell and quantile, (n,)."""
+    cell: NDArray[np.int64]
+    """(n,)."""
+    grey: _Floats
+    """(n,)."""
+    weight: _Floats
+    """(n,): quantiles of a cell together count as two observations, a part of a cell less."""
+    surfaces: _Floats
+    """(n, terms)."""
+    nodes: _Floats
+    """Grey values G of the tables, at equal steps."""
+
+    @classmethod
+    def of(
+        cls,
+        cells: Cells,
+        band: int,
+        sizes: NDArray[np.int64],
+        powers: tuple[tuple[int, int], ...],
+        nodes: _Floats,
+    ) -> Band:
+        """Observations of shared cells; `sizes` (images, 2): width and height."""
+        many = cells.levels.shape[2]
+        _, cell = np.unique(cells.cell, return_inverse=True)
+        surfaces = np.zeros((len(cells), len(powers)))
+        for size in np.unique(sizes, axis=0):
+            rows = (sizes[cells.image] == size).all(axis=1)
+            surfaces[rows] = surface(cells.uv[rows, 0], cells.uv[rows, 1], (int(size[0]), int(size[1])), powers)
+        return cls(
+            image=np.repeat(cells.image, many),
+            group=(cell[:, None] * many + np.arange(many)).ravel(),
+            cell=np.repeat(cell, many),
+            grey=cells.levels[:, band].astype(float).ravel(),
+            weight=np.repeat(cells.share * 2.0 / many, many),
+            surfaces=np.repeat(surfaces, many, axis=0),
+            nodes=nodes,
+        )
+
+    @property
+    def step(self) -> float:
+        """Between two nodes."""
+        return float(self.nodes[1] - self.nodes[0])
+
+    @property
+    def own(self) -> _Floats:
+        """Mean grey value of the images of each group, (groups,)."""
+        return np.asarray(np.bincount(self.group, self.grey) / np.bincount(self.group))
+
+    def start(self, images: int) -> State:
+        """All images show what they have in the mean."""
+        return State(np.tile(self.nodes, (images, 1)), np.zeros((images, self.surfaces.shape[1])), self.own)
+
+    def predicted(self, state: State) -> tuple[_Floats, _Floats, csr_array]:
+        """What the images show (n,), its derivatives by G (n,), and by the unknowns of the images (n, unknowns)."""
+        v = np.maximum(1.0 + (self.surfaces * state.trends[self.image]).sum(axis=1), LEAST)
+        at = (state.ground[self.group] - self.nodes[0]) / self.step
+        k = np.clip(np.floor(at), 0, len(self.nodes) - 2).astype(np.int64)
+        part = at - k
+        low, high = state.tables[self.image, k], state.tables[self.image, k + 1]
+        table = low + part * (high - low)
+        values = np.column_stack([(1 - part) * v, part * v, table[:, None] * self.surfaces])
+        first = self.image * state.width
+        terms = len(self.nodes) + np.arange(self.surfaces.shape[1])
+        columns = np.column_stack([first + k, first + k + 1, first[:, None] + terms])
+        starts = np.arange(0, values.size + 1, values.shape[1])
+        shape = len(self.grey), len(state.tables) * state.width
+        A = csr_array((values.ravel(), columns.ravel(), starts), shape=shape)
+        return table * v, (high - low) / self.step * v, A

@@ -1,0 +1,133 @@
+"""What becomes of grey values: a trend over the image is taken out, then a monotone table follows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.errors import InputError
+from photoplan.geometry.grid import Window
+
+_Floats = NDArray[np.float64]
+
+#: A trend is no less than this, however far its surface runs off in a corner.
+LEAST = 0.2
+
+
+@dataclass(frozen=True)
+class Tone:
+    """The table and the trend of one band of one image: out = table(grey / trend(x, y))."""
+
+    grey: tuple[float, ...]
+    """Grey values of the table, rising."""
+    becomes: tuple[float, ...]
+    """What they become, never falling; between them it is linear, beyond them the first or last interval goes on."""
+    terms: tuple[tuple[int, int, float], ...] = ()
+    """(i, j, c) of the trend 1 + Σ c (uⁱ vʲ − m); see `surface`."""
+
+    def __post_init__(self) -> None:
+        grey, becomes = np.asarray(self.grey), np.asarray(self.becomes)
+        if len(grey) != len(becomes) or len(grey) < 2:
+            raise InputError(f"{len(grey)} grey values that become {len(becomes)}; as many are needed, two at least")
+        if not (np.isfinite(grey).all() and np.isfinite(becomes).all()):
+            raise InputError("a grey value of the table is no number")
+        falling = np.flatnonzero(np.diff(grey) <= 0)
+        if len(falling):
+            raise InputError(f"grey {grey[falling[0] + 1]:g} comes after {grey[falling[0]]:g}; they must rise")
+        falling = np.flatnonzero(np.diff(becomes) < 0)
+        if len(falling):
+            k = falling[0]
+            raise InputError(
+                f"grey {grey[k]:g} becomes {becomes[k]:g}, but {grey[k + 1]:g} becomes {becomes[k + 1]:g}; "
+                "a table may not fall"
+            )
+
+    def table(self, grey: ArrayLike) -> _Floats:
+        """What grey values become without the trend."""
+        x, y = np.asarray(self.grey), np.asarray(self.becomes)
+        value = np.asarray(grey, float)
+        out = np.interp(value, x, y)
+        low, high = value < x[0], value > x[-1]
+        if low.any():
+            out = np.where(low, y[0] + (value - x[0]) * (y[1] - y[0]) / (x[1] - x[0]), out)
+        if high.any():
+            out = np.where(high, y[-1] + (value - x[-1]) * (y[-1] - y[-2]) / (x[-1] - x[-2]), out)
+        return np.asarray(out, float)
+
+    def trend(self, x: ArrayLike, y: ArrayLike, size: tuple[int, int]) -> _Floats:
+        """How bright the image is at pixels, beside its mean; `size`: of the image."""
+        surfaces = surface(x, y, size, tuple((i, j) for i, j, _ in self.terms))
+        return np.asarray(np.maximum(1.0 + surfaces @ np.array([c for _, _, c in self.terms]), LEAST))
+
+
+def powers_of(degree: int) -> tuple[tuple[int, int], ...]:
+    """Powers (i, j) of the surfaces up to a degree, without the constant."""
+    return tuple((total - j, j) for total in range(1, degree + 1) for j in range(total + 1))
+
+
+def surface(x: ArrayLike, y: ArrayLike, size: tuple[int, int], powers: Sequence[tuple[int, int]]) -> _Floats:
+    """Surfaces uⁱ vʲ minus their mean over the image, shape (..., terms).
+
+    u and v are columns and rows from the image's middle in half diagonals. Without their means a trend brightens
+    one part of the image and darkens another, and leaves the whole as it is.
+
+    Parameters
+    ----------
+    x, y : array_like
+        Columns and rows.
+    size : (int, int)
+        Width and height of the image.
+    powers : sequence of (i, j)
+    """
+    half = np.hypot(*size) / 2
+    u = (np.asarray(x, float) - (size[0] - 1) / 2) / half
+    v = (np.asarray(y, float) - (size[1] - 1) / 2) / half
+    edge = np.array(size) / 2 / half
+    found = []
+    for i, j in powers:
+        means = [0.0 if power % 2 else e**power / (power + 1) for power, e in zip((i, j), edge.tolist())]
+        found.append(u**i * v**j - means[0] * means[1])
+    return np.stack(found, axis=-1) if found else np.empty((*np.broadcast_shapes(u.shape, v.shape), 0))
+
+
+def toned(pixels: NDArray[Any], window: Window, size: tuple[int, int], tones: Sequence[Tone]) -> NDArray[Any]:
+    """Pixels of a window of an image after table and trend, in their own type.
+
+    Parameters
+    ----------
+    pixels : ndarray, shape (bands, height, width)
+        Integers are rounded and kept inside their type's range; NaN stays NaN.
+    window : Window
+        Where they lie in the image.
+    size : (int, int)
+        Width and height of the image.
+    tones : sequence of Tone
+        One for each band.
+    """
+    out = np.empty_like(pixels)
+    for band, tone in enumerate(tones):
+        if not tone.terms and pixels.dtype.kind in "ui" and pixels.dtype.itemsize <= 2:
+            limits = np.iinfo(pixels.dtype)
+            table = fitted(tone.table(np.arange(limits.min, limits.max + 1)), pixels.dtype)
+            out[band] = table[pixels[band].astype(np.int64) - limits.min]
+            continue
+        grey = pixels[band].astype(np.float64)
+        if tone.terms:
+            x, y = (
+                start + np.arange(count) for start, count in ((window.col, window.width), (window.row, window.height))
+            )
+            grey /= tone.trend(x[None, :], y[:, None], size)
+        out[band] = fitted(tone.table(grey), pixels.dtype)
+    return out
+
+
+def fitted(values: _Floats, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Values in a type: integers rounded and kept inside its range."""
+    if dtype.kind not in "ui":
+        return values.astype(dtype)
+    limits = np.iinfo(dtype)
+    return np.clip(np.rint(values), limits.min, limits.max).astype(dtype)

@@ -1,0 +1,106 @@
+"""The picture of balanced images: overlaps before and after, tables, and trends over the images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from photoplan.products.balance.run import BalanceReport
+from photoplan.radiometry.balance import Balanced, Pairs
+from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SOFT, STYLE, png
+
+_BANDS = (RED, GREEN, BLUE, ORANGE)
+#: Pairs and images that are shown.
+_PAIRS, _TRENDS = 30, 4
+#: Points of a trend along the longer side of an image.
+_SIDE = 60
+
+
+@dataclass(frozen=True, eq=False)
+class BalancePlots:
+    """Draws what `photoplan balance` has found."""
+
+    mpl: Any
+
+    def balance(self, report: BalanceReport) -> bytes:
+        """Overlaps, tables and trends, as PNG."""
+        pairs, found = report.pairs, report.balanced
+        assert pairs is not None and found is not None
+        shown = np.argsort(-pairs.before.mean(axis=1))[:_PAIRS]
+        images = _spread(found)
+        trends = bool(images) and bool(found.tones[0][0].terms)
+        bands = min(len(found.tones[0]), len(_BANDS))
+        with self.mpl.rc_context(STYLE):
+            heights = [1.1 + 0.2 * len(shown), 3.0, *([2.6] if trends else [])]
+            fig = self.mpl.figure.Figure(figsize=(10.0, sum(heights) + 0.6), layout="constrained")
+            rows = fig.add_gridspec(len(heights), 1, height_ratios=heights)
+            _overlaps(fig.add_subplot(rows[0]), report, pairs, shown.tolist())
+            cells = rows[1].subgridspec(1, bands)
+            for band in range(bands):
+                _tables(fig.add_subplot(cells[band]), found, band)
+            if trends:
+                cells = rows[2].subgridspec(1, len(images))
+                for column, k in enumerate(images):
+                    _trend(fig, fig.add_subplot(cells[column]), report, found, k)
+            return png(fig)
+
+
+def _overlaps(axes: Any, report: BalanceReport, pairs: Pairs, shown: list[int]) -> None:
+    """A line from before to after, for each pair and band."""
+    bands = min(pairs.before.shape[1], len(_BANDS))
+    for band, colour in zip(range(bands), _BANDS):
+        y = np.arange(len(shown)) + (band - (bands - 1) / 2) * 0.22
+        before, after = pairs.before[shown, band], pairs.after[shown, band]
+        axes.hlines(y, after, before, color=colour, linewidth=1.2, alpha=0.5)
+        axes.plot(before, y, "o", markersize=3.5, markerfacecolor="white", color=colour)
+        axes.plot(after, y, "o", markersize=3.5, color=colour, label=f"band {band + 1}")
+    names = [" – ".join(_ending(report.named(int(i))) for i in pairs.images[k]) for k in shown]
+    axes.set_yticks(range(len(shown)), names, fontsize=7)
+    axes.invert_yaxis()
+    axes.set_xlim(left=0)
+    axes.set_xlabel("root mean square of differences, grey values")
+    more = "" if len(shown) == len(pairs.images) else f", the {len(shown)} worst of {len(pairs.images)}"
+    axes.set_title(f"Overlaps before (open) and after (full){more}")
+    axes.legend(loc="lower right")
+
+
+def _tables(axes: Any, found: Balanced, band: int) -> None:
+    """The tables of all images, with what stays the same."""
+    every = [tone[band] for tone in found.tones]
+    ends = [every[0].grey[0], every[0].grey[-1]]
+    axes.plot(ends, ends, color=SOFT, linewidth=0.8, linestyle=":")
+    for tone, sigmas in zip(every, (each[band] for each in found.sigmas)):
+        becomes, sigma = np.array(tone.becomes), np.array(sigmas)
+        if len(every) <= 8:
+            axes.fill_between(tone.grey, becomes - sigma, becomes + sigma, color=_BANDS[band], alpha=0.12, linewidth=0)
+        axes.plot(tone.grey, becomes, color=_BANDS[band], linewidth=1.0, alpha=max(0.15, 1.0 / np.sqrt(len(every))))
+    axes.set(xlabel="grey value", title=f"Tables, band {band + 1}")
+    if band == 0:
+        axes.set_ylabel("becomes (band: one σ)" if len(every) <= 8 else "becomes")
+
+
+def _trend(fig: Any, axes: Any, report: BalanceReport, found: Balanced, k: int) -> None:
+    """The trend of the first band over an image."""
+    number = int(found.images[k])
+    width, height = report.survey.sizes[number].tolist()
+    x, y = (np.linspace(0, side - 1, max(2, round(_SIDE * side / max(width, height)))) for side in (width, height))
+    trend = found.tones[k][0].trend(x[None, :], y[:, None], (width, height))
+    picture = axes.imshow(trend, cmap="RdBu_r", vmin=0.6, vmax=1.4, extent=(0, width, height, 0))
+    axes.contour(x, y, trend, levels=np.arange(0.2, 3, 0.1), colors=INK, linewidths=0.4)
+    axes.set_title(f"Trend, band 1: {_ending(report.named(number))}", fontsize=8)
+    axes.set(xticks=[], yticks=[])
+    axes.grid(False)
+    fig.colorbar(picture, ax=axes, fraction=0.05)
+
+
+def _ending(name: str, most: int = 22) -> str:
+    """The end of a name, by which images differ."""
+    return name if len(name) <= most else "…" + name[1 - most :]
+
+
+def _spread(found: Balanced) -> list[int]:
+    """Places of some images with tones, spread over all."""
+    count = len(found.images)
+    return sorted({int(k) for k in np.linspace(0, count - 1, min(_TRENDS, count))}) if count else []

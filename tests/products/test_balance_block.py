@@ -1,0 +1,121 @@
+"""`photoplan balance` of a small block: tables are entered and applied by `ortho`; odd images are named."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import rasterio
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
+from tools.command import Here
+from tools.small_block import NAMES, SIZE, X0, Y0, Z0, Block, make_project, write_image, write_terrain
+
+from photoplan.io.project.file import load_project
+from photoplan.products.balance.run import BalanceRequest, balance_project
+
+AWAY = (-60.0, 0.0, 60.0)
+NOISE = gaussian_filter(np.random.default_rng(5).normal(size=(3, 420, 420)), (0, 6, 6))
+GROUND = 120 + 35 * NOISE / NOISE.std()
+
+
+def grey(name: str, light: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What an image makes of the ground (bands, rows, columns): exposure and haze, falling off to the corners."""
+    col, row = np.meshgrid(np.arange(SIZE[0]) - (SIZE[0] - 1) / 2, np.arange(SIZE[1]) - (SIZE[1] - 1) / 2)
+    fall = 1 - 0.25 * (col**2 + row**2) / (SIZE[0] ** 2 + SIZE[1] ** 2) * 4
+    made = {"one": light, "two": 0.6 * light + 30, "three": 255 * (np.clip(light, 0, 255) / 255) ** 1.3}
+    return np.asarray(made[name] * fall)
+
+
+@pytest.fixture
+def block(small: Block) -> Block:
+    """Three vertical images of one level ground, each with its own colours."""
+    col, row = np.meshgrid(np.arange(SIZE[0]) - (SIZE[0] - 1) / 2, np.arange(SIZE[1]) - (SIZE[1] - 1) / 2)
+    for path, name, dx in zip(small.images, NAMES, AWAY):
+        seen = np.stack([map_coordinates(band, [210 + row, 210 + col + dx / 1.5], order=3) for band in GROUND])
+        write_image(path, np.clip(np.rint(grey(name, seen)), 1, 255).astype(np.uint8))
+    lines = [f"{name},{X0 + dx},{Y0},{Z0},0,0,0" for name, dx in zip(NAMES, AWAY)]
+    small.orientation.write_text("\n".join(["name,x,y,z,omega,phi,kappa", *lines, ""]))
+    write_terrain(small.terrain, np.full((60, 64), 100.0))
+    make_project(small)
+    return small
+
+
+def differences(block: Block, photoplan: Here, name: str) -> float:
+    """Rms difference of orthophotos in their overlaps."""
+    folder = block.folder / name
+    words = ("ortho", block.project, "--resolution", 3, "--bounds", X0 - 60, Y0 - 90, X0 + 60, Y0 + 90)
+    said = photoplan(*words, "--output", folder, "--no-quicklook")
+    assert said.code == 0, said.err
+    pixels = []
+    for image in NAMES:
+        with rasterio.open(folder / f"{image}_ortho.tif") as file:
+            pixels.append(np.where(file.dataset_mask() > 0, file.read().astype(float), np.nan))
+    return float(np.sqrt(np.nanmean((pixels[0] - pixels[1]) ** 2) + np.nanmean((pixels[2] - pixels[1]) ** 2)))
+
+
+def test_tables_are_written_and_orthophotos_made_with_them(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    photoplan = Here(capsys)
+    before = differences(block, photoplan, "before")
+    dry = photoplan("balance", block.project, "--dry-run")
+    assert dry.code == 0 and "3 images, compared on" in dry.out and not (block.folder / "balance").exists()
+    said = photoplan("balance", block.project, "--resolution", 1.5)
+    assert said.code == 0, said.err
+    assert {path.name for path in (block.folder / "balance").iterdir()} == {
+        *(f"{name}.toml" for name in NAMES), "overlaps.csv", "overlaps.run.json", "balance.png",
+    }  # fmt: skip
+    entries = {image.name: image.balance for image in load_project(block.project).images}
+    assert entries == {name: f"balance/{name}.toml" for name in NAMES}
+    after = differences(block, photoplan, "after")
+    assert before > 20 and after < 3.5
+    again = photoplan("balance", block.project, "--resolution", 1.5)
+    assert again.code == 2 and "exists already" in again.err and "--overwrite" in again.err
+    kept = {name: (block.folder / "balance" / f"{name}.toml").read_text() for name in NAMES}
+    record = json.loads((block.folder / "balance" / "overlaps.run.json").read_text())
+    assert np.mean(record["product"]["rms_after"]) < 3 < 15 < np.mean(record["product"]["rms_before"])
+    said = photoplan("balance", block.project, "--resolution", 1.5, "--overwrite", "--json", "--no-picture")
+    assert said.code == 0 and json.loads(said.out)["notes"] == []
+    # Tables are found from the images as they are, not from what earlier tables made of them.
+    assert kept == {name: (block.folder / "balance" / f"{name}.toml").read_text() for name in NAMES}
+    other = block.folder / "balance" / "two.toml"
+    other.write_text(kept["two"].replace("becomes = [", "becomes = [300, ", 1))
+    broken = photoplan("ortho", block.project, "--resolution", 3, "--output", block.folder / "broken")
+    assert broken.code == 3 and "two.toml" in broken.err
+
+
+def test_the_reference_image_keeps_its_colours(block: Block) -> None:
+    found = balance_project(BalanceRequest(block.project, reference_image="one", resolution=1.5))
+    assert found.balanced is not None
+    tone = found.balanced.tones[0][0]
+    np.testing.assert_allclose(tone.becomes, tone.grey, atol=0.1)
+
+
+def test_odd_images_are_named(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    photoplan = Here(capsys)
+    write_image(block.images[2], np.zeros((3, *SIZE[::-1]), np.uint8))
+    said = photoplan("balance", block.project, "--resolution", 1.5, "--no-picture")
+    assert said.code == 0 and "left out: 'three' has the grey value 0 everywhere; look at its file" in said.err
+    assert [image.balance is None for image in load_project(block.project).images] == [
+        False,
+        True,
+        False,
+    ]
+    write_image(block.images[2], np.full((3, *SIZE[::-1]), 9, np.uint16))
+    said = photoplan("balance", block.project, "--overwrite")
+    assert said.code == 3 and "'three' has 3 bands of uint16" in said.err and "choose among them" in said.err
+
+
+def test_an_image_without_overlap_is_named(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    text = block.project.read_text()
+    far = text.replace(f"{X0 + AWAY[0]:.1f}", f"{X0 - 400:.1f}")
+    assert far != text
+    block.project.write_text(far)
+    photoplan = Here(capsys)
+    said = photoplan("balance", block.project, "--resolution", 1.5, "--no-picture")
+    assert said.code == 0 and "no overlap with other images, so no tables: 'one'; they stay as they are" in said.err
+    assert load_project(block.project).images[0].balance is None
+    said = photoplan("balance", block.project, "--images", "one,two", "--overwrite")
+    assert said.code == 3 and "no two of 2 images show enough of the same ground" in said.err
+    said = photoplan("balance", block.project, "--reference-image", "one", "--overwrite", "--no-picture")
+    assert said.code == 2 and "shows no ground that another image shows" in said.err

@@ -1,0 +1,123 @@
+"""Tables and trends from overlaps: known ones are found again, change counts little, nothing is made up."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+from tools.overlaps import block_of
+
+from photoplan.radiometry.balance import balance, even_images, pairs_of, parts_of, shoulder
+from photoplan.radiometry.cells import LEVELS, PIXELS, SIDE, Cells, cells_of
+
+LIMITS = (0.0, 255.0)
+
+
+def ground(shape: tuple[int, int] = (160, 160), seed: int = 0) -> NDArray[np.float64]:
+    rng = np.random.default_rng(seed)
+    noise = sum(s * gaussian_filter(rng.normal(size=shape), s) for s in (2, 8, 30))
+    return 128 + 35 * (noise - noise.mean()) / noise.std()
+
+
+def seen(*images: NDArray[np.float64]) -> tuple[Cells, NDArray[np.int64]]:
+    """Images that show the same ground in the same pixels, a byte each."""
+    values = np.clip(np.rint(np.stack(images)), 0, 255).astype(np.float32)[:, None]
+    cells, middle = cells_of(values, np.isfinite(values[:, 0]), np.arange(len(images)))
+    cells.uv[:] = middle
+    return cells, np.tile(images[0].shape[::-1], (len(images), 1))
+
+
+def rms(cells: Cells, sizes: NDArray[np.int64], **options: int) -> tuple[float, float]:
+    made = balance(cells, sizes, LIMITS, degree=0, **options)
+    pairs = pairs_of(cells.shared, dict(zip(made.images.tolist(), made.tones)), sizes)
+    return float(pairs.before.mean()), float(pairs.after.mean())
+
+
+def test_cells_hold_the_same_ground_of_all_images() -> None:
+    values = np.arange(2 * 1 * 32 * 48, dtype=np.float32).reshape(2, 1, 32, 48)
+    valid = np.ones((2, 32, 48), bool)
+    valid[1, :, 20:] = False
+    cells, middle = cells_of(values, valid, np.array([4, 7]), 100)
+    assert cells.cell.tolist() == [100, 100, 101, 102, 103, 103, 104, 105]
+    assert cells.image.tolist() == [4, 7, 4, 4, 4, 7, 4, 4]
+    assert middle[0].tolist() == [SIDE / 2 - 0.5] * 2 and middle[2].tolist() == [1.5 * SIDE - 0.5, SIDE / 2 - 0.5]
+    assert cells.levels.shape == (8, 1, LEVELS) and cells.pixels.shape == (8, 1, PIXELS)
+    np.testing.assert_array_equal(cells.pixels[1] - cells.pixels[0], 32 * 48)
+    assert len(cells.shared) == 4 and (np.diff(cells.levels, axis=2) > 0).all()
+
+
+def test_the_image_of_even_histogram_joins_its_original() -> None:
+    """Ecker 1991, section 4.3.2, figures 4.3 and 4.4: an image and its like of even histogram lose their seam."""
+    image = np.clip(np.rint(ground()), 0, 255)
+    table = np.cumsum(np.bincount(image.astype(int).ravel(), minlength=256)) / image.size * 255
+    before, after = rms(*seen(image, table[image.astype(int)]))
+    assert before > 25
+    assert after < 2.0
+
+
+def test_a_lost_contrast_is_found_again_to_a_grey_value() -> None:
+    image = ground()
+    cells, sizes = seen(image, 0.6 * image + 60, image)
+    made = balance(cells, sizes, LIMITS, degree=0)
+    grey = np.array([80.0, 100, 128, 160, 180])
+    of = [tone[0].table(grey if k != 1 else 0.6 * grey + 60) for k, tone in enumerate(made.tones)]
+    assert np.abs(of[1] - of[0]).max() < 0.5 and np.abs(of[2] - of[0]).max() < 0.1
+    # The block keeps its mean and its contrast.
+    np.testing.assert_allclose(np.polyfit(grey, of[0], 1), [2.6 / 3, 60 / 3 + 0.0], rtol=0.02, atol=1.0)
+
+
+def test_the_reference_image_stays_as_it_is() -> None:
+    image = ground()
+    cells, sizes = seen(image, 255 * (image / 255) ** 1.5)
+    made = balance(cells, sizes, LIMITS, fixed=0)
+    tone = made.tones[0][0]
+    np.testing.assert_allclose(tone.becomes, tone.grey, atol=0.1)
+    assert all(c == pytest.approx(0, abs=1e-4) for _, _, c in tone.terms)
+    dark = 255 * (np.array([90.0, 128, 170]) / 255) ** 1.5
+    np.testing.assert_allclose(made.tones[1][0].table(dark), [90, 128, 170], atol=0.7)
+
+
+def test_change_in_a_tenth_of_the_ground_moves_tables_by_less_than_a_grey_value() -> None:
+    image, changed = ground(), ground()
+    changed[:32, :80] = 220
+    cells, sizes = seen(image, changed, image + 5)
+    made = balance(cells, sizes, LIMITS, degree=0, fixed=0)
+    assert np.abs(made.tones[1][0].table([90, 128, 170]) - [90, 128, 170]).max() < 1.0
+
+
+def test_vignetting_is_found_with_the_tables() -> None:
+    scene, truth = block_of(3, 3, seed=3)
+    made = balance(scene.cells, scene.sizes, LIMITS)
+    pairs = pairs_of(scene.cells.shared, dict(zip(made.images.tolist(), made.tones)), scene.sizes)
+    assert pairs.before.mean() > 16
+    assert pairs.after.mean() < 3.5
+    assert truth.trend_error(made) < 0.06
+
+
+def test_images_that_show_nothing_in_common_are_told_apart() -> None:
+    image = ground((64, 64))
+    values = np.stack([image, image, image, np.zeros_like(image)]).astype(np.float32)[:, None]
+    valid = np.zeros((4, 64, 64), bool)
+    valid[0, :, :40], valid[1, :, 10:32], valid[2, :, 48:], valid[3] = True, True, True, True
+    cells, _ = cells_of(values, valid, np.arange(4))
+    assert even_images(cells, 4, 255.0).tolist() == [False, False, False, True]
+    usable = cells.some(cells.image != 3)
+    parts = parts_of(usable, 4)
+    assert parts[0] == parts[1] and len({parts[0], parts[2], parts[3]}) == 3
+
+
+def test_a_shoulder_keeps_bright_values_apart_and_inside() -> None:
+    value = np.linspace(-80, 400, 200)
+    out = shoulder(value, LIMITS)
+    assert (np.diff(out) > 0).all() and out.min() > 0 and out.max() < 255
+    middle = (value > 32) & (value < 222)
+    np.testing.assert_array_equal(out[middle], value[middle])
+
+
+def test_contrast_beyond_the_range_is_bent_not_clipped() -> None:
+    image = np.clip(ground(), 40, 215)
+    assert not balance(*seen(image, 0.5 * image + 60), LIMITS, degree=0).shoulder
+    made = balance(*seen(0.9 * image, np.minimum(1.8 * image - 100, 250)), LIMITS, degree=0, fixed=1)
+    assert made.shoulder
+    assert all(tone[0].becomes[0] >= 0 and tone[0].becomes[-1] <= 255 for tone in made.tones)

@@ -1,0 +1,63 @@
+"""Tables and gains: what becomes of grey values."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from photoplan.errors import InputError
+from photoplan.geometry.grid import Window
+from photoplan.radiometry.tone import Tone, powers_of, surface, toned
+
+SIZE = (40, 30)
+TONE = Tone((0.0, 100.0, 255.0), (10.0, 130.0, 200.0), ((1, 0, 0.2), (0, 2, -0.3)))
+
+
+def test_a_table_is_linear_between_its_entries_and_goes_on_beyond_them() -> None:
+    tone = Tone((50.0, 100.0, 200.0), (40.0, 140.0, 190.0))
+    np.testing.assert_allclose(tone.table([50, 75, 150, 200]), [40, 90, 165, 190])
+    np.testing.assert_allclose(tone.table([40, 220]), [20, 200])
+    assert np.isnan(tone.table(np.nan))
+
+
+@pytest.mark.parametrize(
+    ("grey", "becomes", "words"),
+    [
+        ((0.0, 1.0), (0.0,), "2 grey values that become 1"),
+        ((0.0, 0.0), (0.0, 1.0), "grey 0 comes after 0"),
+        ((0.0, 9.0), (5.0, 4.0), "grey 0 becomes 5, but 9 becomes 4; a table may not fall"),
+        ((0.0, np.inf), (5.0, 6.0), "no number"),
+    ],
+)
+def test_tables_that_cannot_be_are_refused(grey: tuple[float, ...], becomes: tuple[float, ...], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        Tone(grey, becomes)
+
+
+def test_surfaces_have_no_mean_over_the_image() -> None:
+    """The mean over pixels differs from that over the area by the square of a pixel."""
+    x, y = np.meshgrid(np.arange(400), np.arange(300))
+    values = surface(x, y, (400, 300), powers_of(4))
+    assert values.shape == (300, 400, 14)
+    assert np.abs(values.mean(axis=(0, 1))).max() < 1e-5
+
+
+def test_pixels_do_not_depend_on_the_window() -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (1, 30, 40)).astype(np.uint8)
+    whole = toned(pixels, Window(0, 0, *SIZE), SIZE, [TONE])
+    part = toned(pixels[:, 7:20, 11:33], Window(11, 7, 22, 13), SIZE, [TONE])
+    np.testing.assert_array_equal(part, whole[:, 7:20, 11:33])
+    trend = 1 + 0.2 * (11 - 19.5) / 25 - 0.3 * (((7 - 14.5) / 25) ** 2 - (15 / 25) ** 2 / 3)
+    assert whole[0, 7, 11] == np.rint(TONE.table(pixels[0, 7, 11] / trend))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int16, np.float32])
+def test_integers_are_rounded_and_kept_in_their_range(dtype: type) -> None:
+    steep = Tone((0.0, 100.0), (-50.0, 450.0 if dtype == np.uint8 else 90_000.0))
+    pixels = np.array([[[0, 30, 100]]], dtype)
+    out = toned(pixels, Window(0, 0, 3, 1), (3, 1), [steep])
+    expected = steep.table(pixels[0])
+    if dtype != np.float32:
+        expected = np.clip(np.rint(expected), np.iinfo(dtype).min, np.iinfo(dtype).max)
+    np.testing.assert_allclose(out[0], expected, rtol=1e-6)
+    assert out.dtype == dtype

