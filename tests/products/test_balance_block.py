@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import rasterio
 from numpy.typing import NDArray
+from rasterio.transform import from_origin
 from scipy.ndimage import gaussian_filter, map_coordinates
 from tools.command import Here
-from tools.small_block import NAMES, SIZE, X0, Y0, Z0, Block, make_project, write_image, write_terrain
+from tools.small_block import CRS, NAMES, SIZE, X0, Y0, Z0, Block, make_project, write_image, write_terrain
 
 from photoplan.io.project.file import load_project
 from photoplan.products.balance.run import BalanceRequest, balance_project
@@ -89,6 +90,33 @@ def test_the_reference_image_keeps_its_colours(block: Block) -> None:
     assert found.balanced is not None
     tone = found.balanced.tones[0][0]
     np.testing.assert_allclose(tone.becomes, tone.grey, atol=0.1)
+
+
+def test_a_coarse_reference_gives_its_colours(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    """The ground itself, in means of 3 × 3 pixels: all images come near it."""
+    photoplan, path = Here(capsys), block.folder / "mosaic.tif"
+    coarse = np.rint(GROUND.reshape(3, 140, 3, 140, 3).mean(axis=(2, 4))).astype(np.uint8)
+    left, top = X0 - 210.5 * 1.5, Y0 + 210.5 * 1.5
+    write_image(path, coarse, crs=CRS, transform=from_origin(left, top, 4.5, 4.5))
+    said = photoplan("balance", block.project, "--resolution", 1.5, "--reference", path, "--no-picture")
+    assert said.code == 0, said.err
+    differences(block, photoplan, "after")
+    for image in NAMES:
+        with rasterio.open(block.folder / "after" / f"{image}_ortho.tif") as file:
+            grey = np.where(file.dataset_mask() > 0, file.read().astype(float), np.nan)
+            col, row = np.meshgrid(np.arange(file.width), np.arange(file.height))
+            X, Y = file.transform * (col + 0.5, row + 0.5)
+        places = [210 - (Y - Y0) / 1.5, 210 + (X - X0) / 1.5]
+        wanted = np.stack([map_coordinates(band, places, order=1) for band in GROUND])
+        assert abs(np.nanmedian(grey - wanted)) < 1.5 and np.nanstd(grey - wanted) < 4
+    wrong = write_image(block.folder / "grey.tif", coarse[:1], crs=CRS, transform=from_origin(left, top, 4.5, 4.5))
+    said = photoplan("balance", block.project, "--reference", wrong, "--overwrite")
+    assert said.code == 3 and "1 bands of uint8; a reference has those of the images, 3 of uint8" in said.err
+    far = write_image(block.folder / "far.tif", coarse, crs=CRS, transform=from_origin(left + 9000, top, 4.5, 4.5))
+    said = photoplan("balance", block.project, "--reference", far, "--overwrite")
+    assert said.code == 3 and "shows nothing of the ground that the images show" in said.err
+    both = photoplan("balance", block.project, "--reference", path, "--reference-image", "one", "--overwrite")
+    assert both.code == 2 and "give one of them" in both.err
 
 
 def test_odd_images_are_named(block: Block, capsys: pytest.CaptureFixture[str]) -> None:

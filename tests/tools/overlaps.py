@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from photoplan.radiometry.balance import Balanced
-from photoplan.radiometry.cells import SIDE, Cells, cells_of
-from photoplan.radiometry.tone import powers_of, surface
+from photoplan.radiometry.adjust import Adjusted
+from photoplan.radiometry.cells import Cells, cells_of
+from photoplan.radiometry.tone import Tone, powers_of, surface
 
 #: Pixels of the map along the sides of an image, and from one to the next: 62 % overlap in both directions.
-IMAGE, BASE = 160, 64
+IMAGE, BASE = 256, 96
 POWERS = powers_of(2)
 
 
@@ -35,17 +35,26 @@ class Truth:
     """(images, terms)."""
     sizes: NDArray[np.int64]
 
-    def trend_error(self, made: Balanced) -> float:
-        """Largest rms over an image of the gain's error, beside what all images have in common."""
+    def tables(self, nodes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the images show of ground of some grey values, (images, nodes)."""
+        return np.asarray(self.low[:, None] + self.factor[:, None] * nodes)
+
+    def tones(self) -> dict[int, tuple[Tone]]:
+        """What gives the ground back."""
+        ends, grey = np.array([0.0, 255.0]), self.tables(np.array([0.0, 255.0]))
+        terms = [tuple((i, j, float(c)) for (i, j), c in zip(POWERS, trend)) for trend in self.trends]
+        return {k: (Tone(tuple(grey[k].tolist()), tuple(ends.tolist()), terms[k]),) for k in range(len(grey))}
+
+    def trend_errors(self, made: Adjusted) -> NDArray[np.float64]:
+        """Rms error of the trend over each image, (images,)."""
         x, y = np.meshgrid(np.linspace(0, IMAGE - 1, 9), np.linspace(0, IMAGE - 1, 9))
         shapes = surface(x, y, (IMAGE, IMAGE), POWERS).reshape(-1, len(POWERS))
-        found = np.array([[c for _, _, c in tone[0].terms] for tone in made.tones])
-        error = (found - self.trends) @ shapes.T
-        error -= error.mean(axis=0)
-        return float(np.sqrt((error**2).mean(axis=1)).max())
+        return np.asarray(np.sqrt((((made.state.trends - self.trends) @ shapes.T) ** 2).mean(axis=1)))
 
 
-def block_of(rows: int, columns: int, seed: int = 0, change: float = 0.0, noise: float = 1.0) -> tuple[Scene, Truth]:
+def block_of(
+    rows: int, columns: int, seed: int = 0, change: float = 0.0, noise: float = 1.0, reference: bool = False
+) -> tuple[Scene, Truth]:
     """Images in a regular block over one ground, one band, and what was done to them."""
     rng = np.random.default_rng(seed)
     height, width = (IMAGE + (n - 1) * BASE for n in (rows, columns))
@@ -62,13 +71,14 @@ def block_of(rows: int, columns: int, seed: int = 0, change: float = 0.0, noise:
     for k in range(count):
         at = np.s_[k // columns * BASE :, k % columns * BASE :]
         view = ground[at][:IMAGE, :IMAGE].copy()
-        for _ in range(round(change * IMAGE**2 / SIDE**2)):
-            r, c = rng.integers(0, IMAGE - SIDE, 2)
-            view[r : r + SIDE, c : c + SIDE] += rng.choice([-40, 40])
+        while (view != ground[at][:IMAGE, :IMAGE]).mean() < change:
+            (r, c), (high, wide) = rng.integers(-20, IMAGE - 20, 2), rng.integers(30, 70, 2)
+            view[max(r, 0) : r + high, max(c, 0) : c + wide] += rng.choice([-40, 40])
         grey = (low[k] + factor[k] * view) * (1 + shapes @ trends[k]) + rng.normal(0, noise, view.shape)
         values[k, 0][at][:IMAGE, :IMAGE] = np.clip(np.rint(grey), 0, 255)
         valid[k][at][:IMAGE, :IMAGE] = True
-    cells, middle = cells_of(values, valid, np.arange(count))
-    cells.uv[:] = middle - np.stack([cells.image % columns, cells.image // columns], axis=1) * BASE
+    known = (ground[None].astype(np.float32), np.ones(ground.shape, bool)) if reference else None
+    cells = cells_of(values, valid, np.arange(count), reference=known)
+    cells.uv[:] -= np.stack([cells.image % columns, cells.image // columns], axis=1)[:, None] * BASE
     sizes = np.tile([IMAGE, IMAGE], (count, 1))
     return Scene(cells, sizes), Truth(low, factor, trends, sizes)

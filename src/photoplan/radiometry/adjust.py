@@ -7,20 +7,20 @@ less by a robust weight.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import block_diag, csr_array, eye_array, kron
 from scipy.sparse.linalg import SuperLU, splu
 
-from photoplan.adjustment.robust import MEDIAN_1D, huber
+from photoplan.adjustment.robust import MEDIAN_1D, cauchy
 from photoplan.radiometry.equations import Band, State
 
 _Floats = NDArray[np.float64]
 
-#: Residuals beyond this many standard deviations lose influence.
-_HUBER = 3.0
+#: Residuals of this many standard deviations weigh half; 95 % of the efficiency are kept at normally distributed ones.
+_HALF = 2.385
 #: Standard deviations of what is known of tables and trends beforehand: the bend between two intervals of a table in
 #: parts of the range of grey values, slopes, coefficients of a trend.
 _BEND, _SLOPE, _TREND = 0.02, 1.0, 0.25
@@ -32,8 +32,8 @@ _LEAST_SLOPE = 0.05
 #: What a table that may not fall weighs beside the observations; their least standard deviation, part of the range.
 _HARD, _FLOOR = 1e4, 0.001
 _ROUNDS, _CONVERGED = 30, 1e-3
-#: Unknowns whose standard deviations are computed at once.
-_AT_ONCE = 256
+#: Parts of the ground that are left out in turn, and unknowns whose standard deviations are computed at once.
+_PARTS, _AT_ONCE = 16, 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class Gauge:
     parts: NDArray[np.int64]
     """Images (n,) of one number hang together; each part gets a gauge of its own."""
     fixed: int | None = None
-    """The image that stays as it is; elsewhere the mean of a part's tables changes nothing."""
+    """The image that stays as it is; else the mean of a part's tables changes nothing, if there is no reference."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,22 @@ class Adjusted:
     """Standard deviation of a quantile of an image in a cell, grey values."""
     rounds: int
     down: float
-    """Part of the observations that count less."""
+    """Part of the observations that count less than half."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Weights:
+    """What counts how much at a state."""
+
+    of: _Floats
+    """Of the observations, inverse variances, (n,)."""
+    ground: _Floats
+    """Of what holds the ground, (groups,)."""
+    moved: _Floats
+    """What the ground lacks to that, (groups,)."""
+    robust: _Floats
+    """By the size of residuals, (n,)."""
+    sigma: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,13 +81,10 @@ class _Normals:
 
     N: csr_array
     g: _Floats
-    pulls: csr_array
-    """What each observation pulls at the unknowns (n, unknowns)."""
-    ground: tuple[_Floats, csr_array]
-    """Step of the ground (groups,) if images stay, and what it loses with theirs (groups, unknowns)."""
-    robust: _Floats
-    """Weights by the size of residuals, (n,)."""
-    sigma: float
+    alone: _Floats
+    """Step of the ground if images stay, (groups,)."""
+    lost: csr_array
+    """What that loses with theirs, (groups, unknowns)."""
 
 
 def adjust(band: Band, gauge: Gauge) -> Adjusted:
@@ -92,50 +104,64 @@ def adjust(band: Band, gauge: Gauge) -> Adjusted:
     rounds = 0
     while True:
         rounds += 1
-        found = _normals(band, state, robust, gauge.fixed is None)
-        robust, x = found.robust, state.vector
+        weights = _weigh(band, state, robust, gauge.fixed is None)
+        found = _normals(band, state, weights)
+        robust, x = weights.robust, state.vector
         rising, missing = _rising(band, state, flat)
         hard = _HARD * float(found.N.diagonal().max())
-        N = found.N + prior.T @ prior + hard * (rising.T @ rising)
-        solved = _Solved.of(splu(N.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}), H)
+        known = prior.T @ prior + hard * (rising.T @ rising)
+        solved = _Solved.of(found.N + known, H)
         step = solved.step(found.g + prior.T @ (wanted - prior @ x) + hard * (rising.T @ missing), held - H @ x)
-        alone, lost = found.ground
         state = state.with_vector(x + step)
-        state = State(state.tables, state.trends, state.ground + alone - lost @ step)
+        state = State(state.tables, state.trends, state.ground + found.alone - found.lost @ step)
         falling = np.diff(state.tables, axis=1) < _LEAST_SLOPE * band.step * (1 - 1e-6)
         done = float(np.abs(step).max()) < _CONVERGED * span and not (falling & ~flat).any()
         if done or rounds == _ROUNDS:
             break
         flat |= falling
-    sigmas = _sigmas(solved, _sums(band.cell) @ found.pulls, prior, state)
-    return Adjusted(state, sigmas, found.sigma, rounds, float((robust < 1).mean()))
+    weights = _weigh(band, state, robust, gauge.fixed is None)
+    variance = _without_parts(band, state, weights, known, H) + _of_prior(solved, prior, state)
+    sigmas = State(state.tables, state.trends, np.full(len(state.ground), np.nan)).with_vector(np.sqrt(variance))
+    return Adjusted(state, sigmas, weights.sigma, rounds, float((robust < 0.5).mean()))
 
 
-def _normals(band: Band, state: State, robust: _Floats, own: bool) -> _Normals:
-    """Normal equations; `own`: whether the images' own mean counts where nothing else tells."""
+def _weigh(band: Band, state: State, robust: _Floats, own: bool) -> _Weights:
+    """Weights at a state; `own`: whether a reference, or else the images' own mean, holds the ground."""
+    shown, slope, _ = band.predicted(state)
+    residual = band.grey - shown
+    w = band.weight * robust * slope**2
+    # The part of its own error that an observation shows beside the others of its group.
+    size = residual / np.sqrt(np.maximum(1.0 - w / np.bincount(band.group, w)[band.group], 0.1))
+    sigma = max(float(np.median(np.abs(size))) / MEDIAN_1D, _FLOOR * float(np.ptp(band.nodes)))
+    robust = cauchy(size / sigma, _HALF)
+    moved, share = _held(band, state, sigma) if own else np.zeros((2, len(state.ground)))
+    return _Weights(band.weight * robust / sigma**2, share, moved, robust, sigma)
+
+
+def _normals(band: Band, state: State, weights: _Weights) -> _Normals:
+    """Normal equations of observations that have weights; the ground is taken out of them."""
     groups = _sums(band.group)
     shown, slope, A = band.predicted(state)
-    residual = band.grey - shown
-    w = band.weight * robust
-    # The part of its own error that an observation shows beside the others of its group.
-    total = groups @ (w * slope**2)
-    size = residual / np.sqrt(np.maximum(1.0 - w * slope**2 / total[band.group], 0.1))
-    sigma = max(float(np.median(np.abs(size))) / MEDIAN_1D, _FLOOR * float(np.ptp(band.nodes)))
-    robust = huber(size / sigma, _HUBER)
-    w = band.weight * robust / sigma**2
-    total, pull = groups @ (w * slope**2), groups @ (w * slope * residual)
-    if own:
-        moved = band.own - state.ground
-        least = max(_OWN * sigma, _MOVES * float(np.sqrt(np.mean(moved**2))))
-        share = np.bincount(band.group, band.weight) / np.bincount(band.group) / least**2
-        total, pull = total + share, pull + share * moved
+    residual, w = band.grey - shown, weights.of
+    total = np.maximum(groups @ (w * slope**2) + weights.ground, 1e-300)
+    pull = groups @ (w * slope * residual) + weights.ground * weights.moved
     B = A.multiply(w[:, None]).tocsr()
     lost = (groups @ B.multiply(slope[:, None]).tocsr()).multiply(1 / total[:, None]).tocsr()
-    alone = pull / total
     N = A.T @ B - lost.T @ lost.multiply(total[:, None])
-    g = B.T @ residual - lost.T @ pull
-    after = residual - slope * alone[band.group]
-    return _Normals(N, g, B.multiply(after[:, None]).tocsr(), (alone, lost), robust, sigma)
+    return _Normals(N, B.T @ residual - lost.T @ pull, pull / total, lost)
+
+
+def _held(band: Band, state: State, sigma: float) -> tuple[_Floats, _Floats]:
+    """What ground lacks to the reference, or else to what its images show in the mean, and what that weighs."""
+    share = np.bincount(band.group, band.weight) / np.bincount(band.group)
+    if not band.referred:
+        moved = band.own - state.ground
+        return moved, share / max(_OWN * sigma, _MOVES * float(np.sqrt(np.mean(moved**2)))) ** 2
+    moved = band.beside_reference(state)
+    known = np.isfinite(moved)
+    moved[~known] = 0.0
+    least = max(float(np.median(np.abs(moved[known]))) / MEDIAN_1D, sigma)
+    return moved, np.where(known, share * cauchy(moved / least, _HALF), 0.0) / least**2
 
 
 def _sums(of: NDArray[np.int64]) -> csr_array:
@@ -163,13 +189,15 @@ def _gauge(band: Band, state: State, gauge: Gauge) -> tuple[_Floats, _Floats]:
     for part in np.unique(gauge.parts):
         members = np.flatnonzero(gauge.parts == part)
         fixed = members[members == gauge.fixed]
+        if band.referred and not len(fixed):
+            continue
         used = fixed if len(fixed) else members
         for k in range(width if len(fixed) else nodes):
             row = np.zeros((images, width))
             row[used, k] = 1 / len(used)
             rows.append(row.ravel())
             held.append(float(band.nodes[k]) if k < nodes else 0.0)
-    return np.array(rows), np.array(held)
+    return np.array(rows).reshape(-1, images * width), np.array(held)
 
 
 def _rising(band: Band, state: State, flat: NDArray[np.bool_]) -> tuple[csr_array, _Floats]:
@@ -192,24 +220,45 @@ class _Solved:
     """N⁻¹ Hᵀ."""
 
     @classmethod
-    def of(cls, factors: SuperLU, H: _Floats) -> _Solved:
-        return cls(factors, H, factors.solve(np.ascontiguousarray(H.T)))
+    def of(cls, N: csr_array, H: _Floats) -> _Solved:
+        factors = splu(N.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        return cls(factors, H, factors.solve(np.ascontiguousarray(H.T)) if len(H) else H.T)
 
     def step(self, g: _Floats, missing: _Floats | float) -> _Floats:
         """Solutions for right sides (unknowns,) or (unknowns, k) that fulfil the conditions."""
         free = self.factors.solve(g)
+        if not len(self.H):
+            return np.asarray(free)
         return np.asarray(free + self.W @ np.linalg.solve(self.H @ self.W, missing - self.H @ free))
 
 
-def _sigmas(solved: _Solved, pulls: csr_array, prior: csr_array, state: State) -> State:
-    """Standard deviations of the unknowns: by how cells differ (White 1980), since the quantiles of one do not err
-    independently, and by what was known beforehand."""
-    count = pulls.shape[1]
+def _without_parts(band: Band, state: State, weights: _Weights, known: csr_array, H: _Floats) -> _Floats:
+    """Variances of the unknowns by what they become without a part of the ground (Quenouille 1956, Tukey 1958).
+
+    What lies near each other errs together; so parts are blocks of cells, drawn by lot, where there are enough.
+    """
+    unit = band.block if band.block.max() + 1 >= _PARTS else band.cell
+    part = np.random.default_rng(0).permutation(int(unit.max()) + 1) % _PARTS
+    of, ground = part[unit], np.zeros(len(state.ground), np.int64)
+    ground[band.group] = of
+    each = [
+        _normals(band, state, replace(weights, of=weights.of * (of == k), ground=weights.ground * (ground == k)))
+        for k in range(_PARTS)
+    ]
+    N, g = sum(one.N for one in each), sum(one.g for one in each)
+    # What residuals change with the unknowns under robust weights, beside what the weights alone say.
+    kept = max(float(np.mean(2 * weights.robust**2 - weights.robust) / np.mean(weights.robust)), 0.2)
+    moved = np.array([_Solved.of(N - one.N + known, H).step(g - one.g, 0.0) for one in each]) / kept
+    return np.asarray((_PARTS - 1) / _PARTS * ((moved - moved.mean(axis=0)) ** 2).sum(axis=0))
+
+
+def _of_prior(solved: _Solved, prior: csr_array, state: State) -> _Floats:
+    """Variances of the unknowns by what was known of them beforehand."""
+    count = prior.shape[1]
     found = np.empty(count)
     for first in range(0, count, _AT_ONCE):
         columns = np.arange(first, min(first + _AT_ONCE, count))
         unit = np.zeros((count, len(columns)))
         unit[columns, np.arange(len(columns))] = 1.0
-        x = solved.step(unit, 0.0)
-        found[columns] = np.sqrt(((pulls @ x) ** 2).sum(axis=0) + ((prior @ x) ** 2).sum(axis=0))
-    return State(state.tables, state.trends, np.full(len(state.ground), np.nan)).with_vector(found)
+        found[columns] = ((prior @ solved.step(unit, 0.0)) ** 2).sum(axis=0)
+    return found

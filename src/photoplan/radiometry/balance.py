@@ -112,7 +112,10 @@ def balance(
         done()
     seen = cells.some(np.isin(cells.image, images))
     raw = [[_tone(nodes, each, k, powers) for each in found] for k in range(len(images))]
-    kept = np.ones((cells.bands, 2)) * [0.0, 1.0] if place is not None else _kept(seen, images, sizes, raw)
+    kept = _kept(seen, images, sizes, raw)
+    contrast = tuple(1.0 / kept[:, 1])
+    if place is not None or np.isfinite(cells.reference).any():
+        kept[:] = 0.0, 1.0
     moved = [[_mapped(tone, partial(_linear, *kept[b])) for b, tone in enumerate(each)] for each in raw]
     beyond = _beyond(seen, images, sizes, moved, limits)
     if beyond:
@@ -122,7 +125,6 @@ def balance(
         tuple(_sigmas(nodes, each, k, raw[k][b], moved[k][b]) for b, each in enumerate(found))
         for k in range(len(images))
     )
-    contrast = tuple(1.0 / kept[:, 1])
     return Balanced(images, tuple(map(tuple, moved)), sigmas, parts, tuple(found), contrast, beyond)
 
 
@@ -184,14 +186,16 @@ def _values(cells: Cells, tones: dict[int, Sequence[Tone]], sizes: NDArray[np.in
 def _toned(
     cells: Cells, values: NDArray[np.float32], tones: dict[int, Sequence[Tone]], sizes: NDArray[np.int64]
 ) -> _Floats:
+    """Grey values of the cells' pixels, or of their middle, after the tones, (m, bands, n)."""
     out = values.astype(float)
+    places = cells.uv[:, 1:] if values is cells.pixels else cells.uv[:, :1]
     order = np.argsort(cells.image, kind="stable")
     starts = np.searchsorted(cells.image[order], np.arange(len(sizes) + 1))
     for image, tone in tones.items():
         rows = order[starts[image] : starts[image + 1]]
-        (x, y), size = cells.uv[rows].T, (int(sizes[image][0]), int(sizes[image][1]))
+        (x, y), size = np.moveaxis(places[rows], -1, 0), (int(sizes[image][0]), int(sizes[image][1]))
         for band, each in enumerate(tone):
-            trend = each.trend(x, y, size)[:, None] if each.terms else 1.0
+            trend = each.trend(x, y, size) if each.terms else 1.0
             out[rows, band] = each.table(out[rows, band] / trend)
     return out
 

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 SIDE = 16
 #: Quantiles and single pixels that are kept of each image in a cell.
 LEVELS, PIXELS = 12, 8
+#: Cells along the side of what may change at once, a field for instance: their errors are not independent.
+BLOCK = 8
 #: An image counts in a cell if it shows this part of it, and all of them together this one.
 _SHOWN, _COMMON = 0.5, 0.25
 
@@ -23,16 +25,20 @@ class Cells:
 
     cell: NDArray[np.int64]
     """Number of the cell, (m,)."""
+    block: NDArray[np.int64]
+    """Number of the block of `BLOCK` × `BLOCK` cells that it lies in, (m,)."""
     image: NDArray[np.int64]
     """Number of the image, (m,)."""
-    uv: NDArray[np.float64]
-    """Column and row of the cell's middle in the image, (m, 2)."""
+    uv: NDArray[np.float32]
+    """Column and row in the image of the cell's middle and of the places of `pixels`, (m, 1 + PIXELS, 2)."""
     share: NDArray[np.float64]
     """Part of the cell that is compared, (m,)."""
     levels: NDArray[np.float32]
     """Quantiles of the grey values, the cumulative histogram read the other way, (m, bands, LEVELS)."""
     pixels: NDArray[np.float32]
     """Grey values of some places, (m, bands, PIXELS)."""
+    reference: NDArray[np.float32]
+    """Mean of the reference over what is compared, (m, bands); NaN where there is none."""
 
     def __len__(self) -> int:
         return len(self.cell)
@@ -61,8 +67,12 @@ class Cells:
 
 
 def cells_of(
-    values: NDArray[np.float32], valid: NDArray[np.bool_], images: NDArray[np.int64], first: int = 0
-) -> tuple[Cells, NDArray[np.int64]]:
+    values: NDArray[np.float32],
+    valid: NDArray[np.bool_],
+    images: NDArray[np.int64],
+    first: int = 0,
+    reference: tuple[NDArray[np.float32], NDArray[np.bool_]] | None = None,
+) -> Cells:
     """Cells of a part of the map, in squares of `SIDE` pixels from its corner.
 
     Parameters
@@ -74,41 +84,54 @@ def cells_of(
         Their numbers.
     first : int
         Number of the first cell.
+    reference : (ndarray, shape (bands, height, width), ndarray of bool, shape (height, width)), optional
+        What the mean of the images is to be, and where it is known.
 
     Returns
     -------
-    cells : Cells
-        With places in the images still unknown, NaN.
-    middle : ndarray, shape (m, 2)
-        Column and row of each row's cell in the part.
+    Cells
+        `uv` are columns and rows of the part, not yet of the images.
     """
     height, width = valid.shape[1:]
+    bands = values.shape[1]
+    kept: dict[str, list[Any]] = {each.name: [] for each in fields(Cells)}
     corners = [(row, col) for row in range(0, height, SIDE) for col in range(0, width, SIDE)]
-    found: list[tuple[Any, ...]] = []
-    middle: list[tuple[float, float]] = []
     for number, (row, col) in enumerate(corners, first):
         at = np.s_[..., row : row + SIDE, col : col + SIDE]
         seen = valid[at].reshape(len(images), -1)
         rows = _comparable(seen)
         if not len(rows):
             continue
-        common = seen[rows].all(axis=0)
+        common = np.flatnonzero(seen[rows].all(axis=0))
         grey = values[at].reshape(*values.shape[:2], -1)[rows][..., common]
-        levels = np.quantile(grey, (np.arange(LEVELS) + 0.5) / LEVELS, axis=-1).transpose(1, 2, 0)
-        some = grey[..., np.linspace(0, grey.shape[-1] - 1, PIXELS).astype(int)]
-        found += [(number, images[k], common.sum() / SIDE**2, levels[r], some[r]) for r, k in enumerate(rows)]
-        middle += [(col + SIDE / 2 - 0.5, row + SIDE / 2 - 0.5)] * len(rows)
-    cell, image, share, level, pixel = zip(*found) if found else ((), (), (), (), ())
-    bands = values.shape[1]
-    cells = Cells(
-        np.array(cell, np.int64),
-        np.array(image, np.int64),
-        np.full((len(cell), 2), np.nan),
-        np.array(share, float),
-        np.array(level, np.float32).reshape(-1, bands, LEVELS),
-        np.array(pixel, np.float32).reshape(-1, bands, PIXELS),
+        some = np.linspace(0, len(common) - 1, PIXELS).astype(int)
+        down, right = np.divmod(common[some], valid[at].shape[2])
+        middle = (SIDE - 1) / 2
+        places = np.stack([np.r_[middle, right] + col, np.r_[middle, down] + row], axis=1)
+        known = np.full(bands, np.nan)
+        if reference is not None:
+            there = reference[1][at].ravel()[common]
+            if there.mean() >= _SHOWN:
+                known = reference[0][at].reshape(bands, -1)[:, common[there]].mean(axis=1)
+        kept["cell"] += [number] * len(rows)
+        kept["block"] += [first + row // (BLOCK * SIDE) * width + col // (BLOCK * SIDE)] * len(rows)
+        kept["image"] += images[rows].tolist()
+        kept["uv"] += [places] * len(rows)
+        kept["share"] += [len(common) / SIDE**2] * len(rows)
+        kept["levels"].append(np.quantile(grey, (np.arange(LEVELS) + 0.5) / LEVELS, axis=-1).transpose(1, 2, 0))
+        kept["pixels"].append(grey[..., some])
+        kept["reference"] += [known] * len(rows)
+    none = np.zeros((0, bands, LEVELS)), np.zeros((0, bands, PIXELS))
+    return Cells(
+        cell=np.array(kept["cell"], np.int64),
+        block=np.array(kept["block"], np.int64),
+        image=np.array(kept["image"], np.int64),
+        uv=np.array(kept["uv"], np.float32).reshape(-1, 1 + PIXELS, 2),
+        share=np.array(kept["share"], float),
+        levels=np.concatenate([none[0], *kept["levels"]]).astype(np.float32),
+        pixels=np.concatenate([none[1], *kept["pixels"]]).astype(np.float32),
+        reference=np.array(kept["reference"], np.float32).reshape(-1, bands),
     )
-    return cells, np.array(middle, float).reshape(-1, 2)
 
 
 def _comparable(seen: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -59,6 +59,8 @@ class Band:
     """Cell and quantile, (n,)."""
     cell: NDArray[np.int64]
     """(n,)."""
+    block: NDArray[np.int64]
+    """(n,): observations of one block may err together."""
     grey: _Floats
     """(n,)."""
     weight: _Floats
@@ -67,6 +69,8 @@ class Band:
     """(n, terms)."""
     nodes: _Floats
     """Grey values G of the tables, at equal steps."""
+    reference: _Floats
+    """Mean G of each group's cell as a reference has it, (groups,); NaN where there is none."""
 
     @classmethod
     def of(
@@ -79,25 +83,39 @@ class Band:
     ) -> Band:
         """Observations of shared cells; `sizes` (images, 2): width and height."""
         many = cells.levels.shape[2]
-        _, cell = np.unique(cells.cell, return_inverse=True)
+        _, first, cell = np.unique(cells.cell, return_index=True, return_inverse=True)
         surfaces = np.zeros((len(cells), len(powers)))
         for size in np.unique(sizes, axis=0):
             rows = (sizes[cells.image] == size).all(axis=1)
-            surfaces[rows] = surface(cells.uv[rows, 0], cells.uv[rows, 1], (int(size[0]), int(size[1])), powers)
+            surfaces[rows] = surface(cells.uv[rows, 0, 0], cells.uv[rows, 0, 1], (int(size[0]), int(size[1])), powers)
         return cls(
             image=np.repeat(cells.image, many),
             group=(cell[:, None] * many + np.arange(many)).ravel(),
             cell=np.repeat(cell, many),
+            block=np.repeat(np.unique(cells.block, return_inverse=True)[1], many),
             grey=cells.levels[:, band].astype(float).ravel(),
             weight=np.repeat(cells.share * 2.0 / many, many),
             surfaces=np.repeat(surfaces, many, axis=0),
             nodes=nodes,
+            reference=np.repeat(cells.reference[first, band].astype(float), many),
         )
 
     @property
     def step(self) -> float:
         """Between two nodes."""
         return float(self.nodes[1] - self.nodes[0])
+
+    @property
+    def referred(self) -> bool:
+        """Whether there is a reference."""
+        return bool(np.isfinite(self.reference).any())
+
+    def beside_reference(self, state: State) -> _Floats:
+        """What the cell of each group lacks to its reference in the mean, (groups,); NaN where there is none."""
+        group_cell = np.empty(len(self.reference), np.int64)
+        group_cell[self.group] = self.cell
+        mean = np.bincount(group_cell, state.ground) / np.bincount(group_cell)
+        return np.asarray(self.reference - mean[group_cell])
 
     @property
     def own(self) -> _Floats:

@@ -82,14 +82,14 @@ def _tables(axes: Any, found: Balanced, band: int) -> None:
 
 
 def _trend(fig: Any, axes: Any, report: BalanceReport, found: Balanced, k: int) -> None:
-    """The trend of the first band over an image."""
+    """The trend of the first band over an image, beside its mean."""
     number = int(found.images[k])
     width, height = report.survey.sizes[number].tolist()
     x, y = (np.linspace(0, side - 1, max(2, round(_SIDE * side / max(width, height)))) for side in (width, height))
     trend = found.tones[k][0].trend(x[None, :], y[:, None], (width, height))
     picture = axes.imshow(trend, cmap="RdBu_r", vmin=0.6, vmax=1.4, extent=(0, width, height, 0))
     axes.contour(x, y, trend, levels=np.arange(0.2, 3, 0.1), colors=INK, linewidths=0.4)
-    axes.set_title(f"Trend, band 1: {_ending(report.named(number))}", fontsize=8)
+    axes.set_title(f"Trend: {_ending(report.named(number), 16)}", fontsize=8)
     axes.set(xticks=[], yticks=[])
     axes.grid(False)
     fig.colorbar(picture, ax=axes, fraction=0.05)

@@ -22,10 +22,11 @@ from photoplan.io.project.model import Project
 from photoplan.io.run_record import input_entry, run_key, run_times, write_run_record
 from photoplan.io.tables import write_table
 from photoplan.plain import pick
+from photoplan.products.balance.reference import Reference, open_reference
 from photoplan.products.balance.sample import Survey, sample, survey
 from photoplan.project.scene import input_files
 from photoplan.radiometry.balance import Balanced, Pairs, balance, even_images, pairs_of
-from photoplan.radiometry.cells import Cells
+from photoplan.radiometry.cells import SIDE, Cells
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,8 @@ class BalanceRequest:
     """Names or patterns; none: all."""
     reference_image: str | None = None
     """The image that stays as it is; None: the block keeps its mean and its contrast."""
+    reference: Path | None = None
+    """A raster on the map whose colours the images get."""
     degree: int = 2
     """Of the trend over an image; 0: tables alone."""
     resolution: float | None = None
@@ -129,8 +132,12 @@ def balance_project(request: BalanceRequest, events: Events = SILENT) -> Balance
     notes = [f"left out, sees no terrain: {line}" for line in found.blind]
     if request.dry_run:
         return BalanceReport(found, tuple(notes))
-    cells = sample(found, request.workers, events)
-    limits = limits_of(cells, found.looked[0].scene.reader.dtype)
+    reader = found.looked[0].scene.reader
+    reference = _reference(request, found, notes)
+    cells = sample(found, reference, request.workers, events)
+    if reference is not None and not np.isfinite(cells.reference).any():
+        raise GeometryError(f"{reference.path}: shows nothing of the ground that the images show")
+    limits = limits_of(cells, reader.dtype)
     usable, even = _usable(cells, found, limits, notes)
     number = None if fixed is None else found.names.index(fixed) if fixed in found.names else -1
     _refuse_useless(usable, found, number, notes)
@@ -142,7 +149,8 @@ def balance_project(request: BalanceRequest, events: Events = SILENT) -> Balance
     stems = {int(k): safe_stem(found.names[k]) for k in made.images}
     files = tuple(request.folder / f"{stems[k]}.toml" for k in made.images.tolist())
     report = BalanceReport(found, tuple(notes), cells, made, pairs, files)
-    inputs = [input_entry(request.project), *(input_entry(one.scene.reader.path) for one in found.looked)]
+    files_in = [request.project, *(one.scene.reader.path for one in found.looked)]
+    inputs = [input_entry(path) for path in (*files_in, *([request.reference] if request.reference else []))]
     settings = pick(request, "reference_image", "degree", "resolution")
     with together():
         _write(request, project, report)
@@ -156,6 +164,20 @@ def balance_project(request: BalanceRequest, events: Events = SILENT) -> Balance
             settings=settings,
         )
     return report
+
+
+def _reference(request: BalanceRequest, found: Survey, notes: list[str]) -> Reference | None:
+    """The reference that was asked for."""
+    if request.reference is None:
+        return None
+    reader = found.looked[0].scene.reader
+    reference = open_reference(request.reference, found.grid, reader.bands, reader.dtype)
+    if reference.pixel > SIDE * found.grid.resolution:
+        notes.append(
+            f"the pixels of {reference.path.name} ({reference.pixel:g} m) are larger than what is compared "
+            f"({SIDE * found.grid.resolution:g} m); give a coarser resolution if colours come out uneven"
+        )
+    return reference
 
 
 def limits_of(cells: Cells, dtype: np.dtype[Any]) -> tuple[float, float]:
@@ -176,11 +198,14 @@ def _check(request: BalanceRequest, project: Project, names: Sequence[str]) -> s
     """Name of the reference image, and everything that can be refused before any work."""
     if len(names) < 2:
         raise UsageError(f"{len(names)} image; two at least are compared")
+    if request.reference is not None and request.reference_image is not None:
+        raise UsageError("a reference image and a reference; give one of them")
     if not 0 <= request.degree <= 4:
         raise UsageError(f"degree {request.degree}; allowed are 0 (tables alone) to 4, usual is 2")
     if not request.dry_run:
         for path in (request.table, *(request.folder / f"{safe_stem(name)}.toml" for name in names)):
-            check_output(path, [request.project, *input_files(project)], overwrite=request.overwrite)
+            inputs = [request.project, *input_files(project), *([request.reference] if request.reference else [])]
+            check_output(path, inputs, overwrite=request.overwrite)
     if request.reference_image is None:
         return None
     (fixed, *more) = project.select([request.reference_image])
@@ -233,6 +258,7 @@ def _write(request: BalanceRequest, project: Project, report: BalanceReport) -> 
     assert found is not None and report.pairs is not None
     request.folder.mkdir(parents=True, exist_ok=True)
     gauge = f"{request.reference_image} stays" if request.reference_image else "the block keeps mean and contrast"
+    gauge = gauge if request.reference is None else f"colours of {request.reference.name}"
     home = request.project.resolve().parent
     entries: dict[str, dict[str, str | None]] = {}
     for k, path, tones, sigmas in zip(found.images.tolist(), report.files, found.tones, found.sigmas):

@@ -20,16 +20,17 @@ from photoplan.plan.footprint import covered_tiles
 from photoplan.plan.owner import InSight
 from photoplan.plan.product import ProductPlan
 from photoplan.plan.tiles import Tile, Tiles
+from photoplan.products.balance.reference import Reference
 from photoplan.products.orthophoto.look import Looked, look_at, two_figures
 from photoplan.products.orthophoto.mosaic import refuse_mixed
-from photoplan.radiometry.cells import SIDE, Cells, cells_of
+from photoplan.radiometry.cells import BLOCK, SIDE, Cells, cells_of
 from photoplan.surfaces.objects import painted_surface
 from photoplan.targets.map import MapTarget
 
 #: Pixels of the map along the shorter side of an image, unless a resolution is chosen.
 ACROSS = 256
 #: Cells along the side of a tile.
-_CELLS = 8
+_CELLS = BLOCK
 _KERNEL, _TOLERANCE = "bilinear", 0.5
 
 
@@ -83,12 +84,12 @@ def survey(project: Project, names: Sequence[str], resolution: float | None, eve
     return Survey(tuple(looked), tuple(blind), grid, Tiles.shared(taken))
 
 
-def sample(found: Survey, workers: int, events: Events) -> Cells:
+def sample(found: Survey, reference: Reference | None, workers: int, events: Events) -> Cells:
     """What all images show, cell by cell; tiles are looked at one by one and forgotten."""
     tiles = list(found.tiles)
     events.begin("comparing", len(tiles), "tiles")
     with steps("balance", workers, events) as run:
-        return Cells.joined(list(run(_Sampling(found).cells, tiles, pixels=lambda tile: tile.pixels)))
+        return Cells.joined(list(run(_Sampling(found, reference).cells, tiles, pixels=lambda tile: tile.pixels)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +97,7 @@ class _Sampling:
     """From a tile to its cells."""
 
     survey: Survey
+    reference: Reference | None
 
     def cells(self, tile: Tile) -> Cells:
         """Cells of a tile, with all images that see a part of it."""
@@ -109,9 +111,10 @@ class _Sampling:
         if not rows:
             bands = self.survey.looked[0].scene.reader.bands
             values, valid = [np.zeros((bands, 1, 1), np.float32)], [np.zeros((1, 1), bool)]
+        known = None if self.reference is None or not rows else self.reference.pixels(self.survey.grid, window)
         number = tile.index * _CELLS**2
-        cells, middle = cells_of(np.stack(values), np.stack(valid), np.array(rows or [0], np.int64), number)
-        return self._placed(cells, middle + np.array([window.col, window.row]))
+        cells = cells_of(np.stack(values), np.stack(valid), np.array(rows or [0], np.int64), number, known)
+        return self._placed(replace(cells, uv=cells.uv + np.array([window.col, window.row], np.float32)))
 
     def _pixels(self, one: Looked, window: Window) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
         """What an image shows of a window where nothing hides the ground; None: nothing."""
@@ -124,12 +127,12 @@ class _Sampling:
             return None
         return made.values.astype(np.float32), made.valid
 
-    def _placed(self, cells: Cells, at: NDArray[np.float64]) -> Cells:
-        """Cells with their places in the images; those that have none are left out."""
-        uv = np.full((len(cells), 2), np.nan)
-        XY = self.survey.grid.to_map(at)
+    def _placed(self, cells: Cells) -> Cells:
+        """Cells with their places in the images instead of the map; those that have none are left out."""
+        uv = np.full_like(cells.uv, np.nan)
+        XY = self.survey.grid.to_map(cells.uv)
         for image in np.unique(cells.image).tolist():
             rows, scene = cells.image == image, self.survey.looked[image].scene
             heights = scene.surface.heights(XY[rows])
-            uv[rows] = into_image(scene.camera, np.concatenate([XY[rows], heights[:, None]], axis=1))
-        return replace(cells, uv=uv).some(np.isfinite(uv).all(axis=1))
+            uv[rows] = into_image(scene.camera, np.concatenate([XY[rows], heights[..., None]], axis=-1))
+        return replace(cells, uv=uv).some(np.flatnonzero(np.isfinite(uv).all(axis=(1, 2))))
