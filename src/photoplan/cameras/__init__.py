@@ -12,6 +12,7 @@ __getattr__, __dir__, __all__ = public(
         "cameras.plane": "Affine2D Bilinear2D",
         "cameras.build": "oriented_camera",
         "cameras.rpc": "RationalFunctions RpcCamera",
+        "cameras.line": "LineCamera",
         "cameras.refraction": "Refraction",
         "cameras.observed": "GroundPoints ImagePoints ObservedAttitudes ObservedPositions",
         "cameras.lenses.none": "NoLens",

@@ -21,16 +21,57 @@ _REACH = 100.0
 
 
 @dataclass(frozen=True)
-class _Projection:
+class Ellipsoid:
+    """An ellipsoid of revolution, and the Cartesian axes in its middle."""
+
+    a: float
+    """Semi-major axis, metres."""
+    e2: float
+    """Squared first eccentricity."""
+
+    @classmethod
+    def of_radii(cls, equatorial: float, polar: float) -> Ellipsoid:
+        """By its semi-axes, metres."""
+        return cls(equatorial, 1.0 - (polar / equatorial) ** 2)
+
+    def geocentric(
+        self, lon: NDArray[np.float64], lat: NDArray[np.float64], height: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Cartesian coordinates and the outward normal of longitude, latitude (radians) and height, each (..., 3)."""
+        sin, cos = np.sin(lat), np.cos(lat)
+        up = np.stack([cos * np.cos(lon), cos * np.sin(lon), sin], axis=-1)
+        N = self.a / np.sqrt(1.0 - self.e2 * sin * sin)
+        xyz = up * (N + height)[..., None]
+        xyz[..., 2] -= self.e2 * N * sin
+        return xyz, up
+
+    def geodetic(
+        self, xyz: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Longitude, latitude (radians) and height of Cartesian coordinates (..., 3)."""
+        p, z = np.hypot(xyz[..., 0], xyz[..., 1]), xyz[..., 2]
+        b_over_a = math.sqrt(1.0 - self.e2)
+        # Bowring's iteration for the parametric latitude: one step is good to 1e-8 m, two to the last digit.
+        t = z / (p * b_over_a)
+        for _ in range(2):
+            cos = 1.0 / np.sqrt(1.0 + t * t)
+            sin = t * cos
+            tan = (z + self.e2 / b_over_a * self.a * sin**3) / (p - self.e2 * self.a * cos**3)
+            t = b_over_a * tan
+        lat = np.arctan(tan)
+        sin = np.sin(lat)
+        h = p * np.cos(lat) + z * sin - self.a * np.sqrt(1.0 - self.e2 * sin * sin)
+        return np.arctan2(xyz[..., 1], xyz[..., 0]), lat, h
+
+
+@dataclass(frozen=True)
+class ProjectedCrs:
     """A map projection with the ellipsoid below it."""
 
     to_geographic: Transformer
     unit: float
     """Radians in one unit of the geographic coordinates."""
-    a: float
-    """Semi-major axis, metres."""
-    e2: float
-    """Squared first eccentricity."""
+    ellipsoid: Ellipsoid
 
     def radians(self, XY: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Longitude and latitude in radians of map points (..., 2); NaN where the projection ends."""
@@ -54,34 +95,17 @@ class _Projection:
 
     def geocentric(self, XYZ: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Geocentric coordinates and the ellipsoid's outward normal of map points with height, each (..., 3)."""
-        lon, lat = self.radians(XYZ)
-        sin, cos = np.sin(lat), np.cos(lat)
-        up = np.stack([cos * np.cos(lon), cos * np.sin(lon), sin], axis=-1)
-        N = self.a / np.sqrt(1.0 - self.e2 * sin * sin)
-        xyz = up * (N + XYZ[..., 2])[..., None]
-        xyz[..., 2] -= self.e2 * N * sin
-        return xyz, up
+        return self.ellipsoid.geocentric(*self.radians(XYZ), XYZ[..., 2])
 
     def from_geocentric(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
         """Map points with ellipsoidal height of geocentric coordinates (..., 3)."""
-        p, z = np.hypot(xyz[..., 0], xyz[..., 1]), xyz[..., 2]
-        b_over_a = math.sqrt(1.0 - self.e2)
-        # Bowring's iteration for the parametric latitude: one step is good to 1e-8 m, two to the last digit.
-        t = z / (p * b_over_a)
-        for _ in range(2):
-            cos = 1.0 / np.sqrt(1.0 + t * t)
-            sin = t * cos
-            tan = (z + self.e2 / b_over_a * self.a * sin**3) / (p - self.e2 * self.a * cos**3)
-            t = b_over_a * tan
-        lat = np.arctan(tan)
-        sin = np.sin(lat)
-        h = p * np.cos(lat) + z * sin - self.a * np.sqrt(1.0 - self.e2 * sin * sin)
-        XY = self.map(np.arctan2(xyz[..., 1], xyz[..., 0]), lat)
-        return np.concatenate([XY, h[..., None]], axis=-1)
+        lon, lat, h = self.ellipsoid.geodetic(xyz)
+        return np.concatenate([self.map(lon, lat), h[..., None]], axis=-1)
 
 
 @lru_cache(maxsize=64)
-def _projection(crs: str) -> _Projection:
+def projected_crs(crs: str) -> ProjectedCrs:
+    """The projection of a projected CRS in metres; another one is an InputError."""
     projected = require_projected_metres(crs)
     geographic = projected.geodetic_crs
     ellipsoid = projected.ellipsoid
@@ -91,7 +115,7 @@ def _projection(crs: str) -> _Projection:
     transformer = Transformer.from_crs(projected, geographic, always_xy=True)
     flattening = 1.0 / ellipsoid.inverse_flattening if ellipsoid.inverse_flattening else 0.0
     unit = geographic.axis_info[0].unit_conversion_factor
-    return _Projection(transformer, unit, ellipsoid.semi_major_metre, flattening * (2.0 - flattening))
+    return ProjectedCrs(transformer, unit, Ellipsoid(ellipsoid.semi_major_metre, flattening * (2.0 - flattening)))
 
 
 @dataclass(frozen=True)
@@ -114,12 +138,12 @@ class LocalFrame:
     """Map coordinates of the origin, near the product's middle, metres."""
     height: float = 0.0
     """Height of the origin, metres."""
-    _projection: _Projection = field(init=False, repr=False, compare=False)
+    _projection: ProjectedCrs = field(init=False, repr=False, compare=False)
     _origin: NDArray[np.float64] = field(init=False, repr=False, compare=False)
     _R_local_earth: NDArray[np.float64] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        projection = _projection(self.crs)
+        projection = projected_crs(self.crs)
         X, Y = (float(v) for v in self.origin_XY)
         at = np.array([X, Y, float(self.height)])
         lon, lat = projection.radians(at)
@@ -203,6 +227,7 @@ class LocalFrame:
 
 def earth_radius(crs: str, XY: ArrayLike) -> float:
     """Mean radius of curvature (Gauss) of the ellipsoid at a map point (2,), metres."""
-    projection = _projection(crs)
+    projection = projected_crs(crs)
     _, lat = projection.radians(np.asarray(XY, float))
-    return float(projection.a * math.sqrt(1.0 - projection.e2) / (1.0 - projection.e2 * np.sin(lat) ** 2))
+    a, e2 = projection.ellipsoid.a, projection.ellipsoid.e2
+    return float(a * math.sqrt(1.0 - e2) / (1.0 - e2 * np.sin(lat) ** 2))

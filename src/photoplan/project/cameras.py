@@ -9,10 +9,12 @@ from typing import Any
 from photoplan.cameras.base import Camera, CentralCamera
 from photoplan.errors import InputError
 from photoplan.io.project.image import ImageEntry
+from photoplan.io.project.line import LineImage
 from photoplan.io.project.model import Project
 from photoplan.io.project.posed import Image
 from photoplan.io.project.rpc import RpcImage
 from photoplan.io.raster_info import read_info
+from photoplan.project.by_line import line_camera
 from photoplan.project.by_rpc import rpc_camera
 from photoplan.project.ground import Ground, ground_of
 from photoplan.project.posed import posed_camera
@@ -21,6 +23,7 @@ from photoplan.project.posed import posed_camera
 _MAKERS: dict[type[ImageEntry], Callable[[Project, Any, Ground, tuple[int, int]], Camera]] = {
     Image: posed_camera,
     RpcImage: rpc_camera,
+    LineImage: line_camera,
 }
 
 

@@ -6,11 +6,12 @@ from typing import Annotated, Any
 
 from pydantic import Discriminator, Tag
 
+from photoplan.io.project.line import LineImage
 from photoplan.io.project.posed import Image
 from photoplan.io.project.rpc import RpcImage
 
 #: The entry that only images of a kind have; an image without any of them has a pose.
-_BY_ENTRY = {"rpc": RpcImage}
+_BY_ENTRY = {"rpc": RpcImage, "line": LineImage}
 
 
 def _kind(value: Any) -> str:
@@ -20,6 +21,6 @@ def _kind(value: Any) -> str:
 
 
 AnyImage = Annotated[
-    Annotated[Image, Tag("Image")] | Annotated[RpcImage, Tag("RpcImage")],
+    Annotated[Image, Tag("Image")] | Annotated[RpcImage, Tag("RpcImage")] | Annotated[LineImage, Tag("LineImage")],
     Discriminator(_kind),
 ]

@@ -1,0 +1,230 @@
+"""Line cameras: every line of the image has its own position and rotation (Schlüter 2001, §2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.cameras.base import Vantage
+from photoplan.cameras.line_look import LineLook
+from photoplan.cameras.line_track import LineTrack
+from photoplan.errors import InputError, UsageError
+from photoplan.geometry.body import BodyGround
+
+_Floats = NDArray[np.float64]
+#: A moment is found when it changes by less than this, lines; or by less than the second and not less than before.
+_FOUND, _ROUNDED = 1e-10, 1e-6
+#: Steps over which the slope is taken anew, lines.
+_SMOOTH = 1e-3
+_ITERATIONS = 40
+#: Rows beyond either end of the image that still have positions: a part of its height, and lines.
+_ROOM = (0.25, 256.0)
+#: Heights of any ground, metres: of the earth, and of other bodies.
+_EARTH, _ELSEWHERE = (-500.0, 9_000.0), (-10_000.0, 25_000.0)
+#: Half the distance over which the change of a ray on the map is taken, metres.
+_REACH = 50.0
+
+
+@dataclass(frozen=True, eq=False)
+class LineCamera:
+    """An image of one detector line that was carried over the ground, over the ground of a project.
+
+    A ground point is seen at the moment at which it lies in the plane (or the cone, with a lens) of the line; `project`
+    finds it by the secant method from a linear start. Rows are counted by lines; the centre of a line's exposure is a
+    whole number.
+    """
+
+    track: LineTrack
+    look: LineLook
+    ground: BodyGround
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the image in pixels."""
+        return self.look.columns, self.track.lines
+
+    @property
+    def field(self) -> None:
+        """All is in the first factor."""
+        return None
+
+    @property
+    def breaks(self) -> None:
+        """The trajectory is smooth."""
+        return None
+
+    def project_homogeneous(self, XYZ: ArrayLike) -> _Floats:
+        """Ground (..., 3) to (x, y, 1); NaN behind the camera, and at lines whose orientation is not known."""
+        XYZ = np.asarray(XYZ, float)
+        out = np.ones(XYZ.shape)
+        out[..., :2] = self._project(self.ground(XYZ).reshape(-1, 3)).reshape(*XYZ.shape[:-1], 2)
+        out[np.isnan(out[..., 0])] = np.nan
+        return out
+
+    def derivatives(self, XYZ: ArrayLike) -> _Floats:
+        """∂(x, y)/∂(X, Y, Z), shape (..., 2, 3), pixels per metre; NaN where there is no position."""
+        XYZ = np.asarray(XYZ, float)
+        flat = XYZ.reshape(-1, 3)
+        P = self.ground(flat)
+        x, y = self._project(P).T
+        with np.errstate(all="ignore"):
+            S, R = self.track(y)
+            d = np.einsum("nij,ni->nj", R, P - S)
+            tangents = d[:, :2] / d[:, 2:]
+            by_ground = (R[:, :, :2] - R[:, :, 2:] * tangents[:, None, :]) / d[:, 2, None, None]
+            later, earlier = self._tangents(P, y + 0.5), self._tangents(P, y - 0.5)
+            # The tangents of the ground point are those of its column: they change together.
+            J = np.stack([self.look.slope(x), earlier - later], axis=-1)
+            A = np.linalg.solve(np.where(np.isfinite(J), J, np.eye(2)), np.swapaxes(by_ground, 1, 2))
+            out = A @ self.ground.jacobian(flat)
+        out[np.isnan(x)] = np.nan
+        return np.asarray(out.reshape(*XYZ.shape[:-1], 2, 3))
+
+    def rays(self, xy: ArrayLike, height: ArrayLike | None = None) -> tuple[_Floats, _Floats]:
+        """Image points (..., 2) to rays: the point of the ray at `height` and its tangent there, each (..., 3).
+
+        `height` is one number or one for each point. NaN at lines whose orientation is not known, and where a ray does
+        not meet the height.
+
+        Raises
+        ------
+        UsageError
+            `height` is missing.
+        """
+        if height is None:
+            raise UsageError("rays of a line camera begin at no common point; give a height")
+        xy = np.asarray(xy, float)
+        flat = xy.reshape(-1, 2)
+        S, d = self.body_rays(flat)
+        with np.errstate(all="ignore"):
+            point, at = self._meet(S, d, np.broadcast_to(np.asarray(height, float), xy.shape[:-1]).ravel())
+            tangent = self.ground.to_map(at + _REACH * d) - self.ground.to_map(at - _REACH * d)
+            tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+        return point.reshape(*xy.shape[:-1], 3), tangent.reshape(*xy.shape[:-1], 3)
+
+    def body_rays(self, xy: _Floats) -> tuple[_Floats, _Floats]:
+        """Projection centres and unit directions of image points (n, 2) in the axes of the body, each (n, 3)."""
+        x, y = xy.T
+        S, R = self.track(np.nan_to_num(y))
+        unknown = ~np.isfinite(xy).all(axis=1) | self._unoriented(y)
+        d = np.concatenate([self.look.tangents(np.nan_to_num(x)), np.ones((len(x), 1))], axis=1)
+        d = np.einsum("nij,nj->ni", R, d / np.linalg.norm(d, axis=1, keepdims=True))
+        S[unknown], d[unknown] = np.nan, np.nan
+        return S, d
+
+    @cached_property
+    def vantage(self) -> Vantage:
+        """Above the middle of what it sees: the highest ground there is, but not above the camera."""
+        low, high = _EARTH if self.ground.on_earth else _ELSEWHERE
+        first, last = self.track.oriented
+        rows, columns = np.linspace(first, last, 17), np.linspace(-0.5, self.size[0] - 0.5, 9)
+        xy = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+        flying = float(np.nanmin(self.ground.to_map(self.body_rays(xy)[0])[:, 2]))
+        high = min(high, flying - 1.0)
+        feet = np.concatenate([self.rays(xy, level)[0][:, :2] for level in (min(low, high - 1.0), high)])
+        if np.isnan(feet).all():
+            raise InputError("the image does not show the ground of the project; is its CRS that of the right body?")
+        middle = (np.nanmin(feet, axis=0) + np.nanmax(feet, axis=0)) / 2
+        reach = 1.1 * float(np.nanmax(np.linalg.norm(feet - middle, axis=1)))
+        return Vantage(np.array([*middle, high]), low, reach)
+
+    def _unoriented(self, y: _Floats) -> NDArray[np.bool_]:
+        """Rows inside the image whose orientation is not known."""
+        inside = (y >= -0.5) & (y <= self.size[1] - 0.5)
+        return np.asarray(inside & ~self.track.is_oriented(y))
+
+    def _tangents(self, P: _Floats, y: _Floats) -> _Floats:
+        """Tangents (n, 2) of points in the body's axes, from where the camera was at rows (n,)."""
+        S, R = self.track(y)
+        d = np.einsum("nij,ni->nj", R, P - S)
+        return np.asarray(np.where(d[:, 2:] > 0, d[:, :2] / d[:, 2:], np.nan))
+
+    def _across(self, P: _Floats, y: _Floats) -> tuple[_Floats, _Floats]:
+        """How far points lie beside the line at rows (n,), as tangents, and their columns."""
+        tangents = self._tangents(P, y)
+        e, n = self.look.axes
+        column = self.look.column(tangents @ e)
+        return (tangents - self.look.tangents(column)) @ n, column
+
+    def _project(self, P: _Floats) -> _Floats:
+        """Positions (n, 2) of points (n, 3) in the axes of the body."""
+        room = _ROOM[0] * self.size[1] + _ROOM[1]
+        low, high = -room, self.size[1] - 1 + room
+        out = np.full((len(P), 2), np.nan)
+        todo = np.flatnonzero(np.isfinite(P).all(axis=1))
+        with np.errstate(all="ignore"):
+            at = np.clip(self._start(P[todo]), low, high)
+            miss, _ = self._across(P[todo], at)
+            slope = self._across(P[todo], at + 1.0)[0] - miss
+            step = -miss / slope
+            for _ in range(_ITERATIONS):
+                at = at + step
+                before, (miss, column) = miss, self._across(P[todo], at)
+                # Over small steps the slope is rounding; it does not change over them.
+                slope = np.where(np.abs(step) > _SMOOTH, (miss - before) / step, slope)
+                step, last = -miss / slope, step
+                settled = (np.abs(step) < _ROUNDED) & (np.abs(step) > np.abs(last) / 2)
+                found = (np.abs(step) < _FOUND) | settled
+                out[todo[found]] = np.column_stack([column, at + step])[found]
+                # Only what is still on its way goes on; twice the room is left for a step too far.
+                going = ~found & (np.abs(at + step - (low + high) / 2) < high - low)
+                todo, at, step = todo[going], at[going], step[going]
+                miss, slope = miss[going], slope[going]
+                if not len(todo):
+                    break
+        out[(out[:, 1] < low) | (out[:, 1] > high) | self._unoriented(out[:, 1])] = np.nan
+        return out
+
+    def _start(self, P: _Floats) -> _Floats:
+        """Rows at which to begin."""
+        origin, scale, coefficients = self._linear
+        return np.asarray(coefficients[0] + ((P - origin) / scale) @ coefficients[1:])
+
+    @cached_property
+    def _linear(self) -> tuple[_Floats, float, _Floats]:
+        """Rows as a linear function of the place, over the points of rays down to the ground and a tenth above it."""
+        first, last = self.track.oriented
+        rows, columns = np.linspace(first, last, 9), np.linspace(0, self.size[0] - 1, 5)
+        xy = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+        S, d = self.body_rays(xy)
+        r = _to_sphere(S, d, self._radius(S))
+        good = np.isfinite(r)
+        if not good.any():
+            raise InputError("the camera does not look at the body; are positions and attitudes in the same axes?")
+        places = np.concatenate([S[good] + part * r[good, None] * d[good] for part in (0.9, 1.0)])
+        origin, scale = places.mean(axis=0), float(np.ptp(places, axis=0).max())
+        A = np.column_stack([np.ones(len(places)), (places - origin) / scale])
+        return origin, scale, np.linalg.lstsq(A, np.tile(xy[good, 1], 2), rcond=1e-9)[0]
+
+    def _radius(self, S: _Floats) -> _Floats:
+        """Radius of the body below points (n, 3), metres."""
+        return np.asarray(np.linalg.norm(S, axis=1) - self.ground.height(S))
+
+    def _meet(self, S: _Floats, d: _Floats, heights: _Floats) -> tuple[_Floats, _Floats]:
+        """Map points (n, 3) of rays at heights (n,), and the same in the axes of the body."""
+        r = _to_sphere(S, d, self._radius(S) + heights)
+        at = S + r[:, None] * d
+        cos = np.einsum("ni,ni->n", at, d) / np.linalg.norm(at, axis=1)
+        for _ in range(12):
+            point = self.ground.to_map(S + r[:, None] * d)
+            miss = point[:, 2] - heights
+            r = r - miss / cos
+            if not (np.abs(miss) > 1e-9).any():
+                break
+        at = S + r[:, None] * d
+        point = self.ground.to_map(at)
+        point[~(np.abs(point[:, 2] - heights) < 1e-6)] = np.nan
+        point[:, 2] = np.where(np.isnan(point[:, 0]), np.nan, heights)
+        return point, at
+
+
+def _to_sphere(S: _Floats, d: _Floats, radius: ArrayLike) -> _Floats:
+    """Distances (n,) along rays to the near side of a sphere; NaN where they pass it. From inside, to the far side."""
+    along = np.einsum("ni,ni->n", S, d)
+    with np.errstate(invalid="ignore"):
+        half = np.sqrt(along**2 - np.einsum("ni,ni->n", S, S) + np.square(radius))
+    near = -along - half
+    return np.asarray(np.where(near > 0, near, -along + half))

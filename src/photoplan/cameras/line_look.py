@@ -1,0 +1,111 @@
+"""Where the detectors of a line look: their directions in the camera, as a curve over the columns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+
+_Floats = NDArray[np.float64]
+_DEGREE = 16
+#: The curve leaves what it stands for by less than this, in columns.
+_TOLERANCE = 1e-9
+#: Columns beyond either end of the line over which the curve goes on, by its width; further out it is straight.
+_ROOM = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class LineLook:
+    """Directions of a line's detectors in camera axes, as tangents (X/Z, Y/Z): any lens, any place in the focal plane.
+
+    Lens distortion, the place of the line and the pitch of its detectors are one smooth curve, kept as Chebyshev
+    polynomials of the column. Camera axes are those of the file; the camera looks along +Z.
+
+    Raises
+    ------
+    InputError
+        The curve is not smooth, or turns back.
+    """
+
+    columns: int
+    coefficients: _Floats
+    """Shape (degree + 1, 2); over the columns of `span` as −1 to 1."""
+
+    @classmethod
+    def of(cls, tangents: Callable[[_Floats], _Floats], columns: int) -> LineLook:
+        """The curve of a function from columns (n,) to tangents (n, 2)."""
+        low, high = _span(columns)
+        nodes = chebyshev.chebpts1(4 * _DEGREE)
+        values = tangents((low + high) / 2 + (high - low) / 2 * nodes)
+        if not np.isfinite(values).all():
+            raise InputError("detectors of the line have no direction; are the numbers of its lens right?")
+        coefficients = chebyshev.chebfit(nodes, values, _DEGREE)
+        look = cls(columns, np.asarray(coefficients, float))
+        miss = float(np.abs(chebyshev.chebval(nodes, look.coefficients).T - values).max())
+        if miss > _TOLERANCE * look.pitch:
+            raise InputError(f"the line's lens is not smooth: polynomials miss it by {miss / look.pitch:.2g} columns")
+        if not (look.along(look._ends[1]) > look.along(look._ends[0])):
+            raise InputError("the directions of the line's detectors turn back")
+        return look
+
+    def tangents(self, column: _Floats) -> _Floats:
+        """Tangents (n, 2) of columns (n,); straight on where the line has ended."""
+        inside = np.clip(column, *_span(self.columns))
+        values = chebyshev.chebval(self._unit(inside), self.coefficients).T
+        return np.asarray(values + self.slope(inside) * (column - inside)[:, None])
+
+    def slope(self, column: _Floats) -> _Floats:
+        """Change of the tangents (n, 2) from column to column."""
+        unit = self._unit(np.clip(column, *_span(self.columns)))
+        return np.asarray(chebyshev.chebval(unit, self._slopes).T)
+
+    @cached_property
+    def axes(self) -> _Floats:
+        """Unit vectors along the line, from the first to the last column, and across it, (2, 2)."""
+        chord = chebyshev.chebval(self._unit(np.array([0.0, self.columns - 1.0])), self.coefficients)
+        e = (chord[:, 1] - chord[:, 0]) / np.linalg.norm(chord[:, 1] - chord[:, 0])
+        return np.array([e, [-e[1], e[0]]])
+
+    @cached_property
+    def pitch(self) -> float:
+        """Tangent of a column in the middle of the line."""
+        return float(np.linalg.norm(self.slope(np.array([(self.columns - 1) / 2]))))
+
+    def along(self, column: float) -> float:
+        """Tangent along the line's chord."""
+        return float(self.tangents(np.array([column]))[0] @ self.axes[0])
+
+    def column(self, along: _Floats) -> _Floats:
+        """The columns (n,) with these tangents along the chord (n,), by Newton's method."""
+        first, last = self.along(self._ends[0]), self.along(self._ends[1])
+        at = self._ends[0] + (along - first) * (self._ends[1] - self._ends[0]) / (last - first)
+        for _ in range(12):
+            step = (self.tangents(at) @ self.axes[0] - along) / (self.slope(at) @ self.axes[0])
+            at = at - step
+            if not (np.abs(step) > 1e-11 * self.columns).any():
+                break
+        return np.asarray(at)
+
+    @property
+    def _ends(self) -> tuple[float, float]:
+        return -0.5, self.columns - 0.5
+
+    @cached_property
+    def _slopes(self) -> _Floats:
+        low, high = _span(self.columns)
+        return np.asarray(chebyshev.chebder(self.coefficients) * 2.0 / (high - low))
+
+    def _unit(self, column: _Floats) -> _Floats:
+        low, high = _span(self.columns)
+        return (2.0 * column - (low + high)) / (high - low)
+
+
+def _span(columns: int) -> tuple[float, float]:
+    room = 1.0 + _ROOM * columns
+    return -0.5 - room, columns - 0.5 + room

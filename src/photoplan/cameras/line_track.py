@@ -1,0 +1,100 @@
+"""Where a line camera was, and how it was turned, when it took each of its lines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.errors import InputError
+from photoplan.geometry.motion import Course, rotations
+
+_Floats = NDArray[np.float64]
+#: Lines by which tables may end before the image, since large times are rounded.
+_SLACK = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class LineTrack:
+    """From the lines of an image to position and rotation, in the axes of a body.
+
+    Raises
+    ------
+    InputError
+        Times do not grow, or nothing of the image is oriented.
+    """
+
+    lines: int
+    """Rows of the image."""
+    knots: _Floats
+    """Rows (n,) from which on the clock has another rate."""
+    moments: _Floats
+    """Their times (n,), seconds; there may be a pause before any of them."""
+    rates: _Floats
+    """Seconds from line to line (n,), from each of them on."""
+    positions: Course
+    """Projection centres (n, 3), metres."""
+    attitudes: Course
+    """Quaternions (n, 4) of the rotation from camera axes to those of the body, scalar first."""
+    known: tuple[float, float]
+    """First and last moment of which both are known, seconds."""
+
+    def __post_init__(self) -> None:
+        ends = self.moments[:-1] + self.rates[:-1] * np.diff(self.knots)
+        late = ends > self.moments[1:] + _SLACK * self.rates[:-1]
+        if not ((self.rates > 0).all() and (np.diff(self.knots) > 0).all()) or late.any():
+            raise InputError("the times of the image's lines do not grow from line to line")
+        first, last = self.oriented
+        if not (last > first):
+            began, ended = self.time(np.array([0.0, self.lines - 1.0]))
+            raise InputError(
+                f"no line of the image is oriented: they were taken from {began:.3f} to {ended:.3f} s, positions and "
+                f"attitudes are known from {self.known[0]:.3f} to {self.known[1]:.3f} s"
+            )
+
+    @cached_property
+    def oriented(self) -> tuple[float, float]:
+        """First and last row of the image, fractions included, whose position and attitude are known."""
+        begins = np.maximum(np.concatenate([[-0.5], self.knots[1:]]), -0.5)
+        ends = np.minimum(np.concatenate([self.knots[1:], [np.inf]]), self.lines - 0.5)
+        first, last = (self.knots + (known - self.moments) / self.rates for known in self.known)
+        first, last = np.maximum(begins, first), np.minimum(ends, last)
+        some = last > first
+        if not some.any():
+            return -0.5, -0.5
+        low, high = float(first[some].min()), float(last[some].max())
+        # Tables that are to cover the image do so but for the rounding of large times.
+        return low if low > -0.5 + _SLACK else -0.5, high if high < self.lines - 0.5 - _SLACK else self.lines - 0.5
+
+    def is_oriented(self, line: _Floats) -> NDArray[np.bool_]:
+        """Whether position and attitude are known at rows (n,)."""
+        slack = _SLACK * self.rates.max()
+        t = self.time(line)
+        return np.asarray((t >= self.known[0] - slack) & (t <= self.known[1] + slack))
+
+    def __call__(self, line: _Floats) -> tuple[_Floats, _Floats]:
+        """Positions (n, 3) and rotations (n, 3, 3) of rows (n,), whole numbers at the middle of a line's exposure.
+
+        Beyond what is known the camera flies on as it flew at the end: what lies just outside the image has positions.
+        """
+        t = self.time(line)
+        inside = np.clip(t, *self.known)
+        beyond = (t - inside)[:, None]
+        S, q = self.positions(inside), self.attitudes(inside)
+        away = beyond[:, 0] != 0
+        if away.any():
+            step = self.rates.max()
+            back = inside[away] - np.sign(beyond[away, 0]) * step
+            turns = beyond[away] / (inside[away] - back)[:, None]
+            S[away] += turns * (S[away] - self.positions(back))
+            before = self.attitudes(back)
+            before *= np.where(np.einsum("nk,nk->n", before, q[away]) < 0, -1.0, 1.0)[:, None]
+            q[away] += turns * (q[away] - before)
+        return S, rotations(q)
+
+    def time(self, line: _Floats) -> _Floats:
+        """Times (n,) of the middle of the exposure of rows (n,), seconds."""
+        stretch = np.clip(np.searchsorted(self.knots, line, side="right") - 1, 0, None)
+        return np.asarray(self.moments[stretch] + self.rates[stretch] * (line - self.knots[stretch]))

@@ -1,0 +1,1 @@
+"""Line cameras from files."""
