@@ -147,3 +147,17 @@ def test_an_image_without_overlap_is_named(block: Block, capsys: pytest.CaptureF
     assert said.code == 3 and "no two of 2 images show enough of the same ground" in said.err
     said = photoplan("balance", block.project, "--reference-image", "one", "--overwrite", "--no-picture")
     assert said.code == 2 and "shows no ground that another image shows" in said.err
+
+
+def test_check_says_that_colours_differ_until_they_are_balanced(
+    block: Block, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photoplan = Here(capsys)
+    said = photoplan("check", block.project)
+    assert said.code == 0 and "grey values between neighbours: `photoplan balance` evens them out" in said.out
+    assert photoplan("balance", block.project, "--no-picture", "--factor").code == 0
+    assert "photoplan balance" not in photoplan("check", block.project).out
+    for path in block.images:
+        write_image(path, np.full((3, *SIZE[::-1]), 99, np.uint8))
+    block.project.write_text((block.folder / "project.previous.toml").read_text())
+    assert "photoplan balance" not in photoplan("check", block.project).out

@@ -10,6 +10,7 @@ from tools.overlaps import block_of
 
 from photoplan.radiometry.balance import balance, even_images, pairs_of, parts_of, shoulder
 from photoplan.radiometry.cells import LEVELS, PIXELS, SIDE, Cells, cells_of
+from photoplan.radiometry.ratio import factors
 
 LIMITS = (0.0, 255.0)
 
@@ -149,3 +150,26 @@ def test_contrast_beyond_the_range_is_bent_not_clipped() -> None:
     made = balance(*seen(0.9 * image, np.minimum(1.8 * image - 100, 250)), LIMITS, degree=0, fixed=1)
     assert made.shoulder
     assert all(tone[0].becomes[0] >= 0 and tone[0].becomes[-1] <= 255 for tone in made.tones)
+
+
+def test_the_factor_is_the_mean_ratio_of_means() -> None:
+    """Behr 1989, section 6.3.3: three parts of two images, f = (120/100 + 90/60 + 200/160) / 3."""
+    image, other = np.zeros((2, SIDE, 3 * SIDE))
+    for k, (first, second) in enumerate([(100, 120), (60, 90), (160, 200)]):
+        image[:, k * SIDE : (k + 1) * SIDE], other[:, k * SIDE : (k + 1) * SIDE] = first, second
+    cells, sizes = seen(image, other)
+    expected = (120 / 100 + 90 / 60 + 200 / 160) / 3
+    assert factors(cells, 2, np.zeros(2, np.int64), fixed=1)[0, 0] == pytest.approx(expected, rel=1e-9)
+    made = balance(cells, sizes, LIMITS, factor=True, fixed=1)
+    assert made.tones[0][0].table(100) == pytest.approx(100 * expected)
+    assert made.tones[1][0].table(100) == pytest.approx(100)
+    turned, sizes = seen(other, image)
+    assert factors(turned, 2, np.zeros(2, np.int64), fixed=0)[1, 0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_factors_of_many_images_agree_with_each_other() -> None:
+    image = np.clip(ground(), 30, 200)
+    scale = np.array([1.0, 0.7, 0.85, 1.2])
+    cells, _ = seen(*(s * image for s in scale))
+    found = factors(cells, 4, np.zeros(4, np.int64))[:, 0]
+    np.testing.assert_allclose(found * scale / np.exp(np.log(scale).mean()), 1, rtol=2e-3)

@@ -30,6 +30,7 @@ _LISTED = 12
 @click.option("--reference-image", metavar="NAME", help="This image stays as it is [mean and contrast of all stay].")
 @click.option("--reference", type=PATH, metavar="FILE", help="A raster on the map whose colours the images get.")
 @click.option("--degree", type=int, default=2, show_default=True, help="Of the trend over an image; 0: tables alone.")
+@click.option("--factor", is_flag=True, help="One factor for each image and band instead of tables, from means.")
 @click.option("--resolution", type=float, metavar="R", help="Pixels that are compared, metres [by the images' size].")
 @click.option("-o", "--output", type=PATH, metavar="FOLDER", help="[balance by the project]")
 @click.option("--no-picture", is_flag=True, help="Do not draw balance.png.")

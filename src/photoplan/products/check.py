@@ -1,4 +1,4 @@
-"""What to expect of a project, before a pixel is touched."""
+"""What to expect of a project, before more of its pixels are touched than a few windows."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from photoplan.io.project.model import Project
 from photoplan.orientation.plausibility import ImagePlausibility, View
 from photoplan.plain import pick
 from photoplan.plan.footprint import Footprint, footprint, mean_gsd
+from photoplan.products.balance.glance import colour_advice
 from photoplan.products.judged import against_files, judged, reading_of_block
 from photoplan.products.orthophoto.look import two_figures
 from photoplan.project.cameras import camera_without_pixels, is_there
@@ -193,4 +194,6 @@ def _advice(project: Project, checks: Sequence[ImageCheck]) -> tuple[str, ...]:
             f"the earth's curvature displaces up to {curvature:.1f} px: if the orientation was computed with it, "
             'set earth_curvature = "strict" in [orientation]'
         )
+    if not any(check.fault for check in checks) and (colours := colour_advice(project, [c.image for c in checks])):
+        lines.append(colours)
     return tuple(lines)

@@ -12,8 +12,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from photoplan.radiometry.adjust import Adjusted, Gauge, adjust
-from photoplan.radiometry.cells import Cells
+from photoplan.radiometry.cells import Cells, neighbours
 from photoplan.radiometry.equations import Band
+from photoplan.radiometry.ratio import factors
 from photoplan.radiometry.tone import Tone, powers_of
 
 _Floats = NDArray[np.float64]
@@ -81,6 +82,7 @@ def balance(
     *,
     degree: int = 2,
     fixed: int | None = None,
+    factor: bool = False,
     done: Callable[[], None] = lambda: None,
 ) -> Balanced:
     """Tones by which images agree where they show the same ground.
@@ -97,6 +99,8 @@ def balance(
         Of the trend over an image; 0: tables alone.
     fixed : int, optional
         Number of the image that stays as it is; else the block keeps its mean and its contrast.
+    factor : bool
+        One factor for each image and band instead of tables, see `photoplan.radiometry.ratio`.
     done : callable
         Called after each band.
     """
@@ -105,24 +109,29 @@ def balance(
     inner = replace(shared, image=np.asarray(of, np.int64).reshape(-1))
     parts = parts_of(inner, len(images))
     place = None if fixed is None else int(np.flatnonzero(images == fixed)[0])
-    powers = powers_of(degree)
     nodes, found = np.linspace(*limits, NODES), []
-    for band in range(cells.bands):
-        found.append(adjust(Band.of(inner, band, sizes[images], powers, nodes), Gauge(parts, place)))
-        done()
+    if factor:
+        ends = np.array(limits)
+        scale = factors(inner, len(images), parts, place)
+        raw = [[Tone(limits, (float(f * ends[0]), float(f * ends[1]))) for f in each] for each in scale]
+    else:
+        powers = powers_of(degree)
+        for band in range(cells.bands):
+            found.append(adjust(Band.of(inner, band, sizes[images], powers, nodes), Gauge(parts, place)))
+            done()
+        raw = [[_tone(nodes, each, k, powers) for each in found] for k in range(len(images))]
     seen = cells.some(np.isin(cells.image, images))
-    raw = [[_tone(nodes, each, k, powers) for each in found] for k in range(len(images))]
     kept = _kept(seen, images, sizes, raw)
     contrast = tuple(1.0 / kept[:, 1])
-    if place is not None or np.isfinite(cells.reference).any():
+    if factor or place is not None or np.isfinite(cells.reference).any():
         kept[:] = 0.0, 1.0
     moved = [[_mapped(tone, partial(_linear, *kept[b])) for b, tone in enumerate(each)] for each in raw]
     beyond = _beyond(seen, images, sizes, moved, limits)
     if beyond:
-        bent = [[_mapped(tone, partial(shoulder, limits=limits)) for tone in each] for each in moved]
+        bent = [[_mapped(_entered(tone), partial(shoulder, limits=limits)) for tone in each] for each in moved]
         moved = [each if k == place else bent[k] for k, each in enumerate(moved)]
     sigmas = tuple(
-        tuple(_sigmas(nodes, each, k, raw[k][b], moved[k][b]) for b, each in enumerate(found))
+        tuple(_sigmas(nodes, each, k, raw[k][b], moved[k][b]) for b, each in enumerate(found)) or ((),) * cells.bands
         for k in range(len(images))
     )
     return Balanced(images, tuple(map(tuple, moved)), sigmas, parts, tuple(found), contrast, beyond)
@@ -140,14 +149,7 @@ def shoulder(value: _Floats, limits: tuple[float, float]) -> _Floats:
 def pairs_of(cells: Cells, tones: dict[int, Sequence[Tone]], sizes: NDArray[np.int64]) -> Pairs:
     """How images differ before and after; those without tones stay as they are."""
     after = _values(cells, tones, sizes)
-    first, second = [], []
-    for apart in range(1, len(cells)):
-        near = np.flatnonzero(cells.cell[apart:] == cells.cell[:-apart])
-        if not len(near):
-            break
-        first.append(near)
-        second.append(near + apart)
-    a, b = (np.concatenate(rows) if rows else np.empty(0, np.int64) for rows in (first, second))
+    a, b = neighbours(cells)
     pair, of, count = np.unique(
         np.stack([cells.image[a], cells.image[b]], axis=1), axis=0, return_inverse=True, return_counts=True
     )
@@ -166,6 +168,12 @@ def _tone(nodes: _Floats, found: Adjusted, image: int, powers: Sequence[tuple[in
     grey = np.linspace(nodes[0], nodes[-1], ENTRIES)
     terms = tuple((i, j, float(c)) for (i, j), c in zip(powers, found.state.trends[image]))
     return Tone(tuple(grey.tolist()), tuple(table.table(grey).tolist()), terms)
+
+
+def _entered(tone: Tone) -> Tone:
+    """The same tone with as many entries as a bent table needs."""
+    grey = np.linspace(tone.grey[0], tone.grey[-1], ENTRIES)
+    return replace(tone, grey=tuple(grey.tolist()), becomes=tuple(tone.table(grey).tolist()))
 
 
 def _mapped(tone: Tone, function: Callable[[_Floats], _Floats]) -> Tone:

@@ -134,6 +134,18 @@ def cells_of(
     )
 
 
+def neighbours(cells: Cells) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows of all pairs of images in one cell, the one with the lower number first; `cells` are sorted."""
+    first = []
+    for apart in range(1, len(cells)):
+        near = np.flatnonzero(cells.cell[apart:] == cells.cell[:-apart])
+        if not len(near):
+            break
+        first.append(np.stack([near, near + apart]))
+    both = np.concatenate([np.empty((2, 0), np.int64), *first], axis=1)
+    return both[0], both[1]
+
+
 def _comparable(seen: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Images whose common part of a cell is large enough; those that show least of it are left out for that."""
     shown = seen.sum(axis=1)

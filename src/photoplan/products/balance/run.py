@@ -42,6 +42,8 @@ class BalanceRequest:
     """A raster on the map whose colours the images get."""
     degree: int = 2
     """Of the trend over an image; 0: tables alone."""
+    factor: bool = False
+    """One factor for each image and band, from ratios of means (Behr 1989, section 6.3.3), instead of tables."""
     resolution: float | None = None
     """Side of the pixels that are compared, metres."""
     output: Path | None = None
@@ -142,7 +144,9 @@ def balance_project(request: BalanceRequest, events: Events = SILENT) -> Balance
     number = None if fixed is None else found.names.index(fixed) if fixed in found.names else -1
     _refuse_useless(usable, found, number, notes)
     events.begin("adjusting", cells.bands, "bands")
-    made = balance(usable, found.sizes, limits, degree=request.degree, fixed=number, done=events.done)
+    made = balance(
+        usable, found.sizes, limits, degree=request.degree, fixed=number, factor=request.factor, done=events.done
+    )
     _note(made, found, even, notes)
     tones = dict(zip(made.images.tolist(), made.tones))
     pairs = pairs_of(usable.shared, tones, found.sizes)
@@ -151,7 +155,7 @@ def balance_project(request: BalanceRequest, events: Events = SILENT) -> Balance
     report = BalanceReport(found, tuple(notes), cells, made, pairs, files)
     files_in = [request.project, *(one.scene.reader.path for one in found.looked)]
     inputs = [input_entry(path) for path in (*files_in, *([request.reference] if request.reference else []))]
-    settings = pick(request, "reference_image", "degree", "resolution")
+    settings = pick(request, "reference_image", "degree", "factor", "resolution")
     with together():
         _write(request, project, report)
         write_run_record(
@@ -198,6 +202,8 @@ def _check(request: BalanceRequest, project: Project, names: Sequence[str]) -> s
     """Name of the reference image, and everything that can be refused before any work."""
     if len(names) < 2:
         raise UsageError(f"{len(names)} image; two at least are compared")
+    if request.reference is not None and request.factor:
+        raise UsageError("factors from ratios know no reference; give a reference image, or leave `factor` out")
     if request.reference is not None and request.reference_image is not None:
         raise UsageError("a reference image and a reference; give one of them")
     if not 0 <= request.degree <= 4:

@@ -121,4 +121,6 @@ def refuse_mixed(looked: Sequence[Looked]) -> None:
         kinds.setdefault((one.scene.reader.bands, str(one.scene.reader.dtype)), one.name)
     if len(kinds) > 1:
         told = ", ".join(f"{name!r} has {bands} bands of {dtype}" for (bands, dtype), name in kinds.items())
-        raise InputError(f"the images of a mosaic have the same bands and type of pixels: {told}; choose among them")
+        raise InputError(
+            f"the images of a mosaic have the same bands and type of pixels: {told}; choose among them by `images`"
+        )
