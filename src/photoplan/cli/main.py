@@ -32,6 +32,7 @@ VERBS = {
     "balance": "Even colours: tables by which images agree where they overlap.",
     "ortho": "Make orthophotos.",
     "mosaic": "Make one orthophoto of many images.",
+    "illumination": "Take the light on slopes, and haze, out of an orthophoto.",
     "object": "Make a product of each object alone.",
     "run": "Execute a plan written by `ortho --plan`.",
     "dtm": "Terrain models: build, sample, contours, volumes …",

@@ -1,0 +1,186 @@
+"""Light on slopes and haze, corrected in an orthophoto: parameters from the picture itself, then pixel by pixel."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan import __version__
+from photoplan.cameras.sun import SunProjection
+from photoplan.errors import InputError
+from photoplan.events import SILENT, Events
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.io.image_form import form_of, placement_of
+from photoplan.io.product import check_output
+from photoplan.io.raster import RasterReader
+from photoplan.plain import pick
+from photoplan.plan.ground import TileGround
+from photoplan.plan.visibility import hidden_pixels
+from photoplan.products.dtm.raster import GridOptions, GridTile, write_grid
+from photoplan.project.open_terrain import OpenTerrain, open_terrain
+from photoplan.project.restored import kept_nodata
+from photoplan.radiometry.illumination import Ground, LightModel, estimate
+from photoplan.radiometry.tone import fitted
+from photoplan.targets.map import MapTarget
+from photoplan.terrain.shading import Light, surface_slopes
+
+#: Windows along both axes from which parameters are estimated, and their side, pixels.
+_ALONG, _SIDE = 8, 64
+#: Pixels of these that are used, at most about.
+_MOST = 30_000
+
+
+@dataclass(frozen=True)
+class IlluminationRequest:
+    """What is asked."""
+
+    picture: Path
+    terrain: Path
+    output: Path
+    sun: tuple[float, float]
+    """Azimuth from grid north and altitude above the horizon, degrees."""
+    correct: tuple[str, ...] = ("c",)
+    """Names of `photoplan.radiometry.illumination.CORRECTIONS`."""
+    overwrite: bool = False
+    workers: int | None = None
+    dry_run: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class IlluminationReport:
+    """What was found and made."""
+
+    path: Path | None
+    """None after a dry run."""
+    model: LightModel
+    sample: Ground
+    """Of the pixels that parameters are estimated from, (n,)."""
+    before: NDArray[np.float64]
+    """Their grey values, (bands, n)."""
+    after: NDArray[np.float64]
+
+    @property
+    def correlations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Of the grey values of lit pixels with cos i, before and after, by band."""
+        lit = self.sample.lit
+        each = [[np.corrcoef(band[lit], self.sample.cos_i[lit])[0, 1] for band in values] for values in self._both]
+        return np.array(each[0]), np.array(each[1])
+
+    @property
+    def _both(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return self.before, self.after
+
+    def json_fields(self) -> dict[str, Any]:
+        """Parameters and correlations."""
+        before, after = self.correlations
+        own = pick(self.model, "corrections", "cos_z", "height", "bands")
+        shadow = float(np.mean(~self.sample.lit))
+        return {"path": self.path, **own, "not_lit": shadow, "correlation_before": before, "correlation_after": after}
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """Picture, terrain and sun."""
+
+    reader: RasterReader
+    terrain: OpenTerrain
+    grid: MapGrid
+    light: Light
+
+    def ground(self, window: Window) -> Ground:
+        """What the terrain is like in a window of the picture."""
+        slopes = surface_slopes(self.terrain.surface, self.grid, window)
+        gx, gy = slopes.gradient
+        flat = 1 / np.sqrt(1 + gx.astype(float) ** 2 + gy.astype(float) ** 2)
+        east, north, up = self.light.directions[0]
+        tile = TileGround.of(MapTarget(self.grid), window, slopes.heights)
+        shadow = hidden_pixels(SunProjection((east, north, up)), tile, self.terrain.surface)
+        return Ground((up - east * gx - north * gy) * flat, (1 + flat) / 2, slopes.heights, shadow)
+
+    def read(self, window: Window) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        """Pixels and which of them count."""
+        values, valid = self.reader.read(window)
+        return values, np.ones(values.shape[1:], bool) if valid is None else valid
+
+
+def correct_illumination(request: IlluminationRequest, events: Events = SILENT) -> IlluminationReport:
+    """Correct an orthophoto; a run that was killed is continued by the same request.
+
+    Raises
+    ------
+    UsageError
+        The output exists, or a correction or the sun cannot be.
+    InputError
+        Picture or terrain cannot be used.
+    GeometryError
+        They do not overlap, or the picture's light is not that of this sun.
+    """
+    inputs = [request.picture, request.terrain]
+    LightModel(request.correct, 1.0, 0.0, ())
+    if not request.dry_run:
+        check_output(request.output, inputs, overwrite=request.overwrite)
+    place = _open(request)
+    cos_z = place.light.level
+    values, ground, part = _sample(place, events)
+    model = estimate(values, ground, part, request.correct, cos_z)
+    report = IlluminationReport(request.output, model, ground, values, model.corrected(values, ground))
+    if request.dry_run:
+        return IlluminationReport(None, model, ground, values, report.after)
+    dtype, nodata = place.reader.dtype, kept_nodata(place.reader.info, place.reader.dtype)
+
+    def tile(window: Window) -> GridTile:
+        pixels, valid = place.read(window)
+        return fitted(model.corrected(pixels, place.ground(window)), dtype), valid
+
+    options = GridOptions.of(
+        request,
+        "illumination",
+        inputs,
+        events,
+        settings={**pick(request, "sun", "correct"), "bands": [vars(band) for band in model.bands]},
+        tags={"PHOTOPLAN_VERSION": __version__, "PHOTOPLAN_KIND": "illumination"},
+        form=form_of(place.reader.info),
+    )
+    write_grid(request.output, place.grid.placement, dtype, place.reader.bands, nodata, tile, options)
+    return report
+
+
+def _open(request: IlluminationRequest) -> _Place:
+    light = Light(*request.sun)
+    reader = RasterReader(request.picture)
+    placement = placement_of(reader.info)
+    if placement.transform is None or placement.crs is None:
+        raise InputError(f"{request.picture}: no georeference or no CRS; light is corrected in orthophotos")
+    a, b, left, d, e, top = placement.transform
+    if b or d or not math.isclose(a, -e, rel_tol=1e-9) or a <= 0:
+        raise InputError(f"{request.picture}: its pixels are not square and north up; resample it first")
+    grid = MapGrid(left, top, a, *placement.size, placement.crs)
+    terrain, _ = open_terrain(request.terrain).in_crs(placement.crs)
+    terrain.refuse_apart(grid.bounds)
+    return _Place(reader, terrain, grid, light)
+
+
+def _sample(place: _Place, events: Events) -> tuple[NDArray[np.float64], Ground, NDArray[np.int64]]:
+    """Grey values (bands, n), ground (n,) and window (n,) of pixels all over the picture."""
+    width, height = place.grid.width, place.grid.height
+    columns, rows = ({int(at) for at in np.linspace(0, max(side - _SIDE, 0), _ALONG)} for side in (width, height))
+    events.begin("estimating", len(columns) * len(rows), "windows")
+    values, grounds, parts = [], [], []
+    for number, (col, row) in enumerate((c, r) for r in sorted(rows) for c in sorted(columns)):
+        window = Window(col, row, _SIDE, _SIDE) & place.grid.window
+        pixels, valid = place.read(window)
+        ground = place.ground(window)
+        use = valid & np.isfinite(ground.cos_i)
+        values.append(pixels[:, use].astype(float))
+        grounds.append([getattr(ground, each.name)[use] for each in fields(Ground)])
+        parts.append(np.full(int(use.sum()), number))
+        events.done()
+    every = np.concatenate(parts)
+    some = np.arange(0, len(every), max(1, len(every) // _MOST))
+    joined = Ground(*(np.concatenate(column)[some] for column in zip(*grounds)))
+    return np.concatenate(values, axis=1)[:, some], joined, every[some]
