@@ -19,6 +19,8 @@ from photoplan.project.scene import Scene, map_order, open_scene
 _PAIRS, _PLACES, _SIDE = 6, 5, 16
 #: Places that a pair must have; the difference that is told, part of the range of grey values.
 _LEAST, _TOLD = 5, 0.03
+#: A median counts if it is larger than so many times what it may be by chance: its spread over the root of the places.
+_SURE = 6.0
 
 
 def colour_advice(project: Project, names: Sequence[str]) -> str | None:
@@ -66,8 +68,11 @@ def _difference(one: Scene, other: Scene) -> tuple[float, float] | None:
         return None
     every = np.concatenate([first[both], second[both]])
     span = 255.0 if one.reader.dtype == np.uint8 else float(np.ptp(every))
-    # Of single places a difference may be a shadow or a car; all of them are exposure and haze.
-    return float(np.abs(np.median(first[both] - second[both], axis=0)).max()), max(span, 1e-9)
+    # Of single places a difference may be a shadow or a car; what all of them have is exposure and haze.
+    apart = first[both] - second[both]
+    middle = np.median(apart, axis=0)
+    sure = np.abs(middle) > _SURE * np.median(np.abs(apart - middle), axis=0) / np.sqrt(len(apart))
+    return float(np.abs(middle * sure).max()), max(span, 1e-9)
 
 
 def _means(scene: Scene, XYZ: NDArray[np.float64]) -> NDArray[np.float64]:
