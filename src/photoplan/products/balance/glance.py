@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.adjustment.robust import spread
 from photoplan.cameras.base import project as into_image
 from photoplan.errors import PhotoplanError
 from photoplan.geometry.grid import Window
@@ -70,7 +71,9 @@ def _difference(one: Scene, other: Scene) -> tuple[float, float] | None:
     span = 255.0 if one.reader.dtype == np.uint8 else float(np.ptp(every))
     # Of single places a difference may be a shadow or a car; what all of them have is exposure and haze.
     apart = first[both] - second[both]
-    middle = np.median(apart, axis=0)
+    middle, chance = np.median(apart, axis=0), spread(apart, None)
+    if chance > max(spread(first[both], None), _TOLD * span):
+        return None  # The images do not show the same.
     sure = np.abs(middle) > _SURE * np.median(np.abs(apart - middle), axis=0) / np.sqrt(len(apart))
     return float(np.abs(middle * sure).max()), max(span, 1e-9)
 
