@@ -30,6 +30,7 @@ VERBS = {
     "check": "Validate a project and print what to expect of it.",
     "budget": "What limits the accuracy of products, cause by cause.",
     "balance": "Even colours: tables by which images agree where they overlap.",
+    "seams": "Find where images of a mosaic are best joined.",
     "ortho": "Make orthophotos.",
     "mosaic": "Make one orthophoto of many images.",
     "illumination": "Take the light on slopes, and haze, out of an orthophoto.",

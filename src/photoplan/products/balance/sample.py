@@ -9,29 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.cameras.base import project as into_image
-from photoplan.engine.execute import render
 from photoplan.engine.steps import steps
 from photoplan.errors import GeometryError
 from photoplan.events import Events
-from photoplan.geometry.grid import MapGrid, Window
+from photoplan.geometry.grid import MapGrid
 from photoplan.io.project.model import Project
-from photoplan.plan.compile import AnchorRule
 from photoplan.plan.footprint import covered_tiles
-from photoplan.plan.owner import InSight
-from photoplan.plan.product import ProductPlan
 from photoplan.plan.tiles import Tile, Tiles
 from photoplan.products.balance.reference import Reference
 from photoplan.products.orthophoto.look import Looked, look_at, two_figures
 from photoplan.products.orthophoto.mosaic import refuse_mixed
+from photoplan.products.orthophoto.shown import shown
 from photoplan.radiometry.cells import BLOCK, SIDE, Cells, cells_of
 from photoplan.surfaces.objects import painted_surface
-from photoplan.targets.map import MapTarget
 
 #: Pixels of the map along the shorter side of an image, unless a resolution is chosen.
 ACROSS = 256
 #: Cells along the side of a tile.
 _CELLS = BLOCK
-_KERNEL, _TOLERANCE = "bilinear", 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,10 +98,10 @@ class _Sampling:
         """Cells of a tile, with all images that see a part of it."""
         window, values, valid, rows = tile.window, [], [], []
         for row in tile.sources:
-            painted = self._pixels(self.survey.looked[row], window)
-            if painted is not None:
-                values.append(painted[0])
-                valid.append(painted[1])
+            made = shown(self.survey.looked[row], self.survey.grid, window, self.survey.tiles.side)
+            if made.values is not None and made.valid is not None:
+                values.append(made.values.astype(np.float32))
+                valid.append(made.valid)
                 rows.append(row)
         if not rows:
             bands = self.survey.looked[0].scene.reader.bands
@@ -115,17 +110,6 @@ class _Sampling:
         number = tile.index * _CELLS**2
         cells = cells_of(np.stack(values), np.stack(valid), np.array(rows or [0], np.int64), number, known)
         return self._placed(replace(cells, uv=cells.uv + np.array([window.col, window.row], np.float32)))
-
-    def _pixels(self, one: Looked, window: Window) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
-        """What an image shows of a window where nothing hides the ground; None: nothing."""
-        scene, grid = one.scene, self.survey.grid
-        rule = AnchorRule.of(_KERNEL, _TOLERANCE)
-        every = Tiles.every(grid.window, _CELLS * SIDE)
-        plan = ProductPlan(one.name, (one.name,), MapTarget(grid), rule, every, InSight())
-        made = render(plan, Tile(0, window, (0,)), scene.sources, scene.surface, _KERNEL)
-        if made.values is None or made.valid is None:
-            return None
-        return made.values.astype(np.float32), made.valid
 
     def _placed(self, cells: Cells) -> Cells:
         """Cells with their places in the images instead of the map; those that have none are left out."""

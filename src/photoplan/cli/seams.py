@@ -1,0 +1,68 @@
+"""`photoplan seams`: where the images of a mosaic are best joined."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from photoplan.cli.options import (
+    PATH,
+    dry_run_option,
+    images_option,
+    json_option,
+    overwrite_option,
+    quiet_option,
+    workers_option,
+)
+from photoplan.cli.output import say, show, show_json
+
+
+@click.command("seams")
+@click.argument("project", type=PATH)
+@images_option()
+@click.option("--resolution", type=float, metavar="R", help="Seams run along pixels of R metres [256 across an image].")
+@click.option("--keep", type=PATH, metavar="FILE", help="Regions with their images that stay as they are.")
+@click.option("-o", "--output", type=PATH, metavar="FILE", help="[products/seams.gpkg by the project]")
+@click.option("--no-picture", is_flag=True, help="Do not draw the regions.")
+@workers_option
+@dry_run_option("Look at the images and stop.")
+@overwrite_option
+@json_option
+@quiet_option
+def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> None:
+    """Find seams between the images of PROJECT where they are least seen.
+
+    They run where two images show the same, around what stands out of the ground. The regions are a GeoPackage with a
+    column `image`, which `photoplan mosaic --seams` takes and QGIS edits.
+    """
+    from photoplan.cli.telling import Telling
+    from photoplan.engine.executors import available_cpus
+    from photoplan.products.seams.run import SeamsRequest, make_seams
+    from photoplan.report.drawing import has_matplotlib
+    from photoplan.report.mosaic import draw_regions
+
+    options["workers"] = options["workers"] or available_cpus()
+    request = SeamsRequest(**options)
+    with Telling(quiet) as events:
+        found = make_seams(request, events)
+    picture = None
+    if found.path is not None and found.shapes and not no_picture and has_matplotlib():
+        picture = draw_regions(found.path.with_suffix(".png"), found.shapes, "Images of the mosaic")
+    if as_json:
+        show_json(found, picture=picture)
+    elif found.path is None or found.differences is None or found.shapes is None:
+        grid = found.survey.grid
+        show(f"{len(found.survey.names)} images on {grid.width} × {grid.height} pixels of {grid.resolution:g} m")
+    else:
+        show(found.path)
+        if picture is not None:
+            show(picture)
+        show(
+            f"{len(found.shapes)} of {len(found.survey.names)} images joined at {found.survey.grid.resolution:g} m · "
+            "fine detail of the two images along seams differs by "
+            f"{found.differences[1]:.2f} grey values, halfway between them by {found.differences[0]:.2f}"
+        )
+    if not quiet:
+        for note in found.notes:
+            say(note)

@@ -1,0 +1,21 @@
+"""What single images show of a map, where nothing hides the ground: in memory, at a coarse resolution."""
+
+from __future__ import annotations
+
+from photoplan.engine.execute import Painted, render
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.plan.compile import AnchorRule
+from photoplan.plan.owner import InSight
+from photoplan.plan.product import ProductPlan
+from photoplan.plan.tiles import Tile, Tiles
+from photoplan.products.orthophoto.look import Looked
+from photoplan.targets.map import MapTarget
+
+_KERNEL, _TOLERANCE = "bilinear", 0.5
+
+
+def shown(one: Looked, grid: MapGrid, window: Window, side: int) -> Painted:
+    """What an image shows of a window of a map whose tiles have a side; nothing where anything hides the ground."""
+    rule = AnchorRule.of(_KERNEL, _TOLERANCE)
+    plan = ProductPlan(one.name, (one.name,), MapTarget(grid), rule, Tiles.every(grid.window, side), InSight())
+    return render(plan, Tile(0, window, (0,)), one.scene.sources, one.scene.surface, _KERNEL)

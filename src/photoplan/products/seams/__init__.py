@@ -1,0 +1,1 @@
+"""Seams of a mosaic, found in what its images show."""

@@ -1,0 +1,165 @@
+"""Seams between the images of a project, as regions that `mosaic` takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from photoplan.engine.steps import steps
+from photoplan.errors import GeometryError
+from photoplan.events import SILENT, Events
+from photoplan.io.polygons import label_polygons
+from photoplan.io.product import check_output
+from photoplan.io.project.file import load_project
+from photoplan.io.regions import read_regions, write_regions
+from photoplan.io.run_record import input_entry, run_key, run_times, write_run_record
+from photoplan.products.balance.sample import Survey, survey
+from photoplan.products.orthophoto.look import Looked
+from photoplan.products.orthophoto.shown import shown
+from photoplan.project.scene import input_files
+from photoplan.radiometry.seams import Shown, find_seams
+from photoplan.surfaces.objects import painted_surface
+from photoplan.targets.map import MapTarget
+
+#: Ground that stands out by this from what is around it, metres and pixels: houses, trees; and what seams cost there.
+_RAISED, _AROUND, _COSTS = 1.0, 25, 3.0
+
+
+@dataclass(frozen=True)
+class SeamsRequest:
+    """What is asked."""
+
+    project: Path
+    images: tuple[str, ...] = ()
+    """Names or patterns; none: all."""
+    resolution: float | None = None
+    """Pixels along whose edges seams run, metres; None: 256 of them across an image."""
+    keep: Path | None = None
+    """Regions that somebody has drawn: they stay, where their image sees the ground."""
+    output: Path | None = None
+    workers: int = 1
+    overwrite: bool = False
+    dry_run: bool = False
+
+    @property
+    def path(self) -> Path:
+        """The file of regions."""
+        return self.output or self.project.resolve().parent / "products" / "seams.gpkg"
+
+
+@dataclass(frozen=True, eq=False)
+class SeamsReport:
+    """What was found."""
+
+    survey: Survey
+    notes: tuple[str, ...]
+    path: Path | None = None
+    """None after a dry run, as all that follows."""
+    shapes: dict[str, Any] | None = None
+    """Multipolygon of each image that has one."""
+    differences: tuple[float, float] | None = None
+    """Mean difference at a pixel of seam: halfway between the images, and as found; grey values."""
+
+    def json_fields(self) -> dict[str, Any]:
+        """Figures by name."""
+        grid = self.survey.grid
+        facts: dict[str, Any] = {"images": self.survey.names, "resolution": grid.resolution, "notes": self.notes}
+        if self.shapes is None or self.differences is None:
+            return facts
+        halfway, found = self.differences
+        areas = {name: shape.area for name, shape in self.shapes.items()}
+        return {**facts, "path": self.path, "halfway": halfway, "found": found, "areas_m2": areas}
+
+
+def make_seams(request: SeamsRequest, events: Events = SILENT) -> SeamsReport:
+    """Find where the images of a project are best joined, and write the regions.
+
+    Raises
+    ------
+    UsageError
+        The output exists, or an option cannot be.
+    InputError
+        An input cannot be used, or images differ in bands or type of pixels.
+    GeometryError
+        No two images see the same terrain.
+    """
+    times, project = run_times(), load_project(request.project)
+    names = project.select(request.images or None)
+    files = [*input_files(project), *([request.keep] if request.keep else [])]
+    check_output(request.path, files, overwrite=request.overwrite)
+    found = survey(project, names, request.resolution, events)
+    notes = tuple(f"left out, sees no terrain: {line}" for line in found.blind)
+    if request.dry_run:
+        return SeamsReport(found, notes)
+    images = _images(found, request.workers, events)
+    if not sum(each.valid.any() for each in images) > 1:
+        raise GeometryError("fewer than two images show anything of the terrain; there is nothing to join")
+    grid = found.grid
+    fixed = None if request.keep is None else read_regions(request.keep, found.names, grid).rows(grid.window)
+    events.begin("finding seams", 0, "levels")
+    labels, halfway, best = find_seams(images, _weight(found), fixed, events.done)
+    polygons = label_polygons(labels.astype(np.int32), grid)
+    shapes = {row: _multi(shape) for row, shape in sorted(polygons.items())}
+    write_regions(request.path, found.names, shapes, grid.crs)
+    settings = {"resolution": grid.resolution, "images": list(found.names)}
+    inputs = [input_entry(file) for file in files]
+    key = run_key("seams", settings, inputs)
+    differences = {"halfway": halfway, "found": best}
+    run = {"workers": request.workers, **times()}
+    write_run_record(
+        request.path, product="seams", key=key, inputs=inputs, run=run, settings=settings, differences=differences
+    )
+    named = {found.names[row - 1]: shape for row, shape in shapes.items()}
+    return SeamsReport(found, notes, request.path, named, (halfway, best))
+
+
+def _images(found: Survey, workers: int, events: Events) -> list[Shown]:
+    """What each image shows of the map."""
+    events.begin("reading", len(found.looked), "images")
+    with steps("seams", workers, events) as run:
+        return list(run(_Reading(found).image, found.looked))
+
+
+@dataclass(frozen=True, eq=False)
+class _Reading:
+    """From an image to what it shows."""
+
+    survey: Survey
+
+    def image(self, one: Looked) -> Shown:
+        """All that it shows, tile by tile, put together."""
+        grid, tiles = self.survey.grid, self.survey.tiles
+        row = self.survey.looked.index(one)
+        mine = [tile.window for tile in tiles if row in tile.sources]
+        left, top = min(w.col for w in mine), min(w.row for w in mine)
+        right, bottom = max(w.stop[0] for w in mine), max(w.stop[1] for w in mine)
+        values = np.zeros((one.scene.reader.bands, bottom - top, right - left), np.float32)
+        valid = np.zeros(values.shape[1:], np.bool_)
+        for window in mine:
+            made = shown(one, grid, window, tiles.side)
+            if made.values is not None and made.valid is not None:
+                at = np.s_[window.row - top : window.stop[1] - top, window.col - left : window.stop[0] - left]
+                values[(slice(None), *at)], valid[at] = made.values, made.valid
+        return Shown(top, left, values, valid)
+
+
+def _weight(found: Survey) -> NDArray[np.float32]:
+    """What seams cost at a place: more on what stands out of the ground, whose parallax no picture hides."""
+    grid, surface = found.grid, painted_surface(found.looked[0].scene.surface)
+    relief = np.full((grid.height, grid.width), np.nan, np.float32)
+    for tile in found.tiles:
+        relief[tile.window.slices(grid.window)] = surface.relief(MapTarget(grid), tile.window)
+    known = np.where(np.isnan(relief), np.nanmin(relief), relief)
+    ground = ndimage.grey_opening(known, size=(_AROUND, _AROUND))
+    raised = ndimage.binary_dilation((known - ground > _RAISED) & ~np.isnan(relief))
+    return np.where(raised, np.float32(_COSTS), np.float32(1.0))
+
+
+def _multi(shape: Any) -> Any:
+    return shape if shape.geom_type == "MultiPolygon" else shapely.MultiPolygon([shape])

@@ -1,0 +1,85 @@
+"""`photoplan seams` of a small block: regions that `mosaic --seams` takes, kept ones, messages."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pyogrio
+import pytest
+import rasterio
+import rasterio.features
+import shapely
+from scipy.ndimage import gaussian_filter, map_coordinates
+from tools.command import Here
+from tools.small_block import CRS, NAMES, SIZE, X0, Y0, Z0, Block, make_project, write_image, write_terrain
+
+AWAY = (-60.0, 0.0, 60.0)
+NOISE = gaussian_filter(np.random.default_rng(5).normal(size=(3, 420, 420)), (0, 3, 3))
+GROUND = 120 + 35 * NOISE / NOISE.std()
+
+
+@pytest.fixture
+def block(small: Block) -> Block:
+    """Three vertical images of one level ground, of different brightness."""
+    col, row = np.meshgrid(np.arange(SIZE[0]) - (SIZE[0] - 1) / 2, np.arange(SIZE[1]) - (SIZE[1] - 1) / 2)
+    for path, gain, dx in zip(small.images, (1.0, 0.7, 1.2), AWAY):
+        seen = np.stack([map_coordinates(band, [210 + row, 210 + col + dx / 1.5], order=3) for band in GROUND])
+        write_image(path, np.clip(np.rint(gain * seen), 1, 255).astype(np.uint8))
+    lines = [f"{name},{X0 + dx},{Y0},{Z0},0,0,0" for name, dx in zip(NAMES, AWAY)]
+    small.orientation.write_text("\n".join(["name,x,y,z,omega,phi,kappa", *lines, ""]))
+    write_terrain(small.terrain, np.full((60, 64), 100.0))
+    make_project(small)
+    return small
+
+
+def test_regions_are_what_the_mosaic_paints(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    photoplan = Here(capsys)
+    said = photoplan("seams", block.project, "--resolution", 3, "--json", "-q")
+    assert said.code == 0, said.err
+    found = json.loads(said.out)
+    assert found["resolution"] == 3 and found["found"] <= found["halfway"]
+    path = block.folder / "products" / "seams.gpkg"
+    assert path.is_file() and path.with_suffix(".png").is_file() and path.with_suffix(".run.json").is_file()
+    meta, _, geometry, columns = pyogrio.raw.read(path)
+    regions = dict(zip(columns[meta["fields"].tolist().index("image")], shapely.from_wkb(geometry)))
+    assert len(regions) > 1 and set(regions) <= set(NAMES)
+    said = photoplan("mosaic", block.project, "--resolution", 3, "--seams", path, "--sources", "--no-quicklook")
+    assert said.code == 0, said.err
+    with rasterio.open(block.folder / "products" / "mosaic_sources.tif") as file:
+        sources, T = file.read(1), file.transform
+    record = json.loads((block.folder / "products" / "mosaic.run.json").read_text())
+    order = [each["name"] for each in record["images"]]
+    wanted = [(region, order.index(name) + 1) for name, region in regions.items()]
+    drawn = rasterio.features.rasterize(wanted, sources.shape, transform=T, dtype="uint16")
+    both = (drawn > 0) & (sources > 0)
+    # Kernels keep images three pixels away from their borders.
+    assert both.mean() > 0.5 and (drawn == sources)[both].mean() > 0.97
+
+
+def test_kept_regions_stay(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    photoplan = Here(capsys)
+    mine = shapely.box(X0 - 20, Y0 - 20, X0 + 20, Y0 + 20)
+    kept = block.folder / "mine.geojson"
+    shape = {"type": "Feature", "properties": {"image": NAMES[0]}, "geometry": json.loads(shapely.to_geojson(mine))}
+    crs = {"type": "name", "properties": {"name": CRS}}
+    kept.write_text(json.dumps({"type": "FeatureCollection", "crs": crs, "features": [shape]}))
+    said = photoplan("seams", block.project, "--resolution", 4, "--keep", kept, "--no-picture", "-q")
+    assert said.code == 0, said.err
+    meta, _, geometry, columns = pyogrio.raw.read(block.folder / "products" / "seams.gpkg")
+    regions = dict(zip(columns[meta["fields"].tolist().index("image")], shapely.from_wkb(geometry)))
+    assert regions[NAMES[0]].buffer(0.01).contains(mine.buffer(-4))
+
+
+def test_dry_run_existing_files_and_single_images(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    photoplan = Here(capsys)
+    said = photoplan("seams", block.project, "--dry-run")
+    assert said.code == 0 and "3 images on" in said.out
+    path = block.folder / "products" / "seams.gpkg"
+    assert not path.exists()
+    assert photoplan("seams", block.project, "--resolution", 6, "--no-picture", "-q").code == 0
+    before = path.read_bytes()
+    said = photoplan("seams", block.project, "--resolution", 6, "-q")
+    assert said.code == 2 and "exists already" in said.err and path.read_bytes() == before
+    said = photoplan("seams", block.project, "--images", NAMES[0], "-o", block.folder / "one.gpkg")
+    assert said.code == 3 and "two at least" in said.err
