@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import block_diag, csr_array, eye_array, kron
+from scipy.sparse import block_diag, csr_array, eye, kron
 from scipy.sparse.linalg import SuperLU, splu
 
 from photoplan.adjustment.robust import MEDIAN_1D, cauchy
@@ -178,7 +178,7 @@ def _prior(band: Band, state: State) -> tuple[csr_array, _Floats]:
     one = np.concatenate([bend, slope])
     wanted = np.r_[np.zeros(nodes - 2), np.full(nodes - 1, 1.0 / _SLOPE), np.zeros(terms)]
     whole = block_diag([one, np.eye(terms) / _TREND]) if terms else one
-    return csr_array(kron(eye_array(images), whole)), np.tile(wanted, images)
+    return csr_array(kron(eye(images), whole)), np.tile(wanted, images)
 
 
 def _gauge(band: Band, state: State, gauge: Gauge) -> tuple[_Floats, _Floats]:
