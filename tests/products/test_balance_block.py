@@ -119,6 +119,22 @@ def test_a_coarse_reference_gives_its_colours(block: Block, capsys: pytest.Captu
     assert both.code == 2 and "give one of them" in both.err
 
 
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_types_with_more_than_bytes(block: Block, capsys: pytest.CaptureFixture[str], dtype: type) -> None:
+    """The same images with grey values sixteen times as large: the same overlaps, sixteen times as large."""
+    photoplan = Here(capsys)
+    for path in block.images:
+        with rasterio.open(path) as file:
+            pixels = file.read()
+        write_image(path, (pixels.astype(float) * 16).astype(dtype))
+    before = differences(block, photoplan, "before")
+    assert photoplan("balance", block.project, "--resolution", 1.5, "--no-picture").code == 0
+    after = differences(block, photoplan, "after")
+    assert before > 16 * 20 and after < 16 * 3.5
+    with rasterio.open(block.folder / "after" / "one_ortho.tif") as file:
+        assert file.dtypes[0] == np.dtype(dtype).name
+
+
 def test_odd_images_are_named(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
     photoplan = Here(capsys)
     write_image(block.images[2], np.zeros((3, *SIZE[::-1]), np.uint8))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tools.real_projects import dmc_project
 
 from photoplan.io.project.file import load_project
+from photoplan.products.balance.reference import open_reference
 from photoplan.products.balance.run import BalanceRequest, balance_project
 from photoplan.products.orthophoto.plan import plan_orthophotos, render
 
@@ -35,6 +36,21 @@ def overlaps(project: Path) -> tuple[NDArray[np.float64], list[float]]:
     return np.array(pairs), clipped
 
 
+def beside_satellite(project: Path, satellite: Path) -> NDArray[np.float64]:
+    """Rms difference of all orthophotos to Sentinel-2 after one straight line for each band, (bands,)."""
+    plan = plan_orthophotos(load_project(project), resolution=R, hidden="nodata")
+    ours, theirs = [], []
+    for product in plan.products:
+        values, valid = render(plan, product.plan.name)
+        found = open_reference(satellite, product.grid, 3, np.dtype(np.uint8)).pixels(product.grid, product.grid.window)
+        assert found is not None
+        ours.append(values[:, valid & found[1]].astype(float))
+        theirs.append(found[0][:, valid & found[1]])
+    x, y = np.concatenate(ours, axis=1), np.concatenate(theirs, axis=1)
+    lines = [np.polyval(np.polyfit(a, b, 1), a) - b for a, b in zip(x, y)]
+    return np.sqrt(np.square(lines).mean(axis=1))
+
+
 @pytest.mark.slow
 def test_overlaps_before_and_after(shared: Path, tmp_path: Path) -> None:
     project = dmc_project(shared, tmp_path / "plain")
@@ -47,3 +63,7 @@ def test_overlaps_before_and_after(shared: Path, tmp_path: Path) -> None:
     assert (after.mean(axis=0) <= [11.9, 11.5, 9.3]).all()
     assert max(clipped) <= 0.005
     assert found.balanced is not None and np.abs(np.array(found.balanced.contrast) - 1).max() < 0.05
+    # Independent of all that was adjusted: colours came nearer to those of a satellite.
+    satellite = shared / "data" / "ngi_dmc" / "ref" / "sentinel2_b432_byte.tif"
+    plain, even = (beside_satellite(tmp_path / name / "project.toml", satellite) for name in ("plain", "even"))
+    assert (even < 0.95 * plain).all()

@@ -32,8 +32,9 @@ _LEAST_SLOPE = 0.05
 #: What a table that may not fall weighs beside the observations; their least standard deviation, part of the range.
 _HARD, _FLOOR = 1e4, 0.001
 _ROUNDS, _CONVERGED = 30, 1e-3
-#: Parts of the ground that are left out in turn, and unknowns whose standard deviations are computed at once.
-_PARTS, _AT_ONCE = 16, 256
+#: Parts of the ground that are left out in turn, most turns of the iteration for each, where it ends, and
+#: draws of what was known beforehand.
+_PARTS, _TURNS, _LEFT, _DRAWS = 16, 60, 0.001, 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +121,7 @@ def adjust(band: Band, gauge: Gauge) -> Adjusted:
             break
         flat |= falling
     weights = _weigh(band, state, robust, gauge.fixed is None)
-    variance = _without_parts(band, state, weights, known, H) + _of_prior(solved, prior, state)
+    variance = _without_parts(band, state, weights, solved) + _of_prior(solved, prior)
     sigmas = State(state.tables, state.trends, np.full(len(state.ground), np.nan)).with_vector(np.sqrt(variance))
     return Adjusted(state, sigmas, weights.sigma, rounds, float((robust < 0.5).mean()))
 
@@ -145,9 +146,9 @@ def _normals(band: Band, state: State, weights: _Weights) -> _Normals:
     residual, w = band.grey - shown, weights.of
     total = np.maximum(groups @ (w * slope**2) + weights.ground, 1e-300)
     pull = groups @ (w * slope * residual) + weights.ground * weights.moved
-    B = A.multiply(w[:, None]).tocsr()
-    lost = (groups @ B.multiply(slope[:, None]).tocsr()).multiply(1 / total[:, None]).tocsr()
-    N = A.T @ B - lost.T @ lost.multiply(total[:, None])
+    B = _scaled(A, w)
+    lost = _scaled(groups @ _scaled(B, slope), 1 / total)
+    N = A.T @ B - lost.T @ _scaled(lost, total)
     return _Normals(N, B.T @ residual - lost.T @ pull, pull / total, lost)
 
 
@@ -164,10 +165,16 @@ def _held(band: Band, state: State, sigma: float) -> tuple[_Floats, _Floats]:
     return moved, np.where(known, share * cauchy(moved / least, _HALF), 0.0) / least**2
 
 
+def _scaled(A: csr_array, by: _Floats) -> csr_array:
+    """A matrix with its rows multiplied; without the copies of its indices that the library makes."""
+    return csr_array((A.data * np.repeat(by, np.diff(A.indptr)), A.indices, A.indptr), shape=A.shape)
+
+
 def _sums(of: NDArray[np.int64]) -> csr_array:
     """The matrix that adds up observations of one number."""
-    n = len(of)
-    return csr_array((np.ones(n), (of, np.arange(n))), shape=(int(of.max()) + 1, n))
+    starts = np.concatenate([[0], np.cumsum(np.bincount(of))])
+    order = np.argsort(of, kind="stable")
+    return csr_array((np.ones(len(of)), order.astype(np.int32), starts.astype(np.int32)))
 
 
 def _prior(band: Band, state: State) -> tuple[csr_array, _Floats]:
@@ -232,7 +239,7 @@ class _Solved:
         return np.asarray(free + self.W @ np.linalg.solve(self.H @ self.W, missing - self.H @ free))
 
 
-def _without_parts(band: Band, state: State, weights: _Weights, known: csr_array, H: _Floats) -> _Floats:
+def _without_parts(band: Band, state: State, weights: _Weights, solved: _Solved) -> _Floats:
     """Variances of the unknowns by what they become without a part of the ground (Quenouille 1956, Tukey 1958).
 
     What lies near each other errs together; so parts are blocks of cells, drawn by lot, where there are enough.
@@ -241,24 +248,22 @@ def _without_parts(band: Band, state: State, weights: _Weights, known: csr_array
     part = np.random.default_rng(0).permutation(int(unit.max()) + 1) % _PARTS
     of, ground = part[unit], np.zeros(len(state.ground), np.int64)
     ground[band.group] = of
-    each = [
-        _normals(band, state, replace(weights, of=weights.of * (of == k), ground=weights.ground * (ground == k)))
-        for k in range(_PARTS)
-    ]
-    N, g = sum(one.N for one in each), sum(one.g for one in each)
+    moved = np.zeros((_PARTS, state.vector.size))
+    for k in range(_PARTS):
+        some = replace(weights, of=weights.of * (of == k), ground=weights.ground * (ground == k))
+        one = _normals(band, state, some)
+        # (N − Nₖ) x = −gₖ by N alone: what is left shrinks with every turn, the slower the more the part had to say.
+        for _ in range(_TURNS):
+            before, moved[k] = moved[k].copy(), solved.step(one.N @ moved[k] - one.g, 0.0)
+            if np.linalg.norm(moved[k] - before) < _LEFT * np.linalg.norm(before):
+                break
     # What residuals change with the unknowns under robust weights, beside what the weights alone say.
     kept = max(float(np.mean(2 * weights.robust**2 - weights.robust) / np.mean(weights.robust)), 0.2)
-    moved = np.array([_Solved.of(N - one.N + known, H).step(g - one.g, 0.0) for one in each]) / kept
+    moved /= kept
     return np.asarray((_PARTS - 1) / _PARTS * ((moved - moved.mean(axis=0)) ** 2).sum(axis=0))
 
 
-def _of_prior(solved: _Solved, prior: csr_array, state: State) -> _Floats:
-    """Variances of the unknowns by what was known of them beforehand."""
-    count = prior.shape[1]
-    found = np.empty(count)
-    for first in range(0, count, _AT_ONCE):
-        columns = np.arange(first, min(first + _AT_ONCE, count))
-        unit = np.zeros((count, len(columns)))
-        unit[columns, np.arange(len(columns))] = 1.0
-        found[columns] = ((prior @ solved.step(unit, 0.0)) ** 2).sum(axis=0)
-    return found
+def _of_prior(solved: _Solved, prior: csr_array) -> _Floats:
+    """Variances of the unknowns by what was known of them beforehand, from errors of it that are drawn by lot."""
+    drawn = np.random.default_rng(0).normal(size=(prior.shape[0], _DRAWS))
+    return np.asarray((solved.step(prior.T @ drawn, 0.0) ** 2).mean(axis=1))

@@ -21,6 +21,8 @@ _Floats = NDArray[np.float64]
 
 #: Nodes of a table in the adjustment, and grey values of the table that comes of it.
 NODES, ENTRIES = 17, 33
+#: Images in cells that are adjusted: some 100 for each of 500 images, all of a smaller block.
+_MOST_ROWS = 50_000
 #: Where a shoulder begins, parts of the range from its ends; what of the pixels may lie beyond it without one.
 _SHOULDER, _BEYOND = 0.12, 0.0005
 #: An image whose grey values differ by less than this part of the range is all of one colour.
@@ -109,6 +111,7 @@ def balance(
     inner = replace(shared, image=np.asarray(of, np.int64).reshape(-1))
     parts = parts_of(inner, len(images))
     place = None if fixed is None else int(np.flatnonzero(images == fixed)[0])
+    inner = _thinned(inner)
     nodes, found = np.linspace(*limits, NODES), []
     if factor:
         ends = np.array(limits)
@@ -135,6 +138,19 @@ def balance(
         for k in range(len(images))
     )
     return Balanced(images, tuple(map(tuple, moved)), sigmas, parts, tuple(found), contrast, beyond)
+
+
+def _thinned(cells: Cells) -> Cells:
+    """So many cells as an adjustment needs, drawn by lot."""
+    if len(cells) <= _MOST_ROWS:
+        return cells
+    number, of = np.unique(cells.cell, return_inverse=True)
+    taken = np.random.default_rng(0).random(len(number)) < _MOST_ROWS / len(cells)
+    # Images with few cells keep all of them.
+    count = np.bincount(cells.image)
+    few = count < 2 * _MOST_ROWS / len(count)
+    taken[of[few[cells.image]]] = True
+    return cells.some(np.flatnonzero(taken[of]))
 
 
 def shoulder(value: _Floats, limits: tuple[float, float]) -> _Floats:

@@ -137,8 +137,8 @@ class Band:
         values = np.column_stack([(1 - part) * v, part * v, table[:, None] * self.surfaces])
         first = self.image * state.width
         terms = len(self.nodes) + np.arange(self.surfaces.shape[1])
-        columns = np.column_stack([first + k, first + k + 1, first[:, None] + terms])
-        starts = np.arange(0, values.size + 1, values.shape[1])
+        columns = np.column_stack([first + k, first + k + 1, first[:, None] + terms]).astype(np.int32)
+        starts = np.arange(0, values.size + 1, values.shape[1], dtype=np.int32)
         shape = len(self.grey), len(state.tables) * state.width
         A = csr_array((values.ravel(), columns.ravel(), starts), shape=shape)
         return table * v, (high - low) / self.step * v, A
