@@ -39,7 +39,7 @@ test-plain: $(STAMP)
 
 test-oldest: $(OLDEST)/.installed
 	PYTHONPATH=src NUMBA_CACHE_DIR=$(CURDIR)/build/oldest-kernels $(OLDEST)/bin/python -m pytest -m "not slow and not bench" \
-		$(addprefix tests/,kernels geometry cameras surfaces plan engine io orientation terrain matching products)
+		$(addprefix tests/,kernels geometry cameras surfaces plan engine io orientation terrain matching radiometry products)
 
 $(OLDEST)/.installed: pyproject.toml tests/tools/oldest.py
 	$(PYTHON) -m venv --clear $(OLDEST)
