@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
-from pyproj import Transformer
+from pyproj import Proj, Transformer
 
 
 @dataclass(frozen=True)
@@ -82,13 +82,16 @@ class Strip:
             "body_rotation": {"quaternions": [[1.0, 0, 0, 0]], "ephemeris_times": [self.centre_time]},
         }
 
-    def seen(self, height: float) -> NDArray[np.float64]:
-        """Map X, Y (lines, columns, 2) at an ellipsoidal height of what each pixel sees, ray by ray."""
+    def seen(self, height: float, ahead: float = 0.0) -> NDArray[np.float64]:
+        """Map X, Y (lines, columns, 2) at an ellipsoidal height of what each pixel sees, ray by ray.
+
+        `ahead`: millimetres in the focal plane by which the line of detectors looks forward; such a line has no lens.
+        """
         span = self.lines * self.line_time
         S, R = self.pose(-span / 2 + self.line_time * np.arange(self.lines))
         y = (np.arange(self.columns) + 0.5 - self.columns / 2) * self.pitch
-        y = y * (1 - 2e-5 * y**2)
-        d = np.stack([np.zeros_like(y), y, np.full_like(y, self.focal)], axis=-1)
+        y = y if ahead else y * (1 - 2e-5 * y**2)
+        d = np.stack([np.full_like(y, ahead), y, np.full_like(y, self.focal)], axis=-1)
         d = np.einsum("nij,cj->nci", R, d / np.linalg.norm(d, axis=1, keepdims=True))
         back = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
         r = np.full(d.shape[:2], self.flying - height)
@@ -97,6 +100,34 @@ class Strip:
             r = r + (h - height)
         X, Y = Transformer.from_crs("EPSG:4979", self.crs, always_xy=True).transform(lon, lat, h)[:2]
         return np.stack([X, Y], axis=-1)
+
+    def strip_file(self, folder: Path, lever: tuple[float, float, float] = (0.0, 0.0, 0.0), late: float = 0.0) -> Path:
+        """The same flight as an aerial strip: a record of 200 Hz in the map, of an antenna, by a late clock."""
+        span = self.lines * self.line_time
+        t = np.arange(-0.6 * span, 0.6 * span, 0.005)
+        S, R = self.pose(t)
+        rest = R @ np.diag([1.0, -1.0, -1.0])  # camera axes with z up
+        antenna = S - rest @ np.array(lever)
+        back = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+        lon, lat, h = back.transform(*antenna.T)
+        X, Y = Transformer.from_crs("EPSG:4979", self.crs, always_xy=True).transform(lon, lat, h)[:2]
+        # Grid north is turned against true north by the convergence of the map.
+        turn = _convergence(self.crs, lon, lat)
+        omega, phi, kappa = _angles(_true_axes(lon, lat), rest, turn)
+        table = np.column_stack([t + 500 + late, X, Y, h, omega, phi, kappa])
+        np.savetxt(folder / "flight.csv", table, "%.10f", ",", header="time,x,y,z,omega,phi,kappa", comments="")
+        half = (self.columns - 1) / 2
+        path = folder / "strip.toml"
+        path.write_text(
+            f'format = "photoplan strip 1"\nlines = {self.lines}\n[clock]\nfirst = {500 - span / 2}\n'
+            f'line = {self.line_time}\n[flight]\nfile = "flight.csv"\ncrs = "{self.crs}"\n'
+            f'height_system = "ellipsoidal"\nlever_arm = {list(lever)}\ntime_offset = {-late}\n'
+            f"[detectors.nadir]\ncolumns = {self.columns}\nfocal_mm = {self.focal}\n"
+            f"y_mm = {_polynomial(half, self.pitch)}\n"
+            f"[detectors.forward]\ncolumns = {self.columns}\nfocal_mm = {self.focal}\nx_mm = [46.6]\n"
+            f"y_mm = [{half * self.pitch}, {-self.pitch}]\n"
+        )
+        return path
 
     def write(self, folder: Path, height: float) -> Path:
         """Image, ISD and project of a level ground; the project's path."""
@@ -138,3 +169,36 @@ def _quaternion(R: NDArray[np.float64]) -> list[float]:
         ]
     )
     return [float(v) for v in np.linalg.eigh((K + np.triu(K, 1).T) / 3)[1][:, -1]]
+
+
+def _true_axes(lon: NDArray[np.float64], lat: NDArray[np.float64]) -> NDArray[np.float64]:
+    """East, north, up (columns) in the axes of the earth, (n, 3, 3)."""
+    s, c, sl, cl = np.sin(np.radians(lon)), np.cos(np.radians(lon)), np.sin(np.radians(lat)), np.cos(np.radians(lat))
+    zero = np.zeros_like(s)
+    return np.stack(
+        [np.stack([-s, c, zero], -1), np.stack([-sl * c, -sl * s, cl], -1), np.stack([cl * c, cl * s, sl], -1)], -1
+    )
+
+
+def _convergence(crs: str, lon: NDArray[np.float64], lat: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angle from true north to grid north, clockwise, radians (PROJ's own figure)."""
+    return np.radians(Proj(crs).get_factors(lon, lat).meridian_convergence)
+
+
+def _angles(
+    axes: NDArray[np.float64], camera: NDArray[np.float64], turn: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """ω, φ, κ in degrees of camera axes against grid axes: R = Rx(ω) Ry(φ) Rz(κ)."""
+    c, s, zero = np.cos(turn), np.sin(turn), np.zeros_like(turn)
+    to_grid = np.stack(
+        [np.stack([c, -s, zero], -1), np.stack([s, c, zero], -1), np.stack([zero, zero, zero + 1], -1)], 1
+    )
+    R = to_grid @ np.swapaxes(axes, 1, 2) @ camera
+    angles = np.arctan2(-R[:, 1, 2], R[:, 2, 2]), np.arcsin(R[:, 0, 2]), np.arctan2(-R[:, 0, 1], R[:, 0, 0])
+    return tuple(np.degrees(each) for each in angles)  # type: ignore[return-value]
+
+
+def _polynomial(half: float, pitch: float) -> list[float]:
+    """Coefficients of y − 2e-5 y³, y = (half − column) · pitch: the lens of the ISD, columns to the right."""
+    y = np.polynomial.Polynomial([half * pitch, -pitch])
+    return [float(v) for v in (y - 2e-5 * y**3).coef]

@@ -126,6 +126,18 @@ def conjugate(q: _Floats) -> _Floats:
     return np.asarray(q * [1.0, -1.0, -1.0, -1.0])
 
 
+def quaternions(R: _Floats) -> _Floats:
+    """Unit quaternions (n, 4), scalar first, of rotation matrices (n, 3, 3) (Shepperd 1978)."""
+    w = np.trace(R, axis1=1, axis2=2)
+    x, y, z = (2 * R[:, k, k] - w for k in range(3))
+    a, b, c = R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]
+    p, q, r = R[:, 0, 1] + R[:, 1, 0], R[:, 0, 2] + R[:, 2, 0], R[:, 1, 2] + R[:, 2, 1]
+    # Each row of this matrix is the quaternion times one of its elements: the largest is taken.
+    rows = np.array([[1 + w, a, b, c], [a, 1 + x, p, q], [b, p, 1 + y, r], [c, q, r, 1 + z]])
+    best = rows[np.argmax([1 + w, 1 + x, 1 + y, 1 + z], axis=0), :, np.arange(len(R))]
+    return np.asarray(best / np.linalg.norm(best, axis=1, keepdims=True))
+
+
 def rotations(q: _Floats) -> _Floats:
     """Rotation matrices (n, 3, 3) of quaternions (n, 4), scalar first, of any length but 0."""
     w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T

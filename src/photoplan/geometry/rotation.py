@@ -16,28 +16,29 @@ ROTATION_ORDERS = ("opk", "pok", "kpo", "kop", "okp", "pko")
 _AXIS = {"o": 0, "p": 1, "k": 2}
 
 
-def _about(axis: int, angle: float) -> NDArray[np.float64]:
+def _about(axis: int, angle: NDArray[np.float64]) -> NDArray[np.float64]:
     c, s = np.cos(angle), np.sin(angle)
     i, j = (axis + 1) % 3, (axis + 2) % 3
-    R = np.eye(3)
-    R[i, i] = R[j, j] = c
-    R[i, j], R[j, i] = -s, s
+    R = np.zeros((*angle.shape, 3, 3))
+    R[..., axis, axis] = 1.0
+    R[..., i, i] = R[..., j, j] = c
+    R[..., i, j], R[..., j, i] = -s, s
     return R
 
 
 def rotation_from_angles(angles: ArrayLike, order: str = "opk") -> NDArray[np.float64]:
-    """Rotation matrix of three angles given in the sequence of `order`.
+    """Rotation matrices of three angles given in the sequence of `order`.
 
     Parameters
     ----------
-    angles : array_like, shape (3,)
+    angles : array_like, shape (..., 3)
         Radians, in the sequence that `order` spells: with ``"pok"`` the first angle is φ.
     order : str
         One of `ROTATION_ORDERS`; the first letter is the primary rotation, o = about X, p = about Y, k = about Z.
 
     Returns
     -------
-    R_ground_camera : ndarray, shape (3, 3)
+    R_ground_camera : ndarray, shape (..., 3, 3)
         Takes camera axes to ground axes; for ``"opk"`` it is Ecker 1991, eq. 3.3.
 
     Raises
@@ -47,8 +48,9 @@ def rotation_from_angles(angles: ArrayLike, order: str = "opk") -> NDArray[np.fl
     """
     if order not in ROTATION_ORDERS:
         raise UsageError(f"rotation order {order!r}; allowed are {', '.join(ROTATION_ORDERS)}")
-    first, second, third = (_about(_AXIS[k], float(a)) for k, a in zip(order, np.asarray(angles, float)))
-    return first @ second @ third
+    angles = np.asarray(angles, float)
+    first, second, third = (_about(_AXIS[k], angles[..., place]) for place, k in enumerate(order))
+    return np.asarray(first @ second @ third)
 
 
 def rotation_opk(omega: float, phi: float, kappa: float) -> NDArray[np.float64]:

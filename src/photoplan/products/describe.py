@@ -15,7 +15,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.heights import height_label
 from photoplan.io.appearance import looks_like
-from photoplan.io.camera.line.file import is_line, read_line
+from photoplan.io.camera.line.file import describe_line, is_line
 from photoplan.io.camera.rpc.file import is_rpc, read_rpc, rpc_beside, rpc_in
 from photoplan.io.filter_file import is_filter
 from photoplan.io.plan_file import read_plan_tables
@@ -75,6 +75,8 @@ def describe(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     kind = path.suffix.lower()
+    if is_line(path):
+        return {"file": str(path), **describe_line(path), **(read_rpc(path).describe() if is_rpc(path) else {})}
     if kind == ".csv" or (kind == ".toml" and is_filter(path)):
         return describe_filter(path)
     if kind == ".toml":
@@ -83,8 +85,6 @@ def describe(path: Path) -> dict[str, Any]:
         return describe_model(ModelReader(path))
     if kind == ".gpkg":
         return _plan(path)
-    if is_line(path):
-        return {"file": str(path), **read_line(path).describe(), **(read_rpc(path).describe() if is_rpc(path) else {})}
     if kind == ".json":
         return _record(path)
     if is_rpc(path):

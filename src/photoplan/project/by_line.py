@@ -25,7 +25,8 @@ def line_camera(project: Project, image: LineImage, ground: Ground, size: tuple[
         The grid that leads from the ground's heights to the ellipsoid is missing.
     """
     file = project.resolve(image.line)
-    stated = _read(file, stamp_of(file))
+    stamps = tuple(stamp_of(each) for each in image.geometry_files(project.resolve))
+    stated = _read(file, stamps, image.detectors)
     for given, where in ((stated.size, image.line), (image.size, "the project")):
         if given is not None and tuple(given) != size:
             raise InputError(
@@ -36,6 +37,6 @@ def line_camera(project: Project, image: LineImage, ground: Ground, size: tuple[
 
 
 @lru_cache(maxsize=64)
-def _read(file: Path, stamp: tuple[int, int]) -> StatedLine:
-    """Read again only when the file changes."""
-    return read_line(file)
+def _read(file: Path, stamps: tuple[tuple[int, int], ...], detectors: str | None) -> StatedLine:
+    """Read again only when one of the files changes."""
+    return read_line(file, detectors)

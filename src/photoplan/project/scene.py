@@ -118,15 +118,15 @@ class Scene:
 
 def input_files(project: Project) -> list[Path]:
     """All files that a project names; nothing that is written may replace one of them."""
-    each = [file for image in project.images for file in (image.file, image.geometry_file, image.balance)]
-    files = [file for file in each if file is not None]
+    files = [file for image in project.images for file in (image.file, image.balance) if file is not None]
     restored = [project.restoration(image) for image in project.images]
     files += [file for each in restored if each is not None for file in each.files]
     files += [] if project.terrain is None or project.terrain.file is None else [project.terrain.file]
     files += [objects.file for objects in project.objects]
     observed = project.observations
     files += [*observed.image_points, *observed.control, *([observed.positions] if observed.positions else [])]
-    return [project.resolve(file) for file in files]
+    geometry = [file for image in project.images for file in image.geometry_files(project.resolve)]
+    return [*(project.resolve(file) for file in files), *geometry]
 
 
 def open_scene(project: Project, name: str) -> Scene:
@@ -167,8 +167,8 @@ def scene_address(project: Project, name: str) -> SceneAddress:
     """
     image = project.any_image(name)
     alone = project.alone([name])
-    own = image.file, image.geometry_file, image.balance
-    files = [project.resolve(file) for file in own if file is not None]
+    files = [project.resolve(file) for file in (image.file, image.balance) if file is not None]
+    files += image.geometry_files(project.resolve)
     if project.ground.file is not None:
         files.append(project.resolve(project.ground.file))
     files += [project.resolve(objects.file) for objects in project.objects]

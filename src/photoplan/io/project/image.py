@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field, field_validator
@@ -40,6 +42,10 @@ class ImageEntry(Entry, ABC):
     @abstractmethod
     def geometry_file(self) -> str | None:
         """File that its geometry is read from, beside that of its pixels; None: there is none."""
+
+    def geometry_files(self, resolve: Callable[[str], Path]) -> list[Path]:
+        """All files that its geometry is read from, beside that of its pixels; `resolve` finds what entries name."""
+        return [] if self.geometry_file is None else [resolve(self.geometry_file)]
 
     @property
     @abstractmethod

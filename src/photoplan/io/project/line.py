@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 from pydantic import field_validator
 
+from photoplan.io.camera.line.file import line_files
+from photoplan.io.camera.model import Name
 from photoplan.io.project.image import ImageEntry, InputName, plain_file
 
 
@@ -12,6 +17,8 @@ class LineImage(ImageEntry):
 
     line: InputName
     """File of the line camera."""
+    detectors: Name | None = None
+    """Which line of detectors, where the file has several."""
 
     @field_validator("line")
     @classmethod
@@ -22,6 +29,10 @@ class LineImage(ImageEntry):
     def geometry_file(self) -> str:
         """The file of the line camera."""
         return self.line
+
+    def geometry_files(self, resolve: Callable[[str], Path]) -> list[Path]:
+        """That file, and the record of the flight beside it."""
+        return line_files(resolve(self.line))
 
     @property
     def described_by(self) -> None:

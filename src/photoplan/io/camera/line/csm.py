@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from photoplan.cameras.line_look import LineLook
 from photoplan.cameras.line_track import LineTrack
 from photoplan.errors import InputError
-from photoplan.geometry.motion import EvenTable, between, conjugate, continuous, cubic, rotations, times
+from photoplan.geometry.motion import EvenTable, between, conjugate, continuous, cubic, quaternions, rotations, times
 from photoplan.io.camera.line.model import StatedLine
 
 _Floats = NDArray[np.float64]
@@ -132,17 +132,10 @@ class _Isd:
 
 
 def _quaternion(R: _Floats) -> _Floats:
-    """The unit quaternion (4,) of a rotation matrix (3, 3), scalar first (Shepperd 1978)."""
+    """The unit quaternion (4,) of a rotation matrix (3, 3), scalar first."""
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
         raise InputError("a constant rotation is none")
-    # Each row of this matrix is the quaternion times one of its elements.
-    w = float(np.trace(R))
-    x, y, z = (2 * float(R[k, k]) - w for k in range(3))
-    a, b, c = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
-    p, q, r = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
-    rows = np.array([[1 + w, a, b, c], [a, 1 + x, p, q], [b, p, 1 + y, r], [c, q, r, 1 + z]])
-    best = rows[np.argmax(np.diag(rows))]
-    return np.asarray(best / np.linalg.norm(best))
+    return quaternions(R[None])[0]
 
 
 def _track(isd: _Isd) -> LineTrack:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from photoplan.errors import InputError
 from photoplan.io.appearance import looks_like
-from photoplan.io.camera.line import csm, dimap
+from photoplan.io.camera.line import csm, dimap, strip
 from photoplan.io.camera.line.model import MAX_BYTES, StatedLine
 from photoplan.io.markup_files import read_xml
 from photoplan.io.plain_files import read_json
@@ -24,28 +24,59 @@ def _document(path: Path) -> StatedLine:
     return dimap.read(root, path)
 
 
-#: Reader of every format, by file suffix.
+#: Reader of every format that states a single line, by file suffix.
 LINE_FORMATS: dict[str, Callable[[Path], StatedLine]] = {".json": _isd, ".isd": _isd, ".xml": _document}
 
 
-def read_line(path: Path) -> StatedLine:
-    """A line camera of a file: CSM support data (ISD, JSON), or a DIMAP document with a physical model.
+def read_line(path: Path, detectors: str | None = None) -> StatedLine:
+    """A line camera of a file: CSM support data (ISD, JSON), DIMAP with a physical model, or an aerial strip (TOML).
+
+    Parameters
+    ----------
+    path : Path
+    detectors : str, optional
+        Which line of a strip that has several.
 
     Raises
     ------
     InputError
-        The format is unknown, or the file cannot be used.
+        The format is unknown, the file cannot be used, or has no such line.
     """
-    read = LINE_FORMATS.get(path.suffix.lower())
-    if read is None:
-        raise InputError(f"{path}: not a file of a line camera ({', '.join(LINE_FORMATS)}){looks_like(path)}")
-    return read(path)
+    kind = path.suffix.lower()
+    if kind == ".toml":
+        return strip.read(path, detectors)
+    if kind not in LINE_FORMATS:
+        known = ", ".join([*LINE_FORMATS, ".toml"])
+        raise InputError(f"{path}: not a file of a line camera ({known}){looks_like(path)}")
+    if detectors is not None:
+        raise InputError(f"{path}: holds a single line of detectors; take `detectors = {detectors!r}` out")
+    return LINE_FORMATS[kind](path)
+
+
+def describe_line(path: Path) -> dict[str, str]:
+    """A line camera in words, by name; of several lines of detectors the first, and the names of all."""
+    if path.suffix.lower() != ".toml":
+        return read_line(path).describe()
+    names = strip.names(path)
+    return {**read_line(path, names[0]).describe(), "detectors": ", ".join(names)}
+
+
+def line_files(path: Path) -> list[Path]:
+    """The file of a line camera, and those that it names; what is wrong with them is told when they are read."""
+    if path.suffix.lower() != ".toml":
+        return [path]
+    try:
+        return [path, strip.flight_file(path)]
+    except InputError:
+        return [path]
 
 
 def is_line(path: Path) -> bool:
     """Whether a file states a line camera; a file that cannot be read does not."""
     kind = path.suffix.lower()
     try:
+        if kind == ".toml":
+            return strip.is_it(path)
         if kind == ".xml":
             return dimap.is_it(read_xml(path, MAX_BYTES))
         return kind in LINE_FORMATS and "line_scan_rate" in read_json(path, MAX_BYTES)

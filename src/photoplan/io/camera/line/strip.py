@@ -1,0 +1,179 @@
+"""Aerial strips: our own form, TOML beside a table of the flight.
+
+The flight is a record of positions and angles at its own rate, in a projected CRS; angles turn the axes of the map
+(grid east, grid north, up) at each place into those of the record. Camera axes are those of frame images: x in the
+direction of flight, y to the left, z up; a detector at x, y (mm) in the focal plane of a positive looks along
+(x, y, −c).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.polynomial import polynomial
+from numpy.typing import NDArray
+from pydantic import Field
+
+from photoplan.cameras.line_look import LineLook
+from photoplan.cameras.line_track import LineTrack
+from photoplan.errors import InputError
+from photoplan.geometry.body import EARTH_RADII, BodyGround
+from photoplan.geometry.motion import between, continuous, cubic, quaternions
+from photoplan.geometry.rotation import ANGLE_UNITS, rotation_from_angles, rotation_opk
+from photoplan.io.camera.line.model import MAX_BYTES, StatedLine
+from photoplan.io.camera.model import Entry, Name, Number, Pixels, Positive, Triple
+from photoplan.io.plain_files import read_entries, read_head, read_text
+
+_Floats = NDArray[np.float64]
+FORM = "aerial strip (photoplan)"
+MARK = "photoplan strip 1"
+_COLUMNS = "time,x,y,z,omega,phi,kappa"
+#: From the camera axes of frame images to those of a line camera, which looks along +z.
+_TURNED = np.diag([1.0, -1.0, -1.0])
+_Polynomial = Annotated[tuple[Number, ...], Field(min_length=1, max_length=16)]
+
+
+class StripClock(Entry):
+    """``[clock]``: when lines were taken."""
+
+    first: Number
+    """Middle of the exposure of the first line, in the time of the flight's record; seconds."""
+    line: Positive
+    """From line to line, seconds."""
+
+
+class StripFlight(Entry):
+    """``[flight]``: the record of positions and angles."""
+
+    file: Annotated[str, Field(max_length=4000)]
+    """CSV with the header ``time,x,y,z,omega,phi,kappa``, or NPY of shape (n, 7)."""
+    crs: Name
+    height_system: Name
+    angle_unit: Literal["deg", "gon", "rad"] = "deg"
+    rotation: Literal["opk", "pok", "kpo", "kop", "okp", "pko"] = "opk"
+    """Order of the rotations, the primary one first; the columns stay as they are."""
+    time_offset: Number = 0.0
+    """Added to the times of the record, seconds."""
+    lever_arm: Triple = (0.0, 0.0, 0.0)
+    """From the recorded point to the projection centre, in the axes of the record, metres."""
+    boresight: Triple = (0.0, 0.0, 0.0)
+    """ω, φ, κ from the axes of the camera to those of the record, degrees."""
+
+
+class StripDetectors(Entry):
+    """``[detectors.NAME]``: one line of detectors."""
+
+    columns: Pixels
+    focal_mm: Positive
+    x_mm: _Polynomial = (0.0,)
+    """Where the detectors are in the direction of flight: coefficients of the powers of the column, mm."""
+    y_mm: _Polynomial
+    """The same across it, to the left."""
+
+
+class StripFile(Entry):
+    """A whole file."""
+
+    format: Literal["photoplan strip 1"]
+    lines: Pixels
+    clock: StripClock
+    flight: StripFlight
+    detectors: Annotated[dict[Name, StripDetectors], Field(min_length=1, max_length=1000)]
+
+
+def is_it(path: Path) -> bool:
+    """Whether a TOML file is of this form."""
+    return MARK in read_head(path)
+
+
+def names(path: Path) -> list[str]:
+    """Names of the lines of detectors; a file that cannot be used is an InputError."""
+    return list(read_entries(path, StripFile, MAX_BYTES).detectors)
+
+
+def flight_file(path: Path) -> Path:
+    """The record of the flight that a strip names.
+
+    Raises
+    ------
+    InputError
+        The file of the strip cannot be used.
+    """
+    return path.parent / read_entries(path, StripFile, MAX_BYTES).flight.file
+
+
+def read(path: Path, name: str | None) -> StatedLine:
+    """The line camera of a strip, by the name of its detectors; None: there is one line of them.
+
+    Raises
+    ------
+    InputError
+        An entry or a number is missing or wrong.
+    HeightSystemError
+        The grid that leads from the record's heights to the ellipsoid is missing.
+    """
+    strip = read_entries(path, StripFile, MAX_BYTES)
+    known = ", ".join(strip.detectors)
+    if name is None and len(strip.detectors) > 1:
+        raise InputError(f"{path}: has several lines of detectors ({known}); say which by `detectors = NAME`")
+    detectors = strip.detectors.get(name or next(iter(strip.detectors)))
+    if detectors is None:
+        raise InputError(f"{path}: no line of detectors {name!r}; there are {known}")
+    try:
+        return StatedLine(path, FORM, _track(strip, path), _look(detectors), EARTH_RADII)
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if text.startswith(str(path.parent)) else f"{path}: {text}") from None
+
+
+def _track(strip: StripFile, path: Path) -> LineTrack:
+    flight = strip.flight
+    table = _record(path.parent / flight.file)
+    t = table[:, 0] + flight.time_offset - strip.clock.first
+    ground = BodyGround(flight.crs, flight.height_system, EARTH_RADII)
+    places = ground(table[:, 1:4])
+    axes = ground.jacobian(table[:, 1:4])
+    if not (np.isfinite(places).all() and np.isfinite(axes).all()):
+        raise InputError(f"positions of {flight.file} have no place in {flight.crs}; are they in this CRS?")
+    # Grid east, grid north and up in the axes of the earth.
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    angles = table[:, 4:] * (2 * np.pi / ANGLE_UNITS[flight.angle_unit])
+    record = axes @ rotation_from_angles(angles[:, ["opk".index(k) for k in flight.rotation]], flight.rotation)
+    S = places + record @ np.array(flight.lever_arm)
+    q = continuous(quaternions(record @ rotation_opk(*np.radians(flight.boresight)) @ _TURNED))
+    speed = np.gradient(S, t, axis=0, edge_order=2 if len(t) > 2 else 1)
+    clock = np.array([0.0]), np.array([0.0]), np.array([strip.clock.line])
+    known = float(t[0]), float(t[-1])
+    return LineTrack(
+        strip.lines, *clock, lambda when: cubic(t, S, speed, when), lambda when: between(t, q, when), known
+    )
+
+
+def _record(path: Path) -> _Floats:
+    """The table of the flight, shape (n, 7)."""
+    try:
+        if path.suffix.lower() == ".npy":
+            table = np.load(path, allow_pickle=False, mmap_mode="r").astype(float)
+        else:
+            header, _, body = read_text(path, MAX_BYTES).partition("\n")
+            if header.replace(" ", "").lower() != _COLUMNS:
+                raise InputError(f"{path}: the first line is {header[:80]!r}; it has to be {_COLUMNS}")
+            table = np.loadtxt(body.splitlines(), delimiter=",", ndmin=2)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error})") from None
+    if table.ndim != 2 or table.shape[1] != 7 or len(table) < 2 or not np.isfinite(table).all():
+        raise InputError(f"{path}: a table of shape {table.shape}; needed are two rows or more of seven finite numbers")
+    if not (np.diff(table[:, 0]) > 0).all():
+        row = int(np.argmin(np.diff(table[:, 0]))) + 1
+        raise InputError(f"{path}: the time of row {row + 1} ({table[row, 0]:g}) is not after that of the row before")
+    return np.ascontiguousarray(table)
+
+
+def _look(detectors: StripDetectors) -> LineLook:
+    def tangents(column: _Floats) -> _Floats:
+        x, y = (polynomial.polyval(column, each) for each in (detectors.x_mm, detectors.y_mm))
+        return np.asarray(np.stack([x, -y], axis=-1) / detectors.focal_mm)
+
+    return LineLook.of(tangents, detectors.columns)

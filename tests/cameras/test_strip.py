@@ -1,0 +1,102 @@
+"""Aerial strips: a record of the flight, several lines of detectors; pixels drawn ray by ray by other means."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from scipy import ndimage
+from tools.command import inside
+from tools.line_strip import Strip, pattern
+
+from photoplan.cameras.base import project
+from photoplan.errors import InputError
+from photoplan.io.camera.line.file import read_line
+from photoplan.io.project.file import load_project
+from photoplan.project.scene import input_files
+
+
+@pytest.mark.parametrize(("name", "ahead"), [("nadir", 0.0), ("forward", 46.6)])
+@pytest.mark.parametrize(("lever", "late"), [((0.0, 0.0, 0.0), 0.0), ((1.2, -0.4, 2.0), 0.35)])
+def test_pixels_see_what_was_drawn(
+    tmp_path: Path, name: str, ahead: float, lever: tuple[float, float, float], late: float
+) -> None:
+    """A lens, a line that looks 25° ahead, an antenna two metres away, a clock that is late; grid north is 1° off."""
+    strip = Strip()
+    camera = read_line(strip.strip_file(tmp_path, lever, late), name).camera(strip.crs, "ellipsoidal")
+    XY = strip.seen(300.0, ahead)
+    found = project(camera, np.concatenate([XY, np.full((*XY.shape[:2], 1), 300.0)], axis=-1))
+    y, x = np.mgrid[: strip.lines, : strip.columns]
+    assert np.abs(found - np.stack([x, y], axis=-1)).max() < 1e-3
+
+
+def test_boresight_turns_the_camera(tmp_path: Path) -> None:
+    """A tenth of a degree about the line of flight moves columns by 0.1° in units of a pixel."""
+    strip = Strip()
+    path = strip.strip_file(tmp_path)
+    ground = np.array([[*strip.seen(300.0)[300, 200], 300.0]])
+    before = project(read_line(path, "nadir").camera(strip.crs, "ellipsoidal"), ground)
+    path.write_text(path.read_text().replace("lever_arm", "boresight = [0.1, 0.0, 0.0]\nlever_arm"))
+    after = project(read_line(path, "nadir").camera(strip.crs, "ellipsoidal"), ground)
+    assert abs(after - before)[0, 0] == pytest.approx(np.radians(0.1) * strip.focal / strip.pitch, rel=0.01)
+    assert abs(after - before)[0, 1] < 0.3
+
+
+def test_two_lines_of_one_flight_show_the_same_ground(tmp_path: Path) -> None:
+    """Orthophotos of the nadir and the forward line, by command: the grey value of each place in both."""
+    strip = Strip()
+    strip.strip_file(tmp_path)
+    entries = []
+    for name, ahead in (("nadir", 0.0), ("forward", 46.6)):
+        with rasterio.open(
+            tmp_path / f"{name}.tif", "w", driver="GTiff", width=400, height=600, count=1, dtype="float32"
+        ) as file:
+            file.write(pattern(strip.seen(300.0, ahead)).astype(np.float32), 1)
+        entries.append(f'[[images]]\nname = "{name}"\nfile = "{name}.tif"\nline = "strip.toml"\ndetectors = "{name}"\n')
+    toml = tmp_path / "project.toml"
+    height = '[terrain]\nheight = 300.0\nheight_system = "ellipsoidal"\n'
+    toml.write_text(f'format = 1\ncrs = "{strip.crs}"\n{height}{"".join(entries)}')
+    assert tmp_path / "flight.csv" in input_files(load_project(toml))
+    assert "nadir, forward" in inside("info", tmp_path / "strip.toml").out
+    said = inside("ortho", toml, "--resolution", 0.3, "--no-quicklook")
+    assert said.code == 0, said.err
+    for path in said.out.split():
+        with rasterio.open(path) as product:
+            values, valid, T = product.read(1), product.read_masks(1) > 0, product.transform
+        row, column = np.mgrid[: values.shape[0], : values.shape[1]] + 0.5
+        whole = ndimage.binary_erosion(valid, iterations=2)
+        error = (values - pattern(np.stack([T.c + T.a * column, T.f + T.e * row], axis=-1)))[whole]
+        pixel = 0.3 * float(np.hypot(40 / 4, 40 / 5)) / np.sqrt(2)
+        print(f"\n{Path(path).name}: rms {error.std() / pixel:.4f} px, worst {np.abs(error).max() / pixel:.3f} px")
+        assert valid.mean() > 0.7 and error.std() / pixel < 0.03 and np.abs(error).max() / pixel < 0.3
+
+
+@pytest.mark.parametrize(
+    ("what", "by", "told"),
+    [
+        ("flight.csv", lambda t: t.replace("time,x", "t,x"), "the first line is"),
+        ("flight.csv", lambda t: t.replace("\n", "\nnan,1,1,1,1,1,1\n", 1), "finite"),
+        ("flight.csv", lambda t: "\n".join([*t.split("\n")[:5], t.split("\n")[2], ""]), "is not after that of"),
+        ("flight.csv", lambda t: t.replace(".", "x", 9), "cannot be read"),
+        ("strip.toml", lambda t: t.replace("EPSG:32633", "EPSG:4326"), "is geographic"),
+        ("strip.toml", lambda t: t.replace("first = ", "first = 9"), "no line of the image is oriented"),
+        ("strip.toml", lambda t: t.replace("focal_mm = 100.0", "focal_mm = -100.0"), "focal_mm"),
+        ("strip.toml", lambda t: t.replace('"flight.csv"', '"other.csv"'), "other.csv"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, what: str, by: object, told: str) -> None:
+    path = Strip(lines=60).strip_file(tmp_path)
+    file = tmp_path / what
+    file.write_text(by(file.read_text()))  # type: ignore[operator]
+    with pytest.raises(InputError, match=told):
+        read_line(path, "nadir")
+
+
+def test_detectors_are_chosen_by_name(tmp_path: Path) -> None:
+    path = Strip(lines=60).strip_file(tmp_path)
+    with pytest.raises(InputError, match=r"several lines of detectors \(nadir, forward\)"):
+        read_line(path)
+    with pytest.raises(InputError, match="no line of detectors 'back'; there are nadir, forward"):
+        read_line(path, "back")
