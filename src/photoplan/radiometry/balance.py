@@ -60,6 +60,11 @@ class Pairs:
     before: _Floats
     """(n, bands), grey values."""
     after: _Floats
+    places: _Floats
+    """Columns and rows of the cells on the map, (m, 2)."""
+    before_there: _Floats
+    """The same of all pairs in each cell, mean of the bands, (m,)."""
+    after_there: _Floats
 
 
 def even_images(cells: Cells, images: int, span: float) -> NDArray[np.bool_]:
@@ -164,18 +169,21 @@ def shoulder(value: _Floats, limits: tuple[float, float]) -> _Floats:
 
 def pairs_of(cells: Cells, tones: dict[int, Sequence[Tone]], sizes: NDArray[np.int64]) -> Pairs:
     """How images differ before and after; those without tones stay as they are."""
-    after = _values(cells, tones, sizes)
     a, b = neighbours(cells)
     pair, of, count = np.unique(
         np.stack([cells.image[a], cells.image[b]], axis=1), axis=0, return_inverse=True, return_counts=True
     )
-    squares = []
-    for values in (cells.pixels.astype(float), after):
+    cell = np.unique(cells.cell, return_inverse=True)[1]
+    first = np.unique(cell, return_index=True)[1]
+    times = np.bincount(cell[a], minlength=len(first))
+    found, maps = [], []
+    for values in (cells.pixels.astype(float), _values(cells, tones, sizes)):
         mean = np.square(values[a] - values[b]).mean(axis=2)
         total = np.zeros((len(pair), cells.bands))
         np.add.at(total, of.reshape(-1), mean)
-        squares.append(np.sqrt(total / count[:, None]))
-    return Pairs(pair, count * cells.pixels.shape[2], squares[0], squares[1])
+        found.append(np.sqrt(total / count[:, None]))
+        maps.append(np.sqrt(np.bincount(cell[a], mean.mean(axis=1), len(first)) / np.maximum(times, 1)))
+    return Pairs(pair, count * cells.pixels.shape[2], found[0], found[1], cells.place[first], maps[0], maps[1])
 
 
 def _tone(nodes: _Floats, found: Adjusted, image: int, powers: Sequence[tuple[int, int]]) -> Tone:

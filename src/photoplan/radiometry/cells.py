@@ -31,6 +31,8 @@ class Cells:
     """Number of the image, (m,)."""
     uv: NDArray[np.float32]
     """Column and row in the image of the cell's middle and of the places of `pixels`, (m, 1 + PIXELS, 2)."""
+    place: NDArray[np.float64]
+    """Column and row of the cell's middle on the map, (m, 2)."""
     share: NDArray[np.float64]
     """Part of the cell that is compared, (m,)."""
     levels: NDArray[np.float32]
@@ -90,7 +92,7 @@ def cells_of(
     Returns
     -------
     Cells
-        `uv` are columns and rows of the part, not yet of the images.
+        `uv` and `place` are columns and rows of the part, not yet of images and map.
     """
     height, width = valid.shape[1:]
     bands = values.shape[1]
@@ -127,6 +129,7 @@ def cells_of(
         block=np.array(kept["block"], np.int64),
         image=np.array(kept["image"], np.int64),
         uv=np.array(kept["uv"], np.float32).reshape(-1, 1 + PIXELS, 2),
+        place=np.array(kept["uv"], float).reshape(-1, 1 + PIXELS, 2)[:, 0],
         share=np.array(kept["share"], float),
         levels=np.concatenate([none[0], *kept["levels"]]).astype(np.float32),
         pixels=np.concatenate([none[1], *kept["pixels"]]).astype(np.float32),

@@ -1,4 +1,4 @@
-"""The picture of balanced images: overlaps before and after, tables, and trends over the images."""
+"""The picture of balanced images: overlaps before and after, on the map too, tables, and trends."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from photoplan.products.balance.run import BalanceReport
 from photoplan.radiometry.balance import Balanced, Pairs
+from photoplan.radiometry.cells import SIDE
 from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, RED, SOFT, STYLE, png
 
 _BANDS = (RED, GREEN, BLUE, ORANGE)
@@ -25,7 +26,7 @@ class BalancePlots:
     mpl: Any
 
     def balance(self, report: BalanceReport) -> bytes:
-        """Overlaps, tables and trends, as PNG."""
+        """Overlaps, tables, maps and trends, as PNG."""
         pairs, found = report.pairs, report.balanced
         assert pairs is not None and found is not None
         shown = np.argsort(-pairs.before.mean(axis=1))[:_PAIRS]
@@ -33,15 +34,16 @@ class BalancePlots:
         trends = bool(images) and bool(found.tones[0][0].terms)
         bands = min(len(found.tones[0]), len(_BANDS))
         with self.mpl.rc_context(STYLE):
-            heights = [1.1 + 0.2 * len(shown), 3.0, *([2.6] if trends else [])]
+            heights = [1.1 + 0.2 * len(shown), 3.0, 3.6, *([2.6] if trends else [])]
             fig = self.mpl.figure.Figure(figsize=(10.0, sum(heights) + 0.6), layout="constrained")
             rows = fig.add_gridspec(len(heights), 1, height_ratios=heights)
             _overlaps(fig.add_subplot(rows[0]), report, pairs, shown.tolist())
             cells = rows[1].subgridspec(1, bands)
             for band in range(bands):
                 _tables(fig.add_subplot(cells[band]), found, band)
+            _maps(fig, rows[2], pairs)
             if trends:
-                cells = rows[2].subgridspec(1, len(images))
+                cells = rows[3].subgridspec(1, len(images))
                 for column, k in enumerate(images):
                     _trend(fig, fig.add_subplot(cells[column]), report, found, k)
             return png(fig)
@@ -81,6 +83,21 @@ def _tables(axes: Any, found: Balanced, band: int) -> None:
     axes.set(xlabel="grey value", title=f"Tables, band {band + 1}")
     if band == 0:
         axes.set_ylabel("becomes (band: one σ)" if len(every) <= 8 and found.sigmas[0][0] else "becomes")
+
+
+def _maps(fig: Any, row: Any, pairs: Pairs) -> None:
+    """Where on the map images differ, before and after, with the same colours."""
+    col, line = (np.round(pairs.places.T - pairs.places.min(axis=0)[:, None]) // SIDE).astype(int)
+    most = float(np.quantile(pairs.before_there, 0.98))
+    cells = row.subgridspec(1, 2)
+    for k, (word, values) in enumerate((("before", pairs.before_there), ("after", pairs.after_there))):
+        raster = np.full((line.max() + 1, col.max() + 1), np.nan)
+        raster[line, col] = values
+        axes = fig.add_subplot(cells[k])
+        picture = axes.imshow(raster, cmap="viridis", vmin=0, vmax=max(most, 1e-9), interpolation="nearest")
+        axes.set(xticks=[], yticks=[], title=f"Differences {word}")
+        axes.grid(False)
+        fig.colorbar(picture, ax=axes, fraction=0.04)
 
 
 def _trend(fig: Any, axes: Any, report: BalanceReport, found: Balanced, k: int) -> None:

@@ -109,7 +109,8 @@ class _Sampling:
         known = None if self.reference is None or not rows else self.reference.pixels(self.survey.grid, window)
         number = tile.index * _CELLS**2
         cells = cells_of(np.stack(values), np.stack(valid), np.array(rows or [0], np.int64), number, known)
-        return self._placed(replace(cells, uv=cells.uv + np.array([window.col, window.row], np.float32)))
+        corner = np.array([window.col, window.row])
+        return self._placed(replace(cells, place=cells.place + corner, uv=cells.uv + corner.astype(np.float32)))
 
     def _placed(self, cells: Cells) -> Cells:
         """Cells with their places in the images instead of the map; those that have none are left out."""
