@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import block_diag, csr_array, eye, kron
-from scipy.sparse.linalg import SuperLU, splu
 
 from photoplan.adjustment.robust import MEDIAN_1D, cauchy
 from photoplan.radiometry.equations import Band, State
+from photoplan.radiometry.solve import Solved
 
 _Floats = NDArray[np.float64]
 
@@ -111,7 +111,7 @@ def adjust(band: Band, gauge: Gauge) -> Adjusted:
         rising, missing = _rising(band, state, flat)
         hard = _HARD * float(found.N.diagonal().max())
         known = prior.T @ prior + hard * (rising.T @ rising)
-        solved = _Solved.of(found.N + known, H)
+        solved = Solved.of(found.N + known, H, state.width)
         step = solved.step(found.g + prior.T @ (wanted - prior @ x) + hard * (rising.T @ missing), held - H @ x)
         state = state.with_vector(x + step)
         state = State(state.tables, state.trends, state.ground + found.alone - found.lost @ step)
@@ -141,7 +141,7 @@ def _weigh(band: Band, state: State, robust: _Floats, own: bool) -> _Weights:
 
 def _normals(band: Band, state: State, weights: _Weights) -> _Normals:
     """Normal equations of observations that have weights; the ground is taken out of them."""
-    groups = _sums(band.group)
+    groups = _sums(band.group, len(state.ground))
     shown, slope, A = band.predicted(state)
     residual, w = band.grey - shown, weights.of
     total = np.maximum(groups @ (w * slope**2) + weights.ground, 1e-300)
@@ -170,11 +170,12 @@ def _scaled(A: csr_array, by: _Floats) -> csr_array:
     return csr_array((A.data * np.repeat(by, np.diff(A.indptr)), A.indices, A.indptr), shape=A.shape)
 
 
-def _sums(of: NDArray[np.int64]) -> csr_array:
-    """The matrix that adds up observations of one number."""
-    starts = np.concatenate([[0], np.cumsum(np.bincount(of))])
+def _sums(of: NDArray[np.int64], count: int) -> csr_array:
+    """The matrix that adds up observations of one number, of `count` numbers."""
+    starts = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=count))])
     order = np.argsort(of, kind="stable")
-    return csr_array((np.ones(len(of)), order.astype(np.int32), starts.astype(np.int32)))
+    parts = np.ones(len(of)), order.astype(np.int32), starts.astype(np.int32)
+    return csr_array(parts, shape=(count, len(of)))
 
 
 def _prior(band: Band, state: State) -> tuple[csr_array, _Floats]:
@@ -217,29 +218,7 @@ def _rising(band: Band, state: State, flat: NDArray[np.bool_]) -> tuple[csr_arra
     return rows, _LEAST_SLOPE * band.step - np.diff(state.tables, axis=1)[image, k]
 
 
-@dataclass(frozen=True, eq=False)
-class _Solved:
-    """Normal equations, factored, under the conditions of the gauge."""
-
-    factors: SuperLU
-    H: _Floats
-    W: _Floats
-    """N⁻¹ Hᵀ."""
-
-    @classmethod
-    def of(cls, N: csr_array, H: _Floats) -> _Solved:
-        factors = splu(N.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-        return cls(factors, H, factors.solve(np.ascontiguousarray(H.T)) if len(H) else H.T)
-
-    def step(self, g: _Floats, missing: _Floats | float) -> _Floats:
-        """Solutions for right sides (unknowns,) or (unknowns, k) that fulfil the conditions."""
-        free = self.factors.solve(g)
-        if not len(self.H):
-            return np.asarray(free)
-        return np.asarray(free + self.W @ np.linalg.solve(self.H @ self.W, missing - self.H @ free))
-
-
-def _without_parts(band: Band, state: State, weights: _Weights, solved: _Solved) -> _Floats:
+def _without_parts(band: Band, state: State, weights: _Weights, solved: Solved) -> _Floats:
     """Variances of the unknowns by what they become without a part of the ground (Quenouille 1956, Tukey 1958).
 
     What lies near each other errs together; so parts are blocks of cells, drawn by lot, where there are enough.
@@ -250,8 +229,9 @@ def _without_parts(band: Band, state: State, weights: _Weights, solved: _Solved)
     ground[band.group] = of
     moved = np.zeros((_PARTS, state.vector.size))
     for k in range(_PARTS):
-        some = replace(weights, of=weights.of * (of == k), ground=weights.ground * (ground == k))
-        one = _normals(band, state, some)
+        rows = np.flatnonzero(of == k)
+        some = replace(weights, of=weights.of[rows], ground=weights.ground * (ground == k))
+        one = _normals(band.some(rows), state, some)
         # (N − Nₖ) x = −gₖ by N alone: what is left shrinks with every turn, the slower the more the part had to say.
         for _ in range(_TURNS):
             before, moved[k] = moved[k].copy(), solved.step(one.N @ moved[k] - one.g, 0.0)
@@ -263,7 +243,7 @@ def _without_parts(band: Band, state: State, weights: _Weights, solved: _Solved)
     return np.asarray((_PARTS - 1) / _PARTS * ((moved - moved.mean(axis=0)) ** 2).sum(axis=0))
 
 
-def _of_prior(solved: _Solved, prior: csr_array) -> _Floats:
+def _of_prior(solved: Solved, prior: csr_array) -> _Floats:
     """Variances of the unknowns by what was known of them beforehand, from errors of it that are drawn by lot."""
     drawn = np.random.default_rng(0).normal(size=(prior.shape[0], _DRAWS))
     return np.asarray((solved.step(prior.T @ drawn, 0.0) ** 2).mean(axis=1))

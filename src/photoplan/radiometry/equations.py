@@ -100,6 +100,11 @@ class Band:
             reference=np.repeat(cells.reference[first, band].astype(float), many),
         )
 
+    def some(self, rows: NDArray[np.int64]) -> Band:
+        """Some observations."""
+        names = ("image", "group", "cell", "block", "grey", "weight", "surfaces")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+
     @property
     def step(self) -> float:
         """Between two nodes."""
