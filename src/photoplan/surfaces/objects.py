@@ -122,6 +122,16 @@ def without_objects(surface: Terrain) -> Terrain:
     return surface.ground if isinstance(surface, ObjectSurface) else surface
 
 
+def rising_above(surface: Terrain, height: float) -> dict[str, float]:
+    """Objects that rise above a height, with how high they rise, metres; of a surface without objects none."""
+    if not isinstance(surface, ObjectSurface):
+        return {}
+    faces = surface.faces
+    top = np.full(len(faces.names), -np.inf)
+    np.maximum.at(top, np.repeat(faces.owner, 3), faces.corners[..., 2].ravel())
+    return {faces.names[k]: float(top[k]) for k in np.flatnonzero(top > height)}
+
+
 def painted_surface(surface: Terrain) -> Terrain:
     """What a product shows, without what only hides."""
     return surface.painted if isinstance(surface, ObjectSurface) else surface

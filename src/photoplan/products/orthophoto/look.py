@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from photoplan.cameras.base import Camera
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import Events
 from photoplan.geometry.grid import refuse_absurd
@@ -17,6 +18,8 @@ from photoplan.plan.footprint import Footprint, image_border, mean_gsd, some_hei
 from photoplan.products.judged import judged, reading_of_block
 from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.scene import Scene, map_order, open_scene
+from photoplan.surfaces.base import Terrain
+from photoplan.surfaces.objects import rising_above
 
 #: A product is at most so many times finer than its images see the ground.
 _FINER = 4.0
@@ -56,6 +59,7 @@ def look_at(project: Project, names: Sequence[str], force: bool, events: Events)
         events.done()
     if not force:
         _refuse_faults(project, seen, scenes)
+        _refuse_above_cameras(list(scenes.values()))
     looked, blind = [], []
     for name, scene in ((name, scenes[name]) for name in names):
         if scene.footprint.bounds is None:
@@ -90,6 +94,26 @@ def _refuse_faults(
         )
     if other is not None:
         raise GeometryError(f"another reading of the orientations fits better; {forced}. {other}")
+
+
+def _refuse_above_cameras(scenes: Sequence[Scene]) -> None:
+    told = above_cameras(scenes[0].surface, [scene.camera for scene in scenes]) if scenes else None
+    if told is not None:
+        raise GeometryError(f"{told} Nothing is made of it unless you say `force`")
+
+
+def above_cameras(surface: Terrain, cameras: Sequence[Camera]) -> str | None:
+    """What to say of objects that rise above every camera, in feet perhaps; None: none does."""
+    highest = max(float(camera.vantage.point[2]) for camera in cameras)
+    tall = rising_above(surface, highest)
+    if not tall:
+        return None
+    name, top = next(iter(tall.items()))
+    more = f" (and {len(tall) - 1} more)" if len(tall) > 1 else ""
+    return (
+        f"object {name!r}{more} rises to {top:.1f} m, above all cameras (the highest is at {highest:.1f} m): are its "
+        "heights in metres, and in the height system that is stated?"
+    )
 
 
 def _refuse_too_fine(project: Project, resolution: float, settings: OrthoSettings, looked: Sequence[Looked]) -> None:
