@@ -179,3 +179,30 @@ def test_images_of_different_kinds_are_named(small: Block, capsys: pytest.Captur
     make_project(small)
     said = Here(capsys)("mosaic", small.project, *OPTIONS)
     assert said.code == 3 and "'two' has 1 bands of uint8" in said.err and "'one' has 3 bands" in said.err
+
+
+def test_feathered_images_pass_into_each_other(small: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    """Images of one grey value each: no step at seams, nothing else changes, and tiles join."""
+    for path, grey in zip(small.images, (60, 120, 200)):
+        write_image(path, np.full((3, SIZE[1], SIZE[0]), grey, np.uint8))
+    photoplan, folder = Here(capsys), small.folder / "products"
+    plain = ["mosaic", small.project, *OPTIONS, "--sources"]
+    assert photoplan(*plain).code == 0
+    assert photoplan(*plain, "--feather", 40, "--name", "soft").code == 0
+    assert photoplan(*plain, "--feather", 40, "--name", "whole", "--tile", 512).code == 0
+    hard, soft = (made(folder / f"{name}.tif")[0].astype(int) for name in ("mosaic", "soft"))
+    sources = made(folder / "soft_sources.tif")[0]
+    np.testing.assert_array_equal(sources, made(folder / "mosaic_sources.tif")[0])
+    np.testing.assert_array_equal(soft, made(folder / "whole.tif")[0])
+    painted = (sources[:, 1:] > 0) & (sources[:, :-1] > 0)
+    # In the last rows the borders of two images cross: they have nothing in common there.
+    steps = [np.where(painted, np.abs(np.diff(each, axis=1)), 0)[:185].max() for each in (hard, soft)]
+    assert steps[0] >= 60 and steps[1] <= 16
+    seams = painted & (sources[:, 1:] != sources[:, :-1])
+    away = np.ones(sources.shape, bool)
+    for row, col in np.argwhere(seams | np.pad(np.diff(sources, axis=0) != 0, ((0, 1), (0, 0)))[:, 1:]):
+        away[max(row - 22, 0) : row + 23, max(col - 22, 0) : col + 23] = False
+    np.testing.assert_array_equal(soft[away], hard[away])
+    assert away.any() and (soft != hard).any()
+    said = photoplan(*plain, "--feather", -1, "--name", "x")
+    assert said.code == 2 and "--feather" in said.err

@@ -109,7 +109,8 @@ def render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface:
     """
     window, cameras = tile.window, {row: sources[row].camera for row in tile.sources}
     compiled = compile_tile(product, tile, cameras, surface)
-    needed = max((_bytes(layer, sources[layer.source]) for layer in compiled.layers), default=0)
+    every = [*compiled.layers, *(layer for _, layers in compiled.blends for layer in layers)]
+    needed = max((_bytes(layer, sources[layer.source]) for layer in every), default=0)
     if needed <= MOST_SOURCE_BYTES or max(window.width, window.height) <= SMALLEST_PART:
         values, valid = execute_tile(compiled, sources, kernel)
         refused: dict[int, NDArray[np.bool_]] = {}
@@ -117,12 +118,34 @@ def render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface:
             again = compile_next(product, tile, cameras, surface, compiled, refused)
             values, valid = execute_tile(again, sources, kernel, (values, valid))
             compiled = _with_others(compiled, again, np.any(list(refused.values()), axis=0))
+        _blend(compiled, sources, kernel, (values, valid))
         return _painted(compiled, values, valid)
     side = max(SMALLEST_PART, -(-max(window.width, window.height) // 2))
     cut = [replace(tile, window=part) for part in window.tiles(side)]
     parts = ((part.window, render(product, part, sources, surface, kernel)) for part in cut)
     whole = joined(window, parts, sources[tile.sources[0]].reader)
     return whole if np.any(whole.valid) else replace(whole, values=None, valid=None, owner=None)
+
+
+def _blend(
+    tile: CompiledTile, sources: Sequence[Source], kernel: str, onto: tuple[NDArray[Any], NDArray[np.bool_]]
+) -> None:
+    """Replace what is painted along seams by the weighted mean of the sources that pass into each other there."""
+    values, valid = onto
+    if not tile.blends or not len(values):
+        return
+    total, weights = np.zeros(values.shape, np.float64), np.zeros(valid.shape, np.float64)
+    for weight, layers in tile.blends:
+        shown, usable = execute_tile(replace(tile, layers=layers, blends=()), sources, kernel)
+        if len(shown):
+            # In float64: the least weights are those of sources that stand alone in the end.
+            mine = weight.astype(np.float64) * usable
+            total += mine * np.where(usable, shown, 0)
+            weights += mine
+    at = valid & (weights > 0)
+    mean = total[:, at] / weights[at]
+    whole = values.dtype.kind in "iu"
+    values[:, at] = (np.floor(mean + 0.5) if whole else mean).astype(values.dtype)
 
 
 def _refuse(tile: CompiledTile, valid: NDArray[np.bool_], refused: dict[int, NDArray[np.bool_]]) -> bool:

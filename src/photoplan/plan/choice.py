@@ -18,7 +18,7 @@ What an image does not see it does not paint, whatever its score.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -120,6 +120,14 @@ class BestImage:
             best = np.where(seen, best, np.argmin(blind, axis=0))
         paints = np.isfinite(inside) if self.paints_hidden else seen
         return Share(np.where(paints, np.array(rows)[best] + 1, 0).astype(np.uint16), hidden)
+
+    def sees(self, ground: TileGround, camera: Projection, surface: Surface) -> NDArray[np.bool_]:
+        """Pixels of a tile that an image sees, and away from its border and from what it does not see."""
+        wide = _wide(ground, surface)
+        alone = replace(self, ranks=(), drawn=None)
+        cost, scale = alone._penalty(0, camera, (ground, _slope(wide, ground.window)), None)
+        self._look(cost, scale, camera, (ground, wide), surface)
+        return np.asarray(cost < 0.5 * _RIMMED)
 
     def _look(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from photoplan.kernels.footprint import depth_tilt, footprint_levels
 from photoplan.kernels.position import tile_runs
 from photoplan.plan.anchors import Anchors
 from photoplan.plan.compile import FINEST, AnchorRule, compile_anchors
+from photoplan.plan.feather import Feather
 from photoplan.plan.ground import TileGround
 from photoplan.plan.owner import Ownership, Share
 from photoplan.plan.tiles import Tile, Tiles
@@ -61,6 +62,8 @@ class CompiledTile:
     """See `Share.owner`."""
     hidden: NDArray[np.bool_] | None
     """See `Share.hidden`."""
+    blends: tuple[tuple[NDArray[np.float32], tuple[Layer, ...]], ...] = ()
+    """Weights of images along seams, shape (height, width), with the layers by which each paints where it has any."""
 
     @property
     def residual(self) -> float:
@@ -89,6 +92,8 @@ class ProductPlan:
     """Tiles that can hold a part of an image."""
     owners: Ownership | None = None
     """Who paints which pixel; None: there is one source."""
+    feather: Feather | None = None
+    """How sources pass into each other along seams; None: they do not."""
 
     def __post_init__(self) -> None:
         if len(self.sources) != 1 and self.owners is None:
@@ -115,8 +120,34 @@ def compile_tile(product: ProductPlan, tile: Tile, cameras: Mapping[int, Project
     """
     relief, tilt = _depth(product, tile.window, surface)
     ground = TileGround.of(product.target, tile.window, relief)
+    if product.feather is not None:
+        return _feathered(product, tile, cameras, (ground, tilt), surface)
     share = Share(None) if product.owners is None else product.owners.share(ground, cameras, surface)
     return _compiled(product, tile, cameras, (ground, tilt), share)
+
+
+def _feathered(
+    product: ProductPlan,
+    tile: Tile,
+    cameras: Mapping[int, Projection],
+    depth: tuple[TileGround, NDArray[np.float32] | None],
+    surface: Surface,
+) -> CompiledTile:
+    """A tile whose sources pass into each other."""
+    assert product.feather is not None and product.owners is not None
+    wide = product.feather.around(tile.window, product.target.window)
+    ground = TileGround.of(product.target, wide, surface.relief(product.target, wide))
+    share = product.owners.share(ground, cameras, surface)
+    assert share.owner is not None
+    at = tile.window.slices(wide)
+    owner = np.ascontiguousarray(share.owner[at])
+    hidden = None if share.hidden is None else np.ascontiguousarray(share.hidden[at])
+    made = _compiled(product, tile, cameras, depth, Share(owner, hidden))
+    blends = []
+    for row, weight in product.feather.weights(share.owner, ground, tile.window, cameras, surface).items():
+        mine = Share(np.where(weight > 0, np.uint16(row + 1), np.uint16(0)))
+        blends.append((weight, _compiled(product, tile, cameras, depth, mine).layers))
+    return replace(made, blends=tuple(blends))
 
 
 def compile_next(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import overload
@@ -107,6 +108,22 @@ class Tiles(Sequence[Tile]):
             return replace(self, indices=wanted)
         places = np.flatnonzero(np.isin(self.indices, wanted))
         return replace(self, indices=self.indices[places], sources=self.sources.only(places))
+
+    def with_neighbours(self) -> Tiles:
+        """The same tiles, each with the sources of the eight around it, too."""
+        if not isinstance(self.sources, Shares):
+            return self
+        rows, cols = self.shape
+        counts = np.diff(self.sources.ends, prepend=0)
+        row, col = np.divmod(np.repeat(self.indices.astype(np.int64), counts), cols)
+        found = []
+        for down, right in itertools.product((-1, 0, 1), repeat=2):
+            inside = (row + down >= 0) & (row + down < rows) & (col + right >= 0) & (col + right < cols)
+            at = (row + down) * cols + col + right
+            found.append(np.stack([at, self.sources.rows.astype(np.int64)])[:, inside & np.isin(at, self.indices)])
+        tile, source = np.unique(np.concatenate(found, axis=1), axis=1)
+        ends = np.searchsorted(tile, self.indices.astype(np.int64), side="right")
+        return replace(self, sources=Shares(ends, source.astype(np.uint16)))
 
     def touching(self, window: Window) -> Tiles:
         """Tiles of the product that hold pixels of a window, whichever are listed."""

@@ -25,12 +25,13 @@ from photoplan.io.storage import nodata_for
 from photoplan.plan.accuracy import in_image
 from photoplan.plan.choice import BestImage, Drawn
 from photoplan.plan.compile import AnchorRule
+from photoplan.plan.feather import feather_of
 from photoplan.plan.footprint import Footprint, covered_tiles
-from photoplan.plan.owner import InSight, Ownership
+from photoplan.plan.owner import InSight
 from photoplan.plan.product import ProductPlan
 from photoplan.plan.tiles import Tile, Tiles
 from photoplan.products.orthophoto.look import Look, extent_text, look_at, with_resolution
-from photoplan.products.orthophoto.settings import OrthoSettings
+from photoplan.products.orthophoto.settings import Choice, OrthoSettings
 from photoplan.project.scene import Scene
 from photoplan.project.scenes import ScenesAddress
 from photoplan.project.uncertain import ScenesErrors
@@ -221,17 +222,23 @@ def product_plan(
 ) -> ProductPlan:
     """A product of one image or of many, from what each of them sees of the terrain."""
     rule = AnchorRule.of(settings.kernel, settings.tolerance)
-    return ProductPlan(name, images, MapTarget(grid), rule, tiles, _owners(images, settings, looks, regions))
-
-
-def _owners(
-    images: tuple[str, ...], settings: OrthoSettings, looks: Sequence[Look], regions: Drawn | None
-) -> Ownership | None:
-    """Who paints a pixel."""
     if settings.choice is None:
-        return None if settings.hidden == "show" else InSight(paints_hidden=settings.hidden == "mark")
+        owners = None if settings.hidden == "show" else InSight(paints_hidden=settings.hidden == "mark")
+        return ProductPlan(name, images, MapTarget(grid), rule, tiles, owners)
+    best = _best(images, settings, settings.choice, looks, regions)
+    feather = feather_of(best, settings.choice.feather, grid.resolution, settings.tile)
+    if feather is not None:
+        # Whose seams lie beside a tile decides about weights in it.
+        tiles = tiles.with_neighbours()
+    return ProductPlan(name, images, MapTarget(grid), rule, tiles, best, feather)
+
+
+def _best(
+    images: tuple[str, ...], settings: OrthoSettings, choice: Choice, looks: Sequence[Look], regions: Drawn | None
+) -> BestImage:
+    """Who of many images paints a pixel."""
     ranges = np.array([look.footprint.height_range for look in looks])
-    first, weights = settings.choice.prefer, settings.choice.weights
+    first, weights = choice.prefer, choice.weights
     ranks = [float(first.index(name) - len(first)) * PREFERRED if name in first else 0.0 for name in images]
     return BestImage(
         levels=(float(np.nanmin(ranges[:, 0])), float(np.nanmax(ranges[:, 1]))),

@@ -32,6 +32,9 @@ class Choice:
     seams: str | None = None
     """A GeoPackage of regions, each with its image, that come before the score; relative to the project's folder."""
 
+    feather: float = 0.0
+    """Width in which images pass into each other along seams, metres; 0: they do not."""
+
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Choice:
         """A choice from plain values."""

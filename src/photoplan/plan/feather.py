@@ -1,0 +1,127 @@
+"""How images pass into each other along seams: by weights, only where both see the same surface.
+
+The weight of an image is the share of a square window around the pixel that it owns, twice over, so that weights bend
+at no place and, where three meet, still add up to one. An image that does not see a pixel, or hardly (beside its border
+and beside what hides ground from it), has no weight there, and gains it over half the width: nothing is carried across
+an occlusion, and no new seam appears at its edge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.cameras.base import Projection
+from photoplan.errors import UsageError
+from photoplan.geometry.grid import Window
+from photoplan.plan.ground import TileGround
+from photoplan.surfaces.base import Surface
+
+
+class Seeing(Protocol):
+    """A rule of ownership that can tell what an image sees well."""
+
+    def sees(self, ground: TileGround, camera: Projection, surface: Surface) -> NDArray[np.bool_]:
+        """Pixels of a tile that an image may paint beside others, shape (height, width)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Feather:
+    """Weights of images along seams."""
+
+    rule: Seeing
+    width: int
+    """Of the strip in which images pass into each other, pixels."""
+
+    @property
+    def reach(self) -> int:
+        """Pixels around a tile that decide about its weights."""
+        return 2 * ((self.width + 2) // 4)
+
+    def around(self, window: Window, whole: Window) -> Window:
+        """A window of a product with what decides about it."""
+        r = self.reach
+        return Window(window.col - r, window.row - r, window.width + 2 * r, window.height + 2 * r) & whole
+
+    def weights(
+        self,
+        owner: NDArray[np.uint16],
+        ground: TileGround,
+        window: Window,
+        cameras: Mapping[int, Projection],
+        surface: Surface,
+    ) -> dict[int, NDArray[np.float32]]:
+        """Weights of the images that share pixels of a window, by row of the table of sources; all 0 where one alone
+        paints.
+
+        Parameters
+        ----------
+        owner : ndarray of uint16
+            Row plus one of who owns the pixels of `ground`; 0: nobody.
+        ground : TileGround
+            `around` the window.
+        """
+        rows = [int(value) - 1 for value in np.unique(owner) if value]
+        at = window.slices(ground.window)
+        if len(rows) < 2 or not self.reach:
+            return {}
+        painted = owner[at] > 0
+        found = {}
+        for row in rows:
+            share = _twice(owner == row + 1, self.reach // 2)[at]
+            if not share.any():
+                continue
+            sees = self.rule.sees(ground, cameras[row], surface)
+            weight = share * _from_edge(sees, self.reach)[at]
+            weight[~painted] = 0.0
+            # Whom nobody else can stand in for keeps what is his.
+            weight[(owner[at] == row + 1) & (weight == 0)] = np.finfo(np.float32).tiny
+            found[row] = weight.astype(np.float32)
+        several = sum((weight > 0).astype(np.uint8) for weight in found.values()) > 1
+        shared = {row: np.where(several, weight, np.float32(0)) for row, weight in found.items()}
+        return {row: weight for row, weight in shared.items() if weight.any()}
+
+
+def feather_of(rule: Seeing, metres: float, resolution: float, tile: int) -> Feather | None:
+    """The feather of a width in metres; None: it is less than a pixel to both sides.
+
+    Raises
+    ------
+    UsageError
+        It is not a positive number, or wider than a tile.
+    """
+    if not (np.isfinite(metres) and metres >= 0):
+        raise UsageError(f"`feather` {metres:g}; a width in metres is needed, 0 for none")
+    made = Feather(rule, round(min(metres / resolution, 1e9)))
+    if made.reach > tile:
+        raise UsageError(
+            f"`feather` {metres:g} m is {made.width} pixels; at most {2 * tile} are possible with tiles of {tile}: "
+            "give a smaller width, or a larger `tile`"
+        )
+    return made if made.reach else None
+
+
+def _twice(mine: NDArray[np.bool_], half: int) -> NDArray[np.float64]:
+    """Mean over a window of 2 · half + 1 pixels, of the mean over such windows; in whole numbers, so that it does not
+    depend on where an array begins. Beyond the array there is nothing."""
+    total = mine.astype(np.int64)
+    for axis in (0, 1, 0, 1):
+        sums = np.cumsum(np.pad(total, [(half + 1, half) if k == axis else (0, 0) for k in (0, 1)]), axis=axis)
+        n = total.shape[axis]
+        total = np.take(sums, np.arange(2 * half + 1, n + 2 * half + 1), axis) - np.take(sums, np.arange(n), axis)
+    return np.asarray(total / float(2 * half + 1) ** 4)
+
+
+def _from_edge(sees: NDArray[np.bool_], reach: int) -> NDArray[np.float64]:
+    """0 where an image does not see, growing with the distance from there to 1 at `reach` pixels."""
+    if sees.all():
+        return np.ones(sees.shape)
+    # Products without seams do without it: a tenth of a second of their start.
+    from scipy.ndimage import distance_transform_edt  # noqa: PLC0415
+
+    return np.asarray(np.minimum(distance_transform_edt(sees) / (reach + 1), 1.0))

@@ -1,0 +1,115 @@
+"""Weights along seams: smooth, one in sum, and nothing where an image does not see."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from tools.function_surface import raster_surface
+
+from photoplan.errors import UsageError
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.plan.feather import Feather, feather_of
+from photoplan.plan.ground import TileGround
+from photoplan.plan.tiles import Tiles
+from photoplan.targets.map import MapTarget
+
+SIDE = 120
+GRID = MapGrid.covering((0, 0, SIDE, SIDE), 1.0, "EPSG:32632")
+SURFACE = raster_surface(np.zeros((SIDE + 60, SIDE + 60), np.float32), -29.5, SIDE + 29.5, 1.0)
+
+
+class Masks:
+    """What images see, by their number in the place of a camera."""
+
+    def __init__(self, *seen: np.ndarray) -> None:
+        self.seen = seen
+
+    def sees(self, ground: TileGround, camera: Any, surface: Any) -> np.ndarray:
+        return self.seen[camera][ground.window.slices(GRID.window)]
+
+
+def weights(owner: np.ndarray, width: int, seen: list[np.ndarray], window: Window = GRID.window) -> np.ndarray:
+    feather = Feather(Masks(*seen), width)
+    wide = feather.around(window, GRID.window)
+    target = MapTarget(GRID)
+    ground = TileGround.of(target, wide, SURFACE.relief(target, wide))
+    numbers: Any = {k: k for k in range(len(seen))}
+    found = feather.weights(owner[wide.slices(GRID.window)], ground, window, numbers, SURFACE)
+    none = np.zeros((window.height, window.width), np.float32)
+    return np.stack([found.get(k, none) for k in range(len(seen))])
+
+
+def everything() -> np.ndarray:
+    return np.ones((SIDE, SIDE), bool)
+
+
+def halves() -> np.ndarray:
+    owner = np.ones((SIDE, SIDE), np.uint16)
+    owner[:, 60:] = 2
+    return owner
+
+
+def test_images_pass_into_each_other_over_the_width() -> None:
+    first, second = weights(halves(), 20, [everything()] * 2)
+    line, other = first[60], second[60]
+    some = line + other > 0
+    np.testing.assert_allclose((line + other)[some], 1, atol=1e-6)
+    assert some.sum() == 20 and some[50:70].all()
+    assert (np.diff(line[some]) < 0).all() and line[59] == pytest.approx(other[60]) and line[59] > 0.5
+    # It bends nowhere by more than the square of a slope of 2 / width would.
+    assert np.abs(np.diff(line[some], 2)).max() < 2 / 10**2
+
+
+def test_an_image_has_no_weight_where_it_does_not_see_and_little_beside() -> None:
+    blocked = everything()
+    blocked[40:80, 50:58] = False
+    first, second = weights(halves(), 20, [everything(), blocked])
+    assert not second[~blocked].any() and (first[40:80, 50:58].sum(), second[60, 58]) > (0, 0)
+    share = second / np.maximum(first + second, 1e-9)
+    # From the edge of what hides it the share grows step by step, as far as it would have without.
+    assert share[60, 58] < 0.1 and share[60, 62] > share[60, 58]
+    np.testing.assert_array_equal(share[10], (lambda a, b: b / np.maximum(a + b, 1e-9))(*weights(
+        halves(), 20, [everything()] * 2))[10])  # fmt: skip
+
+
+def test_an_owner_keeps_what_nobody_else_sees() -> None:
+    alone = everything()
+    alone[:, :59] = False
+    rim = everything()
+    rim[:, 57:] = False
+    found = weights(halves(), 20, [rim, alone])
+    # The first paints columns 57 to 59 in its rim: where the second sees, that takes over; where not, all stays.
+    assert found[1, 60, 59] > 0.01 > found[0, 60, 59] > 0 and not found[:, 60, 57].any()
+
+
+def test_weights_do_not_depend_on_the_window_and_three_add_up() -> None:
+    random = np.random.default_rng(4)
+    owner = random.integers(1, 4, (6, 6)).repeat(20, axis=0).repeat(20, axis=1).astype(np.uint16)
+    owner[:7, :9] = 0
+    seen = [random.random((SIDE, SIDE)) < 0.995 for _ in range(3)]
+    whole = weights(owner, 24, seen)
+    for window in (Window(0, 0, 64, 64), Window(64, 32, 56, 40), Window(33, 70, 5, 50)):
+        at = window.slices(GRID.window)
+        np.testing.assert_array_equal(weights(owner, 24, seen, window), whole[(slice(None), *at)])
+    plain = weights(owner, 24, [everything()] * 3)
+    inner = plain.sum(axis=0)[30:-30, 30:-30]
+    np.testing.assert_allclose(inner[inner > 0], 1, atol=1e-6)
+    assert not plain[:, owner == 0].any()
+
+
+def test_widths_that_cannot_be() -> None:
+    rule = Masks()
+    assert feather_of(rule, 0.0, 0.1, 512) is None and feather_of(rule, 0.1, 0.1, 512) is None
+    made = feather_of(rule, 2.0, 0.1, 512)
+    assert made is not None and made.width == 20 and made.reach == 10
+    for metres in (-1.0, np.nan, np.inf, 1e9):
+        with pytest.raises(UsageError, match="`feather`"):
+            feather_of(rule, metres, 0.1, 512)
+
+
+def test_tiles_know_the_sources_around_them() -> None:
+    every = Tiles.every(Window(0, 0, 500, 100), 100)
+    shared = Tiles.shared([every.only([0]), every.only([0, 1, 2]), every.only([4])])
+    assert [tile.sources for tile in shared.with_neighbours()] == [(0, 1), (0, 1), (1,), (2,)]
