@@ -1,4 +1,4 @@
-"""What `ortho`, `run` and `demo` do with a plan: execute it and report."""
+"""What `ortho`, `mosaic`, `object`, `run` and `demo` do with a plan: execute it and report."""
 
 from __future__ import annotations
 

@@ -206,11 +206,6 @@ def refuse_blind(settings: OrthoSettings, products: Sequence[Any], blind: Sequen
         raise GeometryError(f"no image sees {where} (xmin ymin xmax ymax in metres):\n  " + "\n  ".join(blind))
 
 
-def project_settings(project: Project) -> OrthoSettings:
-    """The settings of the project's `[ortho]` table; what it does not state has its default."""
-    return OrthoSettings.from_dict({k: v for k, v in project.ortho_settings().items() if v is not None})
-
-
 def product_plan(
     name: str,
     images: tuple[str, ...],

@@ -241,13 +241,15 @@ def read_plan(path: Path | str) -> tuple[OrthoPlan, Path]:
         if changed:
             raise InputError(
                 f"{path}: inputs have changed since the plan was written ({', '.join(changed)}); make the plan again "
-                "with `photoplan ortho`"
+                "with the command that wrote it"
             )
         plan = OrthoPlan(project, settings, tuple(p for p in products if len(p.plan.tiles)), tuple(header["blind"]))
     except (KeyError, TypeError, ValueError, UsageError) as error:
-        raise InputError(f"{path}: the plan is damaged ({error}); make it again with `photoplan ortho`") from error
+        raise InputError(
+            f"{path}: the plan is damaged ({error}); make it again with the command that wrote it"
+        ) from error
     if not plan.products:
-        raise InputError(f"{path}: the plan has no tiles left; make it again with `photoplan ortho`")
+        raise InputError(f"{path}: the plan has no tiles left; make it again with the command that wrote it")
     return plan, (path.resolve().parent / header["output"]).resolve()
 
 

@@ -124,7 +124,7 @@ class OrthoSettings:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> OrthoSettings:
-        """Settings from the plain values of `to_dict`.
+        """Settings from plain values, by name.
 
         Raises
         ------
