@@ -119,7 +119,7 @@ def test_a_coarse_reference_gives_its_colours(block: Block, capsys: pytest.Captu
     assert both.code == 2 and "give one of them" in both.err
 
 
-@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+@pytest.mark.parametrize("dtype", [np.uint16, pytest.param(np.float32, marks=pytest.mark.slow)])
 def test_types_with_more_than_bytes(block: Block, capsys: pytest.CaptureFixture[str], dtype: type) -> None:
     """The same images with grey values sixteen times as large: the same overlaps, sixteen times as large."""
     photoplan = Here(capsys)

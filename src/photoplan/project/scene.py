@@ -21,7 +21,7 @@ from photoplan.io.project.model import Project
 from photoplan.io.project.posed import Image
 from photoplan.io.raster import RasterReader
 from photoplan.plan.footprint import Footprint, footprint
-from photoplan.project.balance import load_balance
+from photoplan.project.balance import BalanceStep, load_balance
 from photoplan.project.cameras import camera_of
 from photoplan.project.filter_files import load_filter
 from photoplan.project.ground import Ground, ground_of, stamp_of
@@ -108,6 +108,9 @@ class Scene:
         step = self.reader.step(RestoreStep)
         if step is not None:
             found += (f"{self.reader.path.name}: {step.describe()}",)
+        balanced = self.reader.step(BalanceStep)
+        if balanced is not None:
+            found += (f"{self.reader.path.name}: colours by {balanced.path.name}",)
         return found
 
     @property

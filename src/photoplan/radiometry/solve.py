@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 _Floats = NDArray[np.float64]
@@ -33,7 +33,8 @@ class Solved:
         """Factor equations whose unknowns come in groups of `width`, one for each image."""
         entries = N.tocoo()
         images = N.shape[0] // width
-        joined = csr_array((np.ones(entries.nnz), (entries.row // width, entries.col // width)), shape=(images, images))
+        at = entries.row // width, entries.col // width
+        joined = csr_matrix((np.ones(entries.nnz), at), shape=(images, images))
         near = reverse_cuthill_mckee(joined, symmetric_mode=True).astype(np.int64)
         order = (near[:, None] * width + np.arange(width)).ravel()
         place = np.empty_like(order)
