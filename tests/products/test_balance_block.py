@@ -115,6 +115,8 @@ def test_a_coarse_reference_gives_its_colours(block: Block, capsys: pytest.Captu
     far = write_image(block.folder / "far.tif", coarse, crs=CRS, transform=from_origin(left + 9000, top, 4.5, 4.5))
     said = photoplan("balance", block.project, "--reference", far, "--overwrite")
     assert said.code == 3 and "shows nothing of the ground that the images show" in said.err
+    said = photoplan("balance", block.project, "-o", path, "--overwrite")
+    assert said.code == 2 and "give the name of a folder" in said.err
     both = photoplan("balance", block.project, "--reference", path, "--reference-image", "one", "--overwrite")
     assert both.code == 2 and "give one of them" in both.err
 

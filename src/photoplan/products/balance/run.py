@@ -134,24 +134,12 @@ def balance_project(request: BalanceRequest, events: Events = SILENT) -> Balance
     notes = [f"left out, sees no terrain: {line}" for line in found.blind]
     if request.dry_run:
         return BalanceReport(found, tuple(notes))
-    reader = found.looked[0].scene.reader
     reference = _reference(request, found, notes)
     cells = sample(found, reference, request.workers, events)
     if reference is not None and not np.isfinite(cells.reference).any():
         raise GeometryError(f"{reference.path}: shows nothing of the ground that the images show")
-    limits = limits_of(cells, reader.dtype)
-    usable, even = _usable(cells, found, limits, notes)
-    number = None if fixed is None else found.names.index(fixed) if fixed in found.names else -1
-    _refuse_useless(usable, found, number, notes)
-    events.begin("adjusting", cells.bands, "bands")
-    made = balance(
-        usable, found.sizes, limits, degree=request.degree, fixed=number, factor=request.factor, done=events.done
-    )
-    _note(made, found, even, notes)
-    tones = dict(zip(made.images.tolist(), made.tones))
-    pairs = pairs_of(usable.shared, tones, found.sizes)
-    stems = {int(k): safe_stem(found.names[k]) for k in made.images}
-    files = tuple(request.folder / f"{stems[k]}.toml" for k in made.images.tolist())
+    made, pairs = _adjusted(request, cells, found, fixed, events, notes)
+    files = tuple(request.folder / f"{safe_stem(found.names[k])}.toml" for k in made.images.tolist())
     report = BalanceReport(found, tuple(notes), cells, made, pairs, files)
     files_in = [request.project, *(one.scene.reader.path for one in found.looked)]
     inputs = [input_entry(path) for path in (*files_in, *([request.reference] if request.reference else []))]
@@ -170,6 +158,31 @@ def balance_project(request: BalanceRequest, events: Events = SILENT) -> Balance
     return report
 
 
+def _adjusted(
+    request: BalanceRequest, cells: Cells, found: Survey, fixed: str | None, events: Events, notes: list[str]
+) -> tuple[Balanced, Pairs]:
+    """Tones of the images that can be compared, and what they bring; the others are named in `notes`."""
+    limits = limits_of(cells, found.looked[0].scene.reader.dtype)
+    usable, even = _usable(cells, found, limits, notes)
+    number = None if fixed is None else found.names.index(fixed) if fixed in found.names else -1
+    _refuse_useless(usable, found, number, notes)
+    events.begin("adjusting", cells.bands, "bands")
+    made = balance(
+        usable, found.sizes, limits, degree=request.degree, fixed=number, factor=request.factor, done=events.done
+    )
+    _note(made, found, even, notes)
+    tones = dict(zip(made.images.tolist(), made.tones))
+    return made, pairs_of(usable.shared, tones, found.sizes)
+
+
+def limits_of(cells: Cells, dtype: np.dtype[Any]) -> tuple[float, float]:
+    """Least and largest grey value: of the type for bytes; of others what images show, since few fill their type."""
+    if dtype == np.uint8:
+        return 0.0, 255.0
+    low, high = float(cells.pixels.min()), float(cells.pixels.max())
+    return (0.0 if dtype.kind == "u" else low), max(high, low + 1.0)
+
+
 def _reference(request: BalanceRequest, found: Survey, notes: list[str]) -> Reference | None:
     """The reference that was asked for."""
     if request.reference is None:
@@ -182,14 +195,6 @@ def _reference(request: BalanceRequest, found: Survey, notes: list[str]) -> Refe
             f"({SIDE * found.grid.resolution:g} m); give a coarser resolution if colours come out uneven"
         )
     return reference
-
-
-def limits_of(cells: Cells, dtype: np.dtype[Any]) -> tuple[float, float]:
-    """Least and largest grey value: of the type for bytes; of others what images show, since few fill their type."""
-    if dtype == np.uint8:
-        return 0.0, 255.0
-    low, high = float(cells.pixels.min()), float(cells.pixels.max())
-    return (0.0 if dtype.kind == "u" else low), max(high, low + 1.0)
 
 
 def _plain(project: Project) -> Project:
@@ -208,6 +213,8 @@ def _check(request: BalanceRequest, project: Project, names: Sequence[str]) -> s
         raise UsageError("a reference image and a reference; give one of them")
     if not 0 <= request.degree <= 4:
         raise UsageError(f"degree {request.degree}; allowed are 0 (tables alone) to 4, usual is 2")
+    if request.folder.exists() and not request.folder.is_dir():
+        raise UsageError(f"{request.folder}: is a file; give the name of a folder")
     if not request.dry_run:
         for path in (request.table, *(request.folder / f"{safe_stem(name)}.toml" for name in names)):
             inputs = [request.project, *input_files(project), *([request.reference] if request.reference else [])]
