@@ -256,6 +256,10 @@ def missing_grids(group: TransformerGroup) -> list[str]:
     return [g.short_name for o in group.unavailable_operations[:1] for g in o.grids if not g.available]
 
 
+#: Half the side of the area of a point, degrees.
+_POINT = 1e-6
+
+
 def area_of(crs: CRS, bounds: tuple[float, float, float, float] | None) -> Any:
     """pyproj's area of interest of map bounds; None if there are none or they are nowhere on the earth."""
     if bounds is None:
@@ -265,7 +269,10 @@ def area_of(crs: CRS, bounds: tuple[float, float, float, float] | None) -> Any:
         west, south, east, north = to_degrees.transform_bounds(*bounds)
     except ProjError:
         return None
-    return AreaOfInterest(west, south, east, north) if np.isfinite([west, south, east, north]).all() else None
+    if not np.isfinite([west, south, east, north]).all():
+        return None
+    # To older PROJ the area of a single point is nowhere.
+    return AreaOfInterest(west - _POINT, south - _POINT, east + _POINT, north + _POINT)
 
 
 #: Derivatives of a step between systems are taken over this distance to either side, metres.

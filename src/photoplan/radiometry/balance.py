@@ -78,7 +78,9 @@ def even_images(cells: Cells, images: int, span: float) -> NDArray[np.bool_]:
 def parts_of(cells: Cells, images: int) -> NDArray[np.int64]:
     """A number for each image (images,), the same for those that hang together."""
     shape = images, int(cells.cell.max(initial=0)) + 1
-    seen = coo_array((np.ones(len(cells)), (cells.image, cells.cell)), shape=shape).tocsr()
+    # Graphs of SciPy 1.11 take numbers of 32 bits alone.
+    at = cells.image.astype(np.int32), cells.cell.astype(np.int32)
+    seen = coo_array((np.ones(len(cells)), at), shape=shape).tocsr()
     return np.asarray(connected_components(seen @ seen.T, directed=False)[1], np.int64)
 
 
