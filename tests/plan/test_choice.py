@@ -152,6 +152,9 @@ class Half:
         u = np.arange(window.col, window.stop[0])
         return np.broadcast_to(np.where(u < 75, 2, 0), (window.height, window.width)).astype(np.uint16)
 
+    def digest(self, margin: float) -> str:
+        return "half"
+
 
 def test_a_drawn_region_comes_before_the_score() -> None:
     cost, inside, unseen = strict(Weights())

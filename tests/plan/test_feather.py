@@ -20,6 +20,9 @@ GRID = MapGrid.covering((0, 0, SIDE, SIDE), 1.0, "EPSG:32632")
 SURFACE = raster_surface(np.zeros((SIDE + 60, SIDE + 60), np.float32), -29.5, SIDE + 29.5, 1.0)
 
 
+WIDE = Window(-40, -40, SIDE + 80, SIDE + 80)
+
+
 class Masks:
     """What images see, by their number in the place of a camera."""
 
@@ -27,16 +30,20 @@ class Masks:
         self.seen = seen
 
     def sees(self, ground: TileGround, camera: Any, surface: Any) -> np.ndarray:
-        return self.seen[camera][ground.window.slices(GRID.window)]
+        return padded(self.seen[camera])[ground.window.slices(WIDE)]
+
+
+def padded(values: np.ndarray) -> np.ndarray:
+    return np.pad(values, 40, mode="edge")
 
 
 def weights(owner: np.ndarray, width: int, seen: list[np.ndarray], window: Window = GRID.window) -> np.ndarray:
     feather = Feather(Masks(*seen), width)
-    wide = feather.around(window, GRID.window)
+    wide = feather.around(window)
     target = MapTarget(GRID)
     ground = TileGround.of(target, wide, SURFACE.relief(target, wide))
     numbers: Any = {k: k for k in range(len(seen))}
-    found = feather.weights(owner[wide.slices(GRID.window)], ground, window, numbers, SURFACE)
+    found = feather.weights(padded(owner)[wide.slices(WIDE)], ground, window, numbers, SURFACE)
     none = np.zeros((window.height, window.width), np.float32)
     return np.stack([found.get(k, none) for k in range(len(seen))])
 

@@ -19,9 +19,11 @@ from photoplan.cli.options import PATH, choosing_options, executing, product_opt
               help="Regions with their images, that come before the score: an edited NAME_seams.gpkg.")  # fmt: skip
 @click.option("--feather", type=float, default=0.0, metavar="W",
               help="Images pass into each other along seams, over W metres, where both see [0].")  # fmt: skip
+@click.option("--sheets", type=float, metavar="SIZE",
+              help="Cut into squares of SIZE metres, each a file with a STAC item; NAME.vrt shows all.")  # fmt: skip
 @executing
 def command(project: Path, name: str, score: tuple[str, ...], prefer: tuple[str, ...], seams: Path | None,
-            feather: float, **options: Any) -> None:  # fmt: skip
+            feather: float, sheets: float | None, **options: Any) -> None:  # fmt: skip
     """Make one orthophoto of all images: each pixel from the best of those that see it.
 
     What no image sees is left empty and told in square metres. The same command continues a run that was interrupted.
@@ -31,7 +33,7 @@ def command(project: Path, name: str, score: tuple[str, ...], prefer: tuple[str,
     from photoplan.products.orthophoto.mosaic import plan_mosaic
     from photoplan.products.orthophoto.settings import Choice
 
-    choice = Choice(name, weights(score), prefer, None if seams is None else str(seams.absolute()), feather)
+    choice = Choice(name, weights(score), prefer, None if seams is None else str(seams.absolute()), feather, sheets)
     how = running.How.from_options(options)
     with running.telling(how) as events:
         running.planned(load_project(project), plan_mosaic, {**options, "choice": choice}, how, events)()

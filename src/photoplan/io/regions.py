@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,17 @@ class Regions:
     grid: MapGrid
     shapes: tuple[tuple[Any, int], ...]
     """Polygon, and row of its image in the table of sources, plus one; the last of those over each other counts."""
+
+    def digest(self, margin: float) -> str:
+        """Of what lies in the grid, and `margin` metres around it: the same for regions that are the same there."""
+        left, bottom, right, top = self.grid.bounds
+        box = shapely.box(left - margin, bottom - margin, right + margin, top + margin)
+        found = hashlib.sha256()
+        for polygon, row in self.shapes:
+            part = shapely.normalize(shapely.set_precision(polygon.intersection(box), 1e-6))
+            if part.area > 0:
+                found.update(row.to_bytes(4, "little") + shapely.to_wkb(part, output_dimension=2))
+        return found.hexdigest()
 
     def rows(self, window: Window) -> NDArray[np.uint16]:
         """Row plus one for each pixel of a window whose centre lies in a polygon; 0 elsewhere."""
@@ -85,8 +97,9 @@ def write_regions(path: Path, images: Sequence[str], shapes: Mapping[int, Any], 
     write_features(path, "MultiPolygon", [shapes[row] for row in rows], columns, crs, "regions")
 
 
-def read_regions(path: Path, images: Sequence[str], grid: MapGrid) -> Regions:
-    """Regions of a GeoPackage, as `write_regions` writes them or somebody has drawn them.
+def read_regions(path: Path, images: Sequence[str], grid: MapGrid, known: Sequence[str] = ()) -> Regions:
+    """Regions of a GeoPackage, as `write_regions` writes them or somebody has drawn them; those of images that are
+    `known`, but none of the table of sources `images`, are left out.
 
     Raises
     ------
@@ -98,11 +111,13 @@ def read_regions(path: Path, images: Sequence[str], grid: MapGrid) -> Regions:
     if "image" not in pyogrio.read_info(path)["fields"]:
         raise InputError(f"{path}: no column `image`, which says whose each region is")
     names = [each.name for each in features]
-    unknown = [name for name in names if name not in images]
+    unknown = [name for name in names if name not in images and name not in known]
     if unknown:
         raise InputError(
             f"{path}: regions of {', '.join(map(repr, dict.fromkeys(unknown)))}, which "
             f"{'is' if len(set(unknown)) == 1 else 'are'} not in the mosaic; choose these images too, or take the "
             "regions out"
         )
-    return Regions(grid, tuple((each.geometry, images.index(name) + 1) for each, name in zip(features, names)))
+    rows = {name: row for row, name in enumerate(images, 1)}
+    taken = ((each.geometry, rows[name]) for each, name in zip(features, names) if name in rows)
+    return Regions(grid, tuple(taken))

@@ -34,7 +34,7 @@ from photoplan.plan.visibility import hidden_pixels, sight_lines
 from photoplan.surfaces.base import Surface
 from photoplan.targets.map import MapTarget
 
-#: Pixels between nodes; they lie at multiples of it in the product's own pixels, whatever the tile.
+#: Pixels between nodes; they lie at multiples of it in pixels counted from the map's origin, whatever the tile.
 _SPACING = 32
 #: Part of an image's shorter side in which its border counts.
 _RIM = 0.1
@@ -77,6 +77,10 @@ class Drawn(Protocol):
 
     def rows(self, window: Window) -> NDArray[np.uint16]:
         """Row of the table of sources, plus one, for each pixel of a window of the product; 0: nobody was given it."""
+        ...
+
+    def digest(self, margin: float) -> str:
+        """Of what lies in the product and `margin` metres around it."""
         ...
 
 
@@ -193,9 +197,14 @@ class BestImage:
         (right, bottom), (low, high) = window.stop, self.levels
         pad = 0.01 + 1e-6 * max(abs(low), abs(high))
         levels = low - pad, high + pad
-        first = window.col // _SPACING, window.row // _SPACING
-        u = np.arange(first[0], max(-(-right // _SPACING), first[0] + 1) + 1) * float(_SPACING)
-        v = np.arange(first[1], max(-(-bottom // _SPACING), first[1] + 1) + 1) * float(_SPACING)
+        grid = target.grid
+        # At multiples of the spacing from the map's own origin: parts of a map agree, whatever their bounds.
+        shift = round(grid.left / grid.resolution) % _SPACING, round(-grid.top / grid.resolution) % _SPACING
+        first = (window.col + shift[0]) // _SPACING, (window.row + shift[1]) // _SPACING
+        u, v = (
+            np.arange(start, max(-(-(end + off) // _SPACING), start + 1) + 1) * float(_SPACING) - off
+            for start, end, off in zip(first, (right, bottom), shift)
+        )
         h, v, u = np.meshgrid(levels, v, u, indexing="ij")
         uvh = np.stack([u, v, h], axis=-1)
         step = np.moveaxis(sight_lines(camera, target, uvh).step, -1, 0)
@@ -215,7 +224,7 @@ class BestImage:
             moves = np.where(up > 0, np.clip(step[:2] / up, -_MOVES, _MOVES), 0.0)
         values = np.stack([smooth, coarse, *moves], axis=-1)
         nodes = np.concatenate([camera.project_homogeneous(target.to_ground(uvh)), values], axis=-1)
-        return nodes, levels, (window.col - first[0] * _SPACING, window.row - first[1] * _SPACING)
+        return nodes, levels, (window.col + shift[0] - first[0] * _SPACING, window.row + shift[1] - first[1] * _SPACING)
 
 
 def _wide(ground: TileGround, surface: Surface) -> TileGround:

@@ -43,10 +43,10 @@ class Feather:
         """Pixels around a tile that decide about its weights."""
         return 2 * ((self.width + 2) // 4)
 
-    def around(self, window: Window, whole: Window) -> Window:
-        """A window of a product with what decides about it."""
+    def around(self, window: Window) -> Window:
+        """A window of a product with what decides about it, also beyond the product."""
         r = self.reach
-        return Window(window.col - r, window.row - r, window.width + 2 * r, window.height + 2 * r) & whole
+        return Window(window.col - r, window.row - r, window.width + 2 * r, window.height + 2 * r)
 
     def weights(
         self,

@@ -135,7 +135,7 @@ def _feathered(
 ) -> CompiledTile:
     """A tile whose sources pass into each other."""
     assert product.feather is not None and product.owners is not None
-    wide = product.feather.around(tile.window, product.target.window)
+    wide = product.feather.around(tile.window)
     ground = TileGround.of(product.target, wide, surface.relief(product.target, wide))
     share = product.owners.share(ground, cameras, surface)
     assert share.owner is not None

@@ -125,6 +125,16 @@ class Tiles(Sequence[Tile]):
         ends = np.searchsorted(tile, self.indices.astype(np.int64), side="right")
         return replace(self, sources=Shares(ends, source.astype(np.uint16)))
 
+    def inner(self) -> Tiles:
+        """Tiles without those at the border, for a product that is smaller by a tile on each side."""
+        rows, cols = self.shape
+        row, col = np.divmod(self.indices.astype(np.int64), cols)
+        kept = self.only(self.indices[(row > 0) & (row < rows - 1) & (col > 0) & (col < cols - 1)].tolist())
+        row, col = np.divmod(kept.indices.astype(np.int64), cols)
+        whole = self.window
+        window = Window(whole.col, whole.row, whole.width - 2 * self.side, whole.height - 2 * self.side)
+        return replace(kept, window=window, indices=((row - 1) * (cols - 2) + col - 1).astype(np.uint32))
+
     def touching(self, window: Window) -> Tiles:
         """Tiles of the product that hold pixels of a window, whichever are listed."""
         col, row = (

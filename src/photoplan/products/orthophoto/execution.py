@@ -22,6 +22,7 @@ from photoplan.io.naming import standing, together, when_named
 from photoplan.io.product import ProductFile, is_product
 from photoplan.io.quicklook import refuse_foreign_overview, write_overview
 from photoplan.io.run_record import input_entry, versions, write_run_record
+from photoplan.io.virtual import refuse_foreign_virtual
 from photoplan.kernels.rectify import is_compiled
 from photoplan.plan.accuracy import BANDS, radial_error
 from photoplan.plan.tiles import Tiles
@@ -35,6 +36,7 @@ from photoplan.products.orthophoto.finished import (
 )
 from photoplan.products.orthophoto.look import Look
 from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, known_errors, painting
+from photoplan.products.orthophoto.sheets import sheet_index, write_index
 from photoplan.products.run import Run, clock, refuse_inputs
 from photoplan.project.restored import RestoreStep
 from photoplan.project.scene import Scene, input_files
@@ -80,6 +82,10 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
     picture = folder / "overview.png" if run.quicklook else None
     rasters = [path for p in plan.products for path in all_files(folder, p, plan.settings)]
     refuse_inputs(input_files(plan.project), [*rasters, *([] if picture is None else [picture])])
+    index = sheet_index(plan, folder)
+    refuse_inputs(input_files(plan.project), index[:1])
+    for path in index:
+        refuse_foreign_virtual(path)
     kept = finished_products(plan, folder, run.overwrite, picture)
     if picture is not None and not run.overwrite:
         refuse_foreign_overview(picture)
@@ -93,6 +99,8 @@ def execute(plan: OrthoPlan, output: Path | str, run: Run | None = None) -> list
         results = Runner[ProductResult](workers, run.in_flight(workers.threads), run.events).run(works)
     if picture is not None:
         write_overview([r.path for r in results if not r.failed], picture)
+    for path in index:
+        write_index(plan, path, [r for r in results if not r.failed])
     failed = [f"{r.path.name}: tiles {', '.join(map(str, r.failed))} ({r.reason})" for r in results if r.failed]
     if failed:
         raise TilesFailed(

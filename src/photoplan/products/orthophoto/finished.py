@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -106,9 +106,9 @@ def finished_products(plan: OrthoPlan, folder: Path, overwrite: bool, picture: P
     """Products that exist: those of this very run, interrupted, are kept; any other is refused before any work.
 
     When all products of a plan and their overview `picture` exist, the run was not interrupted: doing it again needs
-    `overwrite`.
+    `overwrite`. Sheets of a mosaic that would come out the same are kept also then.
     """
-    if overwrite:
+    if overwrite and (plan.settings.choice is None or plan.settings.choice.sheets is None):
         return {}
     kept, existing = {}, []
     for product in plan.products:
@@ -122,6 +122,8 @@ def finished_products(plan: OrthoPlan, folder: Path, overwrite: bool, picture: P
         existing += there
         if not there:
             refuse_foreign_record(record_path(files[0]))
+    if overwrite:
+        return kept
     if existing or (len(kept) == len(plan.products) and (picture is None or picture.exists())):
         first, *more = existing or [result.path for result in kept.values()]
         they = (
@@ -131,6 +133,13 @@ def finished_products(plan: OrthoPlan, folder: Path, overwrite: bool, picture: P
         )
         raise UsageError(f"{first} {they}, or another `output`")
     return kept
+
+
+def _without_seams(settings: OrthoSettings) -> OrthoSettings:
+    """Settings without the name of a file of seams: its content decides, which is part of the key."""
+    if settings.choice is None:
+        return settings
+    return replace(settings, choice=replace(settings.choice, seams=None))
 
 
 def _is_there(path: Path) -> bool:
@@ -144,7 +153,7 @@ def _kept(plan: OrthoPlan, product: OrthoProduct, folder: Path) -> ProductResult
         return None
 
     def result(made: dict[str, Any], recorded: dict[str, Any]) -> ProductResult | None:
-        if OrthoSettings.from_dict(recorded) != plan.settings:
+        if _without_seams(OrthoSettings.from_dict(recorded)) != _without_seams(plan.settings):
             return None
         return ProductResult(
             path=path,

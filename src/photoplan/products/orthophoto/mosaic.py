@@ -27,6 +27,7 @@ from photoplan.products.orthophoto.plan import (
 )
 from photoplan.products.orthophoto.settings import Choice, OrthoSettings
 from photoplan.products.orthophoto.sharpness import with_blur
+from photoplan.products.orthophoto.sheets import sheets_of
 from photoplan.surfaces.objects import painted_surface
 
 
@@ -65,31 +66,63 @@ def plan_mosaic(
     refuse_blind(chosen, looked, blind)
     grid = grid_of(project, chosen, [one.look.footprint for one in looked])
     looked = with_blur(looked, grid, chosen, events)
+    assert chosen.choice is not None
+    name, size = safe_stem(chosen.choice.name), chosen.choice.sheets
+    parts = [("", grid)] if size is None else sheets_of(grid, size)
+    events.begin("finding tiles", len(looked) * len(parts), "images")
+    found = [_product(project, chosen, looked, name + end, part, events) for end, part in parts]
+    products = tuple(each for each in found if each is not None)
+    seen = {image for each in products for image in each.images}
+    blind += [f"{one.name}: sees nothing inside the bounds" for one in looked if one.name not in seen]
+    refuse_blind(chosen, products, blind)
+    return OrthoPlan(project, chosen, products, tuple(blind))
+
+
+def _product(
+    project: Project, chosen: OrthoSettings, looked: Sequence[Looked], name: str, grid: MapGrid, events: Events
+) -> OrthoProduct | None:
+    """A mosaic, or a sheet of one, of the images that see a part of it; None: none does."""
+    assert chosen.choice is not None
+    # Whose seams lie beside a tile decides about weights in it: also beyond the product.
+    side = chosen.tile if chosen.choice.feather else 0
+    margin = side * grid.resolution
+    wide = MapGrid(
+        grid.left - margin, grid.top + margin, grid.resolution, grid.width + 2 * side, grid.height + 2 * side, grid.crs
+    )
     taking, tiles = [], []
-    events.begin("finding tiles", len(looked), "images")
     for one in looked:
-        surface = painted_surface(one.scene.surface)
-        mine = covered_tiles(one.scene.camera, surface, grid, chosen.tile, one.look.footprint.bounds)
-        if len(mine):
+        bounds, surface = one.look.footprint.bounds, painted_surface(one.scene.surface)
+        mine = covered_tiles(one.scene.camera, surface, wide, chosen.tile, bounds) if _meet(bounds, wide) else ()
+        if isinstance(mine, Tiles) and len(mine):
             taking.append(one)
             tiles.append(mine)
-        else:
-            blind.append(f"{one.name}: sees nothing inside the bounds")
         events.done()
-    refuse_blind(chosen, taking, blind)
-    assert chosen.choice is not None
-    name = safe_stem(chosen.choice.name)
+    if not taking:
+        return None
+    shared = Tiles.shared(tiles)
+    if side:
+        shared = shared.with_neighbours().inner()
+    if not len(shared):
+        return None
     check_storable(taking[0].scene, name, grid, chosen)
     taken = tuple(one.name for one in taking)
     looks = tuple(one.look for one in taking)
-    regions = drawn_regions(project, chosen, taken, grid)
-    plan = product_plan(name, taken, grid, Tiles.shared(tiles), chosen, looks, regions)
-    product = OrthoProduct(plan, looks, keyed(project, plan, chosen))
-    return OrthoPlan(project, chosen, (product,), tuple(blind))
+    every = tuple(one.name for one in looked)
+    regions = drawn_regions(project, chosen, taken, grid, every)
+    plan = product_plan(name, taken, grid, shared, chosen, looks, regions)
+    return OrthoProduct(plan, looks, keyed(project, plan, chosen))
 
 
-def drawn_regions(project: Project, settings: OrthoSettings, images: tuple[str, ...], grid: MapGrid) -> Regions | None:
-    """Regions of the choice's file; None: it has none.
+def _meet(bounds: tuple[float, float, float, float] | None, grid: MapGrid) -> bool:
+    """Whether a footprint reaches into a grid."""
+    xmin, ymin, xmax, ymax = grid.bounds
+    return bounds is not None and bounds[0] < xmax and bounds[2] > xmin and bounds[1] < ymax and bounds[3] > ymin
+
+
+def drawn_regions(
+    project: Project, settings: OrthoSettings, images: tuple[str, ...], grid: MapGrid, known: Sequence[str] = ()
+) -> Regions | None:
+    """Regions of the choice's file; None: it has none. Those of `known` images that are no sources are left out.
 
     Raises
     ------
@@ -98,7 +131,7 @@ def drawn_regions(project: Project, settings: OrthoSettings, images: tuple[str, 
     """
     if settings.choice is None or settings.choice.seams is None:
         return None
-    return read_regions(project.resolve(settings.choice.seams), images, grid)
+    return read_regions(project.resolve(settings.choice.seams), images, grid, known)
 
 
 def with_preferred(

@@ -18,7 +18,6 @@ from photoplan.engine.execute import render as render_tile
 from photoplan.errors import GeometryError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.geometry.grid import MapGrid, refuse_absurd
-from photoplan.io.fingerprint import fingerprint
 from photoplan.io.names import safe_stem
 from photoplan.io.project.model import Project
 from photoplan.io.storage import nodata_for
@@ -98,7 +97,8 @@ class OrthoPlan:
         if self.of_objects:
             return f"{count} product{several} of single objects"
         if self.settings.choice is not None:
-            return f"mosaic of {len(self.products[0].images)} images"
+            images = len({image for product in self.products for image in product.images})
+            return f"mosaic of {images} images" + ("" if self.settings.choice.sheets is None else f" in {count} sheets")
         return f"{count} orthophoto{several}"
 
     def __getitem__(self, name: str) -> OrthoProduct:
@@ -222,9 +222,6 @@ def product_plan(
         return ProductPlan(name, images, MapTarget(grid), rule, tiles, owners)
     best = _best(images, settings, settings.choice, looks, regions)
     feather = feather_of(best, settings.choice.feather, grid.resolution, settings.tile)
-    if feather is not None:
-        # Whose seams lie beside a tile decides about weights in it.
-        tiles = tiles.with_neighbours()
     return ProductPlan(name, images, MapTarget(grid), rule, tiles, best, feather)
 
 
@@ -269,10 +266,10 @@ def keyed(project: Project, plan: ProductPlan, settings: OrthoSettings, part: Pa
     """
     address = ScenesAddress.of(project, plan.sources, part)
     facts = address.facts if not settings.accuracy else [address.facts, known_errors(address, plan, settings).facts]
-    regions = None
-    if settings.choice is not None and settings.choice.seams is not None:
-        regions = fingerprint(project.resolve(settings.choice.seams)).digest
-    return product_key(facts, plan, settings, regions)
+    drawn = None
+    if settings.choice is not None and isinstance(plan.owners, BestImage) and plan.owners.drawn is not None:
+        drawn = plan.owners.drawn.digest(settings.choice.feather)
+    return product_key(facts, plan, settings, drawn)
 
 
 def known_errors(address: ScenesAddress, plan: ProductPlan, settings: OrthoSettings) -> ScenesErrors:

@@ -307,7 +307,7 @@ def _product(
     if len(tiles) != entry["tiles"]:
         key = hashlib.sha256(f"{key} {tiles.indices.tolist()}".encode()).hexdigest()
     looks = tuple(_look(each) for each in entry["images"])
-    regions = drawn_regions(project, settings, images, grid)
+    regions = drawn_regions(project, settings, images, grid, project.select(None))
     plan = product_plan(name, images, grid, tiles, settings, looks, regions)
     part = entry.get("part")
     return OrthoProduct(plan, looks, key, part and Part(tuple(part["objects"]), bool(part["below"])))

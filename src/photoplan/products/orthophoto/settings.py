@@ -35,6 +35,9 @@ class Choice:
     feather: float = 0.0
     """Width in which images pass into each other along seams, metres; 0: they do not."""
 
+    sheets: float | None = None
+    """Side of the sheets that a mosaic is cut into, metres; None: it is one file."""
+
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Choice:
         """A choice from plain values."""

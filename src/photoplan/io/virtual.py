@@ -1,0 +1,71 @@
+"""Virtual rasters: one small file that shows many rasters of a grid as one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from xml.sax.saxutils import escape
+
+import rasterio
+import rasterio.enums
+
+from photoplan.errors import UsageError
+from photoplan.io.naming import write_atomically
+
+_MARK = "<!-- written by photoplan -->"
+_TYPES = {"uint8": "Byte", "int8": "Int8", "uint16": "UInt16", "int16": "Int16", "uint32": "UInt32", "int32": "Int32",
+          "float32": "Float32", "float64": "Float64"}  # fmt: skip
+
+
+def refuse_foreign_virtual(path: Path) -> None:
+    """Refuse to replace a file that `write_virtual` has not written.
+
+    Raises
+    ------
+    UsageError
+        Naming it.
+    """
+    if path.is_file() and _MARK not in path.read_bytes()[:4096].decode(errors="replace"):
+        raise UsageError(f"{path}: exists and is not of photoplan; move it away, or give another name")
+
+
+def write_virtual(path: Path, rasters: Sequence[Path]) -> None:
+    """Write a VRT (GDAL's virtual raster) of rasters of one grid, bands and type, which lie in its folder; replaces an
+    older one."""
+    left, top, right, bottom = float("inf"), float("-inf"), float("-inf"), float("inf")
+    facts = []
+    for raster in rasters:
+        with rasterio.open(raster) as file:
+            b, resolution, crs, dtype = file.bounds, file.res[0], file.crs, file.dtypes[0]
+            masked = rasterio.enums.MaskFlags.per_dataset in file.mask_flag_enums[0]
+            facts.append((raster.name, b.left, b.top, file.width, file.height))
+            count, nodata, colours = file.count, file.nodata, [each.name.capitalize() for each in file.colorinterp]
+        left, top, right, bottom = min(left, b.left), max(top, b.top), max(right, b.right), min(bottom, b.bottom)
+    size = round((right - left) / resolution), round((top - bottom) / resolution)
+
+    def sources(band: str) -> str:
+        found = []
+        for name, x, y, width, height in facts:
+            to = f'xOff="{round((x - left) / resolution)}" yOff="{round((top - y) / resolution)}"'
+            at = f'xSize="{width}" ySize="{height}"'
+            found.append(
+                f'<ComplexSource><SourceFilename relativeToVRT="1">{escape(name)}</SourceFilename><SourceBand>{band}'
+                f'</SourceBand><SrcRect xOff="0" yOff="0" {at}/><DstRect {to} {at}/>'
+                + ("" if nodata is None or band.startswith("mask") else f"<NODATA>{nodata!r}</NODATA>")
+                + "</ComplexSource>"
+            )
+        return "\n".join(found)
+
+    none = "" if nodata is None else f"<NoDataValue>{nodata!r}</NoDataValue>"
+    bands = [
+        f'<VRTRasterBand dataType="{_TYPES[dtype]}" band="{k + 1}">{none}<ColorInterp>{colours[k]}</ColorInterp>\n'
+        f"{sources(str(k + 1))}\n</VRTRasterBand>"
+        for k in range(count)
+    ]
+    if masked:
+        bands.append(f'<MaskBand><VRTRasterBand dataType="Byte">\n{sources("mask,1")}\n</VRTRasterBand></MaskBand>')
+    head = (
+        f'<VRTDataset rasterXSize="{size[0]}" rasterYSize="{size[1]}">{_MARK}\n<SRS>{escape(crs.to_wkt())}</SRS>\n'
+        f"<GeoTransform>{left!r}, {resolution!r}, 0, {top!r}, 0, {-resolution!r}</GeoTransform>\n"
+    )
+    write_atomically(path, (head + "\n".join(bands) + "\n</VRTDataset>\n").encode())
