@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+from photoplan.kernels.max_flow import SINK, least_cut
 
 _Floats = NDArray[np.float32]
 _Mask = NDArray[np.bool_]
@@ -181,7 +181,10 @@ class _Level:
             np.add.at(take, number[q[two]], -other[two])
             pairs.append(np.stack([number[p[two]], number[q[two]]]))
             both.append(np.maximum((one + other - keep)[two], 0.0))
-        taken = _least(take, np.concatenate(pairs, axis=1), np.concatenate(both), self.usual / _STEPS)
+        y, x = np.divmod(nodes, self.shape[1])
+        places = (y - row + 1) * (width + 2) + x - col + 1
+        edges = np.concatenate(pairs, axis=1), np.concatenate(both)
+        taken = _least(take, edges, self.usual / _STEPS, places, (height + 2, width + 2))
         if not taken.any():
             return False
         before = self.total(flat)
@@ -264,33 +267,36 @@ class _Level:
         return max(float(np.median(apart)), 1e-3) if len(apart) else 1.0
 
 
-def _least(take: _Floats, pairs: NDArray[np.int64], both: _Floats, step: float) -> _Mask:
+def _least(
+    take: _Floats,
+    edges: tuple[NDArray[np.int64], _Floats],
+    step: float,
+    places: NDArray[np.int64],
+    shape: tuple[int, int],
+) -> _Mask:
     """The nodes (n,) that change in the cheapest way.
 
     Parameters
     ----------
     take : ndarray, shape (n,)
         What a node costs more if it changes.
-    pairs : ndarray of int, shape (2, m)
-    both : ndarray, shape (m,)
-        Cost if the second of a pair changes and the first does not; not negative.
+    edges : ndarrays, shapes (2, m) and (m,)
+        Pairs of nodes, and their cost if the second changes and the first does not; not negative.
     step : float
         Costs are counted in whole steps of it.
+    places : ndarray of int, shape (n,)
+        Of the nodes in a grid of a shape with a rim of one pixel, counted row by row.
     """
-    n = len(take)
     own = np.clip(np.rint(take / step), -(10**8), 10**8).astype(np.int32)
+    pairs, both = edges
     cost = np.clip(np.rint(both / step), 0, 10**8).astype(np.int32)
-    nodes = np.arange(n)
-    changes, stays = nodes[own > 0], nodes[own < 0]
-    tails = np.concatenate([pairs[0], np.full(len(changes), n), stays])
-    heads = np.concatenate([pairs[1], changes, np.full(len(stays), n + 1)])
-    capacity = np.concatenate([cost, own[changes], -own[stays]])
-    graph = csr_matrix((capacity, (tails, heads)), shape=(n + 2, n + 2))
-    rest = graph - maximum_flow(graph, n, n + 1).flow
-    rest.eliminate_zeros()
-    keeps = np.zeros(n + 2, np.bool_)
-    keeps[breadth_first_order(rest, n, return_predecessors=False)] = True
-    return ~keeps[:n]
+    first, second = places[pairs]
+    room, ends = np.zeros((4, shape[0] * shape[1]), np.int32), np.zeros(shape[0] * shape[1], np.int32)
+    room[np.where(second == first + 1, 0, 2), first] = cost
+    ends[places] = own
+    tree = np.zeros(len(ends), np.int8)
+    least_cut(room, ends, shape[1], tree)
+    return np.asarray(tree[places] == SINK)
 
 
 def _detail(image: Shown) -> _Floats:
