@@ -185,15 +185,15 @@ def test_fault_19_objects_that_cannot_be_are_named_one_by_one(town: Block, capsy
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_fault_02_objects_above_all_cameras_are_refused(town: Block, capsys, command: str) -> None:  # type: ignore[no-untyped-def]
+def test_fault_02_objects_with_heights_in_feet_are_refused(town: Block, capsys, command: str) -> None:  # type: ignore[no-untyped-def]
     """Heights in feet put roofs above the aircraft: nothing was hidden, nothing said."""
     photoplan = Here(capsys)
     verb, *options = COMMANDS[command]
-    write_objects(town, [*POLYGONS, [DECK - (0, 0, -900)]], [*NAMES, "feet"])
+    write_objects(town, [*POLYGONS, [(DECK - (0, 0, 17)) * (1, 1, 1 / 0.3048)]], [*NAMES, "feet"])
     said = photoplan(verb, town.project, *options, "--resolution", "1")
-    assert said.code == 3 and "object 'feet' rises to" in said.err and "above all cameras" in said.err
+    assert said.code == 3 and "object 'feet' rises to" in said.err and "in feet" in said.err
     assert not (town.folder / "products").exists()
-    assert "above all cameras" in photoplan("check", town.project).out
+    assert "in feet" in photoplan("check", town.project).out
     assert photoplan(verb, town.project, *options, "--resolution", "1", "--force", "--dry-run").code == 0
 
 

@@ -17,7 +17,7 @@ from photoplan.plain import pick
 from photoplan.plan.footprint import Footprint, footprint, mean_gsd
 from photoplan.products.balance.glance import colour_advice
 from photoplan.products.judged import against_files, judged, reading_of_block
-from photoplan.products.orthophoto.look import above_cameras, two_figures
+from photoplan.products.orthophoto.look import heights_in_feet, two_figures
 from photoplan.project.cameras import camera_without_pixels, is_there
 from photoplan.project.ground import Ground, ground_of
 from photoplan.project.scene import map_order, open_scene
@@ -134,7 +134,7 @@ def _of_objects(project: Project, ground: Ground, names: Sequence[str]) -> tuple
     """What cannot be right of the objects as a whole."""
     if not project.objects:
         return ()
-    told = above_cameras(ground.surface, [camera_without_pixels(project, name) for name in names])
+    told = heights_in_feet(ground.surface, [camera_without_pixels(project, name) for name in names])
     return () if told is None else (told,)
 
 

@@ -18,6 +18,9 @@ from photoplan.surfaces.rays import Hits
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
 
+#: Metres; and between which heights above the ground an object stands there, metres.
+_FOOT, _STANDS = 0.3048, (-3.0, 25.0)
+
 
 @dataclass(frozen=True)
 class Part:
@@ -122,14 +125,19 @@ def without_objects(surface: Terrain) -> Terrain:
     return surface.ground if isinstance(surface, ObjectSurface) else surface
 
 
-def rising_above(surface: Terrain, height: float) -> dict[str, float]:
-    """Objects that rise above a height, with how high they rise, metres; of a surface without objects none."""
+def as_if_in_feet(surface: Terrain, height: float) -> dict[str, float]:
+    """Objects that rise above a height, metres, and would stand on the ground if their own were in feet: how high they
+    rise; of a surface without objects none."""
     if not isinstance(surface, ObjectSurface):
         return {}
     faces = surface.faces
-    top = np.full(len(faces.names), -np.inf)
-    np.maximum.at(top, np.repeat(faces.owner, 3), faces.corners[..., 2].ravel())
-    return {faces.names[k]: float(top[k]) for k in np.flatnonzero(top > height)}
+    owner = np.repeat(faces.owner, 3)
+    top, lowest = np.full(len(faces.names), -np.inf), np.full(len(faces.names), np.inf)
+    np.maximum.at(top, owner, faces.corners[..., 2].ravel())
+    corners = faces.corners.reshape(-1, 3)
+    np.fmin.at(lowest, owner, _FOOT * corners[:, 2] - surface.ground.heights(corners[:, :2]))
+    stands = (lowest > _STANDS[0]) & (lowest < _STANDS[1])
+    return {faces.names[k]: float(top[k]) for k in np.flatnonzero((top > height) & stands)}
 
 
 def painted_surface(surface: Terrain) -> Terrain:

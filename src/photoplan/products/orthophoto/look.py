@@ -19,7 +19,7 @@ from photoplan.products.judged import judged, reading_of_block
 from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.scene import Scene, map_order, open_scene
 from photoplan.surfaces.base import Terrain
-from photoplan.surfaces.objects import rising_above
+from photoplan.surfaces.objects import as_if_in_feet
 
 #: A product is at most so many times finer than its images see the ground.
 _FINER = 4.0
@@ -59,7 +59,7 @@ def look_at(project: Project, names: Sequence[str], force: bool, events: Events)
         events.done()
     if not force:
         _refuse_faults(project, seen, scenes)
-        _refuse_above_cameras(list(scenes.values()))
+        _refuse_feet(list(scenes.values()))
     looked, blind = [], []
     for name, scene in ((name, scenes[name]) for name in names):
         if scene.footprint.bounds is None:
@@ -96,23 +96,23 @@ def _refuse_faults(
         raise GeometryError(f"another reading of the orientations fits better; {forced}. {other}")
 
 
-def _refuse_above_cameras(scenes: Sequence[Scene]) -> None:
-    told = above_cameras(scenes[0].surface, [scene.camera for scene in scenes]) if scenes else None
+def _refuse_feet(scenes: Sequence[Scene]) -> None:
+    told = heights_in_feet(scenes[0].surface, [scene.camera for scene in scenes]) if scenes else None
     if told is not None:
-        raise GeometryError(f"{told} Nothing is made of it unless you say `force`")
+        raise GeometryError(f"{told}; nothing is made of it unless you say `force`")
 
 
-def above_cameras(surface: Terrain, cameras: Sequence[Camera]) -> str | None:
-    """What to say of objects that rise above every camera, in feet perhaps; None: none does."""
+def heights_in_feet(surface: Terrain, cameras: Sequence[Camera]) -> str | None:
+    """What to say of objects that rise above every camera, but would stand on the ground in feet; None: none does."""
     highest = max(float(camera.vantage.point[2]) for camera in cameras)
-    tall = rising_above(surface, highest)
+    tall = as_if_in_feet(surface, highest)
     if not tall:
         return None
     name, top = next(iter(tall.items()))
     more = f" (and {len(tall) - 1} more)" if len(tall) > 1 else ""
     return (
-        f"object {name!r}{more} rises to {top:.1f} m, above all cameras (the highest is at {highest:.1f} m): are its "
-        "heights in metres, and in the height system that is stated?"
+        f"object {name!r}{more} rises to {top:.1f} m, above all cameras (the highest is at {highest:.1f} m), and would "
+        "stand on the ground if its heights were in feet: convert them to metres"
     )
 
 
