@@ -11,6 +11,7 @@ VERBS = {
     "picture": "A picture of terrain, rasters or photos (this word may be left out).",
     "matrix": "The ground of every pixel as a raster.",
     "pick": "Pixels to ground, ground to pixels.",
+    "area": "What of the map is seen, as a raster or a polygon.",
     "skyline": "The border between ground and sky, as a table or on the map.",
 }
 
