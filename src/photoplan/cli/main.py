@@ -35,6 +35,7 @@ VERBS = {
     "mosaic": "Make one orthophoto of many images.",
     "illumination": "Take the light on slopes, and haze, out of an orthophoto.",
     "object": "Make a product of each object alone.",
+    "surface": "Heights and grey values from all images at once.",
     "run": "Execute a plan written by `ortho --plan`.",
     "dtm": "Terrain models: build, sample, contours, volumes …",
     "view": "Perspective views, with the ground of every pixel.",

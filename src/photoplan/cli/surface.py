@@ -1,0 +1,78 @@
+"""`photoplan surface`: heights and grey values of a surface from all images at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photoplan.cli.options import PATH, bounds_option, dry_run_option, executing, images_option
+
+
+@click.command("surface")
+@click.argument("project", type=PATH)
+@click.option("--resolution", type=float, required=True, metavar="R", help="Distance of the heights, metres.")
+@bounds_option
+@images_option()
+@click.option(
+    "--start", default="terrain", metavar="WHAT", help="terrain (the project's), a height, or a file [terrain]."
+)
+@click.option("--reach", type=float, metavar="M", help="How far the start may be wrong [a tenth of the flying height].")
+@click.option("--name", default="surface", metavar="NAME", help="Of the files [surface].")
+@click.option("--output", type=PATH, help="Folder of the files [PROJECT's folder/products].")
+@click.option("--force", is_flag=True, help="Also of orientations with a FAULT.")
+@dry_run_option("Print the plan, and stop.")
+@executing
+def command(project: Path, **options: Any) -> None:
+    """Heights and grey values from all images at once, each with its standard deviation.
+
+    NAME.tif has the heights, NAME_sigma.tif their standard deviations, NAME_count.tif the images that see them,
+    NAME_grey.tif the grey values of the surface. The heights serve as [terrain] of a project. The same command
+    continues a run that was interrupted.
+    """
+    from photoplan.cli import running
+    from photoplan.cli.output import show, show_json
+    from photoplan.cli.telling import Telling
+    from photoplan.io.project.file import load_project
+    from photoplan.products.run import Run
+    from photoplan.products.surface.plan import SurfaceSettings, plan_surface
+    from photoplan.products.surface.run import make_surface
+
+    how = running.How.from_options(options)
+    folder, dry_run, images, force = (options.pop(name) for name in ("output", "dry_run", "images", "force"))
+    stated = load_project(project)
+    with Telling(how.quiet) as events:
+        plan = plan_surface(stated, SurfaceSettings(**options), images or None, force=force, events=events)
+        for line in plan.blind:
+            events.talk(f"  sees no terrain and is left out: {line}")
+        if dry_run:
+            show_json(plan.json_fields()) if how.as_json else show(plan)
+            return
+        events.talk(str(plan))
+        run = Run(how.workers, how.executor, how.memory, how.overwrite, how.quicklook, events)
+        result = make_surface(plan, folder or stated.folder / "products", run)
+        if how.as_json:
+            show_json(result)
+        else:
+            for path in (result.path, *result.others):
+                show(path)
+        _tell(result, plan, how.quicklook, events)
+
+
+def _tell(result: Any, plan: Any, draw: bool, events: Any) -> None:
+    """Figures of a surface, and its picture where pictures can be made."""
+    from photoplan.report.drawing import has_matplotlib
+    from photoplan.report.surface import draw_surface
+
+    known = {name: value for name, value in result.sigma0.items() if value is not None}
+    mean = "unknown" if result.sigma is None else f"{result.sigma:.3g} m ({result.sigma_px:.2g} px of parallax)"
+    events.talk(
+        f"surface in {result.seconds:.1f} s · {result.valid_share:.1%} of {plan.grid.width * plan.grid.height} posts "
+        f"have a height, mean standard deviation {mean}"
+    )
+    corrections = ", ".join(f"{c:.3f}" for c in result.corrections[::-1])
+    events.talk(f"  last corrections, coarse to fine: {corrections} px")
+    events.talk("  sigma0 of grey values: " + ", ".join(f"{name} {value:.3g}" for name, value in known.items()))
+    if draw and has_matplotlib():
+        events.talk(f"  drawn in {draw_surface(result.path, result.path.with_suffix('.png'))}")

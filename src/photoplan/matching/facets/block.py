@@ -1,0 +1,239 @@
+"""Least squares of a block of facets: heights and grey values from the pixels of all views at one level.
+
+Unknown heights, grey values, radiometric parameters and variances are improved in turn: grey values by conjugate
+gradients, the others given them; heights by normal equations from which the grey values are eliminated
+(`kernels.facets_height`). Where they have converged, the sum of squares of all is least.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.kernels.facets_grey import OFFSETS, PAD, add_grey, sample_grey, solve_grey
+from photoplan.kernels.facets_height import add_heights, add_means
+from photoplan.kernels.facets_solve import solve_heights, variances
+from photoplan.matching.facets.curvature import SPANS, Known, Roughness
+from photoplan.matching.facets.observe import Facets, Sight, View
+from photoplan.matching.facets.radiometry import Transfer, first_guess, levelled
+
+_Floats = NDArray[np.float32]
+_Doubles = NDArray[np.float64]
+
+#: Iterations of a level at most, and the mean correction at which they end, grey facets (pixels).
+MOST, ENOUGH = 12, 0.01
+#: Largest correction in one iteration, grey facets.
+_FARTHEST = 2.0
+#: Residuals from so many standard deviations on count less (Huber 1964), and what that takes from their variance.
+_LIMIT, _TAKEN = 2.5, 0.978
+#: Conjugate gradients of grey values: rounds at most, and the factor by which the error falls.
+_ROUNDS, _FALL = 25, 0.01
+#: Pixels beyond those that grey values need, part of all, without which a surface is not tried.
+_TELLING = 0.05
+_NONE = np.empty((0, 0), np.float32)
+#: Posts of a part that is solved at once, and around it.
+_SIDE, _MARGIN = 24, 8
+#: Least standard deviation of grey values, parts of the contrast: images without noise have residuals of rounding.
+_QUIET = 1e-4
+
+
+@dataclass(eq=False)
+class Block:
+    """A level of a block while it is adjusted."""
+
+    facets: Facets
+    sights: list[Sight]
+    transfers: list[Transfer]
+    heights: _Doubles
+    """At the posts, shape (rows, columns), metres."""
+    roughness: Roughness
+    sigmas: _Doubles
+    """Standard deviation of the grey values of each view, in the system of the surface."""
+    views: list[View] = field(default_factory=list)
+    """Whose sights they are."""
+    values: _Floats = field(default_factory=lambda: np.empty((0, 0), np.float32))
+    """Coefficients of the grey facets."""
+    moves: list[float] = field(default_factory=list)
+    """Mean correction of every iteration so far, pixels of the parallax between the outermost views."""
+    system: _Doubles = field(default_factory=lambda: np.empty((0, 0, 0)))
+    """Normal equations of the heights, of the pixels alone."""
+    counted: NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 0), np.uint8))
+    """Views that have pixels around each post."""
+    sums: _Doubles = field(default_factory=lambda: np.zeros((0, 2)))
+    """Of each view: Σ of robust factors times squared residuals in its own grey values; redundancy."""
+    _factors: list[_Floats] = field(default_factory=list)
+
+    def adjust(self, most: int = MOST) -> None:
+        """Iterate until the heights stay."""
+        for _ in range(most):
+            self.iterate()
+            if self.moves[-1] < ENOUGH:
+                break
+
+    def iterate(self) -> None:
+        """One correction of everything."""
+        self.sights = [sight.onto(self.heights) for sight in self.sights]
+        grey, weights = self._observed()
+        if not len(self.values):
+            self._start(grey, weights)
+        density = self._solve_grey(grey, weights)
+        if len(self.sights) > 1:
+            self._improve_radiometry(weights)
+            grey, weights = self._observed()
+        right = self._heights(grey, weights, density)
+        right -= self.roughness.gradient(self.heights)
+        change = np.empty_like(self.heights)
+        solve_heights(self.system, self.roughness.weights, right, _SIDE, _MARGIN, change)
+        scale = self.parallax()
+        known = self.counted > 1
+        change = np.clip(change, -_FARTHEST / scale, _FARTHEST / scale)
+        self.heights = self.heights + change
+        self.moves.append(float(np.sqrt(np.mean(change[known] ** 2)) * scale) if known.any() else 0.0)
+
+    def misfit(self, heights: _Doubles) -> float:
+        """Variance of the grey values about a surface of these heights over their own; infinite if few pixels tell."""
+        trial = replace(self, heights=heights, sights=[s.onto(heights) for s in self.sights], values=_NONE, _factors=[])
+        trial.transfers = first_guess(trial.sights, self.facets)
+        grey, weights = trial._observed()
+        weights = [(w > 0).astype(np.float32) for w in weights]
+        trial._start(grey, weights)
+        density = trial._solve_grey(grey, weights)
+        total = sum(float(w.sum()) for w in weights)
+        free = total - int((density > 0).sum())
+        if free < _TELLING * sum(s.raw.size for s in self.sights):
+            return float("inf")
+        values = np.concatenate([g[w > 0] for g, w in zip(grey, weights)])
+        surface = np.concatenate([trial._surface_at(s, w)[w > 0] for s, w in zip(trial.sights, weights)])
+        return float(np.sum((values - surface) ** 2) / free / max(float(values.var()), 1e-12))
+
+    def variances(self) -> tuple[_Doubles, Known]:
+        """Variances of heights (rows, columns) and of curvatures."""
+        heights, curvatures = np.empty(self.facets.shape), np.empty((3, *self.facets.shape))
+        wide = np.empty(len(SPANS))
+        spans = np.array(SPANS)
+        variances(self.system, self.roughness.weights, _SIDE, _MARGIN, heights, curvatures, spans, wide)
+        return heights, Known(curvatures, wide)
+
+    def roughen(self) -> None:
+        """Estimate the variances of the curvatures."""
+        _, known = self.variances()
+        weights = self.system[0] + 2 * self.system[[1, 4]].sum(axis=0)
+        self.roughness = self.roughness.estimated(self.heights, known, weights)
+
+    def parallax(self) -> float:
+        """How far the outermost views of a place part when its height changes, grey facets (pixels) per metre."""
+        rows, columns = self.facets.shape
+        lowest, highest = (np.full((rows - 1, columns - 1, 2), end) for end in (np.inf, -np.inf))
+        count = np.zeros((rows - 1, columns - 1), int)
+        for sight in self.sights:
+            sums = np.zeros((rows - 1, columns - 1, 3))
+            seen = np.isfinite(sight.places[..., 0]) & np.isfinite(sight.raw)
+            add_means(sight.places, seen.astype(np.float32), sums)
+            known = sums[..., 0] > 0
+            ways = sums[known, 1:] / sums[known, :1]
+            lowest[known], highest[known] = np.minimum(lowest[known], ways), np.maximum(highest[known], ways)
+            count += known
+        apart = (highest - lowest)[count > 1]
+        return max(float(np.median(np.hypot(*apart.T))) * self.facets.ratio if len(apart) else 0.0, 1e-9)
+
+    def grey_values(self, uv: _Doubles) -> _Floats:
+        """Grey values of the surface at places (n, 2) of the posts inside the block."""
+        out = np.empty(len(uv), np.float32)
+        sample_grey(self.values, self.facets.ratio, uv, out)
+        return out
+
+    def _observed(self) -> tuple[list[_Floats], list[_Floats]]:
+        """Grey values of all views' pixels in the system of the surface, and their weights."""
+        grey = [transfer.apply(sight, self.facets) for sight, transfer in zip(self.sights, self.transfers)]
+        if not self._factors:
+            self._factors = [np.ones(sight.raw.shape, np.float32) for sight in self.sights]
+        weights = [
+            np.where(np.isfinite(g), f / np.float32(s * s), np.float32(0))
+            for g, f, s in zip(grey, self._factors, self.sigmas)
+        ]
+        return grey, weights
+
+    def _start(self, grey: Sequence[_Floats], weights: Sequence[_Floats]) -> None:
+        """Coefficients that are the mean grey value."""
+        total = sum(float(w.sum()) for w in weights) or 1.0
+        mean = sum(float(np.nansum(g * w)) for g, w in zip(grey, weights)) / total
+        shape = tuple((n - 1) * self.facets.ratio + 1 + 2 * PAD for n in self.facets.shape)
+        self.values = np.full(shape, mean, np.float32)
+
+    def _solve_grey(self, grey: Sequence[_Floats], weights: Sequence[_Floats]) -> _Floats:
+        """The grey values of the surface; returns the weights that lie on each of them."""
+        shape = self.values.shape
+        system = np.zeros((*shape, OFFSETS), np.float32)
+        right, density = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        for sight, g, w in zip(self.sights, grey, weights):
+            add_grey(sight.places, g, w, self.facets.ratio, system, right, density)
+        usual = float(density[density > 0].mean()) if (density > 0).any() else 1.0
+        # Coefficients that hardly any pixel knows stay near what they were.
+        system[..., 3] += np.float32(1e-4 * usual)
+        right += np.float32(1e-4 * usual) * self.values
+        by_offsets = np.ascontiguousarray(np.moveaxis(system, -1, 0))
+        solve_grey(by_offsets, right, _smooth(density) + np.float32(0.05 * usual), self.values, _ROUNDS, _FALL)
+        return density
+
+    def _surface_at(self, sight: Sight, weights: _Floats) -> _Floats:
+        """Grey values of the surface where a view's pixels lie; 0 where none is used."""
+        out = np.zeros(sight.raw.shape, np.float32)
+        used = weights > 0
+        out[used] = self.grey_values(sight.places[used][:, :2].astype(float))
+        return out
+
+    def _improve_radiometry(self, weights: Sequence[_Floats]) -> None:
+        contrast = max(float(self.values.std()), 1e-6)
+        new = [
+            transfer.improved(sight, self.facets, w, self._surface_at(sight, w), contrast)
+            if (w > 0).any()
+            else transfer
+            for sight, transfer, w in zip(self.sights, self.transfers, weights)
+        ]
+        self.transfers = levelled(new)
+
+    def _heights(self, grey: Sequence[_Floats], weights: Sequence[_Floats], density: _Floats) -> _Doubles:
+        """Normal equations of the heights (kept) and their right-hand side; new standard deviations and factors."""
+        rows, columns = self.facets.shape
+        sums = np.zeros((rows - 1, columns - 1, 3))
+        for sight, w in zip(self.sights, weights):
+            add_means(sight.places, w, sums)
+        means = sums[..., 1:] / np.maximum(sums[..., :1], 1e-30)
+        self.system, right = np.zeros((7, rows, columns)), np.zeros((rows, columns))
+        counted = np.zeros((rows, columns), np.uint8)
+        found, residuals = np.zeros((len(self.sights), 3)), np.empty(0)
+        for n, (sight, g, w) in enumerate(zip(self.sights, grey, weights)):
+            residuals = np.empty(g.shape, np.float32)
+            before = self.system[0].copy()
+            add_heights(
+                sight.places, g, w, self.values, self.facets.ratio, means, self.sigmas[n], _LIMIT,
+                self.system, right, residuals, self._factors[n], found[n],
+            )  # fmt: skip
+            counted += self.system[0] > before
+        self.counted = counted
+        self._weigh(found, int((density > 0).sum()))
+        return right
+
+    def _weigh(self, found: _Doubles, unknowns: int) -> None:
+        """Standard deviations of the views' grey values, by variance components (Förstner 1979)."""
+        used = found[:, 0] > 0
+        share = np.where(used, found[:, 0], 0.0) / self.sigmas**2
+        # A pixel has as much of the unknowns as of the weights.
+        redundancy = np.maximum(found[:, 0] - unknowns * share / max(share.sum(), 1e-30), 0.05 * found[:, 0])
+        factor = np.sqrt(found[:, 1] / np.maximum(redundancy, 1.0) / _TAKEN)
+        if used.sum() < 3:
+            factor[used] = np.sqrt(found[used, 1].sum() / max(redundancy[used].sum(), 1.0) / _TAKEN)
+        quiet = _QUIET * max(float(self.values.std()), 1e-6)
+        gains = np.array([float(t.gains.mean()) for t in self.transfers])
+        self.sums = np.column_stack([found[:, 1] * (self.sigmas * gains) ** 2 / _TAKEN, redundancy])
+        self.sigmas = np.where(used, np.maximum(self.sigmas * np.clip(factor, 0.2, 5.0), quiet), self.sigmas)
+
+
+def _smooth(values: _Floats) -> _Floats:
+    """Means of three by three."""
+    padded = np.pad(values, 1, mode="edge")
+    across = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
+    return (across[:-2] + across[1:-1] + across[2:]) / np.float32(9)

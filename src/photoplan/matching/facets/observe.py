@@ -1,0 +1,162 @@
+"""The pixels of an image that look at a block of facets, and their rays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.cameras.base import Camera, project
+from photoplan.geometry.grid import Window
+from photoplan.kernels.facets_transfer import transfer
+from photoplan.matching.facets.pyramid import Pyramid
+
+_Floats = NDArray[np.float32]
+_Doubles = NDArray[np.float64]
+
+#: Rays are followed for pixels this far apart, or closer where rays between them would be off by more than this part of
+#: a grey facet.
+_STEP, _OFF = 32, 0.004
+#: Points along a side of a block that are projected to find its pixels.
+_POINTS = 9
+
+
+@dataclass(frozen=True)
+class Facets:
+    """A block of height facets on a map: posts and, between them, finer grey facets."""
+
+    left: float
+    """X of the first post."""
+    top: float
+    """Y of the first post."""
+    pitch: float
+    """Side of a height facet, metres."""
+    shape: tuple[int, int]
+    """Rows and columns of posts, at least 2 each."""
+    ratio: int
+    """Grey facets along a side of a height facet."""
+
+    def to_posts(self, XY: ArrayLike) -> _Doubles:
+        """Map points (..., 2) to column and row of the posts."""
+        XY = np.asarray(XY, float)
+        return np.stack([(XY[..., 0] - self.left) / self.pitch, (self.top - XY[..., 1]) / self.pitch], axis=-1)
+
+    def to_map(self, uv: ArrayLike) -> _Doubles:
+        """Inverse of `to_posts`."""
+        uv = np.asarray(uv, float)
+        return np.stack([self.left + uv[..., 0] * self.pitch, self.top - uv[..., 1] * self.pitch], axis=-1)
+
+    def sampled(self, values: _Doubles, XY: ArrayLike) -> _Doubles:
+        """Values at the posts (..., rows, columns), bilinear at map points (n, m, 2) of a grid, shape (..., n, m);
+        beyond the border those of the border."""
+        uv = self.to_posts(XY)
+        rows, columns = self.shape
+        x, y = np.clip(uv[0, :, 0], 0, columns - 1), np.clip(uv[:, 0, 1], 0, rows - 1)
+        i, j = np.minimum(x.astype(int), columns - 2), np.minimum(y.astype(int), rows - 2)
+        a, b = x - i, (y - j)[:, None]
+        upper, lower = values.take(j, -2), values.take(j + 1, -2)
+        upper = upper.take(i, -1) * (1 - a) + upper.take(i + 1, -1) * a
+        lower = lower.take(i, -1) * (1 - a) + lower.take(i + 1, -1) * a
+        return np.asarray(upper * (1 - b) + lower * b)
+
+    @property
+    def posts(self) -> _Doubles:
+        """X, Y of all posts, shape (rows, columns, 2)."""
+        v, u = np.mgrid[: self.shape[0], : self.shape[1]]
+        return self.to_map(np.stack([u, v], axis=-1))
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """An image that takes part."""
+
+    camera: Camera
+    pyramid: Pyramid
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What a view has of a block: pixels of a window of one of its levels, and how their rays run."""
+
+    raw: _Floats
+    """Grey values, shape (h, w); NaN where there are none."""
+    low: _Doubles
+    """Where rays of every `step`-th pixel cross the lower of two levels, column and row of the posts; (m, n, 2)."""
+    high: _Doubles
+    """The same for the upper one."""
+    step: int
+    levels: tuple[float, float]
+    """Heights of the two levels, metres."""
+    places: _Floats = field(default_factory=lambda: np.empty((0, 0, 4), np.float32))
+    """Where the pixels lie on the surface, see `facets_transfer.transfer`."""
+
+    def onto(self, heights: _Doubles) -> Sight:
+        """The same pixels, carried to a surface of heights at the posts."""
+        places = np.empty((*self.raw.shape, 4), np.float32)
+        transfer(self.low, self.high, self.step, self.levels, heights, places)
+        return replace(self, places=places)
+
+
+def look(view: View, level: int, facets: Facets, heights: tuple[float, float]) -> Sight | None:
+    """Pixels of a level of a view that may look at a block between two heights, metres; None: there are none."""
+    low, high = heights
+    high = min(high, float(view.camera.vantage.point[2]) - 1e-3)
+    low = max(low, view.camera.vantage.floor)
+    if not low < high:
+        return None
+    window = _window(view, level, facets, (low, high))
+    if window.width < 2 or window.height < 2:
+        return None
+    raw = view.pyramid.read(level, window)
+    if not np.isfinite(raw).any():
+        return None
+    return _followed(view.camera, raw, window, level, facets, (low, high))
+
+
+def _window(view: View, level: int, facets: Facets, heights: tuple[float, float]) -> Window:
+    """Pixels of a level around the positions of a block between two heights, inside the image."""
+    rows, columns = facets.shape
+    v, u = np.meshgrid(np.linspace(0, rows - 1, _POINTS), np.linspace(0, columns - 1, _POINTS), indexing="ij")
+    XY = facets.to_map(np.stack([u, v], axis=-1)).reshape(-1, 2)
+    XYZ = np.concatenate([np.column_stack([XY, np.full(len(XY), z)]) for z in heights])
+    xy = project(view.camera, XYZ) / 2**level
+    xy = xy[np.isfinite(xy).all(axis=1)]
+    if not len(xy):
+        return Window(0, 0, 0, 0)
+    width, height = view.pyramid.size(level)
+    first = np.clip(np.floor(xy.min(axis=0)) - 1, 0, (width, height)).astype(int)
+    last = np.clip(np.ceil(xy.max(axis=0)) + 2, 0, (width, height)).astype(int)
+    size = np.maximum(last - first, 0)
+    return Window(int(first[0]), int(first[1]), int(size[0]), int(size[1]))
+
+
+def _followed(
+    camera: Camera, raw: _Floats, window: Window, level: int, facets: Facets, levels: tuple[float, float]
+) -> Sight:
+    """Rays of a lattice of pixels, as fine as it takes for straight lines between them to be good."""
+    step = _STEP
+    while True:
+        x, y = (np.arange(0, n + step, step) for n in (window.width - 1, window.height - 1))
+        x, y = (np.append(a, a[-1] + step) if len(a) < 2 else a for a in (x, y))
+        at = np.stack(np.meshgrid(x + window.col, y + window.row), axis=-1) * 2.0**level
+        low, high = (facets.to_posts(_on_level(camera, at, z)) for z in levels)
+        middle = at[:-1, :-1] + 0.5 * step * 2.0**level
+        off = 0.0
+        for cross, z in ((low, levels[0]), (high, levels[1])):
+            found = facets.to_posts(_on_level(camera, middle, z))
+            mean = (cross[:-1, :-1] + cross[1:, :-1] + cross[:-1, 1:] + cross[1:, 1:]) / 4
+            off = max(off, float(np.nanmax(np.abs(found - mean), initial=0.0)) * facets.ratio)
+        if off <= _OFF or step == 1:
+            return Sight(raw, low, high, step, levels)
+        step = max(1, step // 2)
+
+
+def _on_level(camera: Camera, xy: NDArray[Any], height: float) -> _Doubles:
+    """X, Y where rays of image points (..., 2) come down to a height; NaN where they do not."""
+    origin, direction = camera.rays(xy.reshape(-1, 2), height)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = (height - origin[:, 2]) / direction[:, 2]
+        XY = np.where(direction[:, 2:] < 0, origin[:, :2] + along[:, None] * direction[:, :2], np.nan)
+    return XY.reshape(xy.shape)

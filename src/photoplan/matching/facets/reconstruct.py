@@ -1,0 +1,209 @@
+"""A window of a map from coarse to fine: facets in object space with levels of the image pyramids."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.matching.facets.block import Block
+from photoplan.matching.facets.curvature import Roughness
+from photoplan.matching.facets.observe import Facets, Sight, View, look
+from photoplan.matching.facets.radiometry import Transfer, first_guess
+
+_Floats = NDArray[np.float32]
+_Doubles = NDArray[np.float64]
+
+#: Posts around a window that are adjusted with it and belong to its neighbours.
+MARGIN = 12
+#: Iterations until roughness is first estimated, and after each of its estimates, of which the last level has more.
+_FIRST, _THEN, _ESTIMATES = 4, 3, (3, 1)
+#: Standard deviation of curvatures until it is estimated, pixels of parallax.
+_LOOSE = 0.5
+#: A view that has fewer pixels of a block is left out.
+_FEW = 16
+#: How far a surface may move on a level: grey facets, and on the coarsest level part of the flying height.
+_ROOM, _FAR = 16.0, 0.15
+#: Distance of the heights that are tried on the coarsest level, pixels of parallax, and how many up and down at most.
+_TRIAL, _MOST_TRIALS = 0.5, 24
+#: Standard deviation of grey values until it is estimated, part of their contrast.
+_NOISE = 0.1
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """How fine facets and images are."""
+
+    ratio: int
+    """Grey facets along a side of a height facet."""
+    coarsest: int
+    """Level on which the reconstruction begins."""
+    base: int = 0
+    """Level of the image pyramids that the finest facets use: images that are much finer than these."""
+    reach: float = 0.0
+    """How far the start may be wrong, metres: what the coarsest level does not pull in is tried there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A window of the surface."""
+
+    heights: _Floats
+    """Shape (rows, columns), metres; NaN where fewer than two images see it."""
+    sigmas: _Floats
+    """Standard deviations, metres; NaN where there is no height."""
+    count: NDArray[np.uint8]
+    """Images that see the facets around a post."""
+    grey: _Floats
+    """Grey values, `ratio` times as fine; NaN where no image sees it."""
+    sums: _Doubles
+    """Of every view: Σ of squared residuals in its own grey values, and redundancy; shape (n, 2)."""
+    moves: tuple[float, ...]
+    """Mean last correction of the heights on each level, the finest first, pixels of parallax; 0: nothing was seen."""
+
+
+def facets_of(grid: MapGrid, window: Window, level: int, ratio: int, margin: int = MARGIN) -> Facets:
+    """Facets of a level over a window of a map and `margin` posts around it.
+
+    Posts of a level are every 2^level-th pixel of the map, counted from its first: the same for every window.
+    """
+    step = 1 << level
+    first = np.array([window.col, window.row]) // step - margin
+    last = -(-(np.array(window.stop) - 1) // step) + margin
+    left, top = grid.to_map(first * step)
+    columns, rows = (last - first + 1).tolist()
+    return Facets(float(left), float(top), grid.resolution * step, (rows, columns), ratio)
+
+
+def reconstruct(
+    views: Sequence[View], grid: MapGrid, window: Window, scheme: Scheme, start: Callable[[_Doubles], _Doubles]
+) -> Found | None:
+    """Heights and grey values of a window of a map.
+
+    Parameters
+    ----------
+    views : sequence of View
+    grid : MapGrid
+        Its pixels are the height posts.
+    window : Window
+        Of its pixels.
+    scheme : Scheme
+    start : callable
+        Heights of map points (..., 2) with which the coarsest level begins, metres; NaN: unknown.
+
+    Returns
+    -------
+    Found or None
+        None: fewer than two images see any of it, or the start knows no height here.
+    """
+    block: Block | None = None
+    moves = [0.0] * (scheme.coarsest + 1)
+    for level in range(scheme.coarsest, -1, -1):
+        facets = facets_of(grid, window, level, scheme.ratio)
+        heights = _start_heights(start, facets) if block is None else _finer(block, facets)
+        if heights is None:
+            return None
+        block = _opened(views, level + scheme.base, facets, heights, block) or block
+        if block is None or block.facets is not facets:
+            continue
+        if level == scheme.coarsest:
+            block.heights = _lifted(block, scheme.reach)
+        block.adjust(_FIRST)
+        for _ in range(_ESTIMATES[level > 0]):
+            block.roughen()
+            block.adjust(_THEN)
+        moves[level] = block.moves[-1]
+    if block is None or block.facets.pitch != grid.resolution:
+        return None
+    return _found(block, views, window, tuple(moves))
+
+
+def _opened(views: Sequence[View], level: int, facets: Facets, heights: _Doubles, before: Block | None) -> Block | None:
+    """A block at the start of a level; None if fewer than two views see it."""
+    span = float(heights.min()), float(heights.max())
+    sights: list[Sight] = []
+    own: list[View] = []
+    for view in views:
+        room = _room(view, facets, span, before)
+        sight = look(view, level, facets, (span[0] - room, span[1] + room))
+        if sight is None:
+            continue
+        sight = sight.onto(heights)
+        if np.count_nonzero(np.isfinite(sight.places[..., 0]) & np.isfinite(sight.raw)) >= _FEW:
+            sights.append(sight)
+            own.append(view)
+    if len(sights) < 2:
+        return None
+    transfers, sigmas = _radiometry(own, sights, facets, before)
+    # Loose until it is estimated: from a stiff start, what does not fit would be taken for noise.
+    block = Block(facets, sights, transfers, heights, Roughness.uniform(facets.shape, 1.0), sigmas, own)
+    block.roughness = Roughness.uniform(facets.shape, _LOOSE / block.parallax())
+    return block
+
+
+def _lifted(block: Block, reach: float) -> _Doubles:
+    """The start, lifted or lowered as a whole by what fits best within its reach."""
+    pixel = 1.0 / block.parallax()
+    count = min(_MOST_TRIALS, int(np.ceil(reach / (_TRIAL * pixel) - 0.5)))
+    trials = sorted(range(-count, count + 1), key=abs)
+    if len(trials) == 1:
+        return block.heights
+    lifted = [block.heights + k * _TRIAL * pixel for k in trials]
+    return lifted[int(np.argmin([block.misfit(heights) for heights in lifted]))]
+
+
+def _room(view: View, facets: Facets, span: tuple[float, float], before: Block | None) -> float:
+    """How far the surface may still move on a level, metres."""
+    distance = abs(float(view.camera.vantage.point[2]) - sum(span) / 2)
+    return _ROOM * facets.pitch / facets.ratio + (_FAR * distance if before is None else 0.0)
+
+
+def _radiometry(
+    views: Sequence[View], sights: Sequence[Sight], facets: Facets, before: Block | None
+) -> tuple[list[Transfer], _Doubles]:
+    """Transfer parameters and noise of the level before; of views that it did not have, guesses."""
+    guesses = first_guess(sights, facets)
+    contrast = max(float(np.nanstd(np.concatenate([s.raw.reshape(-1) for s in sights]))), 1e-3)
+    sigmas = np.full(len(sights), _NOISE * contrast)
+    known = {} if before is None else {id(view): n for n, view in enumerate(before.views)}
+    for k, view in enumerate(views):
+        if before is not None and id(view) in known:
+            guesses[k] = before.transfers[known[id(view)]].on(facets)
+            sigmas[k] = before.sigmas[known[id(view)]]
+    return guesses, sigmas
+
+
+def _start_heights(start: Callable[[_Doubles], _Doubles], facets: Facets) -> _Doubles | None:
+    """Heights of the start at the posts; where it has none, their mean; None if it has none at all."""
+    found = np.asarray(start(facets.posts), float)
+    known = np.isfinite(found)
+    return np.where(known, found, found[known].mean()) if known.any() else None
+
+
+def _finer(block: Block, facets: Facets) -> _Doubles:
+    """Heights of the level before at the posts of finer facets, bilinear; beyond the border those of the border."""
+    return block.facets.sampled(block.heights, facets.posts)
+
+
+def _found(block: Block, views: Sequence[View], window: Window, moves: tuple[float, ...]) -> Found:
+    """What a block holds of its window."""
+    variance, _ = block.variances()
+    ratio = block.facets.ratio
+    inner = slice(MARGIN, MARGIN + window.height), slice(MARGIN, MARGIN + window.width)
+    count = block.counted[inner]
+    seen = count > 1
+    heights = np.where(seen, block.heights[inner], np.nan).astype(np.float32)
+    sigmas = np.where(seen, np.sqrt(np.maximum(variance[inner], 0.0)), np.nan).astype(np.float32)
+    part = (np.arange(ratio) + 0.5) / ratio - 0.5
+    u = (MARGIN + np.arange(window.width)[:, None] + part).reshape(-1)
+    v = (MARGIN + np.arange(window.height)[:, None] + part).reshape(-1)
+    grey = block.grey_values(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)).reshape(len(v), len(u))
+    seen_grey = np.repeat(np.repeat(count > 0, ratio, axis=0), ratio, axis=1)
+    sums = np.zeros((len(views), 2))
+    place = {id(view): n for n, view in enumerate(views)}
+    for view, both in zip(block.views, block.sums):
+        sums[place[id(view)]] = both
+    return Found(heights, sigmas, count, np.where(seen_grey, grey, np.float32(np.nan)), sums, moves)

@@ -1,0 +1,103 @@
+"""A tile of a surface, as a worker makes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photoplan.engine.run import Made
+from photoplan.geometry.grid import MapGrid, Window
+from photoplan.matching.facets.observe import View
+from photoplan.matching.facets.pyramid import Pyramid
+from photoplan.matching.facets.reconstruct import MARGIN, Scheme, reconstruct
+from photoplan.matching.grey import GreyImage
+from photoplan.plan.tiles import Tile
+from photoplan.project.open_terrain import open_terrain
+from photoplan.project.scene import SceneAddress
+from photoplan.project.scenes import ScenesAddress, surface_of
+from photoplan.surfaces.objects import without_objects
+
+_Doubles = NDArray[np.float64]
+
+#: Grey facets along a part that is reconstructed at once, and blocks of image pyramids that are kept, bytes in all.
+_PART, _KEPT = 384, 256 << 20
+#: Bytes of a grey facet while it is adjusted: its equations twice, and what the pixels need.
+_EACH = 400
+
+
+@dataclass(frozen=True)
+class SurfaceJob:
+    """All that a worker is told."""
+
+    address: ScenesAddress
+    grid: MapGrid
+    scheme: Scheme
+    start: str
+    """See `SurfaceSettings.start`."""
+
+    @property
+    def part(self) -> int:
+        """Posts along a part of a tile that is reconstructed at once."""
+        return max(16, _PART // self.scheme.ratio)
+
+    @property
+    def bytes(self) -> int:
+        """Memory that a tile takes."""
+        return ((self.part + 2 * MARGIN) * self.scheme.ratio) ** 2 * _EACH + 2 * (_PART**2) * len(self.address.scenes)
+
+    def __call__(self, tile: Tile) -> Made:
+        """Heights, standard deviations, number of images, grey values of a tile."""
+        views = [_view(scene, _KEPT // len(self.address.scenes)) for scene in self.address.scenes]
+        start = _start(self.address, self.start, self.grid.crs)
+        window, m = tile.window, self.scheme.ratio
+        shape = window.height, window.width
+        heights, sigmas = (np.full((1, *shape), np.nan, np.float32) for _ in range(2))
+        count, grey = np.zeros((1, *shape), np.uint8), np.full((1, m * shape[0], m * shape[1]), np.nan, np.float32)
+        sums, moves, parts = np.zeros((len(views), 2)), np.zeros(self.scheme.coarsest + 1), 0
+        for part in window.tiles(self.part):
+            found = reconstruct(views, self.grid, part, self.scheme, start)
+            if found is None:
+                continue
+            rows, columns = part.slices(window)
+            heights[0, rows, columns], sigmas[0, rows, columns] = found.heights, found.sigmas
+            count[0, rows, columns] = found.count
+            finer = Window(m * part.col, m * part.row, m * part.width, m * part.height)
+            rows, columns = finer.slices(Window(m * window.col, m * window.row, m * window.width, m * window.height))
+            grey[0, rows, columns] = found.grey
+            sums, moves, parts = sums + found.sums, moves + found.moves, parts + 1
+        record = {
+            "squares": sums[:, 0].tolist(),
+            "redundancy": sums[:, 1].tolist(),
+            "moves": moves.tolist(),
+            "parts": parts,
+            "sigmas": float(np.nansum(sigmas)),
+            "heights": int(np.isfinite(sigmas).sum()),
+        }
+        known, seen = np.isfinite(heights[0]), np.isfinite(grey[0])
+        if not known.any():
+            return Made((None, None, None, None), record)
+        return Made(((heights, known), (sigmas, known), (count, count[0] > 0), (grey, seen)), record)
+
+
+@lru_cache(maxsize=256)
+def _view(address: SceneAddress, kept: int) -> View:
+    """An image and its pyramid, kept for the next tile."""
+    scene = address.open()
+    return View(scene.camera, Pyramid(GreyImage(scene.reader), kept=kept))
+
+
+@lru_cache(maxsize=4)
+def _start(address: ScenesAddress, start: str, crs: str) -> Callable[[_Doubles], _Doubles]:
+    """Heights with which a surface begins."""
+    if start == "terrain":
+        return without_objects(surface_of(address)).heights
+    try:
+        height = float(start)
+    except ValueError:
+        return open_terrain(Path(start)).in_crs(crs)[0].surface.heights
+    return lambda XY: np.full(XY.shape[:-1], height)

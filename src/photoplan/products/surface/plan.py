@@ -1,0 +1,270 @@
+"""Plan a surface from images: its grid, how fine its facets are, where it begins. No pixel is touched."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from photoplan.errors import GeometryError, UsageError
+from photoplan.events import SILENT, Events
+from photoplan.geometry.grid import MapGrid
+from photoplan.io.project.model import Project
+from photoplan.io.run_record import run_key
+from photoplan.matching.facets.reconstruct import Scheme
+from photoplan.plain import pick
+from photoplan.products.orthophoto.look import Looked, extent_text, look_at
+from photoplan.project.open_terrain import open_terrain
+from photoplan.project.scenes import ScenesAddress
+
+Bounds = tuple[float, float, float, float]
+
+#: Side of a tile of heights; those of grey values are as many times larger as they are finer.
+TILE = 128
+#: Grey facets along a side of a height facet at most: images that are finer still are reduced.
+MOST_RATIO = 6
+#: Height facets are at least so many ground pixels of the images.
+_FINEST = 1.0
+#: How far the start may be wrong if nobody states it, part of the flying height.
+_WRONG = 0.1
+#: Pixels of parallax by which the coarsest level may begin wrong, and pixels along the shorter side of an image there.
+_CATCH, _LEAST = 1.0, 16
+#: How far the start of satellites may be wrong if nobody states it, pixels of parallax.
+_SOME = 32.0
+#: Part of the smaller footprint that two images share, whose parallax counts.
+_SHARED = 0.2
+#: Levels at most.
+_LEVELS = 8
+
+
+@dataclass(frozen=True)
+class SurfaceSettings:
+    """What a user may choose about a surface."""
+
+    resolution: float
+    """Distance of the height posts, metres."""
+    bounds: Bounds | None = None
+    """xmin, ymin, xmax, ymax; None: all that two images see."""
+    start: str = "terrain"
+    """`terrain` (the project's), a height in metres, or a file of heights."""
+    reach: float | None = None
+    """How far the start may be wrong, metres; None: a tenth of the flying height."""
+    name: str = "surface"
+    """Of the product, and of its files without the extension."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePlan:
+    """A surface before its heights."""
+
+    project: Project
+    settings: SurfaceSettings
+    images: tuple[str, ...]
+    """Images that see the ground."""
+    blind: tuple[str, ...]
+    """A line for each image that sees none of it."""
+    grid: MapGrid
+    """Its pixels are the height posts."""
+    scheme: Scheme
+    gsd: float
+    """Median ground sampling distance of the images, metres."""
+    height_error: float
+    """What one pixel of parallax between the outermost images is in height, metres."""
+    key: str
+    """Hash of all that decides the product."""
+
+    @property
+    def address(self) -> ScenesAddress:
+        """What its images and the ground are opened by."""
+        return ScenesAddress.of(self.project, self.images)
+
+    @property
+    def grey_grid(self) -> MapGrid:
+        """Pixels of the grey values."""
+        g, m = self.grid, self.scheme.ratio
+        return MapGrid(g.left, g.top, g.resolution / m, g.width * m, g.height * m, g.crs)
+
+    def __str__(self) -> str:
+        g, s = self.grid, self.scheme
+        reduced = f", images reduced by {2**s.base}" if s.base else ""
+        return "\n".join([
+            f"surface of {len(self.images)} images: {g.width} × {g.height} heights of {g.resolution:g} m, grey values "
+            f"of {g.resolution / s.ratio:.3g} m",
+            f"  GSD {self.gsd:.3g} m, {s.ratio**2} pixels of each image per height{reduced}; one pixel of parallax is "
+            f"{self.height_error:.3g} m of height",
+            f"  {s.coarsest + 1} levels, the coarsest with heights of {g.resolution * 2**s.coarsest:g} m; start: "
+            f"{self.settings.start}",
+        ])  # fmt: skip
+
+    def json_fields(self) -> dict[str, object]:
+        """What a dry run tells."""
+        return {
+            **pick(self, "images", "blind", "gsd", "key", height_of_a_pixel="height_error"),
+            **pick(self.grid, "bounds", "resolution", "width", "height"),
+            "levels": self.scheme.coarsest + 1,
+            "grey_resolution": self.grey_grid.resolution,
+        }
+
+
+def plan_surface(
+    project: Project,
+    settings: SurfaceSettings,
+    images: Sequence[str] | None = None,
+    *,
+    force: bool = False,
+    events: Events = SILENT,
+) -> SurfacePlan:
+    """Plan a surface.
+
+    Parameters
+    ----------
+    project : Project
+    settings : SurfaceSettings
+    images : sequence of str, optional
+        Names or patterns; None: all.
+    force : bool
+        Also of images whose orientation `photoplan check` calls a fault.
+    events : Events
+        Told of each image.
+
+    Raises
+    ------
+    InputError
+        An input cannot be used.
+    GeometryError
+        Fewer than two images see a common piece of ground, or an orientation cannot be right.
+    UsageError
+        An unknown image, or a resolution or bounds that make no sense.
+    """
+    names = project.select(images)
+    if len(names) < 2:
+        raise UsageError(f"images {', '.join(names)}: heights need two images at least")
+    check_start(project, settings)
+    events.begin("planning", len(names), "images")
+    looked, blind = look_at(project, names, force, events)
+    bounds = _bounds(settings, looked, blind)
+    gsd = float(np.median([one.look.gsd for one in looked]))
+    if settings.resolution < _FINEST * gsd * 0.999:
+        raise UsageError(
+            f"resolution {settings.resolution:g} m is finer than the images see the ground ({gsd:.3g} m): a height "
+            f"needs some pixels; choose {3 * gsd:.2g} m, or {gsd:.2g} m at least"
+        )
+    grid = MapGrid.covering(bounds, settings.resolution, project.crs)
+    if min(grid.width, grid.height) < 2:
+        raise UsageError(f"bounds {extent_text(bounds)} hold {grid.width} × {grid.height} heights; 2 × 2 are needed")
+    base = max(0, math.ceil(math.log2(settings.resolution / gsd / MOST_RATIO)))
+    ratio = max(1, round(settings.resolution / gsd / 2**base))
+    height_error = _height_of_a_pixel(looked, gsd)
+    reach = settings.reach or _usual_reach(looked, height_error)
+    scheme = Scheme(ratio, _coarsest(reach, looked, height_error, base), base, reach)
+    used = tuple(one.name for one in looked)
+    files = [Path(path) for path, _ in ScenesAddress.of(project, used).digests]
+    if settings.start not in ("terrain",) and _number(settings.start) is None:
+        files.append(Path(settings.start))
+    stated = {"settings": settings, "scheme": scheme, "grid": grid, "facts": ScenesAddress.of(project, used).facts}
+    key = run_key("surface", stated, files)
+    return SurfacePlan(project, settings, used, tuple(blind), grid, scheme, gsd, height_error, key)
+
+
+def check_start(project: Project, settings: SurfaceSettings) -> None:
+    """Refuse a start that is none.
+
+    Raises
+    ------
+    UsageError
+        It is no height and no file, or a reach or name makes no sense.
+    InputError
+        The file cannot be used.
+    """
+    if settings.reach is not None and not (math.isfinite(settings.reach) and settings.reach > 0):
+        raise UsageError(f"reach {settings.reach}; a positive number of metres is needed")
+    if not settings.name.strip() or Path(settings.name).name != settings.name or settings.name in (".", ".."):
+        raise UsageError(f"name {settings.name!r}; give the name of a file without folder and extension")
+    if settings.start == "terrain":
+        return
+    number = _number(settings.start)
+    if number is not None and not math.isfinite(number):
+        raise UsageError(f"start {settings.start}; give `terrain`, a height in metres, or a file of heights")
+    if number is None:
+        if not Path(settings.start).exists():
+            raise UsageError(f"start {settings.start!r}: is no height and no file; give `terrain`, a height, or a file")
+        open_terrain(Path(settings.start)).in_crs(project.crs)
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+def _bounds(settings: SurfaceSettings, looked: Sequence[Looked], blind: Sequence[str]) -> Bounds:
+    """The bounds that were chosen, or around all that two images see by their footprints."""
+    seen = [one.look.footprint.bounds for one in looked if one.look.footprint.bounds is not None]
+    common = []
+    for a, b in combinations(seen, 2):
+        low, high = np.maximum(a[:2], b[:2]), np.minimum(a[2:], b[2:])
+        if (low < high).all():
+            common.append((*low.tolist(), *high.tolist()))
+    if not common:
+        lines = [f"{one.name}: sees {extent_text(one.look.footprint.bounds)}" for one in looked]
+        raise GeometryError(
+            "no two images see a common piece of the ground, so there are no heights:\n  "
+            + "\n  ".join([*lines, *blind][:12])
+        )
+    around = np.array(common)
+    (xmin, ymin), (xmax, ymax) = around[:, :2].min(axis=0).tolist(), around[:, 2:].max(axis=0).tolist()
+    if settings.bounds is None:
+        return (xmin, ymin, xmax, ymax)
+    b = settings.bounds
+    MapGrid.covering(b, settings.resolution, "")
+    if not (b[0] < xmax and xmin < b[2] and b[1] < ymax and ymin < b[3]):
+        together = extent_text((xmin, ymin, xmax, ymax))
+        raise GeometryError(f"bounds {extent_text(b)}: no two images see anything there; together they see {together}")
+    return b
+
+
+def _height_of_a_pixel(looked: Sequence[Looked], gsd: float) -> float:
+    """Height that parts the outermost images of a place by one pixel: GSD · H / B, for images that share enough."""
+    rates = [0.0]
+    for one, other in combinations(looked, 2):
+        a, b = one.look.footprint.bounds, other.look.footprint.bounds
+        assert a is not None and b is not None
+        low, high = np.maximum(a[:2], b[:2]), np.minimum(a[2:], b[2:])
+        areas = [(c[2] - c[0]) * (c[3] - c[1]) for c in (a, b)]
+        if (low < high).all() and float(np.prod(high - low)) > _SHARED * min(areas):
+            middle = (low + high) / 2
+            rates.append(float(np.linalg.norm(_slope(one, middle) - _slope(other, middle))))
+    if not max(rates) > 1e-4:
+        raise GeometryError("all images see the ground from the same direction: there is no parallax, and no height")
+    return gsd / max(rates)
+
+
+def _slope(one: Looked, XY: np.ndarray) -> np.ndarray:
+    """By how much the ground point of a pixel moves on the map per metre of height, at a place, shape (2,)."""
+    low, high = one.look.footprint.height_range
+    level = (low + high) / 2
+    J = one.scene.camera.derivatives(np.array([*XY, level]))
+    return np.asarray(-np.linalg.solve(J[:, :2], J[:, 2]))
+
+
+def _usual_reach(looked: Sequence[Looked], height_error: float) -> float:
+    """A tenth of the flying height; of satellites, which are too far away for that, some pixels of parallax."""
+    heights = []
+    for one in looked:
+        low, high = one.look.footprint.height_range
+        vantage = one.scene.camera.vantage
+        heights.append(float(vantage.point[2]) - (low + high) / 2 if vantage.central else 0.0)
+    return _WRONG * float(np.median(heights)) or _SOME * height_error
+
+
+def _coarsest(reach: float, looked: Sequence[Looked], height_error: float, base: int) -> int:
+    """The level on which a start that is wrong by `reach` is wrong by few pixels, or the images have become small."""
+    wanted = math.ceil(math.log2(max(1.0, reach / height_error / _CATCH / 2**base)))
+    shortest = min(min(one.scene.camera.size) for one in looked)
+    allowed = max(0, math.floor(math.log2(max(1.0, shortest / _LEAST))) - base)
+    return int(min(wanted, allowed, _LEVELS))

@@ -1,0 +1,204 @@
+"""Make a surface: tiles to workers, heights and grey values to files, a record beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from photoplan import __version__
+from photoplan.engine.cluster import Question
+from photoplan.engine.executors import open_workers
+from photoplan.engine.run import Runner, Tally, Work, tiles_in_flight
+from photoplan.io.disk import make_folder
+from photoplan.io.image_form import ImageForm
+from photoplan.io.naming import together
+from photoplan.io.product import ProductFile, check_output
+from photoplan.io.run_record import input_entry, versions, write_run_record
+from photoplan.plain import pick
+from photoplan.plan.tiles import Tiles
+from photoplan.products.run import BASE_MEMORY, Run, clock, refuse_inputs
+from photoplan.products.surface.job import SurfaceJob
+from photoplan.products.surface.plan import TILE, SurfacePlan
+from photoplan.project.scene import input_files
+
+#: What the files hold: name of the file behind that of the product, band, unit.
+KINDS = {
+    "heights": ("", "height", "metre"),
+    "sigma": ("_sigma", "standard deviation of the height", "metre"),
+    "count": ("_count", "images that see it", ""),
+    "grey": ("_grey", "grey value", ""),
+}
+
+
+@dataclass(frozen=True)
+class SurfaceResult:
+    """What became of a surface."""
+
+    path: Path
+    """The heights."""
+    others: tuple[Path, ...]
+    """Standard deviations, number of images, grey values."""
+    images: tuple[str, ...]
+    seconds: float
+    valid_share: float
+    """Posts with a height among all, 0 to 1."""
+    sigma0: dict[str, float | None]
+    """Standard deviation of a grey value by image; None: the image sees nothing of the surface."""
+    redundancy: float
+    """Observations beyond those that determine grey values and heights."""
+    sigma: float | None
+    """Mean standard deviation of the heights, metres."""
+    sigma_px: float | None
+    """The same in pixels of parallax between the outermost images."""
+    corrections: tuple[float, ...]
+    """Mean last correction of the heights on each level, the finest first, pixels of parallax."""
+    tiles: int
+    resumed: int
+    """Tiles taken over from an earlier run."""
+
+    def json_fields(self) -> dict[str, Any]:
+        """All figures, with units."""
+        more = {"sigma_m": "sigma", "corrections_px": "corrections", "resumed_tiles": "resumed"}
+        own = ("path", "images", "seconds", "valid_share", "sigma0", "redundancy", "sigma_px", "tiles")
+        return pick(self, *own, other_files="others", **more)
+
+
+def outputs(folder: Path, plan: SurfacePlan) -> dict[str, Path]:
+    """Files of a surface."""
+    return {kind: folder / f"{plan.settings.name}{ending}.tif" for kind, (ending, _, _) in KINDS.items()}
+
+
+def make_surface(plan: SurfacePlan, output: Path | str, run: Run | None = None) -> SurfaceResult:
+    """Make a surface; a run that was killed is continued by the same call.
+
+    Parameters
+    ----------
+    plan : SurfacePlan
+    output : path
+        Folder of the files; made if it does not exist.
+    run : Run, optional
+        Workers, memory, overwriting, progress.
+
+    Raises
+    ------
+    UsageError
+        A file exists and `run.overwrite` is False, or would replace an input.
+    InputError
+        An input has changed since it was planned.
+    TilesFailed
+        Tiles failed again and again; nothing is written.
+    ResourceError
+        Disk or memory ran out.
+    """
+    run = run or Run()
+    folder = Path(output)
+    run.check()
+    paths = outputs(folder, plan)
+    refuse_inputs(input_files(plan.project), paths.values())
+    for path in paths.values():
+        check_output(path, [], overwrite=run.overwrite)
+    make_folder(folder)
+    address = plan.address
+    job = SurfaceJob(address, plan.grid, plan.scheme, plan.settings.start)
+    inputs = tuple(str(Path(path).resolve()) for path, _ in address.digests)
+    question = Question(versions, inputs, str(folder.resolve()))
+    tiles = Tiles.every(plan.grid.window, TILE)
+    run.events.begin("tiles", len(tiles))
+    with open_workers(run.executor, run.workers, question, run.events) as workers:
+        files = _files(plan, paths, run)
+        wanted = workers.threads if workers.threads == 1 else 2 * workers.threads
+        most = tiles_in_flight(wanted, run.memory, BASE_MEMORY, job.bytes)
+        work = Work(
+            name=plan.settings.name,
+            job=job,
+            tiles=tiles,
+            count=len(tiles),
+            sinks=tuple(files.values()),
+            complete=partial(_complete, plan, run, files, clock(workers)),
+            scratch=paths["heights"].with_name(f".{paths['heights'].name}.parcels"),
+        )
+        (result,) = Runner[SurfaceResult](workers, most, run.events).run([work])
+    return result
+
+
+def _files(plan: SurfacePlan, paths: dict[str, Path], run: Run) -> dict[str, ProductFile]:
+    """The files, in the order of a tile's layers."""
+    made = {}
+    for kind, path in paths.items():
+        grid, side = (plan.grey_grid, TILE * plan.scheme.ratio) if kind == "grey" else (plan.grid, TILE)
+        _, name, unit = KINDS[kind]
+        made[kind] = ProductFile(
+            path,
+            grid.placement,
+            1,
+            np.dtype(np.uint8 if kind == "count" else np.float32),
+            run_key=plan.key,
+            tile=side,
+            overwrite=run.overwrite,
+            inputs=[file for file, _ in plan.address.digests],
+            threads=run.workers,
+            resampling="mode" if kind == "count" else "average",
+            form=ImageForm(descriptions=(name,), units=(unit,) if unit else ()),
+        )
+    return made
+
+
+def _complete(
+    plan: SurfacePlan, run: Run, files: dict[str, ProductFile], times: Callable[[], dict[str, Any]], tally: Tally
+) -> SurfaceResult:
+    """Give the files their names, and write the record."""
+    heights = files["heights"]
+    tally.check(heights.path)
+    tags = {
+        "PHOTOPLAN_VERSION": __version__,
+        "PHOTOPLAN_IMAGE": ", ".join(plan.images),
+        "PHOTOPLAN_KEY": plan.key,
+    }
+    with together():
+        facts, *_ = [file.complete(tags) for file in files.values()]
+        ran = times()
+        result = _result(plan, files, ran["seconds"], facts.valid_share, tally)
+        scene = plan.address.scenes[0].open()
+        write_run_record(
+            heights.path,
+            key=plan.key,
+            inputs=[input_entry(path, digest) for path, digest in plan.address.digests],
+            run={"workers": run.workers, "executor": run.executor, "memory": run.memory, **ran},
+            kind="surface",
+            product=result,
+            settings=plan.settings,
+            scheme=plan.scheme,
+            grid=plan.grid,
+            heights={"orientation": scene.ground.height_systems[1], "working": scene.ground.working_system},
+            project=plan.project.alone(plan.images).model_dump(mode="json", exclude_none=True),
+        )
+    return result
+
+
+def _result(
+    plan: SurfacePlan, files: dict[str, ProductFile], seconds: float, share: float, tally: Tally
+) -> SurfaceResult:
+    """Figures of all tiles."""
+    totals, parts = tally.totals, max(tally.totals["parts"], 1)
+    pairs = zip(totals["squares"], totals["redundancy"])
+    sigma0 = [float(np.sqrt(square / free)) if free > 0 else None for square, free in pairs]
+    sigma = totals["sigmas"] / totals["heights"] if totals["heights"] else None
+    return SurfaceResult(
+        path=files["heights"].path,
+        others=tuple(file.path for kind, file in files.items() if kind != "heights"),
+        images=plan.images,
+        seconds=seconds,
+        valid_share=share,
+        sigma0=dict(zip(plan.images, sigma0)),
+        redundancy=sum(totals["redundancy"]),
+        sigma=sigma,
+        sigma_px=None if sigma is None else sigma / plan.height_error,
+        corrections=tuple(move / parts for move in totals["moves"]),
+        tiles=len(files["heights"].windows),
+        resumed=tally.resumed,
+    )

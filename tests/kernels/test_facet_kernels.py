@@ -1,0 +1,190 @@
+"""Kernels of facets stereo vision against slow, obvious ways."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from photoplan.kernels import facets_grey, facets_height, facets_solve, facets_transfer
+
+
+def test_a_ray_ends_at_the_first_facet_that_it_meets() -> None:
+    """A wall of 20 m hides what is behind it; oblique rays of both directions."""
+    posts = np.zeros((4, 21))
+    posts[:, 8:10] = 20.0
+    u = np.linspace(0, 20, 41) + 0.35
+    low = np.zeros((2, 41, 2))
+    low[..., 0], low[1, :, 1] = u, 3.0
+    for slope in (-0.1, 0.1, 0.3):
+        high = low + np.array([100.0 * slope, 0.0])
+        out = np.empty((2, 41, 4), np.float32)
+        facets_transfer.transfer(low, high, 1, (0.0, 100.0), posts, out)
+        z = np.linspace(25.0, -1.0, 26_001)
+        for k in range(41):
+            at = u[k] + slope * z
+            below = np.flatnonzero(z <= np.interp(at, np.arange(21), posts[0]))[0]
+            if 0.01 <= at[below] <= 19.99:
+                assert abs(out[0, k, 0] - at[below]) < 1e-3
+            elif not -0.01 <= at[below] <= 20.01:
+                assert np.isnan(out[0, k]).all()
+
+
+def test_a_place_moves_as_stated_when_the_surface_rises() -> None:
+    v, u = np.mgrid[:8, :8].astype(float)
+    posts = 3.0 * u - 2.0 * v
+    low = np.array([[[1.0, 2.0], [5.0, 2.0]], [[1.0, 5.0], [5.0, 5.0]]])
+    high = low + np.array([6.0, 3.0])
+    places = [np.empty((2, 2, 4), np.float32) for _ in range(2)]
+    for out, lift in zip(places, (0.0, 0.1)):
+        facets_transfer.transfer(low, high, 1, (0.0, 100.0), posts + lift, out)
+    moved = (places[1] - places[0])[..., :2] / 0.1
+    assert np.abs(moved - places[0][..., 2:]).max() < 1e-3
+    assert np.abs(places[0][..., 2:] - np.array([0.06, 0.03])).max() > 1e-3
+
+
+def spline(f: float) -> np.ndarray:
+    """The four cubic B-splines at a part of a facet (de Boor 1978)."""
+    return np.array([(1 - f) ** 3, 3 * f**3 - 6 * f**2 + 4, -3 * f**3 + 3 * f**2 + 3 * f + 1, f**3]) / 6
+
+
+def grey(values: np.ndarray, at: np.ndarray, ratio: int = 2) -> np.ndarray:
+    out = np.empty(len(at))
+    facets_grey.sample_grey(values, ratio, np.asarray(at, float), out)
+    return out
+
+
+def test_grey_facets_reproduce_a_plane() -> None:
+    v, u = np.mgrid[:9, :11].astype(np.float32) - facets_grey.PAD
+    at = np.random.default_rng(0).uniform(0, 2, (50, 2))
+    assert np.abs(grey(3 * u - 2 * v + 5, at) - (6 * at[:, 0] - 4 * at[:, 1] + 5)).max() < 1e-5
+
+
+def grey_equations(seed: int = 0):
+    """Pixels of one image on 3 × 4 posts with two grey facets each, as equations for the coefficients."""
+    rng = np.random.default_rng(seed)
+    places = np.empty((14, 16, 4), np.float32)
+    places[..., 0], places[..., 1] = rng.uniform(0, 3, (14, 16)), rng.uniform(0, 2, (14, 16))
+    places[..., 2:] = rng.normal(0, 0.1, (14, 16, 2))
+    weights = rng.uniform(0.5, 1.5, (14, 16)).astype(np.float32)
+    weights[3, 4] = 0.0
+    shape = (2 * 2 + 1 + 2 * facets_grey.PAD, 3 * 2 + 1 + 2 * facets_grey.PAD)
+    A = np.zeros((14 * 16, *shape))
+    for row, (u, v) in enumerate(places[..., :2].reshape(-1, 2).astype(float) * 2):
+        A[row, int(v) + 1 : int(v) + 5, int(u) + 1 : int(u) + 5] = np.outer(spline(v - int(v)), spline(u - int(u)))
+    return rng, places, weights, shape, A.reshape(14 * 16, -1)
+
+
+def test_grey_values_are_those_of_least_squares() -> None:
+    rng, places, weights, shape, A = grey_equations()
+    seen = rng.normal(100, 20, (14, 16)).astype(np.float32)
+    system, right = np.zeros((*shape, facets_grey.OFFSETS), np.float32), np.zeros(shape, np.float32)
+    facets_grey.add_grey(places, seen, weights, 2, system, right, np.zeros(shape, np.float32))
+    system[..., 3] += np.float32(0.01)
+    values = np.zeros(shape, np.float32)
+    by_offsets = np.ascontiguousarray(np.moveaxis(system, -1, 0))
+    facets_grey.solve_grey(by_offsets, right, np.ones(shape, np.float32), values, 300, 1e-7)
+    N = A.T @ (weights.reshape(-1, 1) * A) + 0.01 * np.eye(A.shape[1])
+    expected = np.linalg.solve(N, A.T @ (weights * seen).reshape(-1))
+    assert np.abs(values.reshape(-1) - expected).max() < 1e-2
+
+
+def test_heights_get_the_equations_of_the_pixels() -> None:
+    """Against the same equations written out; the mean change of a facet counts nothing."""
+    rng, places, weights, shape, A = grey_equations(1)
+    values = rng.normal(0, 10, shape).astype(np.float32)
+    seen = rng.normal(0, 10, (14, 16)).astype(np.float32)
+    means = rng.normal(0, 0.05, (2, 3, 2))
+    system, right = np.zeros((7, 3, 4)), np.zeros((3, 4))
+    residuals, factors, sums = np.empty((14, 16), np.float32), np.ones((14, 16), np.float32), np.zeros(3)
+    facets_height.add_heights(
+        places, seen, weights, values, 2, means, 8.0, 2.0, system, right, residuals, factors, sums
+    )
+    misfit = (A @ values.reshape(-1)).reshape(14, 16) - seen
+    used = weights > 0
+    assert np.abs(residuals - misfit)[used].max() < 1e-3 and np.isnan(residuals[3, 4])
+    assert np.abs(factors - np.minimum(1, 16.0 / np.abs(misfit)))[used].max() < 1e-3
+    assert sums[2] == 14 * 16 - 1 and sums[1] == pytest.approx((factors * (misfit / 8) ** 2)[used].sum(), rel=1e-4)
+    N, b = np.zeros((12, 12)), np.zeros(12)
+    step = np.array([(1e-4, 0), (-1e-4, 0), (0, 1e-4), (0, -1e-4)])
+    for (u, v, ku, kv), p, m in zip(places.reshape(-1, 4).astype(float), weights.reshape(-1), misfit.reshape(-1)):
+        i, j = min(int(u), 2), min(int(v), 1)
+        g = grey(values, np.array([u, v]) + step)
+        a = ((g[0] - g[1]) * (ku - means[j, i, 0]) + (g[2] - g[3]) * (kv - means[j, i, 1])) / 2e-4
+        phi = np.zeros((3, 4))
+        f, g = u - i, v - j
+        phi[j : j + 2, i : i + 2] = np.outer((1 - g, g), (1 - f, f))
+        N += p * a * a * np.outer(phi, phi)
+        b -= p * a * m * phi.reshape(-1)
+    assert np.abs(right.reshape(-1) - b).max() < 1e-3 * np.abs(b).max()
+    assert np.abs(dense(system, np.zeros((3, 3, 4))) - N).max() < 1e-4 * np.abs(N).max()
+
+
+#: Row, column and factor of the posts of second differences: along columns, along rows, across.
+SECOND = (
+    ((0, -1, 1), (0, 0, -2), (0, 1, 1)),
+    ((-1, 0, 1), (0, 0, -2), (1, 0, 1)),
+    ((0, 0, 1), (0, 1, -1), (1, 0, -1), (1, 1, 1)),
+)
+
+
+def dense(system, curve):
+    """Normal equations as a full matrix."""
+    _, rows, columns = system.shape
+    N = np.zeros((rows, columns, rows, columns))
+    for k, (dj, di) in enumerate(facets_height.OFFSETS):
+        for j in range(rows - dj):
+            for i in range(max(0, -di), columns - max(0, di)):
+                N[j, i, j + dj, i + di] += system[k, j, i]
+                if k:
+                    N[j + dj, i + di, j, i] += system[k, j, i]
+    for kind in range(3):
+        for j, i in zip(*np.nonzero(curve[kind])):
+            c = np.zeros((rows, columns))
+            for dj, di, a in SECOND[kind]:
+                c[j + dj, i + di] += a
+            N += curve[kind, j, i] * c[..., None, None] * c
+    return N.reshape(rows * columns, -1)
+
+
+def height_system(rows: int, columns: int):
+    rng = np.random.default_rng(3)
+    system = np.zeros((7, rows, columns))
+    system[0] = rng.uniform(2, 4, (rows, columns))
+    system[1, :, :-1] = system[4, :-1] = 0.3
+    system[3, :-1, 1:] = system[5, :-1, :-1] = 0.1
+    curve = np.zeros((3, rows, columns))
+    curve[0, :, 1:-1] = curve[1, 1:-1] = curve[2, :-1, :-1] = rng.uniform(0.1, 2)
+    return rng, system, curve
+
+
+def test_heights_and_variances_are_those_of_the_full_matrix() -> None:
+    rng, system, curve = height_system(9, 12)
+    right, out = rng.normal(size=(9, 12)), np.empty((9, 12))
+    N = dense(system, curve)
+    assert facets_solve.solve_heights(system, curve, right, 12, 2, out) == 0
+    inverse = np.linalg.inv(N)
+    assert np.abs(out.reshape(-1) - inverse @ right.reshape(-1)).max() < 1e-12
+    heights, curvatures, wide = np.empty((9, 12)), np.empty((3, 9, 12)), np.empty(2)
+    facets_solve.variances(system, curve, 12, 2, heights, curvatures, np.array([1, 4]), wide)
+    assert np.abs(heights.reshape(-1) - np.diag(inverse)).max() < 1e-12
+    at = inverse.reshape(9, 12, 9, 12)
+    c = np.zeros((9, 12))
+    c[4, 5:8] = 1, -2, 1
+    assert curvatures[0, 4, 6] == pytest.approx(np.einsum("ij,ijkl,kl", c, at, c))
+    found = []
+    for j in range(9):
+        for i in range(4, 8):
+            c = np.zeros((9, 12))
+            c[j, [i - 4, i, i + 4]] = 1, -2, 1
+            found.append(np.einsum("ij,ijkl,kl", c, at, c))
+    assert wide[1] == pytest.approx(np.mean(found))
+
+
+def test_parts_agree_where_pixels_determine_the_heights() -> None:
+    """Parts with a margin of eight posts against the whole: below a hundredth of a standard deviation."""
+    rng, system, curve = height_system(30, 34)
+    right, out, whole = rng.normal(size=(30, 34)), np.empty((30, 34)), np.empty((30, 34))
+    facets_solve.solve_heights(system, curve, right, 10, 8, out)
+    facets_solve.solve_heights(system, curve, right, 40, 0, whole)
+    sigma = np.sqrt(np.diag(np.linalg.inv(dense(system, curve)))).reshape(30, 34)
+    assert np.abs((out - whole) / sigma).max() < 0.01

@@ -1,0 +1,127 @@
+"""`photoplan surface`: heights and grey values from rendered images of known truth."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from tools.command import Said, inside
+from tools.facet_scene import CONTRAST, GROUND, Scene, write_scene
+from tools.small_block import X0, Y0
+
+BOUNDS = (X0 - 18, Y0 - 30, X0 + 18, Y0 + 30)
+KINDS = ("", "_sigma", "_count", "_grey")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return write_scene(tmp_path_factory.mktemp("facets"), 5, gain=0.3)
+
+
+def surface(scene: Scene, *words: object) -> Said:
+    return inside("surface", scene.path, "--resolution", 1.5, "--bounds", *BOUNDS, "--workers", 1, *words)
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """Heights and what they should be."""
+
+    error: np.ndarray
+    """Pixels of parallax."""
+    normalised: np.ndarray
+    grey_error: np.ndarray
+
+    @property
+    def rms(self) -> float:
+        return float(np.sqrt(np.mean(self.error**2)))
+
+
+def places(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A band and X, Y of its pixels."""
+    with rasterio.open(path) as file:
+        col, row = np.meshgrid(np.arange(file.width) + 0.5, np.arange(file.height) + 0.5)
+        return file.read(1).astype(float), *(file.transform * (col, row))
+
+
+def judge(scene: Scene, folder: Path) -> Judged:
+    heights, X, Y = places(folder / "surface.tif")
+    sigma, *_ = places(folder / "surface_sigma.tif")
+    known = np.isfinite(heights)
+    assert (np.isfinite(sigma) == known).all()
+    off = (heights - scene.heights(X, Y))[known]
+    grey, X, Y = places(folder / "surface_grey.tif")
+    seen = np.isfinite(grey)
+    # The images differ by factors: their mean is what the surface has.
+    true = scene.grey(X, Y)[seen]
+    line = np.polyfit(true, grey[seen], 1)
+    return Judged(off / scene.height_of_a_pixel, off / sigma[known], (grey[seen] - np.polyval(line, true)) / line[0])
+
+
+@pytest.fixture(scope="module")
+def made(scene: Scene) -> Path:
+    said = surface(scene, "--start", GROUND, "--json")
+    assert said.code == 0, said.err
+    return scene.path.parent / "products"
+
+
+def test_five_images_of_different_brightness(scene: Scene, made: Path) -> None:
+    judged = judge(scene, made)
+    assert judged.rms < 0.04 and abs(judged.error.mean()) < 0.01
+    assert 0.6 < np.sqrt(np.mean(judged.normalised**2)) < 1.4
+    assert np.sqrt(np.mean(judged.grey_error**2)) < 0.07 * CONTRAST
+    with rasterio.open(made / "surface_count.tif") as file:
+        assert file.read(1).max() == 5
+    record = json.loads((made / "surface.run.json").read_text())
+    sigma0 = np.array(list(record["product"]["sigma0"].values()))
+    # Noise of 0.4 and rounding of 0.29 grey values, and what facets cannot follow.
+    assert ((sigma0 > 0.4) & (sigma0 < 0.8)).all()
+    assert max(record["product"]["corrections_px"]) < 0.05 and record["product"]["redundancy"] > 1000
+    assert (made / "surface.png").exists()
+
+
+def test_a_surface_serves_as_terrain(scene: Scene, made: Path) -> None:
+    text = scene.path.read_text().replace(f"height = {GROUND}", 'file = "products/surface.tif"')
+    project = scene.path.with_name("again.toml")
+    project.write_text(text)
+    said = inside("ortho", project, "--images", "i3", "--resolution", 0.5, "--output", made / "ortho", "--no-quicklook")
+    assert said.code == 0, said.err
+
+
+def test_two_images_and_a_wrong_start(tmp_path: Path) -> None:
+    """The start is 20 m below the ground, a tenth of the flying height: eight pixels of parallax."""
+    scene = write_scene(tmp_path, 2, seed=7)
+    said = surface(scene, "--start", GROUND - 20, "--no-quicklook", "-q")
+    assert said.code == 0, said.err
+    judged = judge(scene, tmp_path / "products")
+    assert judged.rms < 0.04 and abs(judged.error.mean()) < 0.015
+    assert 0.6 < np.sqrt(np.mean(judged.normalised**2)) < 1.6
+
+
+def test_a_plan_is_told_and_nothing_is_written(scene: Scene, tmp_path: Path) -> None:
+    said = surface(scene, "--dry-run", "--output", tmp_path / "new")
+    assert said.code == 0 and "surface of 5 images: 25 × 41 heights of 1.5 m" in said.out
+    assert not (tmp_path / "new").exists()
+    plan = json.loads(surface(scene, "--dry-run", "--json").out)
+    assert plan["levels"] >= 2 and plan["grey_resolution"] == pytest.approx(0.5)
+
+
+def test_what_cannot_be_is_refused_by_name(scene: Scene, made: Path) -> None:
+    for words, code, text in (
+        ([], 2, "exists already"),
+        (["--images", "i1"], 2, "two images at least"),
+        (["--start", "nowhere.tif"], 2, "is no height and no file"),
+        (["--reach", -1], 2, "positive number"),
+        (["--name", "../x"], 2, "without folder"),
+        (["--memory", "300MB"], 2, "needed for one tile"),
+    ):
+        said = surface(scene, *words)
+        assert said.code == code and text in said.err, said.err
+    far = ["--resolution", 1.5, "--bounds", X0 + 900, Y0, X0 + 950, Y0 + 50]
+    said = inside("surface", scene.path, *far)
+    assert said.code == 3 and "together they see" in said.err
+    said = inside("surface", scene.path, "--resolution", 0.2)
+    assert said.code == 2 and "finer than the images" in said.err
