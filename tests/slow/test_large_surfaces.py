@@ -1,0 +1,44 @@
+"""How exact surfaces from images are, and whether their standard deviations tell it: rendered truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from products.test_surface import judge
+from tools.command import inside
+from tools.facet_scene import write_scene
+from tools.small_block import X0, Y0
+
+pytestmark = pytest.mark.slow
+BOUNDS = (X0 - 30, Y0 - 45, X0 + 30, Y0 + 45)
+
+
+@pytest.mark.parametrize(
+    ("images", "base", "snr", "finest", "rms", "normalised"),
+    [
+        (5, 60, 50, 3, 0.010, (0.7, 1.1)),
+        (3, 60, 50, 3, 0.010, (0.7, 1.1)),
+        (2, 48, 50, 3, 0.010, (0.7, 1.1)),
+        (5, 60, 10, 3, 0.025, (0.7, 1.3)),
+        (2, 48, 10, 3, 0.030, (0.7, 1.5)),
+        (5, 60, 50, 6, 0.015, (0.7, 1.1)),
+        (5, 60, 50, 12, 0.030, (0.7, 1.3)),
+    ],
+)
+def test_heights_and_what_they_claim(
+    tmp_path: Path, images: int, base: float, snr: float, finest: float, rms: float, normalised: tuple[float, float]
+) -> None:
+    found = []
+    for seed in range(4):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        scene = write_scene(folder, images, seed=10 * seed, base=base, size=(240, 220), snr=snr, finest=finest)
+        said = inside("surface", scene.path, "--resolution", 1.5, "--bounds", *BOUNDS, "--no-quicklook", "-q")
+        assert said.code == 0, said.err
+        judged = judge(scene, folder / "products")
+        assert abs(judged.error.mean()) < 0.005
+        found.append((judged.rms, np.sqrt(np.mean(judged.normalised**2))))
+    both = np.sqrt(np.mean(np.square(found), axis=0))
+    assert both[0] < rms and normalised[0] < both[1] < normalised[1]
