@@ -30,6 +30,9 @@ _LOOK = ("haze", "haze_colour", "sky", "nodata", "samples", "kernel", "shadows")
 @click.option("--nodata", help="Colour of ground that no content shows [214 214 214].", **_RGB)
 @click.option("--samples", type=int, help="Rays along each side of a pixel [2].")
 @click.option("--kernel", help="nearest, bilinear, bicubic, bicubic-1 or lanczos3 [bicubic].")
+@click.option("--photo", metavar="FILE[@HOW]",
+              help="A photograph with the pixels of the picture: over it, with an opacity (@0.3; 0.5), in @squares "
+              "with it, or @beside it.")  # fmt: skip
 @click.option("--lines", multiple=True, metavar="WHAT",
               help="FILE[:LAYER] of points and lines, or contours:INTERVAL; may be repeated. With "
               "@colour=#d55e00,width=2,dash=6-3,label=name,height=yes,distance=yes,rank=field,drape=yes.")  # fmt: skip
@@ -46,6 +49,7 @@ def command(contents: tuple[str, ...], sun: tuple[float, float] | None, output: 
     from photoplan.products.view.content import ContentRequest
     from photoplan.products.view.job import LookRequest
     from photoplan.products.view.lines import LinesRequest
+    from photoplan.products.view.photo import PhotoRequest
 
     look = {name: value for name in _LOOK if (value := options.pop(name)) is not None}
     if sun is not None:
@@ -54,6 +58,9 @@ def command(contents: tuple[str, ...], sun: tuple[float, float] | None, output: 
         look["contents"] = tuple(ContentRequest.parse(text) for text in contents)
     elif options["source"].suffix.lower() == ".toml":
         look["contents"] = (ContentRequest("photos"),)
+    photo = options.pop("photo")
+    if photo is not None:
+        look["photo"] = PhotoRequest.parse(photo)
     if output is None and not options["dry_run"]:
         raise UsageError("no `output`; give the name of the picture, or `dry_run`")
     drawn: dict[str, Any] = {name: options.pop(name) for name in ("lines", "text_size", "svg")}

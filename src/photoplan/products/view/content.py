@@ -193,10 +193,7 @@ class Resampled:
         painted = render(plan, Tile(0, window, rows), self.sources, scene, scene.kernel)
         if painted.values is None or painted.valid is None:
             return under, np.zeros(under.shape[1:], bool)
-        colours = painted.values[[0, 1, 2] if len(painted.values) >= 3 else [0, 0, 0]].astype(np.float32)
-        if self.span != (0.0, 255.0):
-            colours = np.clip((colours - self.span[0]) * (255 / (self.span[1] - self.span[0])), 0, 255)
-        return colours.astype(np.float32), painted.valid
+        return in_colours(painted.values, self.span), painted.valid
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,7 +307,7 @@ def _layer(
     if len(kinds) > 1:
         raise InputError("photos of one content have the same bands and type of pixels; choose one with photo:NAME")
     sources = tuple(Source(s.camera, s.reader) for s in scenes)
-    return Resampled(sources, tuple(s.reader.path for s in scenes), _span(scenes[0].reader), photos=True)
+    return Resampled(sources, tuple(s.reader.path for s in scenes), grey_span(scenes[0].reader), photos=True)
 
 
 def _ramp(text: str, heights: tuple[float, float]) -> Ramp:
@@ -333,10 +330,18 @@ def _raster(path: Path, ground: ViewGround) -> Layer:
         raise InputError(f"{path}: no CRS; it is not guessed. That of the terrain is {crs_label(ground.crs)}")
     carry = None if same_crs(placement.crs, ground.crs) else crs_step(ground.crs, placement.crs, ground.bounds)
     source = Source(MapProjection(placement, carry), reader)
-    return Resampled((source,), (reader.path,), _span(reader), photos=False)
+    return Resampled((source,), (reader.path,), grey_span(reader), photos=False)
 
 
-def _span(reader: Reader) -> tuple[float, float]:
+def in_colours(values: NDArray[Any], span: tuple[float, float]) -> Colours:
+    """Pixels of an image (bands, height, width) as colours; `span` becomes black and white."""
+    colours = values[[0, 1, 2] if len(values) >= 3 else [0, 0, 0]].astype(np.float32)
+    if span != (0.0, 255.0):
+        colours = np.clip((colours - span[0]) * (255 / (span[1] - span[0])), 0, 255)
+    return colours.astype(np.float32)
+
+
+def grey_span(reader: Reader) -> tuple[float, float]:
     """Values that become black and white: all of a byte, else from the second to the ninety-eighth percentile."""
     if reader.dtype == np.uint8:
         return 0.0, 255.0

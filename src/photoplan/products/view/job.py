@@ -20,6 +20,7 @@ from photoplan.products.view.camera import CameraRequest, view_camera
 from photoplan.products.view.content import Colours, ContentRequest, Layer, Scene, open_layers
 from photoplan.products.view.ground import ViewGround, open_view_ground
 from photoplan.products.view.overlay import Overlay
+from photoplan.products.view.photo import Photo, PhotoRequest
 from photoplan.surfaces.rays import Hits
 from photoplan.surfaces.seen import Seen, SeenSurface, ground_size
 from photoplan.targets.view import Bundle, ViewTarget
@@ -52,6 +53,8 @@ class LookRequest:
     samples: int = 2
     """Rays along each side of a pixel, of which its colour is the mean."""
     kernel: str = "bicubic"
+    photo: PhotoRequest | None = None
+    """A photograph that the picture is compared with."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.haze <= 100:
@@ -101,6 +104,12 @@ class OpenView:
     layers: tuple[Layer, ...]
     light: Light
     matrix: MatrixFile | None
+    photo: Photo | None
+
+    @property
+    def shift(self) -> int:
+        """Columns by which a photo lies beside the picture."""
+        return 0 if self.photo is None else self.photo.shift
 
 
 @lru_cache(maxsize=4)
@@ -113,7 +122,9 @@ def _open(address: ViewAddress) -> OpenView:
     light = Light(address.look.azimuth, address.look.altitude, camera.request.exaggeration)
     layers = open_layers(address.look.contents, ground, light, address.heights)
     matrix = None if address.matrix is None else MatrixFile(Path(address.matrix))
-    return OpenView(camera.target, seen_surface(ground, address.farthest, address.bound), layers, light, matrix)
+    photo = None if address.look.photo is None else Photo.open(address.look.photo, camera.target.bundle.size)
+    surface = seen_surface(ground, address.farthest, address.bound)
+    return OpenView(camera.target, surface, layers, light, matrix, photo)
 
 
 def seen_surface(ground: ViewGround, farthest: float, bound: float) -> SeenSurface:
@@ -160,8 +171,20 @@ class ViewJob:
         if self.matrix:
             seen = view.surface.look(view.target, tile.window)
             return Made((matrix_bands(view.target, seen),), _counts(view.target, seen))
+        picture, tally = np.zeros((3, tile.window.height, tile.window.width), np.uint8), Tally()
+        own = tile.window & view.target.window
+        if own.size:
+            self._paint(view, Tile(tile.index, own), picture[:, *own.slices(tile.window)], tally)
+        if view.photo is not None:
+            view.photo.lay(picture, tile.window)
+        if self.overlay is not None:
+            for shift in dict.fromkeys((0, view.shift)):
+                self.overlay.paint(picture, tile.window, shift)
+        return Made(((picture, None),), tally.totals)
+
+    def _paint(self, view: OpenView, tile: Tile, picture: NDArray[np.uint8], tally: Tally) -> None:
+        """Colours of a part of the view."""
         n, window = (1 if view.matrix else self.address.look.samples), tile.window
-        picture, tally = np.empty((3, window.height, window.width), np.uint8), Tally()
         target = view.target if n == 1 else replace(view.target, bundle=_Finer(view.target.bundle, n))
         for part in window.tiles(-(-max(window.width, window.height) // n)):
             fine = Window(part.col * n, part.row * n, part.width * n, part.height * n)
@@ -172,9 +195,6 @@ class ViewJob:
             at = part.slices(window)
             picture[:, at[0], at[1]] = np.clip(np.rint(means), 0, 255)
             tally.add(_counts(target, scene.seen))
-        if self.overlay is not None:
-            self.overlay.paint(picture, window)
-        return Made(((picture, None),), tally.totals)
 
 
 def colours_of(scene: Scene, view: OpenView, look: LookRequest) -> Colours:

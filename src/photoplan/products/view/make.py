@@ -17,6 +17,7 @@ from photoplan.engine.cluster import Question
 from photoplan.engine.executors import open_workers
 from photoplan.engine.run import Runner, Tally, Work
 from photoplan.errors import GeometryError, InputError, UsageError
+from photoplan.geometry.grid import Placement
 from photoplan.io.disk import make_folder
 from photoplan.io.image_form import ImageForm
 from photoplan.io.matrix_file import BANDS, MatrixFile
@@ -34,6 +35,7 @@ from photoplan.products.view.ground import ViewGround, open_view_ground
 from photoplan.products.view.job import LookRequest, ViewAddress, ViewJob, seen_surface
 from photoplan.products.view.lines import LinesRequest, open_drawing
 from photoplan.products.view.overlay import Lettering, Overlay, OverlayFacts, overlay
+from photoplan.products.view.photo import Photo
 from photoplan.surfaces.seen_lines import Sight
 from photoplan.terrain.shading import Light
 
@@ -90,6 +92,12 @@ class ViewPlan:
     first: FirstLook
     address: ViewAddress
     key: str
+
+    @property
+    def placement(self) -> Placement:
+        """Of what is written: wider than the picture where a photo lies beside it."""
+        photo, (width, height) = self.address.look.photo, self.camera.target.bundle.size
+        return Placement((2 * width if photo is not None and photo.how == "beside" else width, height))
 
     @property
     def field_of_view(self) -> tuple[float, float]:
@@ -170,7 +178,8 @@ def plan_view(request: ViewRequest) -> ViewPlan:
     layers = open_layers(contents, ground, light, heights)
     matrix = None if request.matrix is None else _fitting(request.matrix, camera)
     files = dict.fromkeys([*ground.files, *(f for each in layers for f in each.files)])
-    files |= {} if matrix is None else {matrix: None}
+    photo = None if request.look.photo is None else Photo.open(request.look.photo, camera.target.bundle.size)
+    files |= {each: None for each in (matrix, None if photo is None else photo.reader.path) if each is not None}
     files |= {each.path: None for each in request.lines if each.path is not None}
     inputs = [input_entry(path) for path in files]
     address = ViewAddress(
@@ -224,7 +233,7 @@ def _fitting(path: Path, camera: ViewCamera) -> Path:
 def _look_facts(look: LookRequest) -> dict[str, Any]:
     """What decides colours: of files the content counts, which is among the inputs."""
     contents = [(each.kind, "" if each.kind == "raster" else each.value, each.opacity) for each in look.contents]
-    return {**vars(look), "contents": contents}
+    return {**vars(look), "contents": contents, "photo": look.photo and (look.photo.how, look.photo.opacity)}
 
 
 def _check_driver(request: ViewRequest) -> None:
@@ -274,10 +283,10 @@ def make_view(plan: ViewPlan, run: Run) -> ViewResult:
     for each in outputs:
         check_output(each, [name for name, _ in plan.address.digests], overwrite=run.overwrite)
         make_folder(each.parent)
-    target, is_matrix = plan.camera.target, request.kind == "matrix"
+    is_matrix, placement = request.kind == "matrix", plan.placement
     file = ProductFile(
         path,
-        target.placement,
+        placement,
         len(BANDS) if is_matrix else 3,
         np.dtype(np.float64 if is_matrix else np.uint8),
         run_key=plan.key,
@@ -292,7 +301,7 @@ def make_view(plan: ViewPlan, run: Run) -> ViewResult:
         if is_matrix
         else None,
     )
-    tiles, drawn = Tiles.every(target.window, TILE), draw(plan)
+    tiles, drawn = Tiles.every(placement.window, TILE), draw(plan)
     run.events.begin(path.name, len(tiles))
     question = Question(versions, tuple(each for each, _ in plan.address.digests), str(path.parent.resolve()))
     with open_workers(run.executor, run.workers, question, run.events) as workers, together():
@@ -339,12 +348,13 @@ def _complete(
     }
     made, svg = file.complete(tags), plan.request.svg
     if svg is not None and drawn is not None:
-        below = file.path.name if file.path.suffix.lower() in PICTURES and file.path.parent == svg.parent else None
+        fits = file.path.suffix.lower() in PICTURES and plan.placement.size == drawn.size
+        below = file.path.name if fits and file.path.parent == svg.parent else None
         write_atomically(svg, drawn.svg(below).encode())
     ran, totals = times(), tally.totals
     result = ViewResult(
         path=file.path,
-        size=plan.camera.target.bundle.size,
+        size=plan.placement.size,
         sky=totals["pixels"] - totals["ground"],
         rays=totals["pixels"],
         lost=totals["lost"],

@@ -92,8 +92,14 @@ class Overlay:
     """Pixels."""
     facts: OverlayFacts
 
-    def paint(self, picture: NDArray[np.uint8], window: Window) -> None:
-        """Draw what lies in a window of the picture into its pixels, shape (3, height, width)."""
+    def paint(self, picture: NDArray[np.uint8], window: Window, shift: int = 0) -> None:
+        """Draw what lies in a window of the picture into its pixels, shape (3, height, width); or that many columns
+        beside it. Nothing is drawn beyond the picture."""
+        inside = Window(shift, 0, *self.size) & window
+        if not inside.size:
+            return
+        picture = picture[:, *inside.slices(window)]
+        window = Window(inside.col - shift, inside.row, inside.width, inside.height)
         corner = np.array([window.col, window.row] * 2, float)
         for style, segments in self.strokes:
             reach = style.width / 2 + 1
