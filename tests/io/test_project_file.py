@@ -17,7 +17,7 @@ from photoplan.io.camera.frame import FrameEntry
 from photoplan.io.camera.model import BrownLens, OpenCVFisheyeLens, OpenCVLens, RadialTableLens
 from photoplan.io.names import safe_stem
 from photoplan.io.project.file import load_project, parse_project, project_schema, write_project
-from photoplan.io.project.model import Orientation, OrthoDefaults, Project, Terrain
+from photoplan.io.project.model import Orientation, OrthoDefaults, Project, StatedTerrain
 from photoplan.io.project.posed import Image
 
 MARKS = {"1": (105.999, -106.016), "2": (-106.012, -106.006), "3": (-105.997, 105.993), "4": (106.007, 105.993)}
@@ -33,7 +33,7 @@ def project(folder: Path, **changes: Any) -> Project:
     )
     entries: dict[str, Any] = {
         "crs": "EPSG:32615",
-        "terrain": Terrain(file="dsm.tif", height_system="EPSG:5773"),
+        "terrain": StatedTerrain(file="dsm.tif", height_system="EPSG:5773"),
         "orientation": Orientation(height_system="ellipsoidal"),
         "cameras": {'DJI "x" ü': DRONE, "film": FILM},
         "images": images,
@@ -65,7 +65,7 @@ def test_written_and_read_again_is_equal(tmp_path: Path) -> None:
         orientation=Orientation(
             height_system="same", angle_unit="gon", rotation="pok", earth_curvature="strict", refraction=True
         ),
-        terrain=Terrain(height=183.25, height_system="same"),
+        terrain=StatedTerrain(height=183.25, height_system="same"),
     )
     for made in (plain, full):
         write_project(tmp_path / "project.toml", made)
@@ -97,7 +97,7 @@ def test_any_name_and_number_survives(tmp_path: Path, name: str, numbers: tuple[
 def test_every_entry_has_a_comment_or_a_commented_place(tmp_path: Path) -> None:
     write_project(tmp_path / "p.toml", project(tmp_path))
     text = (tmp_path / "p.toml").read_text()
-    for model in (Terrain, Orientation, OrthoDefaults):
+    for model in (StatedTerrain, Orientation, OrthoDefaults):
         for key in model.model_fields:
             assert f"{key} =" in text
 

@@ -17,7 +17,7 @@ from photoplan.cameras.lenses.none import NoLens
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import MapGrid, Window
 from photoplan.geometry.pose import Pose
-from photoplan.plan.accuracy import Cause, SourceErrors, figures_at, resampling_sigma, tile_accuracy
+from photoplan.plan.accuracy import IndependentError, SourceErrors, figures_at, resampling_sigma, tile_accuracy
 from photoplan.plan.budget import displacement_by_height, displacement_by_kappa, displacement_by_tilt
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.monoplot import MonoplotErrors, monoplot
@@ -64,7 +64,7 @@ def test_orientation_moves_as_equations_4_20_to_4_29_say() -> None:
     w = 0.4
 
     def radial(change: np.ndarray) -> float:
-        cause = Cause("one", moved(camera, change), moved(camera, -change))
+        cause = IndependentError("one", moved(camera, change), moved(camera, -change))
         found = tile_accuracy(target, target.window, LEVEL, constant(0.0), {0: SourceErrors(camera, (cause,))})
         return float(np.hypot(found[0], found[1]).mean())
 
@@ -87,9 +87,9 @@ def test_agrees_with_monoplotting(camera: FrameCamera) -> None:
     for k in range(3):
         move = np.zeros(6)
         move[k] = position[k]
-        causes.append(Cause("centre", moved(camera, move), moved(camera, -move)))
+        causes.append(IndependentError("centre", moved(camera, move), moved(camera, -move)))
         turn = np.r_[0.0, 0.0, 0.0, R.T @ (np.eye(3)[k] * angles[k])]
-        causes.append(Cause("angles", moved(camera, turn), moved(camera, -turn)))
+        causes.append(IndependentError("angles", moved(camera, turn), moved(camera, -turn)))
     errors = SourceErrors(camera, tuple(causes), image)
     # Slopes as monoplotting has them: over a mesh of a pixel, which here is nearly a plane.
     tilted = FunctionSurface(lambda X, Y: 0.25 * X - 0.15 * Y)
@@ -173,7 +173,7 @@ def test_a_projection_needs_no_centre() -> None:
             return np.stack([X + 0.5 * Z + self.shift, -Y, np.ones_like(X)], axis=-1)
 
     target = target_of(100, 10.0)
-    errors = SourceErrors(Parallel(), (Cause("shift", Parallel(0.4), Parallel(-0.4)),))
+    errors = SourceErrors(Parallel(), (IndependentError("shift", Parallel(0.4), Parallel(-0.4)),))
     found = tile_accuracy(target, target.window, LEVEL, constant(2.0), {0: errors})
     np.testing.assert_allclose(found[0], np.hypot(0.5 * 2.0, 0.4), rtol=1e-6)
     assert found[1].max() < 1e-6

@@ -18,7 +18,7 @@ from photoplan.io.project.model import Orientation
 from photoplan.io.project.posed import Image
 from photoplan.io.terrain.reader import TerrainReader
 from photoplan.orientation.other_readings import DECLARED, readings
-from photoplan.orientation.plausibility import Heights, ImagePlausibility, View, look, other_reading
+from photoplan.orientation.plausibility import Heights, ImagePlausibility, JudgedView, look, other_reading
 from photoplan.project.posed import view_of
 from photoplan.surfaces.raster import RasterSurface
 
@@ -36,7 +36,7 @@ def hills(XY: np.ndarray) -> np.ndarray:
 
 def views(
     opk: Any, centers: Any, change: Callable[[np.ndarray], Any] = lambda a: a, order: str = "opk", unit: str = "deg"
-) -> list[View]:
+) -> list[JudgedView]:
     """Images whose table was written by `change` and is read as `order` and `unit` say."""
     orientation = Orientation.model_validate({"rotation": order, "angle_unit": unit})
     made = []
@@ -73,7 +73,7 @@ class Plausibility:
         return tuple(i for i in self.images if i.fault is not None)
 
 
-def assess(block: Sequence[View], heights: Heights) -> Plausibility:
+def assess(block: Sequence[JudgedView], heights: Heights) -> Plausibility:
     """Every image looked at; where something cannot be right, other readings of the whole block."""
     images = tuple(look(view, heights) for view in block)
     return Plausibility(images, other_reading(block, images, heights))

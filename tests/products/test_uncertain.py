@@ -16,7 +16,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.grid import MapGrid
 from photoplan.geometry.pose import Pose
 from photoplan.io.project.file import load_project, parse_project
-from photoplan.io.project.model import Terrain
+from photoplan.io.project.model import StatedTerrain
 from photoplan.orientation.bundle.block import AdjustSettings
 from photoplan.products.adjust.block import adjust_prepared, map_result, prepare, stated_accuracy
 from photoplan.products.adjust.inputs import read_inputs
@@ -131,7 +131,7 @@ def test_terrain_states_its_own(tmp_path) -> None:
     write_small(tmp_path / "model.gpkg")
     loaded = project_with(tmp_path, {})
     target = MapTarget(MapGrid(500_000.0, 5_300_000.0, 2.0, 20, 20, CRS))
-    of_file = Terrain(file="model.gpkg", height_system="same")
+    of_file = StatedTerrain(file="model.gpkg", height_system="same")
     own = height_errors(loaded.model_copy(update={"terrain": of_file}))(target, target.window)
     np.testing.assert_allclose(own, 0.05, rtol=1e-6)
     stated = height_errors(loaded.model_copy(update={"terrain": of_file.model_copy(update={"sigma": 0.3})}))
@@ -147,7 +147,7 @@ def test_of_an_adjusted_project_with_a_calibrated_camera(tmp_path) -> None:
     free = {"cam": {"c": None, "x0": None}}
     result = map_result(*adjust_prepared(prepare(inputs, starts, free), AdjustSettings(robust=False)))
     assert process("adjust", made.path, "--calibrate", "cam=c,x0", "--no-robust").code == 0
-    terrain = Terrain(height=0.0, height_system="same")
+    terrain = StatedTerrain(height=0.0, height_system="same")
     loaded = load_project(made.path).model_copy(update={"terrain": terrain})
     assert set(loaded.cameras["cam"].sigma or ()) == {"c", "x0"}
     points = np.array([XYZ for name, XYZ in made.points.items() if name.startswith("G")])

@@ -17,7 +17,7 @@ from photoplan.quality.formation.parts import (
     Quantisation,
     Readout,
     Spread,
-    Tone,
+    ToneCurve,
     Well,
 )
 from photoplan.quality.formation.scenes import PatternScene
@@ -180,11 +180,11 @@ def test_edge_enhancement_over_and_undershoots():
 
 def test_tone_curves():
     grey = np.array([[0.0, 10.0, 127.5, 255.0, -3.0]])
-    gamma = form_image(ImageModel(tone=Tone("gamma", 255.0, 2.0)), grey).values
+    gamma = form_image(ImageModel(tone=ToneCurve("gamma", 255.0, 2.0)), grey).values
     assert np.allclose(gamma, 255.0 * np.sqrt(np.maximum(grey, 0) / 255.0))
-    srgb = form_image(ImageModel(tone=Tone("srgb")), grey).values
+    srgb = form_image(ImageModel(tone=ToneCurve("srgb")), grey).values
     assert srgb[0, 2] == pytest.approx(187.5, abs=0.1)
-    table = form_image(ImageModel(tone=Tone("table", table=((0.0, 5.0), (255.0, 250.0)))), grey).values
+    table = form_image(ImageModel(tone=ToneCurve("table", table=((0.0, 5.0), (255.0, 250.0)))), grey).values
     assert np.allclose(table, [[5.0, 5 + 10 * 245 / 255, 127.5, 250.0, 5.0]])
 
 
@@ -213,7 +213,7 @@ def test_series_is_its_single_frames():
         (lambda: Well(100.0, drain=0.7, circular=0.6), "at most 1"),
         (lambda: DefectPart(1, 1, "odd"), "dead, weak, hot"),
         (lambda: Quantisation(17), "bits"),
-        (lambda: Tone("table", table=((1.0, 2.0),)), "2 to 65536"),
+        (lambda: ToneCurve("table", table=((1.0, 2.0),)), "2 to 65536"),
         (lambda: ImageModel(seed=-1), "seed"),
         (lambda: form_image(ImageModel(defects=(DefectPart(9, 0, "dead"),)), np.ones((4, 4))), "column 9"),
         (lambda: form_image(ImageModel(), np.ones((4, 4)), exposure=-1.0), "exposure"),

@@ -9,7 +9,7 @@ import numpy as np
 from photoplan.cameras.frame import FrameCamera
 from photoplan.geometry.pose import Pose
 from photoplan.geometry.rotation import small_rotations
-from photoplan.plan.accuracy import Cause, SourceErrors
+from photoplan.plan.accuracy import IndependentError, SourceErrors
 
 _STEP = 1 / 16
 
@@ -25,5 +25,7 @@ def pose_errors(camera: FrameCamera, covariance: np.ndarray, image: float = 0.0)
     """A frame camera with the covariance (6, 6) of a bundle adjustment."""
     variances, axes = np.linalg.eigh(covariance)
     columns = (axes * np.sqrt(np.maximum(variances, 0.0))).T
-    causes = tuple(Cause("orientation", moved(camera, _STEP * c), moved(camera, -_STEP * c), _STEP) for c in columns)
+    causes = tuple(
+        IndependentError("orientation", moved(camera, _STEP * c), moved(camera, -_STEP * c), _STEP) for c in columns
+    )
     return SourceErrors(camera, causes, image)

@@ -68,7 +68,14 @@ def affine_facts(transformation: Affine2D | Bilinear2D) -> AffineFacts:
     # From x to y it is a quarter turn anticlockwise, of a mirrored scan clockwise.
     turn = _half_turn(direction_y - direction_x) * (1.0 if mirrored else -1.0)
     size = 1.0 / scale[0], 1.0 / scale[1]
-    return AffineFacts(scale, size, direction_x, direction_y, turn - math.pi / 2, mirrored)
+    return AffineFacts(
+        scale=scale,
+        pixel_size=size,
+        direction_x=direction_x,
+        direction_y=direction_y,
+        shear=turn - math.pi / 2,
+        mirrored=mirrored,
+    )
 
 
 def film_shrinkage(

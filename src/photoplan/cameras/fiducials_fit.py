@@ -225,7 +225,13 @@ def _adjust(plane: NDArray[np.float64], scan: NDArray[np.float64], design: _Desi
     """Least squares with one design for columns and rows."""
     fit = _solve(design(plane), scan)
     covariance = np.asarray(np.kron(np.eye(2), fit.cofactors) * fit.sigma0**2, float)
-    return _Adjusted(fit.unknowns.T.ravel(), covariance, fit.residuals, fit.redundancy, fit.sigma0)
+    return _Adjusted(
+        unknowns=fit.unknowns.T.ravel(),
+        covariance=covariance,
+        residuals=fit.residuals,
+        redundancy=fit.redundancy,
+        sigma0=fit.sigma0,
+    )
 
 
 def _adjust_similarity(plane: NDArray[np.float64], scan: NDArray[np.float64], mirrored: bool) -> _Adjusted:
@@ -235,7 +241,13 @@ def _adjust_similarity(plane: NDArray[np.float64], scan: NDArray[np.float64], mi
     J = np.array([[1, 0, 0, 0], [0, -turn, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [turn, 0, 0, 0], [0, 0, 0, 1]], float)
     fit = _solve(np.kron(np.eye(2), _affine_design(plane)) @ J, scan.T.ravel())
     covariance = J @ fit.covariance @ J.T if fit.redundancy else np.full((6, 6), math.nan)
-    return _Adjusted(J @ fit.unknowns, covariance, fit.residuals.reshape(2, -1).T, fit.redundancy, fit.sigma0)
+    return _Adjusted(
+        unknowns=J @ fit.unknowns,
+        covariance=covariance,
+        residuals=fit.residuals.reshape(2, -1).T,
+        redundancy=fit.redundancy,
+        sigma0=fit.sigma0,
+    )
 
 
 def _solve(A: NDArray[np.float64], observed: NDArray[np.float64]) -> Fit:

@@ -51,7 +51,7 @@ class LensField:
 def ideal_plane(interior: Interior) -> Affine2D:
     """From tangents to pixels without what is bilinear: its tangent at the principal point."""
     T = interior.tangent_to_pixel
-    return T if isinstance(T, Affine2D) else Affine2D(T.b1, T.b2, T.b4, T.b5, T.b6, T.b8)
+    return T if isinstance(T, Affine2D) else Affine2D(a1=T.b1, a2=T.b2, a3=T.b4, a4=T.b5, a5=T.b6, a6=T.b8)
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,7 +41,7 @@ class Interior:
         x0, y0 = (float(v) for v in self.principal_point)
         object.__setattr__(self, "principal_point", (x0, y0))
         object.__setattr__(self, "size", (int(self.size[0]), int(self.size[1])))
-        combined = self.plane_to_pixel @ Affine2D(self.c, 0.0, x0, 0.0, self.c, y0)
+        combined = self.plane_to_pixel @ Affine2D(a1=self.c, a2=0.0, a3=x0, a4=0.0, a5=self.c, a6=y0)
         object.__setattr__(self, "tangent_to_pixel", combined)
 
     @classmethod
@@ -66,7 +66,7 @@ class Interior:
         if not (math.isfinite(fx) and math.isfinite(fy) and fx > 0 and fy > 0):
             raise InputError(f"focal lengths {focal_px} px; two positive numbers are needed")
         x, y = ((s - 1) / 2 + o for s, o in zip(size, principal_offset_px))
-        return cls(fx, (0.0, 0.0), Affine2D(1.0, 0.0, x, 0.0, -fy / fx, y), size)
+        return cls(fx, (0.0, 0.0), Affine2D(a1=1.0, a2=0.0, a3=x, a4=0.0, a5=-fy / fx, a6=y), size)
 
     @classmethod
     def metric(
@@ -93,7 +93,7 @@ class Interior:
         if not (math.isfinite(width) and math.isfinite(height) and width > 0 and height > 0):
             raise InputError(f"pixel size {pixel_mm} mm; positive numbers are needed")
         x, y = ((s - 1) / 2 for s in size)
-        return cls(c_mm, principal_point_mm, Affine2D(1 / width, 0.0, x, 0.0, -1 / height, y), size)
+        return cls(c_mm, principal_point_mm, Affine2D(a1=1 / width, a2=0.0, a3=x, a4=0.0, a5=-1 / height, a6=y), size)
 
     def border(self, per_side: int = 8) -> NDArray[np.float64]:
         """Points on the outer edge of the image, corners first in each side, shape (4·per_side, 2), pixels."""

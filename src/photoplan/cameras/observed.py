@@ -60,12 +60,12 @@ class ImagePoints:
         points = {name: k for k, name in enumerate(dict.fromkeys(r[0] for r in table))}
         images = {name: k for k, name in enumerate(dict.fromkeys(r[1] for r in table))}
         return cls(
-            tuple(images),
-            tuple(points),
-            np.array([images[r[1]] for r in table], np.int64),
-            np.array([points[r[0]] for r in table], np.int64),
-            np.array([r[2:4] for r in table], float).reshape(-1, 2),
-            np.full((len(table), 2), sigma),
+            images=tuple(images),
+            points=tuple(points),
+            image=np.array([images[r[1]] for r in table], np.int64),
+            point=np.array([points[r[0]] for r in table], np.int64),
+            xy=np.array([r[2:4] for r in table], float).reshape(-1, 2),
+            sigma=np.full((len(table), 2), sigma),
         )
 
     def __len__(self) -> int:
@@ -82,12 +82,12 @@ class ImagePoints:
         used_images, image = np.unique(image, return_inverse=True)
         used_points, point = np.unique(point, return_inverse=True)
         return ImagePoints(
-            tuple(self.images[k] for k in used_images),
-            tuple(self.points[k] for k in used_points),
-            image.reshape(-1),
-            point.reshape(-1),
-            self.xy[keep],
-            self.sigma[keep],
+            images=tuple(self.images[k] for k in used_images),
+            points=tuple(self.points[k] for k in used_points),
+            image=image.reshape(-1),
+            point=point.reshape(-1),
+            xy=self.xy[keep],
+            sigma=self.sigma[keep],
         )
 
     def of_images(self, names: Sequence[str]) -> ImagePoints:
@@ -102,12 +102,12 @@ class ImagePoints:
         points = {n: k for k, n in enumerate(dict.fromkeys(n for p in parts for n in p.points))}
         none = np.empty(0, np.int64)
         return ImagePoints(
-            tuple(images),
-            tuple(points),
-            np.concatenate([none, *(np.array([images[n] for n in p.images], np.int64)[p.image] for p in parts)]),
-            np.concatenate([none, *(np.array([points[n] for n in p.points], np.int64)[p.point] for p in parts)]),
-            np.concatenate([np.empty((0, 2)), *(p.xy for p in parts)]),
-            np.concatenate([np.empty((0, 2)), *(p.sigma for p in parts)]),
+            images=tuple(images),
+            points=tuple(points),
+            image=np.concatenate([none, *(np.array([images[n] for n in p.images], np.int64)[p.image] for p in parts)]),
+            point=np.concatenate([none, *(np.array([points[n] for n in p.points], np.int64)[p.point] for p in parts)]),
+            xy=np.concatenate([np.empty((0, 2)), *(p.xy for p in parts)]),
+            sigma=np.concatenate([np.empty((0, 2)), *(p.sigma for p in parts)]),
         )
 
 
@@ -151,7 +151,9 @@ class GroundPoints:
         index = np.arange(len(self))[np.asarray(keep)]
         covariance = None if self.covariance is None else self.covariance[index]
         names = tuple(self.names[k] for k in index)
-        return GroundPoints(names, self.XYZ[index], self.sigma[index], self.check[index], covariance)
+        return GroundPoints(
+            names=names, XYZ=self.XYZ[index], sigma=self.sigma[index], check=self.check[index], covariance=covariance
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,7 +57,9 @@ class Affine2D:
     def __invert__(self) -> Affine2D:
         d = self.determinant
         a1, a2, a4, a5 = self.a5 / d, -self.a2 / d, -self.a4 / d, self.a1 / d
-        return Affine2D(a1, a2, -(a1 * self.a3 + a2 * self.a6), a4, a5, -(a4 * self.a3 + a5 * self.a6))
+        return Affine2D(
+            a1=a1, a2=a2, a3=-(a1 * self.a3 + a2 * self.a6), a4=a4, a5=a5, a6=-(a4 * self.a3 + a5 * self.a6)
+        )
 
     def __matmul__(self, other: Affine2D | Bilinear2D) -> Affine2D | Bilinear2D:
         first, second = (self.a1, self.a2, self.a3), (self.a4, self.a5, self.a6)

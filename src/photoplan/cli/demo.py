@@ -40,11 +40,11 @@ def command(folder: Path, resolution: float, quiet: bool) -> None:
             f"--orientation {data}/ext.csv --terrain {data}/dsm.tif --height-system same"
         )
         request = InitRequest(
-            folder,
-            (str(data / "images" / "*.jpg"),),
-            data / "int.yaml",
-            data / "ext.csv",
-            str(data / "dsm.tif"),
+            folder=folder,
+            images=(str(data / "images" / "*.jpg"),),
+            camera=data / "int.yaml",
+            orientation=data / "ext.csv",
+            terrain=str(data / "dsm.tif"),
             height_system="same",
             overwrite=True,
         )

@@ -49,10 +49,10 @@ def light_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def take_light(options: dict[str, Any]) -> Any:
     """The light, taken out of the options of a verb."""
-    from photoplan.terrain.shading import Light
+    from photoplan.terrain.shading import Lighting
 
     names = ("azimuth", "altitude", "exaggeration", "multidirectional")
-    return Light(**{name: options.pop(name) for name in names})
+    return Lighting(**{name: options.pop(name) for name in names})
 
 
 def take_request(options: dict[str, Any]) -> Any:

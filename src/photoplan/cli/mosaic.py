@@ -33,7 +33,14 @@ def command(project: Path, name: str, score: tuple[str, ...], prefer: tuple[str,
     from photoplan.products.orthophoto.mosaic import plan_mosaic
     from photoplan.products.orthophoto.settings import Choice
 
-    choice = Choice(name, weights(score), prefer, None if seams is None else str(seams.absolute()), feather, sheets)
+    choice = Choice(
+        name=name,
+        weights=weights(score),
+        prefer=prefer,
+        seams=None if seams is None else str(seams.absolute()),
+        feather=feather,
+        sheets=sheets,
+    )
     how = running.How.from_options(options)
     with running.telling(how) as events:
         running.planned(load_project(project), plan_mosaic, {**options, "choice": choice}, how, events)()

@@ -90,7 +90,14 @@ def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling)
     )
     for line in plan.blind:
         events.talk(f"  {'' if plan.of_objects else 'sees no terrain and is '}left out: {line}")
-    run = Run(how.workers, how.executor, how.memory, how.overwrite, how.quicklook, events)
+    run = Run(
+        workers=how.workers,
+        executor=how.executor,
+        memory=how.memory,
+        overwrite=how.overwrite,
+        quicklook=how.quicklook,
+        events=events,
+    )
     failed = None
     try:
         execute(plan, folder, run)

@@ -50,7 +50,14 @@ def command(project: Path, **options: Any) -> None:
             show_json(plan.json_fields()) if how.as_json else show(plan)
             return
         events.talk(str(plan))
-        run = Run(how.workers, how.executor, how.memory, how.overwrite, how.quicklook, events)
+        run = Run(
+            workers=how.workers,
+            executor=how.executor,
+            memory=how.memory,
+            overwrite=how.overwrite,
+            quicklook=how.quicklook,
+            events=events,
+        )
         result = make_surface(plan, folder or stated.folder / "products", run)
         if how.as_json:
             show_json(result)

@@ -132,7 +132,14 @@ def run_view(request: Any, options: dict[str, Any]) -> None:
         for line in told(plan):
             events.talk(line)
         workers = options["workers"] or available_cpus()
-        run = Run(workers, options["executor"], options["memory"], options["overwrite"], False, events)
+        run = Run(
+            workers=workers,
+            executor=options["executor"],
+            memory=options["memory"],
+            overwrite=options["overwrite"],
+            quicklook=False,
+            events=events,
+        )
         result = make_view(plan, run)
     if as_json:
         show_json(result, view=plan)

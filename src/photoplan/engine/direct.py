@@ -61,11 +61,15 @@ class Direct:
         left = int(np.count_nonzero(gaps[own] & ~valid))
         bare = 0 if hidden is None else int(np.count_nonzero(np.isfinite(compiled.relief[own]) & ~valid & ~hidden))
         if not valid.any():
-            return Painted(None, None, None, hidden, bare - left, 0.0, 0, left)
+            return Painted(
+                values=None, valid=None, owner=None, hidden=hidden, bare=bare - left, residual=0.0, cells=0, gaps=left
+            )
         kind = source.reader.dtype
         cut = values[(slice(None), *own)] * valid
         typed = cut.astype(kind) if kind.kind == "f" else np.rint(cut).astype(kind)
-        return Painted(typed, valid, None, hidden, bare - left, 0.0, 0, left)
+        return Painted(
+            values=typed, valid=valid, owner=None, hidden=hidden, bare=bare - left, residual=0.0, cells=0, gaps=left
+        )
 
     def _carry(
         self,

@@ -96,9 +96,13 @@ def _painted(tile: CompiledTile, values: NDArray[Any], valid: NDArray[np.bool_])
     if tile.hidden is not None:
         bare = int(np.count_nonzero(np.isfinite(tile.relief) & ~valid & ~tile.hidden))
     if not valid.any():
-        return Painted(None, None, None, tile.hidden, bare, tile.residual, tile.cells)
+        return Painted(
+            values=None, valid=None, owner=None, hidden=tile.hidden, bare=bare, residual=tile.residual, cells=tile.cells
+        )
     owner = None if tile.owner is None else tile.owner * valid
-    return Painted(values, valid, owner, tile.hidden, bare, tile.residual, tile.cells)
+    return Painted(
+        values=values, valid=valid, owner=owner, hidden=tile.hidden, bare=bare, residual=tile.residual, cells=tile.cells
+    )
 
 
 def render(product: ProductPlan, tile: Tile, sources: Sequence[Source], surface: Surface, kernel: str) -> Painted:
@@ -198,7 +202,7 @@ def joined(window: Window, parts: Iterable[tuple[Window, Painted]], reader: Read
         if part.owner is not None:
             owner = np.zeros(shape, np.uint16) if owner is None else owner
             owner[to] = part.owner[of]
-    return Painted(values, valid, owner, hidden, bare, residual, cells)
+    return Painted(values=values, valid=valid, owner=owner, hidden=hidden, bare=bare, residual=residual, cells=cells)
 
 
 def _border(layer: Layer, size: tuple[int, int]) -> tuple[float, float, float, float]:

@@ -238,7 +238,9 @@ def crs_step(source: str, target: str, bounds: tuple[float, float, float, float]
         )
     best = group.transformers[0]
     accuracy = best.accuracy if best.accuracy is not None and best.accuracy >= 0 else None
-    return CrsStep(source, target, best.description, accuracy, best.definition)
+    return CrsStep(
+        source=source, target=target, operation=best.description, accuracy=accuracy, definition=best.definition
+    )
 
 
 def utm_codes(latitude: float, longitude: float) -> list[str]:

@@ -228,7 +228,14 @@ class MapGrid:
         col1 = math.ceil(xmax / resolution - 1e-6)
         row0 = math.floor(-ymax / resolution + 1e-6)
         row1 = math.ceil(-ymin / resolution - 1e-6)
-        return cls(col0 * resolution, -row0 * resolution, resolution, max(1, col1 - col0), max(1, row1 - row0), crs)
+        return cls(
+            left=col0 * resolution,
+            top=-row0 * resolution,
+            resolution=resolution,
+            width=max(1, col1 - col0),
+            height=max(1, row1 - row0),
+            crs=crs,
+        )
 
     def window_of(self, bounds: tuple[float, float, float, float]) -> Window:
         """Pixels that map bounds xmin, ymin, xmax, ymax touch; empty if there are none."""

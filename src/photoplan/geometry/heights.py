@@ -187,7 +187,9 @@ def height_step(
     """
     source, target = check_height_system(source), check_height_system(target)
     if source == target or "same" in (source, target):
-        return HeightStep(crs, source, target, "none", 0.0, (), None)
+        return HeightStep(
+            crs=crs, source=source, target=target, operation="none", accuracy=0.0, grids=(), definition=None
+        )
     horizontal = parse_crs(crs)
     a, b = (_with_heights(horizontal, name) for name in (source, target))
     with warnings.catch_warnings():
@@ -200,7 +202,15 @@ def height_step(
     best = group.transformers[0]
     grids = tuple(g.short_name for o in best.operations or () for g in o.grids)
     accuracy = best.accuracy if best.accuracy is not None and best.accuracy >= 0 else None
-    return HeightStep(crs, source, target, best.description, accuracy, grids, best.definition)
+    return HeightStep(
+        crs=crs,
+        source=source,
+        target=target,
+        operation=best.description,
+        accuracy=accuracy,
+        grids=grids,
+        definition=best.definition,
+    )
 
 
 def crs_with_heights(crs: str, system: str | None) -> str:

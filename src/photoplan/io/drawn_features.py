@@ -86,4 +86,13 @@ def read_drawn_features(path: Path, layer: str | None) -> DrawnFeatures:
     stated = meta["crs"] if drawing or _states_crs(path, path.open("rb").read(16)) else None
     crs, heights = (None, None) if stated is None else split_compound(stated)
     is_point = shapely.get_type_id(parts) == _POINT
-    return DrawnFeatures(path, XYZ, part.astype(np.int64), is_point, row, fields, crs, heights)
+    return DrawnFeatures(
+        path=path,
+        XYZ=XYZ,
+        part=part.astype(np.int64),
+        is_point=is_point,
+        row=row,
+        fields=fields,
+        crs=crs,
+        height_system=heights,
+    )

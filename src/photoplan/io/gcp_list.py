@@ -125,7 +125,7 @@ def _line(path: Path, line: int, text: str) -> _Line:
             continue
         values.append(number(word, f"{path}:{line}: {what}"))
     X, Y, Z, col, row = values
-    return _Line(line, (X, Y, Z), (col, row), words[5], words[6] if len(words) > 6 else None)
+    return _Line(number=line, XYZ=(X, Y, Z), xy=(col, row), image=words[5], name=words[6] if len(words) > 6 else None)
 
 
 def _names(rows: list[_Line]) -> list[str]:

@@ -74,7 +74,12 @@ def read_image_points(
     found = table.numbers("x", "y"), _sigma(table)
     keep = _once(table, image * len(point_at) + point, (points, images), doubtful)
     return ImagePoints(
-        tuple(spelled.values()), tuple(point_at), image[keep], point[keep], found[0][keep], found[1][keep]
+        images=tuple(spelled.values()),
+        points=tuple(point_at),
+        image=image[keep],
+        point=point[keep],
+        xy=found[0][keep],
+        sigma=found[1][keep],
     )
 
 
@@ -121,7 +126,14 @@ def named_as(points: ImagePoints, names: Sequence[str]) -> tuple[ImagePoints, tu
     if len(set(renamed)) < len(renamed):
         twice = next(name for name in renamed if renamed.count(name) > 1)
         raise InputError(f"image points: two images are called {twice!r} by their base name; rename one of them")
-    return ImagePoints(tuple(renamed), points.points, points.image, points.point, points.xy, points.sigma), unknown
+    return ImagePoints(
+        images=tuple(renamed),
+        points=points.points,
+        image=points.image,
+        point=points.point,
+        xy=points.xy,
+        sigma=points.sigma,
+    ), unknown
 
 
 def write_image_points(path: Path, points: ImagePoints) -> None:

@@ -56,7 +56,7 @@ def opencv_form(camera: CameraEntry) -> OpenCVForm | None:
         fx *= 1.0 + lens.b1
     elif not isinstance(lens, NoLens):
         return None
-    return OpenCVForm(camera.pixels.size, (fx, fy), camera.pixels.point, fisheye, k, p)
+    return OpenCVForm(size=camera.pixels.size, focal=(fx, fy), point=camera.pixels.point, fisheye=fisheye, k=k, p=p)
 
 
 def opencv_losses(block: OrientationBlock, *, rational: bool = True, fisheye: bool = True) -> list[Loss]:
@@ -116,7 +116,7 @@ def agisoft_form(camera: CameraEntry) -> AgisoftForm | None:
     in_pixels = fx * (1.0 + b[0]) - fy if b[0] or fx != fy else 0.0, fx * b[1]
     (col, row), size = camera.pixels.point, camera.pixels.size
     offset = col - (size[0] - 1) / 2, row - (size[1] - 1) / 2
-    return AgisoftForm(size, fy, offset, k, p, in_pixels, fisheye)
+    return AgisoftForm(size=size, f=fy, offset=offset, k=k, p=p, b=in_pixels, fisheye=fisheye)
 
 
 def frame_camera(form: OpenCVForm | AgisoftForm, where: str) -> CameraEntry:

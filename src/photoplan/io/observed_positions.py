@@ -84,7 +84,7 @@ class PositionTable:
                 f"{self.path}: image {self.images[lost[0]]!r}: the accuracy of observed positions is not stated; give "
                 "sigma_position = [horizontal, height] in [observations], or columns sigma_x, sigma_y, sigma_z"
             )
-        return ObservedPositions(self.images, self.XYZ, full, self.strip, self.time)
+        return ObservedPositions(images=self.images, XYZ=self.XYZ, sigma=full, strip=self.strip, time=self.time)
 
     def attitudes(self, sigma: float | None = None) -> ObservedAttitudes | None:
         """The attitudes that have a standard deviation, or get `sigma` (radians); None if none has."""

@@ -373,12 +373,12 @@ class ProductFile:
     def _facts(self, log: TileLog) -> ProductFacts:
         notes = [log.notes(i) for i in log.finished]
         return ProductFacts(
-            self.path,
-            standing(self.path).stat().st_size,
-            len(self._windows),
-            sum(log.place(i)[1] == 0 for i in log.finished),
-            sum(count for _, count in notes) / self.placement.window.size,
-            sum(moved for moved, _ in notes),
+            path=self.path,
+            bytes=standing(self.path).stat().st_size,
+            tiles=len(self._windows),
+            empty_tiles=sum(log.place(i)[1] == 0 for i in log.finished),
+            valid_share=sum(count for _, count in notes) / self.placement.window.size,
+            moved_values=sum(moved for moved, _ in notes),
         )
 
     def _unwritten(self, cause: str) -> ResourceError:

@@ -153,7 +153,16 @@ def _placed(products: Sequence[Path]) -> list[_Sheet]:
             north_up = dataset.transform.b == dataset.transform.d == 0 and dataset.transform.e < 0
             if dataset.crs == first and north_up:
                 b = dataset.bounds
-                sheets.append(_Sheet(Path(path), b.left, b.top, b.right, b.bottom, dataset.transform.a))
+                sheets.append(
+                    _Sheet(
+                        path=Path(path),
+                        left=b.left,
+                        top=b.top,
+                        right=b.right,
+                        bottom=b.bottom,
+                        pixel=dataset.transform.a,
+                    )
+                )
     return sheets
 
 

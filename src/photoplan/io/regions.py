@@ -71,7 +71,9 @@ def source_regions(path: Path, grid: MapGrid) -> dict[int, Any]:
             at = rasterio.windows.Window(part.col, part.row, part.width, part.height)
             left, top = grid.left + part.col * grid.resolution, grid.top - part.row * grid.resolution
             labels = file.read(1, window=at).astype(np.int32)
-            here = MapGrid(left, top, grid.resolution, part.width, part.height, grid.crs)
+            here = MapGrid(
+                left=left, top=top, resolution=grid.resolution, width=part.width, height=part.height, crs=grid.crs
+            )
             for row, shape in label_polygons(labels, here).items():
                 found.setdefault(row, []).append(shape)
     whole = ((row, shapely.union_all(parts)) for row, parts in sorted(found.items()))

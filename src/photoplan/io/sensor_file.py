@@ -122,7 +122,7 @@ class PictureEntry(Entry):
         return self
 
 
-class Transfer(Entry):
+class ChargeTransfer(Entry):
     """Shifting of charges."""
 
     inefficiency: Share
@@ -177,7 +177,7 @@ class SensorDescription(Entry):
     video: Video | None = None
     sensor: Chip | None = None
     image: PictureEntry | None = None
-    transfer: Transfer | None = None
+    transfer: ChargeTransfer | None = None
     noise: Noise | None = None
     optics: OpticsEntry | None = None
     stated: Annotated[dict[Name, Number], Field(max_length=200, default_factory=dict)]

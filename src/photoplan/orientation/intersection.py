@@ -112,7 +112,11 @@ def intersect(
     )
     used = np.asarray(np.isfinite(rays.tangents).all(axis=1))
     found = Intersected(
-        np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan), np.zeros(n, np.int64), used, np.ones(n, np.int8)
+        XYZ=np.full((n, 3), np.nan),
+        covariance=np.full((n, 3, 3), np.nan),
+        rays=np.zeros(n, np.int64),
+        used=used,
+        reason=np.ones(n, np.int8),
     )
     order = np.flatnonzero(used)
     order = order[np.argsort(rays.point[order], kind="stable")]
@@ -220,7 +224,11 @@ def _solved(cameras: _Cameras, rays: Rays, n: int, min_angle: float) -> tuple[In
     reason[behind] = 3
     reason[~(spread > min_angle**2 / 4.0) | ~np.isfinite(covariance).all(axis=(1, 2))] = 2
     reason[number < 2] = 1
-    return Intersected(X, covariance, number, np.ones(len(at), bool), reason), worst, size
+    return (
+        Intersected(XYZ=X, covariance=covariance, rays=number, used=np.ones(len(at), bool), reason=reason),
+        worst,
+        size,
+    )
 
 
 def _nearest(R: Array, C: Array, rays: Rays, n: int, number: NDArray[np.int64]) -> tuple[Array, Array]:

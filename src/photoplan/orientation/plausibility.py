@@ -34,7 +34,7 @@ ENOUGH = 3
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class JudgedView:
     """What the check needs to know of an image."""
 
     name: str
@@ -78,12 +78,12 @@ class ImagePlausibility:
     """What cannot be right; None if the image is plausible."""
 
 
-def look(view: View, heights: Heights) -> ImagePlausibility:
+def look(view: JudgedView, heights: Heights) -> ImagePlausibility:
     """Look at one image as its orientation is declared."""
     return _look(view, view.center, view.R_ground_camera, heights)
 
 
-def _look(view: View, center: NDArray[np.float64], R: NDArray[np.float64], heights: Heights) -> ImagePlausibility:
+def _look(view: JudgedView, center: NDArray[np.float64], R: NDArray[np.float64], heights: Heights) -> ImagePlausibility:
     axis = -R[:, 2]
     tilt = float(np.degrees(np.arccos(np.clip(-axis[2], -1, 1))))
     azimuth = float(np.degrees(np.arctan2(axis[0], axis[1])) % 360) if tilt > 1e-9 else 0.0
@@ -160,7 +160,7 @@ def _level_near(center: NDArray[np.float64], d: NDArray[np.float64], heights: He
     return float(np.median(found[good])) if good.any() else np.nan
 
 
-def other_reading(views: Sequence[View], images: Sequence[ImagePlausibility], heights: Heights) -> str | None:
+def other_reading(views: Sequence[JudgedView], images: Sequence[ImagePlausibility], heights: Heights) -> str | None:
     """Sentence on the reading that fits where the declared one does not."""
     views, images = list(views), tuple(images)
     chosen = _sample(views, images)
@@ -208,19 +208,19 @@ class _Evidence:
     count: int
 
     @classmethod
-    def of(cls, views: list[View], images: list[ImagePlausibility], reading: OtherReading) -> _Evidence:
+    def of(cls, views: list[JudgedView], images: list[ImagePlausibility], reading: OtherReading) -> _Evidence:
         tilts = [i.tilt for i in images]
         alike, offset = _alignment(views, reading)
         return cls(
-            sum(i.fault is not None for i in images),
-            float(np.mean([i.middle_on_terrain for i in images])),
-            float(np.mean([i.on_terrain for i in images])),
-            float(np.median(tilts)),
-            max(tilts),
-            alike,
-            offset,
-            float(max(np.abs(v.angles).max() for v in views) / (2 * np.pi)),
-            len(views),
+            faults=sum(i.fault is not None for i in images),
+            middles=float(np.mean([i.middle_on_terrain for i in images])),
+            on_terrain=float(np.mean([i.on_terrain for i in images])),
+            median_tilt=float(np.median(tilts)),
+            steepest=max(tilts),
+            alike=alike,
+            offset=offset,
+            largest=float(max(np.abs(v.angles).max() for v in views) / (2 * np.pi)),
+            count=len(views),
         )
 
     @property
@@ -266,14 +266,14 @@ def _possible(reading: OtherReading, largest: float) -> bool:
     return largest > 1.0 and (reading.unit == "gon") == (largest * ANGLE_UNITS["rad"] > ANGLE_UNITS["deg"])
 
 
-def _sample(views: list[View], images: tuple[ImagePlausibility, ...]) -> list[int]:
+def _sample(views: list[JudgedView], images: tuple[ImagePlausibility, ...]) -> list[int]:
     """Images for other readings: faulty ones first, then spread over the block."""
     faulty = [k for k, i in enumerate(images) if i.fault is not None or not i.middle_on_terrain]
     spread = [int(k) for k in np.linspace(0, len(views) - 1, min(SAMPLE, len(views)))]
     return list(dict.fromkeys(faulty[: SAMPLE // 2] + spread))[:SAMPLE]
 
 
-def _alignment(views: list[View], reading: OtherReading) -> tuple[float, float]:
+def _alignment(views: list[JudgedView], reading: OtherReading) -> tuple[float, float]:
     """How the image axes lie to the flight lines: how alike in all images (0 to 1), and the mean difference (degrees).
 
     The line through an image and its nearest neighbour is along or across a strip, so angles count modulo 90°.

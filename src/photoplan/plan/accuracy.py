@@ -49,7 +49,7 @@ DepthErrors = Callable[[Target, Window], NDArray[np.floating]]
 
 
 @dataclass(frozen=True, eq=False)
-class Cause:
+class IndependentError:
     """One of the independent errors of a source, as what it does to its projection."""
 
     name: str
@@ -76,7 +76,7 @@ class SourceErrors:
     """What is not known exactly of a source."""
 
     projection: Projection
-    causes: tuple[Cause, ...]
+    causes: tuple[IndependentError, ...]
     """Independent of each other; correlated unknowns are several causes, along the axes of their covariance."""
     image: float = 0.0
     """Standard deviation of each image coordinate, pixels: anchors, resampling."""

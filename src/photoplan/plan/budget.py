@@ -94,10 +94,10 @@ def orientation_effect(
     """
     scale = flying_height / c if scale_number is None else scale_number
     return OrientationEffect(
-        float(displacement_by_shift(center_sd[0], scale)),
-        float(displacement_by_shift(center_sd[1], scale)),
-        float(displacement_by_height(radius, flying_height, center_sd[2])),
-        float(displacement_by_tilt(angles_sd[0], c, w)),
-        float(displacement_by_tilt(angles_sd[1], c, w)),
-        float(displacement_by_kappa(angles_sd[2], c, w)),
+        X=float(displacement_by_shift(center_sd[0], scale)),
+        Y=float(displacement_by_shift(center_sd[1], scale)),
+        Z=float(displacement_by_height(radius, flying_height, center_sd[2])),
+        omega=float(displacement_by_tilt(angles_sd[0], c, w)),
+        phi=float(displacement_by_tilt(angles_sd[1], c, w)),
+        kappa=float(displacement_by_kappa(angles_sd[2], c, w)),
     )

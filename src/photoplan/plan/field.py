@@ -110,7 +110,15 @@ def field_grid(field: ImageField, size: tuple[int, int], tolerance: float) -> Fi
         share = min(tolerance / 3, max(along_x, along_y))
         finer = [0.5 if len(breaks) else 0.5**0.5 for breaks in _breaks(field)]
         spacings = [s * f if miss >= share else s for s, f, miss in zip(spacings, finer, (along_x, along_y))]
-    return FieldGrid(field, size, (phases[0], phases[1]), (spacings[0], spacings[1]), bounds, stretch, _BESIDE * worst)
+    return FieldGrid(
+        field=field,
+        size=size,
+        phase=(phases[0], phases[1]),
+        spacing=(spacings[0], spacings[1]),
+        bounds=bounds,
+        stretch=stretch,
+        miss=_BESIDE * worst,
+    )
 
 
 def _breaks(field: ImageField) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -66,7 +66,7 @@ class TileGround:
             rects = _between_breaks(target, window)
             heights = height_ranges(relief, rects)
         first = _boxes(target, window, rects, heights, np.ones(len(rects), np.int64))
-        return cls(target, window, relief, np.ascontiguousarray(ranges), first)
+        return cls(target=target, window=window, relief=relief, ranges=np.ascontiguousarray(ranges), first=first)
 
     def boxes(self, rects: NDArray[np.int32], layers: NDArray[np.int64]) -> Boxes:
         """Boxes of rectangles; those without a surface are dropped."""
@@ -148,7 +148,7 @@ def _boxes(
     top = np.where(layer == layers[rect] - 1, high, bottom + step)
     bounds = np.stack([bottom, top], axis=1)
     lattice = _ground(target, window, rects[rect][:, None], bounds[:, None], _LATTICE)
-    return Boxes(rects, layers, rect, bounds, lattice)
+    return Boxes(rects=rects, layers=layers, rect=rect, heights=bounds, lattice=lattice)
 
 
 def _ground(

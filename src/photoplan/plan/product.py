@@ -207,10 +207,25 @@ def _compiled(
             continue
         if tilt is None:
             level = product.rule.level(anchors)
-            layers.append(Layer(source, level, anchors.at_level(level, cameras[source].size), part, share.owner))
+            layers.append(
+                Layer(
+                    source=source,
+                    level=level,
+                    anchors=anchors.at_level(level, cameras[source].size),
+                    part=part,
+                    owner=share.owner,
+                )
+            )
         else:
             layers += _layers_by_level(product.rule, ground, tilt, (source, cameras[source], anchors), share.owner)
-    return CompiledTile(tile.window, ground.relief, tilt, tuple(layers), share.owner, share.hidden)
+    return CompiledTile(
+        window=tile.window,
+        relief=ground.relief,
+        tilt=tilt,
+        layers=tuple(layers),
+        owner=share.owner,
+        hidden=share.hidden,
+    )
 
 
 def _depth(
@@ -247,5 +262,7 @@ def _layers_by_level(
         found = compile_anchors(camera, ground, rule, wanted, float(longest[level]))
         if found is not None:
             raster = mine.astype(np.uint16) * np.uint16(row + 1)
-            layers.append(Layer(row, level, found.at_level(level, camera.size), part, raster))
+            layers.append(
+                Layer(source=row, level=level, anchors=found.at_level(level, camera.size), part=part, owner=raster)
+            )
     return layers

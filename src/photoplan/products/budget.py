@@ -263,7 +263,7 @@ def _of_image(project: Project, name: str, ground: Ground, heights: Any, request
     at = [0, 1 + int(total[1:5].argmax()), 5 + int(total[5:9].argmax())]
     middle = _level_figures(replace(none, image=np.sqrt(0.5)), XY[:1], level)[1]
     kept = {cause: values[at] for cause, values in parts.items() if values[at].any()}
-    return ImageBudget(name, float(middle[0]), kept, total[at], total[9:].reshape(_MAP, _MAP))
+    return ImageBudget(image=name, gsd=float(middle[0]), parts=kept, total=total[at], map=total[9:].reshape(_MAP, _MAP))
 
 
 def _level(camera: CentralCamera, ground: Ground, name: str) -> float:
@@ -291,7 +291,9 @@ def _level_figures(
     errors: SourceErrors, XY: NDArray[np.float64], level: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Run of the rays per metre of height (n, 2), and the errors of position on level ground (n,), metres."""
-    grid = MapGrid(float(np.nanmin(XY[:, 0])), float(np.nanmax(XY[:, 1])), 1.0, 1, 1, _CRS)
+    grid = MapGrid(
+        left=float(np.nanmin(XY[:, 0])), top=float(np.nanmax(XY[:, 1])), resolution=1.0, width=1, height=1, crs=_CRS
+    )
     uv = np.stack([XY[:, 0] - grid.left - 0.5, grid.top - 0.5 - XY[:, 1]], axis=1)
     figures = figures_at(errors, MapTarget(grid), np.column_stack([uv, np.full(len(XY), level)]))
     return figures[:, :2], np.sqrt(figures[:, 2] + figures[:, 4])

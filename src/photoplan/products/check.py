@@ -12,7 +12,7 @@ from photoplan.cameras.base import Camera
 from photoplan.geometry.crs import crs_label
 from photoplan.geometry.local import MEAN_RADIUS
 from photoplan.io.project.model import Project
-from photoplan.orientation.plausibility import ImagePlausibility, View
+from photoplan.orientation.plausibility import ImagePlausibility, JudgedView
 from photoplan.plain import pick
 from photoplan.plan.footprint import Footprint, footprint, mean_gsd
 from photoplan.products.balance.glance import colour_advice
@@ -113,7 +113,7 @@ def check_project(project: Project, images: Sequence[str] | None = None) -> Proj
     """
     names = project.select(images)
     ground = ground_of(project)
-    looked: dict[int, tuple[View | None, ImagePlausibility, ImageCheck]] = {}
+    looked: dict[int, tuple[JudgedView | None, ImagePlausibility, ImageCheck]] = {}
     for place in map_order(project, names):
         # All that is asked of the terrain for one image, before the next: its blocks are then at hand.
         view, found = judged(project, project.any_image(names[place]), ground)
@@ -121,12 +121,12 @@ def check_project(project: Project, images: Sequence[str] | None = None) -> Proj
     views, looks, checks = zip(*(looked[place] for place in range(len(names))))
     gsds = [c.gsd for c in checks if np.isfinite(c.gsd)]
     return ProjectCheck(
-        checks,
-        two_figures(float(np.mean(gsds))) if gsds else float("nan"),
-        (*ground.height_systems, ground.working_system),
-        project.crs,
-        reading_of_block(project, dict(zip(names, zip(views, looks))), ground),
-        _advice(project, checks) + _of_objects(project, ground, names),
+        images=checks,
+        sensible_resolution=two_figures(float(np.mean(gsds))) if gsds else float("nan"),
+        heights=(*ground.height_systems, ground.working_system),
+        crs=project.crs,
+        alternative=reading_of_block(project, dict(zip(names, zip(views, looks))), ground),
+        advice=_advice(project, checks) + _of_objects(project, ground, names),
     )
 
 

@@ -158,7 +158,9 @@ def _by_parts(source: RasterReader, reference: int, others: list[int], measure: 
                 continue
             place = found.place + np.array([window.col, window.row])
             group = found.group + 100_000 * number
-            gathered[band].append(Displacements(place, found.direction, found.value, found.sigma, group))
+            gathered[band].append(
+                Displacements(place=place, direction=found.direction, value=found.value, sigma=found.sigma, group=group)
+            )
     for band in others:
         if not gathered[band]:
             raise InputError(f"band {band}: {why[band] or 'no part of the image is large enough'}")

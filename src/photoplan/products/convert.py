@@ -194,7 +194,9 @@ def _with_axes(block: OrientationBlock, request: ConvertRequest) -> OrientationB
 
 def _with_poses(table: OrientationTable, centers: NDArray[np.float64], opk: NDArray[np.float64]) -> OrientationTable:
     images = tuple(
-        OrientedImage(i.name, _triple(c), _triple(a), i.camera, i.line, i.fiducials)
+        OrientedImage(
+            name=i.name, center=_triple(c), angles=_triple(a), camera=i.camera, line=i.line, fiducials=i.fiducials
+        )
         for i, c, a in zip(table.images, centers, opk)
     )
     return replace(table, images=images, angle_unit="deg", rotation="opk", direction="camera-to-ground")
@@ -343,7 +345,15 @@ def list_readings(request: ConvertRequest, image_points: Path, control: Path) ->
         )
     others = [r for r in results if r not in fits and np.isfinite(r.median)][:OTHERS]
     seen = len(np.unique(sights.image))
-    return ReadingsReport(name, len(sights.image), seen, not open_angles, fits, tuple(others), tuple(notes))
+    return ReadingsReport(
+        format=name,
+        points=len(sights.image),
+        images=seen,
+        matrices=not open_angles,
+        fitting=fits,
+        others=tuple(others),
+        notes=tuple(notes),
+    )
 
 
 def _as_stated(request: ConvertRequest) -> tuple[str, OrientationBlock]:

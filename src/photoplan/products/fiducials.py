@@ -187,7 +187,11 @@ def locate_fiducials(
             except PhotoplanError as error:
                 failed[job.name] = f"{job.file}: {error}" if isinstance(error, MarksNotFound) else str(error)
                 if isinstance(error, MarksNotFound):
-                    unfound.append(UnfoundFiducials(job.name, job.file, request.band, job.layout, error.sought))
+                    unfound.append(
+                        UnfoundFiducials(
+                            name=job.name, file=job.file, band=request.band, layout=job.layout, sought=error.sought
+                        )
+                    )
             events.done()
         written = None
         if project is not None and results and not request.dry_run:
@@ -233,7 +237,10 @@ def _jobs(request: FiducialsRequest, project: Project | None) -> list[_Job]:
         twice = sorted({f for f in files if files.count(f) > 1})
         if twice:
             raise UsageError(f"image {twice[0]} is given twice")
-        return [_Job(path.name, path, name, system.mirrored, layout) for path in request.images]
+        return [
+            _Job(name=path.name, file=path, camera_name=name, mirrored=system.mirrored, layout=layout)
+            for path in request.images
+        ]
     jobs = []
     layouts: dict[str, MarkLayout] = {}
     for name in project.select(request.select or None):
@@ -247,11 +254,11 @@ def _jobs(request: FiducialsRequest, project: Project | None) -> list[_Job]:
             layouts[image.camera] = _layout(marks, image.camera, project.folder)
         jobs.append(
             _Job(
-                name,
-                project.resolve(image.file),
-                image.camera,
-                marks.mirrored,
-                layouts[image.camera],
+                name=name,
+                file=project.resolve(image.file),
+                camera_name=image.camera,
+                mirrored=marks.mirrored,
+                layout=layouts[image.camera],
             )
         )
     if not jobs:
@@ -287,12 +294,12 @@ def _locate(
 ) -> ImageFiducials:
     scan = ScanImage(job.file, request.band)
     known = FiducialSearch(
-        pixel_mm if pixel_mm is not None else stated_pixel_mm(job.file),
-        request.rotation,
-        request.mirrored,
-        job.mirrored,
-        request.negative,
-        request.least_correlation,
+        pixel_mm=pixel_mm if pixel_mm is not None else stated_pixel_mm(job.file),
+        rotation=request.rotation,
+        mirrored=request.mirrored,
+        usual_mirrored=job.mirrored,
+        negative=request.negative,
+        least_correlation=request.least_correlation,
     )
     try:
         found = find_fiducials(scan, job.layout, known)

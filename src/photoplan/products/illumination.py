@@ -27,7 +27,7 @@ from photoplan.project.restored import kept_nodata
 from photoplan.radiometry.illumination import Ground, LightModel, estimate
 from photoplan.radiometry.tone import fitted
 from photoplan.targets.map import MapTarget
-from photoplan.terrain.shading import Light, surface_slopes
+from photoplan.terrain.shading import Lighting, surface_slopes
 
 #: Windows along both axes from which parameters are estimated, and their side, pixels.
 _ALONG, _SIDE = 8, 64
@@ -90,7 +90,7 @@ class _Place:
     reader: RasterReader
     terrain: OpenTerrain
     grid: MapGrid
-    light: Light
+    light: Lighting
 
     def ground(self, window: Window) -> Ground:
         """What the terrain is like in a window of the picture."""
@@ -128,9 +128,11 @@ def correct_illumination(request: IlluminationRequest, events: Events = SILENT) 
     cos_z = place.light.level
     values, ground, part = _sample(place, events)
     model = estimate(values, ground, part, request.correct, cos_z)
-    report = IlluminationReport(request.output, model, ground, values, model.corrected(values, ground))
+    report = IlluminationReport(
+        path=request.output, model=model, sample=ground, before=values, after=model.corrected(values, ground)
+    )
     if request.dry_run:
-        return IlluminationReport(None, model, ground, values, report.after)
+        return IlluminationReport(path=None, model=model, sample=ground, before=values, after=report.after)
     dtype, nodata = place.reader.dtype, kept_nodata(place.reader.info, place.reader.dtype)
 
     def tile(window: Window) -> GridTile:
@@ -151,7 +153,7 @@ def correct_illumination(request: IlluminationRequest, events: Events = SILENT) 
 
 
 def _open(request: IlluminationRequest) -> _Place:
-    light = Light(*request.sun)
+    light = Lighting(*request.sun)
     reader = RasterReader(request.picture)
     placement = placement_of(reader.info)
     if placement.transform is None or placement.crs is None:

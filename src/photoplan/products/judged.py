@@ -23,7 +23,7 @@ from photoplan.io.orientation.table import OrientationTable
 from photoplan.io.project.image import ImageEntry
 from photoplan.io.project.model import Project
 from photoplan.io.project.posed import Image
-from photoplan.orientation.plausibility import ImagePlausibility, View, look, other_reading
+from photoplan.orientation.plausibility import ImagePlausibility, JudgedView, look, other_reading
 from photoplan.plan.footprint import footprint, mean_gsd
 from photoplan.project.cameras import camera_without_pixels, is_there
 from photoplan.project.ground import Ground
@@ -43,7 +43,7 @@ _ENOUGH = 4
 _NEIGHBOURS = 40
 
 
-def judged(project: Project, image: ImageEntry, ground: Ground) -> tuple[View | None, ImagePlausibility]:
+def judged(project: Project, image: ImageEntry, ground: Ground) -> tuple[JudgedView | None, ImagePlausibility]:
     """An oriented image, and what follows from its orientation: by its CRS, its file's own position, and the terrain.
 
     Without a pose there is nothing that could be read in another way, and so no view.
@@ -89,7 +89,7 @@ def _without_pose(project: Project, name: str, ground: Ground) -> ImagePlausibil
 
 
 def reading_of_block(
-    project: Project, seen: Mapping[str, tuple[View | None, ImagePlausibility]], ground: Ground
+    project: Project, seen: Mapping[str, tuple[JudgedView | None, ImagePlausibility]], ground: Ground
 ) -> str | None:
     """The reading of the orientation that would fit better than the declared one, see `other_reading`.
 

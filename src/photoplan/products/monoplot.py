@@ -132,11 +132,11 @@ def monoplot_file(request: MonoplotRequest) -> MonoplotReport:
             notes.append("no standard deviations: the terrain has none of its own; give `sigma_terrain` METRES")
         unit = project.orientation.angle_unit
         errors = MonoplotErrors(
-            request.sigma_image,
-            sigma,
-            request.sigma_position,
-            tuple(float(a) for a in angle_in_radians(np.array(request.sigma_angles), unit)),  # type: ignore[arg-type]
-            _axes_of(project, project.any_image(name), ground, request),
+            image=request.sigma_image,
+            terrain=sigma,
+            position=request.sigma_position,
+            angles=tuple(float(a) for a in angle_in_radians(np.array(request.sigma_angles), unit)),  # type: ignore[arg-type]
+            axes=_axes_of(project, project.any_image(name), ground, request),
         )
         seen = footprint(camera, ground.surface, ground.bounds)
         found = monoplot(camera, given.xy, ground.surface, seen.height_range, errors, mesh)

@@ -109,7 +109,11 @@ def _fit(project: Project, name: str, path: Path) -> tuple[ImagePolynomials, Pat
         found = fit_rpc(camera, GeodeticGround(project.crs, ground.working_system), heights)
     except GeometryError as error:
         raise GeometryError(f"image {name!r}: {error}") from None
-    return ImagePolynomials(name, path, found.rms, found.worst, heights), path, rpc_text(found.functions)
+    return (
+        ImagePolynomials(image=name, file=path, rms=found.rms, worst=found.worst, heights=heights),
+        path,
+        rpc_text(found.functions),
+    )
 
 
 def _heights(camera: Camera, seen: tuple[float, float]) -> tuple[float, float]:

@@ -205,7 +205,9 @@ def _collected(plan: ProductPlan, reader: Reader, work: Any, workers: int) -> Ra
         whole = joined(plan.target.window, parts, reader)
     assert whole.values is not None and whole.valid is not None
     owner = np.zeros_like(whole.valid, np.uint16) if plan.owners is not None and whole.owner is None else whole.owner
-    return Raster(whole.values, whole.valid, plan.target.placement, owner, whole.residual)
+    return Raster(
+        values=whole.values, valid=whole.valid, placement=plan.target.placement, owner=owner, residual=whole.residual
+    )
 
 
 def _painted(outcome: Outcome) -> Painted:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -121,7 +121,14 @@ def resect_project(request: ResectRequest, events: Events = SILENT) -> ResectRes
             events.done()
         written = bool(done) and not request.dry_run
         left = tuple(n for n in names if n not in wanted)
-        result = ResectResult(request.project, tuple(done), failed, left, written, inputs.notes)
+        result = ResectResult(
+            project=request.project,
+            images=tuple(done),
+            failed=failed,
+            left_out=left,
+            written=written,
+            notes=inputs.notes,
+        )
         if written:
             edit_project(request.project, _changes(done))
             record([request.project], result)
@@ -303,7 +310,7 @@ def resect_image(inputs: AdjustInputs, image: Image, settings: ResectSettings) -
     if frame.local is not None and rows:
         XYZ = given.XYZ.copy()
         XYZ[:, 2] = frame.inward(XYZ)
-        working = MeasuredPoints(given.names, given.xy, given.sigma, XYZ, given.covariance)
+        working = replace(given, XYZ=XYZ)
     found = resected(project, image, working, (interior, lens), settings)
     terrain = float(nadir_heights(project, found.pose.center[None, :2], np.nan)[0])
     wrong = impossible(of_resection(working, found, terrain))

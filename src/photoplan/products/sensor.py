@@ -10,12 +10,12 @@ from pathlib import Path
 from photoplan.errors import InputError
 from photoplan.io.product import check_output
 from photoplan.io.sensor_file import (
+    ChargeTransfer,
     Chip,
     Noise,
     OpticsEntry,
     PictureEntry,
     SensorDescription,
-    Transfer,
     Video,
     Viewing,
     read_sensor,
@@ -160,7 +160,15 @@ def sensor_figures(described: SensorDescription, file: str) -> tuple[SensorFigur
                 f"{', '.join(sorted(names)) or 'none'}"
             )
     return tuple(
-        SensorFigure(f.section, f.name, f.meaning, f.value, f.unit, f.source, described.stated.get(f.name))
+        SensorFigure(
+            section=f.section,
+            name=f.name,
+            meaning=f.meaning,
+            value=f.value,
+            unit=f.unit,
+            source=f.source,
+            stated=described.stated.get(f.name),
+        )
         for f in found
     )
 
@@ -182,13 +190,13 @@ def _viewing(table: Viewing) -> Found:
 
 def _video(table: Video) -> Found:
     norm = VideoNorm(
-        table.lines,
-        table.line_us * 1e-6,
-        table.line_blanking_us * 1e-6,
-        table.frame_blanking_us * 1e-6,
-        table.aspect[0] / table.aspect[1],
-        table.kell_factor,
-        table.fields,
+        lines=table.lines,
+        line_s=table.line_us * 1e-6,
+        line_blanking_s=table.line_blanking_us * 1e-6,
+        frame_blanking_s=table.frame_blanking_us * 1e-6,
+        aspect=table.aspect[0] / table.aspect[1],
+        kell_factor=table.kell_factor,
+        fields=table.fields,
     )
     printed = "Behr 1989, table 3.1"
     yield "line_hz", "lines a second", norm.line_hz, "Hz", printed
@@ -275,7 +283,7 @@ def _jitter(jitter_s: float, sampling_hz: float, table: PictureEntry) -> Found:
         yield "jitter_grey", words, grey, "grey values", "Behr 1989, eq. 4.6, 4.7"
 
 
-def _transfer(table: Transfer) -> Found:
+def _transfer(table: ChargeTransfer) -> Found:
     product = table.inefficiency * table.transfers
     yield "transfer_product", "transfer inefficiency product", product, "", "Behr 1989, §3.6.4"
     for ratio in table.signal_to_clock:
@@ -302,11 +310,11 @@ def noise_budget(described: SensorDescription) -> NoiseBudget | None:
     if bits is not None and table.full_well_e is not None:
         rounding = sensor.quantisation_sigma(table.full_well_e / 2.0**bits)
     return NoiseBudget(
-        signal,
-        _dark(table, signal),
-        None if shift is None else sensor.transfer_noise(signal, shift.inefficiency, shift.transfers),
-        amplifier,
-        rounding,
+        signal_e=signal,
+        dark_e=_dark(table, signal),
+        transfer=None if shift is None else sensor.transfer_noise(signal, shift.inefficiency, shift.transfers),
+        amplifier=amplifier,
+        quantisation=rounding,
     )
 
 

@@ -31,12 +31,12 @@ def read_fall_off(path: Path) -> FallOffModel:
     entry = read_fall_off_entry(path)
     try:
         return FallOffModel(
-            entry.size,
-            entry.principal_point_px,
-            entry.camera_constant_px,
-            tuple((term.n, term.m) for term in entry.terms),
-            tuple(term.coefficient for term in entry.terms),
-            entry.dark_dn,
+            size=entry.size,
+            principal_point=entry.principal_point_px,
+            camera_constant=entry.camera_constant_px,
+            terms=tuple((term.n, term.m) for term in entry.terms),
+            coefficients=tuple(term.coefficient for term in entry.terms),
+            dark=entry.dark_dn,
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

@@ -13,8 +13,7 @@ from photoplan.errors import InputError
 from photoplan.geometry.crs import CrsStep
 from photoplan.geometry.heights import HeightStep, declared_pair, height_step
 from photoplan.io.names import resolve_input
-from photoplan.io.project.model import Objects, Project
-from photoplan.io.project.model import Terrain as StatedTerrain
+from photoplan.io.project.model import Objects, Project, StatedTerrain
 from photoplan.project.open_terrain import open_terrain
 from photoplan.surfaces.base import Terrain
 from photoplan.surfaces.level import LevelSurface
@@ -82,7 +81,15 @@ def ground_of(project: Project) -> Ground:
     stamps = tuple(stamp_of(project.resolve(file)) for file in files)
     folder = str(project.folder)
     return _ground(
-        _GroundAddress(project.ground, project.height_system, strict, project.crs, folder, stamps, project.objects)
+        _GroundAddress(
+            terrain=project.ground,
+            orientation_system=project.height_system,
+            to_ellipsoid=strict,
+            crs=project.crs,
+            folder=folder,
+            stamps=stamps,
+            objects=project.objects,
+        )
     )
 
 

@@ -94,13 +94,13 @@ def open_terrain(path: Path, crs: str | None = None, option: str = "with `crs` E
         header = reader.header
         require_projected_metres(header.crs, f"{path}: CRS")
         return OpenTerrain(
-            path,
-            HybridSurface(reader),
-            reader.layout.bounds,
-            header.crs,
-            header.height_system,
-            reader.finest,
-            reader,
+            path=path,
+            surface=HybridSurface(reader),
+            bounds=reader.layout.bounds,
+            crs=header.crs,
+            height_system=header.height_system,
+            resolution=reader.finest,
+            model=reader,
         )
     return _open_raster(path, crs, option)
 
@@ -120,4 +120,11 @@ def _open_raster(path: Path, crs: str | None, option: str) -> OpenTerrain:
     columns, rows = info.size
     bounds = (x0 - xx / 2, y0 + yy * (rows - 0.5), x0 + xx * (columns - 0.5), y0 - yy / 2)
     surface = RasterSurface(reader, (x0, y0), (xx, -yy), part=reader.block)
-    return OpenTerrain(info.path, surface, bounds, found, info.vertical_crs, min(xx, -yy))
+    return OpenTerrain(
+        path=info.path,
+        surface=surface,
+        bounds=bounds,
+        crs=found,
+        height_system=info.vertical_crs,
+        resolution=min(xx, -yy),
+    )

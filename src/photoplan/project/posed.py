@@ -16,7 +16,7 @@ from photoplan.io.orientation.table import angle_in_radians
 from photoplan.io.project.cameras import interior_of, lens_of
 from photoplan.io.project.model import Orientation, Project
 from photoplan.io.project.posed import Image
-from photoplan.orientation.plausibility import View
+from photoplan.orientation.plausibility import JudgedView
 from photoplan.project.ground import Ground
 
 
@@ -69,7 +69,7 @@ def posed_camera(project: Project, image: Image, ground: Ground, size: tuple[int
 _POINTS = 5
 
 
-def view_of(image: Image, camera: CameraEntry, orientation: Orientation, center: ArrayLike) -> View:
+def view_of(image: Image, camera: CameraEntry, orientation: Orientation, center: ArrayLike) -> JudgedView:
     """View of a project's image.
 
     Parameters
@@ -92,6 +92,12 @@ def view_of(image: Image, camera: CameraEntry, orientation: Orientation, center:
     pixel = float(np.linalg.norm(t[1] - t[2]))
     angles = angle_in_radians(np.array(image.pose_numbers[1]), orientation.angle_unit)
     points = np.delete(t, [1, 2], axis=0)
-    return View(
-        image.name, np.asarray(center, float), angles, orientation.rotation, points, pixel, orientation.angle_unit
+    return JudgedView(
+        name=image.name,
+        center=np.asarray(center, float),
+        angles=angles,
+        order=orientation.rotation,
+        tangents=points,
+        pixel=pixel,
+        unit=orientation.angle_unit,
     )

@@ -11,7 +11,7 @@ from photoplan.engine.base import Source
 from photoplan.io.project.model import Project
 from photoplan.project.scene import Scene, SceneAddress, scene_address
 from photoplan.surfaces.base import Terrain
-from photoplan.surfaces.objects import ObjectSurface, Part
+from photoplan.surfaces.objects import ObjectSurface, SingleObject
 
 
 @dataclass(frozen=True)
@@ -20,11 +20,11 @@ class ScenesAddress:
 
     scenes: tuple[SceneAddress, ...]
     """One for each row of the table of sources; all over the same ground."""
-    part: Part | None = None
+    part: SingleObject | None = None
     """What is shown of the ground's objects, where it is a single one."""
 
     @classmethod
-    def of(cls, project: Project, names: Sequence[str], part: Part | None = None) -> ScenesAddress:
+    def of(cls, project: Project, names: Sequence[str], part: SingleObject | None = None) -> ScenesAddress:
         """Addresses of images of a project.
 
         Raises

@@ -18,7 +18,7 @@ from photoplan.io.camera.model import CameraEntry
 from photoplan.io.project.file import parse_project
 from photoplan.io.project.model import Project
 from photoplan.io.project.posed import Image
-from photoplan.plan.accuracy import Cause, DepthErrors, SourceErrors
+from photoplan.plan.accuracy import DepthErrors, IndependentError, SourceErrors
 from photoplan.project.ground import Ground
 from photoplan.project.open_terrain import open_terrain
 from photoplan.project.posed import posed_camera
@@ -61,7 +61,9 @@ def source_errors(
         changed = project.model_copy(update={"cameras": {**project.cameras, image.camera: entry}})
         return posed_camera(changed, moved, ground, projection.size)
 
-    causes = (Cause(name, at(_STEP * d), at(-_STEP * d), _STEP) for name, d in _deviations(project, image, camera))
+    causes = (
+        IndependentError(name, at(_STEP * d), at(-_STEP * d), _STEP) for name, d in _deviations(project, image, camera)
+    )
     return SourceErrors(projection, tuple(causes), in_image)
 
 

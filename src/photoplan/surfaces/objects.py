@@ -23,7 +23,7 @@ _FOOT, _STANDS = 0.3048, (-3.0, 25.0)
 
 
 @dataclass(frozen=True)
-class Part:
+class SingleObject:
     """What a product shows where it is the product of a single object."""
 
     objects: tuple[int, ...]
@@ -42,7 +42,7 @@ class ObjectSurface:
     ground: Terrain
     """Without objects."""
     faces: Faces
-    part: Part | None = None
+    part: SingleObject | None = None
     """What is shown of it; None: the ground, and all that is painted. All of it hides what is behind it."""
     entries: tuple[int, ...] = ()
     """Entry of the project that each object is of, by place in `Faces.names`."""

@@ -101,9 +101,9 @@ def plan_build(measured: MeasuredTerrain, settings: BuildSettings) -> BuildPlan:
             f"points from {xy.min(axis=0)} to {xy.max(axis=0)} with a grid of {width:g} m make {columns} × {rows} "
             f"units, at most {_MOST_UNITS} are allowed; is there a point far from all others? Else give `grid_width`"
         )
-    layout = UnitLayout(float(low[0] * side), float(high[1] * side), side, columns, rows)
+    layout = UnitLayout(left=float(low[0] * side), top=float(high[1] * side), side=side, columns=columns, rows=rows)
     reach = settings.reach or _REACH * seen.spacing
-    return BuildPlan(seen, layout, width, reach, domain_of(measured), settings)
+    return BuildPlan(seen=seen, layout=layout, width=width, reach=reach, polygon=domain_of(measured), settings=settings)
 
 
 def _with_dense_borders(measured: MeasuredTerrain, width: float) -> MeasuredTerrain:
@@ -162,7 +162,14 @@ def build_terrain(plan: BuildPlan, run: Map = map, events: Events = SILENT) -> B
     sigmas = _surrounded(plan, domain, units)
     every = np.concatenate([np.empty(0), *sigmas.values()])
     sigma = float(np.sqrt((every**2).mean())) if len(every) else np.nan
-    return Built(plan, found, units, tuple(lines), tuple(_figures(plan, found, units, lines, sigmas)), sigma)
+    return Built(
+        plan=plan,
+        fit=found,
+        units=units,
+        lines=tuple(lines),
+        figures=tuple(_figures(plan, found, units, lines, sigmas)),
+        sigma=sigma,
+    )
 
 
 def _surrounded(

@@ -75,7 +75,7 @@ def joined(parts: Sequence[HeldOut]) -> HeldOut:
     around = (np.concatenate([getattr(part.around, f.name) for part in parts]) for f in fields(Surroundings))
     error, sigma, noise = (np.concatenate([getattr(part, n) for part in parts]) for n in ("error", "sigma", "noise"))
     block = np.concatenate([part.block + k for part, k in zip(parts, first)])
-    return HeldOut(error, sigma, noise, Surroundings(*around), block)
+    return HeldOut(error=error, sigma=sigma, noise=noise, around=Surroundings(*around), block=block)
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class ClassFigures:
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
+class SigmaFactor:
     """A factor of standard deviations as a function of the surroundings."""
 
     coefficients: NDArray[np.float64]
@@ -114,7 +114,7 @@ class Calibration:
         return np.asarray(np.exp(around.columns @ self.coefficients))
 
 
-NONE = Calibration(np.append(np.zeros(len(KNOTS) + 1), 1.0))
+NONE = SigmaFactor(np.append(np.zeros(len(KNOTS) + 1), 1.0))
 """By the roughness alone."""
 
 
@@ -127,7 +127,7 @@ def signal_share(sigma: NDArray[np.float64], noise: float) -> NDArray[np.float64
     return np.asarray(square / (square + (_AVERAGED * noise) ** 2 + 1e-30))
 
 
-def calibrate(held: HeldOut) -> Calibration:
+def calibrate(held: HeldOut) -> SigmaFactor:
     """The factor under which what was held out is most probable, drawn to that of the roughness alone."""
     if not len(held.error):
         return NONE
@@ -144,11 +144,11 @@ def calibrate(held: HeldOut) -> Calibration:
         square = np.where(square > _KNEE, _KNEE * (1 + np.log(np.maximum(square, _KNEE) / _KNEE)), square)
         return float((weight * (square + np.log(variance))).sum() + (((x - mean) / expected) ** 2).sum())
 
-    found = Calibration(sums @ minimize(objective, mean, method="BFGS").x)
-    return Calibration(found.coefficients, _classes(held, found))
+    found = SigmaFactor(sums @ minimize(objective, mean, method="BFGS").x)
+    return SigmaFactor(found.coefficients, _classes(held, found))
 
 
-def _classes(held: HeldOut, found: Calibration) -> tuple[ClassFigures, ...]:
+def _classes(held: HeldOut, found: SigmaFactor) -> tuple[ClassFigures, ...]:
     of_class = np.searchsorted(_LIMITS, held.around.distance)
     edges = np.concatenate([[0.0], _LIMITS, [np.inf]])
     figures = []
@@ -164,7 +164,16 @@ def _classes(held: HeldOut, found: Calibration) -> tuple[ClassFigures, ...]:
             )
         )
         blocks = len(np.unique(held.block[some]))
-        figures.append(ClassFigures(float(edges[k]), float(edges[k + 1]), int(some.sum()), blocks, before, after))
+        figures.append(
+            ClassFigures(
+                nearest=float(edges[k]),
+                furthest=float(edges[k + 1]),
+                count=int(some.sum()),
+                blocks=blocks,
+                before=before,
+                after=after,
+            )
+        )
     return tuple(figures)
 
 

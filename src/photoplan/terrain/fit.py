@@ -15,7 +15,7 @@ from photoplan.kernels.local_planes import local_scales
 from photoplan.kernels.patch import MOST_MISFIT
 from photoplan.kernels.patch_test import score_models, test_points
 from photoplan.surfaces.units import UnitLayout
-from photoplan.terrain.calibration import NONE, Calibration
+from photoplan.terrain.calibration import NONE, SigmaFactor
 from photoplan.terrain.covariance import LADDER, Covariance, Neighbours, estimate_all, estimate_unit, ladder, near_lines
 from photoplan.terrain.leaves import Leaves, patches_at, quadtree
 from photoplan.terrain.observations import Observations, told_by
@@ -66,7 +66,7 @@ class TerrainFit:
     usual: NDArray[np.float64] = field(default_factory=lambda: np.ones(3))
     """Mean of the squared normalised residuals, how many data it counts as beside those around a place, and the
     distance at which these count a quarter, metres."""
-    calibration: Calibration = NONE
+    calibration: SigmaFactor = NONE
 
     @property
     def squares(self) -> NDArray[np.float64]:

@@ -95,13 +95,13 @@ def flow_of(
     direction = np.empty(shape, np.int8)
     kernels.directions(receiver, direction)
     return Flow(
-        filled,
-        direction,
-        area.reshape(shape),
-        length.reshape(shape) * np.float32(cell),
-        longest.reshape(shape) * np.float32(cell),
-        labels.reshape(shape),
-        leaves.reshape(shape),
+        filled=filled,
+        direction=direction,
+        area=area.reshape(shape),
+        length=length.reshape(shape) * np.float32(cell),
+        longest=longest.reshape(shape) * np.float32(cell),
+        catchment=labels.reshape(shape),
+        leaves=leaves.reshape(shape),
     )
 
 

@@ -67,7 +67,13 @@ def _round(found: TerrainFit, gap: float, meshes: int, rng: np.random.Generator,
     at, predicted = at[known], predicted[known]
     _, number = np.unique(block[at], return_inverse=True)
     error = predicted[:, 0] - seen.xyz[at, 2]
-    return HeldOut(error, predicted[:, 1], noise[known], Surroundings(*predicted[:, 2:].T), number.ravel())
+    return HeldOut(
+        error=error,
+        sigma=predicted[:, 1],
+        noise=noise[known],
+        around=Surroundings(*predicted[:, 2:].T),
+        block=number.ravel(),
+    )
 
 
 def without(found: TerrainFit, held: NDArray[np.bool_], meshes: int) -> TerrainFit:

@@ -75,7 +75,7 @@ def quadtree(xy: NDArray[np.float64], layout: UnitLayout, meshes: int) -> Leaves
     corner = _separate(code & ((1 << (2 * deepest)) - 1)) * (layout.side / 2**deepest)
     x = layout.left + (unit % layout.columns) * layout.side + corner[:, 0] + half
     y = layout.top - (unit // layout.columns) * layout.side - corner[:, 1] - half
-    return Leaves(np.stack([x, y], axis=1), half, unit, count, order, first)
+    return Leaves(middle=np.stack([x, y], axis=1), half=half, unit=unit, count=count, order=order, first=first)
 
 
 def _interleave(cells: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -121,7 +121,13 @@ def monoplot(
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     angle = np.where(np.isnan(XYZ[:, 0]), np.nan, np.arcsin(np.clip(-(normal * direction).sum(axis=1), -1, 1)))
     covariance = _covariance(camera, XYZ, slope, errors)
-    return MonoplotPoints(XYZ, covariance, angle, _holes(camera, xy, XYZ, terrain, height_range[1]), reasons)
+    return MonoplotPoints(
+        XYZ=XYZ,
+        covariance=covariance,
+        angle=angle,
+        hole=_holes(camera, xy, XYZ, terrain, height_range[1]),
+        reasons=reasons,
+    )
 
 
 def _before(

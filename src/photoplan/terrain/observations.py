@@ -22,7 +22,7 @@ _BESIDE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Lines:
+class TerrainLines:
     """Vertices of all lines in one array; the lines that separate their two sides come first."""
 
     xyz: NDArray[np.float64]
@@ -63,7 +63,7 @@ class Observations:
     """Place of each point in its group, shape (points,)."""
     line: NDArray[np.int64]
     """Number of the form line that each datum is of, −1: of none, shape (n,)."""
-    lines: Lines
+    lines: TerrainLines
     barriers: tuple[NDArray[np.float64], NDArray[np.int64]]
     """Vertices (v, 2) and beginnings of breaklines, cut so that no piece turns far."""
     barrier_boxes: NDArray[np.float64]
@@ -197,7 +197,7 @@ def _sigma(own: float | None, of_class: float | None) -> float:
 
 def _line_table(
     lines: list[MeasuredLine], others: list[MeasuredLine], origin: NDArray[np.float64], spacing: float
-) -> Lines:
+) -> TerrainLines:
     ordered = lines + others
     xyz = np.vstack([np.empty((0, 3)), *(line.xyz for line in ordered)]) - origin
     right = np.concatenate([np.empty(0), *(line.xyz[:, 2] if line.right is None else line.right for line in ordered)])
@@ -206,7 +206,9 @@ def _line_table(
     for k in range(len(lines)):
         part = slice(start[k], start[k + 1])
         beside[part] = _left_of(xyz[part, :2]) * spacing * _BESIDE
-    return Lines(xyz, right - origin[2], start, len(lines), tuple(ordered), beside)
+    return TerrainLines(
+        xyz=xyz, right=right - origin[2], start=start, separating=len(lines), lines=tuple(ordered), beside=beside
+    )
 
 
 def _left_of(xy: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -224,7 +226,7 @@ def _left_of(xy: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _line_data(
-    table: Lines, spacing: float, settings: BuildSettings
+    table: TerrainLines, spacing: float, settings: BuildSettings
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Points along lines at most a spacing apart with their known standard deviations, shares and form lines."""
     xyz, given, share, number = [np.empty((0, 3))], [np.empty(0)], [np.empty(0)], [np.empty(0, np.int64)]

@@ -62,7 +62,7 @@ class Domain:
         near = binary_dilation(closed | occupied, np.ones((3, 3), bool))
         if polygon is not None:
             shapely.prepare(polygon)
-        return cls(float(left), float(top), cell, near, polygon)
+        return cls(left=float(left), top=float(top), cell=cell, near=near, polygon=polygon)
 
     def places(self) -> NDArray[np.float64]:
         """Middles of some cells that have a surface, shape (n, 2), evenly taken."""
@@ -217,12 +217,12 @@ def predict_unit(fit: TerrainFit, unit: int, domain: Domain, meshes: int, reach:
     shape = (meshes + 1, meshes + 1)
     origin = fit.seen.origin
     return Unit(
-        left + origin[0],
-        top + origin[1],
-        fit.layout.side,
-        heights.reshape(shape).astype(np.float32),
-        sigmas.reshape(shape).astype(np.float32),
-        float(origin[2]),
+        left=left + origin[0],
+        top=top + origin[1],
+        side=fit.layout.side,
+        heights=heights.reshape(shape).astype(np.float32),
+        sigmas=sigmas.reshape(shape).astype(np.float32),
+        datum=float(origin[2]),
     )
 
 
@@ -280,13 +280,13 @@ def _elements(fit: TerrainFit, left: NDArray[np.float64], right: NDArray[np.floa
             columns = _to_the_end(columns, _END * fit.seen.spacing)
         found.append(
             LineElement(
-                line.name,
-                line.kind,
-                line.code,
-                columns[:, :3].copy(),
-                columns[:, 3].copy() if wall else None,
-                columns[:, 4].copy(),
-                np.zeros(len(columns), bool),
+                name=line.name,
+                kind=line.kind,
+                code=line.code,
+                xyz=columns[:, :3].copy(),
+                right=columns[:, 3].copy() if wall else None,
+                sigmas=columns[:, 4].copy(),
+                on_grid=np.zeros(len(columns), bool),
             )
         )
     return found

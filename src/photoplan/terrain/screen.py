@@ -133,7 +133,7 @@ def screen(seen: Observations, around: Neighbourhoods, limit: float) -> Screened
     clusters, suspects, size = _clusters(seen, around.points, np.nan_to_num(slopes))
     single = _singles(seen, around, planes, slopes, used, limit)
     size[single] = np.maximum(size[single], np.abs(planes[single, 0]))
-    return Screened(single, clusters, suspects, size, slopes)
+    return Screened(single=single, clusters=clusters, suspects=suspects, size=size, slopes=slopes)
 
 
 def finest(seen: Observations) -> NDArray[np.float64]:

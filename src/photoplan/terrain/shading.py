@@ -27,7 +27,7 @@ FAN = (-90.0, -45.0, 0.0, 45.0)
 
 
 @dataclass(frozen=True)
-class Light:
+class Lighting:
     """Where light comes from, and how much relief is made of the terrain."""
 
     azimuth: float = 315.0
@@ -81,8 +81,22 @@ def surface_slopes(surface: Surface, grid: MapGrid, window: Window) -> Slopes:
     In the outer half cell of a raster, where its heights go on level, the slope is that between the outer two posts.
     """
     half = grid.resolution / 2
-    columns = MapGrid(grid.left - half, grid.top, grid.resolution, grid.width + 1, grid.height, grid.crs)
-    rows = MapGrid(grid.left, grid.top + half, grid.resolution, grid.width, grid.height + 1, grid.crs)
+    columns = MapGrid(
+        left=grid.left - half,
+        top=grid.top,
+        resolution=grid.resolution,
+        width=grid.width + 1,
+        height=grid.height,
+        crs=grid.crs,
+    )
+    rows = MapGrid(
+        left=grid.left,
+        top=grid.top + half,
+        resolution=grid.resolution,
+        width=grid.width,
+        height=grid.height + 1,
+        crs=grid.crs,
+    )
     middle = surface.relief(MapTarget(grid), window)
     gradient = np.full((2, *middle.shape), np.nan, np.float32)
     if np.isfinite(middle).any():
@@ -96,7 +110,7 @@ def surface_slopes(surface: Surface, grid: MapGrid, window: Window) -> Slopes:
     return Slopes(middle, gradient, grid.resolution)
 
 
-def hillshade(slopes: Slopes, light: Light) -> NDArray[np.float32]:
+def hillshade(slopes: Slopes, light: Lighting) -> NDArray[np.float32]:
     """Light on a matt surface (Lambert), shape (h, w), 0 to 1; NaN = no surface."""
     result = np.empty(slopes.heights.shape, np.float32)
     illumination(slopes.gradient, light.exaggeration, light.directions, light.multidirectional, result)

@@ -200,7 +200,9 @@ def cover(polygon: Any, grid: MapGrid, window: Window) -> CoveredCells | None:
     if not (whole.any() or keep.any()):
         return None
     centroids = shapely.get_coordinates(shapely.centroid(parts[keep]))
-    return CoveredCells(whole, cells[keep, 0], cells[keep, 1], areas[keep], centroids)
+    return CoveredCells(
+        whole=whole, rows=cells[keep, 0], columns=cells[keep, 1], areas=areas[keep], centroids=centroids
+    )
 
 
 def _boxes(grid: MapGrid, window: Window, blocks: NDArray[np.int64]) -> NDArray[Any]:

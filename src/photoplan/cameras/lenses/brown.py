@@ -87,7 +87,7 @@ class Brown:
     ) -> Brown:
         """From coefficients of the same formula in a system with y down; only p2 and b2 change their sign."""
         k1, k2, k3, k4 = (*k, 0.0, 0.0, 0.0, 0.0)[:4]
-        return cls(k1, k2, k3, p[0], -p[1], b[0], -b[1], k4)
+        return cls(k1=k1, k2=k2, k3=k3, p1=p[0], p2=-p[1], b1=b[0], b2=-b[1], k4=k4)
 
     def distort(self, t: ArrayLike) -> NDArray[np.float64]:
         """Ideal to real tangent coordinates, shapes (..., 2)."""

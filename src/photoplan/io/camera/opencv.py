@@ -63,7 +63,11 @@ def read(path: Path) -> dict[str, CameraEntry]:
     fisheye = _is_fisheye(values, where)
     k, p = _coefficients(d, fisheye, where)
     focal, point = (K[0] / K[8], K[4] / K[8]), (K[2] / K[8], K[5] / K[8])
-    return {name: frame_camera(OpenCVForm((int(size[0]), int(size[1])), focal, point, fisheye, k, p), where)}
+    return {
+        name: frame_camera(
+            OpenCVForm(size=(int(size[0]), int(size[1])), focal=focal, point=point, fisheye=fisheye, k=k, p=p), where
+        )
+    }
 
 
 def _contents(path: Path) -> Any:
@@ -186,4 +190,12 @@ def _sniff(path: Path, head: str) -> bool:
     return known and re.search(r"camera_?matrix", head, re.I) is not None
 
 
-FORMAT = OrientationFormat("opencv", "OpenCV calibration", _sniff, _refuse, _render_block, _losses, suffix=".yml")
+FORMAT = OrientationFormat(
+    name="opencv",
+    title="OpenCV calibration",
+    sniff=_sniff,
+    read=_refuse,
+    render=_render_block,
+    losses=_losses,
+    suffix=".yml",
+)

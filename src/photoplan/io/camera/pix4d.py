@@ -104,7 +104,9 @@ def _camera(section: str, size: tuple[int, int], where: str) -> CameraEntry:
         focal = (focal[0], focal[0])
     point = (v["Px"] * per_mm[0] - 0.5, v["Py"] * per_mm[1] - 0.5)
     k = (v["K1"], v["K2"], v["K3"], 0.0, 0.0, 0.0)
-    return frame_camera(OpenCVForm(size, focal, point, False, k, (v["T1"], v["T2"])), where)
+    return frame_camera(
+        OpenCVForm(size=size, focal=focal, point=point, fisheye=False, k=k, p=(v["T1"], v["T2"])), where
+    )
 
 
 def render(cameras: dict[str, CameraEntry], stem: Path, pixel_mm: float = 0.001) -> dict[Path, str]:

@@ -307,4 +307,12 @@ def _mesh(path: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -
     corners = vertices[faces]
     if not np.isfinite(corners).all():
         raise InputError(f"{path}: vertices that are no numbers; get a fresh copy")
-    return ObjectFile(corners, np.zeros(len(corners), np.int32), (path.stem,), (None,), None, None, mesh=True)
+    return ObjectFile(
+        corners=corners,
+        owner=np.zeros(len(corners), np.int32),
+        names=(path.stem,),
+        roles=(None,),
+        crs=None,
+        height_system=None,
+        mesh=True,
+    )

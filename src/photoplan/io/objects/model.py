@@ -67,4 +67,12 @@ def from_polygons(
     horizontal, heights = (None, None) if crs is None else split_compound(crs)
     owner = np.array(objects, np.int32)[polygon]
     said = tuple(roles or [None] * len(names))
-    return ObjectFile(corners, owner, tuple(names), said, horizontal, heights, faults=faults)
+    return ObjectFile(
+        corners=corners,
+        owner=owner,
+        names=tuple(names),
+        roles=said,
+        crs=horizontal,
+        height_system=heights,
+        faults=faults,
+    )

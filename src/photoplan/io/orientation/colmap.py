@@ -98,7 +98,9 @@ def _camera(model: str, words: list[str], where: str) -> CameraEntry:
     fisheye = model.endswith("FISHEYE")
     k = tuple(v.get(f"k{i + 1}", 0.0) for i in range(4 if fisheye else 6))
     p = (v.get("p1", 0.0), v.get("p2", 0.0))
-    form = OpenCVForm((int(width), int(height)), focal, (v["cx"] - 0.5, v["cy"] - 0.5), fisheye, k, p)
+    form = OpenCVForm(
+        size=(int(width), int(height)), focal=focal, point=(v["cx"] - 0.5, v["cy"] - 0.5), fisheye=fisheye, k=k, p=p
+    )
     return frame_camera(form, where)
 
 
@@ -184,4 +186,6 @@ def _sniff(path: Path, head: str) -> bool:
     return "IMAGE_ID, QW, QX, QY, QZ" in head or "CAMERA_ID, MODEL, WIDTH, HEIGHT" in head
 
 
-FORMAT = OrientationFormat("colmap", "COLMAP model as text", _sniff, read, _render, _losses, suffix="")
+FORMAT = OrientationFormat(
+    name="colmap", title="COLMAP model as text", sniff=_sniff, read=read, render=_render, losses=_losses, suffix=""
+)

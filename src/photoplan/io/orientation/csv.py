@@ -87,7 +87,13 @@ def _image(table: Table, k: int, values: list[float], form: TableFormat) -> Orie
     value = dict(zip(NEEDED[1:], values))
     a, b, c = (value[ANGLE_NAMES[letter]] for letter in form.rotation)
     camera = row[roles["camera"]] if "camera" in roles else None
-    return OrientedImage(name, (value["x"], value["y"], value["z"]), (a, b, c), camera or None, table.lines[k])
+    return OrientedImage(
+        name=name,
+        center=(value["x"], value["y"], value["z"]),
+        angles=(a, b, c),
+        camera=camera or None,
+        line=table.lines[k],
+    )
 
 
 def _delimiter_safe(name: str) -> str:

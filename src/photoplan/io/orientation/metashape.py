@@ -224,7 +224,9 @@ def _sensor(sensor: Element | None, key: str, path: Path) -> tuple[str, CameraEn
     finite([width, height], where, 2)
     c = {name: v.get(name, 0.0) for name in _COEFFICIENTS}
     k, p, b = (c["k1"], c["k2"], c["k3"], c["k4"]), (c["p1"], c["p2"]), (c["b1"], c["b2"])
-    form = AgisoftForm((width, height), c["f"], (c["cx"], c["cy"]), k, p, b, kind == "fisheye")
+    form = AgisoftForm(
+        size=(width, height), f=c["f"], offset=(c["cx"], c["cy"]), k=k, p=p, b=b, fisheye=kind == "fisheye"
+    )
     return label, frame_camera(form, where)
 
 
@@ -373,4 +375,12 @@ def _text(values: ArrayLike) -> str:
     return " ".join(repr(v) for v in np.asarray(values, float).ravel().tolist())
 
 
-FORMAT = OrientationFormat("metashape", "Metashape cameras.xml", _sniff, read, render, losses, suffix=".xml")
+FORMAT = OrientationFormat(
+    name="metashape",
+    title="Metashape cameras.xml",
+    sniff=_sniff,
+    read=read,
+    render=render,
+    losses=losses,
+    suffix=".xml",
+)

@@ -138,4 +138,12 @@ def _sniff(path: Path, head: str) -> bool:
     return '"FeatureCollection"' in head and '"translation"' in head and '"rotation"' in head
 
 
-FORMAT = OrientationFormat("odm", "OpenDroneMap shots.geojson", _sniff, read, _render, _losses, suffix=".geojson")
+FORMAT = OrientationFormat(
+    name="odm",
+    title="OpenDroneMap shots.geojson",
+    sniff=_sniff,
+    read=read,
+    render=_render,
+    losses=_losses,
+    suffix=".geojson",
+)

@@ -93,7 +93,7 @@ def _image(line: str, number: int, path: Path) -> OrientedImage:
     X, Y, Z, omega, phi, kappa, *matrix = numbers(fields[1:], where, f"image {fields[0]!r}: column", len(fields) - 1)
     if matrix:
         _check_matrix(np.array(matrix).reshape(3, 3), rotation_opk(*np.radians([omega, phi, kappa])), fields[0], where)
-    return OrientedImage(fields[0], (X, Y, Z), (omega, phi, kappa), None, number)
+    return OrientedImage(name=fields[0], center=(X, Y, Z), angles=(omega, phi, kappa), camera=None, line=number)
 
 
 def _check_matrix(given: NDArray[np.float64], R: NDArray[np.float64], name: str, where: str) -> None:
@@ -128,4 +128,6 @@ def _sniff(path: Path, head: str) -> bool:
     return any(_HEADER.match(line.strip()) for line in head.split("\n")[:10])
 
 
-FORMAT = OrientationFormat("opk", "Metashape Omega Phi Kappa text", _sniff, read, _render, _losses)
+FORMAT = OrientationFormat(
+    name="opk", title="Metashape Omega Phi Kappa text", sniff=_sniff, read=read, render=_render, losses=_losses
+)

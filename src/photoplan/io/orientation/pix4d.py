@@ -52,7 +52,10 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
         )
     images = [_external(line, number, path) for number, line in enumerate(lines, 1) if number > 1 and line.strip()]
     cameras, of_image, notes = _cameras_beside(path, [i.name for i in images])
-    images = [OrientedImage(i.name, i.center, i.angles, of_image.get(i.name), i.line) for i in images]
+    images = [
+        OrientedImage(name=i.name, center=i.center, angles=i.angles, camera=of_image.get(i.name), line=i.line)
+        for i in images
+    ]
     return _block(path, images, cameras, notes)
 
 
@@ -91,7 +94,9 @@ def _external(line: str, number: int, path: Path) -> OrientedImage:
     # A name may hold spaces: the numbers are counted from the end.
     words = line.rsplit(maxsplit=6)
     X, Y, Z, *angles = numbers(words[1:], where, f"image {words[0]!r}: X, Y, Z, omega, phi, kappa", 6)
-    return OrientedImage(words[0].strip(), (X, Y, Z), (angles[0], angles[1], angles[2]), None, number)
+    return OrientedImage(
+        name=words[0].strip(), center=(X, Y, Z), angles=(angles[0], angles[1], angles[2]), camera=None, line=number
+    )
 
 
 def _cameras_beside(path: Path, names: list[str]) -> tuple[dict[str, CameraEntry], dict[str, str | None], list[str]]:
@@ -152,12 +157,12 @@ def _ten_lines(
     if K[0, 1] != 0 or K[1, 0] != 0:
         raise InputError(f"{path}:{rows[1][0]}: image {words[0]!r}: a sheared camera matrix is not supported")
     form = OpenCVForm(
-        (int(words[1]), int(words[2])),
-        (float(K[0, 0]), float(K[1, 1])),
-        (float(K[0, 2]) - 0.5, float(K[1, 2]) - 0.5),
-        False,
-        (*radial, 0.0, 0.0, 0.0),
-        (tangential[0], tangential[1]),
+        size=(int(words[1]), int(words[2])),
+        focal=(float(K[0, 0]), float(K[1, 1])),
+        point=(float(K[0, 2]) - 0.5, float(K[1, 2]) - 0.5),
+        fisheye=False,
+        k=(*radial, 0.0, 0.0, 0.0),
+        p=(tangential[0], tangential[1]),
     )
     return words[0], frame_camera(form, f"{where}: image {words[0]!r}"), t, R
 
@@ -222,4 +227,6 @@ def _sniff(path: Path, head: str) -> bool:
     return bool(_EXTERNAL.match(first) or _FULL.match(first))
 
 
-FORMAT = OrientationFormat("pix4d", "Pix4D calibrated camera parameters", _sniff, read, _render, _losses)
+FORMAT = OrientationFormat(
+    name="pix4d", title="Pix4D calibrated camera parameters", sniff=_sniff, read=read, render=_render, losses=_losses
+)

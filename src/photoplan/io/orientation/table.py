@@ -175,4 +175,4 @@ def posed(
     """An image whose rotation is given by a matrix (3, 3), with ω, φ, κ in degrees; `center` is X, Y, Z, metres."""
     X, Y, Z = np.asarray(center, float).tolist()
     omega, phi, kappa = degrees_of(R_ground_camera[None])[0].tolist()
-    return OrientedImage(name, (X, Y, Z), (omega, phi, kappa), camera, line)
+    return OrientedImage(name=name, center=(X, Y, Z), angles=(omega, phi, kappa), camera=camera, line=line)

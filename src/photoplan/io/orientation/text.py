@@ -113,9 +113,13 @@ def angle_block(
         X, Y, Z, phi, omega, kappa = numbers(words, line.where, f"image {name!r}: X, Y, Z, phi, omega, kappa", 6)
         named = {"p": phi, "o": omega, "k": kappa}
         a, b, c = (named[letter] for letter in rotation)
-        images.append(OrientedImage(name, (X, Y, Z), (a, b, c), None, line.line))
+        images.append(OrientedImage(name=name, center=(X, Y, Z), angles=(a, b, c), camera=None, line=line.line))
     note = f"{path.name}: angles read as {unit}, rotation {rotation}, {DIRECTIONS[direction]}"
-    return OrientationBlock(OrientationTable(path, tuple(images), unit, rotation, direction, notes=(note,)))
+    return OrientationBlock(
+        OrientationTable(
+            file=path, images=tuple(images), angle_unit=unit, rotation=rotation, direction=direction, notes=(note,)
+        )
+    )
 
 
 def angle_lines(block: OrientationBlock, path: Path, width: int) -> list[str]:

@@ -69,7 +69,11 @@ def read(path: Path, form: TableFormat) -> OrientationBlock:
     notes: list[str] = []
     for i in file.images:
         if i.center is not None and i.angles is not None:
-            images.append(OrientedImage(i.name, i.center, i.angles, i.camera, None, i.fiducials))
+            images.append(
+                OrientedImage(
+                    name=i.name, center=i.center, angles=i.angles, camera=i.camera, line=None, fiducials=i.fiducials
+                )
+            )
         elif i.center is not None or i.angles is not None:
             raise InputError(f"{path}: image {i.name!r}: center and angles go together; give both or none")
     if not images:

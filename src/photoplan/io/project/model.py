@@ -28,7 +28,7 @@ from photoplan.io.project.kinds import AnyImage
 from photoplan.io.project.posed import Image
 
 
-class Terrain(Entry):
+class StatedTerrain(Entry):
     """Where the ground is: a raster of heights, a terrain model, or one height everywhere."""
 
     file: InputName | None = None
@@ -167,7 +167,7 @@ class Project(Entry):
 
     format: Literal[1] = 1
     crs: Annotated[str, Field(min_length=1, max_length=20_000)]
-    terrain: Terrain | None = None
+    terrain: StatedTerrain | None = None
     objects: tuple[Objects, ...] = ()
     orientation: Orientation = Orientation()
     observations: ObservationsEntry = ObservationsEntry()
@@ -216,7 +216,7 @@ class Project(Entry):
                 raise ValueError(f"{where}: {odd}")
 
     @property
-    def ground(self) -> Terrain:
+    def ground(self) -> StatedTerrain:
         """The [terrain] entry.
 
         Raises

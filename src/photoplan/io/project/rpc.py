@@ -43,4 +43,4 @@ class RpcImage(ImageEntry):
         if self.shift is None and self.drift is None:
             return None
         (x, y), (xx, xy, yx, yy) = self.shift or (0.0, 0.0), self.drift or (0.0, 0.0, 0.0, 0.0)
-        return Affine2D(1.0 + xx, xy, x, yx, 1.0 + yy, y)
+        return Affine2D(a1=1.0 + xx, a2=xy, a3=x, a4=yx, a5=1.0 + yy, a6=y)

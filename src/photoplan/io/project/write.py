@@ -18,7 +18,7 @@ from photoplan.io.project.model import (
     Orientation,
     OrthoDefaults,
     Project,
-    Terrain,
+    StatedTerrain,
 )
 
 
@@ -81,7 +81,7 @@ def _entries(rows: Iterable[tuple[str, Any, str]]) -> list[str]:
     return lines
 
 
-def _terrain(terrain: Terrain) -> list[str]:
+def _terrain(terrain: StatedTerrain) -> list[str]:
     return [
         "[terrain]",
         *_entries(

@@ -43,7 +43,7 @@ class SeriesGroup:
 
 
 @dataclass(frozen=True)
-class Frame:
+class SeriesFrame:
     """One image of the series and its conditions; None: not stated."""
 
     file: Path
@@ -68,7 +68,7 @@ class Series:
 
     path: Path
     camera: CameraFacts
-    frames: tuple[Frame, ...]
+    frames: tuple[SeriesFrame, ...]
     reduced: tuple[ReducedPoint, ...]
     size: tuple[int, int] | None
     """Width and height of all frames; None: there are reduced figures only."""
@@ -81,7 +81,7 @@ class Series:
     inputs: tuple[Path, ...]
     """All files that were read or will be."""
 
-    def of(self, *kinds: str) -> tuple[Frame, ...]:
+    def of(self, *kinds: str) -> tuple[SeriesFrame, ...]:
         """Frames of these kinds, in the order of the file."""
         return tuple(frame for frame in self.frames if frame.kind in kinds)
 
@@ -100,7 +100,7 @@ def read_series(path: Path) -> Series:
     """
     entries = read_entries(path, SeriesEntry, _MAX_BYTES)
     folder = path.absolute().parent
-    frames: list[Frame] = []
+    frames: list[SeriesFrame] = []
     inputs: list[Path] = [path]
     facts = _Facts()
     bits = entries.camera.bits
@@ -116,7 +116,9 @@ def read_series(path: Path) -> Series:
         for file, values in files.items():
             facts = facts.join(file, where)
             assert facts.size is not None
-            group = SeriesGroup(index, entry, _window(entry, facts.size, where), mask, where, most)
+            group = SeriesGroup(
+                index=index, entry=entry, window=_window(entry, facts.size, where), mask=mask, label=where, most_dn=most
+            )
             frames.append(_frame(file, group, values, _row_of(conditions, file, table), entries.camera))
         if mask is not None:
             _check_mask(mask, facts, where)
@@ -216,7 +218,7 @@ def _row_of(conditions: Mapping[str, Values], file: Path, table: Path | None) ->
     return conditions[file.name]
 
 
-def _refuse_twice(path: Path, frames: list[Frame]) -> None:
+def _refuse_twice(path: Path, frames: list[SeriesFrame]) -> None:
     seen: dict[tuple[Path, str], int] = {}
     for frame in frames:
         key = (frame.file, frame.kind)
@@ -229,7 +231,7 @@ def _refuse_twice(path: Path, frames: list[Frame]) -> None:
             seen[key] = frame.group.index
 
 
-def _frame(file: Path, group: SeriesGroup, named: Values, row: Values, camera: CameraFacts) -> Frame:
+def _frame(file: Path, group: SeriesGroup, named: Values, row: Values, camera: CameraFacts) -> SeriesFrame:
     """A frame with its conditions: the table counts before the name, the name before the entry."""
     from_entry = {k: v for k in CONDITIONS if (v := getattr(group.entry, k)) is not None}
     values: dict[str, float | str] = {**group.entry.values, **from_entry, **named, **row}
@@ -245,7 +247,7 @@ def _frame(file: Path, group: SeriesGroup, named: Values, row: Values, camera: C
         photons = _photons(known, camera)
         if photons is not None:
             known["photons_per_pixel"] = photons
-    return Frame(file, group, group.entry.kind, **known, values=values)
+    return SeriesFrame(file, group, group.entry.kind, **known, values=values)
 
 
 _NOT_NEGATIVE = ("exposure_ms", "photons_per_pixel", "irradiance_uw_cm2", "density", "wavelength_nm")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
-from photoplan.io.series.file import Frame, Series, SeriesGroup
+from photoplan.io.series.file import Series, SeriesFrame, SeriesGroup
 
 #: Pixels of a frame that are held in memory at once.
 MAX_PIXELS = 400_000_000
@@ -62,11 +62,11 @@ def series_planes(series: Series) -> tuple[Plane, ...]:
     for k, colour in enumerate(pattern):
         row, col = divmod(k, 2)
         name = colour if colour != "G" else "G1" if "R" in pattern[2 * row : 2 * row + 2] else "G2"
-        planes.append(Plane(name, 0, row, col, 2))
+        planes.append(Plane(name=name, band=0, row=row, col=col, step=2))
     return tuple(sorted(planes, key=lambda plane: ("R", "G1", "G2", "B").index(plane.name)))
 
 
-def frame_pixels(frame: Frame, window: Window | None = None) -> NDArray[Any]:
+def frame_pixels(frame: SeriesFrame, window: Window | None = None) -> NDArray[Any]:
     """Pixels of a frame's window, all bands, shape (bands, h, w), in the type of the file.
 
     Raises
@@ -96,7 +96,7 @@ def frame_pixels(frame: Frame, window: Window | None = None) -> NDArray[Any]:
     return pixels
 
 
-def plane_pixels(frame: Frame, plane: Plane, window: Window | None = None) -> NDArray[Any]:
+def plane_pixels(frame: SeriesFrame, plane: Plane, window: Window | None = None) -> NDArray[Any]:
     """Pixels of one plane inside the frame's window, shape (h, w), in the type of the file."""
     window = frame.group.window if window is None else window
     return split(frame_pixels(frame, window), plane, window)
@@ -143,13 +143,13 @@ def grey_step(series: Series) -> float:
     return min(steps, default=1.0)
 
 
-def _middle(frame: Frame) -> Window:
+def _middle(frame: SeriesFrame) -> Window:
     window = frame.group.window
     width, height = min(_SIDE, window.width), min(_SIDE, window.height)
     return Window(window.col + (window.width - width) // 2, window.row + (window.height - height) // 2, width, height)
 
 
-def _step(frame: Frame) -> float | None:
+def _step(frame: SeriesFrame) -> float | None:
     """Smallest distance of two values; None: there are too few different ones, or the frame cannot be used."""
     try:
         pixels = frame_pixels(frame, _middle(frame))

@@ -175,13 +175,13 @@ def _fast(layout: TableLayout, lines: list[str], records: NDArray[np.int64], dec
             return None  # the text may be cut off or in quotes, or its point may have been a comma
         found[role] = [v.strip() for v in values]
     return PointBlock(
-        xyz,
-        records,
-        found["code"],
-        found["line"],
-        found["name"],
-        None if sigma is None else np.array(sigma),
-        None if right is None else np.array(right),
+        xyz=xyz,
+        records=records,
+        code=found["code"],
+        line=found["line"],
+        name=found["name"],
+        sigma=None if sigma is None else np.array(sigma),
+        right=None if right is None else np.array(right),
     )
 
 

@@ -189,15 +189,15 @@ def _merged(parts: Sequence[MeasuredTerrain]) -> MeasuredTerrain:
     if not points and not lines and tin is None:
         raise InputError(f"{', '.join(str(p.files[0]) for p in parts)}: no point and no line is left")
     return MeasuredTerrain(
-        points,
-        lines,
-        stating[0].crs if stating else None,
-        _heights(parts, notes),
-        tin,
-        tuple(f for p in parts for f in p.files),
-        tuple(notes),
-        frozenset().union(*(p.codes for p in parts)),
-        tuple(f for p in parts for f in p.fields),
+        points=points,
+        lines=lines,
+        crs=stating[0].crs if stating else None,
+        height_system=_heights(parts, notes),
+        tin=tin,
+        files=tuple(f for p in parts for f in p.files),
+        notes=tuple(notes),
+        codes=frozenset().union(*(p.codes for p in parts)),
+        fields=tuple(f for p in parts for f in p.fields),
     )
 
 

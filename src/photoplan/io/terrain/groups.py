@@ -54,11 +54,11 @@ class PointColumns:
     def take(self, which: NDArray[Any]) -> PointColumns:
         """The chosen points."""
         return PointColumns(
-            self.xyz[which],
-            self.records[which],
-            None if self.codes is None else self.codes[which],
-            None if self.sigma is None else self.sigma[which],
-            None if self.names is None else self.names[which],
+            xyz=self.xyz[which],
+            records=self.records[which],
+            codes=None if self.codes is None else self.codes[which],
+            sigma=None if self.sigma is None else self.sigma[which],
+            names=None if self.names is None else self.names[which],
         )
 
 
@@ -125,7 +125,7 @@ def make_groups(
         part = columns if len(used) == 1 else columns.take(np.isin(numbers, members))
         name = f"{path.name} {code}".strip()
         groups += [
-            PointGroup(name, kind, p.xyz, p.records, s, p.names)  # type: ignore[arg-type]
+            PointGroup(name=name, kind=kind, xyz=p.xyz, records=p.records, sigma=s, names=p.names)  # type: ignore[arg-type]
             for s, p in _by_sigma(part, sigma)
             if len(p.xyz)
         ]

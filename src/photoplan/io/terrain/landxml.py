@@ -227,7 +227,9 @@ class _Reader:
         elif cls.kind in LINE_KINDS:
             name = self._name(element, surface)
             line_kind: Any = cls.kind
-            surface.lines.append(MeasuredLine(name, line_kind, xyz, None, cls.sigma, code))
+            surface.lines.append(
+                MeasuredLine(name=name, kind=line_kind, xyz=xyz, right=None, sigma=cls.sigma, code=code)
+            )
         else:
             surface.points.append((code, xyz))
 
@@ -266,7 +268,17 @@ class _Reader:
             )
         fields = (f"{self.path.name}: surface {', '.join(s.name for s in surfaces)}",)
         tin, notes = _tin(surfaces), tuple(self.notes)
-        return MeasuredTerrain(tuple(groups), lines, crs, heights, tin, (self.path,), notes, frozenset(held), fields)
+        return MeasuredTerrain(
+            points=tuple(groups),
+            lines=lines,
+            crs=crs,
+            height_system=heights,
+            tin=tin,
+            files=(self.path,),
+            notes=notes,
+            codes=frozenset(held),
+            fields=fields,
+        )
 
     def _chosen(self) -> list[_LandXmlSurface]:
         names = [s.name for s in self.surfaces]

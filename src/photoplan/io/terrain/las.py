@@ -82,7 +82,16 @@ def _decoded(path: Path, options: ReadOptions, head: _Header) -> MeasuredTerrain
             raise
         raise _unreadable(path, head, " ".join(str(error).split())[:200] or type(error).__name__) from None
     group = PointGroup(path.name, "mass", xyz, records)
-    return MeasuredTerrain((group,), (), crs, heights, None, (path,), tuple(notes), fields=(f"{path.name}: LAS",))
+    return MeasuredTerrain(
+        points=(group,),
+        lines=(),
+        crs=crs,
+        height_system=heights,
+        tin=None,
+        files=(path,),
+        notes=tuple(notes),
+        fields=(f"{path.name}: LAS",),
+    )
 
 
 def _unreadable(path: Path, head: _Header, cause: str) -> InputError:

@@ -78,7 +78,15 @@ def unit_of(buffer: NDArray[np.uint8], layout: UnitLayout, column: int, row: int
         faces = MeshFaces(vertices.reshape(-1, 3), face_sigmas, corners.reshape(-1, 3), start)
     left, top = layout.corner(column, row)
     side = (n + 1, n + 1)
-    return Unit(left, top, layout.side, heights.reshape(side), sigmas.reshape(side), shape.datum, faces)
+    return Unit(
+        left=left,
+        top=top,
+        side=layout.side,
+        heights=heights.reshape(side),
+        sigmas=sigmas.reshape(side),
+        datum=shape.datum,
+        faces=faces,
+    )
 
 
 def inflate(packed: bytes, promised: int, where: str) -> NDArray[np.uint8]:
@@ -177,7 +185,15 @@ def unpack_line(buffer: NDArray[np.uint8], name: str, code: str, where: str) -> 
     if kind >= len(LINE_KINDS) or not np.isfinite(xyz[:, :2]).all():
         raise InputError(f"{where}: kind {kind}, or a coordinate that is not finite")
     right = parts[1] if two_sided else None
-    return LineElement(name, LINE_KINDS[kind], code, xyz, right, parts[-2], parts[-1].astype(bool))
+    return LineElement(
+        name=name,
+        kind=LINE_KINDS[kind],
+        code=code,
+        xyz=xyz,
+        right=right,
+        sigmas=parts[-2],
+        on_grid=parts[-1].astype(bool),
+    )
 
 
 def _sections(head: bytes, where: str) -> tuple[Sections, int]:
@@ -194,7 +210,7 @@ def _shape(head: bytes, where: str) -> _Shape:
     _, meshes, vertices, triangles, faces, datum = _UNIT.unpack(head)
     if not 1 <= meshes <= MOST_MESHES:
         raise InputError(f"{where}: {meshes} meshes along a side; 1 to {MOST_MESHES} are allowed")
-    return _Shape(meshes, vertices, triangles, bool(faces), datum)
+    return _Shape(meshes=meshes, vertices=vertices, triangles=triangles, faces=bool(faces), datum=datum)
 
 
 def _views(buffer: NDArray[np.uint8], at: int, sections: Sections) -> list[NDArray[Any]]:

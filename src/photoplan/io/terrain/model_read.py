@@ -203,7 +203,16 @@ class ModelReader:
             x, y, z, residual, redundancy, normalised = (
                 _number(value, False, f"{self.path}: {layer}") for value in values
             )
-            found.append(GrossError(str(name), str(kind), (x, y, z), residual, redundancy, normalised))
+            found.append(
+                GrossError(
+                    name=str(name),
+                    kind=str(kind),
+                    xyz=(x, y, z),
+                    residual=residual,
+                    redundancy=redundancy,
+                    normalised=normalised,
+                )
+            )
         return found
 
     def domain(self) -> Any | None:

@@ -134,7 +134,7 @@ def header_from_json(text: str, path: Path) -> ModelHeader:
         content = json.loads(text)
         place = content["layout"]
         left, top, side = (float(place[name]) for name in ("left", "top", "side"))
-        layout = UnitLayout(left, top, side, int(place["columns"]), int(place["rows"]))
+        layout = UnitLayout(left=left, top=top, side=side, columns=int(place["columns"]), rows=int(place["rows"]))
         check_layout(layout, str(path))
         header = ModelHeader(
             crs=content["crs"],

@@ -261,7 +261,7 @@ class ModelWriter:
         if not content:
             return None
         size, low, high, meshes = _STORED.unpack_from(content)
-        return _Stored(size, low, high, meshes, content[_STORED.size :])
+        return _Stored(size=size, low=low, high=high, meshes=meshes, packed=content[_STORED.size :])
 
     def _check(self, part: Path, identity: str) -> None:
         """Open the assembled file and compare it with the log at some units."""

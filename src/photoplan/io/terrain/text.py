@@ -131,7 +131,7 @@ def _terrain(
     xyz, records, names = whole(out.xyz), whole(out.records), whole(out.names)
     sigma, right = whole(out.sigma), whole(out.right)
     number, line = whole(out.codes), whole(out.lines)
-    columns = PointColumns(xyz, records, number, sigma, names)
+    columns = PointColumns(xyz=xyz, records=records, codes=number, sigma=sigma, names=names)
     if number is None and line is None:
         on_line = np.zeros(len(xyz), bool)
     else:
@@ -156,7 +156,7 @@ def _terrain(
         number = np.zeros(len(xyz), np.int32) if number is None else number
         number[alone] = len(texts) - 1
         on_line[alone] = False
-    columns = PointColumns(xyz, records, number, sigma, names)
+    columns = PointColumns(xyz=xyz, records=records, codes=number, sigma=sigma, names=names)
     if on_line.any():
         columns = columns.take(~on_line)
     groups = make_groups(path, columns, texts, kinds) if len(columns.xyz) else []
@@ -207,12 +207,12 @@ def _make_lines(
         name = f"{path.name}:{columns.records[part[0]]}" + "".join(f" {t}" for t in (text, own) if t)
         lines.append(
             MeasuredLine(
-                name,
-                kind,
-                columns.xyz[part],
-                _right_heights(right, columns.xyz, part, kind),
-                _line_sigma(columns.sigma, part, cls.sigma),
-                text,
+                name=name,
+                kind=kind,
+                xyz=columns.xyz[part],
+                right=_right_heights(right, columns.xyz, part, kind),
+                sigma=_line_sigma(columns.sigma, part, cls.sigma),
+                code=text,
             )
         )
     return lines, np.array(alone, np.int64)

@@ -87,7 +87,15 @@ def read(path: Path, options: ReadOptions) -> MeasuredTerrain:
             codes |= {layer.name, *layer.codes}
             fields.append(f"{path.name}: layer {layer.name} with {', '.join(layer.fields) or 'no attributes'}")
     return MeasuredTerrain(
-        tuple(points), tuple(lines), crs, heights, None, (path,), tuple(notes), frozenset(codes), tuple(fields)
+        points=tuple(points),
+        lines=tuple(lines),
+        crs=crs,
+        height_system=heights,
+        tin=None,
+        files=(path,),
+        notes=tuple(notes),
+        codes=frozenset(codes),
+        fields=tuple(fields),
     )
 
 
@@ -183,14 +191,14 @@ def _layer(
     names = next((fields[n] for n in _NAMES if n in fields), None)
     return (
         _Layer(
-            name,
-            parts,
-            row + 1,
-            codes,
-            None if "sigma" not in fields else _sigma(path, fields["sigma"][row]),
-            None if names is None else np.array([_text(v) for v in names[row]]),
-            tuple(str(f) for f in meta["fields"]),
-            fields["z_right"][row] if "z_right" in fields else None,
+            name=name,
+            geometry=parts,
+            feature=row + 1,
+            codes=codes,
+            sigma=None if "sigma" not in fields else _sigma(path, fields["sigma"][row]),
+            names=None if names is None else np.array([_text(v) for v in names[row]]),
+            fields=tuple(str(f) for f in meta["fields"]),
+            right=fields["z_right"][row] if "z_right" in fields else None,
         ),
         meta["crs"],
     )
@@ -264,11 +272,11 @@ def _features(
     if len(flat):
         raise InputError(_no_height(path, layer, int(rows[flat[0]]), len(flat)))
     columns = PointColumns(
-        xyz,
-        layer.feature[rows],
-        number[rows],
-        None if layer.sigma is None else layer.sigma[rows],
-        None if layer.names is None else layer.names[rows],
+        xyz=xyz,
+        records=layer.feature[rows],
+        codes=number[rows],
+        sigma=None if layer.sigma is None else layer.sigma[rows],
+        names=None if layer.names is None else layer.names[rows],
     )
     if left_out or not used.all():
         notes.append(
@@ -318,7 +326,7 @@ def _lines(path: Path, layer: _Layer, at: int, cls: CodeClass) -> list[MeasuredL
             _heights(path, layer, at, xyz)
         right = _right(path, layer, at, len(xyz)) if own_kind == "breakline" else None
         line_kind: Any = own_kind
-        lines.append(MeasuredLine(name, line_kind, xyz, right, sigma, code))
+        lines.append(MeasuredLine(name=name, kind=line_kind, xyz=xyz, right=right, sigma=sigma, code=code))
     return lines
 
 

@@ -328,4 +328,11 @@ def _adjust(
     covariance = (fit.cofactors @ meat @ fit.cofactors)[:2, :2]
     good = weight > 0
     rms = math.sqrt(float((weight * residual**2).sum() / weight.sum()))
-    return _Solution(fit.unknowns[:2], fit.unknowns[2:], covariance, rms, float(good.sum()) / total, int(good.sum()))
+    return _Solution(
+        shift=fit.unknowns[:2],
+        turn=fit.unknowns[2:],
+        covariance=covariance,
+        rms=rms,
+        used=float(good.sum()) / total,
+        count=int(good.sum()),
+    )

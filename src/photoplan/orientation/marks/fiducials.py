@@ -128,7 +128,10 @@ def _search(
     negatives = (False, True) if known.negative is None else (known.negative,)
     notes: list[str] = []
     if known.pixel_mm is not None:
-        found = search_placements(Search(scan, layout, turns, negatives, STATED_TOLERANCE), [known.pixel_mm])
+        found = search_placements(
+            Search(scan=scan, layout=layout, turns=turns, negatives=negatives, scale_tolerance=STATED_TOLERANCE),
+            [known.pixel_mm],
+        )
         if not everywhere or (found and _convincing(found[0], layout)):
             return found, notes
     wide = search_placements(Search(scan, layout, turns, negatives), pixel_sizes(layout, scan.size))
@@ -266,7 +269,11 @@ def _result(
         x, y = fit.transformation(layout.mm[k])
         # The name that this corner had in the turn in which it was measured.
         old = min(measured.missed, key=lambda n: math.dist(measured.expected[n], (x, y)))
-        missing.append(MissingMark(name, measured.missed[old][0], float(x), float(y), measured.missed[old][1]))
+        missing.append(
+            MissingMark(
+                name=name, correlation=measured.missed[old][0], x=float(x), y=float(y), reason=measured.missed[old][1]
+            )
+        )
     said = list(notes)
     if fit.redundancy == 0:
         said.append("three marks: the affine transformation has no redundancy, nothing checks them")
@@ -326,11 +333,17 @@ def _expected(layout: MarkLayout, scan: Scan, known: FiducialSearch) -> tuple[So
     turn = next(t for t in TURNS if known.rotation in (None, t.rotation) and known.mirrored in (None, t.mirrored))
     places = layout.mm @ turn.matrix.T / pixel_mm
     places += (np.array(scan.size) - 1) / 2 - (places.min(axis=0) + places.max(axis=0)) / 2
-    return tuple(SoughtMark(n, float(x), float(y), False, math.nan) for n, (x, y) in zip(layout.names, places))
+    return tuple(
+        SoughtMark(name=n, x=float(x), y=float(y), found=False, correlation=math.nan)
+        for n, (x, y) in zip(layout.names, places)
+    )
 
 
 def _sought(measured: Measured) -> tuple[SoughtMark, ...]:
-    found = (SoughtMark(name, at.x, at.y, True, at.correlation) for name, at in measured.found.items())
+    found = (
+        SoughtMark(name=name, x=at.x, y=at.y, found=True, correlation=at.correlation)
+        for name, at in measured.found.items()
+    )
     lost = (SoughtMark(name, *measured.expected[name], False, r) for name, (r, _) in measured.missed.items())
     return (*found, *lost)
 
@@ -342,7 +355,13 @@ def _better_turn(scan: Scan, layout: MarkLayout, known: FiducialSearch, measured
     )
     if not excluded:
         return None
-    search = Search(scan, layout, excluded, (measured.placement.negative,), STATED_TOLERANCE)
+    search = Search(
+        scan=scan,
+        layout=layout,
+        turns=excluded,
+        negatives=(measured.placement.negative,),
+        scale_tolerance=STATED_TOLERANCE,
+    )
     others = search_placements(search, [measured.placement.pixel_mm])
     best = max(others, key=lambda p: (len(p.found), p.score), default=None)
     if best is None or len(best.found) < 3 or len(best.found) <= len(measured.found) or not _convincing(best, layout):

@@ -178,7 +178,9 @@ def combine(
     index = [layout.names.index(n) for n in found]
     matrix, shift = fit_placement(layout.mm[index], np.array([f[:2] for f in found.values()]), turn.mirrored)
     rivals = _rivals(layout, candidates, found, blunt)
-    return MarkPlacement(turn, negative, matrix, shift, found, total, rivals)
+    return MarkPlacement(
+        turn=turn, negative=negative, matrix=matrix, shift=shift, found=found, score=total, rivals=rivals
+    )
 
 
 def _rivals(

@@ -77,7 +77,7 @@ def paraboloid_peak(correlation: NDArray[np.floating], row: int, column: int) ->
     fx, fy = np.array([-x / a, -0.5 / a]), np.array([-y / c, -0.5 / c])
     sx = math.sqrt(variance * float(fx @ _INVERSE[:2, :2] @ fx))
     sy = math.sqrt(variance * float(fy @ _INVERSE[2:4, 2:4] @ fy))
-    return Peak(column + x, row + y, sx, sy, float(e + 0.5 * (b * x + d * y)))
+    return Peak(x=column + x, y=row + y, sigma_x=sx, sigma_y=sy, height=float(e + 0.5 * (b * x + d * y)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +191,7 @@ def locate_mark(
     row, column = np.unravel_index(int(np.nanargmax(inside)), inside.shape)
     r = float(inside[row, column])
     top = paraboloid_peak(surface, int(row), int(column))
-    peak = top and Peak(top.x + ox, top.y + oy, top.sigma_x, top.sigma_y, top.height)
+    peak = top and Peak(x=top.x + ox, y=top.y + oy, sigma_x=top.sigma_x, sigma_y=top.sigma_y, height=top.height)
     x, y = (peak.x, peak.y) if peak else (column + ox, row + oy)
     match = match_template(image, fine_template(pattern, mm_to_pixel, blur_px, negative), x, y)
     if match is not None and match.gain > 0 and max(abs(match.x - x), abs(match.y - y)) <= AGREE:

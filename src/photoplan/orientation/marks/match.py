@@ -160,7 +160,7 @@ def _fit(
         if max(abs(x - start[0]), abs(y - start[1])) > _FAR or not math.isfinite(x + y):
             return None
         if np.abs(step).max() < _SMALL:
-            return _Fitted(x, y, fit, g, T, used, iteration)
+            return _Fitted(x=x, y=y, fit=fit, grey=g, T=T, used=used, iterations=iteration)
         _sample(template, x, y, sampled)
     return None
 
@@ -170,7 +170,15 @@ def _result(fitted: _Fitted) -> Match:
     covariance = _covariance(fit.influence, fit.residuals, fitted.used, fit.sigma0)
     trend = fit.A[:, 3:] @ fit.unknowns[3:]
     r = float(np.corrcoef(T, g - trend)[0, 1]) if np.ptp(T) > 0 and np.ptp(g - trend) > 0 else 0.0
-    return Match(fitted.x, fitted.y, covariance, float(fit.unknowns[2]), r, fit.sigma0, fitted.iterations)
+    return Match(
+        x=fitted.x,
+        y=fitted.y,
+        covariance=covariance,
+        gain=float(fit.unknowns[2]),
+        correlation=r,
+        sigma0=fit.sigma0,
+        iterations=fitted.iterations,
+    )
 
 
 def _sample(template: FineTemplate, x: float, y: float, out: NDArray[np.float64]) -> None:

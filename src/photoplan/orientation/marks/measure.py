@@ -85,7 +85,14 @@ def measure_marks(scan: Scan, layout: MarkLayout, placement: MarkPlacement, leas
     expected = placement(layout.mm)
     for name, (x, y, _) in placement.found.items():
         expected[layout.names.index(name)] = x, y
-    look = _Look(placement.matrix, _BLUR, placement.negative, least, expected, start)
+    look = _Look(
+        matrix=placement.matrix,
+        blur_px=_BLUR,
+        negative=placement.negative,
+        least=least,
+        expected=expected,
+        radius=start,
+    )
     found, missed = _round(scan, layout, look, wide)
     blur = _BLUR
     for _ in range(2):
@@ -94,11 +101,19 @@ def measure_marks(scan: Scan, layout: MarkLayout, placement: MarkPlacement, leas
         radius = dict.fromkeys(found, _NEAR_PX)
         for name, at in found.items():
             expected[layout.names.index(name)] = at.x, at.y
-        look = _Look(matrix, blur, placement.negative, least, expected, radius, _KNOWN)
+        look = _Look(
+            matrix=matrix,
+            blur_px=blur,
+            negative=placement.negative,
+            least=least,
+            expected=expected,
+            radius=radius,
+            sigmas=_KNOWN,
+        )
         found, missed = _round(scan, layout, look, wide)
     _, expected = _refit(layout, placement, found)
     where = {name: (float(x), float(y)) for name, (x, y) in zip(layout.names, expected)}
-    return Measured(placement, found, missed, where, look.matrix, blur)
+    return Measured(placement=placement, found=found, missed=missed, expected=where, matrix=look.matrix, blur_px=blur)
 
 
 def mark_window(scan: Scan, xy: tuple[float, float], half: tuple[int, int]) -> tuple[NDArray[np.float32], int, int]:

@@ -119,7 +119,7 @@ def resect(
         The points do not determine the unknowns; the message names these.
     """
     settings = settings or ResectSettings()
-    task = _Task(points, lens, settings, camera_of, name)
+    task = _Task(points=points, lens=lens, settings=settings, camera_of=camera_of, name=name)
     unknowns = 6 + len(settings.free)
     if 2 * len(points) < unknowns or len(points) < 3:
         raise GeometryError(
@@ -217,7 +217,9 @@ def _equations(task: _Task, state: _State) -> _Equations:
     v = np.linalg.solve(root, residuals[..., None])[..., 0]
     distance = float(np.linalg.norm(points.XYZ - state.pose.center, axis=1).mean())
     units = np.array([distance] * 3 + [1.0] * 3 + [interior.c] * len(free))
-    return _Equations(np.asarray(np.linalg.solve(root, A), float), v, root, residuals, units, sound)
+    return _Equations(
+        A=np.asarray(np.linalg.solve(root, A), float), v=v, root=root, residuals=residuals, units=units, sound=sound
+    )
 
 
 def _adjusted(task: _Task, state: _State, use: NDArray[np.bool_]) -> tuple[_State, _Equations]:
@@ -319,7 +321,13 @@ def _tested(task: _Task, equations: _Equations, use: NDArray[np.bool_]) -> _Test
     numbers = np.where(use[:, None], np.diagonal(np.eye(2) - fitted, axis1=1, axis2=2), np.nan)
     scale = spread(normalised[use]) if redundancy > 2 else sigma0
     units = equations.units
-    return _Tests(cofactor * units[:, None] * units, normalised, numbers, float(np.nanmax([1.0, scale])), sigma0)
+    return _Tests(
+        cofactor=cofactor * units[:, None] * units,
+        normalised=normalised,
+        redundancies=numbers,
+        scale=float(np.nanmax([1.0, scale])),
+        sigma0=sigma0,
+    )
 
 
 def _unknowns(task: _Task, equations: _Equations) -> ResectionUnknowns:

@@ -209,7 +209,7 @@ def _completed(pose: Pose, a: Array, b: Array, inliers: NDArray[np.bool_], sigma
             f"rays of common points meet under {np.degrees(angle):.2g}° only: the images were taken from one place"
         )
     r = _misses(_essential(pose)[None], a[inliers], b[inliers])[0]
-    return RelativeOrientation(pose, inliers, XYZ, angle, float(np.sqrt((r * r).mean())))
+    return RelativeOrientation(pose=pose, inliers=inliers, points=XYZ, angle=angle, rms=float(np.sqrt((r * r).mean())))
 
 
 def five_point_essentials(first: ArrayLike, second: ArrayLike) -> Array:

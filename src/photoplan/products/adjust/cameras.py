@@ -150,7 +150,9 @@ def block_camera(
     prior = {p: sigma for p, sigma in names.items() if sigma is not None}
     if "c" in prior and _constant_in_pixels_of_mm(camera) and camera.camera_constant_mm is not None:
         prior["c"] *= interior.c / camera.camera_constant_mm
-    return BlockCamera(interior.c, interior.principal_point, lens, ordered, prior)
+    return BlockCamera(
+        c=interior.c, principal_point=interior.principal_point, lens=lens, free=ordered, prior_sigma=prior
+    )
 
 
 def calibrated(camera: CameraEntry, start: BlockCamera, found: AdjustedCamera) -> Calibrated:
@@ -178,13 +180,13 @@ def calibrated(camera: CameraEntry, start: BlockCamera, found: AdjustedCamera) -
     order = np.argsort([PARAMETERS.index(n) for n in names])
     of_block = np.diag(scales)[order]
     return Calibrated(
-        found.name,
-        tuple(names[k] for k in order),
-        tuple(units[k] for k in order),
-        np.array(before)[order],
-        np.array(after)[order],
-        of_block @ found.covariance @ of_block.T,
-        of_block,
+        name=found.name,
+        parameters=tuple(names[k] for k in order),
+        units=tuple(units[k] for k in order),
+        before=np.array(before)[order],
+        after=np.array(after)[order],
+        covariance=of_block @ found.covariance @ of_block.T,
+        of_block=of_block,
     )
 
 

@@ -217,13 +217,13 @@ def _field(result: MapResult, name: str, at: _Floats, residuals: _Floats) -> Res
     camera = result.prepared.inputs.project.cameras[name]
     unit = "mm" if camera.type == "film" or (camera.camera_constant_mm and not camera.principal_point_px) else "px"
     return ResidualField(
-        name,
-        unit,
-        middles,
-        mean[shown] / count[shown, None],
-        count[shown],
-        frame,
-        float(np.sqrt((residuals**2).mean())),
+        camera=name,
+        unit=unit,
+        at=middles,
+        mean=mean[shown] / count[shown, None],
+        count=count[shown],
+        frame=frame,
+        noise=float(np.sqrt((residuals**2).mean())),
     )
 
 

@@ -183,7 +183,9 @@ def _inside(project: Project, points: ImagePoints, notes: list[str]) -> ImagePoi
 
 def _with_sigma(points: ImagePoints, sigma: float) -> ImagePoints:
     full = np.where(np.isnan(points.sigma), sigma, points.sigma)
-    return ImagePoints(points.images, points.points, points.image, points.point, points.xy, full)
+    return ImagePoints(
+        images=points.images, points=points.points, image=points.image, point=points.point, xy=points.xy, sigma=full
+    )
 
 
 def _ground(project: Project, parts: list[GroundPoints]) -> GroundPoints:

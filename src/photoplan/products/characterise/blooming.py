@@ -78,12 +78,12 @@ def _plane(data: SeriesData, run: SettingsRun, plane: Plane, images: list[np.nda
 
 def _plot(found: Blooming, title: str) -> Chart:
     return Chart(
-        title,
-        "Grey value of the neighbours above what their response promises, over the grey value that the object's "
-        "response promises.",
-        "object DN",
-        "excess of neighbours DN",
-        (Trace(found.object_dn, found.excess_dn, style="line and points", sigma=found.excess_sigma),),
+        title=title,
+        caption="Grey value of the neighbours above what their response promises, over the grey value that the "
+        "object's response promises.",
+        x_label="object DN",
+        y_label="excess of neighbours DN",
+        curves=(Trace(found.object_dn, found.excess_dn, style="line and points", sigma=found.excess_sigma),),
         log_x=True,
         marks=((found.onset_dn, "onset"),) if isfinite(found.onset_dn) else (),
     )

@@ -93,7 +93,7 @@ def _run(settings: Sequence[Setting]) -> SettingsRun | None:
         if None in values or len(set(values)) < 2 or len(set(values)) < len(values):
             continue
         ordered = tuple(sorted(settings, key=lambda s: float(getattr(s.first, name))))
-        return SettingsRun(ordered, name, axis, unit, _common(ordered))
+        return SettingsRun(settings=ordered, name=name, axis=axis, unit=unit, label=_common(ordered))
     return None
 
 

@@ -80,11 +80,11 @@ def _current(settings: list[Setting], levels: list[Level], of: Subject) -> Findi
     )
     t = exposures / 1000
     chart = Chart(
-        of.named("Dark signal"),
-        f"Dark current {found.current_dn_s:.4g} ± {found.current_dn_s_sigma:.2g} DN/s.",
-        "exposure s",
-        "mean grey value DN",
-        (Trace(t, means, "dark frames"), Trace(t, found.line.at(t), "line", "dashed")),
+        title=of.named("Dark signal"),
+        caption=f"Dark current {found.current_dn_s:.4g} ± {found.current_dn_s_sigma:.2g} DN/s.",
+        x_label="exposure s",
+        y_label="mean grey value DN",
+        curves=(Trace(t, means, "dark frames"), Trace(t, found.line.at(t), "line", "dashed")),
     )
     return Findings(
         figures,
@@ -108,11 +108,11 @@ def _doubling(known: dict[float, DarkCurrent], of: Subject, stated: int) -> Find
     grid = np.linspace(temperatures[0], temperatures[-1], 50)
     model = found.current_at_reference * 2 ** ((grid - found.reference_c) / found.doubling_k)
     chart = Chart(
-        of.named("Dark current against temperature"),
-        f"It doubles every {found.doubling_k:.3g} ± {found.doubling_k_sigma:.2g} K.",
-        "temperature °C",
-        "dark current DN/s",
-        (
+        title=of.named("Dark current against temperature"),
+        caption=f"It doubles every {found.doubling_k:.3g} ± {found.doubling_k_sigma:.2g} K.",
+        x_label="temperature °C",
+        y_label="dark current DN/s",
+        curves=(
             Trace(np.array(temperatures), np.array(values), "measured", sigma=np.array(sigmas)),
             Trace(grid, model, "exponential", "dashed"),
         ),

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.errors import InputError
-from photoplan.io.series.file import Frame, Series
+from photoplan.io.series.file import Series, SeriesFrame
 from photoplan.io.series.model import CONDITIONS
 from photoplan.io.series.pixels import Plane, frame_pixels, plane_mask, series_planes, split
 from photoplan.quality.camera.frame_statistics import FrameStack, Level, StackSums
@@ -27,10 +27,10 @@ _UNSATURATED = 1e-3
 class Setting:
     """Frames of one entry that were taken under one condition."""
 
-    frames: tuple[Frame, ...]
+    frames: tuple[SeriesFrame, ...]
 
     @property
-    def first(self) -> Frame:
+    def first(self) -> SeriesFrame:
         """A frame that stands for all."""
         return self.frames[0]
 
@@ -75,7 +75,7 @@ class SeriesData:
 
     def settings(self, *kinds: str, least: int = 1) -> tuple[Setting, ...]:
         """Conditions under which at least so many frames of these kinds were taken, in the order of the file."""
-        found: dict[tuple[object, ...], list[Frame]] = {}
+        found: dict[tuple[object, ...], list[SeriesFrame]] = {}
         for frame in self.series.of(*kinds):
             key = (frame.group.index, *(getattr(frame, name) for name, _ in _CONDITIONS))
             found.setdefault(key, []).append(frame)
@@ -86,7 +86,7 @@ class SeriesData:
         well = self.wells.get(plane)
         return self.series.saturation_dn if well is None else min(self.series.saturation_dn, well.least_dn)
 
-    def pixels(self, frame: Frame) -> dict[str, NDArray[Any]]:
+    def pixels(self, frame: SeriesFrame) -> dict[str, NDArray[Any]]:
         """Pixels of a frame by plane, each of shape (h, w)."""
         pixels = frame_pixels(frame)
         return {plane.name: split(pixels, plane, frame.group.window) for plane in self.planes}
@@ -156,7 +156,7 @@ class SeriesData:
             "are saturated, even, or have another exposure); give brightest_exposure_ms, a roi or a mask"
         )
 
-    def _references(self, frames: list[Frame], plane: Plane, exposure: float | None) -> Iterator[NDArray[Any]]:
+    def _references(self, frames: list[SeriesFrame], plane: Plane, exposure: float | None) -> Iterator[NDArray[Any]]:
         timed = sorted((f for f in frames if f.exposure_ms is not None), key=lambda f: -(f.exposure_ms or 0.0))
         for frame in timed:
             if exposure is None or np.isclose(frame.exposure_ms or 0.0, exposure, rtol=1e-6):

@@ -156,11 +156,11 @@ def _growth(data: SeriesData, setting: Setting, plane: Plane, found: DefectList)
         rate_dn_s=rates,
     )
     chart = Chart(
-        of.named("Growth of the hottest pixels"),
-        "Grey values of the hottest pixels of the longest dark exposure at all exposures.",
-        "exposure ms",
-        "grey value DN",
-        tuple(Trace(exposures, v, name, "line and points") for name, v in zip(named[:6], values)),
+        title=of.named("Growth of the hottest pixels"),
+        caption="Grey values of the hottest pixels of the longest dark exposure at all exposures.",
+        x_label="exposure ms",
+        y_label="grey value DN",
+        curves=tuple(Trace(exposures, v, name, "line and points") for name, v in zip(named[:6], values)),
     )
     return Findings(
         known(of.figure("hottest_dn_s", float(rates[0]), nan, "rate of the hottest pixel", "DN/s", named[0])),
@@ -180,11 +180,12 @@ def _plots(found: DefectList, stack: FrameStack, of: Subject) -> tuple[Chart | P
     bars = log_histogram(found.deviation[np.isfinite(found.deviation)], found.scatter)
     seen = bars.count > 0
     histogram = Chart(
-        f"Deviations from the surroundings, {of.named()}",
-        "Counts on a logarithmic axis; pixels beyond the dashed curve (Gaussian noise) do not belong to the many.",
-        "deviation DN",
-        "pixels",
-        (
+        title=f"Deviations from the surroundings, {of.named()}",
+        caption="Counts on a logarithmic axis; pixels beyond the dashed curve (Gaussian noise) do not belong to the "
+        "many.",
+        x_label="deviation DN",
+        y_label="pixels",
+        curves=(
             Trace(bars.deviation[seen], bars.count[seen].astype(float), "pixels", "points"),
             Trace(bars.deviation[bars.model > 0.3], bars.model[bars.model > 0.3], "Gaussian", "dashed"),
         ),
@@ -194,11 +195,12 @@ def _plots(found: DefectList, stack: FrameStack, of: Subject) -> tuple[Chart | P
     points = tuple((d.col, d.row) for d in found.defects[:_FOLLOWED])
     small, factor = shrunk(stack.mean)
     shown = Plate(
-        f"Defect pixels, {of.named()}",
-        f"Mean image; the {len(points)} strongest of {found.count} are circled. Positions are those of the plane.",
-        small,
-        "grey value DN",
-        points,
+        title=f"Defect pixels, {of.named()}",
+        caption=f"Mean image; the {len(points)} strongest of {found.count} are circled. Positions are those of the "
+        "plane.",
+        values=small,
+        label="grey value DN",
+        points=points,
         factor=factor,
     )
     return histogram, shown

@@ -87,20 +87,24 @@ def _charts(found: BrightnessDrift, label: str, side: int) -> tuple[Chart, ...]:
         curves.append(Trace(v.lapse, white, "Allan deviation of white noise", "dashed"))
     return (
         Chart(
-            f"Brightness over time, {label}",
-            f"Mean of {side} × {side} pixels in the middle (Behr 1989, figs. 4.15 and 4.16), and the straight trend.",
-            "minutes",
-            "grey value",
-            (Trace(minutes, found.values, "measured", "line and points"), Trace(minutes, line, "trend", "dashed")),
+            title=f"Brightness over time, {label}",
+            caption=f"Mean of {side} × {side} pixels in the middle (Behr 1989, figs. 4.15 and 4.16), and the "
+            "straight trend.",
+            x_label="minutes",
+            y_label="grey value",
+            curves=(
+                Trace(minutes, found.values, "measured", "line and points"),
+                Trace(minutes, line, "trend", "dashed"),
+            ),
         ),
         Chart(
-            f"Flicker and drift, {label}",
-            "Root of half the mean squared difference of two measurements a lapse of time apart: level for white "
-            "noise, rising for drift. The Allan deviation of means falls by the root of the lapse "
+            title=f"Flicker and drift, {label}",
+            caption="Root of half the mean squared difference of two measurements a lapse of time apart: level for "
+            "white noise, rising for drift. The Allan deviation of means falls by the root of the lapse "
             "as long as noise is white.",
-            "lapse s",
-            "grey values",
-            tuple(curves),
+            x_label="lapse s",
+            y_label="grey values",
+            curves=tuple(curves),
             log_x=True,
             log_y=True,
         ),

@@ -143,12 +143,12 @@ def _sheet(bright: list[_Point], darks: list[_Point], of: Subject, step: float) 
         used=found.used,
     )
     return Findings(
-        _figures(found, of),
-        {of.named(what): why for what, why in found.refused.items()},
-        {"points": table},
-        _plots(found, points, of.named("EMVA 1288")),
-        (lacking,) if len(pairs) < len(bright) else (),
-        {of.key("sheet"): found},
+        figures=_figures(found, of),
+        refused={of.named(what): why for what, why in found.refused.items()},
+        tables={"points": table},
+        plots=_plots(found, points, of.named("EMVA 1288")),
+        notes=(lacking,) if len(pairs) < len(bright) else (),
+        details={of.key("sheet"): found},
     )
 
 
@@ -178,11 +178,11 @@ def _plots(s: EmvaSheet, p: EmvaPoints, title: str) -> tuple[Chart, ...]:
     grid = np.linspace(0, float(signal[s.used].max()), 30)
     charts = [
         Chart(
-            f"{title}: photon transfer",
-            f"K = {s.gain:.5g} DN/e from levels up to 70 % of saturation.",
-            "signal DN",
-            "variance above dark DN²",
-            (
+            title=f"{title}: photon transfer",
+            caption=f"K = {s.gain:.5g} DN/e from levels up to 70 % of saturation.",
+            x_label="signal DN",
+            y_label="variance above dark DN²",
+            curves=(
                 *used_and_rest(signal, variance, s.used),
                 Trace(grid, s.gain * grid, "line", "dashed", colour=1),
             ),
@@ -194,11 +194,11 @@ def _plots(s: EmvaSheet, p: EmvaPoints, title: str) -> tuple[Chart, ...]:
         ideal = np.sqrt(p.photons[good])
         charts.append(
             Chart(
-                f"{title}: signal-to-noise ratio",
-                "Measured, and that of an ideal sensor that counts every photon.",
-                "photons per pixel",
-                "signal-to-noise ratio",
-                (
+                title=f"{title}: signal-to-noise ratio",
+                caption="Measured, and that of an ideal sensor that counts every photon.",
+                x_label="photons per pixel",
+                y_label="signal-to-noise ratio",
+                curves=(
                     Trace(p.photons[good], signal[good] / noise[good], "measured"),
                     Trace(p.photons[good], ideal, "ideal", "dashed"),
                 ),

@@ -163,13 +163,13 @@ def _outcome(found: FallOff, of: Plane, setting: Setting) -> Findings:
         depth_percent=[100 * d.depth for d in found.dirt],
     )
     return Findings(
-        _figures(found, of),
-        refused,
-        {"corners": corners, "terms": terms, "dirt": dirt},
-        _plots(found, of),
-        tuple(notes),
-        {f"separability{suffix}": found.separability} if found.separability else {},
-        {
+        figures=_figures(found, of),
+        refused=refused,
+        tables={"corners": corners, "terms": terms, "dirt": dirt},
+        plots=_plots(found, of),
+        notes=tuple(notes),
+        details={f"separability{suffix}": found.separability} if found.separability else {},
+        files={
             names[0]: correction_text(found, plane, names[1], factor).encode(),
             names[1]: gain_image(found.model, factor),
         },
@@ -263,11 +263,11 @@ def _profile(found: FallOff, of: str, unit: int) -> Chart:
     radial = replace(model, terms=terms, coefficients=coefficients)
     curves.append(Trace(r, 100 * radial.relative(x, y), "symmetric part", "line", colour=3))
     return Chart(
-        f"Fall-off from the principal point{of}",
-        "Relative brightness; the spread of the blocks at one distance is asymmetry, noise and dust.",
-        "distance from the principal point px",
-        "% of the brightness there",
-        tuple(curves),
+        title=f"Fall-off from the principal point{of}",
+        caption="Relative brightness; the spread of the blocks at one distance is asymmetry, noise and dust.",
+        x_label="distance from the principal point px",
+        y_label="% of the brightness there",
+        curves=tuple(curves),
     )
 
 

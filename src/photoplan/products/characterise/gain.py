@@ -94,11 +94,11 @@ def _outcome(found: GainControl, pixel: tuple[float, float], of: Subject, step: 
     curve = np.linspace(0.0, float(t[-1]), 200)
     caption = "Mean grey value of the window"
     chart = Chart(
-        f"After the step, {found.name}",
-        f"{found.direction}: {a.verdict} (Behr 1989, fig. 4.17).",
-        "seconds since the step",
-        "grey value",
-        (Trace(t, found.values, "measured", "points"), Trace(curve, a.at(curve), "adjusted", "line")),
+        title=f"After the step, {found.name}",
+        caption=f"{found.direction}: {a.verdict} (Behr 1989, fig. 4.17).",
+        x_label="seconds since the step",
+        y_label="grey value",
+        curves=(Trace(t, found.values, "measured", "points"), Trace(curve, a.at(curve), "adjusted", "line")),
         marks=((0.0, "step"),),
     )
     table = Listing.of(caption, series=found.name, time_s=found.times, mean_dn=found.values)

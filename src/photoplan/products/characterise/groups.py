@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.io.series.file import Frame, SeriesGroup
+from photoplan.io.series.file import SeriesFrame, SeriesGroup
 from photoplan.io.series.pixels import frame_pixels, plane_mask, split
 from photoplan.products.characterise.data import SeriesData
 from photoplan.quality.clipping import piled_ends
@@ -31,7 +31,7 @@ class FrameGroup:
     """
 
     group: SeriesGroup
-    frames: tuple[Frame, ...]
+    frames: tuple[SeriesFrame, ...]
 
     @property
     def label(self) -> str:
@@ -153,23 +153,23 @@ def window_means(data: SeriesData, group: FrameGroup, window: Window, advice: st
 
 def frame_groups(data: SeriesData, kind: str) -> tuple[FrameGroup, ...]:
     """Entries with frames of a kind, in the order of the file."""
-    found: dict[int, list[Frame]] = {}
+    found: dict[int, list[SeriesFrame]] = {}
     for frame in data.series.of(kind):
         found.setdefault(frame.group.index, []).append(frame)
     return tuple(FrameGroup(frames[0].group, _ordered(frames)) for frames in found.values())
 
 
-def _ordered(frames: list[Frame]) -> tuple[Frame, ...]:
+def _ordered(frames: list[SeriesFrame]) -> tuple[SeriesFrame, ...]:
     whole, decimal = (tuple(sorted(frames, key=lambda f: _natural(f, n))) for n in (r"([0-9]+)", r"([0-9]*\.?[0-9]+)"))
     return decimal if _grows(decimal) and not _grows(whole) else whole
 
 
-def _grows(frames: tuple[Frame, ...]) -> bool:
+def _grows(frames: tuple[SeriesFrame, ...]) -> bool:
     times = [frame.time_s for frame in frames if frame.time_s is not None]
     return len(times) == len(frames) and all(a < b for a, b in pairwise(times))
 
 
-def _natural(frame: Frame, number: str) -> tuple[tuple[int, str | float], ...]:
+def _natural(frame: SeriesFrame, number: str) -> tuple[tuple[int, str | float], ...]:
     parts = re.split(number, frame.file.name)
     return tuple((1, float(p[:15])) if re.fullmatch(number, p) else (0, p) for p in parts)
 

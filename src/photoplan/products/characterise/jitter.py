@@ -10,7 +10,7 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.io.series.file import Frame
+from photoplan.io.series.file import SeriesFrame
 from photoplan.io.series.model import EdgeEntry
 from photoplan.io.series.pixels import frame_pixels
 from photoplan.products.characterise.data import SeriesData
@@ -30,7 +30,7 @@ class Edge:
     """An edge in a frame."""
 
     entry: EdgeEntry
-    frame: Frame
+    frame: SeriesFrame
     window: Window
     fitted: EdgeLines
     jitter: LineJitter
@@ -49,7 +49,7 @@ class Edge:
         return -self.jitter.field_offset if self.first_line % 2 else self.jitter.field_offset
 
 
-def measured_edge(data: SeriesData, frame: Frame, entry: EdgeEntry, degree: int | None) -> Edge:
+def measured_edge(data: SeriesData, frame: SeriesFrame, entry: EdgeEntry, degree: int | None) -> Edge:
     """An edge of a frame by least squares and by correlation, and the jitter of both.
 
     Raises
@@ -71,12 +71,12 @@ def measured_edge(data: SeriesData, frame: Frame, entry: EdgeEntry, degree: int 
     fitted = fit_edge(lines, name=name, saturation=saturation if math.isfinite(saturation) else None)
     by_correlation = correlate_edge(lines, fitted, name=name)
     return Edge(
-        entry,
-        frame,
-        window,
-        fitted,
-        line_jitter(fitted.position, name, degree),
-        line_jitter(by_correlation.position, name, degree),
+        entry=entry,
+        frame=frame,
+        window=window,
+        fitted=fitted,
+        jitter=line_jitter(fitted.position, name, degree),
+        correlated=line_jitter(by_correlation.position, name, degree),
     )
 
 
@@ -92,12 +92,12 @@ def _charts(edges: Sequence[Edge]) -> list[Chart]:
     file = edges[0].frame.file.name
     charts.append(
         Chart(
-            f"Periods, {file}",
-            "Share of the deviations' sum of squares that an oscillation of each period explains; dashed: what noise "
-            "exceeds anywhere with a chance of 1 ‰.",
-            "period, lines",
-            "% explained",
-            tuple(curves),
+            title=f"Periods, {file}",
+            caption="Share of the deviations' sum of squares that an oscillation of each period explains; dashed: "
+            "what noise exceeds anywhere with a chance of 1 ‰.",
+            x_label="period, lines",
+            y_label="% explained",
+            curves=tuple(curves),
             log_x=True,
         )
     )
@@ -122,11 +122,11 @@ def _deviations(edge: Edge) -> Chart:
     shape = "straight line" if j.degree == 1 else f"polynomial of degree {j.degree}"
     rows = "row" if edge.entry.direction == "vertical" else "column"
     return Chart(
-        f"Edge {edge.entry.name}, {edge.frame.file.name}",
-        f"Deviations d_i from the adjusted {shape} (Behr 1989, fig. 4.4), standard deviation {j.sigma:.3f} px.",
-        rows,
-        "deviation px",
-        tuple(curves),
+        title=f"Edge {edge.entry.name}, {edge.frame.file.name}",
+        caption=f"Deviations d_i from the adjusted {shape} (Behr 1989, fig. 4.4), standard deviation {j.sigma:.3f} px.",
+        x_label=rows,
+        y_label="deviation px",
+        curves=tuple(curves),
     )
 
 

@@ -67,12 +67,12 @@ def _run(data: SeriesData, run: SettingsRun, plane: Plane, of: Subject) -> Findi
         response, sigma_k = float(found.response[k]), float(found.response_sigma[k])
         figures.append(at[k].figure("response_at", response, sigma_k, "signal over exposure", unit))
     return Findings(
-        tuple(figures),
-        {at[k].named("signal over exposure"): cut_off([levels[k]]) for k in np.flatnonzero(hidden)},
-        {"levels": _table(found, run, of)},
-        _plots(found, run, of, full),
-        tuple(f"{of.named()}: {rule}".lstrip(": ") for rule in rules if "cut off" in rule),
-        {of.key("linearity"): found},
+        figures=tuple(figures),
+        refused={at[k].named("signal over exposure"): cut_off([levels[k]]) for k in np.flatnonzero(hidden)},
+        tables={"levels": _table(found, run, of)},
+        plots=_plots(found, run, of, full),
+        notes=tuple(f"{of.named()}: {rule}".lstrip(": ") for rule in rules if "cut off" in rule),
+        details={of.key("linearity"): found},
     )
 
 
@@ -99,6 +99,12 @@ def _plots(found: Linearity, run: SettingsRun, of: Subject, full: float) -> tupl
     caption = f"Linearity error {found.error_percent:.3g} %, from 5 % to 95 % of saturation."
     deviations = Trace(found.exposure[used], found.deviation_percent[used], style="line and points")
     return (
-        Chart(f"{title}: signal", caption, run.axis, "signal DN", (*points, line)),
-        Chart(f"{title}: deviation", "Relative deviation from the line.", run.axis, "deviation %", (deviations,)),
+        Chart(title=f"{title}: signal", caption=caption, x_label=run.axis, y_label="signal DN", curves=(*points, line)),
+        Chart(
+            title=f"{title}: deviation",
+            caption="Relative deviation from the line.",
+            x_label=run.axis,
+            y_label="deviation %",
+            curves=(deviations,),
+        ),
     )

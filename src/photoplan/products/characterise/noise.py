@@ -62,11 +62,11 @@ def _plane(data: SeriesData, name: str, labelled: list[tuple[str, Level]]) -> Fi
     x = mean[sound]
     rounding = data.step / sqrt(12)  # Behr 1989, eq. 3.14
     chart = Chart(
-        of.named("Noise against grey value"),
-        f"Standard deviation of a pixel between frames; the dashed line is rounding alone ({rounding:.3g} DN).",
-        "mean grey value DN",
-        "noise DN",
-        (
+        title=of.named("Noise against grey value"),
+        caption=f"Standard deviation of a pixel between frames; the dashed line is rounding alone ({rounding:.3g} DN).",
+        x_label="mean grey value DN",
+        y_label="noise DN",
+        curves=(
             Trace(x, sigma[sound], "measured", sigma=of_sigma[sound]),
             Trace(x[[0, -1]], np.full(2, rounding), "rounding", "dashed"),
         ),

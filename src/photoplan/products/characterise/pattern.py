@@ -140,11 +140,11 @@ def _spectra(stack: FrameStack, plane: Plane, what: str) -> Findings:
         for way, s in along.items()
     ]
     chart = Chart(
-        f"Spectrogram, {of.named(what)}",
-        "Root of the power; white noise is level, peaks are periodic patterns.",
-        "frequency cycles/px",
-        "amplitude DN",
-        tuple(Trace(s.frequency, s.amplitude, f"along {way}", "line") for way, s in along.items()),
+        title=f"Spectrogram, {of.named(what)}",
+        caption="Root of the power; white noise is level, peaks are periodic patterns.",
+        x_label="frequency cycles/px",
+        y_label="amplitude DN",
+        curves=tuple(Trace(s.frequency, s.amplitude, f"along {way}", "line") for way, s in along.items()),
         log_y=True,
     )
     parts = [Findings(tables={"spectrograms": table}) for table in tables]

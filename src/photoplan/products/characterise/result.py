@@ -219,11 +219,11 @@ def joined(outcomes: Sequence[Findings]) -> Findings:
             rows = table.rows if known is None else known.rows + table.rows
             tables[name] = Listing(table.head, rows, table.caption)
     return Findings(
-        tuple(f for o in outcomes for f in o.figures),
-        {key: why for o in outcomes for key, why in o.refused.items()},
-        tables,
-        tuple(p for o in outcomes for p in o.plots),
-        tuple(dict.fromkeys(n for o in outcomes for n in o.notes)),
-        {key: value for o in outcomes for key, value in o.details.items()},
-        {name: content for o in outcomes for name, content in o.files.items()},
+        figures=tuple(f for o in outcomes for f in o.figures),
+        refused={key: why for o in outcomes for key, why in o.refused.items()},
+        tables=tables,
+        plots=tuple(p for o in outcomes for p in o.plots),
+        notes=tuple(dict.fromkeys(n for o in outcomes for n in o.notes)),
+        details={key: value for o in outcomes for key, value in o.details.items()},
+        files={name: content for o in outcomes for name, content in o.files.items()},
     )

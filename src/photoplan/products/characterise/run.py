@@ -188,7 +188,7 @@ def characterise(
     written = _write_tables(request, series, runs)
     wells = [data.wells.get(plane.name) for plane in data.planes]
     levels = tuple(series.saturation_dn if well is None else well.level_dn for well in wells)
-    return CharacteriseReport(series, tuple(runs), tuple(written), notes, levels)
+    return CharacteriseReport(series=series, runs=tuple(runs), written=tuple(written), notes=notes, levels=levels)
 
 
 def _chosen(only: Sequence[str]) -> list[Analysis]:

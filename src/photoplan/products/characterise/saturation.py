@@ -47,11 +47,11 @@ def _run(data: SeriesData, run: SettingsRun, plane: Plane, of: Subject) -> Findi
     between = f"between {found.last_unsaturated:g} and {found.first_saturated:g} {run.unit}"
     at, sigma = found.exposure, found.exposure_sigma
     chart = Chart(
-        of.named("Saturation"),
-        f"Saturated {between}: {words}.",
-        run.axis,
-        "mean grey value DN",
-        (Trace(np.array(run.values), mean, style="line and points"),),
+        title=of.named("Saturation"),
+        caption=f"Saturated {between}: {words}.",
+        x_label=run.axis,
+        y_label="mean grey value DN",
+        curves=(Trace(np.array(run.values), mean, style="line and points"),),
         log_x=True,
         marks=((found.first_saturated, "saturated"),),
     )

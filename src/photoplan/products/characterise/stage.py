@@ -42,11 +42,11 @@ def analyse(data: SeriesData) -> Findings:
     points = [p for group in frame_groups(data, "stage") for p in _of_frames(data, group)]
     points += [
         _Points(
-            table.label,
-            table.entry.unit,
-            tuple(line.name for line in table.lines),
-            np.array([line.stage for line in table.lines], float).reshape(-1, 2),
-            np.array([(line.x, line.y) for line in table.lines], float),
+            label=table.label,
+            unit=table.entry.unit,
+            names=tuple(line.name for line in table.lines),
+            stage=np.array([line.stage for line in table.lines], float).reshape(-1, 2),
+            measured=np.array([(line.x, line.y) for line in table.lines], float),
         )
         for table in data.series.positions
         if table.entry.kind == "stage"
@@ -79,12 +79,12 @@ def _of_frames(data: SeriesData, group: FrameGroup) -> list[_Points]:
         label = group.label if len(group.group.entry.targets) < 2 else f"{group.label}, {name}"
         out.append(
             _Points(
-                label,
-                unit,
-                tuple(group.frames[k].file.stem for k in seen),
-                np.array(stage)[seen],
-                np.array([(places[k].x, places[k].y) for k in seen]),
-                tuple(f"{label}: not found in {text}" for text in lost),
+                label=label,
+                unit=unit,
+                names=tuple(group.frames[k].file.stem for k in seen),
+                stage=np.array(stage)[seen],
+                measured=np.array([(places[k].x, places[k].y) for k in seen]),
+                notes=tuple(f"{label}: not found in {text}" for text in lost),
             )
         )
     return out
@@ -143,10 +143,10 @@ def _chart(found: StageCalibration, at: str) -> Chart:
     """Residual vectors (Behr 1989, figs. B.2 and B.3), enlarged."""
     x, y = found.measured.T
     return Chart(
-        f"Residuals, {at}",
-        f"Measured minus transformed, enlarged as the legend says; mean errors {found.sigma[0]:.2f} and "
+        title=f"Residuals, {at}",
+        caption=f"Measured minus transformed, enlarged as the legend says; mean errors {found.sigma[0]:.2f} and "
         f"{found.sigma[1]:.2f} px (Behr 1989, figs. B.2 and B.3).",
-        "column px",
-        "row px (upwards in the figure)",
-        (Trace(x, y, "points", "points"), Trace(x, y, "residuals", vectors=found.residuals)),
+        x_label="column px",
+        y_label="row px (upwards in the figure)",
+        curves=(Trace(x, y, "points", "points"), Trace(x, y, "residuals", vectors=found.residuals)),
     )

@@ -9,7 +9,7 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.io.series.file import Frame
+from photoplan.io.series.file import SeriesFrame
 from photoplan.io.series.model import TargetEntry
 from photoplan.io.series.pixels import frame_pixels
 from photoplan.products.characterise.data import SeriesData
@@ -25,7 +25,7 @@ class Located:
     """A target in a frame."""
 
     target: str
-    frame: Frame
+    frame: SeriesFrame
     x: float
     y: float
     """Column and row in the image; NaN where it was not found."""
@@ -61,7 +61,7 @@ def locate_targets(data: SeriesData, group: FrameGroup) -> dict[str, list[Locate
     return found
 
 
-def _locate(data: SeriesData, group: FrameGroup, frame: Frame, target: TargetEntry) -> Located:
+def _locate(data: SeriesData, group: FrameGroup, frame: SeriesFrame, target: TargetEntry) -> Located:
     from photoplan.orientation.marks.target import locate_target  # noqa: PLC0415 - slow to import, rarely needed
 
     window = _window(data, group, target)
@@ -70,13 +70,20 @@ def _locate(data: SeriesData, group: FrameGroup, frame: Frame, target: TargetEnt
     where = f"target {target.name}"
     peak = float(grey.max() if target.bright else grey.min())
     if target.bright and peak >= data.saturation_dn(data.planes[0].name) and (grey >= peak).mean() > 0.5:
-        return Located(target.name, frame, math.nan, math.nan, math.nan, f"{where}: the window is saturated")
+        return Located(
+            target=target.name,
+            frame=frame,
+            x=math.nan,
+            y=math.nan,
+            sigma=math.nan,
+            why=f"{where}: the window is saturated",
+        )
     try:
         at = locate_target(grey, bright=target.bright).location
     except InputError as error:
-        return Located(target.name, frame, math.nan, math.nan, math.nan, str(error))
+        return Located(target=target.name, frame=frame, x=math.nan, y=math.nan, sigma=math.nan, why=str(error))
     sigma = max(at.sigma_x, at.sigma_y)
-    return Located(target.name, frame, window.col + at.x, window.row + at.y, sigma, "")
+    return Located(target=target.name, frame=frame, x=window.col + at.x, y=window.row + at.y, sigma=sigma, why="")
 
 
 def _window(data: SeriesData, group: FrameGroup, target: TargetEntry) -> Window:

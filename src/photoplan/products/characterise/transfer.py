@@ -79,7 +79,14 @@ def _plane(name: str, bright: list[Level], dark: tuple[list[Level], list[float]]
     table = Listing.of(caption, plane=name, mean_dn=f.mean, variance_dn2=f.variance, used=f.used)
     key = f"photon_transfer{name and f'_{name}'}"
     notes = tuple(f"{name}: {note}".lstrip(": ") for note in f.notes)
-    return Findings(figures, refused, {"levels": table}, _plots(f, of, data.step), notes, {key: f})
+    return Findings(
+        figures=figures,
+        refused=refused,
+        tables={"levels": table},
+        plots=_plots(f, of, data.step),
+        notes=notes,
+        details={key: f},
+    )
 
 
 def _plots(found: PhotonTransfer, of: Subject, step: float) -> tuple[Chart, ...]:
@@ -98,13 +105,19 @@ def _plots(found: PhotonTransfer, of: Subject, step: float) -> tuple[Chart, ...]
     caption = f"Slope K = {found.gain:.4g} ± {found.gain_sigma:.2g} DN/e; each point is a level of two frames or more."
     points = used_and_rest(signal, variance, used)
     return (
-        Chart(f"{title}: variance", caption, "signal DN", "temporal variance DN²", (*points, line)),
         Chart(
-            f"{title}: noise, logarithmic",
-            "Read noise to the left, shot noise with slope one half, collapse at full well to the right.",
-            "signal DN",
-            "temporal noise DN",
-            (*log, model),
+            title=f"{title}: variance",
+            caption=caption,
+            x_label="signal DN",
+            y_label="temporal variance DN²",
+            curves=(*points, line),
+        ),
+        Chart(
+            title=f"{title}: noise, logarithmic",
+            caption="Read noise to the left, shot noise with slope one half, collapse at full well to the right.",
+            x_label="signal DN",
+            y_label="temporal noise DN",
+            curves=(*log, model),
             log_x=True,
             log_y=True,
         ),

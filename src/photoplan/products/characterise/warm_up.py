@@ -80,13 +80,13 @@ def _of_frames(data: SeriesData, group: FrameGroup) -> _Input:
     model = group.word("model", ("auto", "shift", "similarity", "affine"))
     lost = sum(bool(p.why) for found in places.values() for p in found)
     return _Input(
-        group.label,
-        times,
-        positions,
-        None if model == "auto" else model,
-        group.word("reference", ("first", "mean")),
-        group.number("bound_px", BOUND, 1e-6, 1e6),
-        (f"{group.label}: targets not found in {lost} places",) if lost else (),
+        label=group.label,
+        times=times,
+        positions=positions,
+        model=None if model == "auto" else model,
+        reference=group.word("reference", ("first", "mean")),
+        bound=group.number("bound_px", BOUND, 1e-6, 1e6),
+        notes=(f"{group.label}: targets not found in {lost} places",) if lost else (),
     )
 
 
@@ -123,7 +123,7 @@ def _of_table(table: MeasuredPositions) -> _Input:
         for k, time in enumerate(times):
             found = of.get(float(time), [])
             positions[name][k, : len(found)] = np.array(found).reshape(-1, 2)
-    return _Input(table.label, times, positions, None, "first", BOUND)
+    return _Input(label=table.label, times=times, positions=positions, model=None, reference="first", bound=BOUND)
 
 
 def _outcome(found: WarmUp, given: _Input) -> Findings:
@@ -155,7 +155,9 @@ def _outcome(found: WarmUp, given: _Input) -> Findings:
     values = {f"{c.name}{s}": v for c in found.courses for s, v in (("", c.values), ("_sigma", c.sigmas))}
     caption = "Parameters by epoch (shifts px, scales in parts, angles rad)"
     table = Listing.of(caption, series=at, time_s=found.times, **values)
-    return Findings(known(*figures), refused, {"epochs": table}, _charts(found, at), notes)
+    return Findings(
+        figures=known(*figures), refused=refused, tables={"epochs": table}, plots=_charts(found, at), notes=notes
+    )
 
 
 def _course(course: Course, of: Subject, bound: float) -> tuple[list[Figure], dict[str, str]]:
@@ -196,18 +198,37 @@ def _charts(found: WarmUp, at: str) -> tuple[Chart, ...]:
         curves = []
         for k, c in enumerate(courses):
             factor, unit = _UNITS[c.unit]
-            curves.append(Trace(minutes, factor * c.values, _LABELS[c.name], "points", factor * c.sigmas, colour=k))
+            curves.append(
+                Trace(
+                    x=minutes,
+                    y=factor * c.values,
+                    label=_LABELS[c.name],
+                    style="points",
+                    sigma=factor * c.sigmas,
+                    colour=k,
+                )
+            )
             if c.approach is not None and c.approach.change is not None:
                 curves.append(Trace(curve / 60.0, factor * c.approach.at(curve), "", "line", colour=k))
         if curves:
             caption = "Measured with standard deviations, and the exponential course where there is one"
             caption += " (Behr 1989, fig. 4.2)."
-            charts.append(Chart(f"Warm-up, {what}, {at}", caption, "minutes", f"{what} {unit}", tuple(curves)))
+            charts.append(
+                Chart(
+                    title=f"Warm-up, {what}, {at}",
+                    caption=caption,
+                    x_label="minutes",
+                    y_label=f"{what} {unit}",
+                    curves=tuple(curves),
+                )
+            )
     moved = [
         Trace(minutes, t.shift[:, axis], f"{t.name}, {word}", "line", colour=2 * k + axis)
         for k, t in enumerate(found.targets[:3])
         for axis, word in enumerate(("column", "row"))
     ]
     caption = "Each target against the reference; targets that move by different amounts tell a change of scale."
-    charts.append(Chart(f"Targets, {at}", caption, "minutes", "movement px", tuple(moved)))
+    charts.append(
+        Chart(title=f"Targets, {at}", caption=caption, x_label="minutes", y_label="movement px", curves=tuple(moved))
+    )
     return tuple(charts)

@@ -9,7 +9,7 @@ import numpy as np
 
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
-from photoplan.io.series.file import Frame
+from photoplan.io.series.file import SeriesFrame
 from photoplan.io.series.pixels import Plane, plane_pixels
 from photoplan.products.characterise.common import black_of, saturation_of, tried
 from photoplan.products.characterise.data import SeriesData, Setting
@@ -52,7 +52,7 @@ def analyse(data: SeriesData) -> Findings:
     return joined(outcomes)
 
 
-def _label(frame: Frame) -> str:
+def _label(frame: SeriesFrame) -> str:
     light = "" if frame.illumination is None else f"illumination {frame.illumination:g}"
     time = "" if frame.exposure_ms is None else f"{frame.exposure_ms:g} ms"
     return spaced(frame.group.entry.name or "", light, time)
@@ -110,11 +110,11 @@ def _curve(data: SeriesData, patches: list[_Patch], plane: Plane, of: Subject) -
 def _plot(found: GreyWedge, title: str) -> Chart:
     grid = np.linspace(found.density.min(), found.density.max(), 60)
     return Chart(
-        title,
-        f"Grey value over density; the dashed curve is a proportional sensor, gamma is {found.gamma:.3g}.",
-        "density",
-        "signal DN",
-        (
+        title=title,
+        caption=f"Grey value over density; the dashed curve is a proportional sensor, gamma is {found.gamma:.3g}.",
+        x_label="density",
+        y_label="signal DN",
+        curves=(
             Trace(found.density, found.signal, "measured", "line and points"),
             Trace(grid, found.slope * 10.0**-grid, "proportional", "dashed"),
         ),

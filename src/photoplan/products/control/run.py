@@ -22,7 +22,7 @@ from photoplan.io.image_points import write_image_points
 from photoplan.io.product import check_output
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
-from photoplan.io.project.model import Project, Terrain
+from photoplan.io.project.model import Project, StatedTerrain
 from photoplan.io.raster import RasterReader
 from photoplan.io.run_record import recording
 from photoplan.matching.grey import GreyImage
@@ -120,7 +120,15 @@ def propose_control(request: ControlRequest, events: Events = SILENT) -> Control
     if request.dry_run or not patches:
         if not patches:
             raise GeometryError("the orthophoto has no textured place with heights that one of the images could see")
-        return ControlReport(None, None, len(patches), settings.resolution, 0, (), (np.nan,) * 3)
+        return ControlReport(
+            output=None,
+            image_points=None,
+            patches=len(patches),
+            resolution=settings.resolution,
+            points=0,
+            images=(),
+            sigma=(np.nan,) * 3,
+        )
     covariances = _ground_covariances(patches, request, ortho)
     # Images that take no part are no inputs.
     files = [project.resolve(project.image(name).file) for name in names]
@@ -152,7 +160,13 @@ def propose_control(request: ControlRequest, events: Events = SILENT) -> Control
         _enter(request.project, output, image_output)
         sigma = (*_medians(ground.sigma[:, [0, 2]]), float(np.median(points.sigma)))
         report = ControlReport(
-            output, image_output, len(patches), settings.resolution, len(ground), tuple(images), sigma
+            output=output,
+            image_points=image_output,
+            patches=len(patches),
+            resolution=settings.resolution,
+            points=len(ground),
+            images=tuple(images),
+            sigma=sigma,
         )
         record([output, image_output, request.project], report)
     return report
@@ -168,7 +182,7 @@ def _with_heights(project: Project, request: ControlRequest) -> Project:
         return project
     system = request.height_system or (None if project.terrain is None else project.terrain.height_system)
     path = os.fspath(Path(request.heights).resolve())
-    return project.model_copy(update={"terrain": Terrain(file=path, height_system=system)})
+    return project.model_copy(update={"terrain": StatedTerrain(file=path, height_system=system)})
 
 
 def _check(request: ControlRequest, project: Project) -> tuple[Path, Path]:
@@ -243,16 +257,16 @@ def _tables(
     XYZ = np.array([patches[k].XYZ for k in used]).reshape(-1, 3)
     C = covariances[used]
     sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
-    ground = GroundPoints(names, XYZ, sigma, np.zeros(len(used), bool), C)
+    ground = GroundPoints(names=names, XYZ=XYZ, sigma=sigma, check=np.zeros(len(used), bool), covariance=C)
     seen = [i for i in images if len(i.points)]
     none = np.empty(0, np.int64)
     points = ImagePoints(
-        tuple(i.name for i in seen),
-        names,
-        np.concatenate([none, *(np.full(len(i.points), k, np.int64) for k, i in enumerate(seen))]),
-        np.searchsorted(used, np.concatenate([none, *(i.points for i in seen)])).astype(np.int64),
-        np.concatenate([np.empty((0, 2)), *(i.xy for i in seen)]),
-        np.concatenate([np.empty((0, 2)), *(i.sigma for i in seen)]),
+        images=tuple(i.name for i in seen),
+        points=names,
+        image=np.concatenate([none, *(np.full(len(i.points), k, np.int64) for k, i in enumerate(seen))]),
+        point=np.searchsorted(used, np.concatenate([none, *(i.points for i in seen)])).astype(np.int64),
+        xy=np.concatenate([np.empty((0, 2)), *(i.xy for i in seen)]),
+        sigma=np.concatenate([np.empty((0, 2)), *(i.sigma for i in seen)]),
     )
     return ground, points
 

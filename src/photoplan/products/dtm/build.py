@@ -126,7 +126,12 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
     facts = [input_facts(path) for path in request.inputs]
     key = _key(request, facts, plan, crs, system)
     kept = ResultLog.beside(request.output, key, locked=True)
-    with ModelWriter(request.output, plan.layout, key, request.overwrite, request.inputs) as writer, kept:
+    with (
+        ModelWriter(
+            path=request.output, layout=plan.layout, run_key=key, overwrite=request.overwrite, inputs=request.inputs
+        ) as writer,
+        kept,
+    ):
         with steps(request.output.name, request.workers, events, kept) as run:
             built = build_terrain(plan, run, events)
         gross = tuple(_gross(built, measured))
@@ -142,14 +147,30 @@ def dtm_build(request: BuildRequest, events: Events = SILENT) -> BuildReport:
             events.done()
         totals = _totals(built, measured, findings, len(gross))
         header = ModelHeader(
-            crs, system, plan.layout, asdict(request.settings), tuple(facts), built.fit.whole.name, totals
+            crs=crs,
+            height_system=system,
+            layout=plan.layout,
+            settings=asdict(request.settings),
+            inputs=tuple(facts),
+            family=built.fit.whole.name,
+            totals=totals,
         )
         with together():
-            writer.finish(ModelParts(header, built.lines, gross, plan.polygon, suspects))
+            writer.finish(
+                ModelParts(header=header, lines=built.lines, gross=gross, domain=plan.polygon, suspects=suspects)
+            )
             when_named(kept.remove)
             ran = times()
             figures = {**totals, "crs": crs_label(crs), "height_system": system, "seconds": ran["seconds"]}
-            report = BuildReport(request.output, figures, gross, suspects, findings, built, measured)
+            report = BuildReport(
+                path=request.output,
+                figures=figures,
+                gross=gross,
+                suspects=suspects,
+                findings=findings,
+                built=built,
+                measured=measured,
+            )
             write_run_record(
                 request.output,
                 key=key,

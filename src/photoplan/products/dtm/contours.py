@@ -133,7 +133,10 @@ class _Run:
             self.facts.add(line)
             if self.labeller is not None and (line.index or self.label_all):
                 size = self.labeller.size
-                new = [LabelRow(a.X, a.Y, a.height, a.angle, a.text, size) for a in self.labeller.place(line)]
+                new = [
+                    LabelRow(X=a.X, Y=a.Y, height=a.height, angle=a.angle, text=a.text, size=size)
+                    for a in self.labeller.place(line)
+                ]
                 self.facts.labels += new
             if self.facts.sketch is not None:
                 self.facts.sketch.add(line)

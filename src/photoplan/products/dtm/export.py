@@ -118,7 +118,7 @@ def _grid(request: ExportRequest, terrain: OpenTerrain) -> MapGrid:
     # Pixels of a raster are its own; those of a model lie centred on its posts, the outer ones included.
     edge = width / 2 if terrain.model is not None else 0.0
     columns, rows = (round((b - a + 2 * edge) / width) for a, b in ((xmin, xmax), (ymin, ymax)))
-    return MapGrid(xmin - edge, ymax + edge, width, columns, rows, crs)
+    return MapGrid(left=xmin - edge, top=ymax + edge, resolution=width, width=columns, height=rows, crs=crs)
 
 
 def _export_raster(request: ExportRequest, terrain: OpenTerrain, events: Events) -> ExportReport:

@@ -203,7 +203,9 @@ def _cells(
 def _row(flow: Flow, grid: MapGrid, number: int, name: str, cell: tuple[int, int]) -> OutletRow:
     X, Y = grid.to_map((cell[1], cell[0]))
     own = float((flow.catchment == number).sum()) * grid.resolution**2
-    return OutletRow(name, float(X), float(Y), float(flow.area[cell]), own, float(flow.longest[cell]))
+    return OutletRow(
+        name=name, X=float(X), Y=float(Y), area=float(flow.area[cell]), own=own, longest=float(flow.longest[cell])
+    )
 
 
 def _write(request: FlowRequest, grid: MapGrid, flow: Flow, depth: NDArray[np.float32], options: GridOptions) -> None:

@@ -114,7 +114,9 @@ def profiles_of(
         xy = np.column_stack([X, Y])
         surface = terrain.surface
         sigmas = surface.sigmas(xy) if isinstance(surface, HybridSurface) else np.full(len(xy), np.nan)
-        found.append(Profile(name, distance, xy, Z, np.where(np.isnan(Z), np.nan, sigmas)))
+        found.append(
+            Profile(name=name, distance=distance, xy=xy, heights=Z, sigmas=np.where(np.isnan(Z), np.nan, sigmas))
+        )
     return found
 
 

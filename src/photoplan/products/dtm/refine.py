@@ -84,7 +84,13 @@ def dtm_refine(request: RefineRequest) -> RefineReport:
     system = common_system(stated, request.height_system)
     polygons = _polygons(request, coarse)
     width = request.width if request.width is not None else fine.finest
-    with ModelWriter(request.output, coarse.layout, _key(request, coarse, fine), request.overwrite, inputs) as writer:
+    with ModelWriter(
+        path=request.output,
+        layout=coarse.layout,
+        run_key=_key(request, coarse, fine),
+        overwrite=request.overwrite,
+        inputs=inputs,
+    ) as writer:
         units, lines = refine_units(
             LinedUnits(coarse, coarse.lines(), coarse.domain()),
             LinedUnits(fine, fine.lines(polygons.bounds), fine.domain()),
@@ -97,7 +103,9 @@ def dtm_refine(request: RefineRequest) -> RefineReport:
         _add(writer, coarse, units, lines)
         reader = writer.finish(_parts(request, coarse, fine, system, polygons, width, lines))
     there = int(np.isfinite(reader.ranges[..., 0]).sum())
-    return RefineReport(request.output, there, len(units), len(lines), _largest(coarse, units))
+    return RefineReport(
+        path=request.output, units=there, changed=len(units), lines=len(lines), largest=_largest(coarse, units)
+    )
 
 
 def _model(path: Path) -> ModelReader:
@@ -193,7 +201,7 @@ def _parts(
         domain = outer.difference(polygons).union(polygons if inner is None else polygons.intersection(inner))
         areas = [p for p in shapely.get_parts(domain) if p.geom_type == "Polygon" and p.area > 0]
         domain = shapely.multipolygons(areas)
-    return ModelParts(header, lines, gross, domain, suspects)
+    return ModelParts(header=header, lines=lines, gross=gross, domain=domain, suspects=suspects)
 
 
 def _largest(coarse: ModelReader, units: dict[tuple[int, int], Unit]) -> float:

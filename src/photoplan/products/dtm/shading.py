@@ -23,7 +23,7 @@ from photoplan.plain import pick
 from photoplan.products.dtm.raster import GridOptions, GridTile, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
 from photoplan.terrain import shading
-from photoplan.terrain.shading import Light, surface_slopes
+from photoplan.terrain.shading import Lighting, surface_slopes
 
 #: From flat to steep, for slope classes.
 SLOPE_COLOURS = ((255, 255, 212), (254, 217, 142), (254, 153, 41), (204, 76, 2), (120, 30, 10))
@@ -135,7 +135,15 @@ def make_picture(
         facts = write_grid(request.output, grid.placement, made.dtype, made.bands, made.nodata, tile, options)
         if request.preview is not None:
             write_quicklook(standing(request.output), request.preview, max_side=1200)
-    return ShadingFacts(request.output, request.preview, made.kind, grid, made.settings, facts.valid_share, facts.bytes)
+    return ShadingFacts(
+        path=request.output,
+        preview=request.preview,
+        kind=made.kind,
+        grid=grid,
+        settings=made.settings,
+        valid_share=facts.valid_share,
+        bytes=facts.bytes,
+    )
 
 
 def _grid(request: PictureRequest, terrain: OpenTerrain) -> MapGrid:
@@ -145,17 +153,19 @@ def _grid(request: PictureRequest, terrain: OpenTerrain) -> MapGrid:
     return grid
 
 
-def shade_picture(light: Light) -> Callable[[OpenTerrain, MapGrid], Picture]:
+def shade_picture(light: Lighting) -> Callable[[OpenTerrain, MapGrid], Picture]:
     """A hillshade: grey values 1 to 255, 0 where there is no terrain."""
 
     def tile(terrain: OpenTerrain, grid: MapGrid, window: Window) -> GridTile:
         slopes = surface_slopes(terrain.surface, grid, window)
         return shading.grey(shading.hillshade(slopes, light))[None]
 
-    return lambda terrain, grid: Picture("hillshade", "uint8", 1, "auto", _light_settings(light), tile)
+    return lambda terrain, grid: Picture(
+        kind="hillshade", dtype="uint8", bands=1, nodata="auto", settings=_light_settings(light), tile=tile
+    )
 
 
-def _light_settings(light: Light) -> dict[str, Any]:
+def _light_settings(light: Lighting) -> dict[str, Any]:
     return {
         "azimuth": light.azimuth,
         "altitude": light.altitude,
@@ -184,7 +194,9 @@ def slope_picture(unit: str = "degrees", classes: tuple[float, ...] = ()) -> Cal
 
     settings = {"unit": unit, "classes": list(classes)}
     if not classes:
-        return lambda terrain, grid: Picture("slope", "float32", 1, "auto", settings, tile)
+        return lambda terrain, grid: Picture(
+            kind="slope", dtype="float32", bands=1, nodata="auto", settings=settings, tile=tile
+        )
     at = np.linspace(0, len(SLOPE_COLOURS) - 1, len(classes) + 1)
     mixed = [np.interp(at, range(len(SLOPE_COLOURS)), np.array(SLOPE_COLOURS)[:, k]) for k in range(3)]
     table = {0: (0, 0, 0)} | {
@@ -208,14 +220,22 @@ def aspect_picture() -> Callable[[OpenTerrain, MapGrid], Picture]:
     def tile(terrain: OpenTerrain, grid: MapGrid, window: Window) -> GridTile:
         return shading.aspect(surface_slopes(terrain.surface, grid, window))[None]
 
-    return lambda terrain, grid: Picture("aspect", "float32", 1, "auto", {"unit": "degrees"}, tile, "nearest")
+    return lambda terrain, grid: Picture(
+        kind="aspect",
+        dtype="float32",
+        bands=1,
+        nodata="auto",
+        settings={"unit": "degrees"},
+        tile=tile,
+        resampling="nearest",
+    )
 
 
 def tint_picture(
     ramp: str = "hypsometric",
     span: tuple[float, float] | None = None,
     steps: int | None = None,
-    light: Light | None = None,
+    light: Lighting | None = None,
     strength: float = 0.6,
 ) -> Callable[[OpenTerrain, MapGrid], Picture]:
     """Height tints, red, green, blue, with a mask.
@@ -255,7 +275,7 @@ def tint_picture(
         }
         if light is not None:
             settings |= _light_settings(light) | {"strength": strength}
-        return Picture("tints", "uint8", 3, "mask", settings, tile)
+        return Picture(kind="tints", dtype="uint8", bands=3, nodata="mask", settings=settings, tile=tile)
 
     return picture
 

@@ -127,7 +127,13 @@ def dtm_visible(request: VisibleRequest, events: Events = SILENT) -> VisibleRepo
     terrain = open_terrain(request.model, request.crs)
     places = _places(request, terrain)
     radius = earth_radius(split_compound(terrain.crs)[0], (places[0][1], places[0][2]))
-    sight = SightSettings(request.height_target, request.radius, request.curvature, request.refraction, radius)
+    sight = SightSettings(
+        target_height=request.height_target,
+        radius=request.radius,
+        curvature=request.curvature,
+        refraction=request.refraction,
+        earth_radius=radius,
+    )
     grid = _grid(request, terrain, places)
     _check_memory(grid, len(places), request)
     heights = read_grid(terrain, grid)
@@ -155,7 +161,14 @@ def dtm_visible(request: VisibleRequest, events: Events = SILENT) -> VisibleRepo
     write_grid(request.output, grid.placement, bands.dtype, len(bands), _nodata(request), tile, options)
     log.remove()
     far = horizon(rows[0].eye - float(terrain.surface.heights(np.array(places[0][1:3]))), sight)
-    return VisibleReport(request.output, tuple(names), grid.resolution, radius, far, tuple(rows))
+    return VisibleReport(
+        path=request.output,
+        bands=tuple(names),
+        resolution=grid.resolution,
+        earth_radius=radius,
+        horizon=far,
+        rows=tuple(rows),
+    )
 
 
 def _nodata(request: VisibleRequest) -> Any:
@@ -223,7 +236,14 @@ def own_grid(terrain: OpenTerrain, low: tuple[float, float], high: tuple[float, 
     mesh, left, top = terrain.resolution, terrain.bounds[0], terrain.bounds[3]
     col0, row0 = math.floor((low[0] - left) / mesh + 1e-6), math.floor((top - high[1]) / mesh + 1e-6)
     col1, row1 = math.ceil((high[0] - left) / mesh - 1e-6), math.ceil((top - low[1]) / mesh - 1e-6)
-    return MapGrid(left + col0 * mesh, top - row0 * mesh, mesh, max(1, col1 - col0), max(1, row1 - row0), terrain.crs)
+    return MapGrid(
+        left=left + col0 * mesh,
+        top=top - row0 * mesh,
+        resolution=mesh,
+        width=max(1, col1 - col0),
+        height=max(1, row1 - row0),
+        crs=terrain.crs,
+    )
 
 
 def _check_memory(grid: MapGrid, count: int, request: VisibleRequest) -> None:

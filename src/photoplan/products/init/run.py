@@ -21,7 +21,7 @@ from photoplan.io.orientation.file import read_orientation
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat
 from photoplan.io.project.file import parse_project, write_project
 from photoplan.io.project.image import ImageEntry
-from photoplan.io.project.model import Project, Terrain
+from photoplan.io.project.model import Project, StatedTerrain
 from photoplan.io.project.posed import Image
 from photoplan.io.raster_info import RasterInfo, read_info
 from photoplan.products.init.match import (
@@ -243,7 +243,7 @@ def _cameras(
 
 def _checked(
     request: InitRequest,
-    terrain: Terrain | None,
+    terrain: StatedTerrain | None,
     systems: tuple[str | None, str],
     crs: str,
     cameras: dict[str, CameraEntry],

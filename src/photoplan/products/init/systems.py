@@ -24,7 +24,7 @@ from photoplan.geometry.crs import (
 from photoplan.geometry.heights import check_height_system, declared_pair, height_label, height_step
 from photoplan.io.names import check_input_name, relative_path
 from photoplan.io.orientation.table import OrientationTable, degrees_of
-from photoplan.io.project.model import Terrain
+from photoplan.io.project.model import StatedTerrain
 from photoplan.io.raster_info import read_info
 from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
 
@@ -85,7 +85,7 @@ def _terrain_facts(file: Path) -> TerrainSource:
     return TerrainSource(info.path, info.crs, info.vertical_crs)
 
 
-def terrain_entry(request: Systems) -> tuple[Terrain | None, TerrainSource | None]:
+def terrain_entry(request: Systems) -> tuple[StatedTerrain | None, TerrainSource | None]:
     """The terrain entry (height system still open) and the facts of its file.
 
     Raises
@@ -97,7 +97,7 @@ def terrain_entry(request: Systems) -> tuple[Terrain | None, TerrainSource | Non
         return None, None
     text = request.terrain.strip()
     try:
-        return Terrain(height=float(text)), None
+        return StatedTerrain(height=float(text)), None
     except ValueError:
         pass
     check_input_name(text)
@@ -112,7 +112,7 @@ def terrain_entry(request: Systems) -> tuple[Terrain | None, TerrainSource | Non
             f"terrain {file}: states {crs_label(info.crs)}, not {request.terrain_crs}; leave `terrain_crs` out"
         )
     crs = None if info.crs is not None else request.terrain_crs
-    return Terrain(file=relative_path(file.absolute(), request.folder), crs=crs), replace(info, crs=stated)
+    return StatedTerrain(file=relative_path(file.absolute(), request.folder), crs=crs), replace(info, crs=stated)
 
 
 def project_crs(

@@ -17,7 +17,7 @@ from photoplan.geometry.grid import Window
 from photoplan.products.mtf.groups import ENOUGH, group_edges
 from photoplan.products.mtf.image import LightImage
 from photoplan.products.mtf.result import ImageMtf, MeasuredEdge, rejected_words
-from photoplan.products.mtf.search import Found, parted, search_edges, select_spread, tiles_of
+from photoplan.products.mtf.search import FoundEdges, parted, search_edges, select_spread, tiles_of
 from photoplan.quality.edges.enhancement import enhancement_of
 from photoplan.quality.edges.find import EdgeRegion, EdgeRules
 from photoplan.quality.edges.response import EdgeSettings, measure_edge
@@ -177,7 +177,7 @@ def _regions(
     return chosen, len(chosen), rejected
 
 
-def _why(found: Found) -> str:
+def _why(found: FoundEdges) -> str:
     words = rejected_words(dict(found.rejected))
     return f"no edge in it can be measured ({words or 'it holds no straight brightness step'}); choose another window"
 

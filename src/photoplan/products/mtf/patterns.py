@@ -87,12 +87,12 @@ def measure_patterns(request: PatternRequest, talk: Callable[[str], None] = lamb
         talk(ENCODED)
     done = bool(results)
     made = PatternReport(
-        request.pattern,
-        tuple(results),
-        failed,
-        linearisation,
-        request.pixel_um,
-        request.csv if done else None,
+        pattern=request.pattern,
+        images=tuple(results),
+        failed=failed,
+        linearisation=linearisation,
+        pixel_um=request.pixel_um,
+        csv=request.csv if done else None,
     )
     if made.csv is not None:
         write_table(made.csv, *made.csv_rows)
@@ -165,7 +165,17 @@ def _measure(named: tuple[str, Path], image: LightImage, request: PatternRequest
             except InputError as error:
                 raise InputError(f"{path}: {error} (`levels` LOW HIGH)") from None
             parts = tuple(window for _, window in sorted(zip(groups, windows), key=lambda part: part[0].frequency))
-            results.append(PatternResult(named, band, _hull(windows), curve, parts, request.coltman, request.pixel_um))
+            results.append(
+                PatternResult(
+                    image=named,
+                    band=band,
+                    window=_hull(windows),
+                    found=curve,
+                    parts=parts,
+                    coltman=request.coltman,
+                    pixel_um=request.pixel_um,
+                )
+            )
             continue
         for k, window in enumerate(windows):
             light, clipped = _read(image, window, channel)
@@ -180,7 +190,9 @@ def _measure(named: tuple[str, Path], image: LightImage, request: PatternRequest
                 results.append(
                     PatternResult(named, band, window, target, pixel_um=request.pixel_um, notes=_stretched(light))
                 )
-    return ImagePattern(name, path, image.size, image.linearisation.describe(), tuple(results))
+    return ImagePattern(
+        name=name, file=path, size=image.size, linearisation=image.linearisation.describe(), results=tuple(results)
+    )
 
 
 def _levels(

@@ -86,17 +86,17 @@ def measure_mtf(
     linearisation = linearisation_of(request.linearisation or "linear")
     lab = None if request.lab is None else read_mtf_table(request.lab)
     measuring = Measuring(
-        request.rois,
-        request.band,
-        EdgeRules.within(
+        rois=request.rois,
+        band=request.band,
+        rules=EdgeRules.within(
             request.half_width,
             least_length=request.least_length or (20.0 if not request.rois else 12.0),
             least_snr=request.least_snr,
         ),
-        request.most_edges,
-        request.grid,
-        request.flight,
-        None if lab is None else (lab.per_pixel(request.pixel_um), lab.modulation),
+        most_edges=request.most_edges,
+        grid=request.grid,
+        flight=request.flight,
+        lab=None if lab is None else (lab.per_pixel(request.pixel_um), lab.modulation),
     )
     names = dict(zip(request.images, unique_names(request.images)))
     opened, failed = _opened(request, linearisation, names)

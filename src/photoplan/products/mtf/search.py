@@ -28,7 +28,7 @@ _TURNED = cos(radians(2.0))
 
 
 @dataclass
-class Found:
+class FoundEdges:
     """Edges that can be measured, and how many others were rejected for what."""
 
     regions: list[EdgeRegion] = field(default_factory=list)
@@ -53,7 +53,7 @@ def search_edges(
     area: Window,
     rules: EdgeRules,
     advance: Callable[[int, int], None] = lambda tiles, pixels: None,
-) -> Found:
+) -> FoundEdges:
     """Edges in a part of an image; pixels outside that part are not used.
 
     Parameters
@@ -68,7 +68,7 @@ def search_edges(
 
     Returns
     -------
-    Found
+    FoundEdges
         In pixel coordinates of the image.
 
     Raises
@@ -76,7 +76,7 @@ def search_edges(
     InputError
         Pixels are damaged.
     """
-    found, open_lines = Found(), []
+    found, open_lines = FoundEdges(), []
     margin = max(rules.halves) + 4
     for tile in tiles_of(area):
         col, row = max(area.col, tile.col - margin), max(area.row, tile.row - margin)
@@ -111,7 +111,7 @@ def search_edges(
 
 
 def _examine_alone(
-    image: LightImage, channel: int, where: tuple[Window, StraightEdge], rules: EdgeRules, found: Found
+    image: LightImage, channel: int, where: tuple[Window, StraightEdge], rules: EdgeRules, found: FoundEdges
 ) -> None:
     """Examine a line in a window of its own."""
     area, line = where

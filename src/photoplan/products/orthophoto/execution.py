@@ -149,7 +149,14 @@ def _work(
     files = {name: open_file(path, **forms[name]) for name, path in paths.items()}
     told = replace(product.plan, tiles=product.plan.tiles.only(()))
     errors = known_errors(address, told, settings) if settings.accuracy else None
-    job = RenderJob(address, told, settings.kernel, tuple(files), errors, painting(product, settings))
+    job = RenderJob(
+        address=address,
+        product=told,
+        kernel=settings.kernel,
+        outputs=tuple(files),
+        errors=errors,
+        paint=painting(product, settings),
+    )
     return Work(
         name=product.plan.name,
         job=job,

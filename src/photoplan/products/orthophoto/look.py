@@ -13,7 +13,7 @@ from photoplan.errors import GeometryError, UsageError
 from photoplan.events import Events
 from photoplan.geometry.grid import refuse_absurd
 from photoplan.io.project.model import Project
-from photoplan.orientation.plausibility import ImagePlausibility, View
+from photoplan.orientation.plausibility import ImagePlausibility, JudgedView
 from photoplan.plan.footprint import Footprint, image_border, mean_gsd, some_height
 from photoplan.products.judged import judged, reading_of_block
 from photoplan.products.orthophoto.settings import OrthoSettings
@@ -50,7 +50,7 @@ class Looked:
 def look_at(project: Project, names: Sequence[str], force: bool, events: Events) -> tuple[list[Looked], list[str]]:
     """Images that see terrain, and a line for each that sees none."""
     scenes: dict[str, Scene] = {}
-    seen: dict[str, tuple[View | None, ImagePlausibility]] = {}
+    seen: dict[str, tuple[JudgedView | None, ImagePlausibility]] = {}
     for place in map_order(project, names):
         # All that is asked of the terrain for one image, before the next: its blocks are then at hand.
         scenes[names[place]] = scene = open_scene(project, names[place])
@@ -79,7 +79,7 @@ def with_resolution(project: Project, settings: OrthoSettings, looked: Sequence[
 
 
 def _refuse_faults(
-    project: Project, seen: dict[str, tuple[View | None, ImagePlausibility]], scenes: dict[str, Scene]
+    project: Project, seen: dict[str, tuple[JudgedView | None, ImagePlausibility]], scenes: dict[str, Scene]
 ) -> None:
     """Refuse what `check` calls a fault or read wrongly; images that see no terrain are told otherwise."""
     if not seen:

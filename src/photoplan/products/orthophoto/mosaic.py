@@ -87,7 +87,12 @@ def _product(
     side = chosen.tile if chosen.choice.feather else 0
     margin = side * grid.resolution
     wide = MapGrid(
-        grid.left - margin, grid.top + margin, grid.resolution, grid.width + 2 * side, grid.height + 2 * side, grid.crs
+        left=grid.left - margin,
+        top=grid.top + margin,
+        resolution=grid.resolution,
+        width=grid.width + 2 * side,
+        height=grid.height + 2 * side,
+        crs=grid.crs,
     )
     taking, tiles = [], []
     for one in looked:

@@ -31,7 +31,7 @@ from photoplan.products.orthophoto.plan import (
 from photoplan.products.orthophoto.settings import Choice, OrthoSettings
 from photoplan.products.orthophoto.sharpness import with_blur
 from photoplan.surfaces.faces import Faces
-from photoplan.surfaces.objects import ObjectSurface, Part
+from photoplan.surfaces.objects import ObjectSurface, SingleObject
 from photoplan.surfaces.polygon_faces import LEAST_AREA
 
 
@@ -156,7 +156,7 @@ def _named(surface: ObjectSurface, entry: int, patterns: Sequence[str]) -> dict[
         if stem.casefold() in stems:
             raise UsageError(f"objects {stems[stem.casefold()]!r} and {name!r} would both be {stem!r}; rename one")
         stems[stem.casefold()] = name
-    return {name: replace(surface, part=Part(tuple(places[name]))) for name in chosen}
+    return {name: replace(surface, part=SingleObject(tuple(places[name]))) for name in chosen}
 
 
 def _placed(found: Mapping[str, ObjectSurface], chosen: OrthoSettings, crs: str, blind: list[str]) -> list[_Single]:

@@ -34,7 +34,7 @@ from photoplan.products.orthophoto.settings import Choice, OrthoSettings
 from photoplan.project.scene import Scene
 from photoplan.project.scenes import ScenesAddress
 from photoplan.project.uncertain import ScenesErrors
-from photoplan.surfaces.objects import Part, painted_surface
+from photoplan.surfaces.objects import SingleObject, painted_surface
 from photoplan.targets.map import MapTarget
 
 #: What it counts that a user prefers an image: more than any penalty of the score.
@@ -51,7 +51,7 @@ class OrthoProduct:
     """What each of its images sees, by row of the table of sources."""
     key: str
     """Hash of all that decides the pixels: inputs, orientation, settings, version."""
-    part: Part | None = None
+    part: SingleObject | None = None
     """What it shows, where it is the product of a single object."""
 
     @property
@@ -219,10 +219,12 @@ def product_plan(
     rule = AnchorRule.of(settings.kernel, settings.tolerance)
     if settings.choice is None:
         owners = None if settings.hidden == "show" else InSight(paints_hidden=settings.hidden == "mark")
-        return ProductPlan(name, images, MapTarget(grid), rule, tiles, owners)
+        return ProductPlan(name=name, sources=images, target=MapTarget(grid), rule=rule, tiles=tiles, owners=owners)
     best = _best(images, settings, settings.choice, looks, regions)
     feather = feather_of(best, settings.choice.feather, grid.resolution, settings.tile)
-    return ProductPlan(name, images, MapTarget(grid), rule, tiles, best, feather)
+    return ProductPlan(
+        name=name, sources=images, target=MapTarget(grid), rule=rule, tiles=tiles, owners=best, feather=feather
+    )
 
 
 def _best(
@@ -256,7 +258,7 @@ def check_storable(scene: Scene, name: str, grid: MapGrid, settings: OrthoSettin
         )
 
 
-def keyed(project: Project, plan: ProductPlan, settings: OrthoSettings, part: Part | None = None) -> str:
+def keyed(project: Project, plan: ProductPlan, settings: OrthoSettings, part: SingleObject | None = None) -> str:
     """Key of a product of a project, or of what it shows of a single object.
 
     Raises

@@ -31,7 +31,7 @@ from photoplan.products.orthophoto.plan import OrthoPlan, OrthoProduct, keyed, p
 from photoplan.products.orthophoto.quadtree import PlanSquares
 from photoplan.products.orthophoto.settings import OrthoSettings
 from photoplan.project.scene import input_files
-from photoplan.surfaces.objects import Part
+from photoplan.surfaces.objects import SingleObject
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +175,15 @@ def write_plan(
     }
     outlines = [_outline(p, look.footprint) for p, _, _, look in seen]
     layer = None if squares is None else (squares.bounds, squares.columns)
-    tables = PlanTables(header, columns, bounds, footprints, outlines, plan.project.crs, layer)
+    tables = PlanTables(
+        header=header,
+        tiles=columns,
+        tile_bounds=bounds,
+        footprints=footprints,
+        outlines=outlines,
+        crs=plan.project.crs,
+        squares=layer,
+    )
     try:
         write_plan_tables(path, tables, overwrite)
     except OSError as error:
@@ -310,4 +318,4 @@ def _product(
     regions = drawn_regions(project, settings, images, grid, project.select(None))
     plan = product_plan(name, images, grid, tiles, settings, looks, regions)
     part = entry.get("part")
-    return OrthoProduct(plan, looks, key, part and Part(tuple(part["objects"]), bool(part["below"])))
+    return OrthoProduct(plan, looks, key, part and SingleObject(tuple(part["objects"]), bool(part["below"])))

@@ -91,7 +91,9 @@ def _quotients(one: Looked, sites: Sequence[Window], grid: MapGrid, settings: Or
     """For each patch that the image shows as a whole, the logarithm to base 2 of fine by coarser detail."""
     target, scene = MapTarget(grid), one.scene
     rule = AnchorRule.of(settings.kernel, settings.tolerance)
-    plan = ProductPlan(one.name, (one.name,), target, rule, Tiles.every(grid.window, settings.tile))
+    plan = ProductPlan(
+        name=one.name, sources=(one.name,), target=target, rule=rule, tiles=Tiles.every(grid.window, settings.tile)
+    )
     shown: dict[int, NDArray[np.float64]] = {}
     for place, window in enumerate(sites):
         corners = np.array([(0.0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0.5)]) * (window.width, window.height)

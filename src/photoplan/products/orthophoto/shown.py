@@ -17,5 +17,12 @@ _KERNEL, _TOLERANCE = "bilinear", 0.5
 def shown(one: Looked, grid: MapGrid, window: Window, side: int) -> Painted:
     """What an image shows of a window of a map whose tiles have a side; nothing where anything hides the ground."""
     rule = AnchorRule.of(_KERNEL, _TOLERANCE)
-    plan = ProductPlan(one.name, (one.name,), MapTarget(grid), rule, Tiles.every(grid.window, side), InSight())
+    plan = ProductPlan(
+        name=one.name,
+        sources=(one.name,),
+        target=MapTarget(grid),
+        rule=rule,
+        tiles=Tiles.every(grid.window, side),
+        owners=InSight(),
+    )
     return render(plan, Tile(0, window, (0,)), one.scene.sources, one.scene.surface, _KERNEL)

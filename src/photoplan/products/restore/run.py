@@ -149,7 +149,9 @@ def plan_restoration(request: RestoreRequest) -> RestorePlan:
             failed[path.name] = str(error)
     for job in jobs:
         _check_outputs(job, request)
-    return RestorePlan(request, filter_, tuple(jobs), failed, _in_flight(request, jobs))
+    return RestorePlan(
+        request=request, filter=filter_, jobs=tuple(jobs), failed=failed, in_flight=_in_flight(request, jobs)
+    )
 
 
 def _check_bands(path: Path, count: int, wanted: Iterable[int]) -> None:
@@ -187,7 +189,16 @@ def _job(request: RestoreRequest, reader: SteppedReader, target: Path, text: str
             f"{info.path}: {reader.bands} bands of {reader.dtype}; compression jpeg takes one or three of uint8"
         )
     form: ImageForm = form_of(info)
-    return Job(reader, target, form, key, nodata, digest, tools, (*request.images, *tools))
+    return Job(
+        reader=reader,
+        target=target,
+        form=form,
+        key=key,
+        nodata=nodata,
+        digest=digest,
+        tools=tools,
+        inputs=(*request.images, *tools),
+    )
 
 
 def _check_outputs(job: Job, request: RestoreRequest) -> None:

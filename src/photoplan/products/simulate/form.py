@@ -93,7 +93,9 @@ class Forming:
         """
         for path, _ in self.frames:
             check_output(path, self.inputs, overwrite=self.overwrite)
-        return self._report([SimulatedImage(p, n, e, 1.0, {}) for n, (p, e) in enumerate(self.frames)])
+        return self._report(
+            [SimulatedImage(path=p, frame=n, exposure=e, gain=1.0, facts={}) for n, (p, e) in enumerate(self.frames)]
+        )
 
     def form(self, events: Events) -> SimulateReport:
         """Form and write the images, and their record.

@@ -144,7 +144,7 @@ def form_frames(
         again = store.index(("frame", n)) in store.finished and not is_kept(store, n, path)
         name = ("frame", n, "again") if again else ("frame", n)
         ((own, gain, facts),) = run(partial(_write, model, light, path, how), [Frame(n, exposure, gain)], [name])
-        images.append(SimulatedImage(path, n, exposure, own, facts))
+        images.append(SimulatedImage(path=path, frame=n, exposure=exposure, gain=own, facts=facts))
     return images
 
 

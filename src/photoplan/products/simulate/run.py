@@ -161,13 +161,13 @@ def _scene(request: SimulateRequest, model: ImageModel) -> LightScene:
     else:
         bands = max((each.band for each in model.lateral), default=1)
         scene = PatternScene(
-            pattern[0],
-            request.size or (512, 512),
-            pattern[1],
-            k or 8,
-            request.levels or (0.0, 1.0),
-            request.phase or (0.0, 0.0),
-            bands,
+            kind=pattern[0],
+            size=request.size or (512, 512),
+            numbers=pattern[1],
+            oversampling=k or 8,
+            levels=request.levels or (0.0, 1.0),
+            phase=request.phase or (0.0, 0.0),
+            bands=bands,
         )
     check_fit(scene, request.scene, model, request.model)
     if isinstance(scene, FileScene) and not scene.has_values:

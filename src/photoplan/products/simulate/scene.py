@@ -71,7 +71,13 @@ class ProjectScene:
         if orientation.earth_curvature != "none" or orientation.refraction:
             # Curved rays are known from heights alone; what lies higher than the camera they cannot meet.
             high = max(low, min(high, z - 1.0))
-        return RenderedScene(camera, self.ground.surface, self.texture, (low, high), self.oversampling)
+        return RenderedScene(
+            camera=camera,
+            surface=self.ground.surface,
+            texture=self.texture,
+            heights=(low, high),
+            oversampling=self.oversampling,
+        )
 
     def from_above(self, grid: MapGrid) -> RenderedScene:
         """What a true orthophoto shows: objects that only hide are left out.
@@ -83,7 +89,13 @@ class ProjectScene:
         """
         low, high = self._heights(grid.bounds, "the true orthophoto")
         above = FromAbove(grid, high + 1.0)
-        return RenderedScene(above, painted_surface(self.ground.surface), self.texture, (low, high), self.oversampling)
+        return RenderedScene(
+            camera=above,
+            surface=painted_surface(self.ground.surface),
+            texture=self.texture,
+            heights=(low, high),
+            oversampling=self.oversampling,
+        )
 
     def _heights(self, bounds: tuple[float, float, float, float], who: str) -> tuple[float, float]:
         low, high = (float(h) for h in self.ground.surface.height_range(bounds))
@@ -139,7 +151,13 @@ def image_truth(scene: RenderedScene, camera: CentralCamera, path: Path, options
         offsets=(*origin.tolist(), 0.0),
     )
     tile = partial(_truth_tile, scene, origin)
-    return TruthRaster(path, Placement(scene.size), np.float32, tile, replace(options, form=form, overviews=False))
+    return TruthRaster(
+        path=path,
+        placement=Placement(scene.size),
+        dtype=np.float32,
+        tile=tile,
+        options=replace(options, form=form, overviews=False),
+    )
 
 
 def _truth_tile(scene: RenderedScene, origin: NDArray[np.float64], window: Window) -> GridTile:
@@ -170,7 +188,7 @@ def true_orthophoto(
     grid = MapGrid.covering(bounds, resolution, scene.project.crs)
     seen = scene.from_above(grid)
     tile, bands = partial(_mean_tile, seen), seen.bands
-    return TruthRaster(path, grid.placement, np.uint8, tile, options, bands)
+    return TruthRaster(path=path, placement=grid.placement, dtype=np.uint8, tile=tile, options=options, bands=bands)
 
 
 def _mean_tile(scene: RenderedScene, window: Window) -> GridTile:

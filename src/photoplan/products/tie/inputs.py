@@ -100,7 +100,17 @@ def open_images(project_: Project, names: Sequence[str], use_orientation: bool) 
             notes.append(f"{image.name}: fiducial marks not measured, its pairs are verified without a camera")
         position = positions.get(match_key(image.name)) if camera is None else camera.center
         grey = GreyImage(reader, _area(image, reader.size))
-        opened.append(TieImage(image.name, reader.path, grey, calibration, camera, level, position))
+        opened.append(
+            TieImage(
+                name=image.name,
+                path=reader.path,
+                grey=grey,
+                calibration=calibration,
+                camera=camera,
+                level=level,
+                position=position,
+            )
+        )
     return opened, notes
 
 
@@ -260,7 +270,12 @@ def find_features(store: FeatureStore, run: Steps) -> list[Features]:
     found = run(
         lambda i: extract_features(i.grey, store.settings), images, store.names, lambda i: int(np.prod(i.grey.size))
     )
-    return [Features(f.xy, f.scale, f.angle, f.strength, np.empty((len(f), 0), np.uint8)) for f in found]
+    return [
+        Features(
+            xy=f.xy, scale=f.scale, angle=f.angle, strength=f.strength, descriptors=np.empty((len(f), 0), np.uint8)
+        )
+        for f in found
+    ]
 
 
 def like_pairs(store: FeatureStore) -> list[tuple[int, int]]:

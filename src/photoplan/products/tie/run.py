@@ -288,7 +288,12 @@ def _points(tracks: Tracks, names: Sequence[str]) -> ImagePoints:
     points = tuple(f"T{k + 1:0{digits}d}" for k in range(tracks.count))
     used, image = np.unique(tracks.image, return_inverse=True)
     return ImagePoints(
-        tuple(names[k] for k in used), points, image.reshape(-1).astype(np.int64), tracks.track, tracks.xy, tracks.sigma
+        images=tuple(names[k] for k in used),
+        points=points,
+        image=image.reshape(-1).astype(np.int64),
+        point=tracks.track,
+        xy=tracks.xy,
+        sigma=tracks.sigma,
     )
 
 

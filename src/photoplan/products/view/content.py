@@ -33,7 +33,7 @@ from photoplan.surfaces.base import Surface
 from photoplan.surfaces.seen import Seen, SeenSurface, pixel_size
 from photoplan.targets.base import Target
 from photoplan.targets.view import ViewTarget
-from photoplan.terrain.shading import RAMPS, Light, Ramp, built_in_ramp, shaded
+from photoplan.terrain.shading import RAMPS, Lighting, Ramp, built_in_ramp, shaded
 
 OWN = ("shade", "tint", "slope")
 #: Colours of slopes, at degrees.
@@ -142,7 +142,7 @@ class Layer(Protocol):
 class Shade:
     """Light on the terrain: alone a hillshade, over other content it darkens and lightens that."""
 
-    light: Light
+    light: Lighting
     strength: float
     first: bool
     files: tuple[Path, ...] = ()
@@ -255,7 +255,7 @@ def best_photos(cameras: Sequence[Any], seen: Seen, surface: SeenSurface) -> NDA
     return owner
 
 
-def illumination(normal: NDArray[np.float64], light: Light) -> NDArray[np.float32]:
+def illumination(normal: NDArray[np.float64], light: Lighting) -> NDArray[np.float32]:
     """Light on a matt surface with these normals, 0 to 1; NaN where there is none."""
     n = normal * (light.exaggeration, light.exaggeration, 1.0)
     sun = light.directions[0]
@@ -263,7 +263,7 @@ def illumination(normal: NDArray[np.float64], light: Light) -> NDArray[np.float3
 
 
 def open_layers(
-    requests: Sequence[ContentRequest], ground: ViewGround, light: Light, heights: tuple[float, float]
+    requests: Sequence[ContentRequest], ground: ViewGround, light: Lighting, heights: tuple[float, float]
 ) -> tuple[Layer, ...]:
     """Contents, ready to paint.
 
@@ -287,7 +287,7 @@ def open_layers(
 
 
 def _layer(
-    request: ContentRequest, first: bool, ground: ViewGround, light: Light, heights: tuple[float, float]
+    request: ContentRequest, first: bool, ground: ViewGround, light: Lighting, heights: tuple[float, float]
 ) -> Layer:
     if request.kind == "shade":
         return Shade(light, request.opacity, first)

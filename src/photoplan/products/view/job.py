@@ -24,7 +24,7 @@ from photoplan.products.view.photo import Photo, PhotoRequest
 from photoplan.surfaces.rays import Hits
 from photoplan.surfaces.seen import Seen, SeenSurface, ground_size
 from photoplan.targets.view import Bundle, ViewTarget
-from photoplan.terrain.shading import Light
+from photoplan.terrain.shading import Lighting
 
 #: Places of shadows are lifted by this, metres, and part of their distance from the eye.
 _LIFT, _LIFT_PART = 0.02, 1e-6
@@ -64,7 +64,7 @@ class LookRequest:
         for name in ("haze_colour", "sky", "nodata"):
             if not all(0 <= v <= 255 for v in getattr(self, name)):
                 raise UsageError(f"`{name}` {getattr(self, name)}; red, green and blue from 0 to 255 are needed")
-        Light(self.azimuth, self.altitude)
+        Lighting(self.azimuth, self.altitude)
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class OpenView:
     target: ViewTarget
     surface: SeenSurface
     layers: tuple[Layer, ...]
-    light: Light
+    light: Lighting
     matrix: MatrixFile | None
     photo: Photo | None
 
@@ -119,7 +119,7 @@ def _open(address: ViewAddress) -> OpenView:
             raise InputError(f"{path}: has changed since the run was planned; run it again")
     ground = open_view_ground(Path(address.source), address.crs)
     camera = view_camera(address.camera, ground, force=True)
-    light = Light(address.look.azimuth, address.look.altitude, camera.request.exaggeration)
+    light = Lighting(address.look.azimuth, address.look.altitude, camera.request.exaggeration)
     layers = open_layers(address.look.contents, ground, light, address.heights)
     matrix = None if address.matrix is None else MatrixFile(Path(address.matrix))
     photo = None if address.look.photo is None else Photo.open(address.look.photo, camera.target.bundle.size)
@@ -221,7 +221,7 @@ def hazy(colours: Colours, distance: NDArray[np.float64], alpha: float, horizon:
     return np.asarray(colours * left + np.array(horizon, np.float32)[:, None, None] * (1 - left))
 
 
-def in_shadow(scene: Scene, light: Light) -> NDArray[np.bool_]:
+def in_shadow(scene: Scene, light: Lighting) -> NDArray[np.bool_]:
     """Pixels whose ground looks away from the sun, or that something stands before."""
     seen, sun = scene.seen, light.directions[0]
     dark = seen.normal @ sun <= 0

@@ -37,7 +37,7 @@ from photoplan.products.view.lines import LinesRequest, open_drawing
 from photoplan.products.view.overlay import Lettering, Overlay, OverlayFacts, overlay
 from photoplan.products.view.photo import Photo
 from photoplan.surfaces.seen_lines import Sight
-from photoplan.terrain.shading import Light
+from photoplan.terrain.shading import Lighting
 
 TILE = 512
 
@@ -174,7 +174,7 @@ def plan_view(request: ViewRequest) -> ViewPlan:
         raise GeometryError(_sees_nothing(camera, ground))
     heights = (0.0, 1.0) if first.lowest is None or first.highest is None else _rounded(first.lowest, first.highest)
     contents = () if request.kind == "matrix" else request.look.contents
-    light = Light(request.look.azimuth, request.look.altitude, camera.request.exaggeration)
+    light = Lighting(request.look.azimuth, request.look.altitude, camera.request.exaggeration)
     layers = open_layers(contents, ground, light, heights)
     matrix = None if request.matrix is None else _fitting(request.matrix, camera)
     files = dict.fromkeys([*ground.files, *(f for each in layers for f in each.files)])

@@ -66,7 +66,13 @@ def dark_current(exposures_ms: Sequence[float], levels: Sequence[Level]) -> Dark
     seconds = np.array(exposures_ms, float) / 1000.0
     sigma = np.array([max(level.mean_sigma, 1e-9) for level in levels])
     line = fit_line(seconds, [level.mean for level in levels], sigma)
-    return DarkCurrent(line.offset, line.offset_sigma, line.slope, line.slope_sigma, line)
+    return DarkCurrent(
+        offset_dn=line.offset,
+        offset_dn_sigma=line.offset_sigma,
+        current_dn_s=line.slope,
+        current_dn_s_sigma=line.slope_sigma,
+        line=line,
+    )
 
 
 def doubling_temperature(

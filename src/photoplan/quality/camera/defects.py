@@ -132,7 +132,13 @@ def find_defects(
     listed = _strongest(
         found, lambda r, c: "hot" if deviation[r, c] > 0 else "dark", deviation, np.abs(deviation) / limit
     )
-    return DefectList(listed, int(found.sum()), float(np.nanmedian(limit)), scatter, deviation)
+    return DefectList(
+        defects=listed,
+        count=int(found.sum()),
+        threshold=float(np.nanmedian(limit)),
+        scatter=scatter,
+        deviation=deviation,
+    )
 
 
 def _strongest(
@@ -175,7 +181,9 @@ def find_blinking(variance: NDArray[np.float64], frames: int, step: float = 1.0)
     limit = 1.5 * usual * float(special.chdtri(frames - 1, _ALARMS / np.isfinite(variance).sum())) / (frames - 1)
     found, sigma = variance > limit, np.sqrt(variance)
     listed = _strongest(found, lambda r, c: "blinking", sigma, sigma / sqrt(limit))
-    return DefectList(listed, int(found.sum()), sqrt(limit), sqrt(usual), None)
+    return DefectList(
+        defects=listed, count=int(found.sum()), threshold=sqrt(limit), scatter=sqrt(usual), deviation=None
+    )
 
 
 def find_lines(mean: NDArray[np.float64], step: float = 1.0) -> DefectList:
@@ -205,11 +213,17 @@ def find_lines(mean: NDArray[np.float64], step: float = 1.0) -> DefectList:
         limit = np.maximum(1.25 * _factor(seen.size) * scatter, 0.5 * step)
         for k in np.flatnonzero(np.abs(deviation) > limit):
             col, row = (float("nan"), float(seen[k])) if kind == "row" else (float(seen[k]), float("nan"))
-            listed.append(Defect(kind, col, row, float(deviation[k]), float(abs(deviation[k]) / limit[k])))
+            listed.append(
+                Defect(
+                    kind=kind, col=col, row=row, value=float(deviation[k]), ratio=float(abs(deviation[k]) / limit[k])
+                )
+            )
         worst_limit = max(worst_limit, float(np.median(limit)))
         worst_scatter = max(worst_scatter, float(np.median(scatter)))
     listed.sort(key=lambda d: -d.ratio)
-    return DefectList(tuple(listed[:MOST]), len(listed), worst_limit, worst_scatter, None)
+    return DefectList(
+        defects=tuple(listed[:MOST]), count=len(listed), threshold=worst_limit, scatter=worst_scatter, deviation=None
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -281,5 +281,7 @@ def _dirt(blocks: Blocks, residuals: Array, relative: Array) -> tuple[Dirt, ...]
         deepest = float(values.flat[int(np.abs(values).argmax())])
         x0, y0 = blocks.corner(columns.start, rows.start)
         x1, y1 = blocks.corner(columns.stop, rows.stop)
-        found.append(Dirt((x0 + x1) / 2.0, (y0 + y1) / 2.0, round(x1 - x0), round(y1 - y0), deepest))
+        found.append(
+            Dirt(x=(x0 + x1) / 2.0, y=(y0 + y1) / 2.0, width=round(x1 - x0), height=round(y1 - y0), depth=deepest)
+        )
     return tuple(sorted(found, key=lambda d: -abs(d.depth))[:_MOST_DIRT])

@@ -104,7 +104,14 @@ def adjust(
     )
     start = settings.principal_point or ((blocks.size[0] - 1) / 2.0, (blocks.size[1] - 1) / 2.0)
     c = settings.camera_constant if settings.natural != "estimated" else _start_constant(blocks, start)
-    model = FallOffModel(blocks.size, start, c, terms, (0.0,) * len(terms), settings.dark)
+    model = FallOffModel(
+        size=blocks.size,
+        principal_point=start,
+        camera_constant=c,
+        terms=terms,
+        coefficients=(0.0,) * len(terms),
+        dark=settings.dark,
+    )
     y = blocks.known
     w = np.ones_like(y) if weights is None else weights
     for step in range(40):
@@ -131,7 +138,13 @@ def adjust(
 
 def _start_constant(blocks: Blocks, point: tuple[float, float]) -> float:
     """From the curvature at the principal point, where cos⁴ω falls by 2 r² / c²."""
-    plain = FallOffModel(blocks.size, point, None, ((1, 1), (1, -1), (2, 0)), (0.0, 0.0, 0.0))
+    plain = FallOffModel(
+        size=blocks.size,
+        principal_point=point,
+        camera_constant=None,
+        terms=((1, 1), (1, -1), (2, 0)),
+        coefficients=(0.0, 0.0, 0.0),
+    )
     found = solve(design(blocks, plain), blocks.known).unknowns
     fall = -found[3] / found[0]
     if not fall > 1e-4:

@@ -163,11 +163,11 @@ def spectrogram(mean: NDArray[np.float64], axis: int) -> Spectrogram:
     around = np.delete(power[max(0, peak - 8) : peak + 9], min(peak, 8))
     standing = around.size and power[peak] > 5 * float(np.median(around)) and power[peak] > 5 * white
     return Spectrogram(
-        np.asarray(frequency, np.float64),
-        np.sqrt(power),
-        sqrt(max(white, 0.0)),
-        excess,
-        float(frequency[peak]) if standing else nan,
+        frequency=np.asarray(frequency, np.float64),
+        amplitude=np.sqrt(power),
+        white=sqrt(max(white, 0.0)),
+        excess=excess,
+        peak_frequency=float(frequency[peak]) if standing else nan,
     )
 
 

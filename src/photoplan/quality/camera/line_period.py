@@ -187,7 +187,13 @@ def adjust_periods(t: Array, y: Array, base: Array, frequencies: list[float], ch
     unknowns = solve(_design(t - middle, base, f), y).unknowns
     covariance = cofactors * found.sigma0**2
     harmonics = tuple(_harmonic(i, k, f, unknowns, covariance, middle, chances) for i in range(len(f)))
-    return AdjustedPeriod(unknowns[:k], np.sqrt(np.diag(covariance)[:k]), harmonics, found.v, found.sigma0)
+    return AdjustedPeriod(
+        unknowns=unknowns[:k],
+        sigmas=np.sqrt(np.diag(covariance)[:k]),
+        harmonics=harmonics,
+        residuals=found.v,
+        sigma0=found.sigma0,
+    )
 
 
 def _design(t: Array, base: Array, f: Array) -> Array:
@@ -217,11 +223,11 @@ def _harmonic(
     of_phase = np.array([b, -a, 0.0]) / max(amplitude, 1e-300) ** 2 - [0.0, 0.0, 2.0 * math.pi * middle]
     phase = math.remainder(math.atan2(a, b) - 2.0 * math.pi * f[i] * middle, math.tau)
     return Harmonic(
-        1.0 / float(f[i]),
-        math.sqrt(C[2, 2]) / float(f[i]) ** 2,
-        amplitude,
-        math.sqrt(of_amplitude @ C @ of_amplitude),
-        phase,
-        math.sqrt(of_phase @ C @ of_phase),
-        chances[i],
+        period=1.0 / float(f[i]),
+        sigma_period=math.sqrt(C[2, 2]) / float(f[i]) ** 2,
+        amplitude=amplitude,
+        sigma_amplitude=math.sqrt(of_amplitude @ C @ of_amplitude),
+        phase=phase,
+        sigma_phase=math.sqrt(of_phase @ C @ of_phase),
+        probability=chances[i],
     )

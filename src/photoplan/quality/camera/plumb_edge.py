@@ -107,7 +107,9 @@ def fit_edge(grey: NDArray[np.floating], *, name: str = "edge", saturation: floa
     seen &= np.abs(fit.contrast) > typical / 4.0
     _refuse_missing(seen, name)
     position, sigma = np.where(seen, fit.position, np.nan), np.where(seen, fit.sigma, np.nan)
-    return EdgeLines("least squares", position, sigma, typical, fit.width, noise)
+    return EdgeLines(
+        method="least squares", position=position, sigma=sigma, contrast=typical, width=fit.width, noise=noise
+    )
 
 
 def correlate_edge(grey: NDArray[np.floating], fitted: EdgeLines, *, name: str = "edge") -> EdgeLines:
@@ -146,7 +148,14 @@ def correlate_edge(grey: NDArray[np.floating], fitted: EdgeLines, *, name: str =
     position[~np.isfinite(fitted.position)] = np.nan
     _refuse_missing(np.isfinite(position), name)
     unknown = np.full(len(g), np.nan)
-    return EdgeLines("correlation", position, unknown, fitted.contrast, fitted.width, fitted.noise)
+    return EdgeLines(
+        method="correlation",
+        position=position,
+        sigma=unknown,
+        contrast=fitted.contrast,
+        width=fitted.width,
+        noise=fitted.noise,
+    )
 
 
 def _window(grey: NDArray[np.floating], name: str) -> Array:
@@ -246,7 +255,14 @@ def _adjusted(g: Array, coarse: NDArray[np.int64]) -> _Fit:
     variance = _typical_square(residuals[whole])
     sigma, sigma_contrast = (np.sqrt(variance * Q[:, k, k]) for k in (2, 1))
     position = np.where(whole, coarse - 0.5 + p, np.nan)
-    return _Fit(position, found[:, 1], s, residuals[whole], sigma, sigma_contrast)
+    return _Fit(
+        position=position,
+        contrast=found[:, 1],
+        width=s,
+        residuals=residuals[whole],
+        sigma=sigma,
+        sigma_contrast=sigma_contrast,
+    )
 
 
 def _solve(A: Array, y: Array) -> tuple[Array, Array]:

@@ -120,7 +120,14 @@ def find_saturation(
     # Clipped shares begin before the mean arrives: the crossing may lie a little outside of the two levels.
     inside = 0.8 * x[first - 1] <= at <= 1.2 * x[first]
     sigma = at * spread / response if inside and first > 1 else nan
-    return Saturation(level, rule, float(x[first - 1]), float(x[first]), at if inside else nan, sigma)
+    return Saturation(
+        level_dn=level,
+        rule=rule,
+        last_unsaturated=float(x[first - 1]),
+        first_saturated=float(x[first]),
+        exposure=at if inside else nan,
+        exposure_sigma=sigma,
+    )
 
 
 def _black_of_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:

@@ -277,7 +277,16 @@ def _courses(t: Array, values: Array, sigmas: Array, model: str) -> tuple[Course
         y, s = values[:, k], sigmas[:, k]
         use = np.isfinite(y)
         approach = fit_approach(t[use], y[use], what=f"warm-up, {name}") if use.sum() >= LEAST_VALUES else None
-        out.append(Course(name, units.get(name, "parts"), y, s, approach, float(np.ptp(_known(y)))))
+        out.append(
+            Course(
+                name=name,
+                unit=units.get(name, "parts"),
+                values=y,
+                sigmas=s,
+                approach=approach,
+                largest=float(np.ptp(_known(y))),
+            )
+        )
     return tuple(out)
 
 

@@ -74,7 +74,9 @@ def edge_displacements(
         )
     table = np.array(rows)
     sigma = np.hypot(table[:, 5], _FLOOR)
-    return Displacements(table[:, :2], table[:, 2:4], table[:, 4], sigma, table[:, 6].astype(int))
+    return Displacements(
+        place=table[:, :2], direction=table[:, 2:4], value=table[:, 4], sigma=sigma, group=table[:, 6].astype(int)
+    )
 
 
 def _step(along: _Array, across: _Array, grey: _Array, slope: float | None) -> tuple[float, float, float] | None:
@@ -175,7 +177,9 @@ def patch_displacements(
     place = np.repeat(table[:, :2], 2, 0)
     direction = np.tile(np.eye(2), (n, 1))
     sigma = np.hypot(table[:, 4:6].ravel(), _MATCHING_FLOOR)
-    return Displacements(place, direction, table[:, 2:4].ravel(), sigma, np.repeat(np.arange(n), 2))
+    return Displacements(
+        place=place, direction=direction, value=table[:, 2:4].ravel(), sigma=sigma, group=np.repeat(np.arange(n), 2)
+    )
 
 
 def _matched(here: _Array, there: _Array) -> tuple[float, float, float, float] | None:

@@ -267,7 +267,15 @@ def _solve(kind: str, size: tuple[int, int], measured: Displacements, kept: NDAr
     residual = measured.value - columns @ fit.unknowns
     rms = float(np.sqrt(np.mean(residual[kept] ** 2)))
     cofactors = fit.cofactors * max(fit.square / max(fit.redundancy, 1), 1.0)
-    return _Solved(kind, fit.unknowns, cofactors, residual, rms, np.array(errors), scale)
+    return _Solved(
+        kind=kind,
+        unknowns=fit.unknowns,
+        cofactors=cofactors,
+        residual=residual,
+        rms=rms,
+        errors=np.array(errors),
+        scale=scale,
+    )
 
 
 def _without_gross(

@@ -71,7 +71,7 @@ class StraightEdge:
         """Line from a to b, the bright side on its right in the picture."""
         length = hypot(b[0] - a[0], b[1] - a[1])
         tx, ty = (b[0] - a[0]) / length, (b[1] - a[1]) / length
-        return cls((a[0] + b[0]) / 2, (a[1] + b[1]) / 2, tx, ty, length, strength)
+        return cls(x=(a[0] + b[0]) / 2, y=(a[1] + b[1]) / 2, tx=tx, ty=ty, length=length, strength=strength)
 
 
 def range_of(grey: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) -> float:

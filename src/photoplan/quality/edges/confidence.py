@@ -54,7 +54,16 @@ class EdgeShape:
         near = (basis.edge(at), basis.line(at), basis.transfer(frequency), basis.steps)
         edge, line, transfer, steps = (np.append(a, np.expand_dims(b, -1), axis=-1) for a, b in zip(near, far))
         ends = np.append(basis.edge(np.array([basis.low, basis.high])), [[0.5], [0.5]], axis=-1)
-        return cls(at, edge, ends, line, frequency, transfer, steps, np.append(basis.tails, 1.0))
+        return cls(
+            at=at,
+            edge=edge,
+            ends=ends,
+            line=line,
+            frequency=frequency,
+            transfer=transfer,
+            steps=steps,
+            tails=np.append(basis.tails, 1.0),
+        )
 
     def allowed(self, shapes: NDArray[np.float64]) -> NDArray[np.float64]:
         """Coefficients (k, size + 1) with what makes negative tails none."""
@@ -115,7 +124,14 @@ def edge_figures(fit: EdgeFit, shape: EdgeShape, confidence: float) -> EdgeFigur
     figures, curves = shape.figures(all_shapes), shape.modulation(all_shapes)
     sigma = _spread(figures, blocks)
     factor = float(stdtrit(blocks - 1, 0.5 + confidence / 2))
-    return EdgeFigures(figures[0], sigma, curves[0], _spread(curves, blocks), factor, blocks - 1)
+    return EdgeFigures(
+        values=figures[0],
+        sigma=sigma,
+        modulation=curves[0],
+        modulation_sigma=_spread(curves, blocks),
+        factor=factor,
+        freedom=blocks - 1,
+    )
 
 
 def gaussian_width(mtf50: float) -> float:

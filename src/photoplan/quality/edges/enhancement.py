@@ -110,7 +110,15 @@ def enhancement_of(edges: Sequence[EnhancedEdge]) -> Enhancement:
     share = float(np.mean([min(e.overshoot, e.undershoot) > LEAST for e in known]))
     sigma = both.sigma if isfinite(both.sigma) else 0.0
     enhanced = both.value - _CLEAR * sigma > LEAST
-    return Enhancement(enhanced, both.value, both.sigma, over, under, len(known), share)
+    return Enhancement(
+        enhanced=enhanced,
+        size=both.value,
+        sigma=both.sigma,
+        overshoot=over,
+        undershoot=under,
+        edges=len(known),
+        share=share,
+    )
 
 
 def _sigma(edge: EnhancedEdge, name: str) -> float:

@@ -223,7 +223,9 @@ def _clean_part(strip: Strip, blur: Blur, half: int, demands: tuple[EdgeRules, f
     line = strip.line.part(start * step, start * step + length)
     bad = np.flatnonzero(~good[start:end])
     gaps = tuple((float(k * step - length / 2), float((k + 1) * step - length / 2)) for k in bad)
-    return EdgeRegion(line, half, part.contrast, part.snr, _is_aligned(line), gaps), ""
+    return EdgeRegion(
+        line=line, half=half, contrast=part.contrast, snr=part.snr, aligned=_is_aligned(line), gaps=gaps
+    ), ""
 
 
 def _bridged(good: NDArray[np.bool_]) -> NDArray[np.bool_]:

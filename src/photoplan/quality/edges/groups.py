@@ -84,14 +84,20 @@ def combine(
     v, s = v[known], s[known]
     n = len(v)
     if n == 0:
-        return CombinedValue(nan, (nan, nan), nan, nan, 0)
+        return CombinedValue(value=nan, interval=(nan, nan), sigma=nan, scatter=nan, edges=0)
     good = np.isfinite(s) & (s > 0.0)
     s = np.where(good, s, float(np.median(s[good])) if good.any() else 0.0)
     # An error that is stated as far too small must not decide alone.
     s = np.maximum(s, 0.2 * float(np.median(s)))
     if n == 1:
         reach = _quantile(confidence, freedom) * float(s[0]) if good.any() else nan
-        return CombinedValue(float(v[0]), (max(float(v[0]) - reach, least), float(v[0]) + reach), float(s[0]), 0.0, 1)
+        return CombinedValue(
+            value=float(v[0]),
+            interval=(max(float(v[0]) - reach, least), float(v[0]) + reach),
+            sigma=float(s[0]),
+            scatter=0.0,
+            edges=1,
+        )
     keep = np.ones(n)
     mean = float(np.median(v))
     tau2 = 0.0
@@ -117,7 +123,9 @@ def combine(
     # Each edge's part is known by its own degrees of freedom, alike edges together by as many times more.
     unsure = rest / (n - 1) + float(parts @ parts) / (max(own, 1e-300) * freedom)
     reach = _quantile(confidence, sigma**2 / unsure if unsure > 1e-9 * sigma**2 else inf) * sigma
-    return CombinedValue(mean, (max(mean - reach, least), mean + reach), sigma, sqrt(tau2), n)
+    return CombinedValue(
+        value=mean, interval=(max(mean - reach, least), mean + reach), sigma=sigma, scatter=sqrt(tau2), edges=n
+    )
 
 
 def _between(v: Array, s: Array, keep: Array) -> float:

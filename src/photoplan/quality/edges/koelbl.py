@@ -108,7 +108,13 @@ def spread_from_edge(
         shift, values, residual = _symmetric(rise, border, reach)
     else:
         shift, values, residual = _unsymmetric(rise, border, reach, centroid - border)
-    return EdgeSpread(SpreadFunction.normalised(values), shift, border, residual, 1.0 - float(values.sum()))
+    return EdgeSpread(
+        spread=SpreadFunction.normalised(values),
+        shift=shift,
+        border=border,
+        residual=residual,
+        beyond=1.0 - float(values.sum()),
+    )
 
 
 def _taps(count: int, shift: float, border: int, reach: int) -> NDArray[np.float64]:
@@ -216,4 +222,4 @@ def spread_of_edge(edge: EdgeMeasurement) -> EdgeSpread | None:
         spread, beyond = spread_from_response(positions, edge.esf.values, half, edge.esf.sigma)
     except InputError:
         return None
-    return EdgeSpread(spread, 0.0, 0, 0.0, beyond)
+    return EdgeSpread(spread=spread, shift=0.0, border=0, residual=0.0, beyond=beyond)

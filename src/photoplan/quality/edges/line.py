@@ -135,7 +135,9 @@ def find_line(image: NDArray[np.float64], valid: NDArray[np.bool_]) -> EdgeLine:
         fit = solve(design, across.astype(float), w)
         offset, slope = fit.unknowns
         reach = max(2.5 * float(np.sqrt(fit.square / w.sum())), 2.0)
-    return EdgeLine(direction, float(offset), float(slope), 0.0, middle, rising)
+    return EdgeLine(
+        direction=direction, offset=float(offset), slope=float(slope), bend=0.0, middle=middle, rising=rising
+    )
 
 
 def fit_line(
@@ -186,7 +188,14 @@ class _LineState:
         old = self.line
         bend = old.bend + (float(step[2]) if curve > 1 else 0.0)
         slope = float(np.clip(old.slope + step[1], -3.0, 3.0))
-        line = EdgeLine(old.direction, old.offset + float(step[0]), slope, bend, old.middle, old.rising)
+        line = EdgeLine(
+            direction=old.direction,
+            offset=old.offset + float(step[0]),
+            slope=slope,
+            bend=bend,
+            middle=old.middle,
+            rising=old.rising,
+        )
         blur = float(np.clip(self.blur + step[curve + 1], max(LEAST_BLUR, 0.4 * self.blur), 2.5 * self.blur))
         return _LineState(line, blur)
 

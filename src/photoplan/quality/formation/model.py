@@ -28,14 +28,14 @@ from photoplan.quality.formation.parts import (
     Exposure,
     Falloff,
     FixedPattern,
+    FormationPart,
     Gain,
     Lateral,
     LineJitterPart,
-    Part,
     Quantisation,
     Readout,
     Spread,
-    Tone,
+    ToneCurve,
     Well,
     Within,
 )
@@ -72,7 +72,7 @@ def enhanced(grey: _Array, enhancement: EnhancementPart) -> _Array:
     return np.asarray(grey + enhancement.amount * (grey - smooth))
 
 
-def toned(grey: _Array, tone: Tone) -> _Array:
+def toned(grey: _Array, tone: ToneCurve) -> _Array:
     """Stored grey values of linear ones."""
     if tone.curve == "table":
         points = np.array(tone.table)
@@ -92,7 +92,7 @@ def quantised(grey: _Array, quantisation: Quantisation) -> NDArray[np.uint8] | N
 
 
 @dataclass(frozen=True)
-class ImageModel(Part, name="model"):
+class ImageModel(FormationPart, name="model"):
     """How an image comes about. Each part's default changes nothing."""
 
     spread: Spread = field(default_factory=Spread)
@@ -109,7 +109,7 @@ class ImageModel(Part, name="model"):
     gain: Gain = field(default_factory=Gain)
     automatic_gain: AutomaticGain | None = None
     enhancement: EnhancementPart | None = None
-    tone: Tone | None = None
+    tone: ToneCurve | None = None
     quantisation: Quantisation | None = None
     seed: Annotated[int, Within(0, 2**63)] = 0
     """Of all that is random: the same seed gives the same sensor, the same seed and frame the same image."""
@@ -242,7 +242,14 @@ def exposed(model: ImageModel, light: _Array, frame: Frame) -> FormedImage:
     facts |= {name: facts[name] / light.size for name in ("electrons", "dark_electrons")}
     single = bands == 1
     shift = _shift(model, height, frame.number)
-    return FormedImage(values[0] if single else values, light[0] if single else light, shift, gain, after, facts)
+    return FormedImage(
+        values=values[0] if single else values,
+        light=light[0] if single else light,
+        line_shift=shift,
+        gain=gain,
+        next_gain=after,
+        facts=facts,
+    )
 
 
 def _electrons(

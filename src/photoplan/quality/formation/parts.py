@@ -32,7 +32,7 @@ class Within:
             raise InputError(f"{what} = {value:g}; allowed is {self.least:g} {to}")
 
 
-class Part:
+class FormationPart:
     """A part of a model: ranges and words that its fields' types state are checked when it is made (`InputError`)."""
 
     name: ClassVar[str]
@@ -60,7 +60,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Spread(Part, name="spread"):
+class Spread(FormationPart, name="spread"):
     """Spread function before the pixel's aperture: the convolution of all of its parts; lengths in pixels.
 
     The light that it spreads is kept: every part has the sum 1, and what falls beyond the reach of a tail is shared out
@@ -126,7 +126,7 @@ def _check_shares(name: str, rows: tuple[tuple[float, ...], ...]) -> None:
 
 
 @dataclass(frozen=True)
-class Lateral(Part, name="lateral"):
+class Lateral(FormationPart, name="lateral"):
     """Lateral chromatic aberration of one band: where its image lies against the object.
 
     With (u, v) from the image's middle and ρ = 1 in its corners the band lies at (u, v) (1 + scale + cubic ρ²) + shift.
@@ -143,7 +143,7 @@ class Lateral(Part, name="lateral"):
 
 
 @dataclass(frozen=True)
-class Falloff(Part, name="falloff"):
+class Falloff(FormationPart, name="falloff"):
     """Fall of light to the image's border: the product of its parts (Behr 1989, section 4.2.1)."""
 
     focal: Annotated[float | None, Within(1.0, 1e7)] = None
@@ -168,7 +168,7 @@ class Falloff(Part, name="falloff"):
 
 
 @dataclass(frozen=True)
-class Aperture(Part, name="aperture"):
+class Aperture(FormationPart, name="aperture"):
     """The light-sensitive area of a sensor element; its mean is the pixel's value (Ecker 1991, section 4.3.1)."""
 
     shape: Literal["square", "round", "point"] = "square"
@@ -181,7 +181,7 @@ class Aperture(Part, name="aperture"):
 
 
 @dataclass(frozen=True)
-class LineJitterPart(Part, name="jitter"):
+class LineJitterPart(FormationPart, name="jitter"):
     """Displacement of whole lines along x, as faulty line synchronisation makes it (Behr 1989, section 4.1.2).
 
     A positive one moves what the line shows to the right. Random displacements are new in every frame.
@@ -200,7 +200,7 @@ class LineJitterPart(Part, name="jitter"):
 
 
 @dataclass(frozen=True)
-class Exposure(Part, name="exposure"):
+class Exposure(FormationPart, name="exposure"):
     """From the scene's values to electrons: value × light × quantum_efficiency × exposure."""
 
     light: Annotated[float, Within(0.0, 1e12)] = 1.0
@@ -212,7 +212,7 @@ class Exposure(Part, name="exposure"):
 
 
 @dataclass(frozen=True)
-class DarkCurrentPart(Part, name="dark"):
+class DarkCurrentPart(FormationPart, name="dark"):
     """Charge without light, which doubles with temperature (Behr 1989, section 3.6.4: about every 10 °C)."""
 
     rate: Annotated[float, Within(0.0, 1e9)] = 0.0
@@ -233,7 +233,7 @@ class DarkCurrentPart(Part, name="dark"):
 
 
 @dataclass(frozen=True)
-class FixedPattern(Part, name="fixed_pattern"):
+class FixedPattern(FormationPart, name="fixed_pattern"):
     """Differences between pixels that are the same in all frames of one seed."""
 
     response: Annotated[float, Within(0.0, 0.5)] = 0.0
@@ -247,7 +247,7 @@ class FixedPattern(Part, name="fixed_pattern"):
 
 
 @dataclass(frozen=True)
-class DefectPart(Part, name="defect"):
+class DefectPart(FormationPart, name="defect"):
     """A sensor element that does not do as the others."""
 
     column: Annotated[int, Within(0)]
@@ -262,7 +262,7 @@ class DefectPart(Part, name="defect"):
 
 
 @dataclass(frozen=True)
-class Well(Part, name="well"):
+class Well(FormationPart, name="well"):
     """How much charge an element holds and where the rest goes: blooming and tailing (Behr 1989, section 3.6.5).
 
     The excess over `capacity` is divided: `drain` disappears, `tailing` flows along the line towards higher columns,
@@ -291,7 +291,7 @@ class Well(Part, name="well"):
 
 
 @dataclass(frozen=True)
-class Readout(Part, name="readout"):
+class Readout(FormationPart, name="readout"):
     """What is added while charge is gathered, moved and read."""
 
     shot_noise: bool = False
@@ -305,7 +305,7 @@ class Readout(Part, name="readout"):
 
 
 @dataclass(frozen=True)
-class Gain(Part, name="gain"):
+class Gain(FormationPart, name="gain"):
     """From electrons to grey values."""
 
     factor: Annotated[float, Within(1e-12, 1e12)] = 1.0
@@ -317,7 +317,7 @@ class Gain(Part, name="gain"):
 
 
 @dataclass(frozen=True)
-class AutomaticGain(Part, name="automatic_gain"):
+class AutomaticGain(FormationPart, name="automatic_gain"):
     """A gain that follows the brightness from frame to frame (Behr 1989, section 4.2.5)."""
 
     target: Annotated[float, Within(1e-9, 1e9)]
@@ -331,7 +331,7 @@ class AutomaticGain(Part, name="automatic_gain"):
 
 
 @dataclass(frozen=True)
-class EnhancementPart(Part, name="enhancement"):
+class EnhancementPart(FormationPart, name="enhancement"):
     """Edge enhancement inside the camera: amount × (signal − signal smoothed by a Gaussian) is added.
 
     It makes the over- and undershoot beside edges of which Kölbl (2006, section 4) says that they limit restoration.
@@ -346,7 +346,7 @@ class EnhancementPart(Part, name="enhancement"):
 
 
 @dataclass(frozen=True)
-class Tone(Part, name="tone"):
+class ToneCurve(FormationPart, name="tone"):
     """The curve from linear to stored grey values, on values divided by `white`; below 0 becomes 0."""
 
     curve: Literal["gamma", "srgb", "table"] = "gamma"
@@ -369,7 +369,7 @@ class Tone(Part, name="tone"):
 
 
 @dataclass(frozen=True)
-class Quantisation(Part, name="quantisation"):
+class Quantisation(FormationPart, name="quantisation"):
     """Rounding to whole grey values and clipping at both ends (Behr 1989, eq. 3.14: noise 1 / √12)."""
 
     bits: Annotated[int, Within(1, 16)] = 8

@@ -104,7 +104,7 @@ def overflow(electrons: _Array, well: Well) -> Overflow:
     excess = np.maximum(electrons - well.capacity, 0.0)
     held = np.minimum(electrons, well.capacity)
     if not excess.any():
-        return Overflow(held, 0.0, 0.0, 0.0, np.zeros(held.shape, bool))
+        return Overflow(electrons=held, excess=0.0, drained=0.0, lost=0.0, touched=np.zeros(held.shape, bool))
     before = held.copy()
     rest = excess * max(1.0 - well.drain - well.tailing - well.circular, 0.0)
     if well.circular:
@@ -116,7 +116,9 @@ def overflow(electrons: _Array, well: Well) -> Overflow:
     held = _flow(held[::-1], (rest / 2.0)[::-1], well.capacity)[::-1]
     total, drained = float(excess.sum()), well.drain * float(excess.sum())
     lost = total - drained - float((held - before).sum())
-    return Overflow(np.ascontiguousarray(held), total, drained, max(lost, 0.0), held > before)
+    return Overflow(
+        electrons=np.ascontiguousarray(held), excess=total, drained=drained, lost=max(lost, 0.0), touched=held > before
+    )
 
 
 def _around(held: _Array, excess: _Array, well: Well) -> tuple[_Array, _Array]:

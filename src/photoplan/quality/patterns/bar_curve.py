@@ -74,12 +74,12 @@ def bar_curve(groups: Sequence[BarContrast], levels: tuple[float, float] | None 
     transfer_sigma = np.array([group.fundamental_sigma for group in ordered]) / share
     transfer_sigma = np.sqrt(transfer_sigma**2 + transfer**2 * (duty_sigma**2 + own**2))
     return BarCurve(
-        ordered,
-        low,
-        high,
-        source,
-        MtfCurve.from_zero(frequency, contrast, contrast_sigma),
-        MtfCurve.from_zero(frequency, transfer, transfer_sigma),
+        groups=ordered,
+        low=low,
+        high=high,
+        levels_from=source,
+        contrast=MtfCurve.from_zero(frequency, contrast, contrast_sigma),
+        mtf=MtfCurve.from_zero(frequency, transfer, transfer_sigma),
     )
 
 

@@ -48,7 +48,7 @@ class StarPixels:
         order = np.argsort(radius, kind="stable")
         x, y = x[order], y[order]
         angle = np.arctan2(y - centre[1], x - centre[0])
-        return cls(centre, values[order], x, y, radius[order], angle)
+        return cls(centre=centre, values=values[order], x=x, y=y, radius=radius[order], angle=angle)
 
     def between(self, inner: float, outer: float) -> tuple[Array, Array]:
         """Light and direction of the pixels of a ring."""

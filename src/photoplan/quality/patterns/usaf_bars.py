@@ -81,7 +81,15 @@ def _pixels(
     part = (slice(low[1], high[1]), slice(low[0], high[0]))
     cut = np.zeros(u.size) if clipped is None else clipped[part].ravel().astype(float)
     frequency = float(np.hypot(*along)) / float(abs(across[0] * along[1] - across[1] * along[0]))
-    return _Pixels(u, v, values[part].ravel(), cut, centre, frequency, across / float(np.hypot(*across)))
+    return _Pixels(
+        u=u,
+        v=v,
+        light=values[part].ravel(),
+        clipped=cut,
+        centre=centre,
+        frequency=frequency,
+        across=across / float(np.hypot(*across)),
+    )
 
 
 def measure_three(

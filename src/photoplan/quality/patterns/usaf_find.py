@@ -62,8 +62,8 @@ def usaf_layout(groups: int) -> Iterator[UsafElement]:
     for step in range(groups):
         scale = 0.25 ** (step // 2)
         for k, (horizontal, vertical, row) in enumerate(_PAIR[step % 2]):
-            yield UsafElement(step, k + 1, True, scale * horizontal, scale * row)
-            yield UsafElement(step, k + 1, False, scale * vertical, scale * row)
+            yield UsafElement(step=step, element=k + 1, horizontal=True, x=scale * horizontal, y=scale * row)
+            yield UsafElement(step=step, element=k + 1, horizontal=False, x=scale * vertical, y=scale * row)
 
 
 def usaf_frequency(group: int, element: int) -> float:
@@ -242,7 +242,7 @@ def _place(threes: Sequence[_Three], bright: bool) -> UsafPlace | None:
         fit = solve(design, wanted)
         matrix, origin = fit.unknowns[:2].T, fit.unknowns[2]
         rms = float(np.sqrt((fit.residuals**2).mean()))
-    return UsafPlace(matrix, origin, len(matches), rms, bright)
+    return UsafPlace(matrix=matrix, origin=origin, matched=len(matches), rms=rms, bright=bright)
 
 
 def _turns(seed: _Three, item: UsafElement) -> list[Array]:

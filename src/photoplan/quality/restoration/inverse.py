@@ -69,11 +69,13 @@ def condition_of(spread: SpreadFunction) -> Condition:
     least = int(np.argmin(transfer))
     singular = svdvals(band_matrix(spread))
     return Condition(
-        float(side[1] / side[0]) if side.size > 1 and side[0] > 0.0 else float("inf" if side[0] <= 0.0 else 0.0),
-        float(transfer[least]),
-        float(_FREQUENCIES[least]),
-        float(singular[-1]),
-        float(singular[0]),
+        neighbour_ratio=float(side[1] / side[0])
+        if side.size > 1 and side[0] > 0.0
+        else float("inf" if side[0] <= 0.0 else 0.0),
+        least_transfer=float(transfer[least]),
+        at_frequency=float(_FREQUENCIES[least]),
+        smallest_singular=float(singular[-1]),
+        largest_singular=float(singular[0]),
     )
 
 

@@ -200,4 +200,6 @@ def fit_scene(
     contrast = sqrt(scale * np.exp(factor) * _unit_contrast(float(exponent)))
     found = sqrt(scale * np.exp(noisy)) if noise[1] > 0.0 else 0.0
     texture = sqrt(scale * np.exp(white) * _unit_contrast(0.0)) if textured else 0.0
-    return SceneStatistics(found, contrast, float(exponent), sqrt(smoothed), texture)
+    return SceneStatistics(
+        noise=found, contrast=contrast, exponent=float(exponent), smoothed=sqrt(smoothed), texture=texture
+    )

@@ -233,7 +233,9 @@ def _map(built: Built, surface: HybridSurface) -> ReportMap:
         kept = np.s_[row[0] : row[-1] + 1, column[0] : column[-1] + 1]
         heights, sigmas = heights[kept], sigmas[kept]
         left, top = grid.left + column[0] * resolution, grid.top - row[0] * resolution
-    return ReportMap(left, top, resolution, heights, sigmas, _lines(built, resolution))
+    return ReportMap(
+        left=left, top=top, resolution=resolution, heights=heights, sigmas=sigmas, lines=_lines(built, resolution)
+    )
 
 
 def _lines(built: Built, resolution: float) -> tuple[tuple[str, NDArray[np.float64]], ...]:
@@ -267,7 +269,9 @@ def _effects(built: Built, measured: MeasuredTerrain, surface: HybridSurface) ->
         shown = _thin(some, _SAMPLE)
         xyz = seen.xyz[shown] + seen.origin
         d = xyz[:, 2] - surface.heights(xyz[:, :2])
-        found.append(FilterEffect(_WORDS[kind], len(some), _one(sigma[some]), xyz[:, :2], d))
+        found.append(
+            FilterEffect(name=_WORDS[kind], count=len(some), sigma=_one(sigma[some]), xy=xyz[:, :2], differences=d)
+        )
     return (*found, *_line_effects(built))
 
 
@@ -290,7 +294,9 @@ def _line_effects(built: Built) -> list[FilterEffect]:
         xy, d = (np.concatenate(values) for values in zip(*parts[kind]))
         step = max(1, -(-len(d) // _SAMPLE))
         name = f"vertices of {_WORDS[kind]}"
-        found.append(FilterEffect(name, len(d), known.get(kind, np.nan), xy[::step], d[::step]))
+        found.append(
+            FilterEffect(name=name, count=len(d), sigma=known.get(kind, np.nan), xy=xy[::step], differences=d[::step])
+        )
     return found
 
 
@@ -332,7 +338,7 @@ def _errors(
     difference = xyz[:, 2] - surface.heights(xyz[:, :2])
     names = [measured.points[seen.group[k]].label(int(seen.record[k])) for k in some.tolist()]
     return tuple(
-        PlottedError(name, float(X), float(Y), float(Z), float(d), float(z))
+        PlottedError(name=name, X=float(X), Y=float(Y), height=float(Z), difference=float(d), normalised=float(z))
         for name, (X, Y, Z), d, z in zip(names, xyz, difference, residuals[:, 2])
     )
 

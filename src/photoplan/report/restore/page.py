@@ -222,11 +222,11 @@ def axis_pictures(part: DesignedPart) -> tuple[AxisPicture, ...]:
         label = f"along {name}" + (" (by the others)" if axis in part.missing else "")
         pictures.append(
             AxisPicture(
-                label,
-                sharpness.spread.side(),
-                _FREQUENCY,
-                _modulation(curve),
-                _expected(curve, part.design.kernel, direction),
+                label=label,
+                spread=sharpness.spread.side(),
+                frequency=_FREQUENCY,
+                modulation=_modulation(curve),
+                expected=_expected(curve, part.design.kernel, direction),
             )
         )
     return tuple(pictures)

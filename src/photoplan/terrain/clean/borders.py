@@ -57,7 +57,15 @@ def closed(lines: Sequence[MeasuredLine]) -> tuple[list[MeasuredLine], list[Find
                 f"to its first, its longest side has {steps.max():.3f} m; close it, or give it another class"
             )
         if gap > 0:
-            found.append(Finding("unclosed border", f"{line.name}: a gap of {gap:.3f} m closed", X, Y, (line.name,)))
+            found.append(
+                Finding(
+                    kind="unclosed border",
+                    text=f"{line.name}: a gap of {gap:.3f} m closed",
+                    X=X,
+                    Y=Y,
+                    names=(line.name,),
+                )
+            )
             line = replace(line, xyz=np.concatenate([line.xyz, line.xyz[:1]]))
         out.append(line)
     return out, found
@@ -76,7 +84,7 @@ def unfit_rings(lines: Sequence[MeasuredLine]) -> tuple[list[MeasuredLine], list
             ring = _polygon(line)
             if ring is None or shapely.make_valid(ring).area == 0:
                 text = f"{line.name}: the {_word(line)} encloses no area; left out"
-                found.append(Finding("empty border", text, X, Y, (line.name,)))
+                found.append(Finding(kind="empty border", text=text, X=X, Y=Y, names=(line.name,)))
                 continue
             if not shapely.is_valid(ring):
                 reason = shapely.is_valid_reason(ring)
@@ -86,7 +94,7 @@ def unfit_rings(lines: Sequence[MeasuredLine]) -> tuple[list[MeasuredLine], list
                     f"{line.name}: the {_word(line)} crosses or touches itself at X {X:.3f}, Y {Y:.3f}; "
                     "taken is what it encloses an odd number of times"
                 )
-                found.append(Finding("self-crossing border", text, X, Y, (line.name,)))
+                found.append(Finding(kind="self-crossing border", text=text, X=X, Y=Y, names=(line.name,)))
         out.append(line)
     return out, found
 
@@ -155,7 +163,7 @@ def outside(measured: MeasuredTerrain, domain: Any, tolerance: float) -> list[Fi
                 f"{group.name}: {int(out.sum())} of {len(out)} points lie outside the border lines or in holes, the "
                 f"first is {group.label(at)} at X {X:.3f}, Y {Y:.3f}; nothing is predicted there"
             )
-            found.append(Finding("points outside", text, X, Y, (group.name,)))
+            found.append(Finding(kind="points outside", text=text, X=X, Y=Y, names=(group.name,)))
     for line in measured.lines:
         if line.kind == "border":
             continue
@@ -165,7 +173,7 @@ def outside(measured: MeasuredTerrain, domain: Any, tolerance: float) -> list[Fi
                 continue
             X, Y = line.xyz[0, :2].tolist()
             text = f"{line.name}: the hole at X {X:.3f}, Y {Y:.3f} lies outside the border lines; it has no effect"
-            found.append(Finding("hole outside", text, X, Y, (line.name,)))
+            found.append(Finding(kind="hole outside", text=text, X=X, Y=Y, names=(line.name,)))
             continue
         out = _outside(line.xyz[:, :2], domain, tolerance)
         if out.any():
@@ -174,7 +182,7 @@ def outside(measured: MeasuredTerrain, domain: Any, tolerance: float) -> list[Fi
                 f"{line.name}: {int(out.sum())} of {len(out)} vertices lie outside the border lines or in holes, the "
                 f"first at X {X:.3f}, Y {Y:.3f}; nothing is predicted there"
             )
-            found.append(Finding("line outside", text, X, Y, (line.name,)))
+            found.append(Finding(kind="line outside", text=text, X=X, Y=Y, names=(line.name,)))
     return found
 
 

@@ -119,7 +119,11 @@ def _meetings(
         pairs = list(seen.items()) if len(seen) > 1 else list(zip(names, z[part].tolist()))
         v = int(vertex[part[0]])
         X, Y = net.xy[v].tolist()
-        out.append(Meeting(X, Y, tuple(n for n, _ in pairs), tuple(h for _, h in pairs), float(mean[v])))
+        out.append(
+            Meeting(
+                X=X, Y=Y, names=tuple(n for n, _ in pairs), heights=tuple(h for _, h in pairs), taken=float(mean[v])
+            )
+        )
     return out
 
 
@@ -199,7 +203,7 @@ def _pieces(
             if not low - tolerance <= own <= high + tolerance:
                 X, Y = net.xy[vertex].tolist()
                 names = (line.name, sides.walls[vertex][4])
-                meetings.append(Meeting(X, Y, names, (own, low, high), float("nan")))
+                meetings.append(Meeting(X=X, Y=Y, names=names, heights=(own, low, high), taken=float("nan")))
         if shared:
             pieces.append([])
         else:

@@ -64,11 +64,11 @@ def make_network(lines: Sequence[MeasuredLine], tolerance: float) -> Network:
     right = [np.full(len(line.xyz), np.nan) if line.right is None else line.right for line in lines]
     used, vertex = np.unique(clusters(xyz[:, :2], tolerance), return_inverse=True)
     return Network(
-        xyz[used, :2],
-        vertex.astype(np.int64),
-        np.repeat(np.arange(len(lines)), count),
-        xyz[:, 2].copy(),
-        np.concatenate(right) if right else np.empty(0),
+        xy=xyz[used, :2],
+        vertex=vertex.astype(np.int64),
+        line=np.repeat(np.arange(len(lines)), count),
+        z=xyz[:, 2].copy(),
+        right=np.concatenate(right) if right else np.empty(0),
     )
 
 
@@ -92,7 +92,7 @@ def without_repeats(net: Network) -> tuple[Network, NDArray[np.int64], NDArray[n
     at = np.flatnonzero((size > 1) & (spread > 0))
     single = size == 1
     z[single], right[single] = net.z[starts[single]], net.right[starts[single]]  # bits as they were
-    return Network(net.xy, net.vertex[new], net.line[new], z, right), at, spread[at]
+    return Network(xy=net.xy, vertex=net.vertex[new], line=net.line[new], z=z, right=right), at, spread[at]
 
 
 def insert(net: Network, new: Insertions) -> tuple[Network, NDArray[np.bool_], NDArray[np.int64]]:
@@ -107,11 +107,11 @@ def insert(net: Network, new: Insertions) -> tuple[Network, NDArray[np.bool_], N
     fresh[place] = True
     where = place + 1
     grown = Network(
-        net.xy,
-        np.insert(net.vertex, where, vertex),
-        np.insert(net.line, where, net.line[place]),
-        np.insert(net.z, where, z),
-        np.insert(net.right, where, right),
+        xy=net.xy,
+        vertex=np.insert(net.vertex, where, vertex),
+        line=np.insert(net.line, where, net.line[place]),
+        z=np.insert(net.z, where, z),
+        right=np.insert(net.right, where, right),
     )
     return grown, np.insert(fresh, where, True), np.insert(np.arange(len(net.line)), where, place)
 

@@ -92,7 +92,7 @@ def without_coincident(points: Points, tolerance: float, height_tolerance: float
         names = tuple(points.label(m) for m in members.tolist())
         heights = ", ".join(f"{n} {h:.3f} m" for n, h in zip(names, points.xyz[members, 2]))
         text = f"{heights}: points at X {X:.3f}, Y {Y:.3f} with different heights; {mean[k]:.3f} m taken"
-        found.append(Finding("coincident points", text, X, Y, names))
+        found.append(Finding(kind="coincident points", text=text, X=X, Y=Y, names=names))
     return replace(points, xyz=xyz, keep=keep), found
 
 
@@ -187,7 +187,7 @@ def _on_wall(points: Points, k: int) -> Finding:
     X, Y, Z = points.xyz[k].tolist()
     name = points.label(k)
     text = f"{name}: lies on a wall at X {X:.3f}, Y {Y:.3f} with height {Z:.3f} m; left out, its side is not known"
-    return Finding("point on wall", text, X, Y, (name,))
+    return Finding(kind="point on wall", text=text, X=X, Y=Y, names=(name,))
 
 
 def _hits(

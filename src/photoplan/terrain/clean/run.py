@@ -138,7 +138,7 @@ def _network(lines: Sequence[MeasuredLine]) -> tuple[Network, list[Finding]]:
                 f"{line.name}: consecutive vertices at X {X:.3f}, Y {Y:.3f} differ by {difference:.3f} m in height; "
                 f"{net.z[place]:.3f} m taken (a wall is given as a two-sided breakline)"
             )
-            found.append(Finding("repeated vertices", text, X, Y, (line.name,)))
+            found.append(Finding(kind="repeated vertices", text=text, X=X, Y=Y, names=(line.name,)))
     return net, found
 
 
@@ -174,7 +174,7 @@ def _without_length(net: Network, lines: Sequence[MeasuredLine]) -> list[Finding
         line = lines[number]
         X, Y = line.xyz[0, :2].tolist()
         text = f"{line.name}: all its vertices are at X {X:.3f}, Y {Y:.3f}; a line without length, left out"
-        found.append(Finding("line without length", text, X, Y, (line.name,)))
+        found.append(Finding(kind="line without length", text=text, X=X, Y=Y, names=(line.name,)))
     return found
 
 
@@ -189,9 +189,9 @@ def _meeting(meeting: Meeting) -> Finding:
             f"{line} meets the wall {wall} at {where} with height {own:.3f} m, the wall stands from {low:.3f} to "
             f"{high:.3f} m; the heights of its sides taken"
         )
-        return Finding("line at wall", text, meeting.X, meeting.Y, meeting.names)
+        return Finding(kind="line at wall", text=text, X=meeting.X, Y=meeting.Y, names=meeting.names)
     text = f"{who}: meet at {where} with heights {apart:.3f} m apart; {meeting.taken:.3f} m taken"
-    return Finding("crossing heights", text, meeting.X, meeting.Y, meeting.names)
+    return Finding(kind="crossing heights", text=text, X=meeting.X, Y=meeting.Y, names=meeting.names)
 
 
 def _check_rank(measured: MeasuredTerrain) -> None:

@@ -129,5 +129,5 @@ def _told(joined: int, lines: Sequence[MeasuredLine]) -> list[Finding]:
             f"{len(left)} of {len(some)} {kind}s{f' of code {code}' if code else ''} are single segments, for one "
             f"{left[0].name}: where they end, no other of their class goes on alone at the same height"
         )
-        found.append(Finding("single segments", text, X, Y, tuple(line.name for line in left[:10])))
+        found.append(Finding(kind="single segments", text=text, X=X, Y=Y, names=tuple(line.name for line in left[:10])))
     return found

@@ -76,7 +76,15 @@ class Labeller:
                 if self._take(float(X), float(Y), radius):
                     # Higher ground is right of the line: read backwards, it is above the text.
                     angle = math.degrees(math.atan2(-chord[at, 1], -chord[at, 0]))
-                    found.append(ContourLabel(float(X), float(Y), line.height, 180.0 if angle == -180 else angle, text))
+                    found.append(
+                        ContourLabel(
+                            X=float(X),
+                            Y=float(Y),
+                            height=line.height,
+                            angle=180.0 if angle == -180 else angle,
+                            text=text,
+                        )
+                    )
                     break
         return found
 

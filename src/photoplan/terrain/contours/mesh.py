@@ -145,7 +145,14 @@ def build_mesh(part: SurfacePart, front: Front) -> PartMesh:
         axis=-1,
     ).reshape(-1, 3)
     creases = _crease_edges(part.creases, xyz, triangles, len(xyz) + len(middles))
-    return PartMesh(np.concatenate([xyz, middles]), columns, whole, triangles, shared, creases)
+    return PartMesh(
+        xyz=np.concatenate([xyz, middles]),
+        columns=columns,
+        whole=whole,
+        triangles=triangles,
+        shared=shared,
+        creases=creases,
+    )
 
 
 def _corner_heights(heights: NDArray[np.float64]) -> NDArray[np.float64]:

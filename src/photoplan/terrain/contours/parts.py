@@ -123,13 +123,13 @@ def _touch(a: Bounds, b: Bounds) -> bool:
 
 def _unit_part(unit: Unit, column: int, row: int, lines: Sequence[LineElement]) -> SurfacePart:
     return SurfacePart(
-        column,
-        row,
-        (unit.left, unit.top),
-        (unit.width, unit.width),
-        unit.heights.astype(float) + unit.datum,
-        unit.faces,
-        tuple(line.xyz[:, :2] for line in lines if line.kind == "breakline"),
+        column=column,
+        row=row,
+        origin=(unit.left, unit.top),
+        mesh=(unit.width, unit.width),
+        heights=unit.heights.astype(float) + unit.datum,
+        faces=unit.faces,
+        creases=tuple(line.xyz[:, :2] for line in lines if line.kind == "breakline"),
     )
 
 
@@ -161,6 +161,8 @@ def grid_parts(
             around = corner[0], corner[1] - window.height * mesh[1], corner[0] + window.width * mesh[0], corner[1]
             if bounds is not None and not _touch(around, bounds):
                 continue
-            part = SurfacePart(column, row, corner, mesh, grid.read(window).astype(float)).cropped(bounds)
+            part = SurfacePart(
+                column=column, row=row, origin=corner, mesh=mesh, heights=grid.read(window).astype(float)
+            ).cropped(bounds)
             if part is not None:
                 yield part

@@ -160,7 +160,7 @@ def _chains(mesh: PartMesh, options: ContourOptions) -> list[Chain]:
     for i, (stop, closed) in enumerate(ends.tolist()):
         level = int(pieces[start, 4])
         if closed:
-            found.append(Chain(level, deque([places[start:stop]]), None, None, True))
+            found.append(Chain(level=level, pieces=deque([places[start:stop]]), start=None, end=None, closed=True))
         else:
             line = np.concatenate([places[start:stop], last[i : i + 1]])
             keys = _key(mesh, pieces[start, :2], level), _key(mesh, pieces[stop - 1, 2:4], level)
