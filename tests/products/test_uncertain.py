@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import rasterio
 from tools.adjust_project import Make, write_project
 from tools.command import process
 from tools.small_model import CRS, write_small
@@ -23,8 +24,21 @@ from photoplan.products.adjust.inputs import read_inputs
 from photoplan.products.adjust.start import started
 from photoplan.project.cameras import camera_without_pixels
 from photoplan.project.ground import ground_of
-from photoplan.project.uncertain import StatedHeightErrors, height_errors, source_errors
+from photoplan.project.scene import input_files
+from photoplan.project.scenes import ScenesAddress
+from photoplan.project.uncertain import ScenesErrors, height_errors, source_errors
+from photoplan.surfaces.height_errors import StatedHeightErrors
 from photoplan.targets.map import MapTarget
+
+
+def write_heights(path, values: np.ndarray) -> None:
+    """A raster of 2 m pixels."""
+    profile = {"driver": "GTiff", "dtype": "float32", "count": 1, "crs": "EPSG:32633"}
+    place = rasterio.Affine(2.0, 0.0, 500_000.0, 0.0, -2.0, 5_300_000.0)
+    height, width = values.shape
+    with rasterio.open(path, "w", **profile, width=width, height=height, transform=place) as file:
+        file.write(values, 1)
+
 
 CENTER, ANGLES = np.array([400_000.0, 5_200_000.0, 1500.0]), np.array([2.0, -3.0, 100.0])
 SIZE, FOCAL, K1 = (4000, 3000), 3600.0, -0.05
@@ -136,6 +150,37 @@ def test_terrain_states_its_own(tmp_path) -> None:
     np.testing.assert_allclose(own, 0.05, rtol=1e-6)
     stated = height_errors(loaded.model_copy(update={"terrain": of_file.model_copy(update={"sigma": 0.3})}))
     assert (stated(target, target.window) == 0.3).all()
+
+
+def test_terrain_states_a_raster_of_its_own(tmp_path) -> None:
+    """Bilinear between its pixels; where it tells nothing, nothing is known; its content is part of the key."""
+    path = tmp_path / "sigma.tif"
+    values = np.linspace(0.1, 0.4, 30, dtype=np.float32)[None] + np.zeros((25, 1), np.float32)
+    values[:5] = -1.0
+    write_heights(path, values)
+    loaded = project_with(tmp_path, {}, terrain={"sigma": "sigma.tif"})
+    errors = height_errors(loaded)
+    XY = np.array([(500_010.0, 5_299_970.0), (500_031.0, 5_299_960.0), (500_010.0, 5_299_997.0), (0.0, 0.0)])
+    expected = np.interp(XY[:, 0], 500_001.0 + 2.0 * np.arange(30), values[-1])
+    np.testing.assert_allclose(errors.sigmas(XY), np.where([1, 1, 0, 0], expected, np.nan), rtol=1e-6)
+    target = MapTarget(MapGrid(500_000.0, 5_300_000.0, 1.0, 60, 50, "EPSG:32633"))
+    relief = errors(target, target.window)
+    v, u = np.mgrid[12:49, 1:59]
+    np.testing.assert_allclose(
+        relief[12:49, 1:59], errors.sigmas(np.stack([500_000.5 + u, 5_299_999.5 - v], axis=-1)), rtol=1e-5
+    )
+    assert np.isnan(relief[:8]).all()
+    stated = {"sigma_center": [0.1, 0.2, 0.3], "sigma_angles": [0.01, 0.02, 0.03]}
+    write_heights(tmp_path / "a.tif", np.zeros(SIZE[::-1], np.float32))
+    project = project_with(tmp_path, stated, terrain={"sigma": "sigma.tif"})
+    assert path in input_files(project)
+    before = ScenesErrors(ScenesAddress.of(project, ("a",)), (0.5,)).facts
+    write_heights(path, values + np.float32(0.01))
+    assert ScenesErrors(ScenesAddress.of(project, ("a",)), (0.5,)).facts != before
+    (tmp_path / "text.tif").write_text("no raster")
+    for wrong in ("none.tif", "text.tif"):
+        with pytest.raises(InputError, match=wrong):
+            height_errors(project_with(tmp_path, {}, terrain={"sigma": wrong}))
 
 
 def test_of_an_adjusted_project_with_a_calibrated_camera(tmp_path) -> None:

@@ -18,7 +18,8 @@ from photoplan.kernels.weights import KERNELS
 from photoplan.plan.accuracy import SourceErrors, figures_at, in_image, resampling_sigma
 from photoplan.project.cameras import central_without_pixels
 from photoplan.project.ground import Ground, ground_of
-from photoplan.project.uncertain import StatedHeightErrors, height_errors, source_errors
+from photoplan.project.uncertain import height_errors, source_errors
+from photoplan.surfaces.height_errors import HeightErrors, StatedHeightErrors
 from photoplan.targets.map import MapTarget
 
 Triple = tuple[float, float, float]
@@ -227,7 +228,9 @@ def _stated(project: Project, request: BudgetRequest) -> tuple[Project, list[str
     return project, notes
 
 
-def _of_image(project: Project, name: str, ground: Ground, heights: Any, request: BudgetRequest) -> ImageBudget:
+def _of_image(
+    project: Project, name: str, ground: Ground, heights: HeightErrors, request: BudgetRequest
+) -> ImageBudget:
     camera = central_without_pixels(project, name)
     whole = source_errors(project, project.image(name), ground, camera, in_image(request.kernel, request.tolerance))
     w, h = camera.size
@@ -239,7 +242,7 @@ def _of_image(project: Project, name: str, ground: Ground, heights: Any, request
     columns, rows = np.meshgrid(np.linspace(0, w - 1, _MAP), np.linspace(0, h - 1, _MAP))
     every = np.concatenate([xy, np.stack([columns.ravel(), rows.ravel()], axis=1)])
     XY = _on_level(camera, every, level)
-    sigma = np.full(len(XY), heights.sigma) if isinstance(heights, StatedHeightErrors) else heights.surface.sigmas(XY)
+    sigma = heights.sigmas(XY)
     sigma = np.where(np.isfinite(sigma), sigma, np.nanmedian(sigma) if np.isfinite(sigma).any() else np.nan)
     parts: dict[str, NDArray[np.float64]] = {}
     none = replace(whole, causes=(), image=0.0)

@@ -30,7 +30,7 @@ from photoplan.project.ground import Ground, ground_of
 from photoplan.project.open_terrain import open_terrain
 from photoplan.project.posed import pose_of
 from photoplan.project.scene import input_files
-from photoplan.surfaces.hybrid import HybridSurface
+from photoplan.project.uncertain import known_height_errors
 from photoplan.terrain.monoplot import REASONS, MonoplotErrors, MonoplotPoints, monoplot
 
 #: Points higher than this above the bare ground lie on objects, metres.
@@ -164,12 +164,10 @@ def _image_name(project: Project, name: str) -> str:
 def _mesh_and_sigma(
     project: Project, ground: Ground
 ) -> tuple[float, Callable[[NDArray[np.float64]], NDArray[np.float64]] | float | None]:
-    """Mesh width of the project's terrain and its standard deviation, if it knows one."""
-    if ground.file is None:
-        return 1.0, None
-    terrain, _ = open_terrain(ground.file, project.ground.crs).in_crs(project.crs)
-    surface = terrain.surface
-    return terrain.resolution, surface.sigmas if isinstance(surface, HybridSurface) else None
+    """Mesh width of the project's terrain and its standard deviation, if that is known."""
+    errors = known_height_errors(project)
+    sigma = None if errors is None else errors.sigmas
+    return 1.0 if ground.file is None else open_terrain(ground.file, project.ground.crs).resolution, sigma
 
 
 def _unknown_on_objects(found: MonoplotPoints, ground: Ground) -> list[str]:

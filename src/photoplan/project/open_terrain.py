@@ -11,6 +11,7 @@ from photoplan.errors import GeometryError, InputError
 from photoplan.geometry.crs import CrsStep, crs_step, require_projected_metres, same_crs
 from photoplan.io.terrain.model_read import ModelReader, is_terrain_model
 from photoplan.io.terrain.reader import TerrainReader
+from photoplan.surfaces.height_errors import HeightErrors, ModelHeightErrors
 from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.raster import RasterSurface
 
@@ -30,6 +31,11 @@ class OpenTerrain:
     """Mesh width, of a hybrid model the finest, metres."""
     model: ModelReader | None = None
     """The file of a hybrid model, with its units, lines and figures; None: a raster of heights."""
+
+    @property
+    def errors(self) -> HeightErrors | None:
+        """What its file knows of the errors of its heights; None: nothing."""
+        return ModelHeightErrors(self.surface) if isinstance(self.surface, HybridSurface) else None
 
     def refuse_apart(self, bounds: tuple[float, float, float, float]) -> None:
         """Refuse bounds xmin, ymin, xmax, ymax that do not meet the terrain.

@@ -124,7 +124,7 @@ def input_files(project: Project) -> list[Path]:
     files = [file for image in project.images for file in (image.file, image.balance) if file is not None]
     restored = [project.restoration(image) for image in project.images]
     files += [file for each in restored if each is not None for file in each.files]
-    files += [] if project.terrain is None or project.terrain.file is None else [project.terrain.file]
+    files += [] if project.terrain is None else project.terrain.files
     files += [objects.file for objects in project.objects]
     observed = project.observations
     files += [*observed.image_points, *observed.control, *([observed.positions] if observed.positions else [])]

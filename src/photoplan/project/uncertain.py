@@ -15,6 +15,7 @@ from photoplan.cameras.base import Projection
 from photoplan.errors import InputError
 from photoplan.geometry.grid import Window
 from photoplan.io.camera.model import CameraEntry
+from photoplan.io.fingerprint import fingerprint
 from photoplan.io.project.file import parse_project
 from photoplan.io.project.model import Project
 from photoplan.io.project.posed import Image
@@ -24,7 +25,7 @@ from photoplan.project.open_terrain import open_terrain
 from photoplan.project.posed import posed_camera
 from photoplan.project.scene import SceneAddress
 from photoplan.project.scenes import ScenesAddress, surface_of
-from photoplan.surfaces.hybrid import HybridSurface
+from photoplan.surfaces.height_errors import HeightErrors, RasterHeightErrors, StatedHeightErrors
 from photoplan.surfaces.objects import ObjectSurface
 from photoplan.targets.base import Target
 
@@ -151,7 +152,9 @@ class ScenesErrors(Mapping[int, SourceErrors]):
             camera = project.cameras[image.camera]
             deviations = [(name, d.tolist()) for name, d in _deviations(project, image, camera)]
             objects = [part.sigma for part in project.objects]
-            out.append([deviations, camera.sigma, project.ground.sigma, *objects])
+            sigma = project.ground.sigma
+            ground = fingerprint(project.resolve(sigma)).digest if isinstance(sigma, str) else sigma
+            out.append([deviations, camera.sigma, ground, *objects])
         return [out, list(self.in_image)]
 
     @property
@@ -199,28 +202,6 @@ def _heights_of(address: ScenesAddress) -> DepthErrors:
     return ground if surface.shown is None else object_errors(project, surface, ground)
 
 
-@dataclass(frozen=True)
-class StatedHeightErrors:
-    """One standard deviation of the heights everywhere, metres."""
-
-    sigma: float
-
-    def __call__(self, target: Target, window: Window) -> NDArray[np.floating]:
-        """See `photoplan.plan.accuracy.DepthErrors`."""
-        return np.full((window.height, window.width), self.sigma)
-
-
-@dataclass(frozen=True)
-class ModelHeightErrors:
-    """The standard deviations that a terrain model holds for its posts, interpolated as its heights are."""
-
-    surface: HybridSurface
-
-    def __call__(self, target: Target, window: Window) -> NDArray[np.floating]:
-        """See `photoplan.plan.accuracy.DepthErrors`."""
-        return self.surface.relief_with_sigma(target, window)[1]
-
-
 @dataclass(frozen=True, eq=False)
 class ObjectHeightErrors:
     """Standard deviations of objects where they are shown, and of the ground elsewhere.
@@ -265,22 +246,32 @@ def object_errors(project: Project, surface: ObjectSurface, ground: DepthErrors)
     return ObjectHeightErrors(surface, of_face, ground)
 
 
-def height_errors(project: Project) -> StatedHeightErrors | ModelHeightErrors:
-    """Standard deviations of a project's terrain: what [terrain] states, or else what the terrain model holds.
+def height_errors(project: Project) -> HeightErrors:
+    """Standard deviations of a project's terrain; see `known_height_errors`.
 
     Raises
     ------
     InputError
-        Neither is known.
+        Nothing is known.
     """
+    found = known_height_errors(project)
+    if found is None:
+        raise InputError(
+            "nothing is known of the accuracy of the terrain's heights: state sigma = METRES in [terrain], or a raster "
+            "of standard deviations, or take a terrain model of `photoplan dtm build`, which holds them"
+        )
+    return found
+
+
+def known_height_errors(project: Project) -> HeightErrors | None:
+    """Standard deviations of a project's terrain, in its CRS: what [terrain] states, a number or a raster of them, or
+    else what the terrain model holds; None: nothing is known."""
     terrain = project.ground
+    if isinstance(terrain.sigma, str):
+        beside, _ = open_terrain(project.resolve(terrain.sigma), terrain.crs).in_crs(project.crs)
+        return RasterHeightErrors(beside.surface)
     if terrain.sigma is not None:
         return StatedHeightErrors(terrain.sigma)
-    if terrain.file is not None:
-        placed, _ = open_terrain(project.resolve(terrain.file), terrain.crs).in_crs(project.crs)
-        if isinstance(placed.surface, HybridSurface):
-            return ModelHeightErrors(placed.surface)
-    raise InputError(
-        "nothing is known of the accuracy of the terrain's heights: state sigma = METRES in [terrain], or take a "
-        "terrain model of `photoplan dtm build`, which holds it"
-    )
+    if terrain.file is None:
+        return None
+    return open_terrain(project.resolve(terrain.file), terrain.crs).in_crs(project.crs)[0].errors

@@ -36,13 +36,18 @@ class StatedTerrain(Entry):
     crs: Name | None = None
     """CRS of a file that does not state one, such as an ASCII grid."""
     height_system: Name | None = None
-    sigma: NotNegative | None = None
-    """Standard deviation of the heights, metres, where the file states none."""
+    sigma: NotNegative | InputName | None = None
+    """Standard deviation of the heights, metres, where the file states none; or a raster of them."""
 
-    @field_validator("file")
+    @field_validator("file", "sigma")
     @classmethod
-    def _file(cls, text: str | None) -> str | None:
-        return None if text is None else plain_file(text)
+    def _file(cls, text: str | float | None) -> str | float | None:
+        return plain_file(text) if isinstance(text, str) else text
+
+    @property
+    def files(self) -> list[str]:
+        """Names of all files that it states."""
+        return [file for file in (self.file, self.sigma) if isinstance(file, str)]
 
     @model_validator(mode="after")
     def _one(self) -> Self:

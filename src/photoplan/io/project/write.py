@@ -88,7 +88,11 @@ def _terrain(terrain: StatedTerrain) -> list[str]:
             [
                 ("file", terrain.file, "heights: GeoTIFF, ASC, or a terrain model (.gpkg)"),
                 ("height", terrain.height, "or one height everywhere"),
-                ("sigma", terrain.sigma, "standard deviation of heights, where a terrain model states none"),
+                (
+                    "sigma",
+                    terrain.sigma,
+                    "standard deviation of heights, or a raster of it",
+                ),
                 ("crs", terrain.crs, "its CRS, where the file does not state one"),
             ]
         ),

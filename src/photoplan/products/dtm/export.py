@@ -18,7 +18,6 @@ from photoplan.io.product import check_output
 from photoplan.io.terrain.export import TIN_SUFFIXES, replacing, write_points, write_tin
 from photoplan.products.dtm.raster import GridOptions, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
-from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.targets.map import MapTarget
 
 RASTERS = (".tif", ".tiff")
@@ -122,18 +121,18 @@ def _grid(request: ExportRequest, terrain: OpenTerrain) -> MapGrid:
 
 
 def _export_raster(request: ExportRequest, terrain: OpenTerrain, events: Events) -> ExportReport:
-    grid, surface = _grid(request, terrain), terrain.surface
+    grid, surface, errors = _grid(request, terrain), terrain.surface, terrain.errors
     target = MapTarget(grid)
     options = GridOptions.of(request, "heights", [request.model], events, tile=_TILE)
 
     def heights(window: Window) -> NDArray[np.float32]:
         return surface.relief(target, window)[None]
 
-    def sigmas(window: Window) -> NDArray[np.float32]:
-        assert isinstance(surface, HybridSurface)
-        return surface.relief_with_sigma(target, window)[1][None]
+    def sigmas(window: Window) -> NDArray[np.floating]:
+        assert errors is not None
+        return errors(target, window)[None]
 
-    if request.sigma is not None and not isinstance(surface, HybridSurface):
+    if request.sigma is not None and errors is None:
         raise UsageError(f"{request.model}: a raster of heights has no standard deviations; leave `sigma` out")
     paths = [request.output]
     with together():

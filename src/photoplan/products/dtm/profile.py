@@ -18,7 +18,6 @@ from photoplan.io.product import check_output
 from photoplan.io.terrain.export import replacing
 from photoplan.io.terrain.points import PointTable, PointTableFormat
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
-from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.surfaces.profile import profile
 
 TABLES = (".csv", ".txt")
@@ -112,8 +111,7 @@ def profiles_of(
         except UsageError as error:
             raise UsageError(f"line {name!r}: {error}") from None
         xy = np.column_stack([X, Y])
-        surface = terrain.surface
-        sigmas = surface.sigmas(xy) if isinstance(surface, HybridSurface) else np.full(len(xy), np.nan)
+        sigmas = np.full(len(xy), np.nan) if terrain.errors is None else terrain.errors.sigmas(xy)
         found.append(
             Profile(name=name, distance=distance, xy=xy, heights=Z, sigmas=np.where(np.isnan(Z), np.nan, sigmas))
         )

@@ -16,7 +16,6 @@ from photoplan.io.terrain.export import replacing
 from photoplan.io.terrain.points import PointTable, PointTableFormat
 from photoplan.plain import pick
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
-from photoplan.surfaces.hybrid import HybridSurface
 
 PART = 100_000
 """Points that are in memory at once."""
@@ -118,10 +117,8 @@ def dtm_sample(request: SampleRequest) -> SampleReport:
 
 
 def _values(terrain: OpenTerrain, XY: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    heights = terrain.surface.heights(XY)
-    if not isinstance(terrain.surface, HybridSurface):
-        return heights, np.full(len(XY), np.nan)
-    return heights, terrain.surface.sigmas(XY)
+    errors = terrain.errors
+    return terrain.surface.heights(XY), np.full(len(XY), np.nan) if errors is None else errors.sigmas(XY)
 
 
 def _texts(values: NDArray[np.float64], request: SampleRequest, delimiter: str) -> list[str]:

@@ -25,7 +25,6 @@ from photoplan.io.result_log import ResultLog
 from photoplan.plain import pick
 from photoplan.products.dtm.raster import GridOptions, write_grid
 from photoplan.project.open_terrain import OpenTerrain, open_terrain
-from photoplan.surfaces.hybrid import HybridSurface
 from photoplan.targets.map import MapTarget
 from photoplan.terrain.volume import TILE, ErrorModel, Volume, VolumeSettings, VolumeSigma, volume_between, volume_sigma
 
@@ -190,7 +189,7 @@ def _errors(
 
 
 def _own(terrain: OpenTerrain) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
-    return terrain.surface.sigmas if isinstance(terrain.surface, HybridSurface) else None
+    return None if terrain.errors is None else terrain.errors.sigmas
 
 
 def _write_difference(
