@@ -56,7 +56,7 @@ def test_a_plane_has_its_slope_aspect_and_light(gx: float, gy: float) -> None:
     falls = np.degrees(np.arctan2(-gx, -gy)) % 360
     off = (shading.aspect(slopes) - falls + 180) % 360 - 180
     assert np.abs(off).max() < 0.02
-    light = shading.Light(azimuth=200, altitude=30)
+    light = shading.Lighting(azimuth=200, altitude=30)
     az, al = np.radians([200, 30])
     normal = np.array([-gx, -gy, 1]) / np.sqrt(gx**2 + gy**2 + 1)
     expected = max(0.0, float(normal @ [np.sin(az) * np.cos(al), np.cos(az) * np.cos(al), np.sin(al)]))
@@ -74,7 +74,7 @@ def test_flat_ground_has_no_aspect_and_the_sine_of_the_sun() -> None:
     slopes = shading.surface_slopes(Formula(lambda X, Y: 1234.56 + 0 * X), GRID, GRID.window)
     assert (shading.aspect(slopes) == shading.FLAT).all()
     for multi in (False, True):
-        shade = shading.hillshade(slopes, shading.Light(altitude=40, multidirectional=multi))
+        shade = shading.hillshade(slopes, shading.Lighting(altitude=40, multidirectional=multi))
         np.testing.assert_allclose(shade, np.sin(np.radians(40)), atol=1e-6)
 
 
@@ -85,7 +85,7 @@ def test_a_sphere_converges_with_the_square_of_the_pixel() -> None:
         return np.sqrt(50.0**2 - X**2 - Y**2)
 
     worst = []
-    light = shading.Light(azimuth=300, altitude=35)
+    light = shading.Lighting(azimuth=300, altitude=35)
     for n in (10, 20, 40):
         grid = MapGrid(-20, 20, 40 / n, n, n, "EPSG:32633")
         shade = shading.hillshade(shading.surface_slopes(Formula(f), grid, grid.window), light)
@@ -107,7 +107,7 @@ def test_invariances() -> None:
     grid = MapGrid(-16, 16, 0.5, 64, 64, "EPSG:32633")
 
     def shade(surface: Formula, **light: Any) -> np.ndarray:
-        return shading.hillshade(shading.surface_slopes(surface, grid, grid.window), shading.Light(**light))
+        return shading.hillshade(shading.surface_slopes(surface, grid, grid.window), shading.Lighting(**light))
 
     base = shade(Formula(f), azimuth=300)
     np.testing.assert_allclose(shade(Formula(lambda X, Y: f(X, Y) + 64), azimuth=300), base, atol=1e-4)
@@ -147,7 +147,7 @@ def test_the_border_of_the_surface_is_shaded_too() -> None:
     empty = np.isnan(slopes.heights)
     np.testing.assert_array_equal(np.isnan(slopes.gradient[0]), empty)
     np.testing.assert_allclose(slopes.gradient[0][~empty], 0.2, atol=2e-3)
-    grey = shading.grey(shading.hillshade(slopes, shading.Light()))
+    grey = shading.grey(shading.hillshade(slopes, shading.Lighting()))
     np.testing.assert_array_equal(grey == 0, empty)
 
 
@@ -237,7 +237,7 @@ def test_gdaldem_agrees(
     assert surface.relief(MapTarget(grid), grid.window)[7, 9] == heights[7, 9]
     slopes = shading.surface_slopes(surface, grid, grid.window)
     if mode == "hillshade":
-        ours = shading.grey(shading.hillshade(slopes, shading.Light(multidirectional=bool(options)))).astype(float)
+        ours = shading.grey(shading.hillshade(slopes, shading.Lighting(multidirectional=bool(options)))).astype(float)
     elif mode == "slope":
         ours = shading.slope_degrees(slopes).astype(float)
     else:
@@ -300,4 +300,4 @@ def test_rasters_of_planes_have_their_slope_up_to_the_border(
 @pytest.mark.parametrize("wrong", [{"altitude": 0}, {"altitude": 91}, {"azimuth": np.nan}, {"exaggeration": -1}])
 def test_lights_that_cannot_be_meant_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(UsageError):
-        shading.Light(**wrong)
+        shading.Lighting(**wrong)
