@@ -23,9 +23,12 @@ demo: $(STAMP)
 # Static checks take as long as docs and plain kernels together: side by side, each with its output in one piece.
 SIDE_BY_SIDE := --jobs=2 $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
 
+# One process more than cores: many tests wait for processes of their own, for locks and for the disk.
+PROCESSES = $(shell $(PYTHON) -c "import os; print(min(5, 1 + (os.cpu_count() or 1)))")
+
 test: $(STAMP)
 	$(MAKE) $(SIDE_BY_SIDE) lint docs test-nojit
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile -m "not slow and not bench"
+	$(BIN)/python -m pytest -n $(PROCESSES) --dist loadfile -m "not slow and not bench"
 
 # What is too long for every change: large inputs, simulations at their full size, new invented cases, kernels without
 # numba's inside, and the oldest libraries that pyproject.toml allows.

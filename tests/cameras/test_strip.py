@@ -19,7 +19,9 @@ from photoplan.project.scene import input_files
 
 
 @pytest.mark.parametrize(("name", "ahead"), [("nadir", 0.0), ("forward", 46.6)])
-@pytest.mark.parametrize(("lever", "late"), [((0.0, 0.0, 0.0), 0.0), ((1.2, -0.4, 2.0), 0.35)])
+@pytest.mark.parametrize(
+    ("lever", "late"), [pytest.param((0.0, 0.0, 0.0), 0.0, marks=pytest.mark.slow), ((1.2, -0.4, 2.0), 0.35)]
+)
 def test_pixels_see_what_was_drawn(
     tmp_path: Path, name: str, ahead: float, lever: tuple[float, float, float], late: float
 ) -> None:

@@ -98,6 +98,7 @@ def rms(found: Matches, name: str) -> tuple[float, float]:
     return float(x), float(y)
 
 
+@pytest.mark.slow
 def test_the_renderer_goes_both_ways(case: Case) -> None:
     """Pixels to the ground and back, the ground on the terrain, nothing of the terrain above the ray."""
     rng = np.random.default_rng(2)

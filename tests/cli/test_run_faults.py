@@ -184,8 +184,8 @@ class TestFault25Interrupts:
         ("executor", "signals"),
         [
             ("threads", [signal.SIGTERM]),
-            ("threads", [signal.SIGINT, signal.SIGINT]),
-            ("processes", [signal.SIGINT]),
+            pytest.param("threads", [signal.SIGINT, signal.SIGINT], marks=pytest.mark.slow),
+            pytest.param("processes", [signal.SIGINT], marks=pytest.mark.slow),
             ("processes", [signal.SIGTERM, signal.SIGTERM]),
         ],
         ids=["threads-TERM", "threads-INT-INT", "processes-INT", "processes-TERM-TERM"],

@@ -65,7 +65,7 @@ def coarse(scale: float) -> tuple[Pinhole, MapGrid, LevelSurface]:
 
 
 @pytest.mark.parametrize("scale", [4.5, 10.0, 30.0])
-@pytest.mark.parametrize("kernel", ["bilinear", "bicubic", "lanczos3"])
+@pytest.mark.parametrize("kernel", ["bilinear", "bicubic", pytest.param("lanczos3", marks=pytest.mark.slow)])
 def test_reduced_sources_make_the_same_product_as_whole_ones(scale: float, kernel: str) -> None:
     """Smooth light with detail down to the product's own resolution: means before the kernel hardly show."""
     cam, grid, surface = coarse(scale)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.engine.arrays import ArrayReader
@@ -109,20 +110,22 @@ def by_rays(pixels: NDArray, picture: Picture, side: int = 24) -> tuple[NDArray[
     return total / side**2, met
 
 
-def test_a_pixel_is_the_mean_of_what_it_covers() -> None:
-    for azimuth in (0.0, 30.0, 45.0):
-        picture, pixels = Picture(azimuth), chess(12)
-        truth, met = by_rays(pixels, picture)
-        _, painted = seen(pixels, picture)
-        assert painted.valid is not None and painted.values is not None
-        assert painted.valid[met].mean() > 0.98 and (met & painted.valid).sum() > 10_000
-        error = (painted.values[0].astype(float) - truth)[met & painted.valid]
-        plain = seen(pixels, picture, tilted=False)[1].values
-        assert plain is not None
-        wrong = (plain[0].astype(float) - truth)[met & painted.valid]
-        # Bilinear kernels are a little wider than pixels; without the tilt most far pixels are wrong.
-        assert np.sqrt(np.mean(error**2)) < 14 < 30 < np.sqrt(np.mean(wrong**2))
-        assert abs(error.mean()) < 0.5
+@pytest.mark.parametrize(
+    "azimuth", [pytest.param(0.0, marks=pytest.mark.slow), 30.0, pytest.param(45.0, marks=pytest.mark.slow)]
+)
+def test_a_pixel_is_the_mean_of_what_it_covers(azimuth: float) -> None:
+    picture, pixels = Picture(azimuth), chess(12)
+    truth, met = by_rays(pixels, picture)
+    _, painted = seen(pixels, picture)
+    assert painted.valid is not None and painted.values is not None
+    assert painted.valid[met].mean() > 0.98 and (met & painted.valid).sum() > 10_000
+    error = (painted.values[0].astype(float) - truth)[met & painted.valid]
+    plain = seen(pixels, picture, tilted=False)[1].values
+    assert plain is not None
+    wrong = (plain[0].astype(float) - truth)[met & painted.valid]
+    # Bilinear kernels are a little wider than pixels; without the tilt most far pixels are wrong.
+    assert np.sqrt(np.mean(error**2)) < 14 < 30 < np.sqrt(np.mean(wrong**2))
+    assert abs(error.mean()) < 0.5
 
 
 def test_a_chessboard_far_away_is_grey() -> None:

@@ -13,7 +13,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "experiments" / "road-edge
 
 
 @pytest.mark.parametrize("width", [2.5, 5.0])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_edge_lies_within_a_fifth_of_a_pixel_with_the_hybrid_model(width, seed):
     outcome = road.run(width, seed)
     assert outcome.offsets["hybrid"].shape[1] > 150

@@ -32,7 +32,10 @@ def many(gather):
 GATHER = {"loops": many(sampling.gather_loops), "vectors": many(sampling.gather)}
 
 
-@pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "float32"])
+@pytest.mark.parametrize(
+    "dtype",
+    ["uint8", pytest.param("int16", marks=pytest.mark.slow), pytest.param("uint16", marks=pytest.mark.slow), "float32"],
+)
 @pytest.mark.parametrize(("name", "bands"), [("nearest", 1), ("bilinear", 4), ("bicubic", 1), ("lanczos3", 4)])
 def test_vectors_and_loops_gather_what_the_weights_say(name, bands, dtype):
     source = noise((bands, 20, 30), dtype)

@@ -102,7 +102,7 @@ def test_sparse_solution_equals_dense_least_squares() -> None:
     np.testing.assert_allclose(redundancy.sum(), result.redundancy, atol=1e-5)
 
 
-@thinned("count", 30, 200)
+@thinned("count", 15, 200)
 def test_simulated_blocks_are_unbiased_and_covariances_calibrated(count: int) -> None:
     """Normalised errors of orientations, camera and points have mean 0 and spread 0.9 to 1.1."""
     normal: dict[str, list[np.ndarray]] = {"orientations": [], "camera": [], "points": []}

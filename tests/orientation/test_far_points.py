@@ -55,7 +55,7 @@ def street(seed: int, far: int = 60, start: tuple[float, float] = (0.1, 0.003)) 
 
 
 @pytest.mark.parametrize("start", [(0.1, 0.003), (0.3, 0.02)])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
 def test_points_near_infinity_are_set_aside_by_name(seed: int, start: tuple[float, float]) -> None:
     block, C = street(seed, start=start)
     result = adjust_block(block)

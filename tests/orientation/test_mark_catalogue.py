@@ -117,7 +117,14 @@ def test_a_free_mark_is_found_to_a_twentieth_of_a_pixel(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", silhouettes())
-@pytest.mark.parametrize(("side", "texture", "limit"), [(0.0, 0.0, 0.05), (90.0, 0.1, 0.1), (270.0, 0.0, 0.05)])
+@pytest.mark.parametrize(
+    ("side", "texture", "limit"),
+    [
+        pytest.param(0.0, 0.0, 0.05, marks=pytest.mark.slow),
+        (90.0, 0.1, 0.1),
+        pytest.param(270.0, 0.0, 0.05, marks=pytest.mark.slow),
+    ],
+)
 @thinned("scans", 1, 3)
 def test_a_silhouette_is_found_by_its_edges(kind: str, side: float, texture: float, limit: float, scans: int) -> None:
     rng = np.random.default_rng(int(side))
@@ -184,6 +191,7 @@ def test_a_negative_has_the_same_edges() -> None:
     assert wrong is None or wrong.used < 0.6 or wrong.rms > 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [4])
 def test_where_there_is_no_mark_none_is_found(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -21,7 +21,10 @@ MARKS = tomllib.loads((Path(__file__).parents[1] / "real" / "usgs_marks" / "mark
 PLACES = {"T": (0.01, 40.0), "B": (-0.01, -40.01), "L": (-40.0, 0.02), "R": (40.01, 0.0)}
 
 
-@pytest.mark.parametrize(("kind", "negative", "allowed"), [("ee_block", False, 0.3), ("nagap_triangle", True, 0.8)])
+@pytest.mark.parametrize(
+    ("kind", "negative", "allowed"),
+    [pytest.param("ee_block", False, 0.3, marks=pytest.mark.slow), ("nagap_triangle", True, 0.8)],
+)
 def test_silhouettes_are_placed_by_their_edges_and_tell_how_the_scan_is_turned(
     kind: str, negative: bool, allowed: float
 ) -> None:

@@ -94,7 +94,9 @@ def test_rotations_that_the_calibrated_values_exclude_are_not_assumed_though_two
 FIVE = CORNERS | {"5": (26.0, 9.0)}
 
 
-@pytest.mark.parametrize("turn", TURNS, ids=str)
+@pytest.mark.parametrize(
+    "turn", [pytest.param(turn, marks=[] if k % 3 == 0 else pytest.mark.slow) for k, turn in enumerate(TURNS)], ids=str
+)
 def test_marks_without_symmetry_tell_how_the_scan_is_turned(turn) -> None:  # type: ignore[no-untyped-def]
     layout = MarkLayout.of(FIVE, dict.fromkeys(FIVE, PATTERN))
     made = Simulated(marks=FIVE, rotation=turn.rotation, mirrored=turn.mirrored, small_turn=1.0)

@@ -231,7 +231,7 @@ def test_three_points_need_an_approximate_pose_or_leave_several() -> None:
     assert refused > 5
 
 
-@pytest.mark.parametrize("count", [4, 5])
+@pytest.mark.parametrize("count", [4, pytest.param(5, marks=pytest.mark.slow)])
 @thinned("poses", 40, 100)
 def test_few_noisy_points_never_give_another_pose(count: int, poses: int) -> None:
     rng = np.random.default_rng(1)

@@ -72,7 +72,7 @@ def simulated(
 NOTHING = GroundPoints((), np.empty((0, 3)), np.empty((0, 3)), np.empty(0, bool))
 
 
-@pytest.mark.parametrize("relief", [0.0, 60.0])
+@pytest.mark.parametrize("relief", [pytest.param(0.0, marks=pytest.mark.slow), 60.0])
 def test_a_block_of_forty_images_without_any_orientation(relief: float) -> None:
     block = simulated(1, relief)
     found = start_block(CAMERA, block.images(), block.observations, block.ground)

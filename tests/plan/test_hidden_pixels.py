@@ -246,7 +246,7 @@ CARRIES = {"posts": None, "posts of another map": turned}
 
 
 @pytest.mark.parametrize("carry", CARRIES)
-@pytest.mark.parametrize("resolution", [0.2, 0.5, 1.0, 2.0])
+@pytest.mark.parametrize("resolution", [pytest.param(0.2, marks=pytest.mark.slow), 0.5, 1.0, 2.0])
 def test_hidden_ground_is_as_large_whatever_the_pixels(resolution: float, carry: str) -> None:
     """Walls of the terrain's own posts stay as steep as they are in pixels of four times their width."""
     posts = fine_town()

@@ -101,8 +101,8 @@ def test_a_good_block_is_plausible_and_its_figures_are_right() -> None:
         assert image.middle_on_terrain
 
 
-@pytest.mark.parametrize("tilt", [20.0, 45.0, 60.0])
-@pytest.mark.parametrize("count", [1, 2, 5, 12])
+@pytest.mark.parametrize("tilt", [20.0, pytest.param(45.0, marks=pytest.mark.slow), 60.0])
+@pytest.mark.parametrize("count", [1, 2, pytest.param(5, marks=pytest.mark.slow), 12])
 def test_oblique_images_are_left_alone(tilt: float, count: int) -> None:
     """Looking in all directions, and to one side only."""
     _, centers = strips(heading=0)
@@ -224,7 +224,9 @@ def inwards(order: str) -> tuple[list[list[float]], np.ndarray]:
     return rows, centers
 
 
-@pytest.mark.parametrize("order", ["kpo", "kop", "okp", "pko"])
+@pytest.mark.parametrize(
+    "order", ["kpo", pytest.param("kop", marks=pytest.mark.slow), pytest.param("okp", marks=pytest.mark.slow), "pko"]
+)
 def test_fault_14_rotation_order_that_sends_oblique_images_elsewhere(order: str) -> None:
     result = assess(views(*inwards(order)), hills)
     assert f"`rotation` {order}" in fails(result)

@@ -64,7 +64,7 @@ def whole(scenes):
     return design_restoration(DesignRequest(scenes[1][:1], most_edges=MOST, options=DesignOptions("regularised")))
 
 
-@pytest.mark.parametrize("level", [65535.0 + 110.0, -90.0])
+@pytest.mark.parametrize("level", [65535.0 + 110.0, pytest.param(-90.0, marks=pytest.mark.slow)])
 def test_full_skies_and_black_shadows_do_not_hide_the_noise(scenes, tmp_path, level):
     """A part that is just full: its few pixels beside the end of the range are not the noise of the image."""
     made, _ = scenes
@@ -112,13 +112,13 @@ def test_parts_without_edges_get_the_filter_of_the_whole_field(scenes):
 def test_bands_of_different_sharpness_get_filters_of_their_own(tmp_path):
     rng = np.random.default_rng(22)
     scene = any_edges(rng, 256)
-    bands = [taken(scene, sigma, rng)[0] for sigma in (0.35, 0.5, 0.65)]
+    bands = [taken(scene, sigma, rng)[0] for sigma in (0.35, 0.65)]
     file = write(tmp_path / "colour.tif", 100.0 * np.array(bands))
-    found = design_restoration(DesignRequest((file,), per_band=True, most_edges=14))
-    assert [kernel.band for kernel in found.filter.kernels] == [1, 2, 3]
+    found = design_restoration(DesignRequest((file,), per_band=True, most_edges=8))
+    assert [kernel.band for kernel in found.filter.kernels] == [1, 2]
     gains = [kernel.noise_gain for kernel in found.filter.kernels]
     print("noise gains", np.round(gains, 2))
-    assert gains[0] < gains[1] < gains[2]
+    assert gains[0] < gains[1]
 
 
 def test_images_of_different_size_are_refused(scenes, tmp_path):
@@ -135,6 +135,7 @@ def test_images_without_edges_give_no_filter(tmp_path):
         design_restoration(DesignRequest((file,)))
 
 
+@pytest.mark.slow
 def test_of_several_parts_the_noisiest_tells_of_the_condition(scenes):
     _, files = scenes
     found = design_restoration(DesignRequest(files[:1], cells=3, most_edges=60))

@@ -56,7 +56,7 @@ def ortho(block: Block, folder: Path, workers: int = 2, executor: str = "threads
         return file.read()
 
 
-@pytest.mark.parametrize("executor", ["threads", "processes"])
+@pytest.mark.parametrize("executor", ["threads", pytest.param("processes", marks=pytest.mark.slow)])
 def test_same_orthophoto_as_from_the_raster(pristine: Block, small: Block, tmp_path: Path, executor: str) -> None:
     raster = ortho(pristine, tmp_path / "raster")
     model_of(small.terrain, small.folder / "model.gpkg")

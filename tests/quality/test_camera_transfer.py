@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from tools.camera_model import Sensor
+from tools.thinned import thinned
 
 from photoplan.errors import InputError
 from photoplan.quality.camera.dark_signal import dark_current, doubling_temperature
@@ -39,9 +40,10 @@ def spread_of(normalised, what):
     return value
 
 
-def test_normalised_errors_of_gain_and_read_noise_spread_by_one():
+@thinned("runs", 200, 500)
+def test_normalised_errors_of_gain_and_read_noise_spread_by_one(runs):
     gain, read, read_dn = [], [], []
-    for run in range(RUNS):
+    for run in range(runs):
         found = transfer_of(SMALL, np.random.default_rng(run))
         gain.append((found.gain - SMALL.gain) / found.gain_sigma)
         truth = np.hypot(SMALL.read_noise, np.sqrt(SMALL.dark_current * 0.02))
@@ -52,10 +54,11 @@ def test_normalised_errors_of_gain_and_read_noise_spread_by_one():
         assert abs(np.mean(normalised)) < 0.15
 
 
-def test_normalised_errors_of_read_noise_without_dark_frames_spread_by_one():
+@thinned("runs", 200, 500)
+def test_normalised_errors_of_read_noise_without_dark_frames_spread_by_one(runs):
     """Far extrapolated: the errors of slope and offset of the line belong together."""
     read = []
-    for run in range(RUNS):
+    for run in range(runs):
         noise = np.random.default_rng(7000 + run)
         bright = [level_of(SMALL, p, 20.0, noise) for p in (60, 120, 200, 300, 400)]
         found = photon_transfer(bright, black_level=SMALL.bias)
@@ -158,9 +161,10 @@ def dark_series(sensor, noise, celsius=20.0, exposures=(100.0, 500.0, 1000.0, 20
     return exposures, [level_of(sensor, 0, e, noise, 3, celsius) for e in exposures]
 
 
-def test_normalised_errors_of_dark_current_and_doubling_temperature_spread_by_one():
+@thinned("runs", 200, 500)
+def test_normalised_errors_of_dark_current_and_doubling_temperature_spread_by_one(runs):
     current, doubling = [], []
-    for run in range(RUNS):
+    for run in range(runs):
         noise = np.random.default_rng(1000 + run)
         found = [dark_current(*dark_series(SMALL, noise, t)) for t in (20.0, 30.0, 40.0)]
         current.append((found[0].current_dn_s - SMALL.dark_current * SMALL.gain) / found[0].current_dn_s_sigma)

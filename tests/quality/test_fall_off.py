@@ -48,11 +48,12 @@ def test_terms_span_the_general_polynomial() -> None:
         assert np.linalg.matrix_rank(A) == np.linalg.matrix_rank(np.column_stack([A, powers])) == A.shape[1]
 
 
-def test_simulated_parts_are_recovered_with_true_standard_deviations() -> None:
+@thinned("runs", 40, 80)
+def test_simulated_parts_are_recovered_with_true_standard_deviations(runs: int) -> None:
     errors, corners = [], []
     truth = dict(zip(TERMS, FACTORS))
     true_corners = 1.0 - MODEL.relative(*CORNERS)
-    for seed in range(40):
+    for seed in range(runs):
         found = fit_fall_off(flat(MODEL, seed), GIVEN)
         assert {(t.n, t.m) for t in found.terms} >= set(TERMS)
         errors += [(t.coefficient - truth.get((t.n, t.m), 0.0)) / t.sigma for t in found.terms]

@@ -40,7 +40,7 @@ def test_repeated_measurements() -> None:
     np.testing.assert_allclose(found.sigma0, SPREAD / np.sqrt(5), rtol=0.15)
 
 
-@pytest.mark.parametrize("reference", ["first", "mean"])
+@pytest.mark.parametrize("reference", ["first", pytest.param("mean", marks=pytest.mark.slow)])
 def test_parameters_have_true_standard_deviations(reference: str) -> None:
     errors: dict[str, list[float]] = {"shift_x": [], "shift_y": [], "scale": [], "rotation": []}
     truth = {"shift_x": DRIFT[0] * COURSE, "shift_y": DRIFT[1] * COURSE, "scale": SCALE * COURSE}

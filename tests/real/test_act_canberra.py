@@ -73,6 +73,7 @@ def test_a_scan_of_unknown_resolution_gives_the_same_places(shared: Path, camera
     np.testing.assert_allclose(places[0], places[1], atol=0.02)
 
 
+@pytest.mark.slow
 def test_wrong_pattern_is_refused_rather_than_misplaced(
     shared: Path, camera: Path, tmp_path: Path, photoplan: Here
 ) -> None:

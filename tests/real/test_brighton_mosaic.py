@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 import rasterio
 from tools.matching import match
 from tools.pictures import gray
@@ -15,6 +16,7 @@ from photoplan.products.orthophoto.execution import Run, execute
 from photoplan.products.orthophoto.mosaic import plan_mosaic
 
 
+@pytest.mark.slow
 def test_the_mosaic_lies_on_the_point_cloud_and_leaves_little_empty(block: Path, tmp_path: Path) -> None:
     drone_project(block, tmp_path)
     plan = plan_mosaic(load_project(tmp_path / "project.toml"), resolution=0.1, sources=True, overviews=False)

@@ -46,6 +46,7 @@ def within(residuals: NDArray, limit: float) -> float:
     return float((np.hypot(*residuals.T) <= limit).mean())
 
 
+@pytest.mark.slow
 def test_without_any_orientation_all_images_hang_together_and_points_fit(free) -> None:
     report, points, residuals = free
     assert report.chosen == "all pairs" and report.pairs == 10 and report.unconnected == ()
@@ -78,6 +79,7 @@ def test_standard_deviations_come_from_loops(free) -> None:
     assert np.isfinite(points.sigma).all() and points.sigma.max() <= 0.2
 
 
+@pytest.mark.slow
 def test_features_of_reduced_images_are_refined_at_full_resolution(project: Path, free) -> None:
     report, _, residuals = ties(project, use_orientation=False, scale=0.5)
     assert report.factor == 2 and report.unconnected == ()

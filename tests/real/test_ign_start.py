@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 from tools.ign_block import ign_project, published
 from tools.photos import turned_by
 
@@ -16,6 +17,7 @@ from photoplan.products.adjust.inputs import read_inputs
 from photoplan.products.adjust.start import started
 
 
+@pytest.mark.slow
 def test_exposures_with_positions_and_no_attitudes(shared: Path, tmp_path: Path) -> None:
     data = shared / "data" / "ign_borea"
     path = ign_project(tmp_path, data, every=False)

@@ -66,9 +66,11 @@ def patterns() -> dict[tuple[str, str], MarkPattern | MarkExample]:
 CROPS, PATTERNS = crops(), patterns()
 
 
-def test_marks_are_located_within_one_and_a_half_pixels(shared, capsys):
+@pytest.mark.parametrize("every", [3, pytest.param(1, marks=pytest.mark.slow)])
+def test_marks_are_located_within_one_and_a_half_pixels(every, shared, capsys):
+    crops = CROPS[::every]
     lines, good, wrong, crosses = [], 0, [], []
-    for crop in CROPS:
+    for crop in crops:
         found = find_mark(crop.grey(shared), PATTERNS[crop.family, crop.side], crop.mm_to_pixel)
         right = found.accepted and crop.off(found) <= LIMIT
         good += right
@@ -83,7 +85,7 @@ def test_marks_are_located_within_one_and_a_half_pixels(shared, capsys):
     with capsys.disabled():
         print("\nfound − by hand\n" + "\n".join(lines))
     assert len(CROPS) == 28
-    assert good >= 26, "\n".join(lines)  # measured: 28, the largest difference 1.2 px
+    assert good >= (26 if every == 1 else len(crops)), "\n".join(lines)  # measured: 28, the largest difference 1.2 px
     assert not wrong, "\n".join(lines)
     # Where the mark defines its point sharply, the program and the eye agree much better.
     assert crosses and max(crosses) <= 0.3

@@ -40,6 +40,7 @@ def test_holes_inside_and_what_is_beyond_the_border_are_outside() -> None:
     assert domain.contains(places).tolist() == [True, False, False, True, False]
 
 
+@pytest.mark.slow
 def test_a_wide_area_takes_larger_cells_and_keeps_all_data() -> None:
     xy = np.random.default_rng(2).uniform(0, 2_000_000, (50, 2))
     domain = Domain.of(xy, 1.0, 10.0, None)

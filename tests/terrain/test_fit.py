@@ -43,8 +43,8 @@ def estimated(xyz: NDArray[np.float64], family: str) -> Covariance:
     return estimate_all(seen, neighbours, members, settings)
 
 
-_FIELDS = [("gaussian", 3.0, 0.1, 3), ("matern", 3.0, 0.1, 3)]
-_MORE_FIELDS = [*((*each[:3], 5) for each in _FIELDS), ("exponential", 3.0, 0.3, 5)]
+_FIELDS = [("matern", 3.0, 0.1, 3)]
+_MORE_FIELDS = [("gaussian", 3.0, 0.1, 5), ("matern", 3.0, 0.1, 5), ("exponential", 3.0, 0.3, 5)]
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_the_smoothest_and_the_roughest_family_are_told_apart() -> None:
 class TestSigma:
     NOISE = 0.15
 
-    @pytest.mark.parametrize("family", ["gaussian", "matern", "exponential"])
+    @pytest.mark.parametrize("family", ["gaussian", pytest.param("matern", marks=pytest.mark.slow), "exponential"])
     def test_held_out_points_scatter_as_sigma_says(self, family: str) -> None:
         """Residual over √(σ² + noise²): σ is that of the surface, the held-out height has its own noise."""
         xyz = sample(family, 4.0, 7, self.NOISE, 6000)

@@ -44,7 +44,11 @@ def test_terraces(lines: bool) -> None:
 
 @pytest.mark.parametrize(
     "ground, count, noise, family",
-    [(hills, 500, 0.1, "auto"), (fractal(3.0, 61, 1), 900, 0.3, "auto"), (hills, 300, 0.3, "exponential")],
+    [
+        (hills, 500, 0.1, "auto"),
+        (fractal(3.0, 61, 1), 900, 0.3, "auto"),
+        pytest.param(hills, 300, 0.3, "exponential", marks=pytest.mark.slow),
+    ],
 )
 def test_hills_and_rough_ground(ground: Ground, count: int, noise: float, family: str) -> None:
     check(ground, [], count, noise, 2, family)

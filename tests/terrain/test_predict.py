@@ -87,6 +87,7 @@ class TestExactInterpolation:
         assert np.abs(element.xyz[:, 2] - ridge.xyz[:, 2]).max() < 2e-3
 
 
+@pytest.mark.slow
 def test_noise_is_filtered_at_nine_points_per_mesh() -> None:
     """Meshes of 3 × 3 points: the error of prediction is at most half the noise of a point."""
     xyz, noise = points(90.0, 8100, 6, 0.2), 0.2
@@ -130,7 +131,7 @@ class TestInvariance:
         difference = (heights - plain[0]) / plain[1]
         assert difference.std() < 0.5
 
-    @pytest.mark.parametrize("degrees", [90, 30])
+    @pytest.mark.parametrize("degrees", [pytest.param(90, marks=pytest.mark.slow), 30])
     def test_rotation(self, degrees: int, xyz: Any, way: Any, plain: Any) -> None:
         """By a right angle the units turn too; else other patches are joined, and the functions are other estimates."""
         angle = np.radians(degrees)

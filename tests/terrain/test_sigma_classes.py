@@ -33,7 +33,12 @@ def test_every_class_of_places(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name, low, high", [("slope 2.5, much noise", 0.85, 1.15), ("cliff", 0.8, 1.15), ("contours", 0.75, 1.35)]
+    "name, low, high",
+    [
+        pytest.param("slope 2.5, much noise", 0.85, 1.15, marks=pytest.mark.slow),
+        ("cliff", 0.8, 1.15),
+        ("contours", 0.75, 1.35),
+    ],
 )
 def test_one_field(name: str, low: float, high: float) -> None:
     """Before, 1.24 where noise hides roughness, 0.6 below the cliff, 30 between contours."""
