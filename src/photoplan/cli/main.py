@@ -36,6 +36,7 @@ VERBS = {
     "illumination": "Take the light on slopes, and haze, out of an orthophoto.",
     "object": "Make a product of each object alone.",
     "surface": "Heights and grey values from all images at once.",
+    "register": "Compare two images to a small part of a pixel.",
     "run": "Execute a plan written by `ortho --plan`.",
     "dtm": "Terrain models: build, sample, contours, volumes …",
     "view": "Perspective views, with the ground of every pixel.",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,8 +35,10 @@ class VectorLayer:
     """Values of each field, (n,)."""
 
 
-def write_geopackage(path: Path, layers: Sequence[VectorLayer], crs: str) -> None:
+def write_geopackage(path: Path, layers: Sequence[VectorLayer], crs: str | None) -> None:
     """Write layers as one GeoPackage, which appears complete or not at all and replaces an older one.
+
+    Without a `crs` they lie in a plane of their own, such as that of an image.
 
     Raises
     ------
@@ -49,6 +52,7 @@ def write_geopackage(path: Path, layers: Sequence[VectorLayer], crs: str) -> Non
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             partial.unlink(missing_ok=True)
+            warnings.filterwarnings("ignore", "'crs' was not provided")
             for layer in layers:
                 pyogrio.raw.write(
                     os.fspath(partial),

@@ -1,0 +1,288 @@
+"""Two images registered against each other: displacements of patches by least-squares matching, with their accuracy.
+
+Patches lie on a regular grid of the first image. Each is found in the other image to a whole pixel by its correlation,
+and then by least-squares matching (affine and radiometric parameters) to a small part of one; both images stay as they
+are, the place where a patch is expected is computed strictly.
+
+Between pixels a spline has less noise than on them, and residuals become smaller towards half pixels: matching would be
+drawn there, by 0.05 px at a signal-to-noise ratio of 10. So both images are smoothed a little first, after which noise
+is nearly the same everywhere. How much larger the errors then are than the fit says, `photoplan.matching.patch_noise`
+finds out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from photoplan.geometry.grid import Window
+from photoplan.kernels.correlation import correlate
+from photoplan.kernels.patch_match import sample_spline, spline_coefficients
+from photoplan.matching.grey import Grey, patches_at
+from photoplan.matching.patch_noise import noise_factors
+from photoplan.matching.refine import RefineSettings, disc, match_between
+
+_Floats = NDArray[np.float64]
+
+#: What became of a patch: found; pixels missing in one of the images; no texture, or along one direction only; not
+#: found again, or unlike; found with too large a standard deviation; contradicts its neighbours.
+FOUND, MISSING, TEXTURELESS, UNLIKE, UNCERTAIN, APART = range(6)
+STATES = ("found", "missing", "textureless", "unlike", "uncertain", "apart")
+#: From the whole pixel of the best correlation, matching may go so far, pixels.
+_NEAR = 1.5
+#: Both images are smoothed by this along rows and columns.
+_SMOOTHING = np.array([0.25, 0.5, 0.25])
+#: A vector is apart if it differs from the median of its neighbours by so many of their own (Westerweel and Scarano
+#: 2005), with an amount that is always allowed, pixels, and by so many of its standard deviations.
+_APART, _ALLOWED, _SIGMAS = 4.0, 0.05, 3.0
+#: Neighbours that must be there to judge by.
+_ENOUGH = 3
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """Where a pixel of the first image is expected in the second one: L xy + t."""
+
+    linear: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 1.0)
+    """L, row by row."""
+    shift: tuple[float, float] = (0.0, 0.0)
+    """t, pixels of the second image."""
+
+    @property
+    def L(self) -> _Floats:
+        """(2, 2)."""
+        return np.array(self.linear).reshape(2, 2)
+
+    def __call__(self, xy: ArrayLike) -> _Floats:
+        """Points (..., 2) of the second image."""
+        return np.asarray(np.asarray(xy, float) @ self.L.T + np.array(self.shift))
+
+
+@dataclass(frozen=True)
+class PatchSettings:
+    """How patches are matched, and which results count."""
+
+    radius: int = 10
+    """Of a patch, pixels."""
+    search: float = 3.0
+    """Largest displacement along each axis, pixels."""
+    correlation: float = 0.7
+    """Least correlation."""
+    sigma: float = 0.2
+    """Largest standard deviation of a coordinate, pixels."""
+
+    @property
+    def refine(self) -> RefineSettings:
+        """The same for least-squares matching."""
+        return RefineSettings(self.radius, _NEAR + 0.5, self.correlation, self.sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class Displacements:
+    """Patches and where they were found."""
+
+    at: NDArray[np.int64]
+    """Middle in the first image, column and row, (n, 2)."""
+    moved: _Floats
+    """Found minus expected place, pixels of the first image, (n, 2); NaN where it was not found."""
+    covariance: _Floats
+    """Of it, (n, 2, 2)."""
+    correlation: _Floats
+    state: NDArray[np.uint8]
+    """See `STATES`."""
+    factor: _Floats
+    """By which the fit's standard deviations were multiplied, (n, 2)."""
+
+    @property
+    def sigma(self) -> _Floats:
+        """Standard deviations, (n, 2)."""
+        return np.sqrt(self.covariance[:, [0, 1], [0, 1]])
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothedImage:
+    """An image, each pixel with a part of its neighbours."""
+
+    image: Grey
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.image.size
+
+    def read(self, window: Window) -> NDArray[np.float32]:
+        """Grey values of any window, shape (height, width); NaN where a pixel or a neighbour has none."""
+        v = self.image.read(Window(window.col - 1, window.row - 1, window.width + 2, window.height + 2))
+        a, b, c = _SMOOTHING.astype(np.float32)
+        v = a * v[:-2] + b * v[1:-1] + c * v[2:]
+        return np.asarray(a * v[:, :-2] + b * v[:, 1:-1] + c * v[:, 2:], np.float32)
+
+
+def match_grid(
+    pair: tuple[Grey, Grey], transfer: Transfer, at: NDArray[np.int64], settings: PatchSettings
+) -> Displacements:
+    """Find patches of the first image in the second one.
+
+    Parameters
+    ----------
+    pair : pair of Grey
+    transfer : Transfer
+        Where they are expected.
+    at : ndarray, shape (n, 2)
+        Middles of the patches, close to each other: the pixels around all of them are held at once.
+    settings : PatchSettings
+    """
+    images = SmoothedImage(pair[0]), SmoothedImage(pair[1])
+    n, r = len(at), settings.radius
+    templates = patches_at(images[0], at - r, 2 * r + 1).astype(float)
+    round_patch = disc(r) > 0
+    state = np.full(n, FOUND, np.uint8)
+    picture = _Tile.of(images[1], transfer, at, r + int(np.ceil(settings.search)) + 1)
+    offset, seen = _whole_pixels(picture, at, templates, settings)
+    state[~np.isfinite(templates[:, round_patch]).all(axis=1) | ~seen] = MISSING
+    state[(state == FOUND) & (_promised(templates, round_patch) > settings.sigma)] = TEXTURELESS
+    state[(state == FOUND) & ~np.isfinite(offset[:, 0])] = UNLIKE
+    moved, covariance = np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
+    correlation, factor = np.full(n, np.nan), np.full((n, 2), np.nan)
+    some = np.flatnonzero(state == FOUND)
+    start = transfer(at[some] + offset[some]), np.broadcast_to(transfer.L, (len(some), 2, 2)).copy()
+    found = match_between(images, at[some], start, settings.refine)
+    inverse = np.linalg.inv(transfer.L)
+    off: _Floats = np.asarray((found.xy - transfer(at[some])) @ inverse.T)
+    correlation[some] = found.correlation
+    far = ~(np.abs(off).max(axis=1, initial=0.0) <= settings.search)
+    bad = ~(found.correlation >= settings.correlation) | far
+    state[some[bad]] = UNLIKE
+    good, here = some[~bad], ~bad
+    if len(good):
+        moved[good] = off[here]
+        f = _factors(picture, templates[good], (found.xy[here], found.affine[here]), round_patch)
+        factor[good] = f
+        C = inverse @ found.covariance[here] @ inverse.T
+        covariance[good] = f[:, :, None] * C * f[:, None, :]
+    with np.errstate(invalid="ignore"):
+        uncertain = np.sqrt(covariance[:, [0, 1], [0, 1]]).max(axis=1, initial=0.0) > settings.sigma
+    state[uncertain & (state == FOUND)] = UNCERTAIN
+    return Displacements(at=at, moved=moved, covariance=covariance, correlation=correlation, state=state, factor=factor)
+
+
+def _promised(templates: _Floats, round_patch: NDArray[np.bool_]) -> _Floats:
+    """Standard deviation that matching will have along the worst direction, from slopes and noise of patches, (n,).
+
+    Noise from the second mixed difference (Immerkær 1996), of the quieter patches; its part in the slopes is taken off.
+    """
+    if not len(templates):
+        return np.empty(0)
+    mixed = templates[:, :-2] - 2 * templates[:, 1:-1] + templates[:, 2:]
+    mixed = mixed[..., :-2] - 2 * mixed[..., 1:-1] + mixed[..., 2:]
+    own = np.sqrt(np.nanmean(np.where(np.isfinite(mixed), mixed, 0.0) ** 2, axis=(1, 2))) / 6
+    noise = max(float(np.percentile(own, 20)), 1e-6 * float(np.nanmax(np.abs(templates), initial=1.0)), 1e-12)
+    gx = (templates[:, 1:-1, 2:] - templates[:, 1:-1, :-2]) / 2
+    gy = (templates[:, 2:, 1:-1] - templates[:, :-2, 1:-1]) / 2
+    inner = round_patch[1:-1, 1:-1]
+    xx, xy, yy = (np.nansum((a * b)[:, inner], axis=1) for a, b in ((gx, gx), (gx, gy), (gy, gy)))
+    least = (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2) - inner.sum() * noise**2 / 2
+    return np.asarray(noise * np.sqrt(2 / np.maximum(least, 1e-300)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Tile:
+    """A part of the second image: as a spline, and at the pixels of the first one."""
+
+    low: NDArray[np.int64]
+    """First pixel of the first image."""
+    values: _Floats
+    """At its pixels; NaN where there are none."""
+    coefficients: _Floats
+    corner: NDArray[np.int64]
+    """First pixel of the spline in the second image."""
+
+    @classmethod
+    def of(cls, other: Grey, transfer: Transfer, at: NDArray[np.int64], around: int) -> _Tile:
+        """The part around patches."""
+        low, high = at.min(axis=0) - around, at.max(axis=0) + around + 1
+        x, y = np.arange(low[0], high[0], dtype=float), np.arange(low[1], high[1], dtype=float)
+        to = transfer(np.stack(np.meshgrid(x, y), axis=-1))
+        corner = np.floor(to.min(axis=(0, 1))).astype(np.int64) - 3
+        size = np.ceil(to.max(axis=(0, 1))).astype(np.int64) + 4 - corner
+        values = other.read(Window(int(corner[0]), int(corner[1]), int(size[0]), int(size[1]))).astype(float)
+        known = np.isfinite(values)
+        coefficients = np.where(known, values, values[known].mean() if known.any() else 0.0)[None].copy()
+        spline_coefficients(coefficients)
+        part = cls(low, values, coefficients[0], corner)
+        out = part.sample(to)
+        near = np.clip(np.rint(to - corner).astype(np.int64), 0, size - 1)
+        out[~known[near[..., 1], near[..., 0]]] = np.nan
+        return cls(low, out, coefficients[0], corner)
+
+    def sample(self, xy: _Floats) -> _Floats:
+        """Grey values at points (..., 2) of the second image; NaN outside."""
+        local = np.ascontiguousarray((xy - self.corner).reshape(-1, 2))
+        out = np.empty(len(local))
+        sample_spline(self.coefficients, local, out)
+        return out.reshape(xy.shape[:-1])
+
+
+def _whole_pixels(
+    picture: _Tile, at: NDArray[np.int64], templates: _Floats, settings: PatchSettings
+) -> tuple[_Floats, NDArray[np.bool_]]:
+    """Displacement of best correlation, whole pixels (n, 2), NaN: none; and whether the expected place has pixels."""
+    r, s = settings.radius, int(np.ceil(settings.search))
+    offset, seen = np.full((len(at), 2), np.nan), np.zeros(len(at), bool)
+    weights, score = disc(r), np.empty((2 * s + 1, 2 * s + 1))
+    side = 2 * (r + s) + 1
+    for k, (col, row) in enumerate((at - picture.low - r - s).tolist()):
+        part = picture.values[row : row + side, col : col + side]
+        seen[k] = np.isfinite(part[s : s + 2 * r + 1, s : s + 2 * r + 1][weights > 0]).all()
+        if not seen[k] or not np.isfinite(templates[k][weights > 0]).all():
+            continue
+        correlate(part, np.nan_to_num(templates[k]), weights, 1.0, score)
+        if np.isfinite(score).any():
+            best = np.unravel_index(int(np.nanargmax(score)), score.shape)
+            offset[k] = best[1] - s, best[0] - s
+    return offset, seen
+
+
+def _factors(
+    picture: _Tile, templates: _Floats, found: tuple[_Floats, _Floats], round_patch: NDArray[np.bool_]
+) -> _Floats:
+    """By how much the errors of patches are larger than their fits say, (n, 2)."""
+    r = len(round_patch) // 2
+    v, u = np.mgrid[-r : r + 1, -r : r + 1].astype(float)
+    xy, affine = found
+    there = picture.sample(xy[:, None, None] + np.einsum("nij,rcj->nrci", affine, np.stack([u, v], axis=-1)))
+    there = np.where(np.isfinite(there), there, np.nanmean(there, axis=(1, 2), keepdims=True))
+    gy, gx = np.gradient(there, axis=(1, 2))
+    columns = np.stack([gx, gy, gx * u, gx * v, gy * u, gy * v, np.ones_like(gx), there], axis=-1)
+    columns[..., 2:6] /= r
+    return noise_factors(columns, np.nan_to_num(templates), round_patch, _SMOOTHING)
+
+
+def contradicting(found: Displacements, shape: tuple[int, int]) -> Displacements:
+    """A whole grid, (rows, columns) of `shape`, in which vectors that contradict their neighbours are APART."""
+    state = found.state.copy()
+    state[_apart(found, shape)] = APART
+    return replace(found, state=state)
+
+
+def _apart(found: Displacements, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Which vectors contradict their neighbours, (n,)."""
+    rows, columns = shape
+    apart = np.zeros((rows, columns), bool)
+    good = (found.state == FOUND).reshape(shape)
+    for axis in range(2):
+        field = np.full((rows + 2, columns + 2), np.nan)
+        field[1:-1, 1:-1] = np.where(good, found.moved[:, axis].reshape(shape), np.nan)
+        near = np.stack([
+            field[i : i + rows, j : j + columns] for i in range(3) for j in range(3) if (i, j) != (1, 1)
+        ])  # fmt: skip
+        enough = np.isfinite(near).sum(axis=0) >= _ENOUGH
+        near[:, ~enough] = 0.0
+        middle = np.nanmedian(near, axis=0)
+        usual = np.nanmedian(np.abs(near - middle), axis=0)
+        sigma = np.nan_to_num(found.sigma[:, axis].reshape(shape), nan=np.inf)
+        limit = np.maximum(_APART * (usual + _ALLOWED), _SIGMAS * sigma)
+        apart |= enough & good & (np.abs(field[1:-1, 1:-1] - middle) > limit)
+    return apart.reshape(-1)

@@ -1,0 +1,284 @@
+"""Register two images against each other: a grid of patches, matched by tiles, written and recorded."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from photoplan.engine.steps import steps
+from photoplan.errors import GeometryError, UsageError
+from photoplan.events import SILENT, Events
+from photoplan.io.geopackage import VectorLayer, write_geopackage
+from photoplan.io.naming import when_named
+from photoplan.io.product import check_output
+from photoplan.io.result_log import ResultLog
+from photoplan.io.run_record import recording, run_key, settings_of
+from photoplan.io.tables import write_table
+from photoplan.matching.register import FOUND, STATES, Displacements, PatchSettings, contradicting, match_grid
+from photoplan.plain import pick
+from photoplan.products.register.figures import MODELS, RegisterFigures, SmoothModel, figures_of, fit_smooth
+from photoplan.products.register.pair import Pair, open_pair
+
+#: Patches of a tile along each side, and of all at most.
+_TILE, _MOST = 24, 2_000_000
+_COLUMNS = ("x", "y", "dx", "dy", "sigma_x", "sigma_y", "covariance", "correlation", "state")
+
+
+@dataclass(frozen=True)
+class RegisterRequest:
+    """What is asked."""
+
+    first: Path
+    second: Path
+    output: Path
+    """GeoPackage of the vectors; the table stands beside it."""
+    radius: int = 10
+    """Of a patch, pixels."""
+    spacing: int | None = None
+    """Of the patches, pixels; None: they touch."""
+    search: float = 3.0
+    """Largest displacement along each axis, pixels."""
+    correlation: float = 0.7
+    sigma: float = 0.2
+    """Largest standard deviation of a coordinate, pixels."""
+    model: str = "affine"
+    """What is laid through the vectors, see `figures.MODELS`."""
+    workers: int = 1
+    overwrite: bool = False
+    dry_run: bool = False
+
+    @property
+    def patch(self) -> PatchSettings:
+        """How patches are matched."""
+        return PatchSettings(self.radius, self.search, self.correlation, self.sigma)
+
+    @property
+    def step(self) -> int:
+        """Distance of the patches."""
+        return 2 * self.radius + 1 if self.spacing is None else self.spacing
+
+    @property
+    def table(self) -> Path:
+        """CSV of the vectors."""
+        return self.output.with_suffix(".csv")
+
+
+@dataclass(frozen=True, eq=False)
+class PatchGrid:
+    """Middles of the patches in the first image."""
+
+    columns: NDArray[np.int64]
+    rows: NDArray[np.int64]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return len(self.rows), len(self.columns)
+
+    def tiles(self) -> list[tuple[slice, slice]]:
+        """Rows and columns of parts of about the same size."""
+        parts = [np.linspace(0, n, max(1, round(n / _TILE)) + 1).astype(int) for n in self.shape]
+        rows, columns = (
+            [slice(a, b) for a, b in zip(edges[:-1].tolist(), edges[1:].tolist()) if b > a] for edges in parts
+        )
+        return [(r, c) for r in rows for c in columns]
+
+    def at(self, tile: tuple[slice, slice]) -> NDArray[np.int64]:
+        """Middles of a part, row by row, (n, 2)."""
+        x, y = np.meshgrid(self.columns[tile[1]], self.rows[tile[0]])
+        return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class RegisterReport:
+    """What was found."""
+
+    output: Path | None
+    """None after a dry run."""
+    table: Path | None
+    pair: Pair
+    shape: tuple[int, int]
+    """Rows and columns of patches."""
+    step: int
+    figures: RegisterFigures | None
+    model: SmoothModel | None
+    found: Displacements | None
+
+    def json_fields(self) -> dict[str, Any]:
+        """Figures, without the vectors."""
+        images = [str(path) for path in self.pair.paths]
+        own = pick(self, "output", "table", "figures", "model", grid="shape", spacing_px="step")
+        return {**own, "images": images, "pixel": self.pair.pixel, "notes": list(self.pair.notes)}
+
+
+def register(request: RegisterRequest, events: Events = SILENT) -> RegisterReport:
+    """Find where the patches of one image lie in the other one.
+
+    Parameters
+    ----------
+    request : RegisterRequest
+    events : Events
+        Told of patches that are done.
+
+    Raises
+    ------
+    UsageError
+        An output exists, or a number makes no sense.
+    InputError
+        An image cannot be used, or they do not belong together.
+    GeometryError
+        They have nothing in common, or no patch was found again.
+    """
+    _check(request)
+    pair = open_pair(request.first, request.second)
+    grid = _grid(pair, request)
+    empty = RegisterReport(
+        output=None, table=None, pair=pair, shape=grid.shape, step=request.step, figures=None, model=None, found=None
+    )
+    if request.dry_run:
+        return empty
+    for path in (request.output, request.table):
+        check_output(path, pair.paths, overwrite=request.overwrite)
+    key = run_key("register", settings_of(request), pair.paths)
+    with recording("register", request, pair.paths) as record, ResultLog.beside(
+        request.output, key, locked=False
+    ) as log:  # fmt: skip
+        tiles = grid.tiles()
+        events.begin("matching", len(tiles))
+        match = partial(match_grid, pair.images, pair.transfer, settings=request.patch)
+        with steps(request.output.name, request.workers, events, log) as run:
+            parts = list(run(match, [grid.at(tile) for tile in tiles], tiles, lambda at: len(at) * request.step**2))
+        found = contradicting(_together(parts, tiles, grid), grid.shape)
+        if not (found.state == FOUND).any():
+            raise GeometryError(_nothing(found, request))
+        figures = figures_of(found)
+        model = fit_smooth(found, request.model, ((2 * request.radius + 1) / request.step) ** 2 * math.pi / 4)
+        _write(request, pair, found)
+        report = RegisterReport(
+            output=request.output,
+            table=request.table,
+            pair=pair,
+            shape=grid.shape,
+            step=request.step,
+            figures=figures,
+            model=model,
+            found=found,
+        )
+        record([request.output, request.table], report)
+        when_named(log.remove)
+    return report
+
+
+def _check(request: RegisterRequest) -> None:
+    numbers = (
+        ("`radius`", request.radius, 4, 50, "pixels"),
+        ("`spacing`", request.step, 1, 10_000, "pixels"),
+        ("`search`", request.search, 0.1, 30, "pixels"),
+        ("`correlation`", request.correlation, 0, 0.999, ""),
+        ("`sigma`", request.sigma, 1e-4, 10, "pixels"),
+    )
+    for what, value, low, high, unit in numbers:
+        if not (math.isfinite(value) and low <= value <= high):
+            raise UsageError(f"{what} {value:g}; allowed are {low:g} to {high:g} {unit}".rstrip())
+    if request.model not in MODELS:
+        raise UsageError(f"model {request.model!r}; allowed are {', '.join(MODELS)}")
+    if request.output.suffix.lower() != ".gpkg":
+        raise UsageError(f"{request.output}: vectors are a GeoPackage; give it a name that ends with .gpkg")
+
+
+def _grid(pair: Pair, request: RegisterRequest) -> PatchGrid:
+    """Patches with a pixel around them, in the middle of what both images show."""
+    common, edge = pair.common, request.radius + 1
+    lines = []
+    for first, length in ((common.col, common.width), (common.row, common.height)):
+        count = (length - 2 * edge - 1) // request.step + 1
+        if count < 1:
+            raise GeometryError(
+                f"the images have {common.width} × {common.height} pixels in common, a patch needs {2 * edge + 1}; "
+                "give a smaller `radius`"
+            )
+        spare = length - 2 * edge - 1 - (count - 1) * request.step
+        lines.append((first + edge + spare // 2, count))
+    if lines[0][1] * lines[1][1] > _MOST:
+        raise UsageError(
+            f"spacing {request.step} gives {lines[0][1]} × {lines[1][1]} patches, more than {_MOST}; choose a larger "
+            "`spacing`"
+        )
+    columns, rows = (first + request.step * np.arange(count) for first, count in lines)
+    return PatchGrid(columns, rows)
+
+
+def _together(parts: Sequence[Displacements], tiles: Sequence[tuple[slice, slice]], grid: PatchGrid) -> Displacements:
+    """Vectors of all tiles as one grid, row by row."""
+    rows, columns = grid.shape
+    number = np.arange(rows * columns).reshape(rows, columns)
+    order = np.argsort(np.concatenate([number[tile].ravel() for tile in tiles]))
+
+    def of(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(part, name) for part in parts])[order]
+
+    return Displacements(
+        at=of("at"),
+        moved=of("moved"),
+        covariance=of("covariance"),
+        correlation=of("correlation"),
+        state=of("state"),
+        factor=of("factor"),
+    )
+
+
+def _nothing(found: Displacements, request: RegisterRequest) -> str:
+    """Why there is no vector."""
+    counts = np.bincount(found.state, minlength=len(STATES))
+    listed = ", ".join(f"{count} {name}" for name, count in zip(STATES, counts.tolist()) if count)
+    worst = STATES[int(counts.argmax())]
+    advice = {
+        "missing": "the images have hardly a valid pixel in common; look at their nodata",
+        "textureless": f"give a larger `radius` or `sigma`; they are {request.radius} and {request.sigma:g} px",
+        "unlike": f"give a larger `search` ({request.search:g} px now) or a smaller `correlation`",
+        "uncertain": "give a larger `radius` or `sigma`",
+    }
+    return f"no patch of {request.first} was found in {request.second}: {listed}; {advice.get(worst, '')}"
+
+
+def _write(request: RegisterRequest, pair: Pair, found: Displacements) -> None:
+    """GeoPackage and table of all patches."""
+    names = np.array(STATES)[found.state]
+    sigma = found.sigma
+    values = dict(
+        zip(
+            _COLUMNS,
+            (*found.at.T, *found.moved.T, *sigma.T, found.covariance[:, 0, 1], found.correlation, names),
+            strict=True,
+        )
+    )
+    at = found.at.astype(float)
+    ends = np.stack([at, at + np.nan_to_num(found.moved)], axis=1)
+    if pair.to_map is not None:
+        x0, xx, xy, y0, yx, yy = pair.to_map
+        matrix, offset = np.array([[xx, xy], [yx, yy]]), np.array([x0, y0])
+        ends = ends @ matrix.T + offset
+        moved = found.moved @ matrix.T
+        values |= {"map_dx": moved[:, 0], "map_dy": moved[:, 1]}
+    else:
+        ends = ends * np.array([1.0, -1.0])
+    good = found.state == FOUND
+    fields = {name: column[good] for name, column in values.items() if name != "state"}
+    layers = [
+        VectorLayer("vectors", "LineString", shapely.linestrings(ends[good]), fields),
+        VectorLayer("patches", "Point", shapely.points(ends[:, 0]), values),
+    ]
+    write_geopackage(request.output, layers, pair.crs)
+    columns = [
+        [f"{v:.6g}" if v == v else "" for v in column.tolist()] if column.dtype.kind == "f" else column.tolist()
+        for column in (values[name] for name in _COLUMNS)
+    ]
+    write_table(request.table, _COLUMNS, zip(*columns))
