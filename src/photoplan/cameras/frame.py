@@ -137,7 +137,9 @@ class FrameCamera:
     def directions(self, xy: ArrayLike) -> NDArray[np.float64]:
         """Directions (..., 3) of the rays of image points (..., 2), as long as it takes to go one metre into depth."""
         t = self._lens.undistort(self.interior.tangent_to_pixel.inverse(xy))
-        return np.asarray(t @ self._axes[:, :2].T + self._axes[:, 2])
+        # Column by column: a product with a matrix this narrow is slower.
+        x, y, z = (t[..., 0] * a[0] + t[..., 1] * a[1] + a[2] for a in self._axes)
+        return np.stack([x, y, z], axis=-1)
 
     def derivatives(self, XYZ: ArrayLike) -> NDArray[np.float64]:
         """∂(x, y)/∂(X, Y, Z), shape (..., 2, 3), pixels per metre; NaN behind the camera."""

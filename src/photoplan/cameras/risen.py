@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import UsageError
+from photoplan.geometry.rotation import dot
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,8 @@ class EarthBend:
         return J
 
     def _squared(self, XYZ: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(((XYZ[..., :2] - self.center) ** 2).sum(axis=-1))
+        away = XYZ[..., :2] - self.center
+        return dot(away, away)
 
 
 @dataclass(frozen=True)

@@ -82,6 +82,11 @@ def angles_from_rotation(R_ground_camera: ArrayLike, order: str = "opk") -> NDAr
     return np.asarray(np.linalg.det(P) * np.array([omega, np.arctan2(R[0, 2], cos_phi), kappa]))
 
 
+def dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Scalar products of vectors (..., k), shape (...): several times as fast as a sum over their short last axis."""
+    return np.asarray(np.einsum("...i,...i", a, b))
+
+
 def skew(v: NDArray[np.float64]) -> NDArray[np.float64]:
     """[v]× of vectors (..., 3), shape (..., 3, 3): [v]× w = v × w."""
     out = np.zeros((*v.shape, 3))

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.kernels.hybrid import _weights
-from photoplan.kernels.jit import inner, kernel
-from photoplan.kernels.raycast import SURFACE, WALL, Faces, _cell
+from photoplan.kernels.jit import inner
+from photoplan.kernels.raycast import Faces, _cell
 
 
 @inner
@@ -63,37 +63,21 @@ def _face_normal(
     return best != -2 or nearest < np.inf
 
 
-@kernel
-def hit_normals(
-    posts: NDArray[np.float32],
-    faces: Faces,
-    rays: NDArray[np.float64],
-    results: NDArray[np.int64],
-    normals: NDArray[np.float64],
+@inner
+def _hit_normal(
+    posts: NDArray[np.float32], faces: Faces, ray: NDArray[np.float64], wall: bool, out: NDArray[np.float64]
 ) -> None:
-    """Normals of the ground where rays have hit it.
-
-    Parameters
-    ----------
-    posts, faces, rays, results
-        As `first_hit` has left them.
-    normals : ndarray, shape (n, 3), float64
-        Filled, of no length in particular, with x and y in meshes and y downwards: (−∂h/∂x, −∂h/∂y, 1) on the surface,
-        level on a wall. Rays without a hit keep theirs.
-    """
-    for i in range(rays.shape[0]):
-        if results[i] != SURFACE and results[i] != WALL:
-            continue
-        ray, wall, out = rays[i], results[i] == WALL, normals[i]
-        t = ray[7]
-        x, y = ray[0] + t * ray[3], ray[1] + t * ray[4]
-        if faces[2].shape[0] > 0:
-            m = _cell(y, ray[4], posts.shape[0] - 1) * (posts.shape[1] - 1) + _cell(x, ray[3], posts.shape[1] - 1)
-            if faces[2][m + 1] > faces[2][m] and _face_normal(faces, m, ray, t, wall, out):
-                continue
-        if wall:
-            # A border of meshes.
-            along_x = abs(x - np.rint(x)) < abs(y - np.rint(y))
-            out[0], out[1], out[2] = (1.0, 0.0, 0.0) if along_x else (0.0, 1.0, 0.0)
-        else:
-            _bilinear_normal(posts, x, y, out)
+    """Normal of the ground where a ray has hit it at ray[7], of no length in particular, with x and y in meshes and y
+    downwards: (−∂h/∂x, −∂h/∂y, 1) on the surface, level on a wall."""
+    t = ray[7]
+    x, y = ray[0] + t * ray[3], ray[1] + t * ray[4]
+    if faces[2].shape[0] > 0:
+        m = _cell(y, ray[4], posts.shape[0] - 1) * (posts.shape[1] - 1) + _cell(x, ray[3], posts.shape[1] - 1)
+        if faces[2][m + 1] > faces[2][m] and _face_normal(faces, m, ray, t, wall, out):
+            return
+    if wall:
+        # A border of meshes.
+        along_x = abs(x - np.rint(x)) < abs(y - np.rint(y))
+        out[0], out[1], out[2] = (1.0, 0.0, 0.0) if along_x else (0.0, 1.0, 0.0)
+    else:
+        _bilinear_normal(posts, x, y, out)

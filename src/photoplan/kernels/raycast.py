@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.kernels.hybrid import Frame, _weights
-from photoplan.kernels.jit import inner, kernel, maker
+from photoplan.kernels.jit import inner, maker
 from photoplan.kernels.pyramid import Pyramid, leave
 
 #: What a ray has met last: no ground, ground below it, ground above it, or a block that lies below it as a whole.
@@ -237,7 +237,11 @@ def _through_mesh(
 def _follow(
     posts: NDArray[np.float32], pyramid: Pyramid, faces: Faces, ray: NDArray[np.float64], state: int
 ) -> tuple[float, Any, Any]:
-    """One ray over one part of the terrain, from parameter ray[7] to ray[8]: parameter, state and result."""
+    """One ray over one part of the terrain: parameter, state and result.
+
+    `ray` is x, y, z at t = 0; their change by t; change of z by t²; first and last t inside the part. `state` is what
+    the ray has met before (NONE, ABOVE, BELOW or OVER), then what it met last; the result is MISS, SURFACE, WALL, ASK.
+    """
     low, high, levels = pyramid
     u, end = ray[7], ray[8]
     last = levels.shape[0] - 1
@@ -269,80 +273,3 @@ def _follow(
         if out >= end:
             return end, state, MISS
         u, level = out, min(level + 1, last)
-
-
-@kernel
-def first_hit(
-    posts: NDArray[np.float32],
-    pyramid: Pyramid,
-    faces: Faces,
-    rays: NDArray[np.float64],
-    states: NDArray[np.int64],
-    results: NDArray[np.int64],
-) -> None:
-    """Follow rays over one part of the terrain, up to their first hit.
-
-    Parameters
-    ----------
-    posts : ndarray, shape (rows, cols), float32
-        Heights above the datum of the part, metres; NaN = no height.
-    pyramid, faces : tuple
-        See `Pyramid` and `Faces`; heights of vertices refer to the same datum.
-    rays : ndarray, shape (n, 9), float64
-        x, y, z at t = 0; their change by t; change of z by t²; first and last t inside the part. The first t becomes
-        that of the hit, or the last.
-    states : ndarray, shape (n,), int64
-        What each ray has met before: NONE, ABOVE, BELOW or OVER; becomes what it met last.
-    results : ndarray, shape (n,), int64
-        Filled with MISS, SURFACE, WALL or ASK.
-    """
-    for i in range(rays.shape[0]):
-        t, state, result = _follow(posts, pyramid, faces, rays[i], states[i])
-        rays[i, 7], states[i], results[i] = t, state, result
-
-
-@kernel
-def next_part(
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
-    rays: NDArray[np.float64],
-    states: NDArray[np.int64],
-    parts: NDArray[np.int64],
-) -> None:
-    """The part of the terrain that each ray has to be followed over next.
-
-    Parameters
-    ----------
-    low, high : ndarray, shape (rows, cols), float64
-        Bounds of the parts' heights, infinite where they are not known; inf and −inf where a part has no ground.
-    rays : ndarray, shape (n, 10), float64
-        As in `first_hit`, with parts in place of meshes. The first t becomes that at which the part is entered; the
-        last number becomes that at which it is left.
-    states : ndarray, shape (n,), int64
-        As in `first_hit`.
-    parts : ndarray, shape (n, 2), int64
-        Filled with column and row of the part; −1, −1: the ray has come to its end.
-    """
-    for i in range(rays.shape[0]):
-        ray = rays[i]
-        u, end = ray[7], ray[8]
-        parts[i, 0] = parts[i, 1] = -1
-        while u < end:
-            col = _cell(ray[0] + u * ray[3], ray[3], low.shape[1])
-            row = _cell(ray[1] + u * ray[4], ray[4], low.shape[0])
-            out = min(leave(col, 0, ray[0], ray[3]), leave(row, 0, ray[1], ray[4]))
-            if not out > u:
-                out = end
-            lowest, highest = _span(ray, u, min(out, end))
-            if not low[row, col] <= high[row, col]:
-                states[i] = NONE
-            elif lowest > high[row, col]:
-                states[i] = OVER
-            elif highest < low[row, col] and (states[i] == NONE or states[i] == BELOW):
-                states[i] = BELOW
-            else:
-                parts[i, 0], parts[i, 1] = col, row
-                ray[9] = min(out, end)
-                break
-            u = out
-        ray[7] = min(u, end)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Protocol
@@ -15,7 +16,7 @@ from photoplan.kernels.extent import height_ranges
 from photoplan.kernels.sample_grid import sample_lattice, sample_points
 from photoplan.surfaces.carried import box_points, carried_positions
 from photoplan.surfaces.lattice import Lattice
-from photoplan.surfaces.rays import Hits, Part, carried_hits
+from photoplan.surfaces.rays import Cache, Hits, Part, carried_hits
 from photoplan.targets.base import Target
 from photoplan.targets.map import MapTarget
 
@@ -47,6 +48,8 @@ class RasterSurface:
     part: tuple[int, int] = (256, 256)
     """Columns and rows that are best read at once: the blocks of a file."""
     _ranges: GridRanges = field(init=False, repr=False, compare=False)
+    _kept: dict[int, Cache] = field(init=False, repr=False, compare=False, default_factory=dict)
+    """Parts that rays were followed over last, by their side."""
 
     def __post_init__(self) -> None:
         if not (self.mesh[0] > 0 and self.mesh[1] > 0):
@@ -77,7 +80,10 @@ class RasterSurface:
     def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
         """Height at map points (..., 2), shape (...); NaN where there is no surface."""
         XY = np.asarray(XY, float)
-        posts = self._posts(XY if self.to_grid_crs is None else self.to_grid_crs(XY))
+        return self._heights(self._posts(XY if self.to_grid_crs is None else self.to_grid_crs(XY)))
+
+    def _heights(self, posts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Heights at post coordinates (..., 2), which may be NaN."""
         flat = posts.reshape(-1, 2)
         there = np.isfinite(flat).all(axis=1)
         if not there.any():
@@ -143,7 +149,8 @@ class RasterSurface:
         paths = np.asarray(paths, float)
         # No more posts at once than the file's blocks have.
         side = max(16, min(FEW_PART if len(paths) < FEW else MANY_PART, *self.part))
-        return carried_hits(RasterParts(self, side), paths, self.to_grid_crs, bend)
+        cache: Cache = self._kept.setdefault(side, OrderedDict())
+        return carried_hits(RasterParts(self, side), paths, self.to_grid_crs, bend, cache)
 
     def _posts(self, XY: NDArray[np.float64]) -> NDArray[np.float64]:
         """Map coordinates to (column, row) of the posts."""
@@ -240,17 +247,22 @@ class RasterParts:
 
     def ranges(self, window: Window) -> NDArray[np.float64]:
         """Bounds of parts, as far as they are known; shape (height, width, 2)."""
-        return self._ranges(window, learn=False)
+        columns, rows = self.surface.grid.size
+        table = self.surface._ranges.table(self.side, (rows // self.side + 1, columns // self.side + 1))
+        here = table[window.row : window.stop[1], window.col : window.stop[0]]
+        unknown = np.isinf(here[..., 0])
+        row, column = np.nonzero(unknown)
+        here[unknown] = self._ranges(column + window.col, row + window.row, learn=False)
+        return here
 
     def range(self, column: int, row: int) -> NDArray[np.float64]:
         """Bounds of a part; what is read for them is read once."""
-        return np.asarray(self._ranges(Window(column, row, 1, 1), learn=True)[0, 0])
+        return np.asarray(self._ranges(np.array([column]), np.array([row]), learn=True)[0])
 
-    def _ranges(self, window: Window, learn: bool) -> NDArray[np.float64]:
-        row, col = np.mgrid[window.row : window.stop[1], window.col : window.stop[0]].reshape(2, -1) * self.side
+    def _ranges(self, columns: NDArray[np.int64], rows: NDArray[np.int64], learn: bool) -> NDArray[np.float64]:
+        col, row = columns * self.side, rows * self.side
         posts = np.stack([col - 1, row - 1, col + self.side, row + self.side], axis=1)
-        posts = np.clip(posts, 0, np.tile(self.surface.grid.size, 2))
-        return self.surface._ranges.of(posts, learn).reshape(window.height, window.width, 2)
+        return self.surface._ranges.of(np.clip(posts, 0, np.tile(self.surface.grid.size, 2)), learn)
 
     def part(self, column: int, row: int) -> Part | None:
         """A part; None if it has no ground."""
@@ -270,7 +282,7 @@ class RasterParts:
 
     def heights(self, XY: ArrayLike) -> NDArray[np.float64]:
         """Heights at points of the grid's CRS."""
-        return replace(self.surface, to_grid_crs=None).heights(XY)
+        return self.surface._heights(self.surface._posts(np.asarray(XY, float)))
 
 
 #: Cells whose ranges are kept (8 bytes each): single posts in small grids, squares of 2, 4, 8 … posts in larger ones.
@@ -305,6 +317,7 @@ class GridRanges:
     _low: NDArray[np.float32] = field(init=False, repr=False)
     _high: NDArray[np.float32] = field(init=False, repr=False)
     _known: NDArray[np.bool_] = field(init=False, repr=False)
+    _tables: dict[int, NDArray[np.float64]] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         columns, rows = self.grid.size
@@ -330,22 +343,27 @@ class GridRanges:
         nothing is read, and windows that touch unknown parts have infinite bounds.
         """
         out = np.full((len(windows), 2), np.nan)
-        some = (windows[:, 2] > windows[:, 0]) & (windows[:, 3] > windows[:, 1])
-        if not some.any():
+        ask = np.flatnonzero((windows[:, 2] > windows[:, 0]) & (windows[:, 3] > windows[:, 1]))
+        if not len(ask):
             return out
-        asked = windows[some]
         if learn:
-            self._learn(asked)
-        cells = np.concatenate([asked[:, :2] // self._side, -(-asked[:, 2:] // self._side)], axis=1).astype(np.int32)
-        out[some, 0] = height_ranges(self._low, cells)[:, 0]
-        out[some, 1] = height_ranges(self._high, cells)[:, 1]
-        out[np.isinf(out)] = np.nan
-        if not learn:
+            self._learn(windows[ask])
+        else:
             unknown = np.pad(~self._known, ((1, 0), (1, 0))).astype(np.int64).cumsum(axis=0).cumsum(axis=1)
-            (c0, r0), (c1, r1) = (asked[:, :2] // self.part).T, (-(-asked[:, 2:] // self.part)).T
+            (c0, r0), (c1, r1) = (windows[ask, :2] // self.part).T, (-(-windows[ask, 2:] // self.part)).T
             count = unknown[r1, c1] - unknown[r0, c1] - unknown[r1, c0] + unknown[r0, c0]
-            out[np.flatnonzero(some)[count > 0]] = -np.inf, np.inf
+            out[ask[count > 0]], ask = (-np.inf, np.inf), ask[count == 0]
+        asked = windows[ask]
+        cells = np.concatenate([asked[:, :2] // self._side, -(-asked[:, 2:] // self._side)], axis=1).astype(np.int32)
+        found = np.stack([height_ranges(self._low, cells)[:, 0], height_ranges(self._high, cells)[:, 1]], axis=1)
+        out[ask] = np.where(np.isinf(found), np.nan, found)
         return out
+
+    def table(self, side: int, shape: tuple[int, int]) -> NDArray[np.float64]:
+        """What was found out of squares of so many posts, rows × columns of them: −inf, inf: nothing yet."""
+        if side not in self._tables:
+            self._tables[side] = np.full((*shape, 2), np.inf) * (-1.0, 1.0)
+        return self._tables[side]
 
     def _learn(self, windows: NDArray[np.int64]) -> None:
         """Read all parts that some windows touch and that are not known yet."""

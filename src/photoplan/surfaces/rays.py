@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -12,21 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
-from photoplan.kernels.normals import hit_normals
 from photoplan.kernels.pyramid import Pyramid, pyramid_of
-from photoplan.kernels.raycast import (
-    ABOVE,
-    ASK,
-    BELOW,
-    MISS,
-    NONE,
-    Faces,
-    first_hit,
-    next_part,
-)
+from photoplan.kernels.raycast import ABOVE, ASK, BELOW, MISS, NONE, Faces
+from photoplan.kernels.raywalk import begin_lines, end_lines, follow_part, next_part
 
-#: Bytes of parts, with their pyramids, that are kept while rays are followed, if all are as large as the last one.
-CACHE = 64 << 20
+#: Bytes of parts, with their pyramids, that are kept for the next rays, if all are as large as the last one.
+CACHE = 128 << 20
 #: Pieces of rays in another CRS, or where heights are shifted, are halved until their middles are no further than this
 #: from where the rays are, metres …
 STRAIGHT = 1e-3
@@ -95,6 +87,7 @@ class Part:
 
 
 Cache = OrderedDict[tuple[int, int], "Part | None"]
+"""Parts that were used last. Threads may share one: two that want one part at once both make it."""
 Carry = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
@@ -176,48 +169,30 @@ def bent(paths: NDArray[np.float64], bend: float) -> NDArray[np.float64]:
     return out
 
 
-def follow(parts: Parts, paths: ArrayLike, bend: float = 0.0) -> Hits:
-    """First hits of rays over terrain in parts; see `Terrain.first_hit`.
+def follow(parts: Parts, paths: ArrayLike, bend: float = 0.0, cache: Cache | None = None) -> Hits:
+    """First hits of rays over terrain in parts, with parts that are kept from the last time; see `Terrain.first_hit`.
 
     Raises
     ------
     UsageError
         The paths have another shape, or fewer than two points each.
     """
-    at = np.asarray(paths, float)
+    at = np.ascontiguousarray(paths, float)
     if at.ndim != 3 or at.shape[1] < 2 or at.shape[2] != 3:
         raise UsageError(f"paths of shape {at.shape}; n paths of two points X, Y, Z or more are needed (n, k, 3)")
     n = len(at)
     hits = Hits.none(n)
     states, away = np.full(n, NONE), np.zeros(n)
-    cache: Cache = OrderedDict()
+    lines, rays, spans = np.empty((n, 7)), np.empty((n, 10)), np.empty((n, 2))
+    frame, cache = (*parts.corner, *parts.step), OrderedDict() if cache is None else cache
     for piece in range(at.shape[1] - 1):
-        step = at[:, piece + 1] - at[:, piece]
-        length = np.hypot(step[:, 0], step[:, 1])
-        # X, Y, Z and their changes; the height is z + bend (away + length t)².
-        lines = np.concatenate([at[:, piece], step, (bend * length**2)[:, None]], axis=1)
-        lines[:, 2] += bend * away**2
-        lines[:, 5] += 2 * bend * away * length
-        away += length
-        todo = np.flatnonzero((hits.result == MISS) & np.isfinite(lines).all(axis=1))
-        if not len(todo):
-            continue
-        t, states[todo], hits.result[todo], hits.normal[todo] = _over_parts(parts, lines[todo], states[todo], cache)
-        there, t = todo[np.isfinite(t)], t[np.isfinite(t)]
-        hits.along[there] = piece + t
-        hits.XYZ[there] = lines[there, :3] + t[:, None] * lines[there, 3:6]
-        hits.XYZ[there, 2] += t**2 * lines[there, 6]
-        _turn(hits.normal, there, step)
+        box = begin_lines(at, piece, bend, parts.inside, frame, away, hits.result, states, lines, rays, spans)
+        if box[0] <= box[2]:
+            _over_parts(parts, _window(parts, box), (lines, rays, states, hits, spans), cache)
+        end_lines(at, piece, bend, away, rays, spans, hits.result, states, hits.XYZ, hits.along, hits.normal)
     hits.below[:] = (hits.result == MISS) & (states == BELOW)
     hits.owner[hits.result != MISS] = 0
     return hits
-
-
-def _turn(normal: NDArray[np.float64], there: NDArray[np.int64], ways: NDArray[np.float64]) -> None:
-    """Give normals of some rays the length one, and those of walls the side that rays come from."""
-    n = normal[there]
-    n[(n[:, 2] == 0) & ((n * ways[there]).sum(axis=1) > 0)] *= -1.0
-    normal[there] = n / np.linalg.norm(n, axis=1, keepdims=True)
 
 
 def carried_hits(
@@ -225,12 +200,13 @@ def carried_hits(
     paths: NDArray[np.float64],
     carry: Carry | None,
     bend: float,
+    cache: Cache | None = None,
 ) -> Hits:
     """First hits of rays over parts that lie in another CRS, to which `carry` takes map points; None: in the same."""
     if carry is None:
-        return follow(parts, paths, bend)
+        return follow(parts, paths, bend, cache)
     fine, carried = chords(paths, bend, lambda XYZ: np.concatenate([carry(XYZ[..., :2]), XYZ[..., 2:]], axis=-1))
-    hits = follow(parts, carried)
+    hits = follow(parts, carried, cache=cache)
     there = np.flatnonzero(np.isfinite(hits.along))
     piece = np.minimum(hits.along[there].astype(int), fine.shape[1] - 2)
     a, b = fine[there, piece], fine[there, piece + 1]
@@ -251,31 +227,22 @@ def _carry_back(hits: Hits, there: NDArray[np.int64], carry: Carry) -> None:
     hits.normal[there] = n / np.linalg.norm(n, axis=1, keepdims=True)
 
 
-def _over_parts(
-    parts: Parts,
-    lines: NDArray[np.float64],
-    states: NDArray[np.int64],
-    cache: OrderedDict[tuple[int, int], Part | None],
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Straight pieces of rays (n, 7): parameters of hits (NaN: none), new states, results and normals."""
-    lines, begin, size = _clipped(lines, parts.inside)
-    t, results, normals = np.full(len(lines), np.nan), np.full(len(lines), MISS), np.full((len(lines), 3), np.nan)
-    # Outside there is no ground.
-    states = np.where((begin > 0) | (size < 0), NONE, states)
-    rays, window = _in_parts(parts, lines)
-    done = ~(size >= 0)
+_Walk = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], Hits, NDArray[np.float64]]
+"""Lines, rays, states, hits and spans: see `kernels.raywalk`."""
+
+
+def _over_parts(parts: Parts, window: Window, walk: _Walk, cache: Cache) -> None:
+    """Follow one piece of all rays from part to part, as far as the first hit."""
+    lines, rays, states, hits, spans = walk
     ranges = parts.ranges(window)
     low, high = (np.array(ranges[..., j], order="C") for j in (0, 1))
     low[np.isnan(low)], high[np.isnan(high)] = np.inf, -np.inf
-    while not done.all():
-        active = np.flatnonzero(~done)
-        moved, state, place = rays[active], states[active], np.empty((len(active), 2), np.int64)
-        next_part(low, high, moved, state, place)
-        rays[active], states[active] = moved, state
-        done[active[place[:, 0] < 0]] = True
-        active, place = active[place[:, 0] >= 0], place[place[:, 0] >= 0]
-        for group in _groups(place):
-            column, row = (int(v) for v in place[group[0]])
+    which, first = np.flatnonzero(spans[:, 1] >= 0), (window.col, window.row)
+    while len(which):
+        places = np.empty(len(which), np.int64)
+        next_part(low, high, first, rays, states, which, places)
+        for group, place in _groups(which, places):
+            row, column = divmod(place, window.width)
             at = column + window.col, row + window.row
             if np.isinf(low[row, column]):
                 # Only then it is known whether the rays have to go there.
@@ -286,97 +253,43 @@ def _over_parts(
             if part is None:
                 low[row, column], high[row, column] = np.inf, -np.inf
                 continue
-            here = active[group]
-            local = _in_part(part, lines[here], rays[here])
-            state, result = states[here], np.empty(len(here), np.int64)
-            first_hit(part.posts, part.pyramid, part.faces, local, state, result)
-            rays[here, 7] = local[:, 7]
-            asks = result == ASK
-            if asks.any():
-                state[asks] = _before(parts, lines[here[asks]], local[asks, 7])
-            states[here] = state
-            met = (result != MISS) & ~asks
-            done[here[met]], t[here[met]], results[here[met]] = True, local[met, 7], result[met]
-            if met.any():
-                normals[here[met]] = _normals(part, local[met], result[met])
-    states[np.isnan(t) & (begin + size < 1)] = NONE
-    return begin + size * t, states, results, normals
+            asks = follow_part(part.posts, part.pyramid, part.faces, (*part.corner, *part.mesh, part.datum),
+                               lines, rays, states, hits.result, hits.normal, group)  # fmt: skip
+            if asks:
+                asking = group[hits.result[group] == ASK]
+                states[asking] = _before(parts, lines[asking], rays[asking, 7])
+                hits.result[asking] = MISS
+        which = which[(places >= 0) & (hits.result[which] == MISS)]
 
 
-def _normals(part: Part, local: NDArray[np.float64], result: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Normals of a part's ground where rays have hit it, of no length in particular."""
-    out = np.empty((len(local), 3))
-    hit_normals(part.posts, part.faces, np.ascontiguousarray(local), result, out)
-    return out / (part.mesh[0], -part.mesh[1], 1.0)
-
-
-def _clipped(
-    lines: NDArray[np.float64], inside: tuple[float, float, float, float]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """The parts of lines inside map bounds, with their own parameter 0 to 1, and begin and size of it in the old one;
-    the size is negative where a line stays outside."""
-    begin, end = np.zeros(len(lines)), np.ones(len(lines))
-    for axis in (0, 1):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            a, b = ((inside[axis + k] - lines[:, axis]) / lines[:, axis + 3] for k in (0, 2))
-        still = lines[:, axis + 3] == 0
-        out = still & ((lines[:, axis] < inside[axis]) | (lines[:, axis] > inside[axis + 2]))
-        begin = np.maximum(begin, np.where(still, np.where(out, np.inf, 0), np.minimum(a, b)))
-        end = np.minimum(end, np.where(still, 1.0, np.maximum(a, b)))
-    size = np.where(begin <= end, end - begin, -1.0)
-    begin = np.where(size < 0, 0.0, begin)
-    s, cut = np.maximum(size, 0.0), lines.copy()
-    cut[:, :3] += begin[:, None] * lines[:, 3:6]
-    cut[:, 2] += begin**2 * lines[:, 6]
-    cut[:, 5] += 2 * begin * lines[:, 6]
-    cut[:, 3:6] *= s[:, None]
-    cut[:, 6] *= s**2
-    return cut, begin, size
-
-
-def _in_parts(parts: Parts, lines: NDArray[np.float64]) -> tuple[NDArray[np.float64], Window]:
-    """Rays for `next_part`, and the window of parts in which their columns and rows are counted."""
-    rays = np.zeros((len(lines), 10))
-    rays[:, :7] = lines
-    rays[:, 0] = (lines[:, 0] - parts.corner[0]) / parts.step[0]
-    rays[:, 1] = (parts.corner[1] - lines[:, 1]) / parts.step[1]
-    rays[:, 3:5] /= (parts.step[0], -parts.step[1])
-    rays[:, 8] = 1.0
-    ends = np.concatenate([rays[:, :2], rays[:, :2] + rays[:, 3:5]])
+def _window(parts: Parts, box: tuple[float, float, float, float]) -> Window:
+    """The parts that rays between lowest x, y and highest x, y, counted in parts, may touch."""
     columns = round((parts.inside[2] - parts.corner[0]) / parts.step[0] + 0.4999999)
     rows = round((parts.corner[1] - parts.inside[1]) / parts.step[1] + 0.4999999)
-    low = np.clip(np.floor(ends.min(axis=0)), 0, (columns - 1, rows - 1)).astype(int)
-    high = np.clip(np.floor(ends.max(axis=0)), 0, (columns - 1, rows - 1)).astype(int)
-    rays[:, :2] -= low
-    return rays, Window(int(low[0]), int(low[1]), int(high[0] - low[0] + 1), int(high[1] - low[1] + 1))
+    ends = np.clip(np.floor(box), 0, (columns - 1, rows - 1) * 2).astype(int)
+    left, top, right, bottom = ends.tolist()
+    return Window(left, top, right - left + 1, bottom - top + 1)
 
 
-def _in_part(part: Part, lines: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rays for `first_hit`, from lines in metres and what `next_part` has found."""
-    local = np.concatenate([lines, rays[:, [7, 9]]], axis=1)
-    local[:, 0] = (lines[:, 0] - part.corner[0]) / part.mesh[0]
-    local[:, 1] = (part.corner[1] - lines[:, 1]) / part.mesh[1]
-    local[:, 2] -= part.datum
-    local[:, 3:5] /= (part.mesh[0], -part.mesh[1])
-    return local
-
-
-def _groups(place: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Indices of rays that are in one part."""
-    if not len(place):
-        return []
-    order = np.lexsort((place[:, 0], place[:, 1]))
-    return np.split(order, np.flatnonzero((np.diff(place[order], axis=0) != 0).any(axis=1)) + 1)
+def _groups(which: NDArray[np.int64], places: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], int]]:
+    """Rays that are in one part, part by part; −1: in none."""
+    order = np.argsort(places, kind="stable")
+    ordered = places[order]
+    starts = np.flatnonzero(np.diff(ordered, prepend=-1))
+    for start, end in zip(starts, [*starts[1:], len(order)]):
+        yield which[order[start:end]], int(ordered[start])
 
 
 def _kept(parts: Parts, at: tuple[int, int], cache: Cache) -> Part | None:
     """A part, from the cache if it is there; parts used longest ago are forgotten."""
-    if at not in cache:
-        part = cache[at] = parts.part(*at)
-        while part is not None and len(cache) > max(1, CACHE // part.bytes):
+    with suppress(KeyError):
+        cache.move_to_end(at)
+        return cache[at]
+    part = cache[at] = parts.part(*at)
+    while part is not None and len(cache) > max(1, CACHE // part.bytes):
+        with suppress(KeyError):
             cache.popitem(last=False)
-    cache.move_to_end(at)
-    return cache[at]
+    return part
 
 
 def _before(parts: Parts, lines: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.int64]:

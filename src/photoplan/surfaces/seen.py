@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Window
+from photoplan.geometry.rotation import dot
 from photoplan.surfaces.base import Terrain
 from photoplan.surfaces.rays import Hits
 from photoplan.targets.base import Target
@@ -16,8 +17,8 @@ from photoplan.targets.view import ViewTarget
 
 #: How far one sees where terrain has no end, metres; and how deep the earth's surface reaches.
 _FAR, _DEEP = 300_000.0, 12_000.0
-#: Rays that are followed at once: each takes about a kilobyte.
-MOST_RAYS = 1 << 17
+#: Rays that are followed at once: each takes about half a kilobyte, and what stays near the processor is fast.
+MOST_RAYS = 1 << 14
 #: What is a little longer on the ground than on the map.
 _STRETCH = 1.01
 
@@ -46,7 +47,7 @@ class Seen:
     @property
     def incidence(self) -> NDArray[np.float64]:
         """Angle between the line of sight and the normal of what it meets, radians, 0 to π/2; NaN: sky."""
-        return np.arccos(np.clip((self.normal * self.towards).sum(axis=-1), 0.0, 1.0))
+        return np.arccos(np.clip(dot(self.normal, self.towards), 0.0, 1.0))
 
     def part(self, rows: slice, cols: slice) -> Seen:
         """Some rows and columns."""
@@ -93,14 +94,14 @@ class SeenSurface:
         if not isinstance(target, ViewTarget):
             raise UsageError(f"terrain is seen in views, not in {type(target).__name__}")
         if len(uv) > MOST_RAYS:
-            parts = [vars(self.at(target, uv[k : k + MOST_RAYS])) for k in range(0, len(uv), MOST_RAYS)]
+            parts = [vars(self.at(target, part)) for part in np.array_split(uv, -(-len(uv) // MOST_RAYS))]
             return Seen(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
         ways = target.bundle.directions(uv)
         hits = self.terrain.first_hit(target.rays(ways, self._reach(target), self.bound / 2), target.bend)
         # The depth of the ray's own point: a hit lies beside it by the rounding of its pieces.
         away = target.to_cartesian(hits.XYZ) - target.bundle.center
-        squared = (ways**2).sum(axis=1)
-        depth = (away * ways).sum(axis=1) / squared
+        squared = dot(ways, ways)
+        depth = dot(away, ways) / squared
         if np.isfinite(self.farthest):
             gone = depth * np.sqrt(squared) > self.farthest
             hits.XYZ[gone], hits.normal[gone], hits.owner[gone], depth[gone] = np.nan, np.nan, -1, np.nan
@@ -127,9 +128,9 @@ class SeenSurface:
 def _back(target: ViewTarget, hits: Hits) -> NDArray[np.float64]:
     """Directions of rays on the map where they end, backwards, of length one."""
     way = target.center - hits.XYZ
-    way[:, 2] -= target.bend * (way[:, :2] ** 2).sum(axis=1)
+    way[:, 2] -= target.bend * dot(way[:, :2], way[:, :2])
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(way / np.linalg.norm(way, axis=1, keepdims=True))
+        return np.asarray(way / np.sqrt(dot(way, way))[:, None])
 
 
 def pixel_size(target: ViewTarget, uvh: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -140,7 +141,7 @@ def pixel_size(target: ViewTarget, uvh: NDArray[np.float64]) -> NDArray[np.float
     )
     here = target.bundle.directions(uv)
     # The solid angle of the pixel, times the squared distance, per unit of depth.
-    area = np.abs((np.cross(across, along) * here).sum(axis=-1)) / np.linalg.norm(here, axis=-1)
+    area = np.abs(dot(np.cross(across, along), here)) / np.sqrt(dot(here, here))
     return np.asarray(np.abs(uvh[..., 2]) * np.sqrt(area))
 
 

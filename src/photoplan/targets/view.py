@@ -18,6 +18,7 @@ from photoplan.cameras.warped import Warp
 from photoplan.errors import UsageError
 from photoplan.geometry.grid import Placement, Window
 from photoplan.geometry.pose import Pose
+from photoplan.geometry.rotation import dot
 
 #: Rays that are bent are followed in at most so many pieces.
 MOST_PIECES = 64
@@ -150,7 +151,8 @@ class ViewTarget:
     def distance(self, uvh: ArrayLike) -> NDArray[np.float64]:
         """Length of the ray to places (..., 3), shape (...), metres of the bundle's space."""
         uvh = np.asarray(uvh, float)
-        return np.asarray(uvh[..., 2] * np.linalg.norm(self.bundle.directions(uvh[..., :2]), axis=-1))
+        ways = self.bundle.directions(uvh[..., :2])
+        return np.asarray(uvh[..., 2] * np.sqrt(dot(ways, ways)))
 
     def rays(self, ways: NDArray[np.float64], reach: float, tolerance: float) -> NDArray[np.float64]:
         """Rays on the map, less what `bend` raises them: for `Terrain.first_hit`.
@@ -183,12 +185,13 @@ class ViewTarget:
 
     def _path(self, ways: NDArray[np.float64], reach: float, pieces: int) -> NDArray[np.float64]:
         along = reach * np.arange(1, pieces + 1)[:, None] / pieces
-        unit = ways / np.linalg.norm(ways, axis=-1, keepdims=True)
+        unit = ways / np.sqrt(dot(ways, ways))[:, None]
         path = np.empty((len(ways), pieces + 1, 3))
         path[:, 0] = self.center
         path[:, 1:] = self._on_map(self.bundle.center + along * unit[:, None])
         if self.warps:
-            path[..., 2] -= self.bend * ((path[..., :2] - self.center[:2]) ** 2).sum(axis=-1)
+            away = path[..., :2] - self.center[:2]
+            path[..., 2] -= self.bend * dot(away, away)
         return path
 
     def _on_map(self, points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,0 +1,269 @@
+"""Perspective views: the ground of every pixel and a picture, beside VTK with the same terrain, camera and size.
+
+    python bench/views.py [--quick] [--repeat N] [--json FILE]
+
+1024 × 763 pixels over 693 × 720 cells, 2000 × 1500 over 4000 × 4000 cells of rough terrain made here; flat earth. Each
+run is a process of its own. The seconds after the imports and a first, small picture are counted, reading the terrain
+included, and the peak memory of the whole. VTK makes a mesh of the posts, a picture and the depth buffer; photoplan the nine bands of the
+matrix and a picture of tints and shades, one ray a pixel. The height error is that of the point of each pixel over the
+bilinear posts below it. Without pyvista (installed into an environment of its own when first needed) VTK is left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import time
+import venv
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from prepare import WORK
+from programs import Missing
+from rasterio.transform import from_origin
+from scipy.ndimage import map_coordinates
+
+HERE = Path(__file__).resolve().parent
+MIB = 2**20
+PYVISTA = WORK / "pyvista-venv"
+CRS, LEFT, TOP = "EPSG:32632", 500_000.0, 5_200_000.0
+#: Most of VTK's time and memory, and height error of the matrix, metres.
+TIME_TARGET, MEMORY_TARGET, HEIGHT_TARGET = 0.5, 0.25, 0.05
+
+
+@dataclass(frozen=True)
+class Case:
+    """A view: posts (rows, columns), mesh width and roughness in metres, picture size."""
+
+    name: str
+    posts: tuple[int, int]
+    mesh: float
+    rough: float
+    size: tuple[int, int]
+    runs: int
+
+    @property
+    def folder(self) -> Path:
+        return WORK / "views" / self.name
+
+
+CASES = (
+    Case("small", (721, 694), 25.0, 300.0, (1024, 763), 3),
+    Case("large", (4001, 4001), 10.0, 500.0, (2000, 1500), 1),
+)
+
+
+def rough_posts(case: Case) -> NDArray[np.float32]:
+    """Terrain whose amplitudes fall with the frequency to the power of 2.2."""
+    rng, n = np.random.default_rng(1), max(case.posts)
+    frequency = np.hypot(np.fft.fftfreq(n)[:, None], np.fft.rfftfreq(n)[None])
+    frequency[0, 0] = 1.0
+    waves = rng.normal(size=frequency.shape) + 1j * rng.normal(size=frequency.shape)
+    heights = np.fft.irfft2(waves * frequency**-2.2, (n, n))
+    heights = 1500 + case.rough * (heights - heights.mean()) / heights.std()
+    return heights[: case.posts[0], : case.posts[1]].astype(np.float32)
+
+
+def prepare_case(case: Case) -> None:
+    """The terrain as GeoTIFF and as plain numbers, and the camera: from a corner to the middle, 300 m above ground."""
+    case.folder.mkdir(parents=True, exist_ok=True)
+    posts = rough_posts(case)
+    rows, cols = posts.shape
+    place = from_origin(LEFT, TOP, case.mesh, case.mesh)
+    profile = {"driver": "GTiff", "width": cols, "height": rows, "count": 1, "dtype": "float32", "crs": CRS}
+    profile |= {"tiled": True, "blockxsize": 512, "blockysize": 512}
+    # The first one is for the picture that loads kernels and drivers.
+    for name, part in (
+        ("first.tif", posts[-200:, :200] if rows < 1000 else posts[-600:, :600]),
+        ("terrain.tif", posts),
+    ):
+        first = place * place.translation(0, rows - len(part))
+        sizes = {"height": part.shape[0], "width": part.shape[1], "transform": first}
+        with rasterio.open(case.folder / name, "w", **profile | sizes) as f:
+            f.write(part, 1)
+    np.save(case.folder / "posts.npy", posts)
+    row, col = int(0.9 * rows), int(0.1 * cols)
+    corner = (LEFT + case.mesh / 2, TOP - case.mesh / 2)
+    told = {
+        "posts": str(case.folder / "posts.npy"),
+        "terrain": str(case.folder / "terrain.tif"),
+        "corner": corner,
+        "mesh": case.mesh,
+        "size": case.size,
+        "center": [corner[0] + col * case.mesh, corner[1] - row * case.mesh, float(posts[row, col]) + 300.0],
+        "azimuth": 45.0,
+        "pitch": -8.0,
+        "field_of_view": 60.0,
+        "near": 50.0,
+        "far": 1.5 * case.mesh * max(case.posts),
+    }
+    (case.folder / "case.json").write_text(json.dumps(told))
+
+
+def photoplan_view(case: Path, out: Path) -> None:
+    """Matrix and picture by this checkout's parts, tile by tile on two threads, without writing files."""
+    from photoplan.geometry.grid import Window  # noqa: PLC0415
+    from photoplan.plan.tiles import Tile  # noqa: PLC0415
+    from photoplan.products.view import job, make  # noqa: PLC0415
+    from photoplan.products.view.camera import CameraRequest  # noqa: PLC0415
+    from photoplan.products.view.content import Scene  # noqa: PLC0415
+    from photoplan.surfaces.seen import Seen  # noqa: PLC0415
+
+    told = json.loads(case.read_text())
+    x, y, z = told["center"]
+    camera = CameraRequest(position=(x, y), altitude=z, azimuth=told["azimuth"], pitch=told["pitch"],
+                           field_of_view=told["field_of_view"], size=(32, 24), curvature="none")  # fmt: skip
+    # A first picture loads the kernels.
+    small = make.ViewRequest(Path(told["terrain"]).with_name("first.tif"), camera)
+    job.ViewJob(make.plan_view(small).address)(Tile(0, Window(0, 0, 32, 24)))
+    marks = [(time.perf_counter(), time.process_time())]
+    camera = replace(camera, size=tuple(told["size"]))
+    address = make.plan_view(make.ViewRequest(Path(told["terrain"]), camera)).address
+    view = address.open()
+    windows = [*view.target.window.tiles(make.TILE)]
+    width, height = view.target.bundle.size
+    bands, picture = np.full((9, height, width), np.nan), np.empty((3, height, width), np.uint8)
+    known: dict[Window, Seen] = {}
+
+    def ground(window: Window) -> None:
+        # With a pixel more all round, as pictures need it.
+        around = Window(window.col - 1, window.row - 1, window.width + 2, window.height + 2) & view.target.window
+        known[around] = view.surface.look(view.target, around)
+        found = job.matrix_bands(view.target, known[around].part(*window.slices(around)))
+        if found is not None:
+            bands[:, *window.slices(view.target.window)] = found[0]
+
+    def paint(window: Window) -> None:
+        scene = Scene.of(view.target, Tile(0, window), known.__getitem__, view.surface, "bicubic")
+        picture[:, *window.slices(view.target.window)] = job.colours_of(scene, view, address.look)
+
+    with ThreadPoolExecutor(2) as pool:
+        for step in (ground, paint):
+            [*pool.map(step, windows)]
+            marks.append((time.perf_counter(), time.process_time()))
+    np.save(out / "matrix.npy", bands[:3])
+    np.save(out / "picture.npy", np.moveaxis(picture, 0, -1))
+    steps = {name: [b - a for a, b in zip(marks[k], marks[k + 1])] for k, name in enumerate(("matrix", "picture"))}
+    (out / "times.json").write_text(json.dumps(steps))
+
+
+def install_pyvista() -> Path:
+    """Python with pyvista, in an environment of its own."""
+    python = PYVISTA / "bin" / "python"
+    if not python.exists():
+        print("installing pyvista into an environment of its own …", file=sys.stderr)
+        try:
+            venv.create(PYVISTA, with_pip=True, clear=True)
+            subprocess.run([PYVISTA / "bin" / "pip", "install", "--quiet", "pyvista"], check=True)
+        except (OSError, subprocess.CalledProcessError) as error:
+            raise Missing(f"VTK: pyvista could not be installed ({error})") from None
+    return python
+
+
+def run_once(name: str, command: list[object], case: Case) -> dict[str, float]:
+    """Seconds of wall and processor after the imports, and peak memory."""
+    out = case.folder / name
+    out.mkdir(exist_ok=True)
+    words = [sys.executable, HERE / "measure.py", *command, case.folder / "case.json", out]
+    cost = json.loads(subprocess.run([*map(str, words)], check=True, capture_output=True, text=True).stdout)
+    if cost["code"] != 0:
+        raise Missing(f"{name}: ended with code {cost['code']}: {cost['stderr'].strip()[-300:]}")
+    steps = json.loads((out / "times.json").read_text())
+    told = {"wall": sum(s[0] for s in steps.values()), "cpu": sum(s[1] for s in steps.values())}
+    return told | {"memory": cost["memory"], "steps": steps}
+
+
+def height_errors(case: Case, XYZ: NDArray[np.float64]) -> dict[str, float]:
+    """Of points (3, …) above the bilinear posts below them, metres."""
+    posts = np.load(case.folder / "posts.npy").astype(float)
+    X, Y, Z = XYZ.reshape(3, -1)[:, np.isfinite(XYZ[2]).ravel()]
+    at = [(TOP - case.mesh / 2 - Y) / case.mesh, (X - LEFT - case.mesh / 2) / case.mesh]
+    error = np.abs(Z - map_coordinates(posts, at, order=1, mode="nearest"))
+    return {"median": float(np.median(error)), "p99": float(np.percentile(error, 99)), "worst": float(error.max())}
+
+
+def points_of_depth(case: Case) -> NDArray[np.float64]:
+    """Points of the pixels of VTK's depth buffer, (3, height, width)."""
+    told, depth = json.loads((case.folder / "case.json").read_text()), np.load(case.folder / "VTK" / "depth.npy")
+    (width, height), focal = case.size, case.size[0] / 2 / np.tan(np.radians(told["field_of_view"]) / 2)
+    v, u = np.mgrid[:height, :width]
+    azimuth, pitch = np.radians(told["azimuth"]), np.radians(told["pitch"])
+    axis = np.array([np.sin(azimuth) * np.cos(pitch), np.cos(azimuth) * np.cos(pitch), np.sin(pitch)])
+    right = np.array([np.cos(azimuth), -np.sin(azimuth), 0.0])
+    up = np.cross(right, axis)
+    x, y = (u - (width - 1) / 2) / focal, ((height - 1) / 2 - v) / focal
+    way = axis[:, None, None] + x * right[:, None, None] + y * up[:, None, None]
+    return np.array(told["center"])[:, None, None] + depth * way
+
+
+def report_views(quick: bool, repeat: int = 3) -> list[dict]:
+    """All rows, printed and as values."""
+    rows = []
+    print("\nPerspective views: ground of every pixel and a picture")
+    ours = [sys.executable, Path(__file__), "--child"]
+    for case in CASES[:1] if quick else CASES:
+        prepare_case(case)
+        programs: dict[str, list[object]] = {"photoplan": ours}
+        try:
+            programs["VTK"] = [install_pyvista(), HERE / "view_vtk.py"]
+            costs: dict[str, list[dict]] = {name: [] for name in programs}
+            run_once("photoplan", ours, case)
+            for _ in range(min(repeat, case.runs)):
+                for name, command in programs.items():
+                    costs[name].append(run_once(name, command, case))
+        except Missing as reason:
+            print(f"left out: {reason}")
+            costs = {"photoplan": [run_once("photoplan", ours, case)]}
+        row: dict = {"case": case.name, "runs": costs}
+        errors = {"photoplan": height_errors(case, np.load(case.folder / "photoplan" / "matrix.npy"))}
+        if "VTK" in costs:
+            errors["VTK"] = height_errors(case, points_of_depth(case))
+        (rows_, cols), (width, height) = case.posts, case.size
+        print(f"  {width} × {height} pixels over {cols - 1} × {rows_ - 1} cells")
+        middle = {
+            n: {k: statistics.median(c[k] for c in cost) for k in ("wall", "cpu", "memory")}
+            for n, cost in costs.items()
+        }
+        for name, m in middle.items():
+            e, steps = errors[name], costs[name][-1]["steps"]
+            parts = ", ".join(f"{what} {s[0]:.2f}" for what, s in steps.items())
+            print(
+                f"    {name:10} {m['wall']:7.2f} s ({parts}), {m['cpu']:7.2f} CPU s, {m['memory'] / MIB:6.0f} MiB; "
+                f"height error {e['median']:.2g} m in the median, {e['p99']:.2g} m (99 %), {e['worst']:.2g} m at worst"
+            )
+        if "VTK" in middle:
+            part = {k: middle["photoplan"][k] / middle["VTK"][k] for k in ("wall", "cpu", "memory")}
+            print(
+                f"    ours / VTK: wall {part['wall']:.2f}, CPU {part['cpu']:.2f} (asked {TIME_TARGET}), memory "
+                f"{part['memory']:.2f} (asked {MEMORY_TARGET} at the larger size)"
+            )
+        print(f"    height error of the matrix {errors['photoplan']['worst']:.2g} m (asked {HEIGHT_TARGET})")
+        rows.append(row | {"errors": errors, "median": middle})
+    return rows
+
+
+def main() -> int:
+    if sys.argv[1:2] == ["--child"]:
+        photoplan_view(Path(sys.argv[2]), Path(sys.argv[3]))
+        return 0
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="the smaller size only")
+    parser.add_argument("--repeat", type=int, default=3, metavar="N", help="runs of each program [3]")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    options = parser.parse_args()
+    WORK.mkdir(exist_ok=True)
+    found = report_views(options.quick, options.repeat)
+    if options.json:
+        options.json.write_text(json.dumps(found, indent=2) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
