@@ -5,7 +5,7 @@
 One real aerial frame, enlarged 6 and 12 times; cubic, three bands, uncompressed, no overviews, one thread where the
 program lets itself be told. Whole processes are measured, from start to end. Runs of the programs alternate, medians
 are compared. Whatever is missing (a program, the data) is named and its rows are left out. Terrain models from
-measured points (terrain.py), orientation (orientation.py) and the rate of filters (filter.py) follow.
+measured points (terrain.py), orientation (orientation.py), the rate of filters (filter.py) and views (views.py) follow.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from planning import report_planning
 from prepare import DATA, LARGE, SMALL, WORK, Source, prepare
 from programs import Bounds, Missing, Program, gdalwarp, orthority, photoplan
 from terrain import report_terrain
+from views import report_views
 
 HERE = Path(__file__).resolve().parent
 MIB = 2**20
@@ -216,6 +217,7 @@ def main() -> int:
     results["orientation"] = report_orientation(options.quick)
     results["planning"] = report_planning(options.quick)
     results["mosaics"] = report_mosaics(options.quick)
+    results["views"] = report_views(options.quick, options.repeat)
     if options.json:
         options.json.write_text(json.dumps(results, indent=2) + "\n")
     return 0

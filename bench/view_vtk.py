@@ -18,12 +18,6 @@ import pyvista as pv
 
 def main(case, out):
     case = json.loads(case.read_text())
-    # A first picture loads libraries and drivers.
-    first = pv.Plotter(off_screen=True, window_size=(32, 24))
-    first.add_mesh(pv.Sphere())
-    first.show(auto_close=False)
-    first.get_image_depth()
-    first.close()
     marks = [(time.perf_counter(), time.process_time())]
     posts = np.load(case["posts"])
     rows, cols = posts.shape

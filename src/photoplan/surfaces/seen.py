@@ -23,6 +23,8 @@ MOST_RAYS = 1 << 14
 _STRETCH = 1.01
 
 
+#: Steps of half a pixel.
+_HALVES = (0.5, 0.0), (0.0, 0.5)
 #: Cosine of the flattest incidence that sizes of pixels know.
 _EDGE_ON = 1e-6
 
@@ -135,13 +137,13 @@ def _back(target: ViewTarget, hits: Hits) -> NDArray[np.float64]:
 
 def pixel_size(target: ViewTarget, uvh: NDArray[np.float64]) -> NDArray[np.float64]:
     """Side of a square of the area that pixels (..., 3) cover at their depth, across the line of sight, metres."""
-    uv, half = uvh[..., :2], np.array([0.5, 0.0])
-    across, along = (
-        target.bundle.directions(uv + step) - target.bundle.directions(uv - step) for step in (half, half[::-1])
-    )
+    uv = uvh[..., :2]
     here = target.bundle.directions(uv)
+    (ax, ay, az), (bx, by, bz) = (np.moveaxis(target.bundle.directions(uv + s) - here, -1, 0) for s in _HALVES)
     # The solid angle of the pixel, times the squared distance, per unit of depth.
-    area = np.abs(dot(np.cross(across, along), here)) / np.sqrt(dot(here, here))
+    x, y, z = np.moveaxis(here, -1, 0)
+    volume = (ay * bz - az * by) * x + (az * bx - ax * bz) * y + (ax * by - ay * bx) * z
+    area = 4 * np.abs(volume) / np.sqrt(dot(here, here))
     return np.asarray(np.abs(uvh[..., 2]) * np.sqrt(area))
 
 
