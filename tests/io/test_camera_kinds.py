@@ -24,6 +24,7 @@ KINDS = {"FrameCamera", "WarpedCamera", "corrected_camera", "curved_camera", "Li
 #: Files that may name a kind, and why.
 ALLOWED = {
     "cameras/line.py": "a kind",
+    "cameras/line_correctable.py": "corrections of a kind",
     "io/camera/line/model.py": "makes a kind of what files state",
     "__init__.py": "public names",
     "cameras/__init__.py": "public names",

@@ -89,6 +89,11 @@ class Layout:
         """The kind of a key; None: its values are held fixed."""
         return next((kind for kind in self.kinds if kind.key == key), None)
 
+    def columns_of(self, key: str) -> _Index:
+        """Columns of all unknowns of a kind, in the order of its values; none of a kind that is held fixed."""
+        kind = self.get(key)
+        return np.arange(0) if kind is None else np.arange(kind.part.start, kind.part.stop)
+
     def moved(self, values: Mapping[str, Unknowns], step: _Floats) -> dict[str, Unknowns]:
         """Values after a step (count,); what is no unknown stays."""
         moved = {k.key: values[k.key].moved(step[k.part].reshape(-1, k.width)) for k in self.kinds}

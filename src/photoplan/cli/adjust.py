@@ -73,7 +73,8 @@ def _figures(report: AdjustReport) -> list[str]:
     lines = [
         f"sigma0 {f.sigma0:.3f} · image residuals {f.rms_pixels:.3f} px rms · redundancy {f.redundancy} · "
         f"{f.unknowns} unknowns · {f.iterations} iterations · {f.seconds:.1f} s",
-        f"{len(f.images)} images, {f.points} points adjusted · {f.rejected} gross errors taken out",
+        f"{len(f.images) + len(f.corrections)} images, {f.points} points adjusted · "
+        f"{f.rejected} gross errors taken out",
     ]
     width = max((len(g.name) for g in f.groups), default=0)
     for g in f.groups:
@@ -85,6 +86,9 @@ def _figures(report: AdjustReport) -> list[str]:
             change = camera.after[k] - camera.before[k]
             value = f"{camera.after[k]:.8g} {camera.units[k]}".rstrip()
             lines.append(f"  camera {camera.name}: {name} {value} ± {camera.sigma[k]:.2g} (change {change:+.3g})")
+    for image in f.corrections:
+        found = ", ".join(f"{p.name} {p.value:+.4g} ± {p.sigma:.2g} {p.unit}" for p in image.parameters)
+        lines.append(f"  {image.name}: {found or 'nothing of it was unknown'}")
     if f.check is not None:
         c = f.check
         count = max(c.horizontal, c.vertical)

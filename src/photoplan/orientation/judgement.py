@@ -61,10 +61,15 @@ def impossible(found: Evidence) -> str | None:
         return f"the camera lies {below:.0f} m below its ground points and looks up: the solution is mirrored"
     if found.terrain - found.center[2] > _SYSTEMS:
         return f"the camera lies {found.terrain - found.center[2]:.0f} m below the terrain"
-    if found.points >= _ENOUGH and found.rejected > _WRONG * found.points:
-        return f"{found.rejected} of {found.points} points do not fit it"
-    if found.sigma0 > _SIGMA0 and found.rms > _PIXELS:
-        return f"residuals of {found.rms:.0f} px are {found.sigma0:.0f} times what was stated"
+    return misfit(found.rejected, found.points, found.sigma0, found.rms)
+
+
+def misfit(rejected: int, points: int, sigma0: float, rms: float) -> str | None:
+    """Why measurements do not fit what was made of them (see `Evidence`), as a clause; None if they do."""
+    if points >= _ENOUGH and rejected > _WRONG * points:
+        return f"{rejected} of {points} points do not fit it"
+    if sigma0 > _SIGMA0 and rms > _PIXELS:
+        return f"residuals of {rms:.0f} px are {sigma0:.0f} times what was stated"
     return None
 
 

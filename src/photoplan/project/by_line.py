@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
 from photoplan.cameras.base import Camera
 from photoplan.errors import InputError
+from photoplan.io.camera.line.correction import read_line_correction
 from photoplan.io.camera.line.file import read_line
 from photoplan.io.camera.line.model import StatedLine
 from photoplan.io.project.line import LineImage
@@ -33,7 +35,11 @@ def line_camera(project: Project, image: LineImage, ground: Ground, size: tuple[
                 f"{image.file}: {size[0]} × {size[1]} pixels, but {where} states {given[0]} × {given[1]}; a line "
                 "camera fits an image of full size only"
             )
-    return stated.camera(project.crs, ground.working_system)
+    camera = stated.camera(project.crs, ground.working_system)
+    if image.correction is None:
+        return camera
+    correction = read_line_correction(project.resolve(image.correction))
+    return replace(camera, track=correction.track(camera.track))
 
 
 @lru_cache(maxsize=64)

@@ -50,7 +50,7 @@ def camera_without_pixels(project: Project, name: str) -> Camera:
         No size is known, that of the file is another one, or the image is not oriented.
     """
     image = project.any_image(name)
-    return camera_of(project, image, ground_of(project), _size(project, image))
+    return camera_of(project, image, ground_of(project), size_of(project, image))
 
 
 def central_without_pixels(project: Project, name: str) -> CentralCamera:
@@ -62,10 +62,11 @@ def central_without_pixels(project: Project, name: str) -> CentralCamera:
         As there, or it has no pose.
     """
     image = project.image(name)
-    return posed_camera(project, image, ground_of(project), _size(project, image))
+    return posed_camera(project, image, ground_of(project), size_of(project, image))
 
 
-def _size(project: Project, image: ImageEntry) -> tuple[int, int]:
+def size_of(project: Project, image: ImageEntry) -> tuple[int, int]:
+    """Width and height of an image: of its file, or what is stated where that is not there."""
     file = project.resolve(image.file)
     if is_there(file):
         return read_info(file).size

@@ -22,7 +22,7 @@ from photoplan.io.project.model import Project
 class ProjectChanges:
     """Entries to set, as plain values (numbers, strings, lists, tables); None removes an entry."""
 
-    images: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    images: Mapping[str, dict[str, Any]] = field(default_factory=dict)
     """Entries of `[[images]]`, by the image's name."""
     cameras: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Entries of `[cameras.NAME]`."""

@@ -6,12 +6,13 @@ from typing import Annotated, Any
 
 from pydantic import Discriminator, Tag
 
+from photoplan.io.project.image import ImageEntry
 from photoplan.io.project.line import LineImage
 from photoplan.io.project.posed import Image
 from photoplan.io.project.rpc import RpcImage
 
 #: The entry that only images of a kind have; an image without any of them has a pose.
-_BY_ENTRY = {"rpc": RpcImage, "line": LineImage}
+_BY_ENTRY: dict[str, type[ImageEntry]] = {"rpc": RpcImage, "line": LineImage}
 
 
 def _kind(value: Any) -> str:

@@ -19,11 +19,15 @@ class LineImage(ImageEntry):
     """File of the line camera."""
     detectors: Name | None = None
     """Which line of detectors, where the file has several."""
+    correction: InputName | None = None
+    """File of corrections of its trajectory, as `photoplan adjust` writes them."""
+    mount: Name | None = None
+    """Images of one mount share boresight, lever arm and clock in an adjustment; None: those of one file do."""
 
-    @field_validator("line")
+    @field_validator("line", "correction")
     @classmethod
-    def _line(cls, text: str) -> str:
-        return plain_file(text)
+    def _line(cls, text: str | None) -> str | None:
+        return None if text is None else plain_file(text)
 
     @property
     def geometry_file(self) -> str:
@@ -31,8 +35,9 @@ class LineImage(ImageEntry):
         return self.line
 
     def geometry_files(self, resolve: Callable[[str], Path]) -> list[Path]:
-        """That file, and the record of the flight beside it."""
-        return line_files(resolve(self.line))
+        """That file, the record of the flight beside it, and the corrections."""
+        correction = [] if self.correction is None else [resolve(self.correction)]
+        return [*line_files(resolve(self.line)), *correction]
 
     @property
     def described_by(self) -> None:

@@ -129,6 +129,36 @@ class ObservationsEntry(Entry):
 Parameter = Literal["c", "x0", "y0", "k1", "k2", "k3", "p1", "p2", "b1", "b2"]
 
 
+class RpcAdjustment(Entry):
+    """What is unknown of images with rational polynomials."""
+
+    correction: Literal["shift", "drift", "affine"] = "shift"
+    """A shift; a shift and what changes by row; or all six parameters of an affine correction."""
+    sigma: tuple[Positive, Positive] = (10.0, 2.0)
+    """What is known beforehand: standard deviation of the shift, and of what changes until the border, pixels."""
+
+
+class StripAdjustment(Entry):
+    """What is unknown of trajectories of line cameras, as standard deviations known beforehand; 0: held fixed."""
+
+    boresight: NotNegative = 0.0
+    """About each axis of the camera, degrees."""
+    lever_arm: NotNegative = 0.0
+    """Along each axis, metres."""
+    time_offset: NotNegative = 0.0
+    """Seconds."""
+    knots: Positive | None = None
+    """Seconds between knots of corrections that change with time; None: there are none."""
+    position: Positive = 0.05
+    """Of corrections of the positions, metres."""
+    attitude: Positive = 0.005
+    """Of corrections of the attitudes, degrees."""
+    smooth_position: Positive | None = None
+    """Of their second differences from knot to knot, metres; None: they are not known to be smooth."""
+    smooth_attitude: Positive | None = None
+    """The same of the attitudes, degrees."""
+
+
 class Adjustment(Entry):
     """What `photoplan adjust` estimates besides orientations and points; options of the command override it."""
 
@@ -144,6 +174,8 @@ class Adjustment(Entry):
     """Drift of observed positions in each strip: none, a shift, or a shift and a change linear in time."""
     boresight: Annotated[bool, Strict()] = False
     """Whether three small rotations between the observed attitudes and the camera are unknowns."""
+    rpc: RpcAdjustment = RpcAdjustment()
+    strips: StripAdjustment = StripAdjustment()
 
 
 class OrthoDefaults(Entry):

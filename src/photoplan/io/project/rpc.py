@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from pydantic import field_validator
+from typing import Annotated
+
+from pydantic import Field, field_validator
 
 from photoplan.cameras.plane import Affine2D
 from photoplan.io.camera.model import Number, Pair
@@ -21,11 +23,20 @@ class RpcImage(ImageEntry):
     """What is added to the polynomials' column and row, pixels."""
     drift: tuple[Number, Number, Number, Number] | None = None
     """What is added beside: to the column by column and row, to the row by column and row, per pixel."""
+    covariance: Annotated[tuple[Number, ...], Field(max_length=21)] | None = None
+    """Of shift and drift: the lower triangle by rows, of two or six numbers; pixels and pixels per pixel."""
 
     @field_validator("rpc")
     @classmethod
     def _rpc(cls, text: str) -> str:
         return plain_file(text)
+
+    @field_validator("covariance")
+    @classmethod
+    def _covariance(cls, values: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if values is not None and len(values) not in (3, 21):
+            raise ValueError(f"covariance of {len(values)} numbers; 3 of shift, or 21 of shift and drift are needed")
+        return values
 
     @property
     def geometry_file(self) -> str | None:

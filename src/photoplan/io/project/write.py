@@ -169,6 +169,8 @@ def _adjustment(adjustment: Adjustment) -> list[str]:
         "lever_arm_sigma": "its standard deviation; 0: held fixed",
         "drift": '"none", "shift" or "linear" for each strip',
         "boresight": "whether rotations between observed attitudes and camera are unknowns",
+        "rpc": "correction of rational polynomials, and what is known of it beforehand",
+        "strips": "what is unknown of trajectories of line cameras, as standard deviations",
     }
     return [
         "# What `photoplan adjust` estimates besides orientations and points.",

@@ -196,8 +196,9 @@ def _rebuilt(
     before = {name: k for k, name in enumerate(model.point_names)}
     old = np.array([before.get(n, -1) for n in made.point_names], np.int64)
     # What wrong rays have driven far away is intersected anew, without them.
-    middle = state.images.centers.mean(axis=0)
-    reach = _FAR * np.linalg.norm(np.concatenate([XYZ, state.images.centers]) - middle, axis=1).max()
+    from_where = state.images.centers if len(state.images.centers) else XYZ
+    middle = from_where.mean(axis=0)
+    reach = _FAR * np.linalg.norm(np.concatenate([XYZ, from_where]) - middle, axis=1).max()
     old[anew | (np.linalg.norm(state.XYZ[old] - middle, axis=1) > reach)] = -1
     XYZ[old >= 0] = state.XYZ[old[old >= 0]]
     return made, state.carried(_started(made, XYZ)), selection, lost
@@ -222,7 +223,7 @@ def _returned(model: Model, state: State, active: Active, factors: _Floats, crit
 
 def _started(model: Model, XYZ: _Floats) -> State:
     poses = [model.block.images[k].pose for k in model.image_rows]
-    return start_state(model.block, model.camera_names, model.strip_names, poses, XYZ)
+    return start_state(model.block, model.camera_names, model.strip_names, poses, XYZ, model.sets)
 
 
 class _Loop:

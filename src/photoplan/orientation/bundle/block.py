@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.cameras.correctable import Correctable
 from photoplan.cameras.lenses.base import Lens
 from photoplan.cameras.observed import GroundPoints, ImagePoints, ObservedAttitudes, ObservedPositions
 from photoplan.cameras.plane import Affine2D, Bilinear2D
@@ -53,6 +54,27 @@ class BlockImage:
     """Start value of the exterior orientation."""
 
 
+#: From block points (n, 3) to map points (n, 3), and their derivatives ∂ map / ∂ block (n, 3, 3).
+OnMap = Callable[[NDArray[np.float64]], "tuple[NDArray[np.float64], NDArray[np.float64]]"]
+
+
+@dataclass(frozen=True, eq=False)
+class BlockProjection:
+    """An image of the block without a pose: its geometry is known but for corrections."""
+
+    name: str
+    group: str
+    """Images that are measured alike, as messages call them: "rational polynomials"."""
+    geometry: Correctable
+    """Over map points."""
+    sight: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
+    """From image points (n, 2) to about where they are seen from, and unit directions, in the block's system."""
+    metres: float
+    """About the size of a pixel on the ground."""
+    away: float
+    """About the distance from where it is seen to the ground, metres."""
+
+
 @dataclass(frozen=True, eq=False)
 class Block:
     """Everything that is observed and that is known beforehand."""
@@ -76,6 +98,9 @@ class Block:
     start_points: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     """Start values of points, where they are known; others are intersected."""
     bend: Bend | None = None
+    projections: tuple[BlockProjection, ...] = ()
+    on_map: OnMap | None = None
+    """Where projections see points of the block; None: map and block are one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,9 +165,10 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class Correlation:
-    """Errors of image points that are alike over some distance, of the images of one camera."""
+    """Errors of image points that are alike over some distance, of the images of one camera or group."""
 
-    camera: str
+    group: str
+    """Of the images: "camera RC30"."""
     effect: float
     """Measurements that count as one for an orientation."""
     reach: float
@@ -165,6 +191,19 @@ class AdjustedCamera:
     """The parameters that were unknowns."""
     covariance: NDArray[np.float64]
     """Of those, shape (k, k), sigma0 included; NaN without covariance."""
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustedCorrections:
+    """A set of corrections after the adjustment."""
+
+    key: str
+    values: NDArray[np.float64]
+    """(owners, parameters)."""
+    covariance: NDArray[np.float64]
+    """Of each owner, (owners, parameters, parameters); NaN without covariance."""
+    known: NDArray[np.float64]
+    """What each value was known to beforehand: standard deviations; infinite: not at all. As `values`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,5 +279,11 @@ class Adjusted:
     iterations: int
     correlations: tuple[Correlation, ...] = ()
     """Of cameras whose image points have clearly correlated errors; orientations and their covariances regard it."""
+    projections: tuple[str, ...] = ()
+    """Images without poses that took part."""
+    corrections: tuple[AdjustedCorrections, ...] = ()
+    """Of these, in the order of their first image."""
+    by_prior: tuple[str, ...] = ()
+    """Motions of the block that nothing but what corrections are known to beforehand determines."""
     other_control: tuple[str, ...] = ()
     """Control points of the largest other set that agrees within itself; empty where all of it agrees."""

@@ -77,7 +77,7 @@ def misclosures(model: Model, state: State, weight: _Floats, loose: float) -> Mi
     point = np.empty(len(names), np.int64)
     point[of] = model.ground_point
     # A point whose rays were all wrong may be anywhere: it is looked at from where it should be.
-    extent = np.linalg.norm(state.images.centers[model.image] - state.XYZ[model.point], axis=1)
+    extent = np.linalg.norm(model.origins(state.images.centers) - state.XYZ[model.point], axis=1)
     far = np.linalg.norm(state.XYZ[point] - model.block.ground.XYZ[names], axis=1) > _FAR * np.median(extent)
     XYZ = state.XYZ.copy()
     XYZ[point[far]] = model.block.ground.XYZ[names[far]]

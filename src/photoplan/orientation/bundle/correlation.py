@@ -45,7 +45,7 @@ def correlation_of(model: Model, normalised: _Floats, used: NDArray[np.bool_]) -
     """
     v = np.nan_to_num(normalised)
     found = []
-    for index, name in enumerate(model.camera_names):
+    for index, name in enumerate(model.groups):
         mine = np.flatnonzero(used & (model.camera_of[model.image] == index))
         made = _of_camera(name, model.image[mine], model.xy[mine], v[mine]) if len(mine) > _PAIRS else None
         if made is not None:
@@ -59,9 +59,9 @@ def effects_of_rows(model: Model, correlations: tuple[Correlation, ...], rows: i
     Control and check points are few and far from each other, so what they say is hardly alike. And if the image points
     of control lost weight, it would lie where its ground coordinates are, and nothing would check these.
     """
-    of_camera = np.ones(len(model.camera_names))
+    of_camera = np.ones(len(model.groups))
     for correlation in correlations:
-        of_camera[model.camera_names.index(correlation.camera)] = correlation.effect
+        of_camera[model.groups.index(correlation.group)] = correlation.effect
     out = np.ones(rows)
     ground = set(model.block.ground.names)
     surveyed = np.array([name in ground for name in model.point_names], bool)

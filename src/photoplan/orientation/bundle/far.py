@@ -47,5 +47,5 @@ def _middles(model: Model, state: State) -> _Floats:
     """Middle of the cameras that see each point, (m, 3)."""
     m = len(state.XYZ)
     rays = np.maximum(np.bincount(model.point, minlength=m), 1)
-    centers = state.images.centers[model.image]
+    centers = model.origins(state.images.centers)
     return np.stack([np.bincount(model.point, centers[:, k], m) / rays for k in range(3)], axis=-1)

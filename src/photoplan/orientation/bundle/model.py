@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.adjustment.blocks import Layout
+from photoplan.cameras.correctable import Corrections
 from photoplan.cameras.lenses.brown import Brown
 from photoplan.cameras.lenses.none import NoLens
 from photoplan.cameras.lenses.opencv import OpenCV
 from photoplan.cameras.plane import Affine2D, Bilinear2D
 from photoplan.errors import InputError, UsageError
-from photoplan.orientation.bundle.block import PARAMETERS, Block, BlockCamera
+from photoplan.orientation.bundle.block import PARAMETERS, Block, BlockCamera, BlockProjection
 from photoplan.orientation.bundle.unknowns import LEVER, CameraState, layout_of
 
 #: Standard deviation of coordinates that are held fixed, in units of an image point's on the ground: small against
@@ -22,6 +23,7 @@ from photoplan.orientation.bundle.unknowns import LEVER, CameraState, layout_of
 FIXED = 1e-5
 
 _Index = NDArray[np.int64]
+_Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,8 @@ class Parts:
     attitude: slice
     known: slice
     """What is known beforehand of unknowns."""
+    smooth: slice
+    """What is known beforehand of corrections, as linear functions of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +46,19 @@ class Model:
 
     block: Block
     image_names: tuple[str, ...]
+    """Those with poses first, then `projections`."""
     image_rows: _Index
-    """Number of each image in `block.images`, (n,)."""
+    """Number of each image with a pose in `block.images`, (n,)."""
+    projections: tuple[BlockProjection, ...]
+    keys: tuple[tuple[str, ...], ...]
+    """Of the sets of corrections of each projection."""
+    sets: tuple[Corrections, ...]
+    """All these sets, each once."""
     camera_names: tuple[str, ...]
     camera_of: _Index
-    """Camera of each image, (n,)."""
+    """Camera of each image with a pose, then the group of each projection: an index into `groups`."""
+    groups: tuple[str, ...]
+    """Cameras as messages call them, then the groups of the projections."""
     plane: NDArray[np.float64]
     """Bilinear coefficients b1 … b8 from image plane to pixels of each image, (n, 8)."""
     point_names: tuple[str, ...]
@@ -84,9 +96,58 @@ class Model:
     @cached_property
     def parts(self) -> Parts:
         """Where the kinds of observations stand."""
-        sizes = (2 * len(self.image), len(self.ground), 3 * len(self.position), 3 * len(self.attitude), len(self.known))
+        smooth = sum(each.known.shape[0] for each in self.sets)
+        known = len(self.known), smooth
+        sizes = (2 * len(self.image), len(self.ground), 3 * len(self.position), 3 * len(self.attitude), *known)
         ends = np.cumsum(sizes).tolist()
         return Parts(*(slice(end - size, end) for end, size in zip(ends, sizes)))
+
+    @property
+    def rows(self) -> int:
+        """Number of all rows."""
+        return int(self.parts.smooth.stop)
+
+    @cached_property
+    def framed(self) -> _Index:
+        """Measurements in images with poses."""
+        return np.flatnonzero(self.image < len(self.image_rows))
+
+    @cached_property
+    def posed(self) -> Model:
+        """The same model with these measurements only."""
+        mine = self.framed
+        if len(mine) == len(self.image):
+            return self
+        return replace(
+            self,
+            observation=self.observation[mine],
+            image=self.image[mine],
+            point=self.point[mine],
+            xy=self.xy[mine],
+            sigma=self.sigma[mine],
+        )
+
+    @cached_property
+    def of_projections(self) -> tuple[tuple[BlockProjection, tuple[str, ...], _Index], ...]:
+        """Each projection with the keys of its sets and its measurements."""
+        first = len(self.image_rows)
+        return tuple((p, self.keys[k], np.flatnonzero(self.image == first + k)) for k, p in enumerate(self.projections))
+
+    @cached_property
+    def seen_from(self) -> _Floats:
+        """About where the measurements in projections are seen from, (k, 3); NaN for those in images with poses."""
+        out = np.full((len(self.image), 3), np.nan)
+        for projection, _, mine in self.of_projections:
+            out[mine] = projection.sight(self.xy[mine])[0]
+        return out
+
+    def origins(self, centers: _Floats) -> _Floats:
+        """Where every measurement is seen from, (k, 3), with projection centres (n, 3)."""
+        if not self.projections:
+            return np.asarray(centers[self.image])
+        out = self.seen_from.copy()
+        out[self.framed] = centers[self.image[self.framed]]
+        return out
 
     @property
     def observed(self) -> int:
@@ -126,15 +187,18 @@ def build_model(block: Block, images: list[int], measured: _Index, points: list[
     ----------
     block : Block
     images : list of int
-        Images that take part, indices into `block.images`.
+        Images that take part, indices into `block.images`, and beyond these into `block.projections`.
     measured : ndarray
         Measurements that take part, indices into `block.observations`.
     points : list of str
         Points that take part.
     """
     seen = block.observations
-    chosen = [block.images[k] for k in images]
-    image_index = {b.name: k for k, b in enumerate(chosen)}
+    chosen = [block.images[k] for k in images if k < len(block.images)]
+    projections = tuple(block.projections[k - len(block.images)] for k in images if k >= len(block.images))
+    of_each = [p.geometry.corrections for p in projections]
+    sets = {each.key: each for own in of_each for each in own}
+    image_index = {n: k for k, n in enumerate([*(b.name for b in chosen), *(p.name for p in projections)])}
     point_index = {name: k for k, name in enumerate(points)}
     camera_names = tuple(dict.fromkeys(b.camera for b in chosen))
     for name in camera_names:
@@ -146,13 +210,20 @@ def build_model(block: Block, images: list[int], measured: _Index, points: list[
     position, position_row = _observed(block.positions.images if block.positions else (), image_index)
     strips, strip_of, tau, epochs = _strips(block, position_row)
     attitude, attitude_row = _observed(block.attitudes.images if block.attitudes else (), image_index)
-    columns = layout_of(block, tuple(image_index), camera_names, strips)
+    columns = layout_of(block, tuple(b.name for b in chosen), camera_names, strips, tuple(sets.values()))
+    groups = tuple(dict.fromkeys(p.group for p in projections))
+    of = [camera_names.index(b.camera) for b in chosen]
+    of += [len(camera_names) + groups.index(p.group) for p in projections]
     return Model(
         block=block,
         image_names=tuple(image_index),
-        image_rows=np.array(images, np.int64),
+        image_rows=np.array(images[: len(chosen)], np.int64),
+        projections=projections,
+        keys=tuple(tuple(each.key for each in own) for own in of_each),
+        sets=tuple(sets.values()),
         camera_names=camera_names,
-        camera_of=np.array([camera_names.index(b.camera) for b in chosen], np.int64),
+        camera_of=np.array(of, np.int64),
+        groups=(*(f"camera {name}" for name in camera_names), *groups),
         plane=np.array([_bilinear(b.plane_to_pixel) for b in chosen]).reshape(-1, 8),
         point_names=tuple(points),
         observation=measured,
@@ -212,7 +283,7 @@ def _on_ground(block: Block) -> float:
         pixel = np.sqrt(abs(np.linalg.det(image.plane_to_pixel.derivative(np.array(camera.principal_point)))))
         angles.append(sigma / (camera.c * pixel))
         away.append(np.median(np.linalg.norm(known - image.pose.center, axis=1)))
-    return float(np.median(np.array(angles) * np.array(away)))
+    return float(np.median([*np.array(angles) * np.array(away), *(sigma * p.metres for p in block.projections)]))
 
 
 def _ground_rows(block: Block, point_index: dict[str, int]) -> tuple[_Index, _Index, _Index, NDArray[np.float64]]:

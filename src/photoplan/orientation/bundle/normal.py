@@ -17,9 +17,10 @@ from scipy.sparse.linalg import ArpackError, LinearOperator, SuperLU, eigsh, spl
 from photoplan.errors import GeometryError
 from photoplan.kernels.quadratic_forms import SparseRows, gathered, point_variances, row_variances
 from photoplan.kernels.selected_inverse import SelectedInverse, aligned, fill_pattern, selected_inverse
+from photoplan.orientation.bundle.datum import motions_of_points
 from photoplan.orientation.bundle.model import Model
 from photoplan.orientation.bundle.rows import Rows
-from photoplan.orientation.bundle.unknowns import State
+from photoplan.orientation.bundle.unknowns import IMAGES, State
 
 _Floats = NDArray[np.float64]
 
@@ -46,6 +47,11 @@ class Reduced:
     N_pg: sparse.csr_matrix
     n_p: _Floats
     """(points, 3)."""
+
+    @property
+    def of_points(self) -> tuple[_Floats, sparse.csr_matrix]:
+        """What takes steps of the other unknowns to those of the points."""
+        return self.V_inverse, self.N_pg
 
     def solved(self, model: Model, state: State) -> tuple[_Floats, _Floats]:
         """As `solve`; what is not determined is named."""
@@ -211,6 +217,7 @@ def check_rank(model: Model, state: State, reduced: Reduced) -> None:
     directions = vectors[:, null] * reduced.scale[:, None]
     names = _datum(model, state, directions, reduced.scale)
     names = names or _one_motion(model, state, directions)
+    names = names or list(motions_of_points(state, reduced.of_points, directions) if model.projections else ())
     names = names or [model.columns.spelled(d, reduced.scale) for d in vectors[:, null].T]
     raise GeometryError(
         f"the observations leave {int(null.sum())} direction{'s' if null.sum() > 1 else ''} of the unknowns free: "
@@ -239,7 +246,10 @@ def _smallest(reduced: Reduced) -> tuple[_Floats, _Floats]:
 def _datum(model: Model, state: State, directions: _Floats, reduced_scale: _Floats) -> list[str]:
     """Names of the block's motions among the undetermined directions; empty if there are others."""
     size, motions = state.images.motions()
-    images = model.columns.kinds[0].part
+    kind = model.columns.get(IMAGES)
+    if kind is None:
+        return []
+    images = kind.part
     unit = np.array([size] * 3 + [1.0] * 3)
     basis, _ = np.linalg.qr(directions[images] / np.tile(unit, len(state.images.centers))[:, None])
     # A direction in which a camera, a lever arm or a drift changes too is no motion of the block.
@@ -256,10 +266,11 @@ def _datum(model: Model, state: State, directions: _Floats, reduced_scale: _Floa
 
 def _one_motion(model: Model, state: State, directions: _Floats) -> list[str]:
     """A turn of the whole block about a line, where the one undetermined direction is that; otherwise empty."""
-    if directions.shape[1] != 1:
+    kind = model.columns.get(IMAGES)
+    if directions.shape[1] != 1 or kind is None:
         return []
     size, motions = state.images.motions()
-    images, unit = model.columns.kinds[0].part, np.array([size] * 3 + [1.0] * 3)
+    images, unit = kind.part, np.array([size] * 3 + [1.0] * 3)
     v = (directions[images, 0].reshape(-1, 6) / unit).ravel()
     A = np.column_stack([(motion / unit).ravel() for motion in motions.values()])
     parts, *_ = np.linalg.lstsq(A, v, rcond=None)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from photoplan.adjustment.robust import ENOUGH, variance_factors
 from photoplan.errors import GeometryError
@@ -14,11 +15,13 @@ from photoplan.orientation.bundle.block import (
     Active,
     Adjusted,
     AdjustedCamera,
+    AdjustedCorrections,
     AdjustedStrip,
     Block,
     Correlation,
     Group,
 )
+from photoplan.orientation.bundle.datum import by_prior
 from photoplan.orientation.bundle.model import Model
 from photoplan.orientation.bundle.normal import Inverse, Reduced, check_rank, reduce_normals
 from photoplan.orientation.bundle.robust import Judged, kinds_of, kinds_of_measurements, robust_scale
@@ -184,7 +187,7 @@ def result_of(block: Block, selection: Selection, weighted: Weighted, active: Ac
     sigma0 = solution.sigma0
     variance = sigma0**2 if np.isfinite(sigma0) else 1.0
     return Adjusted(
-        images=model.image_names,
+        images=model.image_names[: len(model.image_rows)],
         poses=state.poses(),
         pose_covariance=_covariances(solution, IMAGES, variance),
         pose_camera_covariance=_with_camera(solution, variance),
@@ -215,6 +218,9 @@ def result_of(block: Block, selection: Selection, weighted: Weighted, active: Ac
         unknowns=model.columns.count + 3 * len(model.point_names),
         iterations=iterations,
         correlations=weighted.correlations,
+        projections=tuple(p.name for p in model.projections),
+        corrections=_corrections(solution, variance),
+        by_prior=by_prior(model, state, solution.reduced.rows, solution.reduced.of_points),
     )
 
 
@@ -271,9 +277,10 @@ def _with_camera(solution: Solution, variance: float) -> tuple[_Floats, ...]:
     """Covariances of each pose with the free parameters of its camera, (6, k)."""
     model = solution.model
     poses = model.columns.get(IMAGES)
-    assert poses is not None
+    if poses is None:
+        return ()
     out = []
-    for k in range(len(model.image_names)):
+    for k in range(len(model.image_rows)):
         camera = model.columns.get(f"camera {model.camera_names[model.camera_of[k]]}")
         if camera is None or solution.inverse is None:
             out.append(np.full((6, 0 if camera is None else camera.width), np.nan))
@@ -304,6 +311,21 @@ def _cameras(solution: Solution, variance: float) -> tuple[AdjustedCamera, ...]:
                 covariance=covariance[0] if len(covariance) else np.empty((0, 0)),
             )
         )
+    return tuple(found)
+
+
+def _corrections(solution: Solution, variance: float) -> tuple[AdjustedCorrections, ...]:
+    found = []
+    for each in solution.model.sets:
+        own = sparse.csr_matrix(each.known)
+        # Rows of a single value are what is known of it alone.
+        single = own[np.flatnonzero(np.diff(own.indptr) == 1)]
+        weight = np.asarray(single.multiply(single).sum(axis=0)).ravel()
+        with np.errstate(divide="ignore"):
+            known = 1.0 / np.sqrt(weight)
+        values = solution.state.corrections(each.key)
+        covariance = _covariances(solution, each.key, variance)
+        found.append(AdjustedCorrections(each.key, values, covariance, known.reshape(values.shape)))
     return tuple(found)
 
 

@@ -51,8 +51,8 @@ def kinds_of(model: Model) -> tuple[Kinds, NDArray[np.int64]]:
 
     Control and check points are measured otherwise than tie points (by hand, say), so they are groups of their own.
     """
-    kinds: list[tuple[str, str]] = [(f"image points, camera {name}", "px") for name in model.camera_names]
-    kinds += [(f"control and check points in images, camera {name}", "px") for name in model.camera_names]
+    kinds: list[tuple[str, str]] = [(f"image points, {name}", "px") for name in model.groups]
+    kinds += [(f"control and check points in images, {name}", "px") for name in model.groups]
     of = [np.repeat(kinds_of_measurements(model)[model.observation], 2)]
     at = len(kinds)
     kinds += [("control, horizontal", "m"), ("control, height", "m")]
@@ -71,17 +71,18 @@ def kinds_of(model: Model) -> tuple[Kinds, NDArray[np.int64]]:
 def kinds_of_measurements(model: Model) -> NDArray[np.int64]:
     """Group of every measurement of the block, also of those that take no part; −1: its image takes none."""
     seen = model.block.observations
-    cameras = {name: k for k, name in enumerate(model.camera_names)}
-    of_image = {b.name: cameras.get(b.camera, -1) for b in model.block.images}
+    groups = {name: k for k, name in enumerate(model.groups)}
+    of_image = {b.name: groups.get(f"camera {b.camera}", -1) for b in model.block.images}
+    of_image |= {p.name: groups.get(p.group, -1) for p in model.block.projections}
     camera = np.array([of_image.get(n, -1) for n in seen.images], np.int64)[seen.image]
     names = set(model.block.ground.names)
     surveyed = np.array([n in names for n in seen.points], bool)[seen.point]
-    return np.where(camera < 0, -1, camera + len(cameras) * surveyed)
+    return np.where(camera < 0, -1, camera + len(groups) * surveyed)
 
 
 def weights_of(model: Model, active: Active, factors: _Floats | None = None) -> _Floats:
     """Weights of all rows: 0 for what is taken out, 1 / factor² for its group's variance factor."""
-    weight = np.ones(model.parts.known.stop)
+    weight = np.ones(model.rows)
     if factors is not None:
         weight[: model.observed] = 1.0 / factors[kinds_of(model)[1]] ** 2
     weight[model.parts.ground] *= active.ground[model.ground, model.ground_axis]
@@ -94,7 +95,7 @@ def softened(model: Model, state: State) -> _Floats:
 
     A wrong control point of high weight would otherwise draw its image points along, and these would look wrong.
     """
-    out = np.ones(model.parts.known.stop)
+    out = np.ones(model.rows)
     blur = _SOFT * image_on_ground(model, state)
     sigma = 1.0 / np.linalg.norm(model.ground_white, axis=1)
     out[model.parts.ground] = sigma**2 / (sigma**2 + blur**2)
@@ -103,10 +104,12 @@ def softened(model: Model, state: State) -> _Floats:
 
 def image_on_ground(model: Model, state: State) -> float:
     """Standard deviation of an image point on the ground, metres; the median."""
+    size = [model.sigma[mine].mean(axis=1) * p.metres for p, _, mine in model.of_projections]
+    model = model.posed
     distance = np.linalg.norm(state.XYZ[model.point] - state.images.centers[model.image], axis=1)
     pixel = np.sqrt(np.abs(model.plane[:, 0] * model.plane[:, 5] - model.plane[:, 1] * model.plane[:, 4]))
-    c = np.array([state.camera(name).c for name in model.camera_names])[model.camera_of] * pixel
-    return float(np.median(model.sigma.mean(axis=1) * distance / c[model.image]))
+    c = np.array([state.camera(name).c for name in model.camera_names])[model.camera_of[: len(pixel)]] * pixel
+    return float(np.median(np.concatenate([model.sigma.mean(axis=1) * distance / c[model.image], *size])))
 
 
 def robust_scale(e: _Floats, kind: tuple[str, str]) -> float:

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from photoplan.adjustment.blocks import Layout
+from photoplan.cameras.base import Camera, project
 from photoplan.cameras.lenses.brown import Brown
 from photoplan.cameras.lenses.opencv import OpenCV
 from photoplan.geometry.rotation import rotation_vector, skew
+from photoplan.orientation.bundle.block import BlockProjection
 from photoplan.orientation.bundle.model import Model
 from photoplan.orientation.bundle.unknowns import BORESIGHT, DRIFT, IMAGES, LEVER, CameraState, State
 
@@ -33,7 +35,7 @@ class Residuals:
     attitude: _Floats
     """(a, 3), radians."""
     prior: _Floats
-    """(q,) whitened: parameters that are known beforehand."""
+    """(q,) whitened: parameters and corrections that are known beforehand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +66,7 @@ class _Rays:
 
 def residuals_of(model: Model, state: State) -> Residuals:
     """Residuals of all observations at a state."""
-    rays = _project(model, state, derivatives=False)
-    return _residuals(model, state, rays)
+    return _residuals(model, state, _project(model.posed, state, derivatives=False), _seen(model, state))
 
 
 def residuals_of_all(model: Model, state: State) -> _Floats:
@@ -89,15 +90,21 @@ def residuals_of_all(model: Model, state: State) -> _Floats:
     return out
 
 
-def _residuals(model: Model, state: State, rays: _Rays) -> Residuals:
-    block = model.block
-    image = rays.px - model.xy
-    if block.bend is not None:
+def _residuals(model: Model, state: State, rays: _Rays, seen: list[_Seen]) -> Residuals:
+    block, framed = model.block, model.posed
+    image = rays.px - framed.xy
+    if block.bend is not None and len(framed.image):
         # The bend knows the images by their number in the block, of which some may not take part.
         poses = [b.pose for b in block.images]
         for row, pose in zip(model.image_rows, state.poses()):
             poses[row] = pose
-        image = image + block.bend(model.image_rows[model.image], tuple(poses), state.XYZ[model.point])
+        image = image + block.bend(framed.image_rows[framed.image], tuple(poses), state.XYZ[framed.point])
+    if model.projections:
+        every = np.empty((len(model.image), 2))
+        every[model.framed] = image
+        for each in seen:
+            every[each.mine] = each.xy - model.xy[each.mine]
+        image = every
     off = state.XYZ[model.ground_point] - np.nan_to_num(block.ground.XYZ[model.ground])
     ground = (model.ground_white * off).sum(axis=1)
     position, attitude = np.empty((0, 3)), np.empty((0, 3))
@@ -115,14 +122,20 @@ def _residuals(model: Model, state: State, rays: _Rays) -> Residuals:
 
 def linearise(model: Model, state: State, weight: _Floats) -> tuple[Rows, Residuals]:
     """Equations at a state; `weight` (rows,) is the square root of each row's robust weight."""
-    rays = _project(model, state, derivatives=True)
-    found = _residuals(model, state, rays)
+    rays, seen = _project(model.posed, state, derivatives=True), _seen(model, state)
+    found = _residuals(model, state, rays, seen)
     entries = _Entries(model.columns)
-    on_points = _image_rows(model, state, rays, entries)
+    on_points = _image_rows(model, state, (rays, seen), entries)
     _direct_rows(model, state, found, entries)
     for at, (key, parameter, _, sigma) in enumerate(model.known, model.parts.known.start):
         entries.put(np.array([[at]]), key, np.zeros(1, np.int64), np.array([[[1.0 / sigma]]]), parameter)
-    point = np.full(model.parts.known.stop, -1, np.int64)
+    at = model.parts.smooth.start
+    for each in model.sets:
+        rows = at + np.arange(each.known.shape[0])
+        coo = each.known.tocoo()
+        entries.parts.append((coo.data, rows[coo.row], model.columns.columns_of(each.key)[coo.col]))
+        at += len(rows)
+    point = np.full(model.rows, -1, np.int64)
     point[model.parts.image] = np.repeat(model.point, 2)
     point[model.parts.ground] = model.ground_point
     e = whitened(model, found)
@@ -156,8 +169,59 @@ class _Entries:
         self.parts.append((values.ravel(), row.ravel(), column.ravel()))
 
 
-def _image_rows(model: Model, state: State, rays: _Rays, entries: _Entries) -> _Floats:
+def _image_rows(model: Model, state: State, made: tuple[_Rays, list[_Seen]], entries: _Entries) -> _Floats:
     """Rows of image points: entries of orientations and cameras; returned: the coefficients of the points, (2k, 3)."""
+    every = np.arange(2 * len(model.image)).reshape(-1, 2)
+    by_X = _posed_rows(model.posed, state, made[0], entries, every[model.framed])
+    if not model.projections:
+        return by_X.reshape(-1, 3)
+    out = np.zeros((len(model.image), 2, 3))
+    out[model.framed] = by_X
+    for each in made[1]:
+        white = 1.0 / model.sigma[each.mine][:, :, None]
+        out[each.mine] = each.camera.derivatives(each.XYZ) @ each.by_block * white
+        by_set = each.projection.geometry.by_corrections(each.camera, each.XYZ, each.xy)
+        for key, by in by_set.items():
+            values = by.values * white
+            column = model.columns.columns_of(key)[by.columns][:, None]
+            row, column = np.broadcast_arrays(every[each.mine][:, :, None], column)
+            entries.parts.append((values.ravel(), row.ravel(), column.ravel()))
+    return np.nan_to_num(out).reshape(-1, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """The measurements of a projection: where its camera sees their points."""
+
+    projection: BlockProjection
+    mine: _Index
+    camera: Camera
+    XYZ: _Floats
+    """In the map, (n, 3)."""
+    by_block: _Floats
+    """∂ map / ∂ block."""
+    xy: _Floats
+    """(n, 2), pixels."""
+
+
+def _seen(model: Model, state: State) -> list[_Seen]:
+    out = []
+    for projection, keys, mine in model.of_projections:
+        camera = projection.geometry.camera({key: state.corrections(key) for key in keys})
+        XYZ, by_block = _on_map(model, state.XYZ[model.point[mine]])
+        out.append(_Seen(projection, mine, camera, XYZ, by_block, project(camera, XYZ)))
+    return out
+
+
+def _on_map(model: Model, XYZ: _Floats) -> tuple[_Floats, _Floats]:
+    """Map points and their derivatives by block points."""
+    if model.block.on_map is None:
+        return XYZ, np.broadcast_to(np.eye(3), (len(XYZ), 3, 3))
+    return model.block.on_map(XYZ)
+
+
+def _posed_rows(model: Model, state: State, rays: _Rays, entries: _Entries, rows: _Index) -> _Floats:
+    """The same for measurements in images with poses, which have `rows` (k, 2); returned: (k, 2, 3)."""
     k = len(model.image)
     white = 1.0 / model.sigma[:, :, None]
     z = rays.p[:, 2]
@@ -166,7 +230,6 @@ def _image_rows(model: Model, state: State, rays: _Rays, entries: _Entries) -> _
     by_p[:, :, 2] = -rays.t / z[:, None]
     by_p = rays.outer @ rays.inner @ by_p
     by_X = by_p @ np.swapaxes(state.images.rotations[model.image], 1, 2)
-    rows = np.arange(2 * k).reshape(k, 2)
     entries.put(rows, IMAGES, model.image, np.concatenate([-by_X, by_p @ skew(rays.p)], axis=2) * white)
     for index, name in enumerate(model.camera_names):
         camera = state.camera(name)
@@ -174,7 +237,7 @@ def _image_rows(model: Model, state: State, rays: _Rays, entries: _Entries) -> _
         if len(mine):
             J = _by_parameters(camera, rays, mine) * white[mine]
             entries.put(rows[mine], f"camera {name}", np.zeros(len(mine), np.int64), J)
-    return (by_X * white).reshape(-1, 3)
+    return by_X * white
 
 
 def _direct_rows(model: Model, state: State, found: Residuals, entries: _Entries) -> None:
@@ -290,4 +353,5 @@ def _by_coefficient(camera: CameraState, name: str, t: _Floats, real: _Floats) -
 def _known(model: Model, state: State) -> _Floats:
     """Whitened residuals of what is known beforehand."""
     off = [(state.known(key).value(parameter) - value) / sigma for key, parameter, value, sigma in model.known]
-    return np.array(off, float)
+    smooth = [each.known @ state.corrections(each.key).ravel() for each in model.sets]
+    return np.concatenate([np.array(off, float), *smooth])

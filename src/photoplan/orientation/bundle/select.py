@@ -25,7 +25,7 @@ class Selection:
     """Images, measurements and points that can take part."""
 
     images: list[int]
-    """Indices into `block.images`."""
+    """Indices into `block.images`, and beyond these into `block.projections`."""
     measured: _Index
     """Indices into `block.observations`."""
     points: list[str]
@@ -45,7 +45,10 @@ def select(block: Block, active: Active, undetermined: frozenset[str] = frozense
         Points that are known to have parallel rays only.
     """
     seen = block.observations
-    index = {b.name: k for k, b in enumerate(block.images)}
+    names = [*(b.name for b in block.images), *(p.name for p in block.projections)]
+    index = {name: k for k, name in enumerate(names)}
+    # A projection needs no more than a point: what is known of its corrections beforehand does the rest.
+    least = np.repeat([3, 1], [len(block.images), len(block.projections)])
     image_of = np.array([index.get(n, -1) for n in seen.images], np.int64)[seen.image]
     known = _known(block, active.ground)
     keep = active.image & (image_of >= 0)
@@ -57,13 +60,13 @@ def select(block: Block, active: Active, undetermined: frozenset[str] = frozense
         # One ray and a height determine a point too, but check nothing.
         enough = (rays >= 2) | ((rays == 1) & (known == 3))
         keep_points = keep & enough[seen.point]
-        per_image = np.bincount(image_of[keep_points], minlength=len(block.images))
-        poor = [k for k in range(len(block.images)) if per_image[k] < 3 and k not in direct]
-        poor = [k for k in poor if block.images[k].name not in images_out]
+        per_image = np.bincount(image_of[keep_points], minlength=len(names))
+        poor = [k for k in range(len(names)) if per_image[k] < least[k] and k not in direct]
+        poor = [k for k in poor if names[k] not in images_out]
         if not poor:
             break
         for k in poor:
-            images_out[block.images[k].name] = f"image with {per_image[k]} points that can be used; 3 are needed"
+            images_out[names[k]] = f"image with {per_image[k]} points that can be used; {least[k]} are needed"
         keep = keep_points & ~np.isin(image_of, poor)
     used = np.flatnonzero(enough)
     left = list(images_out.items())
@@ -71,7 +74,7 @@ def select(block: Block, active: Active, undetermined: frozenset[str] = frozense
     left += [(n, parallel) for n in seen.points if n in undetermined]
     few = np.flatnonzero(~enough)
     left += [(seen.points[k], _reason(int(rays[k]))) for k in few if seen.points[k] not in undetermined]
-    images = [k for k in range(len(block.images)) if block.images[k].name not in images_out]
+    images = [k for k in range(len(names)) if names[k] not in images_out]
     return Selection(images, np.flatnonzero(keep_points), [seen.points[k] for k in used], tuple(left))
 
 
@@ -104,15 +107,16 @@ def start_points(block: Block, selection: Selection, wait: bool = False) -> tupl
     about right, they would fly off and take the adjustment with them.
     """
     seen = block.observations
-    chosen = [block.images[k] for k in selection.images]
-    image_index = {b.name: k for k, b in enumerate(chosen)}
+    chosen = [block.images[k] for k in selection.images if k < len(block.images)]
+    projections = [block.projections[k - len(block.images)] for k in selection.images if k >= len(block.images)]
+    image_index = {n: k for k, n in enumerate([*(b.name for b in chosen), *(p.name for p in projections)])}
     point_index = {n: k for k, n in enumerate(selection.points)}
     image = np.array([image_index.get(n, -1) for n in seen.images], np.int64)[seen.image[selection.measured]]
     point = np.array([point_index.get(n, -1) for n in seen.points], np.int64)[seen.point[selection.measured]]
-    directions = np.empty((len(image), 3))
+    directions, centers = np.empty((len(image), 3)), np.empty((len(image), 3))
     sigma = np.empty(len(image))
     order = np.argsort(image, kind="stable")
-    ends = np.searchsorted(image[order], np.arange(len(chosen) + 1))
+    ends = np.searchsorted(image[order], np.arange(len(image_index) + 1))
     for k, b in enumerate(chosen):
         mine = order[ends[k] : ends[k + 1]]
         camera = block.cameras[b.camera]
@@ -122,7 +126,12 @@ def start_points(block: Block, selection: Selection, wait: bool = False) -> tupl
         directions[mine] = d / np.linalg.norm(d, axis=1, keepdims=True)
         pixel = np.sqrt(abs(np.linalg.det(b.plane_to_pixel.derivative(np.array(camera.principal_point)))))
         sigma[mine] = seen.sigma[selection.measured][mine].mean(axis=1) / (camera.c * pixel)
-    centers = np.array([b.pose.center for b in chosen])[image]
+        centers[mine] = b.pose.center
+    for k, p in enumerate(projections, len(chosen)):
+        mine = order[ends[k] : ends[k + 1]]
+        centers[mine], directions[mine] = p.sight(seen.xy[selection.measured][mine])
+        # An angle that is as large as the point's size seen from there.
+        sigma[mine] = seen.sigma[selection.measured][mine].mean(axis=1) * p.metres / p.away
     XYZ, angle = intersect(centers, directions, point, len(point_index))
     count = np.maximum(np.bincount(point, minlength=len(point_index)), 1)
     usual = np.bincount(point, sigma, len(point_index)) / count
@@ -134,8 +143,8 @@ def start_points(block: Block, selection: Selection, wait: bool = False) -> tupl
     determined = np.isfinite(XYZ).all(axis=1) & (angle > np.maximum(least, 1e-7)) & ~turned
     if wait:
         wide = determined & (angle > _NARROW)
-        kept = np.bincount(image[wide[point]], minlength=len(chosen))
-        if (kept >= np.minimum(_ENOUGH, np.bincount(image, minlength=len(chosen)))).all():
+        kept = np.bincount(image[wide[point]], minlength=len(image_index))
+        if (kept >= np.minimum(_ENOUGH, np.bincount(image, minlength=len(image_index)))).all():
             determined = wide
     control = [
         (point_index[name], block.ground.XYZ[k])

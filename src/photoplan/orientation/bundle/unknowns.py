@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import cast
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.adjustment.blocks import Kind, Layout, Unknowns
+from photoplan.cameras.correctable import Corrections
 from photoplan.cameras.lenses.base import Lens
 from photoplan.cameras.lenses.brown import Brown
 from photoplan.cameras.lenses.none import NoLens
@@ -41,6 +42,8 @@ class Poses:
     def motions(self) -> tuple[float, dict[str, _Floats]]:
         """What moves all images together: the size of the block, and steps (n, 6) by their names."""
         n = len(self.centers)
+        if not n:
+            return 1.0, {}
         away = self.centers - self.centers.mean(axis=0)
         size = float(np.abs(away).max()) or 1.0
         motions: dict[str, _Floats] = {}
@@ -160,6 +163,10 @@ class State:
         """Blocks of which something may be known beforehand."""
         return cast("CameraState | Vectors", self.blocks[key])
 
+    def corrections(self, key: str) -> _Floats:
+        """Values of a set of corrections, (owners, parameters)."""
+        return cast(Vectors, self.blocks[key]).values
+
     def poses(self) -> tuple[Pose, ...]:
         """Exterior orientations as values."""
         return tuple(Pose(c, R) for c, R in zip(self.images.centers, self.images.rotations))
@@ -176,8 +183,14 @@ class State:
         return replace(start, blocks={**start.blocks, **found, DRIFT: Vectors(np.array(drift).reshape(-1, 6))})
 
 
-def layout_of(block: Block, images: tuple[str, ...], cameras: tuple[str, ...], strips: tuple[str, ...]) -> Layout:
-    """The unknowns of a block: orientations first, then what is free of cameras, lever arm, boresight and drift.
+def layout_of(
+    block: Block,
+    images: tuple[str, ...],
+    cameras: tuple[str, ...],
+    strips: tuple[str, ...],
+    sets: Sequence[Corrections] = (),
+) -> Layout:
+    """The unknowns of a block: orientations, what is free of cameras, lever arm, boresight and drift, corrections.
 
     Raises
     ------
@@ -200,14 +213,20 @@ def layout_of(block: Block, images: tuple[str, ...], cameras: tuple[str, ...], s
             Kind(LEVER, ("",), tuple(f"lever arm {axis}" for axis in "xyz") if lever else ()),
             Kind(BORESIGHT, ("",), tuple(f"boresight about {axis}" for axis in "xyz") if boresight else ()),
             Kind(DRIFT, strips, drift, "strip"),
+            *(Kind(each.key, each.owners, each.parameters, each.owner) for each in sets),
         ]
     )
 
 
 def start_state(
-    block: Block, cameras: tuple[str, ...], strips: tuple[str, ...], poses: list[Pose], XYZ: _Floats
+    block: Block,
+    cameras: tuple[str, ...],
+    strips: tuple[str, ...],
+    poses: list[Pose],
+    XYZ: _Floats,
+    sets: Sequence[Corrections] = (),
 ) -> State:
-    """Start values of the images that take part, their cameras and strips, and the points (m, 3)."""
+    """Start values of the images that take part, their cameras, strips and corrections, and the points (m, 3)."""
     blocks: dict[str, Unknowns] = {
         IMAGES: Poses(
             np.array([p.center for p in poses]).reshape(-1, 3),
@@ -216,6 +235,7 @@ def start_state(
         LEVER: Vectors(np.array([block.lever_arm], float)),
         BORESIGHT: Turn(np.eye(3)),
         DRIFT: Vectors(np.zeros((len(strips), 6))),
+        **{each.key: Vectors(np.array(each.values, float)) for each in sets},
     }
     for name in cameras:
         given = block.cameras[name]

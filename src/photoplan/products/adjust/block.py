@@ -16,11 +16,13 @@ from photoplan.geometry.rotation import ANGLE_UNITS, angles_from_rotation
 from photoplan.io.project.cameras import interior_of
 from photoplan.io.project.model import Project
 from photoplan.orientation.bundle.adjust import adjust_block
-from photoplan.orientation.bundle.block import Adjusted, AdjustSettings, Block, BlockCamera, BlockImage
+from photoplan.orientation.bundle.block import Adjusted, AdjustSettings, Block, BlockCamera, BlockImage, BlockProjection
 from photoplan.orientation.bundle.frame import BlockFrame, angle_derivatives
 from photoplan.products.adjust.cameras import Calibrated, Free, block_camera, calibrated
 from photoplan.products.adjust.frame import block_frame, make_bend, nadir_heights
+from photoplan.products.adjust.geometry import FoundCorrection, Geometry
 from photoplan.products.adjust.inputs import AdjustInputs
+from photoplan.products.adjust.projections import block_projections, found_corrections, on_map, place_of
 
 _Floats = NDArray[np.float64]
 Adjuster = Callable[[Block, AdjustSettings], Adjusted]
@@ -65,6 +67,8 @@ class MapResult:
     """Computed minus observed, (p, 3), metres."""
     cameras: tuple[Calibrated, ...]
     """Those that had unknowns."""
+    corrections: tuple[tuple[str, Geometry, FoundCorrection], ...]
+    """Of the images without poses: name, kind, and what came out."""
 
     @property
     def sigma_center(self) -> _Floats:
@@ -96,8 +100,8 @@ def prepare(inputs: AdjustInputs, starts: Mapping[str, Pose], free: Free) -> Pre
         A parameter cannot be free.
     """
     project = inputs.project
-    centers = np.array([starts[image.name].center for image in inputs.images])
-    frame = block_frame(project, np.concatenate([centers, inputs.ground.XYZ]))
+    centers = np.array([starts[image.name].center for image in inputs.images]).reshape(-1, 3)
+    frame = block_frame(project, np.concatenate([centers, _about(inputs), inputs.ground.XYZ]))
     cameras: dict[str, BlockCamera] = {}
     images = []
     for image in inputs.images:
@@ -110,7 +114,10 @@ def prepare(inputs: AdjustInputs, starts: Mapping[str, Pose], free: Free) -> Pre
     unused = [name for name in free if name not in cameras]
     if unused:
         raise InputError(f"camera {unused[0]!r} is to be calibrated, but none of the images is of it")
+    known = inputs.ground.XYZ[np.isfinite(inputs.ground.XYZ[:, 2]), 2]
+    projections = block_projections(project, inputs.projected, frame, float(known.mean()) if len(known) else None)
     near = _places(inputs, starts, images, cameras)
+    _places_by_projections(inputs, projections, frame, near)
     adjustment = project.adjustment
     stations = {image.name: starts[image.name].center for image in inputs.images}
     positions, attitudes = inputs.positions, inputs.attitudes
@@ -129,8 +136,16 @@ def prepare(inputs: AdjustInputs, starts: Mapping[str, Pose], free: Free) -> Pre
         drift=adjustment.drift,
         boresight=adjustment.boresight,
         bend=make_bend(project, frame, tuple(images), cameras, nadir),
+        projections=projections,
+        on_map=on_map(frame),
     )
     return Prepared(inputs, frame, block, near)
+
+
+def _about(inputs: AdjustInputs) -> _Floats:
+    """About where images without poses look, (n, 3), for a system of its own; without one nothing asks."""
+    strict = inputs.project.orientation.earth_curvature == "strict"
+    return np.array([place_of(inputs.project, image) for image in inputs.projected if strict]).reshape(-1, 3)
 
 
 def _mean_height(ground: GroundPoints) -> float:
@@ -148,10 +163,11 @@ def _places(
     near[np.isnan(near[:, 2]), 2] = _mean_height(ground)
     of = {image.name: image for image in images}
     number = {name: k for k, name in enumerate(points.points)}
-    middle = np.mean([pose.center[:2] for pose in starts.values()], axis=0)
+    middle = np.mean([pose.center[:2] for pose in starts.values()] or [np.full(2, np.nan)], axis=0)
     for k in np.flatnonzero(np.isnan(near[:, 0])):
         near[k, :2] = middle
         rows = np.flatnonzero(points.point == number.get(ground.names[k], -1))
+        rows = rows[[points.images[k] in of for k in points.image[rows]]]
         if not len(rows):
             continue
         image = of[points.images[points.image[rows[0]]]]
@@ -162,6 +178,26 @@ def _places(
         if d[2] < 0:
             near[k, :2] = pose.center[:2] + d[:2] / d[2] * (near[k, 2] - pose.center[2])
     return near
+
+
+def _places_by_projections(
+    inputs: AdjustInputs, projections: Sequence[BlockProjection], frame: BlockFrame, near: _Floats
+) -> None:
+    """Places, in `near` (g, 3), of ground points with a height only that images without poses alone have measured."""
+    points, number = inputs.points, {name: k for k, name in enumerate(inputs.points.points)}
+    for k in np.flatnonzero(~np.isfinite(inputs.ground.XYZ[:, 0])):
+        for p in projections:
+            image = points.images.index(p.name) if p.name in points.images else -1
+            mine = (points.image == image) & (points.point == number.get(inputs.ground.names[k], -1))
+            if not mine.any():
+                continue
+            origin, direction = (v[0] for v in p.sight(points.xy[mine]))
+            high, low = (
+                frame.map_points(origin + 0.9 * p.away * direction),
+                frame.map_points(origin + p.away * direction),
+            )
+            near[k, :2] = low[:2] + (high - low)[:2] * ((near[k, 2] - low[2]) / (high[2] - low[2]))
+            break
 
 
 def adjust_prepared(
@@ -218,6 +254,7 @@ def map_result(prepared: Prepared, adjusted: Adjusted) -> MapResult:
         ground_residuals=_ground_residuals(prepared, adjusted, XYZ),
         position_residuals=_position_residuals(prepared, adjusted),
         cameras=cameras,
+        corrections=tuple(found_corrections(project, prepared.block, adjusted)),
     )
 
 

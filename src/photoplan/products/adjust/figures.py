@@ -12,6 +12,7 @@ from photoplan.orientation.bundle.block import BlockImage, Group
 from photoplan.orientation.check_points import CheckAccuracy
 from photoplan.products.adjust.block import MapResult
 from photoplan.products.adjust.cameras import Calibrated
+from photoplan.products.adjust.geometry import FoundParameter
 
 _Floats = NDArray[np.float64]
 
@@ -36,6 +37,26 @@ class ImageFigures:
     """Metres."""
     sigma_angles: tuple[float, float, float]
     """In the unit of the project."""
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectionFigures:
+    """An image without a pose: its residuals and its correction."""
+
+    name: str
+    group: str
+    measurements: int
+    rejected: int
+    mean: tuple[float, float]
+    rms: tuple[float, float]
+    worst: float
+    parameters: tuple[FoundParameter, ...]
+    seconds: _Floats
+    """Time of each measurement that takes part, (k,); empty where time means nothing."""
+    residuals: _Floats
+    """Of these, (k, 2), pixels."""
+    over_time: tuple[_Floats, _Floats] | None
+    """Times and corrections that change with them: metres, radians."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +143,7 @@ class AdjustFigures:
     angle_unit: str
     groups: tuple[Group, ...]
     images: tuple[ImageFigures, ...]
+    corrections: tuple[CorrectionFigures, ...]
     ground: tuple[GroundFigures, ...]
     check: CheckAccuracy | None
     cameras: tuple[Calibrated, ...]
@@ -173,7 +195,7 @@ def residual_fields(result: MapResult, used: NDArray[np.bool_]) -> tuple[Residua
     camera = np.full(len(points), "", object)
     for k, name in enumerate(points.images):
         rows = np.flatnonzero((points.image == k) & used)
-        if len(rows):
+        if len(rows) and name in of:
             at[rows], turned[rows] = _in_plane(of[name], points.xy[rows], result.adjusted.residuals[rows])
             camera[rows] = of[name].camera
     out = []

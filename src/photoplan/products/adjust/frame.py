@@ -39,7 +39,7 @@ def block_frame(project: Project, XYZ: _Floats) -> BlockFrame:
     if project.orientation.earth_curvature != "strict":
         same = height_step("same", "same", project.crs)
         return BlockFrame(project.crs, None, same, same)
-    system = _orientation_system(project)
+    system = orientation_system(project)
     working = "same" if system == "same" else "ellipsoidal"
     XY = XYZ[np.isfinite(XYZ[:, :2]).all(axis=1), :2]
     low, high = XY.min(axis=0), XY.max(axis=0)
@@ -54,12 +54,20 @@ def block_frame(project: Project, XYZ: _Floats) -> BlockFrame:
     )
 
 
-def _orientation_system(project: Project) -> str:
-    stated = project.orientation.height_system
+def orientation_system(project: Project) -> str:
+    """Height system of orientations and control.
+
+    Raises
+    ------
+    HeightSystemError
+        It is not stated, or cannot be known.
+    """
+    stated = project.height_system
     if stated is None:
         raise HeightSystemError(
-            "strict earth curvature is computed with ellipsoidal heights, and the height system of orientation and "
-            f"control is not stated; give height_system in [orientation]; allowed are {OPTIONS}"
+            "strict earth curvature, satellites and strips are computed with ellipsoidal heights, and the height "
+            "system of orientation and control is not stated; give height_system in [orientation]; allowed are "
+            f"{OPTIONS}"
         )
     system = check_height_system(stated, "orientation")
     if system != "same" or project.terrain is None:

@@ -19,9 +19,11 @@ from photoplan.io.observed_positions import PositionTable, read_observed_positio
 from photoplan.io.orientation.exif import image_files
 from photoplan.io.orientation.table import TableFormat, angle_in_radians
 from photoplan.io.project.cameras import image_size
+from photoplan.io.project.image import ImageEntry
 from photoplan.io.project.model import Project
 from photoplan.io.project.posed import Image
 from photoplan.products.init.match import some
+from photoplan.project.cameras import size_of
 
 #: Part of the measurements that may be wrong in a way that makes one think of the whole file.
 _FEW = 0.02
@@ -33,7 +35,9 @@ class AdjustInputs:
 
     project: Project
     images: tuple[Image, ...]
-    """Those that are wanted."""
+    """Those with poses that are wanted."""
+    projected: tuple[ImageEntry, ...]
+    """The others that are wanted."""
     points: ImagePoints
     """Measurements in these images, by the project's names, each with a standard deviation."""
     ground: GroundPoints
@@ -102,6 +106,7 @@ def read_inputs(project: Project, names: Sequence[str]) -> AdjustInputs:
     return AdjustInputs(
         project=project,
         images=images,
+        projected=tuple(i for i in project.images if i.name in wanted and not isinstance(i, Image)),
         points=points,
         ground=ground,
         table=table,
@@ -163,9 +168,19 @@ def _inside(project: Project, points: ImagePoints, notes: list[str]) -> ImagePoi
 
     Many are of images of another size, or columns and rows are exchanged.
     """
-    sizes = np.array([image_size(project.cameras[i.camera], i) for i in map(project.image, points.images)])
+    sizes = np.array([_size(project, project.any_image(name)) for name in points.images])
     width_height = sizes[points.image]
-    outside = np.flatnonzero(((points.xy < -1.0) | (points.xy > width_height)).any(axis=1))
+    beyond = ((points.xy < -1.0) | (points.xy > width_height)).any(axis=1)
+    # The geometry of a crop holds around it, where points were measured in the whole image.
+    total, lost = (np.bincount(points.image[k], minlength=len(points.images)) for k in (slice(None), beyond))
+    posed = np.array([isinstance(project.any_image(name), Image) for name in points.images], bool)
+    crops = ~posed & (lost > 0) & (2 * lost < total)
+    notes += [
+        f"image {points.images[k]!r}: {lost[k]} of {total[k]} measurements lie outside of it; its geometry is that of "
+        "a larger image, and they take part"
+        for k in np.flatnonzero(crops)
+    ]
+    outside = np.flatnonzero(beyond & ~crops[points.image])
     if not len(outside):
         return points
     k = int(outside[0])
@@ -179,6 +194,10 @@ def _inside(project: Project, points: ImagePoints, notes: list[str]) -> ImagePoi
         )
     notes.append(f"{what}; {len(outside)} such measurements take no part")
     return points.where(np.setdiff1d(np.arange(len(points)), outside))
+
+
+def _size(project: Project, image: ImageEntry) -> tuple[int, int]:
+    return image_size(project.cameras[image.camera], image) if isinstance(image, Image) else size_of(project, image)
 
 
 def _with_sigma(points: ImagePoints, sigma: float) -> ImagePoints:

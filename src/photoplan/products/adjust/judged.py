@@ -9,7 +9,7 @@ import numpy as np
 from photoplan.errors import GeometryError
 from photoplan.io.project.cameras import interior_of, lens_of
 from photoplan.orientation.bundle.causes import Cause
-from photoplan.orientation.judgement import Evidence, fitting, impossible
+from photoplan.orientation.judgement import Evidence, fitting, impossible, misfit
 from photoplan.orientation.resection.model import ResectSettings
 from photoplan.products.adjust.block import MapResult
 from photoplan.products.adjust.frame import nadir_heights
@@ -17,6 +17,8 @@ from photoplan.products.resect import control_rows, measured_control, resected
 
 #: Change of a camera constant, and part of the squared residuals that it explains, from which the block is refused.
 _FAR, _ALL = 0.1, 0.9
+#: Correction over what it is known to beforehand, from which on it is not believed.
+_BEYOND = 8.0
 #: Found over stated accuracy of positions that is worth a word.
 _WORSE = 2.0
 
@@ -30,9 +32,10 @@ def refuse_impossible(result: MapResult) -> None:
         The message says what of the measurements read otherwise would fit.
     """
     adjusted, inputs = result.adjusted, result.prepared.inputs
+    _refuse_corrections(result)
     points, row = inputs.points, {name: k for k, name in enumerate(adjusted.points)}
     at = np.array([row.get(name, -1) for name in points.points], np.int64)[points.point]
-    centers = np.array([pose.center for pose in result.poses])
+    centers = np.array([pose.center for pose in result.poses]).reshape(-1, 3)
     terrain = nadir_heights(inputs.project, centers[:, :2], np.nan)
     residuals = adjusted.residuals[np.isfinite(adjusted.residuals[:, 0]) & ~adjusted.rejected]
     factors = [group.factor for group in adjusted.groups if group.unit == "px" and np.isfinite(group.factor)]
@@ -58,6 +61,29 @@ def refuse_impossible(result: MapResult) -> None:
     name, fault = wrong[0]
     more = f" (so in {len(wrong)} images)" if len(wrong) > 1 else ""
     raise GeometryError(f"image {name!r}: {fault}{more}; the orientations are not written: {_hint(result)}")
+
+
+def _refuse_corrections(result: MapResult) -> None:
+    """Refuse corrections that are far from what is known of them, or that control does not fit."""
+    adjusted, ground = result.adjusted, result.prepared.inputs.ground
+    lost = None
+    for each in adjusted.corrections:
+        off = np.abs(each.values) / each.known
+        if off.max(initial=0.0) > _BEYOND:
+            lost = f"the {each.key} is {off.max():.0f} times what is known of it beforehand"
+    control = np.isfinite(ground.XYZ) & ~ground.check[:, None]
+    out = int((control & (adjusted.ground_rejected | ~np.isfinite(adjusted.ground_residuals))).sum())
+    if not adjusted.images and 2 * out > control.sum():
+        lost = f"{out} of {control.sum()} coordinates of control do not fit the images"
+    rejected = adjusted.rejected
+    if not adjusted.images and lost is None:
+        lost = misfit(int(rejected.sum()), len(rejected), np.nan, np.nan)
+    if lost is not None:
+        raise GeometryError(
+            f"{lost}; the corrections are not written: are names, axes, CRS and height system of the points as they "
+            "are stated, and do the images come with the right polynomials or trajectories? What is known beforehand "
+            "stands in [adjustment]"
+        )
 
 
 def refuse_cause(causes: Sequence[Cause]) -> None:

@@ -16,18 +16,18 @@ import numpy as np
 from photoplan.errors import GeometryError, InputError, UsageError
 from photoplan.events import SILENT, Events
 from photoplan.io.disk import disk_error
-from photoplan.io.fingerprint import fingerprint
 from photoplan.io.geopackage import write_point_layers, write_residuals
 from photoplan.io.naming import write_atomically
 from photoplan.io.product import check_output
 from photoplan.io.project.edit import ProjectChanges, edit_project
 from photoplan.io.project.file import load_project
+from photoplan.io.project.image import ImageEntry
 from photoplan.io.project.model import Project
-from photoplan.io.run_record import recording, versions
+from photoplan.io.project.posed import Image
+from photoplan.io.run_record import recording
 from photoplan.orientation.bundle.adjust import adjust_block
 from photoplan.orientation.bundle.block import Adjusted, AdjustSettings
 from photoplan.orientation.bundle.causes import weighed_causes
-from photoplan.orientation.check_points import CheckAccuracy
 from photoplan.plain import json_text, pick
 from photoplan.products.adjust.block import (
     MapResult,
@@ -38,92 +38,15 @@ from photoplan.products.adjust.block import (
     prepare,
     stated_accuracy,
 )
-from photoplan.products.adjust.cameras import Calibrated, Free, camera_entries, parse_calibrate
-from photoplan.products.adjust.figures import AdjustFigures, GroundFigures, NamedMeasurement
+from photoplan.products.adjust.cameras import Free, camera_entries, parse_calibrate
+from photoplan.products.adjust.figures import AdjustFigures
 from photoplan.products.adjust.inputs import AdjustInputs, read_inputs
 from photoplan.products.adjust.judged import cause_notes, refuse_cause, refuse_impossible
+from photoplan.products.adjust.projections import geometry_of
+from photoplan.products.adjust.record import block_json
 from photoplan.products.adjust.start import known_poses, started
 from photoplan.products.adjust.summary import point_layers, summarise
 from photoplan.project.scene import input_files
-
-
-def block_json(figures: AdjustFigures, result: MapResult) -> dict[str, Any]:
-    """All figures by their keys."""
-    inputs = result.prepared.inputs
-    own = ("sigma0", "redundancy", "unknowns", "iterations", "seconds", "measurements", "points", "notes")
-    group = ("name", "count", "redundancy", "rms", "unit")
-    image = ("name", "center", "sigma_center", "sigma_angles", "measurements", "rejected", "mean", "rms")
-    return {
-        **pick(figures, *own, image_residual_rms_px="rms_pixels", mean_images_of_a_point="mean_rays"),
-        "groups": [pick(g, *group, found_to_stated="factor") for g in figures.groups],
-        "image_correlations": [
-            pick(c, "camera", "effect", "rho", reach_px="reach", distance_px="distance")
-            for c in result.adjusted.correlations
-        ],
-        "cameras": {camera.name: _camera(camera) for camera in figures.cameras},
-        "control": [_ground(g) for g in figures.ground if not g.check],
-        "check_points": [_ground(g) for g in figures.ground if g.check],
-        "check_accuracy": figures.check and _check(figures.check),
-        "gross_errors": [_measurement(m) for m in figures.gross],
-        "largest_normalised": [_measurement(m) for m in figures.worst],
-        "positions": _positions(figures),
-        "images": [
-            {
-                **pick(of, *image, largest_normalised="worst"),
-                "angles": result.angles[k],
-                "covariance_rotation": result.adjusted.pose_covariance[k, 3:, 3:],
-            }
-            for k, of in enumerate(figures.images)
-        ],
-        "left_out": [{"name": name, "reason": reason} for name, reason in figures.left_out],
-        "tie_point_sigma": figures.point_sigma,
-        "crs": inputs.project.crs,
-        "heights": {
-            "system": inputs.project.orientation.height_system,
-            "computed_in": result.prepared.frame.inward.target,
-            "operation": result.prepared.frame.inward.operation,
-        },
-        "inputs": {str(path): fingerprint(path).digest for path in inputs.files},
-        "versions": versions(),
-        "settings": dict(figures.settings),
-    }
-
-
-def _camera(found: Calibrated) -> dict[str, Any]:
-    columns = zip(found.parameters, found.units, found.before, found.after, found.sigma)
-    parameters = {p: {"unit": u, "before": b, "after": a, "sigma": s} for p, u, b, a, s in columns}
-    return {"parameters": parameters, "correlation": found.correlation}
-
-
-def _ground(g: GroundFigures) -> dict[str, Any]:
-    known = pick(g, "name", "residual", "normalised", "rejected", images="rays", given="XYZ", sigma_given="stated")
-    return {**known, "sigma_adjusted": np.sqrt(np.diag(g.covariance))}
-
-
-def _check(check: CheckAccuracy) -> dict[str, Any]:
-    return {
-        "standard": "ASPRS Positional Accuracy Standards for Digital Geospatial Data, Edition 2 (2023)",
-        **pick(check, "rmse", "warnings", number_horizontal="horizontal", number_vertical="vertical"),
-        **pick(check, mean_error="mean", RMSE_H1="fit_h", RMSE_V1="fit_v", RMSE_H2="survey_h", RMSE_V2="survey_v"),
-        **pick(check, RMSE_H="rmse_h", RMSE_V="rmse_v", RMSE_3D="rmse_3d"),
-    }
-
-
-def _measurement(m: NamedMeasurement) -> dict[str, Any]:
-    return pick(m, "residual", "normalised", observation="what")
-
-
-def _positions(figures: AdjustFigures) -> dict[str, Any] | None:
-    if not figures.strips:
-        return None
-    own = ("name", "rejected", "mean", "rms", "shift", "rate", "sigma_shift")
-    arm, turn = figures.lever_arm, figures.boresight
-    return {
-        "strips": [pick(strip, *own, images="count") for strip in figures.strips],
-        "lever_arm": arm and {"value": arm[0], "sigma": arm[1]},
-        "boresight": turn and {"value": turn[0], "sigma": turn[1]},
-    }
-
 
 #: Part of the measurements that take no part, from which on the start is doubted.
 _POOR = 0.1
@@ -285,7 +208,16 @@ def _check_outputs(request: AdjustRequest, project: Project) -> None:
     )
     if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
         raise UsageError(f"{request.folder}: cannot be made, as {there} cannot be written into; give another `output`")
-    _refuse_inputs(request, [request.project, *input_files(project)])
+    # What an earlier run has written of corrections is written again.
+    written = [request.folder.resolve() / n for i in project.images if (n := _correction_file(project, i)) is not None]
+    inputs = [file for file in input_files(project) if file.resolve() not in written]
+    _refuse_inputs(request, [request.project, *inputs])
+    for file in written:
+        check_output(file, inputs, overwrite=request.overwrite)
+
+
+def _correction_file(project: Project, image: ImageEntry) -> str | None:
+    return None if isinstance(image, Image) else geometry_of(image).output(image.name)
 
 
 def _refuse_inputs(request: AdjustRequest, inputs: Sequence[Path]) -> None:
@@ -300,7 +232,8 @@ def _used(prepared: Prepared) -> str:
     attitudes = 0 if inputs.attitudes is None else len(inputs.attitudes.images)
     free = [f"{name}: {', '.join(camera.free)}" for name, camera in prepared.block.cameras.items() if camera.free]
     return (
-        f"{len(inputs.images)} images · {len(inputs.points)} measurements of {len(inputs.points.points)} points · "
+        f"{len(inputs.images) + len(inputs.projected)} images · {len(inputs.points)} measurements of "
+        f"{len(inputs.points.points)} points · "
         f"{control} control, {len(inputs.ground) - control} check points · {positions} positions, {attitudes} attitudes"
         + (f" · calibrated {'; '.join(free)}" if free else "")
     )
@@ -324,8 +257,16 @@ def _write(request: AdjustRequest, result: MapResult, figures: AdjustFigures, da
             adjusted.rejected,
         )
         write_atomically(folder / "report.json", json_text(data, indent=1).encode())
+        files = []
+        for name, kind, found in result.corrections:
+            file = kind.output(name)
+            if file is not None and found.file is not None:
+                files.append(folder / file)
+                write_atomically(files[-1], found.file.encode())
+                where = Path(os.path.relpath(files[-1].resolve(), request.project.resolve().parent)).as_posix()
+                changes.images[name]["correction"] = where
         edit_project(request.project, changes)
-        written = tuple(folder / name for name in OUTPUTS)
+        written = (*(folder / name for name in OUTPUTS), *files)
         figures_of_block = (
             "sigma0",
             "redundancy",
@@ -337,7 +278,7 @@ def _write(request: AdjustRequest, result: MapResult, figures: AdjustFigures, da
             "rejected",
         )
         record((*written, request.project), pick(figures, *figures_of_block))
-    return AdjustReport(written, figures, len(adjusted.images), data)
+    return AdjustReport(written, figures, len(adjusted.images) + len(adjusted.projections), data)
 
 
 def _changes(result: MapResult) -> ProjectChanges:
@@ -350,6 +291,7 @@ def _changes(result: MapResult) -> ProjectChanges:
             "angles": _rounded(result.angles[k], 10),
             **stated_accuracy(result.covariances[k]),
         }
+    images |= {name: dict(found.entries) for name, _, found in result.corrections}
     sigmas = {found.name: found.sigmas for found in result.cameras}
     cameras = {
         found.name: {

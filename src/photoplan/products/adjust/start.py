@@ -54,7 +54,7 @@ def started(inputs: AdjustInputs, *, known: bool = True) -> tuple[AdjustInputs, 
         return inputs, poses
     found, reasons = _found(inputs, poses)
     images = tuple(image for image in inputs.images if image.name in found)
-    if not images:
+    if not images and not inputs.projected:
         why = "; ".join(f"{name}: {reason}" for name, reason in list(reasons.items())[:3])
         raise GeometryError(
             f"no image can be oriented ({why}); give more control or tie points, observed positions, or center and "
@@ -69,7 +69,7 @@ def started(inputs: AdjustInputs, *, known: bool = True) -> tuple[AdjustInputs, 
     if lost:
         why = "; ".join(dict.fromkeys(reasons.get(name, "no reason is known") for name in lost))
         notes.append(f"{len(lost)} images could not be oriented and are left out: {some(lost)} ({why})")
-    names = [image.name for image in images]
+    names = [image.name for image in (*images, *inputs.projected)]
     return replace(inputs, images=images, points=inputs.points.of_images(names), notes=tuple(notes)), found
 
 
@@ -111,6 +111,7 @@ def _found(inputs: AdjustInputs, known: Mapping[str, Pose]) -> tuple[dict[str, P
     full = ground.where(np.isfinite(ground.XYZ).all(axis=1))
     positions = None if inputs.positions is None else frame.positions(inputs.positions)
     sigma = float(np.median(inputs.points.sigma))
-    result = start_block(cameras, images, inputs.points, frame.ground(full, full.XYZ), positions, sigma)
+    points = inputs.points.of_images([image.name for image in images])
+    result = start_block(cameras, images, points, frame.ground(full, full.XYZ), positions, sigma)
     poses = {name: frame.map_pose(pose) for name, pose in result.poses.items()}
     return {**poses, **known}, dict(result.left_out)

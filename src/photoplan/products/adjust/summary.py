@@ -17,6 +17,7 @@ from photoplan.orientation.check_points import CheckAccuracy, check_accuracy
 from photoplan.products.adjust.block import MapResult
 from photoplan.products.adjust.figures import (
     AdjustFigures,
+    CorrectionFigures,
     GroundFigures,
     ImageFigures,
     NamedMeasurement,
@@ -71,6 +72,7 @@ def summarise(title: str, result: MapResult, settings: AdjustSettings, seconds: 
         angle_unit=project.orientation.angle_unit,
         groups=tuple(adjusted.groups),
         images=_images(result, used),
+        corrections=_corrections(result, used),
         ground=ground,
         check=_check(ground),
         cameras=tuple(result.cameras),
@@ -113,10 +115,15 @@ def _advice(result: MapResult, used: NDArray[np.bool_]) -> list[str]:
         out.append(f"{group.name}: the stated standard deviation is {ratio:.1f} times too {how}{advice}")
     out += _control_out(result)
     out += [
-        f"image errors of camera {c.camera} are alike over up to {c.reach:.0f} px: for its orientations "
+        f"image errors of {c.group} are alike over up to {c.reach:.0f} px: for its orientations "
         f"{c.effect:.1f} measurements count as one"
         for c in adjusted.correlations
     ]
+    if adjusted.by_prior:
+        out.append(
+            "no observation determines " + ", ".join(adjusted.by_prior) + ": only what is known of corrections "
+            "beforehand does; give control, if the block is to lie better than that"
+        )
     seen = {points.images[k] for k in np.unique(points.image[used])}
     alone = [name for name in adjusted.images if name not in seen]
     if alone:
@@ -187,6 +194,34 @@ def _images(result: MapResult, used: NDArray[np.bool_]) -> tuple[ImageFigures, .
                 center=_triple(result.poses[k].center),
                 sigma_center=_triple(result.sigma_center[k]),
                 sigma_angles=_triple(result.sigma_angles[k]),
+            )
+        )
+    return tuple(out)
+
+
+def _corrections(result: MapResult, used: NDArray[np.bool_]) -> tuple[CorrectionFigures, ...]:
+    """Images without poses that took part."""
+    adjusted, points = result.adjusted, result.prepared.inputs.points
+    out = []
+    for name, kind, found in result.corrections:
+        at = points.images.index(name) if name in points.images else -1
+        rows = np.flatnonzero(points.image == at)
+        mine = rows[used[rows]]
+        r, w = adjusted.residuals[mine], np.abs(adjusted.normalised[mine])
+        timed = found.seconds is not None
+        out.append(
+            CorrectionFigures(
+                name=name,
+                group=kind.group,
+                measurements=len(mine),
+                rejected=int(adjusted.rejected[rows].sum()),
+                mean=(float(r[:, 0].mean()), float(r[:, 1].mean())) if len(mine) else (float("nan"),) * 2,
+                rms=(_rms(r[:, 0]), _rms(r[:, 1])),
+                worst=float(np.nanmax(w)) if np.isfinite(w).any() else float("nan"),
+                parameters=found.parameters,
+                seconds=np.empty(0) if found.seconds is None else found.seconds(points.xy[mine, 1]),
+                residuals=r if timed else np.empty((0, 2)),
+                over_time=found.over_time,
             )
         )
     return tuple(out)
@@ -341,7 +376,7 @@ def point_layers(result: MapResult, facts: AdjustFigures) -> list[PointLayer]:
             "strip": np.array([image.strip for image in images], object),
             "points": np.array([image.measurements for image in images], np.int32),
             "rms_px": np.array([np.hypot(*image.rms) for image in images]),
-            **_xyz("sigma", np.array([image.sigma_center for image in images])),
+            **_xyz("sigma", np.array([image.sigma_center for image in images]).reshape(-1, 3)),
         },
     )
     shown = [g for g in facts.ground if np.isfinite(g.XYZ).all() and np.isfinite(g.residual).all()]

@@ -8,6 +8,7 @@ import numpy as np
 
 from photoplan.orientation.check_points import CheckAccuracy
 from photoplan.products.adjust.figures import AdjustFigures
+from photoplan.report.adjust.corrections import correction_parts
 from photoplan.report.adjust.plots import AdjustPlots
 from photoplan.report.adjust.tables import (
     Row,
@@ -50,7 +51,10 @@ def adjust_page(facts: AdjustFigures, mpl: Any) -> str:
         parts.append(section("Calibration", [part for camera in facts.cameras for part in camera_parts(camera)]))
     if facts.strips:
         parts.append(section("Observed positions and attitudes", position_parts(facts)))
-    parts.append(section("Images", image_parts(facts)))
+    if facts.images:
+        parts.append(section("Images", image_parts(facts)))
+    if facts.corrections:
+        parts.append(section("Satellites and strips", correction_parts(facts.corrections, mpl)))
     if facts.left_out:
         parts.append(section("Left out", left_out_parts(facts)))
     parts.append(section("Inputs and settings", _record(facts)))
@@ -61,6 +65,7 @@ def _headline(facts: AdjustFigures) -> list[tuple[str, str, str]]:
     control = [g for g in facts.ground if not g.check]
     sigma = np.array([image.sigma_center for image in facts.images])
     mean = np.sqrt(np.mean(sigma**2, axis=0)) if len(sigma) else np.full(3, np.nan)
+    spread = "standard deviation, horizontal · height, root mean square"
     fit = "1 where the stated standard deviations are right"
     boxes = [
         (plain(facts.sigma0, 3), "sigma0", fit),
@@ -70,18 +75,21 @@ def _headline(facts: AdjustFigures) -> list[tuple[str, str, str]]:
             f"root mean square of {number(2 * facts.measurements)} coordinates",
         ),
         (number(facts.redundancy), "redundancy", f"{number(facts.unknowns)} unknowns, {facts.iterations} iterations"),
-        (number(len(facts.images)), "images", f"{len(facts.left_out)} images and points could not take part"),
+        (
+            number(len(facts.images) + len(facts.corrections)),
+            "images",
+            f"{len(facts.left_out)} images and points could not take part",
+        ),
         (number(facts.points), "points", f"in {plain(facts.mean_rays, 1)} images on average"),
         (number(facts.rejected), "gross errors", "measurements taken out" if facts.robust else "none were sought"),
-        (
-            f"{plain(float(np.hypot(mean[0], mean[1])))} · {plain(float(mean[2]))} m",
-            "projection centres",
-            "standard deviation, horizontal · height, root mean square",
+        *(
+            (f"{plain(float(np.hypot(m[0], m[1])))} · {plain(float(m[2]))} m", "projection centres", spread)
+            for m in ([mean] if len(sigma) else [])
         ),
         (
             f"{plain(float(np.hypot(*facts.point_sigma[:2])))} · {plain(facts.point_sigma[2])} m",
             "tie points",
-            "standard deviation, horizontal · height, root mean square",
+            spread,
         ),
     ]
     if facts.check is not None:
@@ -108,13 +116,16 @@ def _network(facts: AdjustFigures, plots: AdjustPlots) -> list[str]:
         figure(
             plots.network(facts),
             "Network",
-            f"{len(facts.images)} images, {number(facts.points)} points, {len(control)} control and {check} check "
-            "points.",
+            f"{len(facts.images) + len(facts.corrections)} images, {number(facts.points)} points, {len(control)} "
+            f"control and {check} check points.",
         ),
-        figure(
-            plots.sigmas(facts),
-            "Standard deviations of the projection centres",
-            "They grow at the edges of the block, and where images hang on few points or little control.",
+        *(
+            figure(
+                plots.sigmas(facts),
+                "Standard deviations of the projection centres",
+                "They grow at the edges of the block, and where images hang on few points or little control.",
+            )
+            for _ in facts.images[:1]
         ),
     ]
 

@@ -74,7 +74,7 @@ class AdjustPlots:
         some = [g for g in facts.ground if g.check == check and np.isfinite(g.residual).any()]
         with self.mpl.rc_context(STYLE):
             fig, axes = self._map(facts)
-            centers = np.array([image.center[:2] for image in facts.images])
+            centers = np.array([image.center[:2] for image in facts.images]).reshape(-1, 2)
             axes.scatter(*centers.T, s=2, marker="s", color="#d3dbe0", linewidths=0)
             left, right = axes.get_xlim()
             bottom, top = axes.get_ylim()

@@ -1,0 +1,158 @@
+"""Line cameras whose trajectory an adjustment corrects: mount (boresight, lever arm, clock) and splines over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from photoplan.cameras.base import Camera
+from photoplan.cameras.correctable import ByCorrections, Corrections, prior_rows
+from photoplan.cameras.line import LineCamera
+from photoplan.cameras.line_correction import TURNED, LineCorrection, TrackSpline, map_axes, spline_weights
+from photoplan.errors import InputError
+from photoplan.geometry.rotation import rotation_vector, skew
+
+_Floats = NDArray[np.float64]
+#: Parameters of a mount, in their order.
+MOUNT = ("boresight about x", "boresight about y", "boresight about z",
+         "lever arm x", "lever arm y", "lever arm z", "time offset")  # fmt: skip
+_SPLINE = ("position correction east of {}", "position correction north of {}", "height correction of {}",
+           "attitude correction about x of {}", "attitude correction about y of {}",
+           "attitude correction about z of {}")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TrackPriors:
+    """What is known of a trajectory beforehand: standard deviations; 0: a parameter is held fixed."""
+
+    boresight: float = 0.0
+    """Radians, about each axis."""
+    lever_arm: float = 0.0
+    """Metres."""
+    time_offset: float = 0.0
+    """Seconds."""
+    knots: float | None = None
+    """Between knots of the splines, seconds; None: there are none."""
+    position: float = 0.0
+    """Of each coefficient, metres."""
+    attitude: float = 0.0
+    """Radians."""
+    smooth_position: float = np.inf
+    """Of second differences of coefficients, metres."""
+    smooth_attitude: float = np.inf
+    """Radians."""
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectableLine:
+    """An image of a line camera whose trajectory is corrected."""
+
+    plain: LineCamera
+    """As delivered."""
+    mount: str
+    """Images of one mount share boresight, lever arm and clock."""
+    flight: str
+    """Images of one flight share the splines."""
+    priors: TrackPriors
+    start: LineCorrection
+    """Where to begin."""
+
+    @property
+    def keys(self) -> tuple[str, str]:
+        """Of the two sets."""
+        return f"mount of {self.mount!r}", f"trajectory of {self.flight!r}"
+
+    @property
+    def spline(self) -> TrackSpline | None:
+        """Its times, without corrections."""
+        if self.priors.knots is None:
+            return None
+        track = self.plain.track
+        ends = track.time(np.array([-0.5, track.lines - 0.5]))
+        first, last = max(float(ends[0]), track.known[0]), min(float(ends[1]), track.known[1])
+        return TrackSpline.over((first, last), self.priors.knots)
+
+    @property
+    def away(self) -> float:
+        """Height of the flight over the ellipsoid, metres."""
+        middle = np.array([[(self.plain.size[0] - 1) / 2, np.mean(self.plain.track.oriented)]])
+        away = float(self.plain.ground.height(self.plain.body_rays(middle)[0])[0])
+        if not away > 0:
+            raise InputError("the trajectory lies below the ellipsoid; are its heights of the stated system?")
+        return away
+
+    @property
+    def free(self) -> NDArray[np.int64]:
+        """Which parameters of the mount are unknown."""
+        p = self.priors
+        return np.flatnonzero(np.repeat([p.boresight > 0, p.lever_arm > 0, p.time_offset > 0], [3, 3, 1]))
+
+    @property
+    def corrections(self) -> tuple[Corrections, ...]:
+        """The sets that are unknown."""
+        p, start = self.priors, self.start
+        sets, free, spline = [], self.free, self.spline
+        if len(free):
+            sigma = np.repeat([p.boresight, p.lever_arm, p.time_offset], [3, 3, 1])[free]
+            values = np.concatenate([start.boresight, start.lever_arm, [start.time_offset]])[free]
+            names = tuple(f"{MOUNT[k]} of {{}}" for k in free)
+            sets.append(Corrections(self.keys[0], (self.mount,), names, values[None], prior_rows(sigma), "mount"))
+        if spline is not None:
+            count = len(spline.coefficients)
+            size = np.tile(np.repeat([p.position, p.attitude], 3), count)
+            smooth = np.repeat([p.smooth_position, p.smooth_attitude], 3)
+            second = sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(count - 2, count))
+            known = np.flatnonzero(np.isfinite(smooth))
+            pick = sparse.csr_matrix((1.0 / smooth[known], (np.arange(len(known)), known)), (len(known), 6))
+            rows = sparse.vstack([prior_rows(size), sparse.kron(second, pick)]).tocsr()
+            owners = tuple(f"{t:.3g} s of {self.flight}" for t in spline.times)
+            began = start.spline
+            same = began is not None and began.coefficients.shape == spline.coefficients.shape
+            values = began.coefficients if began is not None and same else spline.coefficients
+            sets.append(Corrections(self.keys[1], owners, _SPLINE, values, rows, "knot"))
+        return tuple(sets)
+
+    def correction(self, values: Mapping[str, _Floats]) -> LineCorrection:
+        """What values of the sets mean."""
+        mount = np.concatenate([self.start.boresight, self.start.lever_arm, [self.start.time_offset]])
+        if len(self.free):
+            mount[self.free] = values[self.keys[0]][0]
+        spline = self.spline
+        spline = self.start.spline if spline is None else replace(spline, coefficients=values[self.keys[1]])
+        return LineCorrection(mount[:3], mount[3:6], float(mount[6]), spline)
+
+    def camera(self, values: Mapping[str, _Floats]) -> Camera:
+        """See `Correctable`."""
+        return replace(self.plain, track=self.correction(values).track(self.plain.track))
+
+    def by_corrections(self, camera: Camera, XYZ: _Floats, xy: _Floats) -> Mapping[str, ByCorrections]:
+        """See `Correctable`; whatever moves the camera moves the ground the other way."""
+        assert isinstance(camera, LineCamera)
+        track, ground = camera.track, camera.ground
+        S, R = track(xy[:, 1])
+        d = np.einsum("nij,ni->nj", R, ground(XYZ) - S)
+        by_place = camera.derivatives(XYZ) @ np.linalg.inv(ground.jacobian(XYZ))
+        # A turn δ of the camera about its own axes moves the ground by R (d × δ), seen from a camera that stays.
+        by_turn = by_place @ R @ skew(d) @ TURNED
+        out: dict[str, ByCorrections] = {}
+        n, free = len(xy), self.free
+        if len(free):
+            ahead, behind = (track(xy[:, 1] + half) for half in (0.5, -0.5))
+            seconds = (track.time(xy[:, 1] + 0.5) - track.time(xy[:, 1] - 0.5))[:, None]
+            speed = (ahead[0] - behind[0]) / seconds
+            turning = rotation_vector(np.swapaxes(behind[1], 1, 2) @ ahead[1]) / seconds
+            # A later record: the camera is where it was before.
+            late = by_place @ speed[:, :, None] - (by_place @ R @ skew(d)) @ turning[:, :, None]
+            J = np.concatenate([by_turn, -by_place @ R @ TURNED, late], axis=2)
+            out[self.keys[0]] = ByCorrections(np.broadcast_to(np.arange(len(free)), (n, len(free))), J[:, :, free])
+        spline = self.spline
+        if spline is not None:
+            at, w = spline_weights(track.time(xy[:, 1]), spline.first, spline.step, len(spline.coefficients))
+            J = np.concatenate([-by_place @ map_axes(self.plain.track), by_turn], axis=2)
+            columns = (6 * at[:, :, None] + np.arange(6)).reshape(n, 24)
+            out[self.keys[1]] = ByCorrections(columns, (J[:, :, None, :] * w[:, None, :, None]).reshape(n, 2, 24))
+        return out

@@ -1,0 +1,75 @@
+"""Images of line cameras in an adjustment: mount and trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from photoplan.cameras.line_correctable import CorrectableLine, TrackPriors
+from photoplan.cameras.line_correction import LineCorrection
+from photoplan.io.camera.line.correction import line_correction_text, read_line_correction
+from photoplan.io.project.line import LineImage
+from photoplan.io.project.model import Project, StripAdjustment
+from photoplan.orientation.bundle.block import AdjustedCorrections
+from photoplan.products.adjust.geometry import FoundCorrection, FoundParameter, Geometry
+from photoplan.project.by_line import line_camera
+from photoplan.project.ground import Ground
+
+_UNITS = np.repeat([180.0 / np.pi, 1.0, 1.0], [3, 3, 1])
+_CALLED = [*(f"{what} {axis}" for what in ("boresight", "lever arm") for axis in "xyz"), "time offset"]
+
+
+def _correctable(project: Project, image: LineImage, ground: Ground, size: tuple[int, int]) -> CorrectableLine:
+    plain: Any = line_camera(project, image.model_copy(update={"correction": None}), ground, size)
+    start = LineCorrection.none()
+    if image.correction is not None and project.resolve(image.correction).exists():
+        start = read_line_correction(project.resolve(image.correction))
+    return CorrectableLine(plain, image.mount or image.line, image.line, _priors(project.adjustment.strips), start)
+
+
+def _priors(stated: StripAdjustment) -> TrackPriors:
+    smooth = stated.smooth_position, stated.smooth_attitude
+    return TrackPriors(
+        boresight=float(np.radians(stated.boresight)),
+        lever_arm=stated.lever_arm,
+        time_offset=stated.time_offset,
+        knots=stated.knots,
+        position=stated.position,
+        attitude=float(np.radians(stated.attitude)),
+        smooth_position=np.inf if smooth[0] is None else smooth[0],
+        smooth_attitude=np.inf if smooth[1] is None else float(np.radians(smooth[1])),
+    )
+
+
+def _found(image: CorrectableLine, sets: Mapping[str, AdjustedCorrections]) -> FoundCorrection:
+    correction = image.correction({key: each.values for key, each in sets.items()})
+    covariance, sigma, free = None, None, image.free
+    mount = np.concatenate([correction.boresight, correction.lever_arm, [correction.time_offset]]) * _UNITS
+    parameters: tuple[FoundParameter, ...] = ()
+    if len(free):
+        Q = sets[image.keys[0]].covariance[0]
+        roots = np.sqrt(np.diag(Q)) * _UNITS[free]
+        parameters = tuple(
+            FoundParameter(_CALLED[k], float(mount[k]), float(s), "°" if k < 3 else "m" if k < 6 else "s")
+            for k, s in zip(free, roots)
+        )
+        if np.isfinite(Q).all():
+            covariance = np.zeros((7, 7))
+            covariance[np.ix_(free, free)] = Q
+    over_time = None
+    if image.spline is not None and correction.spline is not None:
+        found = sets[image.keys[1]]
+        sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+        over_time = correction.spline.times, correction.spline.coefficients
+    text = line_correction_text(correction, covariance, sigma)
+    return FoundCorrection({}, parameters, text, over_time, image.plain.track.time)
+
+
+def _output(name: str) -> str:
+    return f"{Path(name).stem}.correction.toml"
+
+
+LINES = Geometry("lines", lambda image: image.away, _correctable, _found, _output)
