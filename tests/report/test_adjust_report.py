@@ -14,12 +14,14 @@ from photoplan.orientation.check_points import check_accuracy
 from photoplan.products.adjust.cameras import Calibrated
 from photoplan.products.adjust.figures import (
     AdjustFigures,
+    CorrectionFigures,
     GroundFigures,
     ImageFigures,
     NamedMeasurement,
     ResidualField,
     StripFigures,
 )
+from photoplan.products.adjust.geometry import FoundParameter
 from photoplan.report.adjust.page import adjust_page
 from photoplan.report.adjust.plots import AdjustPlots
 from photoplan.report.drawing import load_matplotlib
@@ -101,6 +103,21 @@ def facts(name: str = "p") -> AdjustFigures:
             Group("observed attitudes", 36, 9.0, np.pi / 200, "rad", 0.9),
         ),
         images=images,
+        corrections=(
+            CorrectionFigures(
+                name=f"{name} nadir",
+                group="lines",
+                measurements=9,
+                rejected=1,
+                mean=(0.0, 0.1),
+                rms=(0.2, 0.3),
+                worst=2.5,
+                parameters=(FoundParameter("boresight x", 0.03, 0.001, "°"),),
+                seconds=np.arange(9.0),
+                residuals=np.zeros((9, 2)),
+                over_time=(np.arange(5.0), np.full((5, 6), 1e-4)),
+            ),
+        ),
         ground=ground,
         check=check_accuracy(np.array([g.residual for g in check]), np.array([g.stated for g in check])),
         cameras=(
@@ -151,7 +168,7 @@ def test_it_holds_everything_and_reaches_for_nothing() -> None:
     document = adjust_page(facts(), MPL)
     page = Page(document)
     assert all(address and address.startswith("data:image/png;base64,") for address in page.addresses)
-    assert page.tags.count("img") == 6
+    assert page.tags.count("img") == 7
     words = " ".join(page.words)
     for said in ("1.020", "RMSE_H", "ASPRS", "Edition 2 (2023)", "4 check points; the standard asks for at least 30"):
         assert said in words, said
@@ -176,7 +193,7 @@ def test_fault_11_hostile_names_are_shown_and_not_obeyed() -> None:
     document = adjust_page(facts(HOSTILE), MPL)
     page = Page(document)
     assert "script" not in page.tags
-    assert page.tags.count("img") == 6
+    assert page.tags.count("img") == 7
     assert "\u202e" not in document
     assert any("<script>" in words for words in page.words)
     assert re.search(r"default-src 'none'", document)
