@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from photoplan.kernels import facets_grey, facets_height, facets_solve, facets_transfer
+from photoplan.kernels import facets_grey, facets_height, facets_radiometry, facets_solve, facets_transfer
+
+
+def carried(low, high, posts, out) -> None:
+    steep = np.empty((-(-(len(posts) - 1) // facets_transfer.CELL), -(-(posts.shape[1] - 1) // facets_transfer.CELL)))
+    facets_transfer.steepness(posts, steep)
+    facets_transfer.transfer(low, high, 1, (0.0, 100.0), posts, steep, out)
 
 
 def test_a_ray_ends_at_the_first_facet_that_it_meets() -> None:
@@ -18,7 +24,7 @@ def test_a_ray_ends_at_the_first_facet_that_it_meets() -> None:
     for slope in (-0.1, 0.1, 0.3):
         high = low + np.array([100.0 * slope, 0.0])
         out = np.empty((2, 41, 4), np.float32)
-        facets_transfer.transfer(low, high, 1, (0.0, 100.0), posts, out)
+        carried(low, high, posts, out)
         z = np.linspace(25.0, -1.0, 26_001)
         for k in range(41):
             at = u[k] + slope * z
@@ -36,7 +42,7 @@ def test_a_place_moves_as_stated_when_the_surface_rises() -> None:
     high = low + np.array([6.0, 3.0])
     places = [np.empty((2, 2, 4), np.float32) for _ in range(2)]
     for out, lift in zip(places, (0.0, 0.1)):
-        facets_transfer.transfer(low, high, 1, (0.0, 100.0), posts + lift, out)
+        carried(low, high, posts + lift, out)
     moved = (places[1] - places[0])[..., :2] / 0.1
     assert np.abs(moved - places[0][..., 2:]).max() < 1e-3
     assert np.abs(places[0][..., 2:] - np.array([0.06, 0.03])).max() > 1e-3
@@ -81,8 +87,7 @@ def test_grey_values_are_those_of_least_squares() -> None:
     facets_grey.add_grey(places, seen, weights, 2, system, right, np.zeros(shape, np.float32))
     system[..., 3] += np.float32(0.01)
     values = np.zeros(shape, np.float32)
-    by_offsets = np.ascontiguousarray(np.moveaxis(system, -1, 0))
-    facets_grey.solve_grey(by_offsets, right, np.ones(shape, np.float32), values, 300, 1e-7)
+    facets_grey.solve_grey(system, right, np.ones(shape, np.float32), values, 300, 1e-7)
     N = A.T @ (weights.reshape(-1, 1) * A) + 0.01 * np.eye(A.shape[1])
     expected = np.linalg.solve(N, A.T @ (weights * seen).reshape(-1))
     assert np.abs(values.reshape(-1) - expected).max() < 1e-2
@@ -95,9 +100,10 @@ def test_heights_get_the_equations_of_the_pixels() -> None:
     seen = rng.normal(0, 10, (14, 16)).astype(np.float32)
     means = rng.normal(0, 0.05, (2, 3, 2))
     system, right = np.zeros((7, 3, 4)), np.zeros((3, 4))
+    noise = np.zeros((3, 4))
     residuals, factors, sums = np.empty((14, 16), np.float32), np.ones((14, 16), np.float32), np.zeros(3)
     facets_height.add_heights(
-        places, seen, weights, values, 2, means, 8.0, 2.0, system, right, residuals, factors, sums
+        places, seen, weights, values, 2, means, 8.0, 2.0, system, right, noise, residuals, factors, sums
     )
     misfit = (A @ values.reshape(-1)).reshape(14, 16) - seen
     used = weights > 0
@@ -116,6 +122,8 @@ def test_heights_get_the_equations_of_the_pixels() -> None:
         N += p * a * a * np.outer(phi, phi)
         b -= p * a * m * phi.reshape(-1)
     assert np.abs(right.reshape(-1) - b).max() < 1e-3 * np.abs(b).max()
+    # Errors of one standard deviation have the variances of the equations.
+    assert 0.4 < np.mean(noise**2 / system[0]) < 2.0
     assert np.abs(dense(system, np.zeros((3, 3, 4))) - N).max() < 1e-4 * np.abs(N).max()
 
 
@@ -159,32 +167,41 @@ def height_system(rows: int, columns: int):
 
 def test_heights_and_variances_are_those_of_the_full_matrix() -> None:
     rng, system, curve = height_system(9, 12)
-    right, out = rng.normal(size=(9, 12)), np.empty((9, 12))
-    N = dense(system, curve)
-    assert facets_solve.solve_heights(system, curve, right, 12, 2, out) == 0
-    inverse = np.linalg.inv(N)
-    assert np.abs(out.reshape(-1) - inverse @ right.reshape(-1)).max() < 1e-12
-    heights, curvatures, wide = np.empty((9, 12)), np.empty((3, 9, 12)), np.empty(2)
-    facets_solve.variances(system, curve, 12, 2, heights, curvatures, np.array([1, 4]), wide)
-    assert np.abs(heights.reshape(-1) - np.diag(inverse)).max() < 1e-12
-    at = inverse.reshape(9, 12, 9, 12)
-    c = np.zeros((9, 12))
-    c[4, 5:8] = 1, -2, 1
-    assert curvatures[0, 4, 6] == pytest.approx(np.einsum("ij,ijkl,kl", c, at, c))
-    found = []
-    for j in range(9):
-        for i in range(4, 8):
-            c = np.zeros((9, 12))
-            c[j, [i - 4, i, i + 4]] = 1, -2, 1
-            found.append(np.einsum("ij,ijkl,kl", c, at, c))
-    assert wide[1] == pytest.approx(np.mean(found))
+    right, out = rng.normal(size=(9, 12)), np.zeros((9, 12))
+    inverse = np.linalg.inv(dense(system, curve))
+    facets_solve.add_curvatures(curve, system)
+    assert facets_solve.solve_heights(system, right, 200, 1e-12, out) < 200
+    assert np.abs(out.reshape(-1) - inverse @ right.reshape(-1)).max() < 1e-10
+    facets_solve.variances(system, 12, 2, out)
+    assert np.abs(out.reshape(-1) - np.diag(inverse)).max() < 1e-12
 
 
-def test_parts_agree_where_pixels_determine_the_heights() -> None:
-    """Parts with a margin of eight posts against the whole: below a hundredth of a standard deviation."""
-    rng, system, curve = height_system(30, 34)
-    right, out, whole = rng.normal(size=(30, 34)), np.empty((30, 34)), np.empty((30, 34))
-    facets_solve.solve_heights(system, curve, right, 10, 8, out)
-    facets_solve.solve_heights(system, curve, right, 40, 0, whole)
-    sigma = np.sqrt(np.diag(np.linalg.inv(dense(system, curve)))).reshape(30, 34)
-    assert np.abs((out - whole) / sigma).max() < 0.01
+def test_variances_of_parts_are_those_of_the_whole_where_pixels_determine_the_heights() -> None:
+    _, system, curve = height_system(30, 34)
+    facets_solve.add_curvatures(curve, system)
+    parts, whole = np.empty((30, 34)), np.empty((30, 34))
+    facets_solve.variances(system, 10, 8, parts)
+    facets_solve.variances(system, 40, 0, whole)
+    assert np.abs(parts / whole - 1).max() < 0.01
+
+
+def test_a_ray_that_meets_gentle_ground_is_not_stopped_by_a_wall_far_away_but_by_one_before_it() -> None:
+    posts = 0.1 * np.random.default_rng(2).normal(size=(60, 60))
+    posts[:, 40:42] = 15.0
+    u = np.linspace(1, 58, 58)
+    low = np.stack([np.tile(u, (2, 1)), np.repeat([[5.0], [50.0]], 58, axis=1)], axis=-1)
+    for slope in (0.1, 1.0):
+        out = np.empty((2, 58, 4), np.float32)
+        carried(low, low + np.array([100.0 * slope, 0.0]), posts, out)
+        far, hidden = u + slope * 15.0 < 39.0, (u < 38.5) & (u + slope * 13.0 > 42.0)
+        assert np.abs(out[0, far, 0] - u[far]).max() < 0.6
+        assert slope < 0.5 or (hidden.any() and (out[0, hidden, 0] > 38.9).all())
+
+
+def test_radiometry_is_solved_as_a_full_matrix() -> None:
+    rng = np.random.default_rng(6)
+    A = rng.normal(size=(40, 20))
+    N, right = A.T @ A, rng.normal(size=20)
+    want = np.linalg.solve(N, right)
+    facets_radiometry.solve_radiometry(N, right)
+    assert np.abs(right - want).max() < 1e-9 * np.abs(want).max()

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from photoplan.geometry.grid import Window
-from photoplan.matching.facets.curvature import Roughness, curvatures
+from photoplan.kernels.facets_solve import add_curvatures, solve_heights, variances
+from photoplan.matching.facets.curvature import Roughness, Smoother, curvatures
 from photoplan.matching.facets.pyramid import FILTERS, Pyramid, halved
 from photoplan.matching.facets.reconstruct import facets_of
 
@@ -60,23 +61,63 @@ def test_posts_of_a_level_are_the_same_for_every_window() -> None:
     assert (fine.posts[0, 0] == grid.to_map((64, 64))).all()
 
 
-def test_roughness_is_estimated_in_patches() -> None:
-    """Curvatures of known variance, ten times as rough on one half, pixels that know the heights well."""
-    rng = np.random.default_rng(4)
-    sigma = np.where(np.arange(120) < 60, 0.1, 1.0)
-    heights = rng.normal(size=(120, 120)) * sigma
-    from photoplan.matching.facets.curvature import SPANS, Known
+def ground(kind: str, rng: np.random.Generator) -> np.ndarray:
+    """Heights of 120 × 120 posts: waves of 40 posts, or a spectrum like that of terrain."""
+    v, u = np.mgrid[:120, :120].astype(float)
+    if kind == "waves":
+        return 10 * np.sin(u / 6.4 + 0.4) * np.cos(v / 6.4)
+    k = np.hypot(np.fft.fftfreq(120)[:, None], np.fft.fftfreq(120)[None])
+    z = np.fft.ifft2(
+        np.fft.fft2(rng.normal(size=(120, 120))) / np.maximum(k, 1e-2) ** (3.0 if kind == "rough" else 2.0)
+    ).real
+    return z * {"rough": 0.02, "fractal": 0.05}[kind]
 
-    known = Known(np.full((3, 120, 120), 1e-9), np.full(len(SPANS), 1e-9))
-    rough = Roughness.uniform((120, 120), 3.0)
-    for _ in range(6):
-        rough = rough.estimated(heights, known, np.full((120, 120), 1e6))
-    # Differences of independent heights have 6 and 4 times their variance; Student's scale is somewhat less.
-    for kind, times in ((0, 6), (1, 6), (2, 4)):
-        left, right = rough.squares[kind, 20:100, 15:45].mean(), rough.squares[kind, 20:100, 75:105].mean()
-        assert 0.5 < left / (0.01 * times) < 1.2 and 0.5 < right / times < 1.2
-    slope = rough.gradient(heights)
-    step = np.zeros_like(heights)
-    step[50, 50] = 1e-4
+
+@pytest.mark.parametrize("kind", ["waves", "rough", "fractal"])
+def test_standard_deviations_hold_whatever_the_ground_is_like(kind: str) -> None:
+    """Heights observed with a noise of 1, half of them three times worse; curvatures have estimated variances."""
+    rng = np.random.default_rng(4)
+    true = ground(kind, rng)
+    sigma = np.where(np.arange(120) < 60, 1.0, 3.0) * np.ones((120, 1))
+    seen = true + rng.normal(size=true.shape) * sigma
+    pixels = np.zeros((7, 120, 120))
+    pixels[0] = 1 / sigma**2
+    inside = np.zeros((120, 120), bool)
+    inside[6:-6, 6:-6] = True
+    rough = Roughness.uniform((120, 120), 10.0)
+    noise = rng.choice((-1.0, 1.0), size=true.shape) / sigma
+
+    def equations(stiffer: float = 1.0) -> np.ndarray:
+        out = pixels.copy()
+        add_curvatures(stiffer * rough.weights, out)
+        return out
+
+    def solve(rights) -> np.ndarray:
+        out = np.zeros((len(rights), 120, 120))
+        for right, x in zip(rights, out):
+            solve_heights(equations(), right, 500, 1e-4, x)
+        return out
+
+    smoother = Smoother(solve, noise, inside)
+    for _ in range(8):
+        (heights,) = solve([seen / sigma**2])
+        rough = rough.estimated(heights, smoother)
+    (heights,) = solve([seen / sigma**2])
+    found = np.empty((2, 120, 120))
+    for out, stiffer in zip(found, (1.0, 1.2)):
+        variances(equations(stiffer), 24, 8, out)
+    claimed = rough.sandwich(heights, smoother, found, 1.2)
+    normalised = (heights - true) / np.sqrt(claimed)
+    for half in (slice(8, 52), slice(68, 112)):
+        assert 0.8 < np.sqrt(np.mean(normalised[8:-8, half] ** 2)) < 1.25
+    assert np.sqrt(np.mean((heights - true)[8:-8, 8:52] ** 2)) < 0.9
+
+
+def test_the_pull_of_curvatures_is_half_the_gradient_of_their_sum() -> None:
+    rng = np.random.default_rng(4)
+    heights = rng.normal(size=(60, 60))
+    rough = Roughness.uniform((60, 60), 0.5)
+    slope, step = rough.gradient(heights), np.zeros_like(heights)
+    step[30, 30] = 1e-4
     sums = [(rough.weights * curvatures(heights + s) ** 2).sum() / 2 for s in (step, -step)]
-    assert slope[50, 50] == pytest.approx((sums[0] - sums[1]) / 2e-4, rel=1e-5)
+    assert slope[30, 30] == pytest.approx((sums[0] - sums[1]) / 2e-4, rel=1e-5)

@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from photoplan.kernels.jit import inner, kernel
+from photoplan.kernels.facets_rows import add_product, add_share, dot
+from photoplan.kernels.jit import inner, kernel, maker
 
 PAD = 2
 """Coefficients before the first and behind the last post."""
 OFFSETS = 28
 """Entries of a row of the system, some of them unused."""
+#: The inverse of (1 4 1)/6 at 0 to 3 nodes: √3 · (√3 − 2)^k.
+_INVERSE = np.array([3**0.5 * (3**0.5 - 2) ** k for k in range(4)], np.float32)
 
 
 @inner
@@ -65,69 +68,85 @@ def add_grey(places, grey, weights, ratio, system, right, density):
             spline(t - j, y)
             density[int(t + 0.5) + PAD, int(s + 0.5) + PAD] += p
             i, j = i + PAD - 1, j + PAD - 1
+            x0, x1, x2, x3 = np.float32(x[0]), np.float32(x[1]), np.float32(x[2]), np.float32(x[3])
             for b in range(4):
                 for a in range(4):
-                    first = p * y[b] * x[a]
+                    first = np.float32(p * y[b] * x[a])
                     right[j + b, i + a] += first * grey[r, c]
+                    row = system[j + b, i + a]
                     for e in range(b, 4):
-                        for d in range(a if e == b else 0, 4):
-                            system[j + b, i + a, 7 * (e - b) + d - a + 3] += first * y[e] * x[d]
+                        # Four at once; of a row's own entries those to the left are not used.
+                        both, k = first * np.float32(y[e]), 7 * (e - b) + 3 - a
+                        row[k] += both * x0
+                        row[k + 1] += both * x1
+                        row[k + 2] += both * x2
+                        row[k + 3] += both * x3
 
 
 @inner
 def _times(system, x, y):
-    """y = system · x, system by offsets first: shape (OFFSETS, m, n)."""
+    """y = system · x, system by rows, then by offsets: shape (m, OFFSETS, n)."""
     rows, columns = x.shape
+    y[:] = np.float32(0.0)
     for j in range(rows):
         for i in range(columns):
-            y[j, i] = 0.0
-    for k in range(3, OFFSETS):
-        dj, di = k // 7, k % 7 - 3
-        first, last = max(0, -di), columns - max(0, di)
-        for j in range(rows - dj):
-            for i in range(first, last):
-                y[j, i] += system[k, j, i] * x[j + dj, i + di]
-            if k > 3:
-                for i in range(first, last):
-                    y[j + dj, i + di] += system[k, j, i] * x[j, i]
+            y[j, i] += system[j, 3, i] * x[j, i]
+        for k in range(4, OFFSETS):
+            dj, di = k // 7, k % 7 - 3
+            if j + dj < rows:
+                # Slices, since an index that might be negative would be looked at.
+                i0, i1 = max(0, -di), columns - max(0, di)
+                part = system[j, k, i0:i1]
+                add_product(part, x[j + dj, i0 + di : i1 + di], y[j, i0:i1])
+                add_product(part, x[j, i0:i1], y[j + dj, i0 + di : i1 + di])
 
 
 @inner
-def _unfiltered(x, gain):
-    """Divide by the sampled B-spline (1 4 1)/6 along rows and columns, in place; `gain` is scratch."""
+def _unfiltered(x, scratch):
+    """Divide by the sampled B-spline (1 4 1)/6 along columns and rows, in place, but for what is cut off."""
     rows, columns = x.shape
-    for n in range(max(rows, columns)):
-        gain[n] = 1.0 / (4.0 - (gain[n - 1] if n else 0.0))
     for j in range(rows):
-        x[j, 0] *= 6.0 * gain[0]
-        for i in range(1, columns):
-            x[j, i] = (6.0 * x[j, i] - x[j, i - 1]) * gain[i]
-        for i in range(columns - 2, -1, -1):
-            x[j, i] -= gain[i] * x[j, i + 1]
-    for i in range(columns):
-        x[0, i] *= 6.0 * gain[0]
-    for j in range(1, rows):
-        for i in range(columns):
-            x[j, i] = (6.0 * x[j, i] - x[j - 1, i]) * gain[j]
-    for j in range(rows - 2, -1, -1):
-        for i in range(columns):
-            x[j, i] -= gain[j] * x[j + 1, i]
+        out = scratch[j]
+        out[:] = np.float32(0.0)
+        for k in range(max(0, j - 3), min(rows, j + 4)):
+            add_share(_INVERSE[abs(k - j)], x[k], out)
+    for j in range(rows):
+        here, out = scratch[j], x[j]
+        out[:] = np.float32(0.0)
+        add_share(_INVERSE[0], here, out)
+        for k in range(1, 4):
+            add_share(_INVERSE[k], here[k:], out[: columns - k])
+            add_share(_INVERSE[k], here[: columns - k], out[k:])
+
+
+@maker
+def _by_rows(system):
+    """The same system, by rows, then by offsets."""
+    rows, columns, count = system.shape
+    out = np.empty((rows, count, columns), np.float32)
+    for j in range(rows):
+        for first in range(0, columns, 16):
+            for k in range(count):
+                for i in range(first, min(columns, first + 16)):
+                    out[j, k, i] = system[j, i, k]
+    return out
 
 
 @kernel
-def solve_grey(system, right, diagonal, values, rounds, tolerance):
+def solve_grey(system, right, diagonal, values, rounds, enough):
     """Improve coefficients by conjugate gradients, preconditioned in the grey values at the nodes.
 
     Parameters
     ----------
-    system : ndarray, shape (OFFSETS, m, n), float32
+    system : ndarray, shape (m, n, OFFSETS), float32
     right : ndarray, shape (m, n), float32
     diagonal : ndarray, shape (m, n), float32
         About the weight of the grey value at each node, positive.
     values : ndarray, shape (m, n), float32
         Coefficients: start and result.
-    rounds, tolerance
-        Iterations at most; they end when the error, measured by the preconditioner, has fallen by this factor.
+    rounds, enough
+        Iterations at most; they end when the errors of the grey values are about this part of their own standard
+        deviations, in the mean.
 
     Returns
     -------
@@ -136,38 +155,38 @@ def solve_grey(system, right, diagonal, values, rounds, tolerance):
     """
     rows, columns = values.shape
     residual, product = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.float32)
-    improved, gain = np.empty((rows, columns), np.float32), np.empty(max(rows, columns))
+    improved, way = np.empty((rows, columns), np.float32), np.zeros((rows, columns), np.float32)
+    part, system = np.empty(8, np.float32), _by_rows(system)
     _times(system, values, product)
-    residual[:] = right - product
-    way = np.zeros((rows, columns), np.float32)
-    before, first = 1.0, 0.0
+    for j in range(rows):
+        for i in range(columns):
+            residual[j, i] = right[j, i] - product[j, i]
+    before = 1.0
     for k in range(rounds):
-        improved[:] = residual
-        _unfiltered(improved, gain)
+        for j in range(rows):
+            for i in range(columns):
+                improved[j, i] = residual[j, i]
+        _unfiltered(improved, product)
         for j in range(rows):
             for i in range(columns):
                 improved[j, i] /= diagonal[j, i]
-        _unfiltered(improved, gain)
-        size = 0.0
-        for j in range(rows):
-            for i in range(columns):
-                size += residual[j, i] * improved[j, i]
-        if k == 0:
-            first = size
-        if not size > tolerance * tolerance * first:
+        _unfiltered(improved, product)
+        size = dot(residual, improved, part)
+        if not size > enough * enough * rows * columns:
             return k
-        share = 0.0 if k == 0 else size / before
-        way[:] = improved + np.float32(share) * way
-        _times(system, way, product)
-        curve = 0.0
+        share = np.float32(0.0 if k == 0 else size / before)
         for j in range(rows):
             for i in range(columns):
-                curve += way[j, i] * product[j, i]
+                way[j, i] = improved[j, i] + share * way[j, i]
+        _times(system, way, product)
+        curve = dot(way, product, part)
         if not curve > 0.0:
             return k
         along = np.float32(size / curve)
-        values += along * way
-        residual -= along * product
+        for j in range(rows):
+            for i in range(columns):
+                values[j, i] += along * way[j, i]
+                residual[j, i] -= along * product[j, i]
         before = size
     return rounds
 

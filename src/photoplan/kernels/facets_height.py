@@ -34,7 +34,9 @@ def add_means(places, weights, sums):
 
 
 @kernel
-def add_heights(places, grey, weights, values, ratio, means, sigma, limit, system, right, residuals, factors, sums):
+def add_heights(
+    places, grey, weights, values, ratio, means, sigma, limit, system, right, noise, residuals, factors, sums
+):
     """Add the equations of an image to the normal equations of the heights; residuals and robust factors.
 
     Parameters
@@ -47,7 +49,8 @@ def add_heights(places, grey, weights, values, ratio, means, sigma, limit, syste
         Mean change of place with height of the pixels of all images in a facet.
     sigma, limit : float
         Standard deviation of the grey values, and the multiple of it from which weights fall (Huber 1964).
-    system : ndarray, shape (7, rows, columns); right : ndarray, shape (rows, columns)
+    system : ndarray, shape (7, rows, columns); right, noise : ndarray, shape (rows, columns)
+        Normal equations; and a right-hand side of independent errors of the pixels, one standard deviation each.
     residuals, factors : ndarray, shape (h, w), float32
         Grey value of the surface less that of the pixel (NaN: no pixel), and the robust factor of its weight.
     sums : ndarray, shape (3,)
@@ -55,6 +58,7 @@ def add_heights(places, grey, weights, values, ratio, means, sigma, limit, syste
     """
     x, y, dx, dy, found = np.empty(4), np.empty(4), np.empty(4), np.empty(4), np.empty(3)
     phi = np.empty(4)
+    state = np.uint64(88172645463325252)
     for r in range(places.shape[0]):
         for c in range(places.shape[1]):
             p = weights[r, c]
@@ -75,8 +79,14 @@ def add_heights(places, grey, weights, values, ratio, means, sigma, limit, syste
             f, g = u - i, v - j
             phi[0], phi[1], phi[2], phi[3] = (1 - f) * (1 - g), f * (1 - g), (1 - f) * g, f * g
             pa = p * a
+            # The sign of the error is that of xorshift (Marsaglia 2003).
+            state ^= state << np.uint64(13)
+            state ^= state >> np.uint64(7)
+            state ^= state << np.uint64(17)
+            error = a * np.sqrt(p) * (1.0 if state & np.uint64(65536) else -1.0)
             for k in range(4):
                 right[j + k // 2, i + k % 2] -= pa * phi[k] * misfit
+                noise[j + k // 2, i + k % 2] += phi[k] * error
             paa = pa * a
             system[0, j, i] += paa * phi[0] * phi[0]
             system[0, j, i + 1] += paa * phi[1] * phi[1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from photoplan.kernels.facets_rows import add_share
 from photoplan.kernels.jit import inner, kernel
 
 
@@ -83,3 +84,28 @@ def add_radiometry(places, raw, weights, surface, shape, lattice, system, right)
                     system[index[k], n + index[q]] += both * g
                     system[n + index[k], index[q]] += both * g
                     system[n + index[k], n + index[q]] += both * g * g
+
+
+@kernel
+def solve_radiometry(system, right):
+    """Solve with a full positive matrix, in place: its upper triangle becomes its Cholesky factor, `right`
+    the solution.
+
+    Libraries use threads of their own for this, which stand in each other's way in the workers of a run.
+    """
+    n = len(right)
+    for k in range(n):
+        system[k, k] = np.sqrt(system[k, k])
+        scale = 1.0 / system[k, k]
+        for j in range(k + 1, n):
+            system[k, j] *= scale
+        for j in range(k + 1, n):
+            if system[k, j] != 0.0:
+                add_share(-system[k, j], system[k, j:], system[j, j:])
+    for k in range(n):
+        right[k] /= system[k, k]
+        add_share(-right[k], system[k, k + 1 :], right[k + 1 :])
+    for k in range(n - 1, -1, -1):
+        for j in range(k + 1, n):
+            right[k] -= system[k, j] * right[j]
+        right[k] /= system[k, k]

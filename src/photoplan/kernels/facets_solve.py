@@ -1,66 +1,37 @@
-"""The heights of a part of a grid of facets, by a band Cholesky factor, and the variances of heights and curvatures."""
+"""Heights of a grid of facets by conjugate gradients, and their variances by band Cholesky factors of its parts."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from photoplan.kernels.facets_rows import add_product, add_share, dot
 from photoplan.kernels.jit import inner, kernel
 
-
-@inner
-def _fill(system, curve, first, shape, free, band):
-    """The band of a part: row k holds the columns k − w … k of its lower triangle at the end of a row of w + 1."""
-    rows, columns = shape
-    w = band.shape[1] - 1
-    j0, i0 = first
-    band[:] = 0.0
-    for j in range(rows):
-        for i in range(columns):
-            n = j * columns + i
-            row, col = j0 + j, i0 + i
-            band[n, w] += system[0, row, col]
-            if i + 1 < columns:
-                band[n + 1, w - 1] += system[1, row, col]
-            if j + 1 < rows:
-                band[n + columns, w - columns] += system[4, row, col]
-                if i > 0:
-                    band[n + columns - 1, w - columns + 1] += system[3, row, col]
-                if i + 1 < columns:
-                    band[n + columns + 1, w - columns - 1] += system[5, row, col]
-    # Curvatures (1, −2, 1) along columns and rows, and (1, −1, −1, 1) across: with a free border only those inside.
-    for j in range(-1, rows + 1):
-        for i in range(-1, columns + 1):
-            row, col = j0 + j, i0 + i
-            for kind in range(3):
-                _add_curvature(curve, row, col, j, i, kind, shape, free, band)
+#: Rows and columns between the posts of an entry: see `facets_height.OFFSETS`.
+_DOWN, _ALONG = (0, 0, 0, 1, 1, 1, 2), (0, 1, 2, -1, 0, 1, 0)
 
 
-@inner
-def _add_curvature(curve, row, col, j, i, kind, shape, free, band):
-    rows, columns = shape
-    w = band.shape[1] - 1
-    if row < 0 or col < 0 or row >= curve.shape[1] or col >= curve.shape[2]:
-        return
-    p = curve[kind, row, col]
-    if not p > 0.0:
-        return
-    count = 3 if kind < 2 else 4
-    if free:
-        for k in range(count):
-            dj, di, _ = curvature(kind, k)
-            if not (0 <= j + dj < rows and 0 <= i + di < columns):
-                return
-    for k in range(count):
-        dj, di, a = curvature(kind, k)
-        if not (0 <= j + dj < rows and 0 <= i + di < columns):
-            continue
-        n = (j + dj) * columns + i + di
-        for q in range(count):
-            ej, ei, b = curvature(kind, q)
-            if 0 <= j + ej < rows and 0 <= i + ei < columns:
-                o = (j + ej) * columns + i + ei
-                if o <= n:
-                    band[n, w - (n - o)] += p * a * b
+@kernel
+def add_curvatures(curve, out):
+    """Add the normal equations of curvatures to those of the pixels, (7, rows, columns).
+
+    `curve` has the weights of curvatures along columns, rows and across, (3, rows, columns), 0 where not inside.
+    """
+    for kind in range(3):
+        count = 3 if kind < 2 else 4
+        for row in range(curve.shape[1]):
+            for col in range(curve.shape[2]):
+                p = curve[kind, row, col]
+                if not p > 0.0:
+                    continue
+                for k in range(count):
+                    dj, di, a = curvature(kind, k)
+                    for q in range(k, count):
+                        ej, ei, b = curvature(kind, q)
+                        down, along = ej - dj, ei - di
+                        # (0, 0) (0, 1) (0, 2), (1, −1) (1, 0) (1, 1), (2, 0)
+                        entry = along if down == 0 else (4 + along if down == 1 else 6)
+                        out[entry, row + dj, col + di] += p * a * b
 
 
 @inner
@@ -75,174 +46,134 @@ def curvature(kind, k):
 
 @inner
 def _factor(band):
-    """Cholesky factor in place: L is the lower triangle."""
-    size, w = band.shape[0], band.shape[1] - 1
+    """Cholesky factor in place: L is the lower triangle, stored as the band is."""
+    size, width = band.shape
     for n in range(size):
-        for m in range(max(0, n - w), n):
-            total = band[n, w - n + m]
-            start = max(0, n - w, m - w)
-            a, b = w - n, w - m
-            for k in range(start, m):
-                total -= band[n, a + k] * band[m, b + k]
-            band[n, w - n + m] = total / band[m, w]
-        total = band[n, w]
-        for k in range(max(0, n - w), n):
-            total -= band[n, w - n + k] ** 2
-        if not total > 0.0:
+        column = band[n]
+        if not column[0] > 0.0:
             return False
-        band[n, w] = np.sqrt(total)
+        column[0] = np.sqrt(column[0])
+        scale = 1.0 / column[0]
+        for k in range(1, width):
+            column[k] *= scale
+        for k in range(1, min(width, size - n)):
+            if column[k] != 0.0:
+                add_share(-column[k], column[k:], band[n + k, : width - k])
     return True
 
 
 @inner
-def _back(band, x):
-    """Solve with the factor, in place."""
-    size, w = band.shape[0], band.shape[1] - 1
-    for n in range(size):
-        total = x[n]
-        for k in range(max(0, n - w), n):
-            total -= band[n, w - n + k] * x[k]
-        x[n] = total / band[n, w]
-    for n in range(size - 1, -1, -1):
-        x[n] /= band[n, w]
-        for k in range(max(0, n - w), n):
-            x[k] -= band[n, w - n + k] * x[n]
+def _times(system, x, y):
+    """y = system · x."""
+    rows, columns = x.shape
+    y[:] = 0.0
+    for j in range(rows):
+        add_product(system[0, j], x[j], y[j])
+        for k in range(1, 7):
+            dj, di = _DOWN[k], _ALONG[k]
+            if j + dj < rows:
+                i0, i1 = max(0, -di), columns - max(0, di)
+                part = system[k, j, i0:i1]
+                add_product(part, x[j + dj, i0 + di : i1 + di], y[j, i0:i1])
+                add_product(part, x[j, i0:i1], y[j + dj, i0 + di : i1 + di])
 
 
 @kernel
-def solve_heights(system, curve, right, side, margin, out):
-    """Heights' corrections, part by part: each with `margin` posts around it, beyond which nothing changes.
+def solve_heights(system, right, rounds, enough, out):
+    """Heights' corrections by conjugate gradients, preconditioned by the diagonal.
 
     Parameters
     ----------
     system : ndarray, shape (7, rows, columns)
-        Of the pixels, see `facets_height`.
-    curve : ndarray, shape (3, rows, columns)
-        Weights of the curvatures along columns, rows and across.
+        Of pixels and curvatures, see `add_curvatures`.
     right : ndarray, shape (rows, columns)
-        Right-hand side, of pixels and curvatures.
-    side, margin : int
+    rounds, enough
+        Iterations at most; they end when what is left of the equations has fallen to this part.
     out : ndarray, shape (rows, columns)
+        Start and result.
 
     Returns
     -------
     int
-        Parts without a solution; their heights stay.
+        Iterations.
     """
     rows, columns = right.shape
-    failed = 0
-    for row in range(0, rows, side):
-        for col in range(0, columns, side):
-            j0, i0 = max(0, row - margin), max(0, col - margin)
-            j1, i1 = min(rows, row + side + margin), min(columns, col + side + margin)
-            n, m = j1 - j0, i1 - i0
-            band = np.empty((n * m, 2 * m + 1))
-            _fill(system, curve, (j0, i0), (n, m), False, band)
-            x = right[j0:j1, i0:i1].copy().reshape(-1)
-            done = _factor(band)
-            if done:
-                _back(band, x)
-            else:
-                failed += 1
-            for j in range(row, min(rows, row + side)):
-                for i in range(col, min(columns, col + side)):
-                    out[j, i] = x[(j - j0) * m + i - i0] if done else 0.0
-    return failed
+    residual, product = np.empty((rows, columns)), np.empty((rows, columns))
+    way, improved = np.zeros((rows, columns)), np.empty((rows, columns))
+    part, diagonal = np.empty(8), np.empty((rows, columns))
+    _times(system, out, product)
+    for j in range(rows):
+        for i in range(columns):
+            residual[j, i] = right[j, i] - product[j, i]
+            diagonal[j, i] = 1.0 / max(system[0, j, i], 1e-300)
+            improved[j, i] = diagonal[j, i] * right[j, i]
+    first = dot(right, improved, part)
+    before = 1.0
+    for k in range(rounds):
+        for j in range(rows):
+            for i in range(columns):
+                improved[j, i] = diagonal[j, i] * residual[j, i]
+        size = dot(residual, improved, part)
+        if not size > enough * enough * first:
+            return k
+        share = 0.0 if k == 0 else size / before
+        for j in range(rows):
+            for i in range(columns):
+                way[j, i] = improved[j, i] + share * way[j, i]
+        _times(system, way, product)
+        curve = dot(way, product, part)
+        if not curve > 0.0:
+            return k
+        for j in range(rows):
+            add_share(size / curve, way[j], out[j])
+            add_share(-size / curve, product[j], residual[j])
+        before = size
+    return rounds
 
 
 @inner
 def _invert(band, inverse, column):
-    """Entries of the inverse inside the band (Takahashi 1973), stored as the factor is."""
+    """Entries of the inverse inside the band (Takahashi 1973): row n holds columns n − w … n + w."""
     size, w = band.shape[0], band.shape[1] - 1
     inverse[:] = 0.0
     for n in range(size - 1, -1, -1):
         below = min(w, size - 1 - n)
-        for k in range(1, below + 1):
-            column[k] = band[n + k, w - k] / band[n, w]
-        for k in range(below, 0, -1):
-            total = 0.0
-            for q in range(1, k):
-                total -= column[q] * inverse[n + k, w - k + q]
-            for q in range(k, below + 1):
-                total -= column[q] * inverse[n + q, w - q + k]
-            inverse[n + k, w - k] = total
-        total = 1.0 / band[n, w] ** 2
+        column[:] = 0.0
         for q in range(1, below + 1):
-            total -= column[q] * inverse[n + q, w - q]
+            if band[n, q] != 0.0:
+                add_share(
+                    -band[n, q] / band[n, 0], inverse[n + q, w - q + 1 : w - q + 1 + below], column[1 : below + 1]
+                )
+        total = 1.0 / band[n, 0] ** 2
+        for k in range(1, below + 1):
+            inverse[n, w + k] = inverse[n + k, w - k] = column[k]
+            total -= band[n, k] / band[n, 0] * column[k]
         inverse[n, w] = total
 
 
 @kernel
-def variances(system, curve, side, margin, heights, curvatures, spans, wide):
-    """Variances of heights and curvatures, part by part with a free border.
+def variances(system, side, margin, out):
+    """Variances of heights, part by part, with `margin` posts around each beyond which nothing changes; NaN where a
+    part is singular.
 
-    Parameters
-    ----------
-    system, curve, side, margin
-        See `solve_heights`.
-    heights : ndarray, shape (rows, columns)
-        Out; NaN where a part is singular.
-    curvatures : ndarray, shape (3, rows, columns)
-        Out; 0 for curvatures without weight.
-    spans : ndarray, shape (k,), int
-        Distances m; below each the mean variance of z(i − m) − 2 z(i) + z(i + m) along rows goes into `wide`, (k,).
+    See `solve_heights`; `out` has shape (rows, columns).
     """
-    rows, columns = heights.shape
-    number = np.zeros(len(spans))
+    rows, columns = out.shape
     column = np.empty(2 * (side + 2 * margin) + 1)
-    wide[:] = 0.0
     for row in range(0, rows, side):
         for col in range(0, columns, side):
             j0, i0 = max(0, row - margin), max(0, col - margin)
             j1, i1 = min(rows, row + side + margin), min(columns, col + side + margin)
             n, m = j1 - j0, i1 - i0
-            band, inverse = np.empty((n * m, 2 * m + 1)), np.empty((n * m, 2 * m + 1))
-            _fill(system, curve, (j0, i0), (n, m), True, band)
+            band, inverse = np.zeros((n * m, 2 * m + 1)), np.empty((n * m, 4 * m + 1))
+            for j in range(n):
+                for i in range(m):
+                    for k in range(7):
+                        if j + _DOWN[k] < n and 0 <= i + _ALONG[k] < m:
+                            band[j * m + i, _DOWN[k] * m + _ALONG[k]] = system[k, j0 + j, i0 + i]
             done = _factor(band)
             if done:
                 _invert(band, inverse, column)
-                for k in range(len(spans)):
-                    _add_wide(inverse, (n, m), spans[k], wide, number, k)
             for j in range(row, min(rows, row + side)):
                 for i in range(col, min(columns, col + side)):
-                    heights[j, i] = inverse[(j - j0) * m + i - i0, 2 * m] if done else np.nan
-                    for kind in range(3):
-                        curvatures[kind, j, i] = 0.0
-                        if done and curve[kind, j, i] > 0.0:
-                            curvatures[kind, j, i] = _variance(inverse, j - j0, i - i0, kind, (n, m))
-
-
-@inner
-def _add_wide(inverse, shape, span, wide, number, k):
-    """Bring the variances of a part's second differences over 2 · `span` posts of a row into their mean."""
-    rows, columns = shape
-    w = inverse.shape[1] - 1
-    for j in range(rows):
-        for i in range(span, columns - span):
-            n = j * columns + i
-            total = inverse[n - span, w] + 4.0 * inverse[n, w] + inverse[n + span, w]
-            total += 2.0 * inverse[n + span, w - 2 * span]
-            total -= 4.0 * (inverse[n, w - span] + inverse[n + span, w - span])
-            number[k] += 1.0
-            wide[k] += (total - wide[k]) / number[k]
-
-
-@inner
-def _variance(inverse, j, i, kind, shape):
-    """Variance of a curvature; 0 where it is not inside."""
-    rows, columns = shape
-    w = inverse.shape[1] - 1
-    count = 3 if kind < 2 else 4
-    total = 0.0
-    for k in range(count):
-        dj, di, a = curvature(kind, k)
-        if not (0 <= j + dj < rows and 0 <= i + di < columns):
-            return 0.0
-        n = (j + dj) * columns + i + di
-        for q in range(count):
-            ej, ei, b = curvature(kind, q)
-            if not (0 <= j + ej < rows and 0 <= i + ei < columns):
-                return 0.0
-            o = (j + ej) * columns + i + ei
-            total += a * b * inverse[max(n, o), w - abs(n - o)]
-    return total
+                    out[j, i] = inverse[(j - j0) * m + i - i0, 2 * m] if done else np.nan

@@ -12,6 +12,11 @@ _STRIDE = 0.25
 _HALVINGS = 20
 #: Least that a surface's height counts on a ray that grazes it.
 _GRAZING = 0.1
+#: Facets along a side of a cell whose steepness is known.
+CELL = 8
+#: What a surface may rise around a ray, part of what the ray comes down, that it is met but once without a look; steps
+#: to where it is, and the part of a facet to which they find it.
+_GENTLE, _STEPS, _EXACT = 0.5, 12, 1e-5
 
 
 @inner
@@ -61,8 +66,67 @@ def _rise(posts, u, v, ku, kv):
     return along * ku + down * kv
 
 
+@inner
+def _only_hit(posts, u, v, ku, kv, z):
+    """Height at which the same line meets a surface that it meets once, by Newton's way from z; NaN: not found."""
+    rows, columns = posts.shape
+    enough = _EXACT / (abs(ku) + abs(kv) + 1e-12)
+    for _ in range(_STEPS):
+        x, y = u + z * ku, v + z * kv
+        x, y = min(max(x, 0.0), columns - 1.0), min(max(y, 0.0), rows - 1.0)
+        i, j = min(int(x), columns - 2), min(int(y), rows - 2)
+        a, b = x - i, y - j
+        p00, p01, p10, p11 = posts[j, i], posts[j, i + 1], posts[j + 1, i], posts[j + 1, i + 1]
+        upper, lower = p00 + a * (p01 - p00), p10 + a * (p11 - p10)
+        rise = ((1.0 - b) * (p01 - p00) + b * (p11 - p10)) * ku + (lower - upper) * kv
+        step = (upper + b * (lower - upper) - z) / (1.0 - rise)
+        z += step
+        if abs(step) <= enough:
+            return z
+    return np.nan
+
+
 @kernel
-def transfer(low, high, step, levels, posts, out):
+def steepness(posts, out):
+    """Largest difference of neighbouring posts in cells of `CELL` × `CELL` facets and in those around each.
+
+    `out` has shape (⌈(rows − 1)/CELL⌉, ⌈(columns − 1)/CELL⌉).
+    """
+    rows, columns = posts.shape
+    out[:] = 0.0
+    for j in range(rows):
+        for i in range(columns):
+            most = 0.0
+            if i + 1 < columns:
+                most = abs(posts[j, i + 1] - posts[j, i])
+            if j + 1 < rows:
+                most = max(most, abs(posts[j + 1, i] - posts[j, i]))
+            # A post on the border of cells belongs to both, and cells around have it, too.
+            for n in range(max(0, (j - 1) // CELL - 1), min(out.shape[0], j // CELL + 2)):
+                for m in range(max(0, (i - 1) // CELL - 1), min(out.shape[1], i // CELL + 2)):
+                    out[n, m] = max(out[n, m], most)
+
+
+@inner
+def _hit(posts, steep, u, v, ku, kv, top, bottom, slope, z):
+    """Where a ray first meets the surface: at once where all below the ray from above is gentle, else by a search from
+    above; z: about there."""
+    reach = abs(ku) + abs(kv)
+    found = _only_hit(posts, u, v, ku, kv, z)
+    at, clear = found, not np.isnan(found)
+    while clear:
+        i, j = int(u + at * ku) // CELL, int(v + at * kv) // CELL
+        i, j = min(max(i, 0), steep.shape[1] - 1), min(max(j, 0), steep.shape[0] - 1)
+        clear = steep[j, i] * reach < _GENTLE
+        # What is around a cell goes as far as that.
+        at += CELL / max(reach, 1e-12)
+        if at > top:
+            break
+    return found if clear else _first_hit(posts, u, v, ku, kv, top, bottom, slope)
+
+
+@kernel
+def transfer(low, high, step, levels, posts, steep, out):
     """Where the rays of all pixels of a window first meet the surface: what hides behind it is met by none.
 
     Parameters
@@ -75,6 +139,8 @@ def transfer(low, high, step, levels, posts, out):
         The two levels, metres; the rays are straight in between and beyond.
     posts : ndarray, shape (m, n)
         Heights, metres, none of them NaN.
+    steep : ndarray
+        See `steepness`.
     out : ndarray, shape (height, width, 4), float32
         Column and row of the posts where the ray of a pixel ends, and by how much these change if the surface there
         rises, 1/m: (X − X0)/(Z − Z0) of Schlüter 2001, eq. 1, over 1 less the surface's own rise along the ray.
@@ -85,33 +151,39 @@ def transfer(low, high, step, levels, posts, out):
     for j in range(rows):
         for i in range(columns):
             top, bottom = max(top, posts[j, i]), min(bottom, posts[j, i])
-            if i > 0:
-                slope = max(slope, abs(posts[j, i] - posts[j, i - 1]))
-            if j > 0:
-                slope = max(slope, abs(posts[j, i] - posts[j - 1, i]))
+    for j in range(steep.shape[0]):
+        for i in range(steep.shape[1]):
+            slope = max(slope, steep[j, i])
     top, bottom = top + 1e-3, bottom - 1e-3
     rise = levels[1] - levels[0]
-    at = np.zeros(4)
+    first, way = np.zeros(4), np.zeros(4)
+    z = 0.5 * (top + bottom)
     for r in range(out.shape[0]):
         j = min(r // step, low.shape[0] - 2)
         b = r / step - j
-        for c in range(out.shape[1]):
-            i = min(c // step, low.shape[1] - 2)
-            a = c / step - i
-            w00, w01, w10, w11 = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
-            out[r, c] = np.nan
+        for i in range(low.shape[1] - 1):
+            # Along a row rays change linearly from node to node.
             for k in range(2):
-                at[k] = w00 * low[j, i, k] + w01 * low[j, i + 1, k]
-                at[k] += w10 * low[j + 1, i, k] + w11 * low[j + 1, i + 1, k]
-                end = w00 * high[j, i, k] + w01 * high[j, i + 1, k]
-                end += w10 * high[j + 1, i, k] + w11 * high[j + 1, i + 1, k]
-                at[2 + k] = (end - at[k]) / rise
-                at[k] -= levels[0] * at[2 + k]
-            if np.isnan(at[0] + at[1]):
-                continue
-            z = _first_hit(posts, at[0], at[1], at[2], at[3], top, bottom, slope)
-            u, v = at[0] + z * at[2], at[1] + z * at[3]
-            if u >= 0.0 and v >= 0.0 and u <= columns - 1.0 and v <= rows - 1.0:
-                towards = max(1.0 - _rise(posts, u, v, at[2], at[3]), _GRAZING)
-                out[r, c, 0], out[r, c, 1] = u, v
-                out[r, c, 2], out[r, c, 3] = at[2] / towards, at[3] / towards
+                p = (1.0 - b) * low[j, i, k] + b * low[j + 1, i, k]
+                p1 = (1.0 - b) * low[j, i + 1, k] + b * low[j + 1, i + 1, k]
+                t = ((1.0 - b) * high[j, i, k] + b * high[j + 1, i, k] - p) / rise
+                t1 = ((1.0 - b) * high[j, i + 1, k] + b * high[j + 1, i + 1, k] - p1) / rise
+                first[k], first[2 + k] = p - levels[0] * t, t
+                way[k], way[2 + k] = ((p1 - levels[0] * t1) - first[k]) / step, (t1 - t) / step
+            last = out.shape[1] if i == low.shape[1] - 2 else min(out.shape[1], (i + 1) * step)
+            for c in range(i * step, last):
+                a = c - i * step
+                u0, v0 = first[0] + a * way[0], first[1] + a * way[1]
+                ku, kv = first[2] + a * way[2], first[3] + a * way[3]
+                for k in range(4):
+                    out[r, c, k] = np.nan
+                if np.isnan(u0 + v0 + ku + kv):
+                    continue
+                z = _hit(posts, steep, u0, v0, ku, kv, top, bottom, slope, z)
+                u, v = u0 + z * ku, v0 + z * kv
+                if u >= 0.0 and v >= 0.0 and u <= columns - 1.0 and v <= rows - 1.0:
+                    towards = max(1.0 - _rise(posts, u, v, ku, kv), _GRAZING)
+                    out[r, c, 0], out[r, c, 1] = u, v
+                    out[r, c, 2], out[r, c, 3] = ku / towards, kv / towards
+                if np.isnan(z):
+                    z = 0.5 * (top + bottom)

@@ -15,27 +15,33 @@ from numpy.typing import NDArray
 
 from photoplan.kernels.facets_grey import OFFSETS, PAD, add_grey, sample_grey, solve_grey
 from photoplan.kernels.facets_height import add_heights, add_means
-from photoplan.kernels.facets_solve import solve_heights, variances
-from photoplan.matching.facets.curvature import SPANS, Known, Roughness
+from photoplan.kernels.facets_solve import add_curvatures, solve_heights, variances
+from photoplan.matching.facets.curvature import Roughness, Smoother
 from photoplan.matching.facets.observe import Facets, Sight, View
 from photoplan.matching.facets.radiometry import Transfer, first_guess, levelled
 
 _Floats = NDArray[np.float32]
 _Doubles = NDArray[np.float64]
 
-#: Iterations of a level at most, and the mean correction at which they end, grey facets (pixels).
-MOST, ENOUGH = 12, 0.01
+#: The mean correction at which iterations end, grey facets (pixels).
+ENOUGH = 0.01
 #: Largest correction in one iteration, grey facets.
 _FARTHEST = 2.0
 #: Residuals from so many standard deviations on count less (Huber 1964), and what that takes from their variance.
 _LIMIT, _TAKEN = 2.5, 0.978
-#: Conjugate gradients of grey values: rounds at most, and the factor by which the error falls.
-_ROUNDS, _FALL = 25, 0.01
+#: Conjugate gradients of grey values: rounds at most, and the part of their standard deviations that is exact enough.
+_ROUNDS, _EXACT = 25, 0.1
 #: Pixels beyond those that grey values need, part of all, without which a surface is not tried.
 _TELLING = 0.05
 _NONE = np.empty((0, 0), np.float32)
-#: Posts of a part that is solved at once, and around it.
+#: Conjugate gradients of heights: rounds at most, and the part of the equations that may be left.
+_MOST, _LEFT = 400, 0.01
+#: Posts of a part whose variances are computed at once, and around it.
 _SIDE, _MARGIN = 24, 8
+#: Posts along the border of a block from which nothing is learnt about its roughness.
+_BORDER = 6
+#: Times by which curvatures weigh more to see what they take away.
+_STIFFER = 1.2
 #: Least standard deviation of grey values, parts of the contrast: images without noise have residuals of rounding.
 _QUIET = 1e-4
 
@@ -52,6 +58,8 @@ class Block:
     roughness: Roughness
     sigmas: _Doubles
     """Standard deviation of the grey values of each view, in the system of the surface."""
+    scale: float = 1.0
+    """See `parallax`."""
     views: list[View] = field(default_factory=list)
     """Whose sights they are."""
     values: _Floats = field(default_factory=lambda: np.empty((0, 0), np.float32))
@@ -60,38 +68,44 @@ class Block:
     """Mean correction of every iteration so far, pixels of the parallax between the outermost views."""
     system: _Doubles = field(default_factory=lambda: np.empty((0, 0, 0)))
     """Normal equations of the heights, of the pixels alone."""
+    noise: _Doubles = field(default_factory=lambda: np.empty((0, 0)))
+    """Right-hand side of the heights of independent errors of the pixels."""
     counted: NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 0), np.uint8))
     """Views that have pixels around each post."""
     sums: _Doubles = field(default_factory=lambda: np.zeros((0, 2)))
     """Of each view: Σ of robust factors times squared residuals in its own grey values; redundancy."""
     _factors: list[_Floats] = field(default_factory=list)
+    _pull: tuple[_Doubles, _Doubles] = (np.empty((0, 0)), np.empty((0, 0)))
+    """Heights where the last equations were set up, and their right-hand side, of the pixels alone."""
 
-    def adjust(self, most: int = MOST) -> None:
-        """Iterate until the heights stay."""
-        for _ in range(most):
-            self.iterate()
+    def adjust(self, most: int, radiometry: bool) -> None:
+        """Iterate until the heights stay; perhaps with parameters of the radiometry improved in the first iteration."""
+        for k in range(most):
+            self.iterate(radiometry and k == 0)
             if self.moves[-1] < ENOUGH:
                 break
 
-    def iterate(self) -> None:
+    def iterate(self, radiometry: bool = True) -> None:
         """One correction of everything."""
         self.sights = [sight.onto(self.heights) for sight in self.sights]
         grey, weights = self._observed()
         if not len(self.values):
             self._start(grey, weights)
         density = self._solve_grey(grey, weights)
-        if len(self.sights) > 1:
+        if radiometry:
             self._improve_radiometry(weights)
             grey, weights = self._observed()
-        right = self._heights(grey, weights, density)
-        right -= self.roughness.gradient(self.heights)
-        change = np.empty_like(self.heights)
-        solve_heights(self.system, self.roughness.weights, right, _SIDE, _MARGIN, change)
-        scale = self.parallax()
+        self._pull = self.heights, self._heights(grey, weights, density)
+        self._settle()
         known = self.counted > 1
-        change = np.clip(change, -_FARTHEST / scale, _FARTHEST / scale)
-        self.heights = self.heights + change
-        self.moves.append(float(np.sqrt(np.mean(change[known] ** 2)) * scale) if known.any() else 0.0)
+        change = self.heights - self._pull[0]
+        self.moves.append(float(np.sqrt(np.mean(change[known] ** 2)) * self.scale) if known.any() else 0.0)
+
+    def _settle(self) -> None:
+        """Heights by the equations of the last iteration and the curvatures' weights as they are now."""
+        before, right = self._pull
+        (change,) = self._solved(right - self.roughness.gradient(before))
+        self.heights = before + np.clip(change, -_FARTHEST / self.scale, _FARTHEST / self.scale)
 
     def misfit(self, heights: _Doubles) -> float:
         """Variance of the grey values about a surface of these heights over their own; infinite if few pixels tell."""
@@ -109,19 +123,37 @@ class Block:
         surface = np.concatenate([trial._surface_at(s, w)[w > 0] for s, w in zip(trial.sights, weights)])
         return float(np.sum((values - surface) ** 2) / free / max(float(values.var()), 1e-12))
 
-    def variances(self) -> tuple[_Doubles, Known]:
-        """Variances of heights (rows, columns) and of curvatures."""
-        heights, curvatures = np.empty(self.facets.shape), np.empty((3, *self.facets.shape))
-        wide = np.empty(len(SPANS))
-        spans = np.array(SPANS)
-        variances(self.system, self.roughness.weights, _SIDE, _MARGIN, heights, curvatures, spans, wide)
-        return heights, Known(curvatures, wide)
+    def variances(self) -> _Doubles:
+        """Of the heights, shape (rows, columns): of the pixels' noise, and of what smoothing takes away."""
+        found = np.empty((2, *self.facets.shape))
+        for out, stiffer in zip(found, (1.0, _STIFFER)):
+            variances(self._equations(stiffer), _SIDE, _MARGIN, out)
+        return self.roughness.sandwich(self.heights, self._smoother(), found, _STIFFER)
 
-    def roughen(self) -> None:
-        """Estimate the variances of the curvatures."""
-        _, known = self.variances()
-        weights = self.system[0] + 2 * self.system[[1, 4]].sum(axis=0)
-        self.roughness = self.roughness.estimated(self.heights, known, weights)
+    def roughen(self, times: int) -> None:
+        """Estimate the variances of the curvatures, and the heights with them."""
+        for _ in range(times):
+            self.roughness = self.roughness.estimated(self.heights, self._smoother())
+            self._settle()
+
+    def _smoother(self) -> Smoother:
+        inside = np.zeros(self.facets.shape, bool)
+        inner = (slice(_BORDER, -_BORDER),) * 2
+        inside[inner] = (self.counted > 1)[inner]
+        return Smoother(lambda rights: self._solved(*rights), self.noise, inside)
+
+    def _equations(self, stiffer: float = 1.0) -> _Doubles:
+        """Normal equations of pixels and curvatures."""
+        out = self.system.copy()
+        add_curvatures(stiffer * self.roughness.weights, out)
+        return out
+
+    def _solved(self, *rights: _Doubles) -> _Doubles:
+        """Solutions of the normal equations for right-hand sides, shape (k, rows, columns)."""
+        out, system = np.zeros((len(rights), *self.facets.shape)), self._equations()
+        for right, x in zip(rights, out):
+            solve_heights(system, right, _MOST, _LEFT, x)
+        return out
 
     def parallax(self) -> float:
         """How far the outermost views of a place part when its height changes, grey facets (pixels) per metre."""
@@ -174,8 +206,7 @@ class Block:
         # Coefficients that hardly any pixel knows stay near what they were.
         system[..., 3] += np.float32(1e-4 * usual)
         right += np.float32(1e-4 * usual) * self.values
-        by_offsets = np.ascontiguousarray(np.moveaxis(system, -1, 0))
-        solve_grey(by_offsets, right, _smooth(density) + np.float32(0.05 * usual), self.values, _ROUNDS, _FALL)
+        solve_grey(system, right, _smooth(density) + np.float32(0.05 * usual), self.values, _ROUNDS, _EXACT)
         return density
 
     def _surface_at(self, sight: Sight, weights: _Floats) -> _Floats:
@@ -203,6 +234,7 @@ class Block:
             add_means(sight.places, w, sums)
         means = sums[..., 1:] / np.maximum(sums[..., :1], 1e-30)
         self.system, right = np.zeros((7, rows, columns)), np.zeros((rows, columns))
+        self.noise = np.zeros((rows, columns))
         counted = np.zeros((rows, columns), np.uint8)
         found, residuals = np.zeros((len(self.sights), 3)), np.empty(0)
         for n, (sight, g, w) in enumerate(zip(self.sights, grey, weights)):
@@ -210,7 +242,7 @@ class Block:
             before = self.system[0].copy()
             add_heights(
                 sight.places, g, w, self.values, self.facets.ratio, means, self.sigmas[n], _LIMIT,
-                self.system, right, residuals, self._factors[n], found[n],
+                self.system, right, self.noise, residuals, self._factors[n], found[n],
             )  # fmt: skip
             counted += self.system[0] > before
         self.counted = counted

@@ -3,37 +3,52 @@
 A second difference of the heights is observed to be zero (Wrobel, Kaiser and Hausladen 1992). How little that says,
 its variance, is a component estimated from the heights themselves, in patches and for each direction, since terrain is
 rough here and smooth there. Differences follow Student's distribution, which lets breaklines be.
+
+Terrain's curvatures are not independent, so that the variance of those from post to post says little of those over
+the distance by which a surface is smoothed. With N = S + R of pixels and curvatures, what smoothing takes away of a
+surface z is N⁻¹ R z; of the smoothed one, N⁻¹ R N⁻¹ S z: a band of wavelengths around those where pixels and
+curvatures weigh alike. Variances are such that this band holds what independent curvatures would put there.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photoplan.matching.facets.observe import Facets
+
 _Doubles = NDArray[np.float64]
 
 #: Posts along a patch that has its own variances.
-_PATCH = 16
+_PATCH = 24
 #: Degrees of freedom of the curvatures.
 _FREEDOM = 4.0
-#: Redundancy with which the mean of a block takes part in the variance of each patch.
-_ENOUGH = 10.0
-
-
-#: Posts over which second differences are taken.
-SPANS = (1, 2, 4, 8)
+#: The part with which the mean of a block takes part in the variances of each patch, and what these change at once.
+_SHARED, _MOST = 0.25, 64.0
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
-    """Variances of second differences of heights, as they come out of an adjustment."""
+class Smoother:
+    """The normal equations of an adjustment."""
 
-    single: _Doubles
-    """Of each, shape (3, rows, columns); 0: unknown."""
-    wide: _Doubles
-    """Mean of those over each of `SPANS`."""
+    solve: Callable[[Sequence[_Doubles]], _Doubles]
+    """N⁻¹ of right-hand sides, shape (k, rows, columns)."""
+    noise: _Doubles
+    """A right-hand side of errors of the pixels, shape (rows, columns)."""
+    inside: NDArray[np.bool_]
+    """Posts that tell: seen by some images, and away from the border."""
+
+    def mean(self, values: _Doubles, shared: float) -> _Doubles:
+        """Means of what tells over patches and, in the part `shared`, of all of the block, (rows, columns)."""
+        number = max(float(np.count_nonzero(self.inside)), 1.0)
+        telling = np.where(self.inside, values, 0.0)
+        whole = float(telling.sum()) / number
+        own, share = _means(telling), _means(self.inside.astype(float))
+        few = 1.0 / _PATCH**2
+        return np.asarray((1 - shared) * (own + few * whole) / (share + few) + shared * whole)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +65,10 @@ class Roughness:
         """One standard deviation everywhere, metres."""
         return cls(np.full((3, *shape), sigma**2), _inside(shape).astype(float))
 
+    def on(self, own: Facets, finer: Facets) -> Roughness:
+        """The same variances at the posts of other facets, all curvatures counting alike."""
+        return Roughness(own.sampled(self.squares, finer.posts), _inside(finer.shape).astype(float))
+
     @property
     def weights(self) -> _Doubles:
         """Of the curvatures, shape (3, rows, columns)."""
@@ -57,78 +76,92 @@ class Roughness:
 
     def gradient(self, heights: _Doubles) -> _Doubles:
         """Half the gradient of the weighted sum of their squares, shape (rows, columns)."""
-        c, out = self.weights * curvatures(heights), np.zeros_like(heights)
-        for shift, a in ((-1, 1.0), (0, -2.0), (1, 1.0)):
-            out += a * np.roll(c[0], shift, axis=1) + a * np.roll(c[1], shift, axis=0)
-        for k in range(4):
-            out += (1.0 if k in (0, 3) else -1.0) * np.roll(c[2], (k // 2, k % 2), axis=(0, 1))
-        return out
+        return _transposed(self.weights * curvatures(heights))
 
-    def smoothing(self, weights: _Doubles) -> float:
-        """Posts over which a surface is smoothed, from the weights that pixels give to the heights (rows, columns):
-        the fourth root of what a curvature weighs in them."""
-        known = weights > 0
-        if not known.any():
-            return float(SPANS[-1])
-        return float(np.median((weights * self.squares.mean(axis=0))[known]) ** -0.25)
-
-    def estimated(self, heights: _Doubles, known: Known, weights: _Doubles) -> Roughness:
-        """Variances from heights and how well they are known: Σ f c² / Σ (1 − var/σ²) (Förstner 1979).
-
-        Differences are taken as far apart as the surface is smoothed (`smoothing`, from the `weights` of the heights):
-        if curvatures are correlated, as those of terrain are, it is their sum over this length that a weight too
-        large would take away, and that a standard deviation has to tell.
-        """
-        k = int(np.argmin(np.abs(np.log(SPANS) - np.log(max(self.smoothing(weights), 1e-9)))))
-        span = SPANS[k]
-        c, inside = curvatures(heights, span), _inside(self.factors.shape[1:], span)
-        sums = np.array([(2 * span**3 + span) / 3] * 2 + [span**2])[:, None, None]
-        normal = np.where(inside, c**2 / (sums * self.squares), 0.0)
-        factors = np.where(inside, (_FREEDOM + 1) / (_FREEDOM + normal), 0.0)
-        if span > 1:
-            share = known.wide[k] / (sums[0, 0, 0] * self.squares[0].mean())
-            redundancy = inside * np.clip(1 - share, 0.1, 1.0)
-        else:
-            redundancy = np.where(known.single > 0, np.clip(1 - factors * known.single / self.squares, 0.0, 1.0), 0.0)
-            factors = np.where(known.single > 0, factors, 0.0)
-        above, below = _means(factors * normal * self.squares), _means(redundancy)
-        # Where the texture determines few curvatures, those of the whole block count with as many.
-        found = np.log(np.maximum(above / np.maximum(below, 1e-30), 1e-12 * self.squares))
-        total = np.maximum(below.sum(axis=(1, 2)), 1e-30)
-        usual = ((below * found).sum(axis=(1, 2)) / total)[:, None, None]
-        few = _ENOUGH / _PATCH**2
-        squares = np.exp((below * found + few * usual) / (below + few))
+    def estimated(self, heights: _Doubles, smoother: Smoother) -> Roughness:
+        """Variances with which the band around the smoothing length holds what it does in heights (rows, columns)."""
+        mean = smoother.mean
+        seen, drawn, noise = (band**2 for band in self._bands(heights, smoother, 1)[0][0])
+        usual = np.maximum(mean(drawn + noise, 0.0), 1e-300)
+        weighed = seen * (_FREEDOM + 1) / (_FREEDOM + seen / usual)
+        # In parts of what is usual at a place, all places count alike.
+        change = mean((weighed - noise) / usual, _SHARED) / np.maximum(mean(drawn / usual, _SHARED), 1e-30)
+        # Of smooth terrain it falls with the 2.5th power of the variance: whole steps would not settle.
+        squares = self.squares * np.sqrt(np.clip(change, 1 / _MOST, _MOST))
         single = curvatures(heights) ** 2 / squares
         return Roughness(squares, np.where(self.factors > 0, (_FREEDOM + 1) / (_FREEDOM + single), 0.0))
 
+    def sandwich(self, heights: _Doubles, smoother: Smoother, variances: _Doubles, stiffer: float) -> _Doubles:
+        """Variances of heights (rows, columns), of the pixels' noise and of what smoothing takes away.
 
-def curvatures(heights: _Doubles, span: int = 1) -> _Doubles:
-    """Second differences over `span` posts along columns, along rows and across, shape (3, rows, columns); 0 where they
-    are not inside."""
-    out, s = np.zeros((3, *heights.shape)), span
-    if min(heights.shape) > 2 * s:
-        out[0, :, s:-s] = heights[:, 2 * s :] - 2 * heights[:, s:-s] + heights[:, : -2 * s]
-        out[1, s:-s] = heights[2 * s :] - 2 * heights[s:-s] + heights[: -2 * s]
-        out[2, :-s, :-s] = heights[:-s, :-s] - heights[:-s, s:] - heights[s:, :-s] + heights[s:, s:]
+        `variances` are the diagonals of N⁻¹ with these weights and with weights `stiffer` times as large, (2, rows,
+        columns): how much they fall is the part N⁻¹ R N⁻¹ that independent curvatures would have. The real one is
+        Σ B² P over wavelengths, if smoothing takes the part B away of a power P. Of B² = (1 − B)² (B² + 2 B³ + 3 B⁴ + …)
+        the first terms are seen in the smoothed surface; the others are those of independent curvatures, as many
+        times as the third is.
+        """
+        whole = variances[0]
+        prior = np.clip(-np.log(variances[1] / whole) / np.log(stiffer), 0.0, 1.0) * whole
+        bands, taken = self._bands(heights, smoother, 2)
+        mean = smoother.mean
+        usual = np.maximum(mean(taken**2, 0.0), 1e-300)
+        known, rest = np.zeros_like(prior), np.ones_like(prior)
+        for n, (a, b) in enumerate(((0, 0), (0, 1), (1, 1))):
+            seen, drawn, noise = (bands[a][k] * bands[b][k] / usual for k in range(3))
+            known += (n + 1) * mean(seen - noise, _SHARED)
+            rest -= (n + 1) * mean(drawn, _SHARED)
+        times = mean(seen - noise, 1.0) / np.maximum(mean(drawn, 1.0), 1e-30)
+        share = np.clip(known + np.maximum(times, 0.0) * np.maximum(rest, 0.0), 0.0, _MOST)
+        return np.asarray(whole - prior + share * prior)
+
+    def _bands(self, heights: _Doubles, smoother: Smoother, count: int) -> tuple[list[_Doubles], _Doubles]:
+        """(N⁻¹ R)ⁿ of a smoothed surface, n = 1 … count: of heights, and expected ones of independent curvatures and
+        of noise, each of shape (3, rows, columns); and what smoothing takes away of the second, not yet smoothed."""
+        signs = np.random.default_rng(5).integers(0, 2, self.squares.shape) * 2.0 - 1.0
+        drawn = _transposed(np.sqrt(self.weights) * signs)
+        first, taken, noise = smoother.solve([self.gradient(heights), drawn, smoother.noise])
+        again = smoother.solve([self.gradient(taken), self.gradient(noise)])
+        bands = [np.stack([first, taken - again[0], again[1]])]
+        for _ in range(count - 1):
+            bands.append(smoother.solve([self.gradient(band) for band in bands[-1]]))
+        return bands, taken
+
+
+def _transposed(c: _Doubles) -> _Doubles:
+    """The transpose of `curvatures`, shape (rows, columns), for c that are 0 where they are not inside."""
+    out = np.zeros(c.shape[1:])
+    for shift, a in ((-1, 1.0), (0, -2.0), (1, 1.0)):
+        out += a * np.roll(c[0], shift, axis=1) + a * np.roll(c[1], shift, axis=0)
+    for k in range(4):
+        out += (1.0 if k in (0, 3) else -1.0) * np.roll(c[2], (k // 2, k % 2), axis=(0, 1))
     return out
 
 
-def _inside(shape: tuple[int, int], span: int = 1) -> NDArray[np.bool_]:
+def curvatures(heights: _Doubles) -> _Doubles:
+    """Second differences along columns, along rows and across, shape (3, rows, columns); 0 where not inside."""
+    out = np.zeros((3, *heights.shape))
+    out[0, :, 1:-1] = heights[:, 2:] - 2 * heights[:, 1:-1] + heights[:, :-2]
+    out[1, 1:-1] = heights[2:] - 2 * heights[1:-1] + heights[:-2]
+    out[2, :-1, :-1] = heights[:-1, :-1] - heights[:-1, 1:] - heights[1:, :-1] + heights[1:, 1:]
+    return out
+
+
+def _inside(shape: tuple[int, int]) -> NDArray[np.bool_]:
     """Which of `curvatures` are inside."""
-    out, s = np.zeros((3, *shape), bool), span
-    if min(shape) > 2 * s:
-        out[0, :, s:-s] = out[1, s:-s] = out[2, :-s, :-s] = True
+    out = np.zeros((3, *shape), bool)
+    out[0, :, 1:-1] = out[1, 1:-1] = out[2, :-1, :-1] = True
     return out
 
 
 def _means(values: _Doubles) -> _Doubles:
-    """Means around each post over patches of about `_PATCH` posts, shape (3, rows, columns)."""
+    """Means around each post over patches of about `_PATCH` posts, shape (rows, columns)."""
     out = values
-    for axis in (1, 2):
+    for axis in (0, 1):
         count, half = values.shape[axis], _PATCH // 2
         sums = np.insert(np.cumsum(out, axis=axis), 0, 0.0, axis=axis)
         at = np.arange(count)
         first, last = np.maximum(at - half, 0), np.minimum(at + half, count)
-        width = (last - first).reshape([-1 if k == axis else 1 for k in range(3)])
-        out = (sums.take(last, axis) - sums.take(first, axis)) / width
+        out = (sums.take(last, axis) - sums.take(first, axis)) / (last - first).reshape(
+            (-1, 1) if axis == 0 else (1, -1)
+        )
     return out

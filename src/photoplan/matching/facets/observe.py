@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photoplan.cameras.base import Camera, project
 from photoplan.geometry.grid import Window
-from photoplan.kernels.facets_transfer import transfer
+from photoplan.kernels.facets_transfer import CELL, steepness, transfer
 from photoplan.matching.facets.pyramid import Pyramid
 
 _Floats = NDArray[np.float32]
@@ -18,7 +18,7 @@ _Doubles = NDArray[np.float64]
 
 #: Rays are followed for pixels this far apart, or closer where rays between them would be off by more than this part of
 #: a grey facet.
-_STEP, _OFF = 32, 0.004
+_STEP, _OFF = 32, 0.001
 #: Points along a side of a block that are projected to find its pixels.
 _POINTS = 9
 
@@ -95,7 +95,9 @@ class Sight:
     def onto(self, heights: _Doubles) -> Sight:
         """The same pixels, carried to a surface of heights at the posts."""
         places = np.empty((*self.raw.shape, 4), np.float32)
-        transfer(self.low, self.high, self.step, self.levels, heights, places)
+        steep = np.empty((-(-(heights.shape[0] - 1) // CELL), -(-(heights.shape[1] - 1) // CELL)))
+        steepness(heights, steep)
+        transfer(self.low, self.high, self.step, self.levels, heights, steep, places)
         return replace(self, places=places)
 
 

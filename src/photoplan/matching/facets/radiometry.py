@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photoplan.kernels.facets_radiometry import add_radiometry, transferred
+from photoplan.kernels.facets_radiometry import add_radiometry, solve_radiometry, transferred
 from photoplan.matching.facets.observe import Facets, Sight
 
 _Floats = NDArray[np.float32]
@@ -57,8 +57,8 @@ class Transfer:
         lattice = self._lattice(facets)
         add_radiometry(sight.places, sight.raw, weights, surface, (rows, columns), lattice, system, right)
         self._tie(system, right, contrast)
-        found = np.linalg.solve(system, right)
-        offsets, gains = found[:n].reshape(rows, columns), found[n:].reshape(rows, columns)
+        solve_radiometry(system, right)
+        offsets, gains = right[:n].reshape(rows, columns), right[n:].reshape(rows, columns)
         return Transfer(offsets, np.maximum(gains, 0.05), self.left, self.top, self.pitch)
 
     @property

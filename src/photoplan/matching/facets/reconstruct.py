@@ -19,8 +19,9 @@ _Doubles = NDArray[np.float64]
 
 #: Posts around a window that are adjusted with it and belong to its neighbours.
 MARGIN = 12
-#: Iterations until roughness is first estimated, and after each of its estimates, of which the last level has more.
-_FIRST, _THEN, _ESTIMATES = 4, 3, (3, 1)
+#: Iterations of the coarsest level and of others until roughness is estimated; for the last level and others, how many
+#: estimates follow each other, and iterations after each series.
+_FIRST, _THEN = (4, 2), (((3, 1), (2, 2)), ((3, 1),))
 #: Standard deviation of curvatures until it is estimated, pixels of parallax.
 _LOOSE = 0.5
 #: A view that has fewer pixels of a block is left out.
@@ -111,10 +112,10 @@ def reconstruct(
             continue
         if level == scheme.coarsest:
             block.heights = _lifted(block, scheme.reach)
-        block.adjust(_FIRST)
-        for _ in range(_ESTIMATES[level > 0]):
-            block.roughen()
-            block.adjust(_THEN)
+        block.adjust(_FIRST[level < scheme.coarsest], True)
+        for estimates, iterations in _THEN[level > 0]:
+            block.roughen(estimates)
+            block.adjust(iterations, level == 0)
         moves[level] = block.moves[-1]
     if block is None or block.facets.pitch != grid.resolution:
         return None
@@ -138,15 +139,21 @@ def _opened(views: Sequence[View], level: int, facets: Facets, heights: _Doubles
     if len(sights) < 2:
         return None
     transfers, sigmas = _radiometry(own, sights, facets, before)
-    # Loose until it is estimated: from a stiff start, what does not fit would be taken for noise.
-    block = Block(facets, sights, transfers, heights, Roughness.uniform(facets.shape, 1.0), sigmas, own)
-    block.roughness = Roughness.uniform(facets.shape, _LOOSE / block.parallax())
+    block = Block(facets, sights, transfers, heights, Roughness.uniform(facets.shape, 1.0), sigmas)
+    block.views, block.scale = own, block.parallax()
+    # Loose until it is estimated: from a stiff start, what does not fit would be taken for noise. Curvatures over twice
+    # the distance are larger than those to be estimated.
+    block.roughness = (
+        Roughness.uniform(facets.shape, _LOOSE / block.scale)
+        if before is None
+        else before.roughness.on(before.facets, facets)
+    )
     return block
 
 
 def _lifted(block: Block, reach: float) -> _Doubles:
     """The start, lifted or lowered as a whole by what fits best within its reach."""
-    pixel = 1.0 / block.parallax()
+    pixel = 1.0 / block.scale
     count = min(_MOST_TRIALS, int(np.ceil(reach / (_TRIAL * pixel) - 0.5)))
     trials = sorted(range(-count, count + 1), key=abs)
     if len(trials) == 1:
@@ -190,7 +197,7 @@ def _finer(block: Block, facets: Facets) -> _Doubles:
 
 def _found(block: Block, views: Sequence[View], window: Window, moves: tuple[float, ...]) -> Found:
     """What a block holds of its window."""
-    variance, _ = block.variances()
+    variance = block.variances()
     ratio = block.facets.ratio
     inner = slice(MARGIN, MARGIN + window.height), slice(MARGIN, MARGIN + window.width)
     count = block.counted[inner]

@@ -24,7 +24,7 @@ from photoplan.project.scenes import ScenesAddress
 Bounds = tuple[float, float, float, float]
 
 #: Side of a tile of heights; those of grey values are as many times larger as they are finer.
-TILE = 128
+TILE = 256
 #: Grey facets along a side of a height facet at most: images that are finer still are reduced.
 MOST_RATIO = 6
 #: Height facets are at least so many ground pixels of the images.
