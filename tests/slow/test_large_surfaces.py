@@ -16,19 +16,19 @@ BOUNDS = (X0 - 30, Y0 - 45, X0 + 30, Y0 + 45)
 
 
 @pytest.mark.parametrize(
-    ("images", "base", "snr", "finest", "rms", "normalised"),
+    ("images", "base", "snr", "finest", "rms"),
     [
-        (5, 60, 50, 3, 0.010, (0.7, 1.1)),
-        (3, 60, 50, 3, 0.010, (0.7, 1.1)),
-        (2, 48, 50, 3, 0.010, (0.7, 1.1)),
-        (5, 60, 10, 3, 0.025, (0.7, 1.3)),
-        (2, 48, 10, 3, 0.030, (0.7, 1.5)),
-        (5, 60, 50, 6, 0.015, (0.7, 1.1)),
-        (5, 60, 50, 12, 0.030, (0.7, 1.3)),
+        (5, 60, 50, 3, 0.010),
+        (3, 60, 50, 3, 0.010),
+        (2, 48, 50, 3, 0.010),
+        (5, 60, 10, 3, 0.025),
+        (2, 48, 10, 3, 0.030),
+        (5, 60, 50, 6, 0.015),
+        (5, 60, 50, 12, 0.030),
     ],
 )
 def test_heights_and_what_they_claim(
-    tmp_path: Path, images: int, base: float, snr: float, finest: float, rms: float, normalised: tuple[float, float]
+    tmp_path: Path, images: int, base: float, snr: float, finest: float, rms: float
 ) -> None:
     found = []
     for seed in range(4):
@@ -41,4 +41,5 @@ def test_heights_and_what_they_claim(
         assert abs(judged.error.mean()) < 0.005
         found.append((judged.rms, np.sqrt(np.mean(judged.normalised**2))))
     both = np.sqrt(np.mean(np.square(found), axis=0))
-    assert both[0] < rms and normalised[0] < both[1] < normalised[1]
+    print(images, snr, finest, both)
+    assert both[0] < rms and 0.8 < both[1] < 1.3

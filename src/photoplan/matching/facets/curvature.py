@@ -96,7 +96,7 @@ class Roughness:
 
         `variances` are the diagonals of N⁻¹ with these weights and with weights `stiffer` times as large, (2, rows,
         columns): how much they fall is the part N⁻¹ R N⁻¹ that independent curvatures would have. The real one is
-        Σ B² P over wavelengths, if smoothing takes the part B away of a power P. Of B² = (1 − B)² (B² + 2 B³ + 3 B⁴ + …)
+        Σ B² P over wavelengths, if smoothing takes the part B of a power P. Of B² = (1 − B)² (B² + 2 B³ + 3 B⁴ + …)
         the first terms are seen in the smoothed surface; the others are those of independent curvatures, as many
         times as the third is.
         """
