@@ -21,14 +21,7 @@ from photoplan.cli.output import say, show, show_json
 
 @click.command("control")
 @click.argument("project", type=PATH)
-@click.option(
-    "--ortho",
-    type=PATH,
-    multiple=True,
-    required=True,
-    metavar="FILE",
-    help="Orthophoto; may be repeated.",
-)
+@click.option("--ortho", type=PATH, multiple=True, required=True, metavar="FILE", help="Orthophoto; may be repeated.")
 @click.option("--height-sigma", type=float, required=True, metavar="M", help="Standard deviation of the heights.")
 @click.option("--ortho-sigma", type=float, metavar="M", help="Standard deviation of X and of Y in it [one pixel].")
 @click.option("--heights", type=PATH, metavar="FILE", help="[the project's terrain]")

@@ -51,12 +51,7 @@ _FILE = PATH
 @overwrite_option
 @json_option
 @quiet_option
-def command(
-    folder: Path,
-    as_json: bool,
-    quiet: bool,
-    **options: Any,
-) -> None:
+def command(folder: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     """Write DIR/project.toml from images, camera, orientation and terrain.
 
     Prints the path of the project file on stdout. Height systems must be stated by the files or declared. Without

@@ -164,9 +164,7 @@ def choosing_options(command: Callable[..., Any]) -> Callable[..., Any]:
             help="Images that come first wherever they see the ground.",
         ),
         click.option(
-            "--sources",
-            is_flag=True,
-            help="Also which image painted each pixel: NAME_sources.tif, NAME_seams.gpkg.",
+            "--sources", is_flag=True, help="Also which image painted each pixel: NAME_sources.tif, NAME_seams.gpkg."
         ),
     ]
     for option in reversed(options):

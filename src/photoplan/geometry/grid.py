@@ -253,12 +253,7 @@ class MapGrid:
     @property
     def bounds(self) -> tuple[float, float, float, float]:
         """Outer edges xmin, ymin, xmax, ymax."""
-        return (
-            self.left,
-            self.top - self.height * self.resolution,
-            self.left + self.width * self.resolution,
-            self.top,
-        )
+        return (self.left, self.top - self.height * self.resolution, self.left + self.width * self.resolution, self.top)
 
     @property
     def placement(self) -> Placement:
@@ -270,22 +265,14 @@ class MapGrid:
         """Pixel coordinates (column, row) to map X, Y; shapes (..., 2)."""
         uv = np.asarray(uv, float)
         return np.stack(
-            [
-                self.left + (uv[..., 0] + 0.5) * self.resolution,
-                self.top - (uv[..., 1] + 0.5) * self.resolution,
-            ],
-            axis=-1,
+            [self.left + (uv[..., 0] + 0.5) * self.resolution, self.top - (uv[..., 1] + 0.5) * self.resolution], axis=-1
         )
 
     def to_pixel(self, XY: ArrayLike) -> NDArray[np.float64]:
         """Map X, Y to pixel coordinates (column, row); inverse of `to_map`."""
         XY = np.asarray(XY, float)
         return np.stack(
-            [
-                (XY[..., 0] - self.left) / self.resolution - 0.5,
-                (self.top - XY[..., 1]) / self.resolution - 0.5,
-            ],
-            axis=-1,
+            [(XY[..., 0] - self.left) / self.resolution - 0.5, (self.top - XY[..., 1]) / self.resolution - 0.5], axis=-1
         )
 
     def bounds_of(self, window: Window) -> tuple[float, float, float, float]:

@@ -67,7 +67,4 @@ class Pose:
         return Pose(-self.R_ground_camera.T @ self.center, self.R_ground_camera.T)
 
     def __matmul__(self, other: Pose) -> Pose:
-        return Pose(
-            self.R_ground_camera @ other.center + self.center,
-            self.R_ground_camera @ other.R_ground_camera,
-        )
+        return Pose(self.R_ground_camera @ other.center + self.center, self.R_ground_camera @ other.R_ground_camera)

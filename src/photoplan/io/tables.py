@@ -198,11 +198,7 @@ def read_table(path: Path, columns: Columns, dialect: Dialect = Dialect(), max_b
         if len(row) != layout.width:
             raise InputError(f"{path}:{line}: {wrong_width(len(row), layout)}")
     return Table(
-        path=path,
-        rows=rows,
-        lines=tuple(line for line, _ in body),
-        layout=layout,
-        decimal_comma=dialect.decimal_comma,
+        path=path, rows=rows, lines=tuple(line for line, _ in body), layout=layout, decimal_comma=dialect.decimal_comma
     )
 
 

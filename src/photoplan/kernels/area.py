@@ -147,11 +147,7 @@ def _sum_blocks(
 
 @inner
 def mean_at(
-    source: NDArray[Any],
-    valid: NDArray[np.uint8],
-    spot: tuple[Any, ...],
-    rule: tuple[Any, ...],
-    work: tuple[Any, ...],
+    source: NDArray[Any], valid: NDArray[np.uint8], spot: tuple[Any, ...], rule: tuple[Any, ...], work: tuple[Any, ...]
 ) -> tuple[float, float]:
     """Mean under the widened kernel at spot; the weight of the pixels that are usable, and of all.
 

@@ -197,11 +197,7 @@ def _widen(
 
 @kernel
 def find_owned(
-    owner: NDArray[np.uint16],
-    place: NDArray[np.int64],
-    side: int,
-    squares: NDArray[np.bool_],
-    parts: NDArray[np.int64],
+    owner: NDArray[np.uint16], place: NDArray[np.int64], side: int, squares: NDArray[np.bool_], parts: NDArray[np.int64]
 ) -> None:
     """Where the pixels are that each source paints.
 

@@ -28,12 +28,7 @@ _WALL = 1e-3
 
 @inner
 def _weights(
-    vertices: NDArray[np.float64],
-    corners: NDArray[np.int32],
-    f: int,
-    frame: Frame,
-    x: float,
-    y: float,
+    vertices: NDArray[np.float64], corners: NDArray[np.int32], f: int, frame: Frame, x: float, y: float
 ) -> tuple[Any, Any, Any, Any]:
     """Barycentric weights of a point in triangle f, and a key: −2 outside, −1 inside, else a number of the edge."""
     a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
@@ -68,13 +63,7 @@ def _weights(
 
 @inner
 def _in_mesh(
-    vertices: NDArray[np.float64],
-    corners: NDArray[np.int32],
-    first: int,
-    last: int,
-    frame: Frame,
-    x: float,
-    y: float,
+    vertices: NDArray[np.float64], corners: NDArray[np.int32], first: int, last: int, frame: Frame, x: float, y: float
 ) -> tuple[Any, Any]:
     """Value at a point among triangles first … last − 1, and the key of its triangle; NaN, −2 if it is in none."""
     best, found = -2, np.nan

@@ -104,12 +104,7 @@ def solid_patches(valid: NDArray[np.uint8], taps: int) -> NDArray[np.uint8]:
 
 @kernel
 def fill_block(
-    pixels: NDArray[Any],
-    valid: NDArray[np.bool_],
-    nodata: Any,
-    neighbour: Any,
-    fill: NDArray[Any],
-    block: NDArray[Any],
+    pixels: NDArray[Any], valid: NDArray[np.bool_], nodata: Any, neighbour: Any, fill: NDArray[Any], block: NDArray[Any]
 ) -> int:
     """Write a tile into the upper left of a block.
 

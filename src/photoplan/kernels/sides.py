@@ -46,11 +46,7 @@ def sides_of(xy: NDArray[Any], vertices: NDArray[Any], start: NDArray[Any], piec
 
 @kernel
 def clip_lines(
-    lines: NDArray[Any],
-    start: NDArray[Any],
-    box: NDArray[Any],
-    out: NDArray[Any],
-    out_start: NDArray[Any],
+    lines: NDArray[Any], start: NDArray[Any], box: NDArray[Any], out: NDArray[Any], out_start: NDArray[Any]
 ) -> int:
     """The parts of lines that pass a box, prolonged far outwards where they leave it; returns the number of pieces.
 

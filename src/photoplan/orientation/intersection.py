@@ -80,12 +80,7 @@ class _Cameras:
 
 
 def intersect(
-    poses: Sequence[Pose],
-    rays: Rays,
-    count: int | None = None,
-    *,
-    critical: float = 4.0,
-    min_angle: float = 0.0035,
+    poses: Sequence[Pose], rays: Rays, count: int | None = None, *, critical: float = 4.0, min_angle: float = 0.0035
 ) -> Intersected:
     """Points where rays meet, by least squares of the image coordinates.
 

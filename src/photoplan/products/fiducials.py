@@ -151,10 +151,7 @@ class _Job:
     layout: MarkLayout
 
 
-def locate_fiducials(
-    request: FiducialsRequest,
-    events: Events = SILENT,
-) -> FiducialsReport:
+def locate_fiducials(request: FiducialsRequest, events: Events = SILENT) -> FiducialsReport:
     """Find the fiducial marks of all images; one that fails does not stop the others.
 
     Parameters
@@ -286,12 +283,7 @@ def _layout(system: FiducialSystem, name: str, folder: Path) -> MarkLayout:
         raise InputError(f"camera {name!r}: {error}") from None
 
 
-def _locate(
-    request: FiducialsRequest,
-    job: _Job,
-    pixel_mm: float | None,
-    in_project: bool,
-) -> ImageFiducials:
+def _locate(request: FiducialsRequest, job: _Job, pixel_mm: float | None, in_project: bool) -> ImageFiducials:
     scan = ScanImage(job.file, request.band)
     known = FiducialSearch(
         pixel_mm=pixel_mm if pixel_mm is not None else stated_pixel_mm(job.file),

@@ -229,11 +229,7 @@ def _thinned(plan: BuildPlan, unit: Unit | None) -> Unit | None:
 
 
 def _with_faces(
-    plan: BuildPlan,
-    units: dict[tuple[int, int], Unit],
-    lines: list[LineElement],
-    run: Map,
-    events: Events,
+    plan: BuildPlan, units: dict[tuple[int, int], Unit], lines: list[LineElement], run: Map, events: Events
 ) -> dict[tuple[int, int], Unit]:
     boxes = shapely.STRtree([shapely.LineString(line.xyz[:, :2]) for line in lines])
     keys = list(units)

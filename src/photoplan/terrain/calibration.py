@@ -158,10 +158,7 @@ def _classes(held: HeldOut, found: SigmaFactor) -> tuple[ClassFigures, ...]:
             float(np.sqrt(np.average(held.error[some] ** 2 / variance[some], weights=held.weight[some])))
             if some.any()
             else np.nan
-            for variance in (
-                held.sigma**2 + held.noise,
-                (held.sigma * found.factor(held.around)) ** 2 + held.noise,
-            )
+            for variance in (held.sigma**2 + held.noise, (held.sigma * found.factor(held.around)) ** 2 + held.noise)
         )
         blocks = len(np.unique(held.block[some]))
         figures.append(

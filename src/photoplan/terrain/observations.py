@@ -282,10 +282,7 @@ def _straight_pieces(
                 begin = k
         vertices.append(line[begin:])
     sizes = [len(v) for v in vertices]
-    return (
-        np.vstack([np.empty((0, 2)), *vertices]),
-        np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
-    )
+    return (np.vstack([np.empty((0, 2)), *vertices]), np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64))
 
 
 def _boxes(xy: NDArray[np.float64], start: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -82,13 +82,7 @@ class VolumeSettings:
             raise UsageError(f"tolerance {self.tolerance}; a part of the volume from 0 to below 1 is needed")
 
 
-def volume_between(
-    a: Terrain,
-    b: Terrain,
-    polygon: Any,
-    settings: VolumeSettings,
-    run: Map = map,
-) -> Volume:
+def volume_between(a: Terrain, b: Terrain, polygon: Any, settings: VolumeSettings, run: Map = map) -> Volume:
     """Cut and fill from surface A to surface B inside a polygon.
 
     The difference B − A is taken at the middle of square cells (midpoint rule), its positive and negative values are

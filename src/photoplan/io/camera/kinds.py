@@ -18,7 +18,4 @@ def _kind(value: Any) -> str:
     return found if isinstance(found, str) else repr(found)
 
 
-Camera = Annotated[
-    Annotated[FrameEntry, Tag("frame")] | Annotated[FilmEntry, Tag("film")],
-    Discriminator(_kind),
-]
+Camera = Annotated[Annotated[FrameEntry, Tag("frame")] | Annotated[FilmEntry, Tag("film")], Discriminator(_kind)]

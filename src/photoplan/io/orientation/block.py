@@ -158,13 +158,7 @@ def without_lenses(block: OrientationBlock) -> OrientationBlock:
     return replace(block, cameras=cameras)
 
 
-def common_losses(
-    block: OrientationBlock,
-    *,
-    cameras: bool,
-    crs: bool = False,
-    film: bool = True,
-) -> list[Loss]:
+def common_losses(block: OrientationBlock, *, cameras: bool, crs: bool = False, film: bool = True) -> list[Loss]:
     """Losses of a format that holds what is True, and no lens nor height system.
 
     Parameters

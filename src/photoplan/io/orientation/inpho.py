@@ -282,12 +282,7 @@ def _affine(section: _Section, path: Path) -> tuple[NDArray[np.float64], NDArray
 
 
 def _frame(
-    section: _Section,
-    name: str,
-    A: NDArray[np.float64],
-    t: NDArray[np.float64],
-    pixel: NDArray[np.float64],
-    path: Path,
+    section: _Section, name: str, A: NDArray[np.float64], t: NDArray[np.float64], pixel: NDArray[np.float64], path: Path
 ) -> CameraEntry:
     where = f"{path}:{section.line}: camera {name!r}"
     ppa = numbers((section.text("$PRINCIPAL_POINT_PPA") or "0 0").split(), where, "$PRINCIPAL_POINT_PPA", 2)
@@ -328,11 +323,5 @@ def _own(path: Path, head: str) -> bool:
 
 
 FORMAT = OrientationFormat(
-    name="inpho",
-    title="project of Trimble Inpho",
-    sniff=_own,
-    read=read,
-    render=render,
-    losses=losses,
-    suffix=".prj",
+    name="inpho", title="project of Trimble Inpho", sniff=_own, read=read, render=render, losses=losses, suffix=".prj"
 )

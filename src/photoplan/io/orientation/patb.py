@@ -23,14 +23,7 @@ from photoplan.io.orientation.block import (
     require_map,
 )
 from photoplan.io.orientation.table import OrientationTable, OrientedImage, TableFormat, posed
-from photoplan.io.orientation.text import (
-    DIRECTIONS,
-    Words,
-    checked_rotation,
-    numbers,
-    one_word,
-    word_lines,
-)
+from photoplan.io.orientation.text import DIRECTIONS, Words, checked_rotation, numbers, one_word, word_lines
 from photoplan.io.table_lines import number
 
 #: Characters of an image name that PATB takes at most (Catalyst's guide on export to PATB).
@@ -116,11 +109,5 @@ def _sniff(path: Path, head: str) -> bool:
 
 
 FORMAT = OrientationFormat(
-    name="patb",
-    title="orientation file of PATB",
-    sniff=_sniff,
-    read=read,
-    render=render,
-    losses=_losses,
-    suffix=".ori",
+    name="patb", title="orientation file of PATB", sniff=_sniff, read=read, render=render, losses=_losses, suffix=".ori"
 )

@@ -13,15 +13,7 @@ from pydantic.json_schema import SkipJsonSchema
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.bounds import odd_angles, odd_place
 from photoplan.io.camera.kinds import Camera
-from photoplan.io.camera.model import (
-    Entry,
-    Name,
-    NotNegative,
-    Number,
-    Positive,
-    Restoration,
-    Triple,
-)
+from photoplan.io.camera.model import Entry, Name, NotNegative, Number, Positive, Restoration, Triple
 from photoplan.io.names import resolve_input, unique_stems
 from photoplan.io.project.image import ImageEntry, InputName, plain_file
 from photoplan.io.project.kinds import AnyImage

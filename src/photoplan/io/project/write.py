@@ -88,11 +88,7 @@ def _terrain(terrain: StatedTerrain) -> list[str]:
             [
                 ("file", terrain.file, "heights: GeoTIFF, ASC, or a terrain model (.gpkg)"),
                 ("height", terrain.height, "or one height everywhere"),
-                (
-                    "sigma",
-                    terrain.sigma,
-                    "standard deviation of heights, or a raster of it",
-                ),
+                ("sigma", terrain.sigma, "standard deviation of heights, or a raster of it"),
                 ("crs", terrain.crs, "its CRS, where the file does not state one"),
             ]
         ),

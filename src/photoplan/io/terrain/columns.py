@@ -186,11 +186,7 @@ def _fast(layout: TableLayout, lines: list[str], records: NDArray[np.int64], dec
 
 
 def _slow(
-    path: Path,
-    layout: TableLayout,
-    block: tuple[list[str], NDArray[np.int64]],
-    look_up: LookUp,
-    decimal_comma: bool,
+    path: Path, layout: TableLayout, block: tuple[list[str], NDArray[np.int64]], look_up: LookUp, decimal_comma: bool
 ) -> PointBlock:
     """The same line by line: it names the line and the column that cannot be read."""
     lines, records = block

@@ -20,15 +20,7 @@ from numpy.typing import NDArray
 
 from photoplan.errors import InputError
 from photoplan.io.terrain.model_blob import MOST_BYTES, check_unit, inflate, unit_of, unpack_line
-from photoplan.io.terrain.model_tables import (
-    FORMAT,
-    HEADER,
-    LINES,
-    UNITS,
-    GrossError,
-    ModelHeader,
-    header_from_json,
-)
+from photoplan.io.terrain.model_tables import FORMAT, HEADER, LINES, UNITS, GrossError, ModelHeader, header_from_json
 from photoplan.surfaces.units import LineElement, Unit, UnitFigures, UnitLayout
 
 T = TypeVar("T")

@@ -232,11 +232,7 @@ def _arms(arm: float, width: float, free: float, rotation: float) -> list[tuple[
 
 
 def _mark(
-    name: str,
-    parts: Sequence[tuple[NDArray[np.float64], float]],
-    bright: bool,
-    margin: float | None,
-    least: float,
+    name: str, parts: Sequence[tuple[NDArray[np.float64], float]], bright: bool, margin: float | None, least: float
 ) -> MarkPattern:
     """A pattern from parts that are 1 on ground 0."""
     if margin is not None and not (math.isfinite(margin) and margin >= 0):

@@ -254,10 +254,7 @@ def _sigma0(layout: MarkLayout, measured: Measured, names: Sequence[str], turn: 
 
 
 def _result(
-    layout: MarkLayout,
-    measured: Measured,
-    decided: tuple[ScanTurn, FiducialFit, dict[str, str]],
-    notes: Sequence[str],
+    layout: MarkLayout, measured: Measured, decided: tuple[ScanTurn, FiducialFit, dict[str, str]], notes: Sequence[str]
 ) -> FiducialResult:
     turn, fit, names = decided
     marks = {names[old]: _located(names[old], at) for old, at in measured.found.items()}

@@ -158,12 +158,7 @@ def _locate(scan: Scan, layout: MarkLayout, k: int, look: _Look, radius: float) 
         return None
     try:
         at = locate_mark(
-            grey,
-            pattern,
-            look.matrix,
-            negative=look.negative,
-            blur_px=look.blur_px,
-            near=(x - col, y - row, radius),
+            grey, pattern, look.matrix, negative=look.negative, blur_px=look.blur_px, near=(x - col, y - row, radius)
         )
     except InputError:
         return None

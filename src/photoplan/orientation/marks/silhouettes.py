@@ -169,12 +169,7 @@ def notch(reach: float, tip: float, shoulder: float, *, angle: float = 45.0, sty
 
 
 def triangle(
-    flanks: tuple[float, float],
-    near: float,
-    far: float,
-    *,
-    inside_bright: bool = False,
-    style: Style | None = None,
+    flanks: tuple[float, float], near: float, far: float, *, inside_bright: bool = False, style: Style | None = None
 ) -> MarkPattern:
     """A wedge between two straight flanks: its vertex is the reference point.
 
@@ -214,14 +209,7 @@ def triangle(
 
 
 def arc(
-    arm: float,
-    width: float,
-    tip: float,
-    depth: float,
-    rise: float,
-    run: float,
-    *,
-    style: Style | None = None,
+    arm: float, width: float, tip: float, depth: float, rise: float, run: float, *, style: Style | None = None
 ) -> MarkPattern:
     """A cusp of two arcs with a bright cross in it: the middle of the cross is the reference point.
 

@@ -138,11 +138,7 @@ def _frame(
 
 
 def _draw(
-    pattern: MarkPattern,
-    matrix: NDArray[np.float64],
-    shape: tuple[int, int],
-    at: tuple[float, float],
-    blur_px: float,
+    pattern: MarkPattern, matrix: NDArray[np.float64], shape: tuple[int, int], at: tuple[float, float], blur_px: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Values and weights of a drawn pattern; each part covers those before it in proportion to its share of a pixel."""
     margin = int(np.ceil(4 * blur_px)) + 1

@@ -9,13 +9,7 @@ import numpy as np
 from photoplan.errors import InputError
 from photoplan.io.series.statistics import ReducedPoint
 from photoplan.products.characterise import dark, pattern
-from photoplan.products.characterise.common import (
-    SettingsRun,
-    exposure_runs,
-    of_one_temperature,
-    tried,
-    used_and_rest,
-)
+from photoplan.products.characterise.common import SettingsRun, exposure_runs, of_one_temperature, tried, used_and_rest
 from photoplan.products.characterise.data import SeriesData, Setting
 from photoplan.products.characterise.result import Chart, Figure, Findings, Listing, Subject, Trace, joined, known
 from photoplan.products.characterise.transfer import reduced_level
@@ -182,10 +176,7 @@ def _plots(s: EmvaSheet, p: EmvaPoints, title: str) -> tuple[Chart, ...]:
             caption=f"K = {s.gain:.5g} DN/e from levels up to 70 % of saturation.",
             x_label="signal DN",
             y_label="variance above dark DN²",
-            curves=(
-                *used_and_rest(signal, variance, s.used),
-                Trace(grid, s.gain * grid, "line", "dashed", colour=1),
-            ),
+            curves=(*used_and_rest(signal, variance, s.used), Trace(grid, s.gain * grid, "line", "dashed", colour=1)),
         )
     ]
     if isfinite(s.quantum_efficiency_percent):

@@ -63,12 +63,7 @@ ANALYSES: tuple[Analysis, ...] = (
         "dark frames at three or more exposures (at two or more temperatures: the doubling temperature)",
         "dark",
     ),
-    Analysis(
-        "linearity",
-        "Linearity",
-        "flat or scene frames at three or more exposures or illuminations",
-        "linearity",
-    ),
+    Analysis("linearity", "Linearity", "flat or scene frames at three or more exposures or illuminations", "linearity"),
     Analysis("wedge", "Grey wedge", "wedge frames with three or more densities", "wedge"),
     Analysis(
         "saturation",

@@ -150,10 +150,7 @@ class CharacteriseReport:
         }
 
 
-def characterise(
-    request: CharacteriseRequest,
-    events: Events = SILENT,
-) -> CharacteriseReport:
+def characterise(request: CharacteriseRequest, events: Events = SILENT) -> CharacteriseReport:
     """Run the analyses that a series allows; one that fails does not stop the others.
 
     Parameters

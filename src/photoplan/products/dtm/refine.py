@@ -133,10 +133,7 @@ def _key(request: RefineRequest, coarse: ModelReader, fine: ModelReader) -> str:
 
 
 def _add(
-    writer: ModelWriter,
-    coarse: ModelReader,
-    units: dict[tuple[int, int], Unit],
-    lines: tuple[LineElement, ...],
+    writer: ModelWriter, coarse: ModelReader, units: dict[tuple[int, int], Unit], lines: tuple[LineElement, ...]
 ) -> None:
     """All units into the new model."""
     done = writer.done()

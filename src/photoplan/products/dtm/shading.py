@@ -83,9 +83,7 @@ class ShadingFacts:
 
 
 def make_picture(
-    request: PictureRequest,
-    picture: Callable[[OpenTerrain, MapGrid], Picture],
-    events: Events = SILENT,
+    request: PictureRequest, picture: Callable[[OpenTerrain, MapGrid], Picture], events: Events = SILENT
 ) -> ShadingFacts:
     """Write a picture of a terrain model; a run that was killed is continued by the same request.
 

@@ -138,12 +138,7 @@ def dtm_visible(request: VisibleRequest, events: Events = SILENT) -> VisibleRepo
     _check_memory(grid, len(places), request)
     heights = read_grid(terrain, grid)
     options = GridOptions.of(
-        request,
-        "visibility",
-        inputs,
-        events,
-        tile=TILE,
-        resampling="average" if request.minimum_height else "nearest",
+        request, "visibility", inputs, events, tile=TILE, resampling="average" if request.minimum_height else "nearest"
     )
     events.begin("lines of sight", len(places) * parts(heights), "parts")
     workers = available_cpus() if request.workers is None else request.workers

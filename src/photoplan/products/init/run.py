@@ -34,13 +34,7 @@ from photoplan.products.init.match import (
     unoriented,
 )
 from photoplan.products.init.own_geometry import own_geometry
-from photoplan.products.init.systems import (
-    check_joined,
-    height_systems,
-    placed,
-    project_crs,
-    terrain_entry,
-)
+from photoplan.products.init.systems import check_joined, height_systems, placed, project_crs, terrain_entry
 from photoplan.products.judged import differences, on_map, stated_positions
 
 LENS_NAMES = {

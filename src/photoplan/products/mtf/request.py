@@ -15,12 +15,7 @@ ENCODED = (
 )
 
 
-def check_files(
-    images: Sequence[Path],
-    tables: Sequence[Path | str | None],
-    csv: Path | None,
-    overwrite: bool,
-) -> None:
+def check_files(images: Sequence[Path], tables: Sequence[Path | str | None], csv: Path | None, overwrite: bool) -> None:
     """Refuse images, inputs and outputs that cannot be meant together.
 
     Parameters

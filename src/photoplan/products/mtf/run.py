@@ -58,10 +58,7 @@ class MtfRequest:
     overwrite: bool = False
 
 
-def measure_mtf(
-    request: MtfRequest,
-    events: Events = SILENT,
-) -> MtfReport:
+def measure_mtf(request: MtfRequest, events: Events = SILENT) -> MtfReport:
     """Measure the edges of all images; one that fails does not stop the others.
 
     Parameters

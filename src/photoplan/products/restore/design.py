@@ -118,10 +118,7 @@ class MeasuredFilter:
     """What a user should know: edge enhancement, parts of the field without edges."""
 
 
-def design_restoration(
-    request: DesignRequest,
-    events: Events = SILENT,
-) -> MeasuredFilter:
+def design_restoration(request: DesignRequest, events: Events = SILENT) -> MeasuredFilter:
     """Measure the sharpness of images at their edges, all together, and design the filter that restores them.
 
     Parameters

@@ -51,10 +51,7 @@ class FoundFilter:
     """What was measured, where it was."""
 
 
-def requested_filter(
-    request: FilterRequest,
-    events: Events = SILENT,
-) -> FoundFilter:
+def requested_filter(request: FilterRequest, events: Events = SILENT) -> FoundFilter:
     """The filter that is asked for.
 
     Parameters

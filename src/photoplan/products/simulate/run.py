@@ -100,10 +100,7 @@ class FileScene:
         return np.pad(values, ((0, 0), (before[0], after[0]), (before[1], after[1])), mode="edge")
 
 
-def simulate(
-    request: SimulateRequest,
-    events: Events = SILENT,
-) -> SimulateReport:
+def simulate(request: SimulateRequest, events: Events = SILENT) -> SimulateReport:
     """Form images of a scene and write them.
 
     Parameters

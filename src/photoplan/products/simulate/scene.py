@@ -146,9 +146,7 @@ def image_truth(scene: RenderedScene, camera: CentralCamera, path: Path, options
     """
     origin = np.round(camera.center / _ORIGIN) * _ORIGIN * (1.0, 1.0, 0.0)
     form = ImageForm(
-        descriptions=("X", "Y", "Z", "object"),
-        units=("metre", "metre", "metre", ""),
-        offsets=(*origin.tolist(), 0.0),
+        descriptions=("X", "Y", "Z", "object"), units=("metre", "metre", "metre", ""), offsets=(*origin.tolist(), 0.0)
     )
     tile = partial(_truth_tile, scene, origin)
     return TruthRaster(

@@ -133,12 +133,7 @@ def fit_approach(times: Array, values: Array, what: str = "series") -> Approach:
     if verdict.startswith("the change"):  # neither are its size and time
         return seen
     return replace(
-        seen,
-        start=start,
-        change=end - start,
-        sigma_change=sigmas[3],
-        time_constant=tau,
-        sigma_time_constant=sigmas[2],
+        seen, start=start, change=end - start, sigma_change=sigmas[3], time_constant=tau, sigma_time_constant=sigmas[2]
     )
 
 

@@ -75,13 +75,7 @@ class Asymmetry:
     """Chance that equal changes differ as much."""
 
 
-def gain_control(
-    times: Array,
-    values: Array,
-    *,
-    step_time: float | None = None,
-    name: str = "series",
-) -> GainControl:
+def gain_control(times: Array, values: Array, *, step_time: float | None = None, name: str = "series") -> GainControl:
     """Follow the grey values after a step of brightness.
 
     The scene is the same in all frames after the step, so a change of the grey values is the camera's.

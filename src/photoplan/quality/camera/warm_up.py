@@ -72,11 +72,7 @@ class WarmUp:
 
 
 def warm_up(
-    times: Array,
-    positions: Mapping[str, Array],
-    *,
-    model: str | None = None,
-    reference: str = "first",
+    times: Array, positions: Mapping[str, Array], *, model: str | None = None, reference: str = "first"
 ) -> WarmUp:
     """Separate shift, scale and rotation of targets over time.
 
@@ -241,10 +237,7 @@ def _weights(repeat: tuple[float, float] | None) -> Array:
 
 
 def _sigmas(
-    cofactors: Array,
-    rest: tuple[Array, int, Array],
-    repeated: tuple[tuple[float, float] | None, Array],
-    reference: str,
+    cofactors: Array, rest: tuple[Array, int, Array], repeated: tuple[tuple[float, float] | None, Array], reference: str
 ) -> tuple[Array, tuple[float, float]]:
     """Standard deviations of the parameters against the reference, and sigma0 of an epoch's columns and rows.
 

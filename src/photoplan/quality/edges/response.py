@@ -236,11 +236,7 @@ def _span(
 
 
 def _weights(
-    pixels: EdgePixels,
-    distance: NDArray[np.float64],
-    line: EdgeLine,
-    model: PixelEdge,
-    settings: EdgeSettings,
+    pixels: EdgePixels, distance: NDArray[np.float64], line: EdgeLine, model: PixelEdge, settings: EdgeSettings
 ) -> tuple[NDArray[np.float64], float]:
     """Weights of pixels whose noise differs between dark and bright side, and their mean noise.
 
@@ -261,11 +257,7 @@ def _weights(
 
 
 def _levels(
-    pixels: EdgePixels,
-    distance: NDArray[np.float64],
-    line: EdgeLine,
-    rise: NDArray[np.float64],
-    settings: EdgeSettings,
+    pixels: EdgePixels, distance: NDArray[np.float64], line: EdgeLine, rise: NDArray[np.float64], settings: EdgeSettings
 ) -> NDArray[np.float64]:
     """Columns of the dark level and of the changes of both levels along, and across, the edge."""
     columns = [np.ones_like(distance)]

@@ -236,10 +236,7 @@ class Margin:
 
 def _part(common: Window, of: Window) -> tuple[slice, slice]:
     """Rows and columns of a common part in the arrays of a window."""
-    return (
-        slice(common.row - of.row, common.stop[1] - of.row),
-        slice(common.col - of.col, common.stop[0] - of.col),
-    )
+    return (slice(common.row - of.row, common.stop[1] - of.row), slice(common.col - of.col, common.stop[0] - of.col))
 
 
 def _beyond_edges(

@@ -305,11 +305,7 @@ class _Choice:
 
     @classmethod
     def of(
-        cls,
-        transfer: Transfer,
-        scenes: Sequence[SceneStatistics],
-        aperture: float,
-        kept: NDArray[np.float64] | None,
+        cls, transfer: Transfer, scenes: Sequence[SceneStatistics], aperture: float, kept: NDArray[np.float64] | None
     ) -> _Choice:
         """Of an image of a modulation transfer."""
         cases = ((transfer, None), (transfer, kept), (sharpest(transfer), kept))

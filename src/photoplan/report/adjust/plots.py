@@ -10,19 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photoplan.products.adjust.figures import AdjustFigures, GroundFigures, ResidualField
-from photoplan.report.drawing import (
-    BLUE,
-    GREEN,
-    INK,
-    ORANGE,
-    PURPLE,
-    RED,
-    SKY,
-    SOFT,
-    STYLE,
-    png,
-    round_down,
-)
+from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, PURPLE, RED, SKY, SOFT, STYLE, png, round_down
 
 _WIDTH = 7.2
 #: Radius of the 95 % ellipse of two normal coordinates in standard deviations: root of −2 ln 0.05.

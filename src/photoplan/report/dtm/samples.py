@@ -62,12 +62,7 @@ class ReportMap:
     def extent(self) -> tuple[float, float, float, float]:
         """Left, right, bottom, top, metres."""
         rows, columns = self.heights.shape
-        return (
-            self.left,
-            self.left + columns * self.resolution,
-            self.top - rows * self.resolution,
-            self.top,
-        )
+        return (self.left, self.left + columns * self.resolution, self.top - rows * self.resolution, self.top)
 
 
 @dataclass(frozen=True, eq=False)

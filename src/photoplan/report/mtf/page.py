@@ -13,19 +13,7 @@ from photoplan.geometry.grid import Window
 from photoplan.io.raster import RasterReader
 from photoplan.products.mtf.result import EdgeGroup, ImageMtf, MeasuredEdge, MtfReport, rejected_words
 from photoplan.quality.spread import gaussian_modulation
-from photoplan.report.drawing import (
-    BLUE,
-    GREEN,
-    INK,
-    ORANGE,
-    PURPLE,
-    RED,
-    SKY,
-    SOFT,
-    STYLE,
-    axes_of,
-    png,
-)
+from photoplan.report.drawing import BLUE, GREEN, INK, ORANGE, PURPLE, RED, SKY, SOFT, STYLE, axes_of, png
 from photoplan.report.page import Cell, cells, figure, headline, number, page, section, table, text
 
 #: Images that get plots.

@@ -65,11 +65,7 @@ def _filter(found: FoundFilter, plots: RestorePlots) -> list[str]:
     columns, rows = used.margin
     figures = [
         (f"{used.noise_gain:.3g} ×", "growth of noise", "the largest of all kernels" if len(used.kernels) > 1 else ""),
-        (
-            f"{2 * columns + 1} × {2 * rows + 1}",
-            "pixels that the filter reaches",
-            _count(len(used.kernels), "kernel"),
-        ),
+        (f"{2 * columns + 1} × {2 * rows + 1}", "pixels that the filter reaches", _count(len(used.kernels), "kernel")),
     ]
     figures += [] if measured is None else _measured_figures(measured)
     parts = [headline(figures), f"<p>{text(origin(found))}</p>"]

@@ -42,8 +42,7 @@ _FARTHEST = 1e8
 
 
 def clean(
-    measured: MeasuredTerrain,
-    sigmas: Mapping[str, float] | None = None,
+    measured: MeasuredTerrain, sigmas: Mapping[str, float] | None = None
 ) -> tuple[MeasuredTerrain, tuple[Finding, ...]]:
     """The terrain without contradictions, and what was found.
 

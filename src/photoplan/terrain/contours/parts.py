@@ -86,9 +86,7 @@ def _kept_faces(faces: MeshFaces, keep: NDArray[np.bool_]) -> MeshFaces:
 
 
 def unit_parts(
-    source: UnitSource,
-    bounds: Bounds | None = None,
-    lines: Callable[[Bounds], Sequence[LineElement]] | None = None,
+    source: UnitSource, bounds: Bounds | None = None, lines: Callable[[Bounds], Sequence[LineElement]] | None = None
 ) -> Iterator[SurfacePart]:
     """The units of a hybrid model, row by row from the north.
 
