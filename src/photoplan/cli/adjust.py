@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import PATH, dry_run_option, images_option, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, ending, images_option
 from photoplan.cli.output import show, show_json
 
 if TYPE_CHECKING:
@@ -29,10 +29,7 @@ _SHOWN = 20
 @click.option("--no-correlation", is_flag=True, help="Take errors of neighbouring image points as independent.")
 @click.option("--iterations", type=click.IntRange(1), default=40, show_default=True, help="Most of each solution.")
 @click.option("-o", "--output", type=PATH, metavar="FOLDER", help="Report [PROJECT/adjustment].")
-@dry_run_option("Adjust and print the figures; write nothing.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending("Adjust and print the figures; write nothing.")
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Orientations, points and cameras from all measurements of a project at once.
 

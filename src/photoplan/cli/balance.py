@@ -6,15 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import (
-    PATH,
-    dry_run_option,
-    images_option,
-    json_option,
-    overwrite_option,
-    quiet_option,
-    workers_option,
-)
+from photoplan.cli.options import PATH, ending, images_option
 from photoplan.cli.output import say, show, show_json
 
 if TYPE_CHECKING:
@@ -34,11 +26,7 @@ _LISTED = 12
 @click.option("--resolution", type=float, metavar="R", help="Pixels that are compared, metres [by the images' size].")
 @click.option("-o", "--output", type=PATH, metavar="FOLDER", help="[balance by the project]")
 @click.option("--no-picture", is_flag=True, help="Do not draw balance.png.")
-@workers_option
-@dry_run_option("Look at the images and stop.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending("Look at the images and stop.", workers=True)
 def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> None:
     """Find tables by which the images of PROJECT agree in colour where they overlap.
 
@@ -46,14 +34,12 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
     from then on.
     """
     from photoplan.cli.telling import Telling
-    from photoplan.engine.executors import available_cpus
     from photoplan.io.naming import together
     from photoplan.products.balance.run import BalanceRequest, balance_project
     from photoplan.report.balance import BalancePlots
     from photoplan.report.drawing import has_matplotlib
     from photoplan.report.page import open_picture
 
-    options["workers"] = options["workers"] or available_cpus()
     request = BalanceRequest(**options)
     wanted = not no_picture and not request.dry_run and has_matplotlib()
     place = request.folder / "balance.png" if wanted else None

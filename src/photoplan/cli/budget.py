@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, images_option, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, ending, images_option
 from photoplan.cli.output import say, show, show_json
 
 
@@ -26,9 +26,7 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--tolerance", type=float, default=0.02, metavar="PX", help="Largest residual of the anchors [0.02].")
 @click.option("--tables", is_flag=True, help="Print the tables and examples of Ecker 1991 instead.")
 @click.option("--picture", type=PATH, metavar="PNG", help="Contributions, and a map of the total.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending()
 def command(tables: bool, picture: Path | None, overwrite: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     """Standard deviations of position on level ground, cause by cause, in the middle, at the edge and in the corner.
 

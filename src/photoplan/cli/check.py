@@ -6,15 +6,14 @@ from pathlib import Path
 
 import click
 
-from photoplan.cli.options import PATH, images_option, json_option, quiet_option
+from photoplan.cli.options import PATH, ending, images_option
 from photoplan.cli.output import show, show_json
 
 
 @click.command("check")
 @click.argument("project", type=PATH)
 @images_option()
-@json_option
-@quiet_option
+@ending(overwrite=False)
 def command(project: Path, images: tuple[str, ...], as_json: bool, quiet: bool) -> None:
     """Open every input of PROJECT and print, image by image, what it promises.
 

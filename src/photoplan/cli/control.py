@@ -7,15 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import (
-    PATH,
-    dry_run_option,
-    images_option,
-    json_option,
-    overwrite_option,
-    quiet_option,
-    workers_option,
-)
+from photoplan.cli.options import PATH, ending, images_option
 from photoplan.cli.output import say, show, show_json
 
 
@@ -32,11 +24,7 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--radius", type=int, default=15, show_default=True, help="Of a patch, pixels of the coarser picture.")
 @click.option("--correlation", type=float, default=0.7, show_default=True, help="Least correlation of a patch.")
 @click.option("-o", "--output", type=PATH, metavar="CSV", help="[control.csv by the project]")
-@workers_option
-@dry_run_option("Choose the patches and stop.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending("Choose the patches and stop.", workers=True)
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Propose control for the approximately oriented images of PROJECT.
 
@@ -45,10 +33,8 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     agree on one correction of an image's orientation are left out.
     """
     from photoplan.cli.telling import Telling
-    from photoplan.engine.executors import available_cpus
     from photoplan.products.control.run import ControlRequest, propose_control
 
-    options["workers"] = options["workers"] or available_cpus()
     request = ControlRequest(**options)
     with Telling(quiet) as events:
         found = propose_control(request, events)

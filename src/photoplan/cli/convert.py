@@ -7,15 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import (
-    DIRECTIONS,
-    PATH,
-    json_option,
-    overwrite_option,
-    quiet_option,
-    reading_options,
-    table_format,
-)
+from photoplan.cli.options import DIRECTIONS, PATH, ending, reading_options, table_format
 from photoplan.cli.output import say, show, show_json
 
 
@@ -46,9 +38,7 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--list-readings", is_flag=True, help="Only list the readings of the file that fit measured points.")
 @click.option("--image-points", type=PATH, help="Measured image points, for --list-readings.")
 @click.option("--control", type=PATH, help="Their ground points, for --list-readings.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending()
 def command(
     orientation: Path,
     target: str | None,

@@ -22,14 +22,20 @@ def command(folder: Path, resolution: float, quiet: bool) -> None:
     import shutil
 
     from photoplan.cli import running
+    from photoplan.engine.executors import available_cpus
     from photoplan.io.project.file import load_project
     from photoplan.products.check import check_project
     from photoplan.products.init.run import InitRequest, init_project
     from photoplan.products.orthophoto.plan import plan_orthophotos
 
-    how = running.How.from_options(
-        {"workers": None, "executor": "threads", "memory": None, "overwrite": True, "no_quicklook": False}
-        | {"as_json": False, "quiet": quiet}
+    how = running.How(
+        workers=available_cpus(),
+        executor="threads",
+        memory=None,
+        overwrite=True,
+        quicklook=True,
+        as_json=False,
+        quiet=quiet,
     )
     data = folder / "data"
     with as_file(files("photoplan") / "demo_block") as block:

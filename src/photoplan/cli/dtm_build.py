@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import PATH, dry_run_option, json_option, overwrite_option, quiet_option, workers_option
+from photoplan.cli.options import PATH, POSITIVE, ending
 from photoplan.cli.output import show, show_json
 
 if TYPE_CHECKING:
     from photoplan.products.dtm.build import BuildReport, BuildRequest
 
-_POSITIVE = click.FloatRange(0, min_open=True)
 #: Findings and gross errors that are shown; all are in the report, in the model and in --json.
 _SHOWN = 10
 
@@ -21,7 +20,7 @@ _SHOWN = 10
 @click.argument("points", type=PATH, nargs=-1, required=True)
 @click.option("-o", "--output", type=PATH, required=True, metavar="MODEL", help="The model, a .gpkg.")
 @click.option(
-    "--grid-width", type=_POSITIVE, metavar="M", help="Grid width [half the spacing; half of that at breaklines]."
+    "--grid-width", type=POSITIVE, metavar="M", help="Grid width [half the spacing; half of that at breaklines]."
 )
 @click.option("--adapt", type=click.FloatRange(0), metavar="M", help="Widen a unit's grid while its surface stays "
               "within this; 0: never [a quarter of its standard deviation].")  # fmt: skip
@@ -31,7 +30,7 @@ _SHOWN = 10
 @click.option("--covariance", default="auto", show_default=True, help="auto, gaussian, matern or exponential.")
 @click.option("--gross", type=click.FloatRange(0), default=5.0, show_default=True, help="Normalised residual of gross "
               "errors; 0: none is sought.")  # fmt: skip
-@click.option("--reach", type=_POSITIVE, metavar="M", help="Gaps over twice this stay open [10 spacings].")
+@click.option("--reach", type=POSITIVE, metavar="M", help="Gaps over twice this stay open [10 spacings].")
 @click.option("--codes", type=PATH, metavar="FILE", help="Codes and layers: TOML, or CSV with code, class, sigma.")
 @click.option("--columns", help="Columns of text files, such as x=East,y=North,z=Height,code=Art or x,y,z,-,code.")
 @click.option("--delimiter", help="Comma, semicolon, tab or space [what fits].")
@@ -43,12 +42,8 @@ _SHOWN = 10
 @click.option("--nodata", type=float, help="Height that means none.")
 @click.option("--crs", help="CRS of files that state none.")
 @click.option("--height-system", help="Height system of files that state none: ellipsoidal or EPSG:nnnn.")
-@workers_option
 @click.option("--report/--no-report", default=None, help="A page with plots beside the model [if matplotlib is there].")
-@dry_run_option("Read, clean and plan; print it and stop.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending("Read, clean and plan; print it and stop.", workers=True)
 def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     """Predict a terrain model from POINTS: files of points and lines (text, LAS, LandXML, GeoPackage, Shapefile, DXF).
 
@@ -100,7 +95,6 @@ def command(dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
 
 
 def _request(options: dict[str, Any]) -> BuildRequest:
-    from photoplan.engine.executors import available_cpus
     from photoplan.io.tables import Dialect
     from photoplan.io.terrain.options import CodeTable, ReadOptions, read_code_table
     from photoplan.products.dtm.build import BuildRequest
@@ -131,7 +125,7 @@ def _request(options: dict[str, Any]) -> BuildRequest:
         gross=options.pop("gross"),
         reach=options.pop("reach"),
     )
-    workers = options.pop("workers") or available_cpus()
+    workers = options.pop("workers")
     return BuildRequest(inputs=options.pop("points"), options=reading, settings=settings, workers=workers, **options)
 
 

@@ -6,15 +6,13 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, bounds_option, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, POSITIVE, bounds_option, ending
 from photoplan.cli.output import say, show, show_json
-
-_POSITIVE = click.FloatRange(0, min_open=True)
 
 
 @click.command("contours")
 @click.argument("model", type=PATH)
-@click.option("--interval", type=_POSITIVE, required=True, metavar="M", help="Height between contours, metres.")
+@click.option("--interval", type=POSITIVE, required=True, metavar="M", help="Height between contours, metres.")
 @click.option("--base", type=float, default=0.0, show_default=True, help="Height that contours are counted from.")
 @click.option("--index", type=click.IntRange(0), default=5, show_default=True, help="Every N-th is an index contour.")
 @click.option("--smooth", is_flag=True, help="Smooth lines inside their band; they never cross.")
@@ -25,14 +23,12 @@ _POSITIVE = click.FloatRange(0, min_open=True)
 @bounds_option
 @click.option("--labels", is_flag=True, help="Places for labels: a second layer or file.")
 @click.option("--label-all", is_flag=True, help="Labels on every contour, not on index contours alone.")
-@click.option("--text-height", type=_POSITIVE, help="Height of labels, metres on the ground [1/200 of the extent].")
-@click.option("--label-spacing", type=_POSITIVE, help="Metres between labels of a line [60 text heights].")
+@click.option("--text-height", type=POSITIVE, help="Height of labels, metres on the ground [1/200 of the extent].")
+@click.option("--label-spacing", type=POSITIVE, help="Metres between labels of a line [60 text heights].")
 @click.option("--crs", help="CRS of a model that does not state it.")
 @click.option("-o", "--output", type=PATH, required=True, metavar="FILE", help=".gpkg, .shp, .geojson or .dxf")
 @click.option("--preview", type=PATH, metavar="PNG", help="A small picture to look at, too.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending()
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Contour lines on MODEL's own surface: they bend sharply at breaklines, end at borders and at walls.
 

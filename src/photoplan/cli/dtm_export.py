@@ -6,21 +6,18 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, bounds_option, json_option, overwrite_option, quiet_option, workers_option
+from photoplan.cli.options import PATH, POSITIVE, bounds_option, ending
 from photoplan.cli.output import say, show, show_json
 
 
 @click.command("export")
 @click.argument("model", type=PATH)
 @click.option("-o", "--output", type=PATH, required=True, help="What to write, by its suffix.")
-@click.option("--resolution", type=click.FloatRange(0, min_open=True), metavar="R", help="Of a raster [finest width].")
+@click.option("--resolution", type=POSITIVE, metavar="R", help="Of a raster [finest width].")
 @bounds_option
 @click.option("--sigma", type=PATH, metavar="TIF", help="Write the standard deviations too.")
 @click.option("--crs", help="CRS of a terrain file that does not state it.")
-@workers_option
-@overwrite_option
-@json_option
-@quiet_option
+@ending(workers=True)
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Write MODEL as a raster (.tif), a triangulation (.obj, .ply, .xml = LandXML) or points (.xyz, .csv).
 

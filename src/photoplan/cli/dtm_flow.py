@@ -6,24 +6,21 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import BYTES, PATH, json_option, overwrite_option, quiet_option, workers_option
+from photoplan.cli.options import BYTES, PATH, POSITIVE, ending
 from photoplan.cli.output import say, show, show_json
 
 
 @click.command("flow")
 @click.argument("model", type=PATH)
-@click.option("--resolution", type=click.FloatRange(0, min_open=True), help="Side of a cell, metres [mesh width].")
+@click.option("--resolution", type=POSITIVE, help="Side of a cell, metres [mesh width].")
 @click.option("--outlets", type=PATH, help="Points (table x, y, name, or vector file).")
 @click.option("--snap", type=float, default=0.0, help="Move outlets to the largest flow within this, metres [0].")
 @click.option("--catchments", type=PATH, metavar="GPKG", help="Write the catchments as polygons.")
 @click.option("--method", type=click.Choice(["d8", "dinf"]), default="d8", help="How upstream areas are summed [d8].")
 @click.option("-o", "--output", type=PATH, required=True, metavar="TIF", help="The raster.")
 @click.option("--memory", type=BYTES, default="2GB", show_default=True, metavar="SIZE", help="Stay under this.")
-@workers_option
 @click.option("--crs", help="CRS of a model that does not state it.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending(workers=True)
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Upstream area, flow length, direction and catchment of every cell, in six bands of one raster.
 

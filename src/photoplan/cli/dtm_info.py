@@ -6,15 +6,14 @@ from pathlib import Path
 
 import click
 
-from photoplan.cli.options import PATH, json_option, quiet_option
+from photoplan.cli.options import PATH, ending
 from photoplan.cli.output import show, show_json
 
 
 @click.command("info")
 @click.argument("model", type=PATH)
 @click.option("--gross", is_flag=True, help="List the measurements that were flagged as gross errors, and suspects.")
-@json_option
-@quiet_option
+@ending(overwrite=False)
 def command(model: Path, gross: bool, as_json: bool, quiet: bool) -> None:
     """Show the figures of MODEL: units, lines, accuracy, gross errors. A raster is shown as by `photoplan info`."""
     from photoplan.products.describe import dtm_info

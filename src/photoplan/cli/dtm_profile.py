@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, POSITIVE, ending
 from photoplan.cli.output import say, show, show_json
 
 
@@ -16,16 +16,14 @@ from photoplan.cli.output import say, show, show_json
 @click.argument("lines", type=PATH)
 @click.option("-o", "--output", "outputs", type=PATH, required=True, multiple=True,
               metavar="FILE", help=".csv, or .png for a picture; may be repeated.")  # fmt: skip
-@click.option("--tolerance", type=click.FloatRange(0, min_open=True), default=0.001, show_default=True,
+@click.option("--tolerance", type=POSITIVE, default=0.001, show_default=True,
               metavar="M", help="Largest distance in height from the surface.")  # fmt: skip
 @click.option("--x", metavar="NAME", help="Column of X of a CSV, by name or number [x, east, easting].")
 @click.option("--y", metavar="NAME", help="Column of Y [y, north, northing].")
 @click.option("--line", "line_column", metavar="NAME", help="Column that tells lines apart [line, if there is one].")
 @click.option("--decimal-comma", is_flag=True, help="Numbers of a CSV are written 1,5.")
 @click.option("--crs", help="CRS of a terrain file that does not state it.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending()
 def command(
     outputs: tuple[Path, ...],
     x: str | None,

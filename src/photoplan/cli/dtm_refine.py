@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, POSITIVE, ending
 from photoplan.cli.output import say, show, show_json
 
 
@@ -16,13 +16,11 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--polygons", type=PATH, required=True, metavar="FILE", help="Where the fine model counts.")
 @click.option("--transition", type=click.FloatRange(0), required=True, metavar="M",
               help="Width of the band inside the polygons in which the two are joined.")  # fmt: skip
-@click.option("--width", type=click.FloatRange(0, min_open=True), metavar="M",
+@click.option("--width", type=POSITIVE, metavar="M",
               help="Largest grid width inside the polygons [the fine model's finest].")  # fmt: skip
 @click.option("--height-system", metavar="same", help="Declare that both models have the same height system.")
 @click.option("-o", "--output", type=PATH, required=True, metavar="MODEL", help="The new model, a .gpkg.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending()
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Write the model COARSE with the model FINE inside polygons, joined without a step.
 

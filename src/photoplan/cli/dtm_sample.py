@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, ending
 from photoplan.cli.output import say, show, show_json
 
 
@@ -23,9 +23,7 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--digits", type=click.IntRange(0, 9), default=4, show_default=True, help="Decimals of the heights.")
 @click.option("--points-crs", metavar="CRS", help="CRS of the points [the model's].")
 @click.option("--crs", help="CRS of a terrain file that does not state it.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending()
 def command(
     x: str | None,
     y: str | None,

@@ -7,44 +7,32 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import PATH, bounds_option, json_option, overwrite_option, quiet_option, workers_option
+from photoplan.cli.options import PATH, POSITIVE, bounds_option, ending, several
 from photoplan.cli.output import say, show, show_json
 
 if TYPE_CHECKING:
     from photoplan.products.dtm.shading import ShadingFacts
 
 
-def picture_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Model, grid, output and run of every picture of a terrain."""
-    positive = click.FloatRange(0, min_open=True)
-    options = [
-        click.argument("model", type=PATH),
-        click.option("--resolution", type=positive, metavar="R", help="Pixel in metres [the model's mesh width]."),
-        bounds_option,
-        click.option("--crs", help="CRS of a model that does not state it."),
-        click.option("-o", "--output", type=PATH, required=True, metavar="TIF", help="The GeoTIFF."),
-        click.option("--preview", type=PATH, metavar="PNG", help="A small picture to look at, too."),
-        workers_option,
-        overwrite_option,
-        json_option,
-        quiet_option,
-    ]
-    for option in reversed(options):
-        command = option(command)
-    return command
+#: Model, grid, output and run of every picture of a terrain.
+picture_options = several(
+    click.argument("model", type=PATH),
+    click.option("--resolution", type=POSITIVE, metavar="R", help="Pixel in metres [the model's mesh width]."),
+    bounds_option,
+    click.option("--crs", help="CRS of a model that does not state it."),
+    click.option("-o", "--output", type=PATH, required=True, metavar="TIF", help="The GeoTIFF."),
+    click.option("--preview", type=PATH, metavar="PNG", help="A small picture to look at, too."),
+    ending(workers=True),
+)
 
 
-def light_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Where the light comes from."""
-    options = [
-        click.option("--azimuth", type=float, default=315.0, show_default=True, help="Sun, degrees from north."),
-        click.option("--altitude", type=float, default=45.0, show_default=True, help="Sun above horizon, degrees."),
-        click.option("--exaggeration", type=float, default=1.0, show_default=True, help="Factor of heights."),
-        click.option("--multidirectional", is_flag=True, help="Four suns instead of one."),
-    ]
-    for option in reversed(options):
-        command = option(command)
-    return command
+#: Where the light comes from.
+light_options = several(
+    click.option("--azimuth", type=float, default=315.0, show_default=True, help="Sun, degrees from north."),
+    click.option("--altitude", type=float, default=45.0, show_default=True, help="Sun above horizon, degrees."),
+    click.option("--exaggeration", type=float, default=1.0, show_default=True, help="Factor of heights."),
+    click.option("--multidirectional", is_flag=True, help="Four suns instead of one."),
+)
 
 
 def take_light(options: dict[str, Any]) -> Any:

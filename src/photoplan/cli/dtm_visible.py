@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import BYTES, PATH, json_option, overwrite_option, quiet_option, workers_option
+from photoplan.cli.options import BYTES, PATH, POSITIVE, ending
 from photoplan.cli.output import say, show, show_json
 
 
@@ -21,14 +21,11 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--refraction", type=float, default=0.13, show_default=True, help="Coefficient of refraction k.")
 @click.option("--curvature/--no-curvature", default=True, help="Whether the earth is round [yes].")
 @click.option("--minimum-height", is_flag=True, help="Write the height above ground from which a place is seen.")
-@click.option("--resolution", type=click.FloatRange(0, min_open=True), help="Pixel of the map, metres [mesh width].")
+@click.option("--resolution", type=POSITIVE, help="Pixel of the map, metres [mesh width].")
 @click.option("-o", "--output", type=PATH, required=True, metavar="TIF", help="The map.")
 @click.option("--memory", type=BYTES, default="2GB", show_default=True, metavar="SIZE", help="Stay under this.")
-@workers_option
 @click.option("--crs", help="CRS of a model that does not state it.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending(workers=True)
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Map of what can be seen: 1 visible, 0 hidden, 255 no terrain; for several observers first how many see it.
 

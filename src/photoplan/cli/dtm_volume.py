@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, json_option, overwrite_option, quiet_option, workers_option
+from photoplan.cli.options import PATH, POSITIVE, ending
 from photoplan.cli.output import say, show, show_json
 
 
@@ -14,7 +14,7 @@ from photoplan.cli.output import say, show, show_json
 @click.argument("a", metavar="A", type=PATH)
 @click.argument("b", metavar="B", type=PATH)
 @click.option("--polygon", "polygons", type=PATH, help="Polygons: one line of figures for each.")
-@click.option("--resolution", type=click.FloatRange(0, min_open=True), help="Cells of the integration, metres [auto].")
+@click.option("--resolution", type=POSITIVE, help="Cells of the integration, metres [auto].")
 @click.option("--tolerance", type=float, default=1e-3, show_default=True, help="Where cells are halved: part of it.")
 @click.option("--difference", type=PATH, metavar="TIF", help="Write B − A as a raster.")
 @click.option("--sigma-a", type=float, help="Standard deviation of A's heights, metres [the model's own].")
@@ -23,10 +23,7 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--bias", type=float, default=0.0, help="Standard deviation of a common height error, metres [0].")
 @click.option("--height-system", metavar="same", help="Declare that both models have the same height system.")
 @click.option("--crs", help="CRS of files that do not state it.")
-@workers_option
-@overwrite_option
-@json_option
-@quiet_option
+@ending(workers=True)
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Cut, fill and net volume from terrain A to terrain B, with their exactness.
 

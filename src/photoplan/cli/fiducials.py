@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, dry_run_option, images_option, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, ending, images_option
 from photoplan.cli.output import end_with_failures, say, show, show_json
 
 _ANSWER = {"auto": None, "yes": True, "no": False}
@@ -28,10 +28,7 @@ _ANSWER = {"auto": None, "yes": True, "no": False}
 @click.option("--band", type=click.IntRange(1), metavar="N", help="Band to use [luminance of the first three].")
 @click.option("--least-correlation", type=click.FloatRange(0.3, 0.99), metavar="R", help="Less is no mark [0.6].")
 @click.option("--pictures", type=PATH, metavar="FOLDER", help="Receives a picture of the marks.")
-@overwrite_option
-@dry_run_option("Of a project: do not write the marks into it.")
-@json_option
-@quiet_option
+@ending("Of a project: do not write the marks into it.")
 def command(scans: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any) -> None:
     """Find the fiducial marks of scanned film photos, without approximate values.
 

@@ -7,15 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import (
-    PATH,
-    dry_run_option,
-    json_option,
-    listed,
-    overwrite_option,
-    quiet_option,
-    workers_option,
-)
+from photoplan.cli.options import LISTED, PATH, ending
 from photoplan.cli.output import show, show_json
 
 if TYPE_CHECKING:
@@ -27,15 +19,11 @@ if TYPE_CHECKING:
 @click.option("--terrain", type=PATH, required=True, metavar="MODEL", help="Terrain model or raster of heights.")
 @click.option("--sun", type=float, nargs=2, required=True, metavar="AZIMUTH ALTITUDE",
               help="From grid north, above the horizon, degrees.")  # fmt: skip
-@click.option("--correct", multiple=True, metavar="NAME,…", callback=lambda c, p, values: listed(values),
+@click.option("--correct", metavar="NAME,…", **LISTED,
               help="cosine or c; haze or haze-by-height; both of them [c].")  # fmt: skip
 @click.option("-o", "--output", type=PATH, required=True, metavar="TIF", help="The corrected picture.")
 @click.option("--no-picture", is_flag=True, help="Do not draw what was before and after beside the output.")
-@workers_option
-@dry_run_option("Estimate the parameters and stop.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending("Estimate the parameters and stop.", workers=True)
 def command(as_json: bool, quiet: bool, no_picture: bool, correct: tuple[str, ...], **options: Any) -> None:
     """Take the light on slopes, and haze, out of PICTURE, an orthophoto.
 

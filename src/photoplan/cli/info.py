@@ -6,16 +6,14 @@ from pathlib import Path
 
 import click
 
-from photoplan.cli.options import PATH, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, ending
 from photoplan.cli.output import show, show_json
 
 
 @click.command("info")
 @click.argument("file", type=PATH)
 @click.option("--plot", type=PATH, metavar="PICTURE", help="Draw a restoration filter as PNG.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending()
 def command(file: Path, plot: Path | None, overwrite: bool, as_json: bool, quiet: bool) -> None:
     """Show what FILE holds: a raster, a terrain model, a project, a plan, a run record or a restoration filter."""
     from photoplan.products.describe import describe

@@ -7,33 +7,22 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import (
-    FOLDER,
-    PATH,
-    json_option,
-    listed,
-    overwrite_option,
-    quiet_option,
-    reading_options,
-    table_format,
-)
+from photoplan.cli.options import FOLDER, LISTED, PATH, ending, reading_options, table_format
 from photoplan.cli.output import show, show_json, talking
-
-_FILE = PATH
 
 
 @click.command("init")
 @click.argument("folder", metavar="DIR", type=FOLDER)
-@click.option("--images", multiple=True, required=True, metavar="PATTERN,…", help="Files; may be repeated.",
-              callback=lambda context, parameter, values: listed(values))  # fmt: skip
+@click.option("--images", required=True, metavar="PATTERN,…", help="Files; may be repeated.",
+              **LISTED)  # fmt: skip
 @click.option("--camera", type=PATH, help="Cameras: TOML, YAML or JSON [images have RPC].")
-@click.option("--orientation", type=_FILE, help="Orientation: TOML, JSON, table … [images are to be oriented].")
+@click.option("--orientation", type=PATH, help="Orientation: TOML, JSON, table … [images are to be oriented].")
 @click.option(
     "--terrain", metavar="FILE|HEIGHT", help="Raster of heights, or one height in metres; needed for products."
 )
-@click.option("--image-points", multiple=True, type=_FILE, metavar="FILE", help="Measured image points.")
-@click.option("--control", multiple=True, type=_FILE, metavar="FILE", help="Ground points, control and check.")
-@click.option("--positions", type=_FILE, metavar="FILE", help="Observed projection centres (GNSS).")
+@click.option("--image-points", multiple=True, type=PATH, metavar="FILE", help="Measured image points.")
+@click.option("--control", multiple=True, type=PATH, metavar="FILE", help="Ground points, control and check.")
+@click.option("--positions", type=PATH, metavar="FILE", help="Observed projection centres (GNSS).")
 @click.option("--crs", metavar="CRS", help="CRS of the project, EPSG:nnnn or WKT [the orientation's].")
 @click.option(
     "--height-system",
@@ -48,9 +37,7 @@ _FILE = PATH
     "--earth-curvature", type=click.Choice(["none", "correction", "strict"]), default="none", show_default=True
 )
 @click.option("--refraction", is_flag=True, help="Correct for refraction by a standard atmosphere.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending()
 def command(folder: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     """Write DIR/project.toml from images, camera, orientation and terrain.
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, images_option, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, ending, images_option
 from photoplan.cli.output import end_with_failures, say, show, show_json
 
 
@@ -22,9 +22,7 @@ from photoplan.cli.output import end_with_failures, say, show, show_json
 @click.option("--report", type=PATH, metavar="HTML", help="Figures and plots as a page.")
 @click.option("--plot", type=PATH, metavar="PNG", help="Residual vectors.")
 @click.option("--write", is_flag=True, help="Make --model that of the cameras in the project file.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending()
 def command(images: tuple[str, ...], as_json: bool, quiet: bool, **options: Any) -> None:
     """Residuals, sigma0, scales, shear and film shrinkage of the scans in PROJECT.
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, ending
 from photoplan.cli.output import say, show, show_json
 
 
@@ -21,9 +21,7 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--sigma-terrain", type=float, help="Of terrain heights, metres [the model's own].")
 @click.option("--sigma-position", type=float, nargs=3, default=(0, 0, 0), help="Of the projection centre, metres [0].")
 @click.option("--sigma-angles", type=float, nargs=3, default=(0, 0, 0), help="Of ω φ κ, in the project's unit [0].")
-@overwrite_option
-@json_option
-@quiet_option
+@ending()
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Ground points of image points, with standard deviations.
 

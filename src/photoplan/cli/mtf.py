@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import click
 
-from photoplan.cli.options import PATH, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, ending
 from photoplan.cli.output import end_with_failures, show, show_json, talking
 
 
@@ -140,9 +140,7 @@ def _refuse(names: set[str], why: str) -> None:
               help="Contrast of an edge over its noise.")  # fmt: skip
 @click.option("--report", type=PATH, metavar="FILE.html", help="Report with plots.")
 @click.option("--csv", type=PATH, metavar="FILE", help="A row for each edge.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending()
 def command(images: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any) -> None:
     """Measure sharpness: edges are found, or given by --roi, and their spread function and MTF measured.
 

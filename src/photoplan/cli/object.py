@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, choosing_options, executing, listed, product_options, weights
+from photoplan.cli.options import LISTED, PATH, choosing_options, executing, product_options, weights
 
 
 @click.command("object")
@@ -16,7 +16,7 @@ from photoplan.cli.options import PATH, choosing_options, executing, listed, pro
 @click.argument("polygons", type=PATH)
 @product_options
 @choosing_options
-@click.option("--objects", metavar="NAME,…", multiple=True, callback=lambda c, p, values: listed(values),
+@click.option("--objects", metavar="NAME,…", **LISTED,
               help="Objects of the file, or patterns; may be repeated [all].")  # fmt: skip
 @click.option("--below", is_flag=True, help="Also what lies below each object: NAME_below.tif.")
 @click.option("--layer", help="Layer of the file, or type of CityJSON's objects.")

@@ -24,31 +24,39 @@ class _Path(click.Path):
 
 PATH = _Path(path_type=Path)
 FOLDER = _Path(path_type=Path, file_okay=False)
+POSITIVE = click.FloatRange(0, min_open=True)
 
 
-def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Options that say what an orientation file does not say of itself."""
-    options = [
-        click.option("--format", "format", metavar="FORMAT", help="Format of the orientation file [by its content]."),
-        click.option("--columns", help="Columns of a table: name,x,y,z,omega,phi,kappa[,camera] or name=LABEL,x=…"),
-        click.option("--delimiter", type=click.Choice([*_DELIMITERS]), help="Of a table [found by itself]."),
-        click.option("--decimal-comma", is_flag=True, help="Numbers of a table are written 1,5."),
-        click.option("--angle-unit", type=click.Choice(["deg", "gon", "rad"]), help="[deg, or the format's own]"),
-        click.option(
-            "--rotation",
-            type=click.Choice(["opk", "pok", "kpo", "kop", "okp", "pko"]),
-            help="Order of omega, phi, kappa; the first is primary [opk, or the format's own].",
-        ),
-        click.option(
-            "--rotation-direction",
-            "direction",
-            type=click.Choice(DIRECTIONS),
-            help="What the file's rotation does [camera-to-ground; some formats have to be told].",
-        ),
-    ]
-    for option in reversed(options):
-        command = option(command)
-    return command
+def several(*options: Callable[..., Any]) -> Callable[..., Any]:
+    """Options (and arguments) as one decorator, in the order of the help."""
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+#: Options that say what an orientation file does not say of itself.
+reading_options = several(
+    click.option("--format", "format", metavar="FORMAT", help="Format of the orientation file [by its content]."),
+    click.option("--columns", help="Columns of a table: name,x,y,z,omega,phi,kappa[,camera] or name=LABEL,x=…"),
+    click.option("--delimiter", type=click.Choice([*_DELIMITERS]), help="Of a table [found by itself]."),
+    click.option("--decimal-comma", is_flag=True, help="Numbers of a table are written 1,5."),
+    click.option("--angle-unit", type=click.Choice(["deg", "gon", "rad"]), help="[deg, or the format's own]"),
+    click.option(
+        "--rotation",
+        type=click.Choice(["opk", "pok", "kpo", "kop", "okp", "pko"]),
+        help="Order of omega, phi, kappa; the first is primary [opk, or the format's own].",
+    ),
+    click.option(
+        "--rotation-direction",
+        "direction",
+        type=click.Choice(DIRECTIONS),
+        help="What the file's rotation does [camera-to-ground; some formats have to be told].",
+    ),
+)
 
 
 def table_format(options: dict[str, Any]) -> Any:
@@ -80,10 +88,26 @@ class _Bytes(click.ParamType):
 
 BYTES = _Bytes()
 
+
+def _all_cores(context: click.Context, parameter: click.Parameter, given: int | None) -> int:
+    from photoplan.engine.executors import available_cpus
+
+    return given or available_cpus()
+
+
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
 quiet_option = click.option("-q", "--quiet", is_flag=True, help="No talk on stderr.")
 overwrite_option = click.option("--overwrite", is_flag=True, help="Replace what exists.")
-workers_option = click.option("--workers", type=click.IntRange(1), default=None, help="Worked on at once [all cores].")
+workers_option = click.option(
+    "--workers", type=click.IntRange(1), callback=_all_cores, help="Worked on at once [all cores]."
+)
+executor_option = click.option(
+    "--executor",
+    default="threads",
+    show_default=True,
+    metavar="KIND",
+    help="threads, processes, or a Dask scheduler's address tcp://host:port.",
+)
 memory_option = click.option("--memory", type=BYTES, default=None, metavar="SIZE", help="Stay under this, e.g. 2GB.")
 bounds_option = click.option(
     "--bounds", type=float, nargs=4, default=None, metavar="XMIN YMIN XMAX YMAX", help="Part to make [all]."
@@ -95,16 +119,10 @@ def dry_run_option(what: str) -> Callable[..., Any]:
     return click.option("--dry-run", is_flag=True, help=what)
 
 
-def images_option(default: str = "all", name: str = "images") -> Callable[..., Any]:
-    """`--images A,B` or repeated, for verbs that choose among the images of a project."""
-    return click.option(
-        "--images",
-        name,
-        multiple=True,
-        metavar="NAME,…",
-        callback=lambda context, parameter, values: listed(values),
-        help=f"Images or patterns; may be repeated [{default}].",
-    )
+def ending(dry_run: str = "", *, workers: bool = False, overwrite: bool = True) -> Callable[..., Any]:
+    """What the options of nearly every verb end with; `dry_run` says what happens instead."""
+    first = [workers_option] * workers + [dry_run_option(dry_run)] * bool(dry_run) + [overwrite_option] * overwrite
+    return several(*first, json_option, quiet_option)
 
 
 def listed(values: Sequence[str]) -> tuple[str, ...]:
@@ -113,63 +131,56 @@ def listed(values: Sequence[str]) -> tuple[str, ...]:
     return tuple(part.strip() for split in parts for part in split if part.strip())
 
 
-def product_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """What may be chosen of orthophotos and mosaics."""
-    options = [
-        images_option(),
-        click.option("--resolution", type=float, metavar="R", help="Ground pixel in metres [the images' mean GSD]."),
-        bounds_option,
-        click.option("--kernel", help="nearest, bilinear, bicubic, bicubic-1 or lanczos3 [bicubic]."),
-        click.option("--tolerance", type=float, metavar="PX", help="Largest residual of the anchors [0.02]."),
-        click.option(
-            "--hidden",
-            help="What no image sees: show, nodata, or mark (second raster) [ortho: show; mosaic, --true: nodata].",
-        ),
-        click.option("--accuracy", is_flag=True, default=None, help="Also a raster of standard deviations, a picture."),
-        click.option("--compress", help="deflate, zstd, lzw, jpeg or none [deflate]."),
-        click.option("--nodata", help="A number, mask, or auto: 0 for integers, NaN for floats [auto]."),
-        click.option("--overviews/--no-overviews", default=None, help="Whether the file holds overviews [yes]."),
-        click.option("--tile", type=int, metavar="PX", help="Side of a tile [512]."),
-        click.option("--output", type=PATH, help="Folder of the products [PROJECT's folder/products]."),
-        click.option(
-            "--force", is_flag=True, help="Also of orientations with a FAULT, and finer than a quarter of the GSD."
-        ),
-        click.option("--plan", "plan_file", type=PATH, help="Write the plan (GeoPackage) and stop."),
-        click.option("--show-quadtree", is_flag=True, help="With --plan or --dry-run: objects as squares, too."),
-        dry_run_option("Compile the plan, print it, and stop."),
-    ]
-    for option in reversed(options):
-        command = option(command)
-    return command
+#: Of an option that takes a list.
+LISTED: dict[str, Any] = {"multiple": True, "callback": lambda context, parameter, values: listed(values)}
+
+
+def images_option(default: str = "all", name: str = "images") -> Callable[..., Any]:
+    """`--images A,B` or repeated, for verbs that choose among the images of a project."""
+    return click.option(
+        "--images", name, metavar="NAME,…", **LISTED, help=f"Images or patterns; may be repeated [{default}]."
+    )
+
+
+#: What may be chosen of orthophotos and mosaics.
+product_options = several(
+    images_option(),
+    click.option("--resolution", type=float, metavar="R", help="Ground pixel in metres [the images' mean GSD]."),
+    bounds_option,
+    click.option("--kernel", help="nearest, bilinear, bicubic, bicubic-1 or lanczos3 [bicubic]."),
+    click.option("--tolerance", type=float, metavar="PX", help="Largest residual of the anchors [0.02]."),
+    click.option(
+        "--hidden",
+        help="What no image sees: show, nodata, or mark (second raster) [ortho: show; mosaic, --true: nodata].",
+    ),
+    click.option("--accuracy", is_flag=True, default=None, help="Also a raster of standard deviations, a picture."),
+    click.option("--compress", help="deflate, zstd, lzw, jpeg or none [deflate]."),
+    click.option("--nodata", help="A number, mask, or auto: 0 for integers, NaN for floats [auto]."),
+    click.option("--overviews/--no-overviews", default=None, help="Whether the file holds overviews [yes]."),
+    click.option("--tile", type=int, metavar="PX", help="Side of a tile [512]."),
+    click.option("--output", type=PATH, help="Folder of the products [PROJECT's folder/products]."),
+    click.option(
+        "--force", is_flag=True, help="Also of orientations with a FAULT, and finer than a quarter of the GSD."
+    ),
+    click.option("--plan", "plan_file", type=PATH, help="Write the plan (GeoPackage) and stop."),
+    click.option("--show-quadtree", is_flag=True, help="With --plan or --dry-run: objects as squares, too."),
+    dry_run_option("Compile the plan, print it, and stop."),
+)
 
 
 _PENALTIES = ("slant", "coarseness", "border", "occlusion", "sharpness")
 
 
-def choosing_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """How images are chosen, for verbs that make one product of many."""
-    options = [
-        click.option(
-            "--score",
-            metavar="NAME=WEIGHT,…",
-            multiple=True,
-            callback=lambda c, p, values: listed(values),
-            help=f"Weights of {', '.join(_PENALTIES)} [1, 1, 1, 0.5, 0].",
-        ),
-        click.option(
-            "--prefer",
-            metavar="NAME,…",
-            multiple=True,
-            callback=lambda c, p, values: listed(values),
-            help="Images that come first wherever they see the ground.",
-        ),
-        click.option(
-            "--sources", is_flag=True, help="Also which image painted each pixel: NAME_sources.tif, NAME_seams.gpkg."
-        ),
-    ]
-    for option in reversed(options):
-        command = option(command)
-    return command
+#: How images are chosen, for verbs that make one product of many.
+choosing_options = several(
+    click.option(
+        "--score", metavar="NAME=WEIGHT,…", **LISTED, help=f"Weights of {', '.join(_PENALTIES)} [1, 1, 1, 0.5, 0]."
+    ),
+    click.option("--prefer", metavar="NAME,…", **LISTED, help="Images that come first wherever they see the ground."),
+    click.option(
+        "--sources", is_flag=True, help="Also which image painted each pixel: NAME_sources.tif, NAME_seams.gpkg."
+    ),
+)
 
 
 def weights(given: Sequence[str]) -> Any:
@@ -188,23 +199,13 @@ def weights(given: Sequence[str]) -> Any:
     return Weights(**values)
 
 
-def executing(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The options of every verb that executes a plan."""
-    options = [
-        workers_option,
-        click.option(
-            "--executor",
-            default="threads",
-            show_default=True,
-            metavar="KIND",
-            help="threads, processes, or a Dask scheduler's address tcp://host:port.",
-        ),
-        memory_option,
-        overwrite_option,
-        click.option("--no-quicklook", is_flag=True, help="Do not write overview.png."),
-        json_option,
-        quiet_option,
-    ]
-    for option in reversed(options):
-        command = option(command)
-    return command
+#: The options of every verb that executes a plan.
+executing = several(
+    workers_option,
+    executor_option,
+    memory_option,
+    overwrite_option,
+    click.option("--no-quicklook", is_flag=True, help="Do not write overview.png."),
+    json_option,
+    quiet_option,
+)

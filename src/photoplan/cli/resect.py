@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import PATH, dry_run_option, images_option, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, POSITIVE, ending, images_option
 from photoplan.cli.output import end_with_failures, say, show, show_json
 
 if TYPE_CHECKING:
@@ -21,17 +21,14 @@ _DIGITS = {"deg": 4, "gon": 4, "rad": 6}
 @images_option("all with 3 control points")
 @click.option("--image-points", multiple=True, type=PATH, metavar="FILE", help="Instead of the project's.")
 @click.option("--control", multiple=True, type=PATH, metavar="FILE", help="Instead of the project's.")
-@click.option("--sigma-image", type=click.FloatRange(0, min_open=True), help="Of image points, pixels [the project's].")
+@click.option("--sigma-image", type=POSITIVE, help="Of image points, pixels [the project's].")
 @click.option("--sigma-control", type=click.FloatRange(0), nargs=2, metavar="XY Z", help="Metres [the project's].")
 @click.option("--free", metavar="c,x0,y0", help="Parameters of the camera that are unknowns; one image only.")
 @click.option("--unknown-camera-constant", is_flag=True, help="Not even about known; one image only.")
 @click.option("--critical", type=click.FloatRange(2, 20), default=4.0, show_default=True,
               help="Normalised residual from which a point is a gross error.")  # fmt: skip
 @click.option("--report", type=PATH, metavar="HTML", help="Residuals with pictures.")
-@overwrite_option
-@dry_run_option("Do not write into the project.")
-@json_option
-@quiet_option
+@ending("Do not write into the project.")
 def command(as_json: bool, quiet: bool, free: str | None, **options: Any) -> None:
     """Exterior orientation of single images by control points, without start values.
 

@@ -8,15 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import (
-    PATH,
-    dry_run_option,
-    json_option,
-    memory_option,
-    overwrite_option,
-    quiet_option,
-    workers_option,
-)
+from photoplan.cli.options import PATH, ending, memory_option
 from photoplan.cli.output import end_with_failures, show, show_json
 
 if TYPE_CHECKING:
@@ -112,14 +104,10 @@ def _refuse_measuring(given: str) -> None:
               help="How grey values become light, which is what is filtered.")  # fmt: skip
 @click.option("--dtype", default="same", show_default=True, metavar="same|float32|uint16", help="Type of the results.")
 @click.option("--compress", default="deflate", show_default=True, help="deflate, zstd, lzw, jpeg or none.")
-@workers_option
 @memory_option
 @click.option("--report", type=PATH, metavar="FILE.html", help="Report with plots.")
-@overwrite_option
 @click.option("--no-quicklook", is_flag=True, help="Write no pictures.")
-@dry_run_option("Say what would be done, and stop.")
-@json_option
-@quiet_option
+@ending("Say what would be done, and stop.", workers=True)
 def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool, **options: Any) -> None:
     """Restore images of any size: NAME_restored.tif (a cloud-optimised GeoTIFF) and its run record.
 
@@ -128,7 +116,6 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
     image that fails does not stop the others (exit code 4). The same command continues a run that was interrupted.
     """
     from photoplan.cli.telling import Telling
-    from photoplan.engine.executors import available_cpus
     from photoplan.products.restore.filter import FILTER_NAME, keep_filter, requested_filter
     from photoplan.products.restore.run import RestoreRequest, plan_restoration, restore_images
     from photoplan.report.page import open_report
@@ -137,7 +124,6 @@ def command(images: tuple[Path, ...], as_json: bool, quiet: bool, dry_run: bool,
     if options["chromatic"] not in (None, "measure"):
         options["chromatic"] = Path(options["chromatic"])
     options["quicklook"] = not options.pop("no_quicklook")
-    options["workers"] = options["workers"] or available_cpus()
     asked = filter_request(images, options)
     kept = options.pop("save_filter")
     files = [path for path in (asked.file, options["chromatic"], options["fall_off"]) if isinstance(path, Path)]

@@ -13,9 +13,9 @@ import click
 
 from photoplan.cli.output import show_json
 from photoplan.cli.telling import Telling
-from photoplan.engine.executors import available_cpus
 from photoplan.errors import TilesFailed
 from photoplan.io.project.model import Project
+from photoplan.plain import pick
 from photoplan.products.orthophoto.execution import ProductResult, execute, seams_path
 from photoplan.products.orthophoto.plan import OrthoPlan
 from photoplan.products.run import Run
@@ -36,15 +36,12 @@ class How:
     @classmethod
     def from_options(cls, options: dict[str, Any]) -> How:
         """Take the options of `executing` out of the options of a verb."""
-        return cls(
-            workers=options.pop("workers") or available_cpus(),
-            executor=options.pop("executor"),
-            memory=options.pop("memory"),
-            overwrite=options.pop("overwrite"),
-            quicklook=not options.pop("no_quicklook"),
-            as_json=options.pop("as_json"),
-            quiet=options.pop("quiet"),
-        )
+        names = ("workers", "executor", "memory", "overwrite", "as_json", "quiet")
+        return cls(quicklook=not options.pop("no_quicklook"), **{name: options.pop(name) for name in names})
+
+    def run(self, events: Telling) -> Run:
+        """What is asked of a run, told to `events`."""
+        return Run(**pick(self, "workers", "executor", "memory", "overwrite", "quicklook"), events=events)
 
 
 def telling(how: How) -> Telling:
@@ -90,17 +87,9 @@ def execute_and_report(plan: OrthoPlan, folder: Path, how: How, events: Telling)
     )
     for line in plan.blind:
         events.talk(f"  {'' if plan.of_objects else 'sees no terrain and is '}left out: {line}")
-    run = Run(
-        workers=how.workers,
-        executor=how.executor,
-        memory=how.memory,
-        overwrite=how.overwrite,
-        quicklook=how.quicklook,
-        events=events,
-    )
     failed = None
     try:
-        execute(plan, folder, run)
+        execute(plan, folder, how.run(events))
     except TilesFailed as error:
         failed = error
     seconds = time.perf_counter() - started

@@ -6,15 +6,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import (
-    PATH,
-    dry_run_option,
-    images_option,
-    json_option,
-    overwrite_option,
-    quiet_option,
-    workers_option,
-)
+from photoplan.cli.options import PATH, ending, images_option
 from photoplan.cli.output import say, show, show_json
 
 
@@ -25,11 +17,7 @@ from photoplan.cli.output import say, show, show_json
 @click.option("--keep", type=PATH, metavar="FILE", help="Regions with their images that stay as they are.")
 @click.option("-o", "--output", type=PATH, metavar="FILE", help="[products/seams.gpkg by the project]")
 @click.option("--no-picture", is_flag=True, help="Do not draw the regions.")
-@workers_option
-@dry_run_option("Look at the images and stop.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending("Look at the images and stop.", workers=True)
 def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> None:
     """Find seams between the images of PROJECT where they are least seen.
 
@@ -37,12 +25,10 @@ def command(as_json: bool, quiet: bool, no_picture: bool, **options: Any) -> Non
     column `image`, which `photoplan mosaic --seams` takes and QGIS edits.
     """
     from photoplan.cli.telling import Telling
-    from photoplan.engine.executors import available_cpus
     from photoplan.products.seams.run import SeamsRequest, make_seams
     from photoplan.report.drawing import has_matplotlib
     from photoplan.report.mosaic import draw_regions
 
-    options["workers"] = options["workers"] or available_cpus()
     request = SeamsRequest(**options)
     with Telling(quiet) as events:
         found = make_seams(request, events)

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, dry_run_option, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, ending
 from photoplan.cli.output import say, show, show_json
 
 
@@ -14,10 +14,7 @@ from photoplan.cli.output import say, show, show_json
 @click.argument("file", type=PATH, metavar="FILE")
 @click.option("--report", type=PATH, metavar="HTML", help="Figures and plots as a page.")
 @click.option("--csv", type=PATH, metavar="CSV", help="Figures as a table.")
-@overwrite_option
-@dry_run_option("Print the figures, write nothing.")
-@json_option
-@quiet_option
+@ending("Print the figures, write nothing.")
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Resolution, bandwidth, charge transfer and noise of the sensor that FILE (TOML) describes."""
     from photoplan.io.run_record import recording

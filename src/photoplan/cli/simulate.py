@@ -7,16 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import (
-    PATH,
-    bounds_option,
-    dry_run_option,
-    images_option,
-    json_option,
-    overwrite_option,
-    quiet_option,
-    workers_option,
-)
+from photoplan.cli.options import PATH, bounds_option, ending, images_option
 from photoplan.cli.output import say, show, show_json
 
 _OF_PATTERNS = ("frames", "exposure", "size", "levels", "phase")
@@ -48,18 +39,13 @@ _OF_PROJECTS = ("images", "texture", "grain", "truth", "resolution", "bounds")
 @click.option("--oversampling", type=click.IntRange(1, 64), metavar="K",
               help="Cells of the scene along a side of a pixel [files 1, patterns 8, projects 2].")  # fmt: skip
 @click.option("--dtype", type=click.Choice(["uint8", "uint16", "float32"]), help="Of the files [as the model says].")
-@workers_option
-@overwrite_option
-@dry_run_option("Check everything, say what would be written, write nothing.")
-@json_option
-@quiet_option
+@ending("Check everything, say what would be written, write nothing.", workers=True)
 def command(scene: str | None, project: Path | None, as_json: bool, quiet: bool, **options: Any) -> None:
     """Form images of a scene with blur, noise, jitter, blooming and all else that a camera does.
 
     SCENE is an image file, or a pattern: flat, edge:ANGLE, bars:PERIOD,ANGLE, star:SECTORS, wedge:STEPS or
     discs:PITCH,DIAMETER. With --scene it is the terrain and the objects of a project, as its cameras see them.
     """
-    from photoplan.engine.executors import available_cpus
 
     if (scene is None) == (project is None):
         raise click.UsageError("give SCENE, a file or a pattern, or --scene PROJECT")
@@ -68,7 +54,6 @@ def command(scene: str | None, project: Path | None, as_json: bool, quiet: bool,
     if unfit:
         what = "project" if scene is None else "file or pattern"
         raise click.UsageError(f"--{unfit[0]} does not go with a {what}; leave it out")
-    options["workers"] = options["workers"] or available_cpus()
     if project is None:
         _pattern(str(scene), as_json, quiet, options)
     else:

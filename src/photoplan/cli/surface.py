@@ -35,7 +35,6 @@ def command(project: Path, **options: Any) -> None:
     from photoplan.cli.output import show, show_json
     from photoplan.cli.telling import Telling
     from photoplan.io.project.file import load_project
-    from photoplan.products.run import Run
     from photoplan.products.surface.plan import SurfaceSettings, plan_surface
     from photoplan.products.surface.run import make_surface
 
@@ -50,15 +49,7 @@ def command(project: Path, **options: Any) -> None:
             show_json(plan.json_fields()) if how.as_json else show(plan)
             return
         events.talk(str(plan))
-        run = Run(
-            workers=how.workers,
-            executor=how.executor,
-            memory=how.memory,
-            overwrite=how.overwrite,
-            quicklook=how.quicklook,
-            events=events,
-        )
-        result = make_surface(plan, folder or stated.folder / "products", run)
+        result = make_surface(plan, folder or stated.folder / "products", how.run(events))
         if how.as_json:
             show_json(result)
         else:

@@ -6,15 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photoplan.cli.options import (
-    PATH,
-    dry_run_option,
-    images_option,
-    json_option,
-    overwrite_option,
-    quiet_option,
-    workers_option,
-)
+from photoplan.cli.options import PATH, ending, images_option
 from photoplan.cli.output import say, show, show_json
 
 if TYPE_CHECKING:
@@ -32,11 +24,7 @@ if TYPE_CHECKING:
 @click.option("--ignore-orientation", is_flag=True, help="Work as if no image had a position.")
 @click.option("-o", "--output", type=PATH, metavar="CSV", help="[tie_points.csv by the project]")
 @click.option("--no-picture", is_flag=True, help="Do not write a picture beside the output.")
-@workers_option
-@dry_run_option("Open the images, choose pairs and stop.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending("Open the images, choose pairs and stop.", workers=True)
 def command(as_json: bool, quiet: bool, **options: Any) -> None:
     """Find points that several images of PROJECT have in common.
 
@@ -44,7 +32,6 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
     [observations] in PROJECT. Images that hang together with no other are named.
     """
     from photoplan.cli.telling import Telling
-    from photoplan.engine.executors import available_cpus
     from photoplan.io.naming import together
     from photoplan.products.tie.run import TieRequest, find_ties
     from photoplan.report.drawing import has_matplotlib
@@ -53,7 +40,6 @@ def command(as_json: bool, quiet: bool, **options: Any) -> None:
 
     options["refine"] = not options.pop("no_refine")
     options["use_orientation"] = not options.pop("ignore_orientation")
-    options["workers"] = options["workers"] or available_cpus()
     wanted = not options.pop("no_picture") and not options["dry_run"] and has_matplotlib()
     request = TieRequest(**options)
     place = request.table.with_suffix(".png") if wanted else None

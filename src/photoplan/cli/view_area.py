@@ -7,19 +7,16 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, json_option, overwrite_option, quiet_option, workers_option
+from photoplan.cli.options import PATH, POSITIVE, ending
 from photoplan.cli.view_options import camera_options, take_request
 
 
 @click.command("area")
 @camera_options
 @click.option("--matrix", type=PATH, help="Take the camera of this coordinate matrix.")
-@click.option("--resolution", type=click.FloatRange(0, min_open=True), help="Pixel of the map, metres [a thousandth].")
+@click.option("--resolution", type=POSITIVE, help="Pixel of the map, metres [a thousandth].")
 @click.option("-o", "--output", type=PATH, required=True, metavar="FILE", help="GeoTIFF, or GeoPackage of a polygon.")
-@workers_option
-@overwrite_option
-@json_option
-@quiet_option
+@ending(workers=True)
 def command(matrix: Path | None, **options: Any) -> None:
     """The visible area: where on the map lies what the picture shows. 1 seen, 0 not seen, 255 no terrain."""
     from photoplan.cli.output import say, show, show_json

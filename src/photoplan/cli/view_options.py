@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, json_option, memory_option, overwrite_option, quiet_option, workers_option
+from photoplan.cli.options import PATH, ending, executor_option, memory_option, several, workers_option
 
 _XY: dict[str, Any] = {"type": float, "nargs": 2, "default": None}
 _CAMERA = ("position", "height", "altitude", "look_at", "azimuth", "pitch", "roll", "field_of_view", "size",
@@ -15,63 +14,42 @@ _CAMERA = ("position", "height", "altitude", "look_at", "azimuth", "pitch", "rol
            "reference")  # fmt: skip
 
 
-def camera_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The terrain or project, and the camera."""
-    options = [
-        click.argument("source", type=PATH),
-        click.option(
-            "--camera", metavar="IMAGE|FILE", help="An image of the project, or a TOML file of the options below."
-        ),
-        click.option("--from", "position", metavar="X Y", help="Standpoint.", **_XY),
-        click.option("--height", type=float, help="Eye above ground, metres [1.7]."),
-        click.option("--altitude", type=float, help="Height of the eye in the terrain's system instead."),
-        click.option("--look-at", metavar="X Y", help="Point of the ground in the middle of the picture.", **_XY),
-        click.option("--look-at-height", type=float, help="Height of that point, if it is not on the ground."),
-        click.option("--azimuth", type=float, help="Direction of view instead, degrees from grid north."),
-        click.option("--pitch", type=float, help="Of the view above the horizon, degrees, with --azimuth [0]."),
-        click.option("--roll", type=float, help="Of the camera, degrees clockwise [0]."),
-        click.option("--fov", "field_of_view", type=float, help="Left to right, degrees [60; panoramas 360]."),
-        click.option(
-            "--size", type=int, nargs=2, default=None, metavar="W H", help="Of the picture, pixels [1200 800]."
-        ),
-        click.option("--pixel-aspect", type=float, help="Width of a pixel by its height [1]."),
-        click.option("--panorama", type=click.Choice(["cylinder", "sphere"]), help="Instead of a plane picture."),
-        click.option(
-            "--curvature",
-            type=click.Choice(["none", "bend", "strict"]),
-            help="The earth: flat, lowered by s²/2R, or strict [standpoints bend, images as the project has it].",
-        ),
-        click.option("--refraction", type=float, help="Coefficient k [0.13]."),
-        click.option("--earth-radius", type=float, help="R, metres [the ellipsoid's]."),
-        click.option("--exaggeration", type=float, help="Factor of heights [1]."),
-        click.option(
-            "--reference", type=float, help="Height that it leaves [where the picture's middle meets ground]."
-        ),
-        click.option("--farthest", type=float, help="See no further than this, metres [all]."),
-        click.option("--bound", type=float, help="Largest error of ground coordinates, metres [0.01]."),
-        click.option("--crs", help="CRS of a terrain model that does not state it."),
-        click.option("--force", is_flag=True, help="Also from below the ground, or where none is seen."),
-    ]
-    for option in reversed(options):
-        command = option(command)
-    return command
+#: The terrain or project, and the camera.
+camera_options = several(
+    click.argument("source", type=PATH),
+    click.option(
+        "--camera", metavar="IMAGE|FILE", help="An image of the project, or a TOML file of the options below."
+    ),
+    click.option("--from", "position", metavar="X Y", help="Standpoint.", **_XY),
+    click.option("--height", type=float, help="Eye above ground, metres [1.7]."),
+    click.option("--altitude", type=float, help="Height of the eye in the terrain's system instead."),
+    click.option("--look-at", metavar="X Y", help="Point of the ground in the middle of the picture.", **_XY),
+    click.option("--look-at-height", type=float, help="Height of that point, if it is not on the ground."),
+    click.option("--azimuth", type=float, help="Direction of view instead, degrees from grid north."),
+    click.option("--pitch", type=float, help="Of the view above the horizon, degrees, with --azimuth [0]."),
+    click.option("--roll", type=float, help="Of the camera, degrees clockwise [0]."),
+    click.option("--fov", "field_of_view", type=float, help="Left to right, degrees [60; panoramas 360]."),
+    click.option("--size", type=int, nargs=2, default=None, metavar="W H", help="Of the picture, pixels [1200 800]."),
+    click.option("--pixel-aspect", type=float, help="Width of a pixel by its height [1]."),
+    click.option("--panorama", type=click.Choice(["cylinder", "sphere"]), help="Instead of a plane picture."),
+    click.option(
+        "--curvature",
+        type=click.Choice(["none", "bend", "strict"]),
+        help="The earth: flat, lowered by s²/2R, or strict [standpoints bend, images as the project has it].",
+    ),
+    click.option("--refraction", type=float, help="Coefficient k [0.13]."),
+    click.option("--earth-radius", type=float, help="R, metres [the ellipsoid's]."),
+    click.option("--exaggeration", type=float, help="Factor of heights [1]."),
+    click.option("--reference", type=float, help="Height that it leaves [where the picture's middle meets ground]."),
+    click.option("--farthest", type=float, help="See no further than this, metres [all]."),
+    click.option("--bound", type=float, help="Largest error of ground coordinates, metres [0.01]."),
+    click.option("--crs", help="CRS of a terrain model that does not state it."),
+    click.option("--force", is_flag=True, help="Also from below the ground, or where none is seen."),
+)
 
 
-def running_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """How it is made."""
-    options = [
-        workers_option,
-        click.option("--executor", default="threads", show_default=True, metavar="KIND",
-                     help="threads, processes, or a Dask scheduler's address tcp://host:port."),
-        memory_option,
-        click.option("--dry-run", is_flag=True, help="Say what will be seen, and stop."),
-        overwrite_option,
-        json_option,
-        quiet_option,
-    ]  # fmt: skip
-    for option in reversed(options):
-        command = option(command)
-    return command
+#: How it is made.
+running_options = several(workers_option, executor_option, memory_option, ending("Say what will be seen, and stop."))
 
 
 def take_camera(options: dict[str, Any]) -> Any:
@@ -115,7 +93,6 @@ def run_view(request: Any, options: dict[str, Any]) -> None:
     """Plan and make a view, or say what it would show."""
     from photoplan.cli.output import say, show, show_json
     from photoplan.cli.telling import Telling
-    from photoplan.engine.executors import available_cpus
     from photoplan.products.run import Run
     from photoplan.products.view.make import make_view, plan_view
 
@@ -131,16 +108,8 @@ def run_view(request: Any, options: dict[str, Any]) -> None:
             return
         for line in told(plan):
             events.talk(line)
-        workers = options["workers"] or available_cpus()
-        run = Run(
-            workers=workers,
-            executor=options["executor"],
-            memory=options["memory"],
-            overwrite=options["overwrite"],
-            quicklook=False,
-            events=events,
-        )
-        result = make_view(plan, run)
+        asked = {name: options[name] for name in ("workers", "executor", "memory", "overwrite")}
+        result = make_view(plan, Run(**asked, quicklook=False, events=events))
     if as_json:
         show_json(result, view=plan)
         return

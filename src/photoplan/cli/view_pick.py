@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, ending
 from photoplan.cli.view_options import camera_options, take_request
 
 
@@ -20,9 +20,7 @@ from photoplan.cli.view_options import camera_options, take_request
     "--points", "file", type=PATH, metavar="TABLE", help="Ground points: columns x, y and optionally z, name."
 )
 @click.option("-o", "--output", type=PATH, metavar="CSV", help="Write them as a table, too.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending()
 def command(matrix: Path | None, **options: Any) -> None:
     """The ground of pixels of a view, and the pixels of ground points, with what is seen there.
 

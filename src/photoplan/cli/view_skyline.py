@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from photoplan.cli.options import PATH, json_option, overwrite_option, quiet_option
+from photoplan.cli.options import PATH, ending
 from photoplan.cli.view_options import camera_options, take_request
 
 
@@ -15,9 +15,7 @@ from photoplan.cli.view_options import camera_options, take_request
 @camera_options
 @click.option("--matrix", type=PATH, help="Take the camera of this coordinate matrix.")
 @click.option("-o", "--output", type=PATH, required=True, metavar="FILE", help="CSV, or GeoPackage of points.")
-@overwrite_option
-@json_option
-@quiet_option
+@ending()
 def command(matrix: Path | None, output: Path, overwrite: bool, **options: Any) -> None:
     """The skyline: in every column the highest ground that is seen, with its place in the picture and on the map."""
     from photoplan.cli.output import show, show_json
