@@ -22,9 +22,6 @@ def spelled(text: str, verb: click.Command | None, group: click.Command | None =
 
     Parameters
     ----------
-    text : str
-    verb : click.Command or None
-        The verb that runs.
     group : click.Command, optional
         Holds the verbs that a text may name, as in ``declare `crs` to `photoplan init` ``: theirs are the options that
         `verb` does not have.

@@ -21,8 +21,6 @@ class Telling:
 
     Parameters
     ----------
-    quiet : bool
-        Whether nothing is told but results.
     result : callable
         Prints a result; it goes to stdout.
     terminal : bool or None

@@ -60,11 +60,8 @@ def execute_tile(
 
     Parameters
     ----------
-    tile : CompiledTile
     sources : sequence of Source
         One for each row of the table of sources; all with the same bands and type of pixels.
-    kernel : str
-        Name of a resampling kernel.
     onto : (values, valid), optional
         What of the tile has been painted before.
 

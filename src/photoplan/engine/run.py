@@ -178,8 +178,6 @@ class Runner(Generic[T]):
 
     Parameters
     ----------
-    workers : Workers
-        Compute tiles.
     in_flight : int or None
         Tiles under way at once; None: as many as keep the workers busy.
     events : Events

@@ -56,12 +56,8 @@ class Steps:
 
     Parameters
     ----------
-    name : str
-        The product.
     workers : Workers
         Threads: functions and items are handed over as they are.
-    events : Events
-        Told of items that are done.
     store : Store, optional
         Keeps results; None: they end with the process.
     root : str
@@ -89,8 +85,6 @@ class Steps:
 
         Parameters
         ----------
-        function : callable
-        items : iterable
         names : sequence, optional
             What the result of each item depends on beside the store's key; None: the root and the numbers of the call
             and of the item.

@@ -54,7 +54,6 @@ def read_gcp_list(path: Path, crs: str | None = None) -> GcpList:
 
     Parameters
     ----------
-    path : Path
     crs : str, optional
         Projected CRS that the points are wanted in; that of the file otherwise.
 

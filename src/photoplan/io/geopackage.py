@@ -115,8 +115,6 @@ def write_residuals(
 
     Parameters
     ----------
-    path : Path
-    points : ImagePoints
     residuals, normalised, redundancies : ndarray, shape (n, 2)
         Columns and rows; NaN, an empty field, where a measurement was not used.
     rejected : ndarray, shape (n,)

@@ -51,7 +51,6 @@ def read_ground_points(
 
     Parameters
     ----------
-    path : Path
     crs : str, optional
         The CRS that the points must be in, where the file (or a ``.prj`` beside it) states one.
     columns : str, optional

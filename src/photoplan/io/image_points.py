@@ -42,7 +42,6 @@ def read_image_points(
 
     Parameters
     ----------
-    path : Path
     columns : str, optional
         Columns in their order, as in ``"image,point,-,x,y"``, where the table does not say.
     decimal_comma : bool

@@ -64,7 +64,6 @@ def opencv_losses(block: OrientationBlock, *, rational: bool = True, fisheye: bo
 
     Parameters
     ----------
-    block : OrientationBlock
     rational, fisheye : bool
         Whether the format has k4–k6, and the fisheye lens.
     """

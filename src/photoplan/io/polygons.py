@@ -56,7 +56,6 @@ def read_features(path: Path, *kinds: str, crs: str | None = None) -> VectorFeat
 
     Parameters
     ----------
-    path : Path
     kinds : str
         What the objects may be: `Polygon`, `Point`, `LineString`; several objects in one are taken as such.
     crs : str, optional
@@ -148,8 +147,6 @@ def write_features(
     shapes : sequence of shapely geometries
     columns : mapping
         Name and values of each column.
-    crs : str
-    layer : str
 
     Raises
     ------

@@ -40,7 +40,6 @@ def reduced_by_blocks(key: Hashable, reader: FullSize, window: Window, level: in
     ----------
     key : hashable
         What tells the file and its state from all others.
-    reader : FullSize
     window : Window
         Of the reduced image.
     level : int
@@ -221,7 +220,6 @@ def best_overview(info: RasterInfo, level: int) -> Overview | None:
 
     Parameters
     ----------
-    info : RasterInfo
     level : int
         At least 1.
     """

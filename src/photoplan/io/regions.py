@@ -62,8 +62,6 @@ def source_regions(path: Path, grid: MapGrid) -> dict[int, Any]:
     ----------
     path : Path
         A raster of sources.
-    grid : MapGrid
-        Its grid.
     """
     found: dict[int, list[Any]] = {}
     with rasterio.open(path) as file:

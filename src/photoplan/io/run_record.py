@@ -116,7 +116,6 @@ def recording(kind: str, request: Any, inputs: Iterable[Any]) -> Iterator[Callab
 
     Parameters
     ----------
-    kind : str
     request : dataclass
         See `settings_of`.
     inputs : iterable

@@ -115,7 +115,6 @@ def write_picture(source: Path, target: Path, driver: str, quality: int, note: s
 
     Parameters
     ----------
-    source, target : Path
     driver : str
         A value of `PICTURES`.
     quality : int

@@ -62,8 +62,6 @@ def split_line(path: Path, item: Line, delimiter: str) -> tuple[str, ...]:
 
     Parameters
     ----------
-    path : Path
-        For the message.
     item : tuple of int and str
         Number of the line, from 1, and its text.
     delimiter : str

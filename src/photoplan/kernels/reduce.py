@@ -25,7 +25,6 @@ def reduce_means(
     ----------
     source : (bands, height, width)
     valid : (height, width) bool, or (0, 0): all are valid
-    side : int
     whole : bool
         Whether means are rounded, half up, as integers want it.
     out : (bands, ceil(height / side), ceil(width / side)), type of `source`

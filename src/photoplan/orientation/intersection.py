@@ -91,7 +91,6 @@ def intersect(
     ----------
     poses : sequence of Pose
         In a Cartesian system.
-    rays : Rays
     count : int, optional
         Number of points [the largest index + 1].
     critical : float

@@ -122,7 +122,6 @@ def sights_of(
         Interior orientation and lens of every image by its name; images that are missing here are not used.
     observed : ImagePoints
         Names of images as in `names`.
-    ground : GroundPoints
 
     Raises
     ------

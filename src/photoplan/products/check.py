@@ -102,7 +102,6 @@ def check_project(project: Project, images: Sequence[str] | None = None) -> Proj
 
     Parameters
     ----------
-    project : Project
     images : sequence of str, optional
         Names or patterns; all images if it is None.
 

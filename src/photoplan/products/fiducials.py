@@ -154,13 +154,6 @@ class _Job:
 def locate_fiducials(request: FiducialsRequest, events: Events = SILENT) -> FiducialsReport:
     """Find the fiducial marks of all images; one that fails does not stop the others.
 
-    Parameters
-    ----------
-    request : FiducialsRequest
-        What is asked.
-    events : Events
-        Told how far it is.
-
     Raises
     ------
     UsageError

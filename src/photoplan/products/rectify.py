@@ -96,13 +96,10 @@ class Raster:
 
         Parameters
         ----------
-        path : path
         nodata : float, ``"mask"`` or ``"auto"``
             See `photoplan.io.product.ProductFile`.
         compress : str
             ``none``, ``deflate``, ``zstd``, ``lzw`` or ``jpeg``.
-        overwrite : bool
-            Whether an existing file may be replaced.
 
         Raises
         ------

@@ -89,12 +89,6 @@ class ResectResult:
 def resect_project(request: ResectRequest, events: Events = SILENT) -> ResectResult:
     """Orient images by control and write the result into the project.
 
-    Parameters
-    ----------
-    request : ResectRequest
-    events : Events
-        Told of every image.
-
     Raises
     ------
     UsageError

@@ -125,12 +125,6 @@ Found = Iterator[tuple[str, str, float, str, str]]
 def sensor_figures(described: SensorDescription, file: str) -> tuple[SensorFigure, ...]:
     """Every figure that a description determines, in the order of its tables.
 
-    Parameters
-    ----------
-    described : SensorDescription
-    file : str
-        Name of the file, for messages.
-
     Raises
     ------
     InputError

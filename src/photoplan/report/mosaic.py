@@ -22,10 +22,8 @@ def draw_regions(path: Path, shapes: Mapping[str, Any], title: str) -> Path:
 
     Parameters
     ----------
-    path : Path
     shapes : mapping
         Multipolygon of each image, in map coordinates.
-    title : str
 
     Raises
     ------

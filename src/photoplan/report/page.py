@@ -173,11 +173,8 @@ def open_report(
 
     Parameters
     ----------
-    path : Path, optional
     inputs : iterable of Path
         What it must not replace; None and words that are no files are passed over.
-    overwrite : bool
-        It may exist.
     table : Path, optional
         Another file that is written.
     project : Path, optional

@@ -21,7 +21,6 @@ def draw_surface(heights: Path, picture: Path) -> Path:
     ----------
     heights : Path
         NAME.tif; NAME_sigma.tif and NAME_grey.tif stand beside it.
-    picture : Path
 
     Raises
     ------

@@ -44,7 +44,6 @@ def quadtree(xy: NDArray[np.float64], layout: UnitLayout, meshes: int) -> Leaves
     ----------
     xy : ndarray, shape (n, 2)
         Points inside the layout, in its coordinates.
-    layout : UnitLayout
     meshes : int
         Meshes along a unit's side, a power of two.
     """

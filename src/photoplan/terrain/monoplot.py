@@ -93,14 +93,10 @@ def monoplot(
 
     Parameters
     ----------
-    camera : Camera
     xy : array_like, shape (n, 2)
         Image points, pixels.
-    terrain : Terrain
-        The ground.
     height_range : (float, float)
         Lowest and highest terrain that the image can show, metres.
-    errors : MonoplotErrors
     mesh : float
         Mesh width of the terrain, metres: slopes are taken over it.
 

@@ -95,8 +95,6 @@ def needed_heights(
         NaN = no height; such places block nothing.
     mesh : float
         Distance of the posts, metres.
-    observer : Observer
-    settings : SightSettings
     only_whether : bool
         Ask only whether targets of the given height are seen: where they are not, the result is infinite. Several
         times faster.

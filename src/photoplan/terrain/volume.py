@@ -96,7 +96,6 @@ def volume_between(a: Terrain, b: Terrain, polygon: Any, settings: VolumeSetting
     a, b : Terrain
         In one CRS and one height system.
     polygon : shapely Polygon or MultiPolygon
-    settings : VolumeSettings
     run : callable
         ``map``, or what computes windows as it does.
     """
@@ -267,7 +266,6 @@ def volume_sigma(
 
     Parameters
     ----------
-    a, b : Terrain
     errors : (ErrorModel, ErrorModel)
         How the heights of A and of B err.
     polygon : shapely Polygon or MultiPolygon

@@ -31,8 +31,6 @@ def distance_differences(
         Coordinates of the marks.
     distances_mm : dict
         Printed distances; a key is the names of two marks with a hyphen between.
-    where : str
-        What messages begin with.
 
     Raises
     ------

@@ -45,8 +45,6 @@ def from_polygons(
 
     Parameters
     ----------
-    where : str
-        The file, for messages.
     polygons : list of `Rings`
     objects : list of int
         Place of the object of each polygon in `names`.

@@ -163,7 +163,6 @@ def common_losses(block: OrientationBlock, *, cameras: bool, crs: bool = False, 
 
     Parameters
     ----------
-    block : OrientationBlock
     cameras, crs : bool
         Whether the format holds cameras, a coordinate system.
     film : bool

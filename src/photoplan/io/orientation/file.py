@@ -102,13 +102,10 @@ def write_orientation(block: OrientationBlock, path: str | Path, format: str, *,
 
     Parameters
     ----------
-    block : OrientationBlock
     path : path
         File, or folder of a format with several files.
     format : str
         One of `FORMATS`.
-    overwrite : bool
-        Replace files that exist.
 
     Returns
     -------

@@ -45,7 +45,6 @@ def numbers(words: Sequence[str], where: str, what: str, count: int) -> tuple[fl
     words : sequence of str
     where, what : str
         File and line, and what the numbers are, for messages.
-    count : int
 
     Raises
     ------
@@ -94,7 +93,6 @@ def angle_block(
 
     Parameters
     ----------
-    path : Path
     form : TableFormat
         What the user declares against the format's own conventions.
     rows : sequence of (Words, str, sequence of str)
@@ -127,9 +125,6 @@ def angle_lines(block: OrientationBlock, path: Path, width: int) -> list[str]:
 
     Parameters
     ----------
-    block : OrientationBlock
-    path : Path
-        For the message.
     width : int
         Characters that names are filled up to.
 

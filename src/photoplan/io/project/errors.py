@@ -20,7 +20,6 @@ def explain(
 
     Parameters
     ----------
-    error : ValidationError
     data : dict
         The plain values that were checked.
     source : str

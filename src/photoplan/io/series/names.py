@@ -123,8 +123,6 @@ def find_files(folder: Path, pattern: str, where: str) -> dict[Path, Values]:
     pattern : str
         A path whose last part may hold ``*``, ``?`` and fields: ``{exposure_ms}`` stands for a number,
         ``{time:%Y%m%d-%H%M%S}`` for a time in that form, any other ``{name}`` for a text.
-    where : str
-        Beginning of messages.
 
     Raises
     ------

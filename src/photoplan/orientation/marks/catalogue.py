@@ -185,8 +185,6 @@ def polygon(
         What is compared, millimetres, before the rotation; default: all parts and a tenth of their size around them.
     rotation : float
         Anticlockwise, degrees.
-    name : str
-        For messages.
 
     Raises
     ------

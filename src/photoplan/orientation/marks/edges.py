@@ -127,8 +127,6 @@ def fit_edges(
     ----------
     image : ndarray, shape (h, w)
         Grey values; NaN: not compared.
-    pattern : MarkPattern
-        What the mark looks like.
     mm_to_pixel : (2, 2)
         From millimetres (x right, y up) to columns and rows, about.
     at : (float, float)

@@ -145,8 +145,6 @@ def combine(
 
     Parameters
     ----------
-    layout : MarkLayout
-        The marks.
     candidates : sequence of (k, 3) arrays
         Column, row and correlation for each mark, best first; may be empty.
     turn, negative

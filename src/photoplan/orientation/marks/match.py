@@ -98,8 +98,6 @@ def match_template(image: NDArray[np.floating], template: FineTemplate, x: float
     ----------
     image : ndarray, shape (h, w)
         Grey values; NaN: not compared.
-    template : FineTemplate
-        The mark.
     x, y : float
         Approximate place of the reference point, to a pixel or two.
 

@@ -71,11 +71,6 @@ def measure_marks(scan: Scan, layout: MarkLayout, placement: MarkPlacement, leas
 
     Parameters
     ----------
-    scan : Scan
-    layout : MarkLayout
-        The marks that are sought.
-    placement : MarkPlacement
-        Where they about lie.
     least : float
         A place that correlates less is no mark.
     """

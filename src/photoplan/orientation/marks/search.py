@@ -79,8 +79,6 @@ def search_placements(search: Search, pixels_mm: Sequence[float]) -> list[MarkPl
 
     Parameters
     ----------
-    search : Search
-        What is sought.
     pixels_mm : sequence of float
         Sides of a pixel that are tried, millimetres; not all, if one fits all marks very well.
     """

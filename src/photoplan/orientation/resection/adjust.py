@@ -100,10 +100,8 @@ def resect(
 
     Parameters
     ----------
-    points : MeasuredPoints
     interior, lens
         Interior orientation, approximate for free parameters.
-    settings : ResectSettings, optional
     camera_of : callable, optional
         The camera that a pose makes where central projection in the given coordinates is not all: earth curvature,
         refraction. What it adds to central projection is taken off the measurements, again at every step. The

@@ -74,7 +74,6 @@ def start_block(
         Those of other images are not used.
     ground : GroundPoints
         Points with all three coordinates that are no check points serve as control.
-    positions : ObservedPositions, optional
     sigma : float
         Standard deviation of measurements that state none, pixels.
     """

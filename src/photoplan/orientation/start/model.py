@@ -240,7 +240,6 @@ def net_of(
     cameras : mapping of str to BlockCamera
     images : sequence
         With name, camera and transformation from image plane to pixels.
-    observations : ImagePoints
     ground : GroundPoints
         Check points and points without all three coordinates are no control here.
     sigma : float

@@ -153,12 +153,6 @@ class CharacteriseReport:
 def characterise(request: CharacteriseRequest, events: Events = SILENT) -> CharacteriseReport:
     """Run the analyses that a series allows; one that fails does not stop the others.
 
-    Parameters
-    ----------
-    request : CharacteriseRequest
-    events : Events
-        Told how far it is.
-
     Raises
     ------
     UsageError

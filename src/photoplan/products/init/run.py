@@ -111,7 +111,6 @@ def init_project(request: InitRequest, talk: Callable[[str], None] = lambda line
 
     Parameters
     ----------
-    request : InitRequest
     talk : callable
         Takes lines for the user: what was found and what was left out.
 

@@ -76,8 +76,6 @@ def measure_image(name: tuple[str, Path], image: LightImage, how: Measuring, adv
     ----------
     name : str and Path
         What messages call it, and its file as it was given.
-    image : LightImage
-    how : Measuring
     advance : callable
         Called with (tiles, pixels) as they are done.
 

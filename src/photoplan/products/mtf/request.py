@@ -23,10 +23,6 @@ def check_files(images: Sequence[Path], tables: Sequence[Path | str | None], csv
     images : sequence of Path
     tables : sequence
         Other inputs; None and the words ``linear`` and ``srgb`` are no files.
-    csv : Path, optional
-        The table that is written.
-    overwrite : bool
-        It may exist.
 
     Raises
     ------

@@ -61,12 +61,6 @@ class MtfRequest:
 def measure_mtf(request: MtfRequest, events: Events = SILENT) -> MtfReport:
     """Measure the edges of all images; one that fails does not stop the others.
 
-    Parameters
-    ----------
-    request : MtfRequest
-    events : Events
-        Told how far it is.
-
     Returns
     -------
     MtfReport

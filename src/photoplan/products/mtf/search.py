@@ -58,11 +58,8 @@ def search_edges(
 
     Parameters
     ----------
-    image : LightImage
-    channel : int
     area : Window
         Inside the image.
-    rules : EdgeRules
     advance : callable
         Called with (1, pixels) after each tile.
 

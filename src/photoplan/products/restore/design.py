@@ -121,12 +121,6 @@ class MeasuredFilter:
 def design_restoration(request: DesignRequest, events: Events = SILENT) -> MeasuredFilter:
     """Measure the sharpness of images at their edges, all together, and design the filter that restores them.
 
-    Parameters
-    ----------
-    request : DesignRequest
-    events : Events
-        Told how far it is.
-
     Raises
     ------
     UsageError

@@ -56,7 +56,6 @@ def requested_filter(request: FilterRequest, events: Events = SILENT) -> FoundFi
 
     Parameters
     ----------
-    request : FilterRequest
     events : Events
         Told how far a measurement is, and what was found.
 

@@ -221,7 +221,6 @@ def restore_images(request: RestoreRequest, events: Events = SILENT) -> RestoreR
 
     Parameters
     ----------
-    request : RestoreRequest
     events : Events
         Told of tiles that are done, and of each image as soon as it is written.
 

@@ -84,12 +84,6 @@ class SceneReport:
 def simulate_project(request: SceneRequest, events: Events = SILENT) -> SceneReport:
     """Render images of a project and write them.
 
-    Parameters
-    ----------
-    request : SceneRequest
-    events : Events
-        Told how far it is.
-
     Raises
     ------
     UsageError

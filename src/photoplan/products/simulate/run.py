@@ -103,12 +103,6 @@ class FileScene:
 def simulate(request: SimulateRequest, events: Events = SILENT) -> SimulateReport:
     """Form images of a scene and write them.
 
-    Parameters
-    ----------
-    request : SimulateRequest
-    events : Events
-        Told how far it is.
-
     Raises
     ------
     UsageError

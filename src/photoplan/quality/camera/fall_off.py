@@ -126,7 +126,6 @@ def fit_fall_off(flat: NDArray[np.floating], settings: FallOffSettings | None = 
     ----------
     flat : ndarray, shape (h, w)
         Mean of flat frames, dark frame subtracted; NaN: pixels not to be used.
-    settings : FallOffSettings, optional
 
     Raises
     ------

@@ -107,7 +107,6 @@ def correct_fall_off(pixels: NDArray[Any], window: Window, model: FallOffModel) 
         Grey values proportional to light, but for the model's `dark`; NaN stays.
     window : Window
         Where they lie in the image.
-    model : FallOffModel
 
     Returns
     -------

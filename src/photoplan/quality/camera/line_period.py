@@ -119,7 +119,6 @@ def false_alarm(found: Spectrum, freedom: int, extent: float) -> float:
 
     Parameters
     ----------
-    found : Spectrum
     freedom : int
         Degrees of freedom that are left beside the base functions and one oscillation.
     extent : float

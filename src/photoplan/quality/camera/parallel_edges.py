@@ -74,7 +74,6 @@ def compare_edges(first: LineJitter, second: LineJitter, offset: int = 0, *, per
 
     Parameters
     ----------
-    first, second : LineJitter
     offset : int
         Line of the second window minus that of the first one, in the image.
     periodic : bool

@@ -181,7 +181,6 @@ def fit_band(band: int, size: tuple[int, int], measured: Displacements, kind: st
     band : int
         Counted from 1.
     size : (width, height)
-    measured : Displacements
     kind : str, optional
         A name of `KINDS`, in place of the choice.
 

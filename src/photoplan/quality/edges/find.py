@@ -135,11 +135,6 @@ class EdgeRegion:
 def find_edges(picture: EdgePicture, rules: EdgeRules | None = None) -> tuple[list[EdgeRegion], Counter[str]]:
     """Edges of a picture that can be measured.
 
-    Parameters
-    ----------
-    picture : EdgePicture
-    rules : EdgeRules, optional
-
     Returns
     -------
     list of EdgeRegion
@@ -162,12 +157,6 @@ def find_edges(picture: EdgePicture, rules: EdgeRules | None = None) -> tuple[li
 
 def examine(picture: EdgePicture, line: StraightEdge, rules: EdgeRules) -> tuple[EdgeRegion | None, str]:
     """The part of a line where both sides are clean, in the widest window that allows it.
-
-    Parameters
-    ----------
-    picture : EdgePicture
-    line : StraightEdge
-    rules : EdgeRules
 
     Returns
     -------

@@ -266,7 +266,6 @@ def strip_along(
         Shape (h, w).
     valid, saturated : array, optional
         Masks of the same shape; None: all valid, none saturated.
-    line : StraightEdge
     half : int
         Bins to each side.
 

@@ -73,7 +73,6 @@ def spread_transfer(spread: Spread, fx: _Array, fy: _Array, scale: float = 1.0) 
 
     Parameters
     ----------
-    spread : Spread
     fx, fy : arrays of one shape
         Frequencies, cycles per pixel.
     scale : float
@@ -209,8 +208,6 @@ def pixel_kernel(spread: Spread, aperture: Aperture, scale: float, cells: int, c
 
     Parameters
     ----------
-    spread : Spread
-    aperture : Aperture
     scale : float
         Factor of all lengths of the spread function.
     cells : int

@@ -53,7 +53,6 @@ def next_gain(automatic: AutomaticGain, gain: float, mean: float) -> float:
 
     Parameters
     ----------
-    automatic : AutomaticGain
     gain : float
         Of this frame.
     mean : float
@@ -154,7 +153,6 @@ def form_image(
 
     Parameters
     ----------
-    model : ImageModel
     scene : LightScene or array
         An array is taken as a scene with one cell per pixel.
     frame : int
@@ -302,7 +300,6 @@ def model_transfer(
 
     Parameters
     ----------
-    model : ImageModel
     frequency : array
         Cycles per pixel along the direction.
     angle_deg : float

@@ -101,7 +101,6 @@ def measure_star(
     ----------
     light : ndarray
         Shape (rows, columns), proportional to light.
-    rules : StarRules, optional
     clipped : ndarray, optional
         True where a pixel is cut off at an end of its range, same shape.
     what : str

@@ -222,7 +222,6 @@ def design_filter(
     scenes : sequence of SceneStatistics
         Noise and spectrum that the image may have, the likeliest first; only an exact inverse that is asked for can do
         without.
-    options : DesignOptions, optional
     kept : ndarray, shape (8, 8), optional
         What compression has left of the scene (`kept_by_compression`); None: all.
 

@@ -84,7 +84,6 @@ def exact_inverse(spread: SpreadFunction, half: int = 5, rows: int = BAND_ROWS) 
 
     Parameters
     ----------
-    spread : SpreadFunction
     half : int
         How many values of the row are kept to each side.
     rows : int

@@ -78,7 +78,6 @@ class Expectation:
         ----------
         transfer : Transfer
             Of the image, real and symmetric.
-        scene : SceneStatistics
         aperture : float
             Side of the ideal aperture, pixels; below 1 the best filter is sharper and noisier.
         kept : ndarray, shape (8, 8), optional

@@ -219,7 +219,6 @@ def field_weights(
     ----------
     places : sequence of (column, row)
         All different.
-    window : Window
 
     Returns
     -------
