@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 import rasterio
 from tools.command import inside
+from tools.formed import form_image
 
-from photoplan.quality.formation.model import ImageModel, form_image
+from photoplan.quality.formation.model import ImageModel
 from photoplan.quality.formation.parts import (
     DarkCurrentPart,
     DefectPart,

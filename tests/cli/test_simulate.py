@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import rasterio
 from tools.command import Here
-from tools.formed import form_series
+from tools.formed import form_image, form_series
 
 from photoplan.io.whole_image import write_whole_image
 from photoplan.products.simulate.model import entry_of, model_of, read_model
-from photoplan.quality.formation.model import ImageModel, form_image
+from photoplan.quality.formation.model import ImageModel
 from photoplan.quality.formation.scenes import PatternScene
 
 MODEL = """

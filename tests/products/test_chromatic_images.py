@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tools.formed import form_image
 
 from photoplan.errors import InputError, UsageError
 from photoplan.geometry.grid import Window
@@ -22,7 +23,7 @@ from photoplan.products.chromatic import (
 from photoplan.project.align import AlignStep
 from photoplan.project.stepped import SteppedReader
 from photoplan.quality.colour.model import BandModel, ChromaticModel
-from photoplan.quality.formation.model import ImageModel, form_image
+from photoplan.quality.formation.model import ImageModel
 from photoplan.quality.formation.parts import Gain, Lateral, Quantisation, Spread
 from photoplan.quality.formation.scenes import PatternScene
 

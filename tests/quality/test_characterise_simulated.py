@@ -6,14 +6,14 @@ import math
 
 import numpy as np
 import pytest
-from tools.formed import form_series
+from tools.formed import form_image, form_series
 
 from photoplan.quality.camera.fall_off import fit_fall_off
 from photoplan.quality.camera.fall_off_adjust import FallOffSettings
 from photoplan.quality.camera.gain_control import gain_control
 from photoplan.quality.camera.line_jitter import line_jitter
 from photoplan.quality.camera.plumb_edge import correlate_edge, fit_edge
-from photoplan.quality.formation.model import ImageModel, form_image
+from photoplan.quality.formation.model import ImageModel
 from photoplan.quality.formation.parts import (
     AutomaticGain,
     Exposure,

@@ -3,15 +3,16 @@
 import numpy as np
 import pytest
 from scipy import ndimage
+from tools.formed import ArrayScene, form_image
 
 from photoplan.errors import GeometryError, InputError
 from photoplan.quality.colour.discs import disc_displacements, find_discs
 from photoplan.quality.colour.displacements import edge_displacements, patch_displacements
 from photoplan.quality.colour.model import BandModel, ChromaticModel, Displacements, fit_band
 from photoplan.quality.edges.find import EdgePicture, find_edges
-from photoplan.quality.formation.model import ImageModel, form_image
+from photoplan.quality.formation.model import ImageModel
 from photoplan.quality.formation.parts import Falloff, Gain, Lateral, Quantisation, Spread
-from photoplan.quality.formation.scenes import ArrayScene, PatternScene
+from photoplan.quality.formation.scenes import PatternScene
 
 LATERAL = (Lateral(1, (0.3, -0.2), 0.002, 0.001), Lateral(3, (-0.15, 0.05), -0.001, 0.0))
 #: Contrast 200 with noise 4: a signal-to-noise ratio of 50.

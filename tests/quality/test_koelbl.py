@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from tools.blurred_scenes import discrete_spread
 from tools.edges import edge_image, gaussian
+from tools.koelbl import normalised_edge, spread_from_edge
 
 from photoplan.errors import InputError
-from photoplan.quality.edges.koelbl import normalised_edge, spread_from_edge, spread_from_response, spread_of_edge
+from photoplan.quality.edges.koelbl import spread_from_response, spread_of_edge
 from photoplan.quality.edges.response import measure_edge
 from photoplan.quality.spread import SpreadFunction
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from tools.formed import form_series
+from tools.formed import form_image, form_series
 
 from photoplan.errors import InputError
-from photoplan.quality.formation.model import ImageModel, form_image
+from photoplan.quality.formation.model import ImageModel
 from photoplan.quality.formation.parts import (
     AutomaticGain,
     DarkCurrentPart,

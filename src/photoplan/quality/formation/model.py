@@ -39,7 +39,7 @@ from photoplan.quality.formation.parts import (
     Well,
     Within,
 )
-from photoplan.quality.formation.scenes import ArrayScene, LightScene
+from photoplan.quality.formation.scenes import LightScene
 from photoplan.quality.formation.sensor import Pattern, add_shot_noise, fixed_pattern, moved_charge, overflow
 from photoplan.quality.mtf_curve import MtfCurve
 
@@ -146,33 +146,6 @@ class FormedImage:
     """Figures: electrons (means), overflow, clipped pixels; plain values."""
 
 
-def form_image(
-    model: ImageModel, scene: LightScene | NDArray[Any], frame: int = 0, exposure: float = 1.0, gain: float = 1.0
-) -> FormedImage:
-    """Form one image of a scene.
-
-    Parameters
-    ----------
-    scene : LightScene or array
-        An array is taken as a scene with one cell per pixel.
-    frame : int
-        Number in a series: frames differ in what is random in time, not in the fixed pattern.
-    exposure : float
-        Factor of the light and of the time.
-    gain : float
-        Automatic gain that earlier frames led to, `FormedImage.next_gain`.
-
-    Raises
-    ------
-    InputError
-        The scene is too large, or a part of the model does not fit it.
-    """
-    scene = _checked(model, scene)
-    if not exposure >= 0.0 or not np.isfinite(exposure) or frame < 0:
-        raise InputError(f"frame {frame} with exposure {exposure}; neither may be negative")
-    return exposed(model, frame_light(model, scene, frame).whole(), Frame(frame, exposure, gain))
-
-
 @dataclass(frozen=True)
 class Frame:
     """One of a series."""
@@ -182,25 +155,11 @@ class Frame:
     exposure: float = 1.0
     """Factor of the light and of the time."""
     gain: float = 1.0
-    """Automatic gain that earlier frames led to."""
+    """Automatic gain that earlier frames led to, `FormedImage.next_gain`."""
 
-
-def _checked(model: ImageModel, scene: Any) -> LightScene:
-    """A scene that is small enough and has the bands that the model describes."""
-    made: Any = ArrayScene(scene) if isinstance(scene, np.ndarray) else scene
-    width, height = made.size
-    if width * height * made.bands > MOST_PIXELS:
-        raise InputError(
-            f"a scene of {made.bands} × {width} × {height} pixels; at most {MOST_PIXELS:,} are formed at once: cut it"
-        )
-    absent = [each.band for each in model.lateral if each.band > made.bands]
-    if absent:
-        raise InputError(
-            f"lateral: band {absent[0]} is described, but the scene has only {made.bands}; leave its "
-            "entry out, or give a scene that has it"
-        )
-    found: LightScene = made
-    return found
+    def __post_init__(self) -> None:
+        if not self.exposure >= 0.0 or not np.isfinite(self.exposure) or self.number < 0:
+            raise InputError(f"frame {self.number} with exposure {self.exposure}; neither may be negative")
 
 
 def _random(model: ImageModel, *key: int) -> np.random.Generator:

@@ -1,4 +1,4 @@
-"""Scenes for the image formation model: arrays, and test patterns integrated exactly over small cells."""
+"""Scenes for the image formation model: test patterns integrated exactly over small cells."""
 
 from __future__ import annotations
 
@@ -51,57 +51,6 @@ class LightScene(Protocol):
     def cells(self, window: Window) -> _Array:
         """Cells of a window of pixels, shape (bands, height · k, width · k); it may reach beyond the image."""
         ...
-
-
-@dataclass(frozen=True, eq=False)
-class ArrayScene:
-    """A scene from an array; beyond its border it goes on as at the border."""
-
-    values: _Array
-    """Mean values of the cells, shape (rows · k, columns · k) or (bands, rows · k, columns · k)."""
-    oversampling: int = 1
-    """k: cells along a side of a pixel."""
-    continuous: bool | None = None
-    """Whether the cells are means of a continuous scene; else the scene consists of even squares, as Kölbl's object
-    pixels. None: even squares where k is 1, else continuous."""
-
-    def __post_init__(self) -> None:
-        values = np.array(self.values, np.float64)
-        values = values[None] if values.ndim == 2 else values
-        if values.ndim != 3 or 0 in values.shape:
-            raise InputError(f"a scene has rows and columns, or bands, rows and columns; given is shape {values.shape}")
-        if (
-            not 1 <= self.oversampling <= 64
-            or values.shape[1] % self.oversampling
-            or values.shape[2] % self.oversampling
-        ):
-            raise InputError(
-                f"a scene of {values.shape[2]} × {values.shape[1]} cells with oversampling {self.oversampling}; needed "
-                "is 1 to 64, and sides that are multiples of it"
-            )
-        if not np.isfinite(values).all():
-            raise InputError("a scene has finite values only")
-        values.setflags(write=False)
-        object.__setattr__(self, "values", values)
-        if self.continuous is None:
-            object.__setattr__(self, "continuous", self.oversampling > 1)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of the image, pixels."""
-        return self.values.shape[2] // self.oversampling, self.values.shape[1] // self.oversampling
-
-    @property
-    def bands(self) -> int:
-        """Number of bands."""
-        return int(self.values.shape[0])
-
-    def cells(self, window: Window) -> _Array:
-        """Cells of a window of pixels, shape (bands, height · k, width · k)."""
-        k = self.oversampling
-        rows = np.clip(np.arange(window.row * k, window.stop[1] * k), 0, self.values.shape[1] - 1)
-        columns = np.clip(np.arange(window.col * k, window.stop[0] * k), 0, self.values.shape[2] - 1)
-        return self.values[:, rows[:, None], columns[None, :]]
 
 
 @dataclass(frozen=True)
